@@ -1,0 +1,71 @@
+"""Calibrated posteriors of layered dielectrics from polarization captures.
+
+Names are loaded when they are first used: `import polar_bayes` starts no array library, and
+reading a capture does not load a sampler.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+_HOMES = {
+    "capture.files": ("load_capture", "save_capture"),
+    "capture.goniometer": ("from_goniometer",),
+    "capture.schema": ("count", "validate"),
+    "diagnostics.convergence": ("json_summary", "summary", "verdict"),
+    "errors": ("CaptureError", "FitError", "PolarBayesError", "SceneError"),
+    "inference.files": ("load_result", "save_result"),
+    "inference.fit": ("fit",),
+    "inference.laplace": ("Laplace",),
+    "inference.nuts": ("Nuts",),
+    "inference.point": ("Point",),
+    "observation.links": (
+        "BetaLink",
+        "LogitNormalLink",
+        "NormalLink",
+        "StokesLink",
+        "StudentTLink",
+    ),
+    "observation.noise": ("ConcentrationSchedule", "ScaleSchedule"),
+    "physics.discrepancy": ("Discrepancy",),
+    "physics.facets": ("FacetQuadrature",),
+    "physics.geometry": ("Geometry",),
+    "physics.illumination": ("Disc", "PointSource", "UniformSky"),
+    "physics.instrument": (
+        "AngleZero",
+        "ChannelGain",
+        "DarkLevel",
+        "DolpGain",
+        "Instrument",
+        "Leakage",
+    ),
+    "physics.microfacet": ("GGX", "Beckmann"),
+    "physics.mixing": ("DopMixing", "StokesMixing"),
+    "physics.scene": ("Scene",),
+    "physics.subsurface": ("Depolarizer", "Lambertian", "Unpolarized"),
+    "physics.surface": ("RoughSurface", "SmoothSurface"),
+    "priors": ("PRIORS",),
+    "report.html": ("report",),
+    "setups": ("SETUPS", "Setup"),
+    "simulation.presets": ("PRESETS", "Material"),
+    "simulation.protocol": ("Protocol",),
+    "simulation.simulate": ("simulate",),
+}
+_MODULE_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = sorted(_MODULE_OF)  # noqa: PLE0605
+
+if TYPE_CHECKING:
+    from polar_bayes.inference.fit import fit as fit
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name from its home (PEP 562)."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'polar_bayes' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"polar_bayes.{_MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,1 @@
+"""Measurements: what a capture holds, and the doors through which it enters."""

@@ -1,0 +1,72 @@
+"""Captures in netCDF files: read whole, written whole or not at all."""
+
+import os
+import tempfile
+from pathlib import Path
+
+import xarray as xr
+
+from polar_bayes.capture.paths import as_path, existing_file, system_error
+from polar_bayes.capture.schema import validate
+from polar_bayes.errors import CaptureError
+
+
+def load_capture(path: str | os.PathLike[str]) -> xr.Dataset:
+    """A capture from a netCDF file.
+
+    The file is read whole and closed. Where the capture has no attribute `name`, it is named after
+    the file.
+
+    Args:
+        path: A netCDF file (version 4 or classic).
+
+    Returns:
+        The validated capture.
+
+    Raises:
+        CaptureError: The file cannot be read, or does not hold a capture.
+    """
+    file = existing_file(path, "capture")
+    try:
+        # Absolute, so that netCDF takes no path for an address; times stay the numbers they are.
+        with xr.open_dataset(file.absolute(), engine="netcdf4", decode_times=False) as opened:
+            dataset = opened.load()
+    except PermissionError as error:
+        raise system_error(error, file) from error
+    except Exception as error:  # the libraries below raise nearly every type for a broken file
+        what = "it cannot be read as netCDF"
+        mend = "write it again with save_capture"
+        raise CaptureError(what, where=str(file), mend=mend) from error
+    dataset.attrs.setdefault("name", file.stem)
+    return validate(dataset, source=str(file))
+
+
+def save_capture(capture: xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a capture to a netCDF-4 file.
+
+    It is written beside its place and then moved there, so a failure leaves what was there before.
+
+    Args:
+        capture: The capture; it is validated first.
+        path: The file; an older one is replaced.
+
+    Raises:
+        CaptureError: It is not a capture, or the file cannot be written.
+    """
+    file = as_path(path, "capture")
+    checked = validate(capture)
+    try:
+        if file.is_dir():
+            raise CaptureError("it is a folder", where=str(file), mend="give the path of a file")
+        with tempfile.TemporaryDirectory(dir=file.parent, prefix=".capture-") as folder:
+            unfinished = Path(folder) / "capture.nc"
+            checked.to_netcdf(unfinished, engine="netcdf4", format="NETCDF4")
+            unfinished.replace(file)
+    except FileNotFoundError as error:
+        mend = "make the folder first"
+        raise CaptureError("its folder is not there", where=str(file), mend=mend) from error
+    except OSError as error:
+        raise system_error(error, file) from error
+    except (RuntimeError, UnicodeError) as error:  # so the netCDF library tells of a full disk
+        mend = "check its name and the room on the disk"
+        raise CaptureError("it could not be written", where=str(file), mend=mend) from error

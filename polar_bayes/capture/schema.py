@@ -1,0 +1,343 @@
+"""The only door through which a capture enters: checked once, trusted afterwards.
+
+A capture is an `xarray.Dataset`; `polar_bayes.capture.contract` lists its variables. *Readings*,
+their errors and flags share the dims (leading..., view[, wavelength]); *geometry* has (view) or
+(leading..., view). Leading dims are none (one material), material, patch, or y and x. A dim may
+carry labels: a coordinate of its own name, or the single label that `isel` leaves behind; the dim
+wavelength must, in nanometers. Known truth rides along as `true_<anything>`, over any of the
+capture's dims, NaN where it is not known.
+"""
+
+import difflib
+from collections.abc import Hashable, Mapping, Sequence
+
+import numpy as np
+import xarray as xr
+
+from polar_bayes.capture.attributes import clean_attributes
+from polar_bayes.capture.contract import (
+    BRIGHTNESS,
+    CONTRACT,
+    EXCESS_POLARIZATION,
+    LABELS,
+    LEADING,
+    MASK,
+    SIGNALS,
+    SPELLINGS,
+    TRUTH,
+    UNIT,
+    WAVELENGTH,
+    Layout,
+    Variable,
+)
+from polar_bayes.errors import CaptureError
+
+Attributes = dict[str, str | int | float]
+
+
+def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
+    """The capture, checked against the contract and written in one canonical form.
+
+    Canonical: float64 numbers, boolean flags, dims in the order (leading..., view[, wavelength]),
+    `units` and `long_name` of the contract, attributes of text and numbers only. No number is
+    changed and none is dropped. Readings in entries marked `valid=False` are not looked at: they
+    may be NaN. A second call changes nothing.
+
+    Args:
+        dataset: The capture, in memory or lazy (then it is loaded).
+        source: Its name in errors, for instance the file.
+
+    Returns:
+        A new dataset; the given one is left alone.
+
+    Raises:
+        CaptureError: The first departure from the contract, with its variable and index.
+    """
+    if not isinstance(dataset, xr.Dataset):
+        what = f"a {type(dataset).__name__} is not a capture"
+        raise CaptureError(what, where=source, mend="give an xarray.Dataset")
+    _check_names(dataset, source)
+    layout = _layout(dataset, source)
+    present = [row for row in CONTRACT if row.name in dataset]
+    flags = {row.name: _flag(dataset, row, layout, source) for row in present if row.kind == "flag"}
+    valid = _valid_entries(dataset, flags, layout, source)
+    numbers = {
+        row.name: _numbers(dataset, row, layout, valid, source)
+        for row in present
+        if row.kind != "flag"
+    }
+    _check_polarization(numbers, layout, valid, source)
+    _check_intensity_units(numbers, source)
+    return xr.Dataset(
+        {**numbers, **flags, **_truths(dataset, layout, source)},
+        coords=_labels(dataset, layout, source),
+        attrs=clean_attributes(dataset.attrs, source),
+    )
+
+
+def count(capture: xr.Dataset) -> dict[str, int]:
+    """How many entries a capture holds: every view of every patch or pixel and wavelength.
+
+    Args:
+        capture: A validated capture.
+
+    Returns:
+        `views`: all entries; `masked`: those with `valid=False`; `saturated`: those flagged.
+
+    Raises:
+        Nothing.
+    """
+    signal = next(capture[name] for name in SIGNALS if name in capture)
+    return {
+        "views": int(signal.size),
+        "masked": int((~capture["valid"]).sum()) if "valid" in capture else 0,
+        "saturated": int(capture["saturated"].sum()) if "saturated" in capture else 0,
+    }
+
+
+# --- which variables, over which dims ---------------------------------------------------------
+
+
+def _check_names(dataset: xr.Dataset, source: str) -> None:
+    known = [*(row.name for row in CONTRACT), WAVELENGTH.name, *LABELS]
+    for name in dataset.variables:
+        if name not in known and not (isinstance(name, str) and TRUTH.fullmatch(name)):
+            near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.0)[0]
+            raise CaptureError(
+                "a capture has no such variable",
+                where=f"{source}: {name}",
+                mend=f"rename it (nearest known name: {near}), call it true_<name> or drop it",
+            )
+    for row in CONTRACT:
+        if row.kind == "geometry" and row.name not in dataset:
+            mend = f"add {row.name} in degree, with dim view"
+            raise CaptureError("it is missing", where=f"{source}: {row.name}", mend=mend)
+        if row.name in dataset and row.needs and row.needs not in dataset:
+            what = f"it has no meaning without {row.needs}"
+            mend = f"add {row.needs} or drop {row.name}"
+            raise CaptureError(what, where=f"{source}: {row.name}", mend=mend)
+    if not any(name in dataset for name in SIGNALS):
+        raise CaptureError("no reading is there", where=source, mend="add dop, q or intensity")
+
+
+def _layout(dataset: xr.Dataset, source: str) -> Layout:
+    name = next(name for name in SIGNALS if name in dataset)
+    dims = dataset[name].dims
+    rest = [dim for dim in dims if dim not in ("view", "wavelength")]
+    leading = next((option for option in LEADING if _same_dims(rest, option)), None)
+    if leading is None or "view" not in dims or len(set(dims)) != len(dims):
+        raise CaptureError(
+            f"its dims are {_listed(dims)}",
+            where=f"{source}: {name}",
+            mend="use view[, wavelength], alone or behind material, patch, or y and x together",
+        )
+    for dim in dims:
+        if dataset.sizes[dim] == 0:
+            mend = f"give at least one {dim}"
+            raise CaptureError("its length is 0", where=f"{source}: dim {dim}", mend=mend)
+    if "wavelength" in dims and "wavelength" not in dataset.variables:
+        mend = "add a coordinate wavelength in nm"
+        raise CaptureError("it has no coordinate", where=f"{source}: dim wavelength", mend=mend)
+    return Layout(leading, "wavelength" in dims)
+
+
+def _ordered(variable: xr.Variable, row: Variable, layout: Layout, source: str) -> xr.Variable:
+    """The variable with its dims in canonical order."""
+    options = layout.allowed(row)
+    for dims in options:
+        if _same_dims(variable.dims, dims):
+            return variable.transpose(*dims)
+    raise CaptureError(
+        f"its dims are {_listed(variable.dims)}",
+        where=f"{source}: {row.name}",
+        mend=f"give it {' or '.join(_listed(dims) for dims in options)}",
+    )
+
+
+def _same_dims(dims: Sequence[Hashable], wanted: Sequence[str]) -> bool:
+    return len(dims) == len(wanted) and set(dims) == set(wanted)
+
+
+def _listed(dims: Sequence[Hashable]) -> str:
+    return f"({', '.join(map(str, dims))})"
+
+
+# --- what a variable holds --------------------------------------------------------------------
+
+
+def _flag(dataset: xr.Dataset, row: Variable, layout: Layout, source: str) -> xr.Variable:
+    variable = _ordered(dataset[row.name].variable, row, layout, source)
+    values = variable.values
+    if values.dtype.kind != "b":  # netCDF has no truth values, so 0 and 1 stand for them
+        values = _floats(values, f"{source}: {row.name}")
+        _check_values(values, row, variable.dims, source, np.isin(values, (0.0, 1.0)))
+    return xr.Variable(variable.dims, values.astype(bool), _attributes(variable, row, source))
+
+
+def _valid_entries(
+    dataset: xr.Dataset, flags: Mapping[str, xr.Variable], layout: Layout, source: str
+) -> np.ndarray:
+    """The `valid` flag, or all True; shaped like the readings."""
+    if "valid" not in flags:
+        return np.ones([dataset.sizes[dim] for dim in layout.readings], dtype=bool)
+    valid = flags["valid"].values
+    if not valid.any():
+        mend = "mark what was measured valid=True"
+        raise CaptureError("every view is masked", where=f"{source}: valid", mend=mend)
+    return valid
+
+
+def _numbers(
+    dataset: xr.Dataset, row: Variable, layout: Layout, valid: np.ndarray, source: str
+) -> xr.Variable:
+    variable = _ordered(dataset[row.name].variable, row, layout, source)
+    values = _floats(variable.values, f"{source}: {row.name}")
+    inside = row.range.contains(values)
+    allowed = inside | ~valid if row.kind == "reading" else inside
+    _check_values(values, row, variable.dims, source, allowed)
+    return xr.Variable(variable.dims, values, _attributes(variable, row, source))
+
+
+def _check_values(
+    values: np.ndarray, row: Variable, dims: Sequence[Hashable], source: str, allowed: np.ndarray
+) -> None:
+    if allowed.all():
+        return
+    index = np.unravel_index(np.argmin(allowed), allowed.shape)
+    raise CaptureError(
+        f"{values[index]:g} is outside {row.range}",
+        where=f"{source}: {_entry(row.name, dims, index)}",
+        mend=row.mend,
+    )
+
+
+def _check_polarization(
+    numbers: Mapping[str, xr.Variable], layout: Layout, valid: np.ndarray, source: str
+) -> None:
+    if "u" not in numbers:
+        return
+    with np.errstate(invalid="ignore", over="ignore"):  # masked entries may hold anything
+        excess = numbers["q"].values ** 2 + numbers["u"].values ** 2 - 1.0
+        wrong = valid & (excess > EXCESS_POLARIZATION)
+    if wrong.any():
+        index = np.unravel_index(np.argmax(wrong), wrong.shape)
+        raise CaptureError(
+            f"q^2 + u^2 = {1.0 + excess[index]:g} is more than light can have",
+            where=f"{source}: {_entry('u', layout.readings, index)}",
+            mend=f"{MASK} (noise may carry the sum to {1.0 + EXCESS_POLARIZATION:g})",
+        )
+
+
+def _truths(dataset: xr.Dataset, layout: Layout, source: str) -> dict[str, xr.Variable]:
+    return {
+        str(name): _truth(variable, str(name), layout, source)
+        for name, variable in dataset.variables.items()
+        if TRUTH.fullmatch(str(name))
+    }
+
+
+def _truth(variable: xr.Variable, name: str, layout: Layout, source: str) -> xr.Variable:
+    where = f"{source}: {name}"
+    dims = [dim for dim in layout.readings if dim in variable.dims]
+    if not _same_dims(variable.dims, dims):
+        mend = f"give it any of {_listed(layout.readings)}"
+        raise CaptureError(f"its dims are {_listed(variable.dims)}", where=where, mend=mend)
+    values = _floats(variable.transpose(*dims).values, where)
+    if np.isinf(values).any():
+        mend = "give a number, or NaN where the truth is not known"
+        raise CaptureError("a value is infinite", where=where, mend=mend)
+    default = {"units": "1", "long_name": f"known {name.removeprefix('true_')}"}
+    attributes = default | clean_attributes(variable.attrs, where)
+    return xr.Variable(dims, values, attributes | {key: str(attributes[key]) for key in default})
+
+
+def _floats(values: np.ndarray, where: str) -> np.ndarray:
+    if values.dtype.kind not in "iuf":
+        what = f"it holds {values.dtype.name}, not real numbers"
+        raise CaptureError(what, where=where, mend="store floating-point numbers")
+    with np.errstate(over="ignore"):  # a wider float may become inf, which the range refuses
+        return values.astype(np.float64)
+
+
+# --- labels, units and attributes -------------------------------------------------------------
+
+
+def _labels(dataset: xr.Dataset, layout: Layout, source: str) -> dict[str, xr.Variable]:
+    """Coordinates named after a dim, along it or as the one label that selection leaves."""
+    labels = {}
+    for name in (*LABELS, WAVELENGTH.name):
+        if name not in dataset.variables:
+            continue
+        row = (
+            WAVELENGTH if name == WAVELENGTH.name else Variable(name, "label", None, UNIT, name, "")
+        )
+        variable = _ordered(dataset[name].variable, row, layout, source)
+        where = f"{source}: {name}"
+        if row is WAVELENGTH:
+            values = _floats(variable.values, where)
+            _check_values(values, row, variable.dims, source, row.range.contains(values))
+        else:
+            values = _label_values(variable.values, where)
+        labels[name] = xr.Variable(variable.dims, values, _attributes(variable, row, source))
+    return labels
+
+
+def _label_values(values: np.ndarray, where: str) -> np.ndarray:
+    items = values.ravel().tolist()
+    if all(isinstance(item, str) and item and item.isprintable() for item in items):
+        labels = np.array(items, dtype=np.str_)
+    elif values.dtype.kind in "iu" and all(abs(item) < 2**63 for item in items):
+        labels = values.ravel().astype(np.int64)
+    elif values.dtype.kind == "f" and np.isfinite(values).all():
+        labels = values.ravel().astype(np.float64)
+    else:
+        what = "a label is neither a finite number nor printable text"
+        mend = "give each a number or a name, or drop the coordinate"
+        raise CaptureError(what, where=where, mend=mend)
+    if len(set(labels.tolist())) != labels.size:
+        mend = "give each its own, or drop the coordinate"
+        raise CaptureError("two labels are the same", where=where, mend=mend)
+    return labels.reshape(values.shape)
+
+
+def _attributes(variable: xr.Variable, row: Variable, source: str) -> Attributes:
+    where = f"{source}: {row.name}"
+    attributes = clean_attributes(variable.attrs, where)
+    given = str(attributes.get("units", "")).strip()
+    if row.units is not None and "units" in attributes and given not in SPELLINGS[row.units]:
+        mend = f"convert it to units {row.units}"
+        raise CaptureError(f"its units are {given!r}", where=where, mend=mend)
+    if row.name == "intensity" and "saturation_level" in attributes:
+        attributes["saturation_level"] = _saturation_level(attributes["saturation_level"], where)
+    units = row.units or given or ("arbitrary" if row.kind == "reading" else "1")
+    return {**attributes, "units": units, "long_name": row.meaning}
+
+
+def _saturation_level(level: str | int | float, where: str) -> float:
+    if isinstance(level, str) or not 0.0 < level < BRIGHTNESS.high:
+        mend = "give the reading, above zero, at which the detector saturates"
+        raise CaptureError(f"saturation_level is {level!r}", where=where, mend=mend)
+    return float(level)
+
+
+def _check_intensity_units(numbers: dict[str, xr.Variable], source: str) -> None:
+    """An error without units has those of the intensity; others must agree."""
+    if "intensity_error" not in numbers:
+        return
+    intensity, error = numbers["intensity"].attrs, numbers["intensity_error"].attrs
+    if error["units"] == "arbitrary":
+        error["units"] = intensity["units"]
+    if error["units"] != intensity["units"]:
+        raise CaptureError(
+            f"its units are {error['units']!r}, those of intensity {intensity['units']!r}",
+            where=f"{source}: intensity_error",
+            mend="give both in the same units",
+        )
+
+
+def _entry(name: str, dims: Sequence[Hashable], index: Sequence[int | np.intp]) -> str:
+    """A place in a variable, such as `dop[patch=2, view=3]`."""
+    if not dims:
+        return name
+    places = (f"{dim}={int(position)}" for dim, position in zip(dims, index, strict=True))
+    return f"{name}[{', '.join(places)}]"

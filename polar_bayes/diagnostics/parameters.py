@@ -1,0 +1,131 @@
+"""The scalar parameters of a fit: one label and one block of draws each, the material first."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import xarray as xr
+
+from polar_bayes.errors import FitError, one_line
+from polar_bayes.inference.result import provenance_of
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS
+
+SAMPLE_DIMS = ("chain", "draw")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scalar:
+    """One number that a fit estimates.
+
+    Args:
+        label: Its name in ArviZ's style, such as `refractive_index[450]`.
+        name: The variable that it belongs to.
+        index: Where in that variable, by dim.
+        labels: The coordinate of each dim as text.
+        draws: Its draws, shape (chain, draw), in the unit of the variable.
+    """
+
+    label: str
+    name: str
+    index: Mapping[str, int]
+    labels: Mapping[str, str]
+    draws: np.ndarray
+
+    @property
+    def is_material(self) -> bool:
+        """True for roughness, subsurface fraction, absorption and refractive index."""
+        return self.name in MATERIAL_PARAMETERS
+
+
+def scalars(group: xr.Dataset) -> list[Scalar]:
+    """Every scalar of a group of draws.
+
+    Args:
+        group: The dataset of `posterior` or `prior`, with dims chain and draw.
+
+    Returns:
+        Material parameters first, then other single numbers, then the entries of vectors. Equal
+        labels (two readings at one wavelength) are told apart by `#2`, `#3`.
+    """
+    ordered = sorted(group.data_vars, key=lambda name: _rank(str(name), group[name]))
+    found = [scalar for name in ordered for scalar in _entries(str(name), group[name])]
+    seen: dict[str, int] = {}
+    for position, scalar in enumerate(found):
+        seen[scalar.label] = repeat = seen.get(scalar.label, 0) + 1
+        if repeat > 1:
+            found[position] = dataclasses.replace(scalar, label=f"{scalar.label}#{repeat}")
+    return found
+
+
+def posterior_scalars(result: xr.DataTree) -> list[Scalar]:
+    """Every scalar of the posterior of a result.
+
+    Raises:
+        FitError: The tree holds no posterior.
+    """
+    if not isinstance(result, xr.DataTree) or "posterior" not in result.children:
+        raise FitError(
+            "it holds no posterior",
+            where="result",
+            mend="give the tree that polar_bayes.fit or load_result returned",
+        )
+    return scalars(result["posterior"].to_dataset())
+
+
+def truth_of(result: xr.DataTree, scalar: Scalar) -> float:
+    """The true value of a parameter, NaN where the capture does not know it."""
+    if "constant_data" not in result.children:
+        return np.nan
+    constants = result["constant_data"].to_dataset()
+    true = constants.get(f"true_{scalar.name}")
+    if true is None or not set(true.dims) <= set(scalar.index):
+        return np.nan
+    return float(true.isel({dim: scalar.index[str(dim)] for dim in true.dims}))
+
+
+def method_of(result: xr.DataTree) -> str:
+    """How the fit was made: "nuts", "laplace" or "point"; told by its statistics if not said."""
+    method = provenance_of(result).get("method")
+    if method in ("nuts", "laplace", "point"):
+        return str(method)
+    stats = result["sample_stats"].data_vars if "sample_stats" in result.children else ()
+    if "loss" in stats or result["posterior"].sizes.get("draw", 0) == 1:
+        return "point"
+    return "nuts" if "diverging" in stats else "laplace"
+
+
+def _rank(name: str, variable: xr.DataArray) -> tuple[int, int]:
+    if name in MATERIAL_PARAMETERS:
+        return 0, MATERIAL_PARAMETERS.index(name)
+    return (2 if _has_event(name, variable) else 1), 0
+
+
+def _has_event(name: str, variable: xr.DataArray) -> bool:
+    """True for a vector that is one site, such as the weights of a discrepancy."""
+    return any(str(dim).startswith(f"{name}_") for dim in variable.dims)
+
+
+def _entries(name: str, variable: xr.DataArray) -> Iterator[Scalar]:
+    dims = [str(dim) for dim in variable.dims if dim not in SAMPLE_DIMS]
+    values = variable.transpose(*SAMPLE_DIMS, *dims).to_numpy().astype(float)
+    texts = {dim: _coordinate(variable, dim) for dim in dims}
+    for place in np.ndindex(values.shape[2:]):
+        labels = {dim: texts[dim][at] for dim, at in zip(dims, place, strict=True)}
+        yield Scalar(
+            label=f"{name}[{', '.join(labels.values())}]" if labels else name,
+            name=name,
+            index=dict(zip(dims, place, strict=True)),
+            labels=labels,
+            draws=values[(slice(None), slice(None), *place)],
+        )
+
+
+def _coordinate(variable: xr.DataArray, dim: str) -> list[str]:
+    """Labels of one axis as text: 450 rather than 450.0."""
+    values = variable[dim].to_numpy() if dim in variable.coords else np.arange(variable.sizes[dim])
+    return [
+        repr(float(value)).removesuffix(".0")
+        if isinstance(value, np.floating)
+        else one_line(str(value))
+        for value in values
+    ]

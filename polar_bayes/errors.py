@@ -1,0 +1,40 @@
+"""What goes wrong is told in one line: where, what, and the mend."""
+
+
+class PolarBayesError(ValueError):
+    """Base of every error that a user can mend.
+
+    Args:
+        what: What is wrong, as a clause without a full stop.
+        where: File, variable, view or option that is wrong.
+        mend: What to do about it, as an imperative clause.
+    """
+
+    def __init__(self, what: str, *, where: str, mend: str) -> None:
+        self.what, self.where, self.mend = (one_line(text) for text in (what, where, mend))
+        super().__init__(f"{self.where}: {self.what}; {self.mend}")
+
+
+class CaptureError(PolarBayesError):
+    """A capture, table or file does not hold what a measurement must hold."""
+
+
+class SceneError(PolarBayesError):
+    """The optics asked for do not exist or do not fit together."""
+
+
+class FitError(PolarBayesError):
+    """A model, prior, link or sampler setting cannot be used."""
+
+
+def one_line(text: str) -> str:
+    """Text that stays on one line, whatever a file's names or attributes contain.
+
+    Args:
+        text: Any string; control characters and line breaks are escaped.
+
+    Returns:
+        A printable string of at most 400 characters.
+    """
+    printable = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return printable if len(printable) <= 400 else printable[:397] + "..."

@@ -1,0 +1,187 @@
+"""What a caller asked of a fit, checked and with every default filled in."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpyro.distributions as dist
+import xarray as xr
+
+from polar_bayes.capture.schema import validate
+from polar_bayes.errors import CaptureError, FitError
+from polar_bayes.inference.laplace import Laplace
+from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.point import Point
+from polar_bayes.models.per_material import per_material
+from polar_bayes.observation.data import Observations
+from polar_bayes.observation.links import AbstractLink, noise_parameters
+from polar_bayes.physics.scene import Scene
+from polar_bayes.priors import resolve_priors
+from polar_bayes.setups import SETUPS, Setup, find_setup
+
+Method = Nuts | Laplace | Point
+MODELS: dict[str, Callable] = {"per_material": per_material}
+METHODS: dict[str, Method] = {"nuts": Nuts(), "laplace": Laplace(), "point": Point()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """What the caller asked for, with every default filled in."""
+
+    capture: xr.Dataset
+    model: Callable
+    model_name: str
+    method: Method
+    method_name: str
+    scene: Scene
+    scene_name: str
+    priors: dict[str, dist.Distribution]
+    links: dict[str, AbstractLink]
+    swapped: tuple[str, ...]
+    largest_view_zenith: float
+    seed: int
+    precision: str
+
+    def bind(self, scene: Scene) -> Callable[[Observations], None]:
+        """The model with everything but its data in place."""
+        needed = (*scene.parameters, *noise_parameters(self.links))
+        priors = {name: self.priors[name] for name in needed}
+        return functools.partial(self.model, scene=scene, priors=priors, links=self.links)
+
+
+def resolve(
+    capture: xr.Dataset,
+    model: str | Callable,
+    method: str | Method,
+    scene: str | Scene | None,
+    priors: Mapping[str, dist.Distribution] | None,
+    links: AbstractLink | Mapping[str, AbstractLink] | None,
+    largest_view_zenith: float | None,
+    seed: int,
+    precision: str,
+) -> Request:
+    capture = validate(capture)
+    if {"y", "x"} & set(map(str, capture.dims)):
+        raise CaptureError(
+            "an image has too many materials for one joint fit",
+            where=f"{capture.attrs.get('name', 'capture')}: dims y, x",
+            mend="average a region into one capture first, for example capture.mean(('y', 'x'))",
+        )
+    if scene is None:
+        scene = str(capture.attrs.get("setup", "paper"))
+    setup = find_setup(scene) if isinstance(scene, str) else _setup_around(scene, capture)
+    chosen = _choose_links(capture, setup, links)
+    needed = (*setup.scene.parameters, *noise_parameters(chosen))
+    limit = setup.largest_view_zenith if largest_view_zenith is None else largest_view_zenith
+    if not 0.0 < limit <= 90.0:
+        raise FitError(
+            f"largest_view_zenith is {limit}", where="fit", mend="give degrees from 0 to 90"
+        )
+    _check_views(capture, limit)
+    if precision not in ("double", "single"):
+        raise FitError(f"precision is {precision!r}", where="fit", mend="give 'double' or 'single'")
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**32:
+        raise FitError(f"seed is {seed!r}", where="fit", mend="give an integer from 0 to 2**32 - 1")
+    swapped = {
+        "scene": not isinstance(scene, str),
+        "model": callable(model),
+        "links": links is not None,
+        **{f"prior of {name}": True for name in priors or {}},
+    }
+    return Request(
+        capture=capture,
+        model=model if callable(model) else _find(MODELS, "model", model),
+        model_name=getattr(model, "__name__", type(model).__name__) if callable(model) else model,
+        method=method if isinstance(method, Method) else _find(METHODS, "method", method),
+        method_name=type(method).__name__.lower() if isinstance(method, Method) else method,
+        scene=setup.scene,
+        scene_name=scene if isinstance(scene, str) else "custom",
+        priors=resolve_priors(needed, priors),
+        links=chosen,
+        swapped=tuple(name for name, was_swapped in swapped.items() if was_swapped),
+        largest_view_zenith=limit,
+        seed=seed,
+        precision=precision,
+    )
+
+
+def _find(table: Mapping[str, Any], kind: str, name: object) -> Any:
+    if not isinstance(name, str) or name not in table:
+        raise FitError(
+            f"no such {kind}", where=f"{kind}={name!r}", mend=f"give one of {', '.join(table)}"
+        )
+    return table[name]
+
+
+def _setup_around(scene: object, capture: xr.Dataset) -> Setup:
+    """A scene of the user's own, with the links and limits of the capture's set-up."""
+    if not isinstance(scene, Scene):
+        raise FitError(
+            f"a {type(scene).__name__} is not a scene",
+            where="scene",
+            mend=f"give a polar_bayes.Scene or one of {', '.join(SETUPS)}",
+        )
+    base = SETUPS.get(str(capture.attrs.get("setup")), SETUPS["paper"])
+    return dataclasses.replace(base, scene=scene)
+
+
+def _choose_links(
+    capture: xr.Dataset, setup: Setup, links: AbstractLink | Mapping[str, AbstractLink] | None
+) -> dict[str, AbstractLink]:
+    """The links of the variables that the capture holds."""
+    if links is None:
+        chosen = {name: link for name, link in setup.links.items() if name in capture}
+        wanted = list(setup.links)
+    elif isinstance(links, AbstractLink):
+        kept = {n: link for n, link in setup.links.items() if n == "intensity" and n in capture}
+        chosen = {name: links for name in links.observables if name in capture}
+        chosen |= {n: link for n, link in kept.items() if n not in chosen}
+        wanted = list(links.observables)
+    elif isinstance(links, Mapping):
+        chosen, wanted = dict(links), list(links)
+    else:
+        raise FitError(
+            f"a {type(links).__name__} is not a link",
+            where="links",
+            mend="give a link such as BetaLink(), or a mapping {'dop': BetaLink()}",
+        )
+    for name, link in chosen.items():
+        if not isinstance(link, AbstractLink):
+            raise FitError(
+                f"a {type(link).__name__} is not a link",
+                where=f"links[{name!r}]",
+                mend="give a link such as BetaLink()",
+            )
+        if name not in link.observables:
+            raise FitError(
+                f"{type(link).__name__} does not describe {name}",
+                where=f"links[{name!r}]",
+                mend=f"it describes {', '.join(link.observables)}",
+            )
+        if name not in capture:
+            raise FitError(
+                f"the capture has no variable {name}",
+                where=f"links[{name!r}]",
+                mend="leave that link out or measure the variable",
+            )
+    if not any(name in chosen for name in ("dop", "q", "u")):
+        raise CaptureError(
+            f"no polarization that these links describe (wanted {' or '.join(wanted)})",
+            where=str(capture.attrs.get("name", "capture")),
+            mend="choose another scene or link: BetaLink for dop, StokesLink for q and u",
+        )
+    return chosen
+
+
+def _check_views(capture: xr.Dataset, limit: float) -> None:
+    """One view cannot separate four parameters, whatever the prior."""
+    data_valid = capture.get("valid", xr.DataArray(True)) & (capture["view_zenith"] <= limit)
+    per_fit = data_valid.broadcast_like(capture["view_zenith"])
+    used = int(per_fit.any([d for d in per_fit.dims if d != "view"]).sum())
+    if used < 2:
+        raise CaptureError(
+            f"only {used} valid view{'s' if used != 1 else ''} up to {limit:g} degrees",
+            where=f"{capture.attrs.get('name', 'capture')}: view",
+            mend="measure at two or more angles; the more they differ, the better",
+        )

@@ -1,0 +1,160 @@
+"""A finished fit as an ArviZ DataTree: labels come back here, and everything is saved.
+
+Root attributes are one JSON string, because netCDF holds only text and numbers; it says enough
+to repeat the fit.
+"""
+
+import json
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+from arviz_base import from_dict
+
+from polar_bayes.inference.program import Draw, Program
+from polar_bayes.observation.data import Observations
+
+PROVENANCE = "polar_bayes"
+SYMBOLS = {
+    "roughness": ("r", "roughness"),
+    "subsurface_fraction": ("beta", "subsurface fraction"),
+    "absorption": ("a", "absorption relative to scattering"),
+    "refractive_index": ("n", "refractive index"),
+    "angle_zero": ("", "offset of both zenith angles", "degree"),
+}
+GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
+
+
+def assemble(
+    program: Program,
+    capture: xr.Dataset,
+    data: Observations,
+    posterior: Draw,
+    prior: Draw | None,
+    sample_stats: Mapping[str, np.ndarray],
+    provenance: Mapping[str, object],
+) -> xr.DataTree:
+    """Put draws, data and provenance into one tree.
+
+    Args:
+        program: The model that was fitted.
+        capture: The validated capture.
+        data: The same as arrays, with the views that were set aside.
+        posterior: Arrays of shape (chain, draw, ...).
+        prior: The same from the prior, or None.
+        sample_stats: Arrays of shape (chain, draw).
+        provenance: Whatever JSON can hold.
+
+    Returns:
+        The tree of DESIGN section 4.
+    """
+    groups: dict[str, dict[str, np.ndarray]] = {
+        "posterior": _latent(program, posterior.latent, data),
+        "sample_stats": {name: np.asarray(x) for name, x in sample_stats.items()},
+        "posterior_predictive": _readings(posterior.predictive, data),
+        "log_likelihood": {n: np.asarray(x) for n, x in posterior.log_likelihood.items()},
+        "log_prior": {n: np.asarray(x) for n, x in posterior.log_prior.items()},
+        "noise_free": _readings(posterior.center, data),
+    }
+    if prior is not None:
+        groups["prior"] = _latent(program, prior.latent, data)
+        groups["prior_predictive"] = _readings(prior.predictive, data)
+    lengths = dict(data.dims)
+    dims = {
+        name: [*program.dims[name], *(f"{name}_{i}" for i, _ in enumerate(program.events[name]))]
+        for name in program.dims
+    }
+    coords = {dim: capture[dim].to_numpy() for dim in lengths if dim in capture.coords}
+    coords |= {dim: np.arange(length) for dim, length in lengths.items() if dim not in coords}
+    # The log prior is one number per site and draw, whatever the site's own axes are.
+    log_prior = xr.Dataset(
+        {name: (("chain", "draw"), x) for name, x in groups.pop("log_prior").items()}
+    )
+    tree = from_dict(groups, coords=coords, dims=dims)
+    tree["log_prior"] = xr.DataTree(log_prior)
+    tree["observed_data"] = xr.DataTree(_observed(program, capture, data, coords))
+    tree["constant_data"] = xr.DataTree(_constants(capture, data, coords))
+    for group in ("posterior", "prior"):
+        if group in tree.children:
+            _annotate(tree[group])
+    tree.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
+    return tree
+
+
+def provenance_of(result: xr.DataTree) -> dict:
+    """What a result says about how it was made.
+
+    Args:
+        result: A tree made by `assemble`, in memory or read back.
+
+    Returns:
+        The decoded root attribute; empty where there is none.
+    """
+    return json.loads(result.attrs.get(PROVENANCE, "{}"))
+
+
+def posterior_of(program: Program, draw: Draw, data: Observations) -> xr.Dataset:
+    """The posterior group alone, for a fit that stands beside the main one."""
+    dims = {
+        name: [*program.dims[name], *(f"{name}_{i}" for i, _ in enumerate(program.events[name]))]
+        for name in program.supports
+    }
+    tree = from_dict({"posterior": _latent(program, draw.latent, data)}, dims=dims)
+    return tree["posterior"].to_dataset()
+
+
+def _latent(
+    program: Program, values: Mapping[str, np.ndarray], data: Observations
+) -> dict[str, np.ndarray]:
+    """Drop the axes of length 1 that plates leave behind."""
+    lengths = dict(data.dims)
+    return {
+        name: np.asarray(value).reshape(
+            *np.shape(value)[:2],
+            *(lengths[dim] for dim in program.dims[name]),
+            *program.events[name],
+        )
+        for name, value in values.items()
+    }
+
+
+def _readings(values: Mapping[str, np.ndarray], data: Observations) -> dict[str, np.ndarray]:
+    unit = {"intensity": float(data.intensity_unit)}
+    return {name: np.asarray(value) * unit.get(name, 1.0) for name, value in values.items()}
+
+
+def _observed(
+    program: Program, capture: xr.Dataset, data: Observations, coords: Mapping[str, np.ndarray]
+) -> xr.Dataset:
+    order = [dim for dim, _ in data.dims]
+    valid = xr.DataArray(np.asarray(data.valid), dims=order)
+    readings = {
+        name: capture[name]
+        .transpose(*order)
+        .drop_vars(capture.coords, errors="ignore")
+        .where(valid)
+        for name in program.observed
+        if name in capture
+    }
+    return xr.Dataset(readings, coords=dict(coords))
+
+
+def _constants(
+    capture: xr.Dataset, data: Observations, coords: Mapping[str, np.ndarray]
+) -> xr.Dataset:
+    order = [dim for dim, _ in data.dims]
+    bare = capture.drop_vars(capture.coords)
+    constants = {name: bare[name] for name in GEOMETRY}
+    constants |= {name: bare[name] for name in bare if str(name).startswith("true_")}
+    constants |= {name: bare[name] for name in bare if str(name).endswith("_error")}
+    constants["valid"] = xr.DataArray(np.asarray(data.valid).astype("int8"), dims=order)
+    constants["saturated"] = xr.DataArray(np.asarray(data.saturated).astype("int8"), dims=order)
+    return xr.Dataset(constants, coords=dict(coords))
+
+
+def _annotate(group: xr.DataTree) -> None:
+    for name, variable in group.data_vars.items():
+        symbol, long_name, *unit = SYMBOLS.get(str(name), ("", str(name).replace("_", " ")))
+        variable.attrs |= {"long_name": long_name, "units": unit[0] if unit else "1"}
+        if symbol:
+            variable.attrs["symbol"] = symbol

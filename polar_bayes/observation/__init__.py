@@ -1,0 +1,1 @@
+"""From predicted to recorded: data as arrays, noise schedules, likelihood links."""

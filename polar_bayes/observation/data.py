@@ -1,0 +1,124 @@
+"""A capture as arrays: what a compiled program needs of it, and nothing else.
+
+Labels end here and come back in `polar_bayes.inference.result`. Missing readings become
+harmless numbers beside `valid=False`, so that every shape is static and nothing is dropped.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array, Bool, Float
+
+from polar_bayes.physics.geometry import Geometry
+
+READINGS = ("dop", "q", "u", "intensity")
+
+
+class Observations(eqx.Module):
+    """One capture in the layout of a model: leading dims, then wavelength, then view.
+
+    Args:
+        geometry: Directions in degree, each broadcastable to the readings.
+        readings: The recorded variables, each (..., [wavelength,] view).
+        errors: Their stated standard errors, where the capture has them.
+        brightness: Recorded intensity over the largest of the capture; 1 without intensity.
+        full_scale: Where the sensor saturates, in the unit of `readings["intensity"]`.
+        intensity_unit: What an intensity reading of 1 is in the capture's own unit.
+        valid: False where a view is missing or set aside.
+        saturated: True where the sensor stopped.
+        dims: Names and lengths of all axes, outermost first, ending with the view.
+    """
+
+    geometry: Geometry
+    readings: dict[str, Float[Array, "... view"]]
+    errors: dict[str, Float[Array, "... view"]]
+    brightness: Float[Array, "... view"]
+    full_scale: Float[Array, ""]
+    intensity_unit: Float[Array, ""]
+    valid: Bool[Array, "... view"]
+    saturated: Bool[Array, "... view"]
+    dims: tuple[tuple[str, int], ...] = eqx.field(static=True)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Length of every axis, outermost first."""
+        return tuple(length for _, length in self.dims)
+
+
+def observe(capture: xr.Dataset, *, largest_view_zenith: float = 90.0) -> Observations:
+    """Turn a validated capture into the arrays of a model.
+
+    Args:
+        capture: A Dataset as `polar_bayes.capture.schema.validate` returns it.
+        largest_view_zenith: Views beyond it are set aside (`valid=False`). Unit degree.
+
+    Returns:
+        The arrays, in double precision; intensity is in units of the capture's largest
+        (its saturation level, where stated), so that one prior serves every camera.
+    """
+    names = [name for name in READINGS if name in capture]
+    order = _axis_order(capture[names[0]])
+    valid = np.asarray(_values(capture, "valid", order, default=True), bool)
+    valid = valid & (_values(capture, "view_zenith", order) <= largest_view_zenith)
+    saturated = np.asarray(_values(capture, "saturated", order, default=False), bool)
+    shape = np.broadcast_shapes(
+        valid.shape, *(_values(capture, name, order).shape for name in names)
+    )
+    valid, saturated = (np.broadcast_to(mask, shape) for mask in (valid, saturated))
+    largest, full_scale = _intensity_range(capture)
+
+    readings, errors = {}, {}
+    for name in names:
+        unit = largest if name == "intensity" else 1.0
+        # 0.5 is inside the range of every reading; `valid` keeps it out of the likelihood.
+        readings[name] = np.where(valid, _values(capture, name, order), 0.5 * unit) / unit
+        if f"{name}_error" in capture:
+            error = _values(capture, f"{name}_error", order)
+            errors[name] = np.where(valid, error, unit) / unit
+    brightness = readings.get("intensity", np.ones(shape))
+    angles = {
+        name: np.where(np.isfinite(angle), angle, 0.0)
+        for name in Geometry._fields
+        for angle in [_values(capture, name, order)]
+    }
+    return Observations(
+        geometry=Geometry.from_degrees(**{name: jnp.asarray(x) for name, x in angles.items()}),
+        readings={name: jnp.asarray(x) for name, x in readings.items()},
+        errors={name: jnp.asarray(x) for name, x in errors.items()},
+        brightness=jnp.clip(jnp.asarray(brightness), 0.0, 1.0),
+        full_scale=jnp.asarray(full_scale / largest),
+        intensity_unit=jnp.asarray(largest),
+        valid=jnp.asarray(valid),
+        saturated=jnp.asarray(saturated),
+        dims=tuple(zip(order, shape, strict=True)),
+    )
+
+
+def _axis_order(reading: xr.DataArray) -> tuple[str, ...]:
+    last = [dim for dim in ("wavelength", "view") if dim in reading.dims]
+    return (*(str(dim) for dim in reading.dims if dim not in last), *last)
+
+
+def _values(
+    capture: xr.Dataset, name: str, order: tuple[str, ...], default: bool | None = None
+) -> np.ndarray:
+    """One variable with the axes of `order`, of length 1 where it does not have them."""
+    if name not in capture and default is not None:
+        return np.full((1,) * len(order), default)
+    variable = capture[name]
+    present = [dim for dim in order if dim in variable.dims]
+    values = variable.transpose(*present).to_numpy()
+    return values.reshape([variable.sizes.get(dim, 1) for dim in order])
+
+
+def _intensity_range(capture: xr.Dataset) -> tuple[float, float]:
+    """The unit of intensity (largest reading or saturation level) and the full scale."""
+    if "intensity" not in capture:
+        return 1.0, np.inf
+    level = capture["intensity"].attrs.get("saturation_level")
+    if level is not None:
+        return float(level), float(level)
+    # Over the whole capture, masked angles included: dropping a view changes no other's noise.
+    largest = float(np.nanmax(capture["intensity"].to_numpy()))
+    return (largest if largest > 0.0 else 1.0), np.inf

@@ -1,0 +1,193 @@
+"""Two distributions that stay accurate where the textbook forms lose their digits.
+
+`MeanConcentrationBeta` is the Beta distribution by mean and concentration; its log density is
+written as a divergence plus Stirling remainders, so that concentrations of 1e8 cancel nothing.
+`SensorStudentT` is Student's t as a sensor records it, stopped at zero and at full scale.
+"""
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpyro.distributions as dist
+from jax.scipy.special import betainc, gammaln
+from jaxtyping import Array, Float
+from numpyro.distributions import constraints
+from numpyro.distributions.util import promote_shapes
+
+HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
+
+
+class MeanConcentrationBeta(dist.Distribution):
+    r"""Beta distribution with mean $\mu$ and concentration $\kappa$.
+
+    $$ \log p(x) = -\kappa D(\mu \| x) - \log x(1-x) + \tfrac12 \log \frac{\kappa\mu(1-\mu)}{2\pi}
+       + r(\kappa) - r(\mu\kappa) - r((1-\mu)\kappa) $$
+
+    with $D$ the divergence of two Bernoulli distributions and $r$ the remainder of Stirling's
+    formula. It equals `numpyro.distributions.BetaProportion`, whose differences of log gamma
+    lose all digits in single precision beyond concentrations of about 1e6.
+
+    Args:
+        mean: $\mu$, unit 1, range (0, 1).
+        concentration: $\kappa$, unit 1, range > 0.
+    """
+
+    arg_constraints = {
+        "mean_value": constraints.unit_interval,
+        "concentration": constraints.positive,
+    }
+    support = constraints.unit_interval
+    reparametrized_params = ["mean_value", "concentration"]
+
+    def __init__(
+        self,
+        mean: Float[Array, "..."],
+        concentration: Float[Array, "..."],
+        *,
+        validate_args: bool | None = None,
+    ) -> None:
+        shape = jnp.broadcast_shapes(jnp.shape(mean), jnp.shape(concentration))
+        self.mean_value, self.concentration = promote_shapes(mean, concentration, shape=shape)
+        super().__init__(batch_shape=shape, validate_args=validate_args)
+
+    def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
+        first = self.mean_value * self.concentration
+        second = (1.0 - self.mean_value) * self.concentration
+        return dist.Beta(first, second).sample(key, sample_shape)
+
+    def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        mean, concentration = self.mean_value, self.concentration
+        other = 1.0 - mean
+        step = value - mean
+        divergence = mean * _excess(step / mean) + other * _excess(-step / other)
+        remainders = (
+            _stirling_remainder(concentration)
+            - _stirling_remainder(mean * concentration)
+            - _stirling_remainder(other * concentration)
+        )
+        spread = 0.5 * jnp.log(concentration * mean * other) - HALF_LOG_TWO_PI
+        return (
+            -concentration * divergence - jnp.log(value) - jnp.log1p(-value) + spread + remainders
+        )
+
+    @property
+    def mean(self) -> Array:
+        return jnp.broadcast_to(self.mean_value, self.batch_shape)
+
+    @property
+    def variance(self) -> Array:
+        return self.mean_value * (1.0 - self.mean_value) / (1.0 + self.concentration)
+
+
+class SensorStudentT(dist.Distribution):
+    r"""Student's t noise, recorded by a sensor that stops at zero and at full scale.
+
+    A reading at either stop counts with the probability of landing beyond it, so that a
+    saturated view says "at least this bright" and nothing more.
+
+    Args:
+        degrees_of_freedom: $\nu$, unit 1, range > 0; a Python number.
+        location: Noise-free intensity over full scale.
+        scale: Noise over full scale, range > 0.
+        saturated: True where the reading stopped at full scale.
+        full_scale: Where the sensor stops, in the same unit; infinite where it never does.
+    """
+
+    arg_constraints = {"location": constraints.real, "scale": constraints.positive}
+    support = constraints.nonnegative
+    reparametrized_params = ["location", "scale"]
+    pytree_data_fields = ("saturated", "full_scale")
+    pytree_aux_fields = ("degrees_of_freedom",)
+
+    def __init__(
+        self,
+        degrees_of_freedom: float,
+        location: Float[Array, "..."],
+        scale: Float[Array, "..."],
+        saturated: Array,
+        full_scale: Float[Array, "..."],
+        *,
+        validate_args: bool | None = None,
+    ) -> None:
+        shape = jnp.broadcast_shapes(*map(jnp.shape, (location, scale, saturated, full_scale)))
+        self.location, self.scale, self.saturated, self.full_scale = (
+            jnp.broadcast_to(x, shape) for x in (location, scale, saturated, full_scale)
+        )
+        self.degrees_of_freedom = degrees_of_freedom
+        super().__init__(batch_shape=shape, validate_args=validate_args)
+
+    def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
+        noisy = dist.StudentT(self.degrees_of_freedom, self.location, self.scale).sample(
+            key, sample_shape
+        )
+        return jnp.clip(noisy, 0.0, self.full_scale)
+
+    def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        distance = (value - self.location) / self.scale
+        inside = dist.StudentT(self.degrees_of_freedom, self.location, self.scale).log_prob(value)
+        beyond_full_scale = log_survival(distance, self.degrees_of_freedom)
+        below_zero = log_survival(-distance, self.degrees_of_freedom)
+        stopped = jnp.where(self.saturated, beyond_full_scale, below_zero)
+        return jnp.where(self.saturated | (value <= 0.0), stopped, inside)
+
+    @property
+    def mean(self) -> Array:
+        """The noise-free reading, stopped as the sensor stops it."""
+        return jnp.clip(self.location, 0.0, self.full_scale)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def log_survival(distance: Float[Array, "..."], degrees_of_freedom: float) -> Float[Array, "..."]:
+    """Log probability that Student's t exceeds `distance`, finite far into the tail.
+
+    Args:
+        distance: In units of the scale.
+        degrees_of_freedom: A Python number > 0.
+
+    Returns:
+        The log probability; its derivative is minus the hazard, exact at 0 too, where the
+        incomplete beta function alone has none.
+    """
+    tiny = jnp.finfo(jnp.result_type(distance)).tiny
+    argument = degrees_of_freedom / (degrees_of_freedom + distance**2)
+    tail = 0.5 * betainc(0.5 * degrees_of_freedom, 0.5, jnp.maximum(argument, tiny))
+    tail = jnp.maximum(tail, tiny)
+    return jnp.where(distance > 0.0, jnp.log(tail), jnp.log1p(-tail))
+
+
+@log_survival.defjvp
+def _log_survival_derivative(degrees_of_freedom, primals, tangents):  # noqa: ANN001, ANN202
+    (distance,), (step,) = primals, tangents
+    value = log_survival(distance, degrees_of_freedom)
+    log_density = dist.StudentT(degrees_of_freedom, 0.0, 1.0).log_prob(distance)
+    return value, -jnp.exp(log_density - value) * step
+
+
+def _excess(step: Float[Array, "..."]) -> Float[Array, "..."]:
+    """`step - log(1 + step)`, whose first-order terms would otherwise cancel near 0."""
+    near = jnp.abs(step) < 0.1
+    small = jnp.where(near, step, 0.0)
+    series = jnp.zeros_like(small)
+    for power in range(17, 1, -1):  # 0.1 ** 17 / 17 is below double precision of step ** 2 / 2
+        series = small * series + (-1.0) ** power / power
+    series = small * small * series
+    far = jnp.where(near, 1.0, step)
+    return jnp.where(near, series, far - jnp.log1p(far))
+
+
+def _stirling_remainder(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    """`log gamma(z)` less Stirling's `(z - 1/2) log z - z + log(2 pi) / 2`."""
+    large = z > 10.0
+    big = jnp.where(large, z, 10.0)
+    inverse = 1.0 / big
+    square = inverse * inverse
+    # Bernoulli numbers over 2k(2k-1); the next term is below 1e-16 for z > 10.
+    coefficients = (1 / 12, -1 / 360, 1 / 1260, -1 / 1680, 1 / 1188, -691 / 360360, 1 / 156)
+    series = jnp.zeros_like(inverse)
+    for coefficient in reversed(coefficients):
+        series = series * square + coefficient
+    small = jnp.where(large, 1.0, z)
+    exact = gammaln(small) - ((small - 0.5) * jnp.log(small) - small + HALF_LOG_TWO_PI)
+    return jnp.where(large, inverse * series, exact)

@@ -1,0 +1,1 @@
+"""Optics in pure JAX: parameters and geometry in, brightness and polarization out."""

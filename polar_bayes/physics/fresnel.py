@@ -1,0 +1,166 @@
+r"""Fresnel's laws for a lossless dielectric, written without cancellation.
+
+With c the cosine of incidence, B = (1-c)(1+c) its squared sine (both are given, because the caller
+knows them to full precision), Q = sqrt((n-1)(n+1) + c^2) and A = c Q:
+
+    R_s = ((n^2-1)/(c+Q)^2)^2     R+ = R_s (A^2+B^2)/(A+B)^2     R- = K B,  K = 2 R_s A/(A+B)^2
+
+R+ and R- are half the sum and half the difference of the reflectances for s and p. At Brewster's
+angle A = B. Everything is regular at n = 1 and accurate up to grazing, in both precisions.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+# Gauss-Legendre nodes and weights on [0, 1] for integrals over the hemisphere.
+HEMISPHERE_NODES, HEMISPHERE_WEIGHTS = (
+    0.5 * (np.polynomial.legendre.leggauss(24)[0] + 1.0),
+    0.5 * np.polynomial.legendre.leggauss(24)[1],
+)
+
+
+def reflection(
+    cos_incidence: Array, sin_squared: Array, refractive_index: Array
+) -> tuple[Array, Array]:
+    """Mean reflectance R+ and contrast K, where K times the squared sine is R-.
+
+    Args:
+        cos_incidence: c. Any shape, 1, in (0, 1].
+        sin_squared: B, the squared sine of incidence. Same shape, 1, in [0, 1).
+        refractive_index: n, inside over outside. Broadcasts, 1, >= 1.
+
+    Returns:
+        `(R+, K)`. Broadcast shape, 1; R+ in [0, 1].
+
+    Raises:
+        Nothing.
+    """
+    c, b, n = cos_incidence, sin_squared, refractive_index
+    root = _inner(c, n)
+    a = c * root
+    s_reflectance = ((n - 1.0) * (n + 1.0) / (c + root) ** 2) ** 2
+    mean = s_reflectance * (a**2 + b**2) / (a + b) ** 2
+    contrast = 2.0 * s_reflectance * a / (a + b) ** 2
+    return mean, contrast
+
+
+def polarizance(cos_incidence: Array, sin_squared: Array, refractive_index: Array) -> Array:
+    """Degree of polarization of reflected light divided by the squared sine: 2A/(A^2+B^2).
+
+    Args:
+        cos_incidence: c. Any shape, 1, in (0, 1].
+        sin_squared: B. Same shape, 1, in [0, 1).
+        refractive_index: n. Broadcasts, 1, >= 1.
+
+    Returns:
+        K/R+. Broadcast shape, 1, > 0; no limit has to be taken at normal incidence or n = 1.
+
+    Raises:
+        Nothing.
+    """
+    a = cos_incidence * _inner(cos_incidence, refractive_index)
+    return 2.0 * a / (a**2 + sin_squared**2)
+
+
+def reflection_polarization(
+    cos_incidence: Array, sin_squared: Array, refractive_index: Array
+) -> Array:
+    """Degree of polarization of reflected light, 2AB/(A^2+B^2); exactly 1 at Brewster's angle.
+
+    Args:
+        cos_incidence: c. Any shape, 1, in (0, 1].
+        sin_squared: B. Same shape, 1, in [0, 1).
+        refractive_index: n. Broadcasts, 1, >= 1.
+
+    Returns:
+        Degree of linear polarization, along s. Broadcast shape, 1, in [0, 1].
+
+    Raises:
+        Nothing.
+    """
+    return polarizance(cos_incidence, sin_squared, refractive_index) * sin_squared
+
+
+def transmission(cos_incidence: Array, refractive_index: Array) -> Array:
+    """Mean transmittance T+ = 2cQ [1/(c+Q)^2 + n^2/(n^2 c+Q)^2], the same inwards and outwards.
+
+    Args:
+        cos_incidence: c, outside. Any shape, 1, in (0, 1].
+        refractive_index: n. Broadcasts, 1, >= 1.
+
+    Returns:
+        T+. Broadcast shape, 1, in [0, 1].
+
+    Raises:
+        Nothing.
+    """
+    c, n = cos_incidence, refractive_index
+    root = _inner(c, n)
+    return 2.0 * c * root * (1.0 / (c + root) ** 2 + (n / (n**2 * c + root)) ** 2)
+
+
+def exit_polarization(cos_exit: Array, sin_squared: Array, refractive_index: Array) -> Array:
+    """Degree of polarization, along p, of unpolarized light that leaves through the interface.
+
+    u(2-u)/(1+(1-u)^2) with u = (n-1)^2 (n+1) B/[n (c+Q)(Q+nc)]; at grazing (n^2-1)/(n^2+1).
+
+    Args:
+        cos_exit: c, outside. Any shape, 1, in (0, 1].
+        sin_squared: B, outside. Same shape, 1, in [0, 1).
+        refractive_index: n. Broadcasts, 1, >= 1.
+
+    Returns:
+        Degree of linear polarization. Broadcast shape, 1, in [0, 1).
+
+    Raises:
+        Nothing.
+    """
+    c, n = cos_exit, refractive_index
+    root = _inner(c, n)
+    lost = (n - 1.0) ** 2 * (n + 1.0) * sin_squared / (n * (c + root) * (root + n * c))
+    return lost * (2.0 - lost) / (1.0 + (1.0 - lost) ** 2)
+
+
+def hemispherical_reflection(refractive_index: Array) -> Array:
+    """Share of diffuse light that the interface turns back outside: Fe = int_0^1 2 mu R+(mu) dmu.
+
+    Args:
+        refractive_index: n. Any shape, 1, >= 1.
+
+    Returns:
+        Fe. Same shape, 1, in [0, 1).
+
+    Raises:
+        Nothing.
+    """
+    cosine = HEMISPHERE_NODES
+    sin_squared = (1.0 - cosine) * (1.0 + cosine)
+    mean, _ = reflection(
+        _like(cosine, refractive_index),
+        _like(sin_squared, refractive_index),
+        refractive_index[..., None],
+    )
+    return mean @ _like(2.0 * cosine * HEMISPHERE_WEIGHTS, refractive_index)
+
+
+def escape(refractive_index: Array) -> Array:
+    """Share of diffuse light inside that leaves: 1 - Fi = (1 - Fe)/n^2. Same shape, in (0, 1]."""
+    return (1.0 - hemispherical_reflection(refractive_index)) / refractive_index**2
+
+
+def internal_reflection(refractive_index: Array) -> Array:
+    """Share of diffuse light inside that is turned back: Fi = ((n-1)(n+1) + Fe)/n^2, in [0, 1)."""
+    n = refractive_index
+    return ((n - 1.0) * (n + 1.0) + hemispherical_reflection(n)) / n**2
+
+
+def _inner(cos_incidence: Array, refractive_index: Array) -> Array:
+    """Q, the index times the cosine inside."""
+    n = refractive_index
+    return jnp.sqrt((n - 1.0) * (n + 1.0) + cos_incidence**2)
+
+
+def _like(nodes: np.ndarray, array: Array) -> Array:
+    """Constants in the precision of the data."""
+    return jnp.asarray(nodes, jnp.result_type(float, array))

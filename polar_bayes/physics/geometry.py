@@ -1,0 +1,142 @@
+"""Where the viewer and the light stand, and the one facet that mirrors one into the other.
+
+The surface normal is z. Azimuths 180 degrees apart are the specular side. Nothing here subtracts
+two nearly equal numbers: cosines near grazing come from the complement of the zenith angle, and
+differences of directions from half angles.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+
+class Geometry(NamedTuple):
+    """Directions of viewer and light, in degrees, one entry per view.
+
+    A negative zenith means the same zenith on the other side of the normal, so that a small shift
+    through the normal is smooth.
+
+    Args:
+        view_zenith: Angle of the viewer from the normal. Shape (..., view), degree, |.| < 90.
+        view_azimuth: Azimuth of the viewer. Shape (..., view), degree.
+        light_zenith: Angle of the light from the normal. Shape (..., view), degree, |.| < 90.
+        light_azimuth: Azimuth of the light. Shape (..., view), degree.
+    """
+
+    view_zenith: Array
+    view_azimuth: Array
+    light_zenith: Array
+    light_azimuth: Array
+
+    @classmethod
+    def from_degrees(
+        cls,
+        *,
+        view_zenith: ArrayLike,
+        view_azimuth: ArrayLike,
+        light_zenith: ArrayLike,
+        light_azimuth: ArrayLike,
+    ) -> "Geometry":
+        """Directions broadcast to one shape; a viewer on the normal looks away from the light.
+
+        On the normal there is no plane of incidence for the viewer, so the frame of Stokes is
+        taken from the light: the view azimuth becomes the light's plus 180 degrees.
+
+        Args:
+            view_zenith: Angle of the viewer from the normal. Any shape, degree, 0 <= . < 90.
+            view_azimuth: Azimuth of the viewer. Any shape, degree.
+            light_zenith: Angle of the light from the normal. Any shape, degree, 0 <= . < 90.
+            light_azimuth: Azimuth of the light. Any shape, degree.
+
+        Returns:
+            Geometry of shape (..., view); a lone angle counts as one view.
+
+        Raises:
+            Nothing: angles are checked where captures enter.
+        """
+        angles = [
+            jnp.asarray(angle) for angle in (view_zenith, view_azimuth, light_zenith, light_azimuth)
+        ]
+        dtype = jnp.result_type(float, *angles)
+        angles = [jnp.atleast_1d(angle).astype(dtype) for angle in angles]
+        view_zenith, view_azimuth, light_zenith, light_azimuth = jnp.broadcast_arrays(*angles)
+        view_azimuth = jnp.where(view_zenith == 0.0, light_azimuth + 180.0, view_azimuth)
+        return cls(view_zenith, view_azimuth, light_zenith, light_azimuth)
+
+
+class MirrorFacet(NamedTuple):
+    """The facet that mirrors the light to the viewer: its incidence, tilt and orientation.
+
+    Args:
+        cos_incidence: Cosine of the angle between facet and viewer. Shape (..., view), 1.
+        sin_squared: Squared sine of the same angle. Shape (..., view), 1.
+        tan_squared_tilt: Squared slope of the facet. Shape (..., view), 1.
+        along_s: sin_squared times cos(2 psi); psi turns the facet's s axis to the viewer's.
+        across_s: sin_squared times sin(2 psi). Both (..., view) and regular everywhere.
+    """
+
+    cos_incidence: Array
+    sin_squared: Array
+    tan_squared_tilt: Array
+    along_s: Array
+    across_s: Array
+
+
+def sin_degrees(angle: Array) -> Array:
+    """Sine of an angle in degrees. Any shape; returns the same shape."""
+    return jnp.sin(jnp.deg2rad(angle))
+
+
+def cos_degrees(angle: Array) -> Array:
+    """Cosine of an angle in degrees, accurate up to 90, where a plain cosine loses its digits."""
+    return jnp.sin(jnp.deg2rad(90.0 - angle))
+
+
+def mirror_facet(geometry: Geometry) -> MirrorFacet:
+    r"""Facet whose normal is half-way between viewer and light, in half angles.
+
+    $$ \sin^2\theta_d = \sin^2\tfrac{\theta_v-\theta_l}{2} + s_v s_l \sin^2\tfrac{\varphi}{2},
+       \qquad \tan^2\theta_h = \frac{(s_v-s_l)^2 + 4 s_v s_l \cos^2(\varphi/2)}{(c_v+c_l)^2} $$
+
+    With X = s_v c_l - c_v s_l cos(phi) and Y = s_l sin(phi) the s axis of the facet is turned by
+    psi, where tan(psi) = Y/X and X^2 + Y^2 = 4 sin^2 cos^2: so sin^2 cos(2 psi) needs no angle.
+
+    Args:
+        geometry: Directions. Shape (..., view), degree.
+
+    Returns:
+        MirrorFacet of shape (..., view).
+
+    Raises:
+        Nothing.
+    """
+    sin_half, cos_half = _half_azimuth(geometry.light_azimuth - geometry.view_azimuth)
+    sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
+    sin_light, cos_light = sin_degrees(geometry.light_zenith), cos_degrees(geometry.light_zenith)
+    half_difference = 0.5 * (geometry.view_zenith - geometry.light_zenith)
+    half_sum = 0.5 * (geometry.view_zenith + geometry.light_zenith)
+    sin_sin = sin_view * sin_light
+
+    sin_squared = sin_degrees(half_difference) ** 2 + sin_sin * sin_half**2
+    cos_squared = cos_degrees(half_sum) ** 2 + sin_sin * cos_half**2
+    sine_gap = 2.0 * cos_degrees(half_sum) * sin_degrees(half_difference)
+    slope_squared = (sine_gap**2 + 4.0 * sin_sin * cos_half**2) / (cos_view + cos_light) ** 2
+
+    x = sin_degrees(2.0 * half_difference) + 2.0 * cos_view * sin_light * sin_half**2
+    y = 2.0 * sin_light * sin_half * cos_half
+    scale = 4.0 * cos_squared
+    return MirrorFacet(
+        cos_incidence=jnp.sqrt(cos_squared),
+        sin_squared=sin_squared,
+        tan_squared_tilt=slope_squared,
+        along_s=(x**2 - y**2) / scale,
+        across_s=2.0 * x * y / scale,
+    )
+
+
+def _half_azimuth(azimuth: Array) -> tuple[Array, Array]:
+    """Sine and cosine of half an azimuth difference, exact on the mirror side and behind."""
+    azimuth = azimuth - 360.0 * jnp.round(azimuth / 360.0)
+    forwards = jnp.where(azimuth < 0.0, -azimuth, azimuth)
+    return sin_degrees(0.5 * azimuth), cos_degrees(0.5 * forwards)

@@ -1,0 +1,185 @@
+"""A scene: the optics and the instrument that turn material parameters into predicted readings."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+from polar_bayes.errors import SceneError
+from polar_bayes.physics.geometry import Geometry
+from polar_bayes.physics.instrument import AbstractInstrumentTerm, Instrument
+from polar_bayes.physics.mixing import AbstractMixing
+from polar_bayes.physics.stokes import Light, degree_of_linear_polarization, to_stokes
+from polar_bayes.physics.subsurface import AbstractSubsurface
+from polar_bayes.physics.surface import AbstractSurface
+
+# The order in which material parameters are listed.
+MATERIAL_PARAMETERS = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Parts that are there act; parts that are None are absent from the compiled program.
+
+    Args:
+        surface: SmoothSurface() or RoughSurface(...).
+        subsurface: Unpolarized(), Lambertian(), Depolarizer(), or None for no light from below.
+        mixing: DopMixing() or StokesMixing(); needed with a subsurface, and only then.
+        coat: None; coats come with a later version.
+        instrument: Instrument((...)), or None for a perfect one.
+
+    Raises:
+        SceneError: A part is of the wrong kind, or one is missing beside another.
+    """
+
+    surface: AbstractSurface
+    subsurface: AbstractSubsurface | None = None
+    mixing: AbstractMixing | None = None
+    coat: None = None
+    instrument: Instrument | None = None
+
+    def __post_init__(self) -> None:
+        _check_part(self.surface, "surface", AbstractSurface, "SmoothSurface() or RoughSurface()")
+        if self.subsurface is not None:
+            allowed = "Unpolarized(), Lambertian(), Depolarizer() or None"
+            _check_part(self.subsurface, "subsurface", AbstractSubsurface, allowed)
+        if self.mixing is not None:
+            _check_part(
+                self.mixing, "mixing", AbstractMixing, "DopMixing(), StokesMixing() or None"
+            )
+        if self.instrument is not None:
+            allowed = "Instrument((DolpGain(), ...)) or None"
+            _check_part(self.instrument, "instrument", Instrument, allowed)
+        if self.coat is not None:
+            raise SceneError(
+                f"{self.coat!r} cannot be used yet", where="coat", mend="leave coat=None"
+            )
+        if self.mixing is not None and self.subsurface is None:
+            raise SceneError(
+                "there is no subsurface to mix",
+                where="mixing",
+                mend="give a subsurface, such as Depolarizer(), or leave mixing=None",
+            )
+        if self.subsurface is not None and self.mixing is None:
+            raise SceneError(
+                "nothing says how its light adds to the surface's",
+                where="subsurface",
+                mend="give mixing=StokesMixing() or DopMixing(), or leave subsurface=None",
+            )
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that the scene reads: the material's, then the instrument's."""
+        parts = (self.surface, self.subsurface, self.mixing)
+        read = {name for part in parts if part is not None for name in part.parameters}
+        material = tuple(name for name in MATERIAL_PARAMETERS if name in read)
+        return material + (() if self.instrument is None else self.instrument.parameters)
+
+    def light(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> Light:
+        """Light that reaches the viewer, before any instrument.
+
+        Args:
+            parameters: Material parameters by name; more than the scene reads may be given.
+                Shape (...), which must broadcast with the leading axes of the geometry.
+            geometry: Directions. Shape (..., view), degree.
+
+        Returns:
+            Light of shape (..., view).
+
+        Raises:
+            SceneError: A material parameter that the scene reads is missing.
+        """
+        return self._optics(self._per_view(parameters, MATERIAL_PARAMETERS), geometry)
+
+    def stokes(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> Array:
+        """Stokes vector S0, S1, S2 that reaches the viewer, before any instrument.
+
+        Args:
+            parameters: Material parameters by name. Shape (...), 1.
+            geometry: Directions. Shape (..., view), degree.
+
+        Returns:
+            Stokes vectors for unit irradiance; unit radiance under a disc or sky.
+            Shape (..., view, 3).
+
+        Raises:
+            SceneError: A material parameter that the scene reads is missing.
+        """
+        return to_stokes(self.light(parameters, geometry))
+
+    def predict(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> dict[str, Array]:
+        """Readings as the instrument records them, without noise.
+
+        Args:
+            parameters: Material and instrument parameters by name. Shape (...);
+                `discrepancy_weights` has a trailing axis over its basis.
+            geometry: Directions as read off. Shape (..., view), degree.
+
+        Returns:
+            `dop`, `q`, `u` and `intensity`, each (..., view).
+
+        Raises:
+            SceneError: A parameter that the scene reads is missing.
+        """
+        per_view = self._per_view(parameters, self.parameters)
+        if self.instrument is None:
+            light = self._optics(per_view, geometry)
+        else:
+            light = self._optics(per_view, self.instrument.aim(per_view, geometry))
+            light = self.instrument.record(per_view, geometry, light)
+        intensity, q, u = jnp.broadcast_arrays(*light)
+        dop = degree_of_linear_polarization(q, u)
+        return {"dop": dop, "q": q, "u": u, "intensity": intensity}
+
+    def without(self, term: type[AbstractInstrumentTerm]) -> "Scene":
+        """The same scene with one instrument term removed.
+
+        Args:
+            term: Class of the term, such as DarkLevel.
+
+        Returns:
+            A new scene; its instrument is None when no term is left.
+
+        Raises:
+            SceneError: The scene has no such term.
+        """
+        terms = () if self.instrument is None else self.instrument.terms
+        rest = tuple(part for part in terms if not isinstance(part, term))
+        if len(rest) == len(terms):
+            present = ", ".join(type(part).__name__ for part in terms) or "none"
+            raise SceneError(
+                f"the scene has no {term.__name__}",
+                where="without",
+                mend=f"name one of its instrument terms: {present}",
+            )
+        return dataclasses.replace(self, instrument=Instrument(rest) if rest else None)
+
+    def _optics(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
+        """Surface, body and their mixture, for parameters that have a view axis."""
+        surface = self.surface.light(parameters, geometry)
+        if self.subsurface is None or self.mixing is None:
+            return Light(*jnp.broadcast_arrays(*surface))
+        subsurface = self.subsurface.light(parameters, geometry, self.surface)
+        mixture = self.mixing.mix(parameters["subsurface_fraction"], surface, subsurface)
+        return Light(*jnp.broadcast_arrays(*mixture))
+
+    def _per_view(
+        self, parameters: Mapping[str, ArrayLike], names: tuple[str, ...]
+    ) -> dict[str, Array]:
+        """The parameters that the scene reads, each with a trailing view axis."""
+        needed = [name for name in self.parameters if name in names]
+        missing = [name for name in needed if name not in parameters]
+        if missing:
+            raise SceneError(
+                f"{', '.join(missing)} missing",
+                where="parameters",
+                mend=f"this scene reads {', '.join(needed)}",
+            )
+        return {name: jnp.asarray(parameters[name])[..., None] for name in needed}
+
+
+def _check_part(part: object, where: str, kind: type, allowed: str) -> None:
+    """Refuse a part of the wrong kind, naming the right ones."""
+    if not isinstance(part, kind):
+        raise SceneError(f"{part!r} is no {where}", where=where, mend=f"give {allowed}")

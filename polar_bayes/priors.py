@@ -1,0 +1,156 @@
+"""What is believed before any data: one NumPyro distribution for every named parameter.
+
+The table is written once and read by every model. A caller replaces any row with any NumPyro
+distribution of the right support: `priors={"refractive_index": dist.Normal(1.5, 0.02)}` is
+refused (an index below 1 is possible under it), `dist.TruncatedNormal(1.5, 0.02, low=1.0)` is
+not. Distributions are made of Python numbers, so that importing this file creates no array and
+the fit chooses the precision.
+"""
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+
+import numpyro.distributions as dist
+from numpyro.distributions import constraints
+
+from polar_bayes.errors import FitError
+
+PRIORS: dict[str, dist.Distribution] = {
+    # The material: the paper, section 2.
+    "roughness": dist.HalfNormal(0.2),
+    "subsurface_fraction": dist.Beta(2.0, 2.0),
+    "absorption": dist.LogNormal(-1.0, 0.5),
+    "refractive_index": dist.TruncatedNormal(1.45, 0.15, low=1.2, high=2.0),
+    # The instrument: what a careful set-up leaves unknown.
+    "dolp_gain": dist.Beta(10.0, 1.5),
+    "channel_gain_ratio": dist.LogNormal(0.0, 0.1),
+    "leakage": dist.HalfNormal(0.01),
+    "dark_level": dist.Normal(0.0, 0.001),
+    "angle_zero": dist.Normal(0.0, 0.75),
+    "discrepancy_amplitude": dist.HalfNormal(0.1),
+    "discrepancy_weights": dist.Normal(0.0, 1.0).expand([4]).to_event(1),
+    # The noise: scales that the data themselves determine.
+    "concentration_scale": dist.LogNormal(math.log(200.0), 1.0),
+    "logit_scale": dist.HalfNormal(0.5),
+    "normal_scale": dist.HalfNormal(0.1),
+    "stokes_scale": dist.HalfNormal(0.05),
+    "stokes_error_factor": dist.LogNormal(math.log(2.0), 1.0),
+    "exposure": dist.LogNormal(0.0, 3.0),
+    "intensity_scale": dist.HalfNormal(0.05),
+}
+
+RANGES: dict[str, tuple[float, float]] = {
+    "roughness": (0.0, math.inf),
+    "subsurface_fraction": (0.0, 1.0),
+    "absorption": (0.0, math.inf),
+    "refractive_index": (1.0, math.inf),
+    "dolp_gain": (0.0, 1.0),
+    "channel_gain_ratio": (0.0, math.inf),
+    "leakage": (0.0, math.inf),
+    "discrepancy_amplitude": (0.0, math.inf),
+    "concentration_scale": (0.0, math.inf),
+    "logit_scale": (0.0, math.inf),
+    "normal_scale": (0.0, math.inf),
+    "stokes_scale": (0.0, math.inf),
+    "stokes_error_factor": (0.0, math.inf),
+    "exposure": (0.0, math.inf),
+    "intensity_scale": (0.0, math.inf),
+}
+"""Physical range of a parameter; one that is not listed may take any real value."""
+
+
+def resolve_priors(
+    parameters: Iterable[str], overrides: Mapping[str, dist.Distribution] | None = None
+) -> dict[str, dist.Distribution]:
+    """The prior of every parameter that a model reads.
+
+    Args:
+        parameters: Names that the scene and the links read.
+        overrides: Priors that replace or extend the table.
+
+    Returns:
+        A distribution for each name, in the order given.
+
+    Raises:
+        FitError: An override is not a NumPyro distribution, names no parameter of this model,
+            or allows values outside the parameter's physical range; or a parameter has no prior.
+    """
+    parameters = tuple(parameters)
+    overrides = dict(overrides or {})
+    for name, prior in overrides.items():
+        _check_override(str(name), prior, parameters)
+    available = {**PRIORS, **overrides}
+    for name in parameters:
+        if name not in available:
+            raise FitError(
+                "this parameter has no prior",
+                where=f"priors[{name!r}]",
+                mend=f"give one: priors={{{name!r}: <a NumPyro distribution>}}",
+            )
+    return {name: available[name] for name in parameters}
+
+
+def describe_prior(prior: dist.Distribution) -> str:
+    """A prior as text, for reports: `TruncatedNormal(loc=1.45, scale=0.15, low=1.2, high=2)`."""
+    event = ""
+    while isinstance(prior, dist.Independent | dist.ExpandedDistribution):
+        event = f" x {tuple(prior.event_shape)}" if prior.event_shape else event
+        prior = prior.base_dist
+    name = type(prior).__name__
+    if isinstance(prior, dist.TransformedDistribution) and not prior.arg_constraints:
+        return f"{name}({describe_prior(prior.base_dist)}){event}"
+    arguments = {key: getattr(prior, key, None) for key in prior.arg_constraints}
+    base = getattr(prior, "base_dist", None)
+    if base is not None and type(prior).__name__.startswith(("TwoSided", "Left", "Right")):
+        return f"Truncated({describe_prior(base)}, {_bounds(prior)}){event}"
+    text = ", ".join(f"{key}={_number(value)}" for key, value in arguments.items())
+    return f"{name}({text}){event}"
+
+
+def _number(value: object) -> str:
+    try:
+        return f"{float(value):g}"  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return "..."
+
+
+def _bounds(prior: dist.Distribution) -> str:
+    low, high = support_bounds(prior)
+    return f"low={low:g}, high={high:g}"
+
+
+def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
+    """Smallest and largest value that a prior allows, infinite where it has no bound."""
+    support = prior.support
+    while isinstance(support, constraints.independent):
+        support = support.base_constraint
+    low = getattr(support, "lower_bound", -math.inf)
+    high = getattr(support, "upper_bound", math.inf)
+    return float(low), float(high)
+
+
+def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> None:
+    where = f"priors[{name!r}]"
+    if name not in parameters:
+        near = difflib.get_close_matches(name, parameters, n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise FitError(
+            "no such parameter in this model",
+            where=where,
+            mend=f"{hint}the parameters are {', '.join(parameters)}",
+        )
+    if not isinstance(prior, dist.Distribution):
+        raise FitError(
+            f"a {type(prior).__name__} is not a NumPyro distribution",
+            where=where,
+            mend="give an object such as numpyro.distributions.Normal(0.0, 1.0)",
+        )
+    low, high = support_bounds(prior)
+    least, most = RANGES.get(name, (-math.inf, math.inf))
+    if low < least or high > most:
+        raise FitError(
+            f"{type(prior).__name__} allows values outside {least:g} to {most:g}",
+            where=where,
+            mend="use a distribution of that support, for example TruncatedNormal or Beta",
+        )

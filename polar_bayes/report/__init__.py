@@ -1,0 +1,1 @@
+"""The standard report: figures, tables and one self-contained page."""

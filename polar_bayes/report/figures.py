@@ -1,0 +1,362 @@
+"""Figures of a fit: each is drawn from the saved tree alone.
+
+`readings` (its own file) shows the data; here are the parameters and the checks. In a notebook a
+figure is the last line of a cell; `figure.savefig("name.pdf")` writes it.
+"""
+
+import textwrap
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+from arviz_stats.base import array_stats
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from polar_bayes.diagnostics.parameters import Scalar, posterior_scalars, scalars, truth_of
+from polar_bayes.diagnostics.predictive import Check, pit_band, predictive_checks
+from polar_bayes.errors import FitError
+from polar_bayes.report.readings import readings as readings
+from polar_bayes.report.style import (
+    BLACK,
+    BLUE,
+    CHAIN_COLORS,
+    GRAY,
+    ORANGE,
+    QUANTITIES,
+    VERMILLION,
+    grid,
+    lighten,
+    quiet_ticks,
+    styled,
+    title_of,
+    unit_of,
+)
+
+MOST_PAIRED = 8
+MOST_PANELS = 12
+MOST_POINTS = 800
+RANK_BINS = 20
+MINUS = "\N{MINUS SIGN}"
+
+
+def drawable(result: xr.DataTree, *, material: bool = False) -> list[Scalar]:
+    """The parameters that figures show: single numbers that are finite and move.
+
+    Args:
+        result: The tree.
+        material: True for material parameters only.
+
+    Returns:
+        Those parameters, the material first; entries of vector sites are left out.
+    """
+    found = [
+        scalar
+        for scalar in posterior_scalars(result)
+        if np.isfinite(scalar.draws).all()
+        and np.ptp(scalar.draws) > 0.0
+        and (scalar.is_material or not material)
+        and not any(dim.startswith(f"{scalar.name}_") for dim in scalar.index)
+    ]
+    return sorted(found, key=_first_material_first)
+
+
+def _first_material_first(scalar: Scalar) -> tuple[bool, list[int]]:
+    """Figures have room for a few: all parameters of one material, then those of the next."""
+    places = [at for dim, at in scalar.index.items() if dim != "wavelength"]
+    return not scalar.is_material, places
+
+
+@styled
+def pairs(result: xr.DataTree) -> Figure:
+    """Joint draws of the material parameters (the first material, at most 8), and correlations.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+
+    Returns:
+        The figure: draws below the diagonal, correlations above it. Diverging draws are marked.
+
+    Raises:
+        FitError: Fewer than two material parameters have draws.
+    """
+    found = drawable(result, material=True)
+    found = [s for s in found if _first_material_first(s) == _first_material_first(found[0])]
+    found = found[:MOST_PAIRED]
+    if len(found) < 2:
+        raise _nothing("pairs", "two material parameters with draws")
+    posterior = result["posterior"].to_dataset()
+    size = len(found)
+    # Placed by hand: a layout engine takes seconds for this many axes.
+    side = max(5.6, min(1.35 * size + 0.9, 9.6))
+    figure = Figure(figsize=(side, side))
+    left, bottom = 0.95 / side, 0.75 / side
+    panels = figure.subplots(
+        size,
+        size,
+        squeeze=False,
+        gridspec_kw={
+            "left": left,
+            "right": 0.99,
+            "bottom": bottom,
+            "top": 0.99,
+            "hspace": 0.12,
+            "wspace": 0.12,
+        },
+    )
+    draws = np.stack([scalar.draws.ravel() for scalar in found])
+    shown = np.linspace(0, draws.shape[1] - 1, min(MOST_POINTS, draws.shape[1])).astype(int)
+    diverging = _diverging(result)
+    correlation = np.corrcoef(draws)
+    limits = [_range(values) for values in draws]
+    labels = [_narrow(title_of(scalar, posterior)) for scalar in found]
+    truths = [truth_of(result, scalar) for scalar in found]
+    for row in range(size):
+        for column in range(size):
+            axes = panels[row, column]
+            axes.set_xlim(limits[column])
+            if row == column:
+                _histogram(axes, draws[row], limits[row], truths[row])
+            elif row > column:
+                axes.set_ylim(limits[row])
+                _scatter(axes, draws[[column, row]], shown, diverging)
+                _cross(axes, truths[column], truths[row])
+            else:
+                _correlation(axes, correlation[row, column])
+            _pair_ticks(axes, row, column, size)
+        panels[-1, row].set_xlabel(labels[row], fontsize=8)
+        if row:
+            panels[row, 0].set_ylabel(labels[row], fontsize=8)
+    panels[0, 0].set_ylabel("share of draws", fontsize=8)
+    figure.align_labels()
+    return figure
+
+
+@styled
+def ranks(result: xr.DataTree) -> Figure:
+    """How each chain's draws rank among all draws: flat and overlapping lines are good.
+
+    Args:
+        result: A tree with at least two chains.
+
+    Returns:
+        The figure, a panel for each parameter (the 12 of largest R-hat, if there are more).
+
+    Raises:
+        FitError: There is one chain only, or no parameter moves.
+    """
+    found = drawable(result)
+    if not found or found[0].draws.shape[0] < 2:
+        raise _nothing("ranks", "two chains")
+    r_hat = array_stats.rhat(np.stack([scalar.draws for scalar in found]))
+    worst = np.sort(np.argsort(-r_hat, kind="stable")[:MOST_PANELS])
+    found = [found[i] for i in worst]
+    posterior = result["posterior"].to_dataset()
+    figure, panels = grid(len(found), columns=3, width=8.2, panel_height=1.35, header=0.5)
+    chains, length = found[0].draws.shape
+    edges = np.linspace(0.0, 1.0, RANK_BINS + 1)
+    for axes, scalar in zip(panels, found, strict=True):
+        order = np.argsort(np.argsort(scalar.draws.ravel(), kind="stable")) / scalar.draws.size
+        for chain, own in enumerate(order.reshape(chains, length)):
+            share = np.histogram(own, edges)[0] * RANK_BINS / length
+            color = CHAIN_COLORS[chain % len(CHAIN_COLORS)]
+            axes.stairs(share, edges, color=color, lw=1.1, baseline=None)
+        axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
+        axes.set(xlim=(0, 1), ylim=(0, max(2.0, axes.get_ylim()[1])), xticks=[0, 0.5, 1])
+        axes.set_title(title_of(scalar, posterior), loc="left")
+    quiet_ticks(panels)
+    figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)", fontsize=9)
+    figure.supylabel("density", fontsize=9)
+    handles = [
+        Line2D([], [], color=color, label=f"chain {i + 1}")
+        for i, color in enumerate(CHAIN_COLORS[:chains])
+    ]
+    figure.legend(handles=handles, loc="outside upper left", ncols=6, frameon=False)
+    return figure
+
+
+@styled
+def prior_posterior(result: xr.DataTree) -> Figure:
+    """Prior against posterior: what the data added.
+
+    Args:
+        result: A tree with draws of the prior.
+
+    Returns:
+        The figure, a panel for each parameter (at most 12). Each curve is scaled to the same
+        height; the bar below is the posterior's 95% interval.
+
+    Raises:
+        FitError: The tree holds no prior, or no parameter moves.
+    """
+    before = {}
+    if "prior" in result.children:
+        before = {s.label: s.draws for s in scalars(result["prior"].to_dataset())}
+    found = [scalar for scalar in drawable(result) if scalar.label in before][:MOST_PANELS]
+    if not found:
+        raise _nothing("prior_posterior", "draws of the prior")
+    posterior = result["posterior"].to_dataset()
+    figure, panels = grid(len(found), columns=3, width=8.2, panel_height=1.5, header=0.5)
+    any_truth = False
+    for axes, scalar in zip(panels, found, strict=True):
+        prior, draws = before[scalar.label].ravel(), scalar.draws.ravel()
+        limits = _range(np.concatenate([np.quantile(prior, [0.01, 0.99]), draws]))
+        _hill(axes, prior, limits, GRAY, 0.72)
+        _hill(axes, draws, limits, BLUE, 0.45)
+        low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
+        axes.plot([low, high], [-0.09, -0.09], color=BLUE, lw=3, solid_capstyle="butt")
+        axes.plot([middle], [-0.09], "|", color=BLACK, ms=8)
+        true = truth_of(result, scalar)
+        if np.isfinite(true):
+            any_truth = True
+            axes.axvline(true, color=ORANGE, lw=1.6, ls="--")
+        axes.set(xlim=limits, ylim=(-0.18, 1.08), yticks=[])
+        axes.spines["left"].set_visible(False)
+        axes.locator_params(axis="x", nbins=5)
+        axes.set_title(title_of(scalar, posterior), loc="left")
+        axes.set_xlabel(unit_of(scalar, posterior), fontsize=8)
+    quiet_ticks(panels)
+    handles: list[Patch | Line2D] = [
+        Patch(color=lighten(GRAY, 0.72), label="prior"),
+        Patch(color=lighten(BLUE, 0.45), label="posterior"),
+        Line2D([], [], color=BLUE, lw=3, label="posterior median and 95% interval"),
+    ]
+    if any_truth:
+        handles.append(Line2D([], [], color=ORANGE, ls="--", label="true value"))
+    figure.legend(handles=handles, loc="outside upper left", ncols=4, frameon=False)
+    return figure
+
+
+@styled
+def pit(result: xr.DataTree, checks: dict[str, Check] | None = None) -> Figure:
+    """PIT and leave-one-out PIT of every variable: distance from the uniform distribution.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+        checks: Those of `predictive_checks(result)`, where they are there already.
+
+    Returns:
+        The figure: a row for each variable, bands that hold the whole curve with 95%.
+
+    Raises:
+        FitError: No variable has two readings and enough draws.
+    """
+    checks = predictive_checks(result) if checks is None else checks
+    rows = [check for check in checks.values() if check.pit.size >= 2]
+    if not rows:
+        raise _nothing("pit", "two readings and 100 draws")
+    figure = Figure(figsize=(8.2, 2.1 * len(rows) + 0.5), layout="constrained")
+    panels = figure.subplots(len(rows), 2, sharex=True, sharey="row", squeeze=False)
+    for row, check in enumerate(rows):
+        parts = {"PIT": check.pit, "leave-one-out PIT": check.loo.pit if check.loo else None}
+        for axes, (kind, values) in zip(panels[row], parts.items(), strict=True):
+            _pit_panel(axes, values)
+            axes.set_title(f"{QUANTITIES[check.name]}: {kind}", loc="left")
+        panels[row, 0].set_ylabel("share below, minus uniform")
+    quiet_ticks(list(panels.flat))
+    figure.supxlabel("PIT: share of the prediction below the reading", fontsize=9)
+    return figure
+
+
+def _pit_panel(axes: Axes, values: np.ndarray | None) -> None:
+    band = pit_band(values) if values is not None else None
+    if band is None:
+        axes.text(0.5, 0.5, "not available", ha="center", transform=axes.transAxes, color=GRAY)
+        return
+    color = VERMILLION if band.leaves else BLUE
+    axes.fill_between(band.at, band.lower, band.upper, color=lighten(GRAY, 0.75), lw=0, step="mid")
+    axes.axhline(0.0, color=GRAY, lw=0.8)
+    axes.step(band.at, band.difference, where="mid", color=color, lw=1.4)
+    axes.set_xlim(0, 1)
+
+
+def _diverging(result: xr.DataTree) -> np.ndarray:
+    stats = result["sample_stats"].data_vars if "sample_stats" in result.children else {}
+    if "diverging" not in stats:
+        return np.empty(0, int)
+    return np.flatnonzero(stats["diverging"].to_numpy().ravel())
+
+
+def _range(values: np.ndarray) -> tuple[float, float]:
+    low, high = float(np.min(values)), float(np.max(values))
+    margin = 0.04 * (high - low) or 1.0
+    return low - margin, high + margin
+
+
+def _histogram(
+    axes: Axes, values: np.ndarray, limits: tuple[float, float], true: float = np.nan
+) -> None:
+    counts, edges = np.histogram(values, 30, range=limits)
+    axes.stairs(counts, edges, fill=True, color=lighten(BLUE, 0.45))
+    axes.set_ylim(0, 1.08 * counts.max())
+    if np.isfinite(true):
+        axes.axvline(true, color=ORANGE, lw=1.4, ls="--")
+
+
+def _hill(
+    axes: Axes, values: np.ndarray, limits: tuple[float, float], color: str, share: float
+) -> None:
+    """A histogram over its own range, scaled to height 1."""
+    inside = values[(values >= limits[0]) & (values <= limits[1])]
+    counts, edges = np.histogram(inside, 16 if inside.size < 1000 else 30)
+    axes.stairs(counts / counts.max(), edges, fill=True, color=lighten(color, share))
+    axes.stairs(counts / counts.max(), edges, color=color, lw=0.8)
+
+
+def _scatter(axes: Axes, xy: np.ndarray, shown: np.ndarray, diverging: np.ndarray) -> None:
+    axes.plot(*xy[:, shown], "o", color=BLUE, ms=1.6, mew=0, alpha=0.4, rasterized=True)
+    if diverging.size:
+        axes.plot(*xy[:, diverging], "x", color=VERMILLION, ms=4, mew=1.2, rasterized=True)
+
+
+def _cross(axes: Axes, x: float, y: float) -> None:
+    style = {"color": ORANGE, "lw": 1.2, "ls": "--", "zorder": 3}
+    if np.isfinite(x):
+        axes.axvline(x, **style)
+    if np.isfinite(y):
+        axes.axhline(y, **style)
+
+
+def _correlation(axes: Axes, value: float) -> None:
+    axes.axis("off")
+    strength = min(abs(value), 1.0)
+    axes.text(
+        0.5,
+        0.5,
+        f"{value:+.2f}".replace("-", MINUS),
+        ha="center",
+        va="center",
+        transform=axes.transAxes,
+        fontsize=8.0 + 3.0 * strength,
+        color=BLACK if strength > 0.3 else GRAY,
+    )
+
+
+def _pair_ticks(axes: Axes, row: int, column: int, size: int) -> None:
+    axes.locator_params(nbins=3)
+    axes.tick_params(labelsize=7, length=2, color=GRAY)
+    axes.tick_params(axis="x", labelbottom=row == size - 1, labelrotation=45)
+    axes.tick_params(axis="y", labelleft=column == 0 and row > 0)
+    if row == column:
+        axes.set_yticks([])
+
+
+def _narrow(text: str) -> str:
+    """Break a label at its commas, and long parts at a space, for narrow panels."""
+    return "\n".join(
+        line for part in text.split(", ") for line in textwrap.wrap(part, 17, max_lines=2)
+    )
+
+
+def _nothing(what: str, needed: str) -> FitError:
+    return FitError(
+        "there is nothing to draw", where=what, mend=f"give a result that has {needed}"
+    )
+
+
+def captioned(scalars_shown: Sequence[Scalar], total: int) -> str:
+    """A note on what a figure leaves out; empty when it shows everything."""
+    shown = len(scalars_shown)
+    return "" if shown == total else f"The first {shown} of {total} parameters are shown."

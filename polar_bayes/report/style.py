@@ -1,0 +1,145 @@
+"""How figures look: colors that everybody can tell apart, labels in words with units.
+
+Nothing here changes matplotlib's global settings for longer than one figure takes, and no figure
+belongs to pyplot, so drawing a report leaves a notebook as it was.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont, get_font
+
+from polar_bayes.diagnostics.parameters import Scalar
+from polar_bayes.errors import one_line
+
+# Okabe and Ito, "Color universal design" (2008).
+BLACK, GRAY = "#000000", "#6b6b6b"
+ORANGE, SKY, GREEN, BLUE = "#e69f00", "#56b4e9", "#009e73", "#0072b2"
+VERMILLION, PURPLE = "#d55e00", "#cc79a7"
+CHAIN_COLORS = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
+
+STYLE: dict[str, Any] = {
+    "font.family": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.labelsize": 9.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": GRAY,
+    "xtick.color": GRAY,
+    "ytick.color": GRAY,
+    "xtick.labelcolor": BLACK,
+    "ytick.labelcolor": BLACK,
+    "axes.grid": False,
+    "figure.facecolor": "white",
+    "axes.facecolor": "white",
+    "savefig.facecolor": "white",
+    # Names of captures and materials are text, whatever dollar signs they contain.
+    "text.parse_math": False,
+    "text.usetex": False,
+    "axes.formatter.use_mathtext": False,
+    "axes.unicode_minus": True,
+    "svg.hashsalt": "polar_bayes",
+    "path.simplify": True,
+}
+
+QUANTITIES = {
+    "dop": "degree of polarization",
+    "q": "q (s positive)",
+    "u": "u",
+    "intensity": "intensity",
+}
+SHORT = {**QUANTITIES, "dop": "DoP", "q": "q"}
+GREEK = {"beta": "β"}
+
+
+def styled[**P, R](draw: Callable[P, R]) -> Callable[P, R]:
+    """Run a drawing function in the house style and leave the settings as they were."""
+
+    @functools.wraps(draw)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        with matplotlib.rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return wrapper
+
+
+def grid(
+    count: int, *, columns: int, width: float, panel_height: float, header: float = 0.0
+) -> tuple[Figure, list[Axes]]:
+    """A figure of equal panels in rows.
+
+    Args:
+        count: Panels; the last row may stay shorter.
+        columns: Panels in a full row.
+        width: Of the figure, unit inch.
+        panel_height: Of a row, unit inch.
+        header: Room above the first row, unit inch.
+
+    Returns:
+        The figure and its axes, row by row.
+    """
+    columns = max(1, min(columns, count))
+    rows = max(1, math.ceil(count / columns))
+    figure = Figure(figsize=(width, rows * panel_height + header), layout="constrained")
+    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
+    return figure, axes
+
+
+def title_of(scalar: Scalar, posterior: xr.Dataset) -> str:
+    """A parameter in words: `refractive index n, 450 nm`."""
+    attributes = posterior[scalar.name].attrs
+    words = str(attributes.get("long_name", scalar.name.replace("_", " ")))
+    words = {"absorption relative to scattering": "absorption"}.get(words, words)
+    symbol = str(attributes.get("symbol", ""))
+    places = [place_of(dim, label) for dim, label in scalar.labels.items()]
+    return plain(", ".join([f"{words} {GREEK.get(symbol, symbol)}".strip(), *places]))
+
+
+def unit_of(scalar: Scalar, posterior: xr.Dataset) -> str:
+    """The unit of a parameter, empty for pure numbers."""
+    unit = str(posterior[scalar.name].attrs.get("units", "1"))
+    return "" if unit == "1" else plain(unit)
+
+
+def place_of(dim: str, label: str) -> str:
+    """One coordinate in words: `450 nm`, `material leaf`."""
+    if dim == "wavelength":
+        return f"{label} nm"
+    return label if dim.endswith(tuple("0123456789")) else f"{dim} {label}"
+
+
+def plain(text: str, longest: int = 60) -> str:
+    """Text that the figure's font can draw, on one line and not too long."""
+    line = one_line(text)
+    known = _characters()
+    drawn = "".join(c if ord(c) in known else "□" for c in line)
+    return drawn if len(drawn) <= longest else f"{drawn[: longest - 1]}…"
+
+
+def lighten(color: str, share: float) -> tuple[float, float, float]:
+    """A color mixed with white, so that areas need no transparency (print, old readers)."""
+    rgb = np.array(matplotlib.colors.to_rgb(color))
+    red, green, blue = rgb + (1.0 - rgb) * share
+    return float(red), float(green), float(blue)
+
+
+def quiet_ticks(axes: Axes | Sequence[Axes]) -> None:
+    """Fix tick sizes now: matplotlib would look them up only when the figure is drawn."""
+    for axis in [axes] if isinstance(axes, Axes) else axes:
+        axis.tick_params(labelsize=STYLE["xtick.labelsize"], length=3.0, color=GRAY)
+
+
+@functools.cache
+def _characters() -> frozenset[int]:
+    return frozenset(get_font(findfont("DejaVu Sans")).get_charmap())

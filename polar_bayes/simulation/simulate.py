@@ -1,0 +1,196 @@
+"""Captures of known truth: the forward story of a model, told without data."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+
+from polar_bayes.capture.schema import validate
+from polar_bayes.errors import CaptureError, SceneError
+from polar_bayes.observation.data import Observations
+from polar_bayes.observation.links import AbstractLink, noise_parameters
+from polar_bayes.physics.geometry import Geometry
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
+from polar_bayes.setups import SETUPS, Setup, find_setup
+from polar_bayes.simulation.presets import Material, find_preset
+from polar_bayes.simulation.protocol import Protocol
+
+NOISE: Mapping[str, float] = {
+    "concentration_scale": 300.0,
+    "logit_scale": 0.15,
+    "normal_scale": 0.02,
+    "stokes_scale": 0.01,
+    "stokes_error_factor": 1.0,
+    "intensity_scale": 0.01,
+}
+"""Noise of a careful laboratory capture, by the names of the links' parameters."""
+
+NEUTRAL: Mapping[str, np.ndarray] = {
+    "dolp_gain": np.asarray(1.0),
+    "channel_gain_ratio": np.asarray(1.0),
+    "leakage": np.asarray(0.0),
+    "dark_level": np.asarray(0.0),
+    "angle_zero": np.asarray(0.0),
+    "discrepancy_amplitude": np.asarray(0.0),
+    "discrepancy_weights": np.zeros(4),
+}
+"""A perfect instrument, by the names of the terms' parameters."""
+
+FULL_SCALE = 1.0
+BRIGHT_QUANTILE = 0.9
+BRIGHT_LEVEL = 0.6
+"""Exposure puts the 90% brightest view at 60% of full scale; a specular lobe may saturate."""
+
+
+def simulate(
+    preset: str | Material = "leaf",
+    *,
+    scene: str | Scene = "paper",
+    links: Mapping[str, AbstractLink] | None = None,
+    protocol: Protocol | None = None,
+    parameters: Mapping[str, float | np.ndarray] | None = None,
+    noise: Mapping[str, float] | None = None,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Draw a capture of a known material.
+
+    Args:
+        preset: A name in `PRESETS` or a `Material`.
+        scene: A name in `SETUPS` or a `Scene`.
+        links: How each variable scatters; by default those of the scene's set-up.
+        protocol: Where to look from; the paper's by default.
+        parameters: Values that replace the preset's, and those of instrument terms (which are
+            otherwise 0 for offsets and 1 for gains); shape () or (wavelength,).
+        noise: Values that replace those of `NOISE`.
+        seed: The same seed gives the same capture.
+
+    Returns:
+        A validated capture with dims (view, wavelength), or (view,) without wavelengths. The
+        truth rides along as `true_<parameter>`; readings at full scale are flagged `saturated`.
+
+    Raises:
+        CaptureError: No such preset, or a value outside its range.
+        SceneError: No such scene, or a parameter that it does not have.
+    """
+    protocol = protocol or Protocol()
+    setup = find_setup(scene) if isinstance(scene, str) else Setup(scene, SETUPS["paper"].links)
+    links = dict(links or setup.links)
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**32:
+        raise CaptureError(
+            f"seed is {seed!r}", where="simulate", mend="give an integer from 0 to 2**32 - 1"
+        )
+    material = find_preset(preset) if isinstance(preset, str) else preset
+    wavelengths = np.asarray(protocol.wavelengths, float)
+    truth = _truth(material, setup.scene, wavelengths, parameters or {})
+    levels = {name: {**NOISE, **(noise or {})}.get(name) for name in noise_parameters(links)}
+    with jax.enable_x64(True):
+        recorded = _record(setup.scene, links, protocol, truth, levels, seed)
+    name = preset if isinstance(preset, str) else "simulated"
+    setup_name = scene if isinstance(scene, str) else "paper"
+    return _label(recorded, protocol, truth, {"name": name, "setup": setup_name, "seed": seed})
+
+
+def _truth(
+    material: Material,
+    scene: Scene,
+    wavelengths: np.ndarray,
+    overrides: Mapping[str, float | np.ndarray],
+) -> dict[str, np.ndarray]:
+    unknown = set(overrides) - set(scene.parameters)
+    if unknown:
+        raise SceneError(
+            f"the scene has no parameter {', '.join(sorted(unknown))}",
+            where="simulate: parameters",
+            mend=f"give any of {', '.join(scene.parameters)}",
+        )
+    known = material.at(wavelengths if wavelengths.size else np.asarray(550.0))
+    available = {**NEUTRAL, **known, **{k: np.asarray(v, float) for k, v in overrides.items()}}
+    missing = [name for name in scene.parameters if name not in available]
+    if missing:
+        raise SceneError(
+            f"no value for {', '.join(missing)}",
+            where="simulate: parameters",
+            mend=f"give parameters={{{missing[0]!r}: <a number>}}",
+        )
+    return {name: available[name] for name in scene.parameters}
+
+
+def _record(
+    scene: Scene,
+    links: Mapping[str, AbstractLink],
+    protocol: Protocol,
+    truth: Mapping[str, np.ndarray],
+    noise: Mapping[str, float | None],
+    seed: int,
+) -> dict[str, np.ndarray]:
+    """Readings with dims ([wavelength,] view): intensity first, since noise depends on it."""
+    key_intensity, key_rest = jax.random.split(jax.random.key(seed))
+    blank = _blank(protocol)
+    parameters = {name: jnp.asarray(value) for name, value in truth.items()}
+    prediction = scene.predict(parameters, blank.geometry)
+    prediction = {n: jnp.broadcast_to(x, blank.shape) for n, x in prediction.items()}
+    exposure = BRIGHT_LEVEL / jnp.quantile(prediction["intensity"], BRIGHT_QUANTILE)
+    levels = {n: exposure if n == "exposure" else jnp.asarray(x) for n, x in noise.items()}
+    recorded: dict[str, Array] = {}
+    data = blank
+    if "intensity" in links:
+        link = links["intensity"]
+        intensity = link.distribution("intensity", prediction, blank, levels).sample(key_intensity)
+        recorded["intensity"] = intensity
+        recorded["saturated"] = intensity >= FULL_SCALE
+        data = _with_intensity(blank, intensity)
+    for name, key in zip(links, jax.random.split(key_rest, len(links)), strict=True):
+        if name != "intensity":
+            recorded[name] = links[name].distribution(name, prediction, data, levels).sample(key)
+    for name in {"q", "u"} & set(recorded):
+        recorded[name] = jnp.clip(recorded[name], -1.0, 1.0)
+    return {name: np.asarray(value) for name, value in recorded.items()}
+
+
+def _blank(protocol: Protocol) -> Observations:
+    """The layout of the capture before anything was recorded."""
+    dims = (("view", protocol.views),)
+    if protocol.wavelengths:
+        dims = (("wavelength", len(protocol.wavelengths)), *dims)
+    shape = tuple(length for _, length in dims)
+    angles = {name: jnp.asarray(angle) for name, angle in protocol.angles().items()}
+    return Observations(
+        geometry=Geometry.from_degrees(**angles),
+        readings={},
+        errors={},
+        brightness=jnp.ones(shape),
+        full_scale=jnp.asarray(FULL_SCALE),
+        intensity_unit=jnp.asarray(1.0),
+        valid=jnp.ones(shape, bool),
+        saturated=jnp.zeros(shape, bool),
+        dims=dims,
+    )
+
+
+def _with_intensity(data: Observations, intensity: Array) -> Observations:
+    return dataclasses.replace(data, brightness=jnp.clip(intensity / FULL_SCALE, 0.0, 1.0))
+
+
+def _label(
+    recorded: Mapping[str, np.ndarray],
+    protocol: Protocol,
+    truth: Mapping[str, np.ndarray],
+    attributes: Mapping[str, str | int],
+) -> xr.Dataset:
+    dims = ("view", "wavelength") if protocol.wavelengths else ("view",)
+    capture = xr.Dataset(
+        {name: ("view", angle) for name, angle in protocol.angles().items()}, attrs=attributes
+    )
+    for name, value in recorded.items():
+        capture[name] = (dims, value.T)
+    for name in (name for name in MATERIAL_PARAMETERS if name in truth):
+        capture[f"true_{name}"] = ("wavelength" if truth[name].ndim else (), truth[name])
+    if protocol.wavelengths:
+        capture = capture.assign_coords(wavelength=np.asarray(protocol.wavelengths, float))
+    if "intensity" in capture:
+        capture["intensity"].attrs["saturation_level"] = FULL_SCALE
+    return validate(capture, source="simulate")

@@ -1,0 +1,157 @@
+"""Text tables: every common form is read alike, every slip is named with its line."""
+
+import re
+
+import numpy as np
+import pytest
+
+from polar_bayes.capture import tables
+from polar_bayes.capture.tables import read_table
+from polar_bayes.errors import CaptureError
+
+
+@pytest.fixture
+def write(tmp_path):
+    """A function that writes a table, text or bytes, and gives its path."""
+
+    def write_table(content):
+        path = tmp_path / "table.txt"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write_table
+
+
+SAME_TABLE = {
+    "tab": "angle\tlevel\n10\t1.5\n20\t2.5\n",
+    "runs of tabs": "angle\t\tlevel\n10\t\t1.5\n20\t2.5\t\n",
+    "comma": "angle,level\n10,1.5\n20,2.5\n",
+    "comma and blank": "angle, level\n10, 1.5\n20, 2.5\n",
+    "semicolon": "angle;level\n10;1.5\n20;2.5\n",
+    "comma, many blanks": "angle , level\n10 ,1.5\n20  ,2.5\n",
+    "blanks": "angle level\n  10  1.5\n  20  2.5\n",
+    "decimal comma, semicolon": "angle;level\n10;1,5\n20;2,5\n",
+    "decimal comma, tab": "angle\tlevel\n10\t1,5\n20\t2,5\n",
+    "decimal comma, blank": "angle level\n10 1,5\n20 2,5\n",
+    "quotes": '"angle","level"\n"10","1.5"\n"20","2.5"\n',
+    "comments": "# a lamp\nangle,level # here\n\n10,1.5\n# dark\n20,2.5 # late\n",
+    "byte order mark": "\ufeffangle,level\n10,1.5\n20,2.5\n",
+    "carriage returns": "angle,level\r\n10,1.5\r\n20,2.5\r\n",
+    "old carriage returns": "angle,level\r10,1.5\r20,2.5",
+    "exponents": "angle,level\n1e1,15E-1\n+2.0e+1,.25e1\n",
+    "no last line break": "angle,level\n10,1.5\n20,2.5",
+}
+
+
+@pytest.mark.parametrize("form", SAME_TABLE)
+def test_every_form_of_a_table_is_read_alike(write, form):
+    table = read_table(write(SAME_TABLE[form]))
+    assert table.names == ("angle", "level")
+    np.testing.assert_array_equal(table.columns["angle"], [10.0, 20.0])
+    np.testing.assert_array_equal(table.columns["level"], [1.5, 2.5])
+
+
+def test_columns_without_names_are_numbered(write):
+    assert read_table(write("1 2 3\n")).names == ("column_1", "column_2", "column_3")
+    assert read_table(write("a,,c\n1,2,3\n")).names == ("a", "column_2", "c")
+
+
+def test_columns_are_chosen_by_name_in_the_order_asked(write):
+    table = read_table(write("a b c\n1 2 3\n"), ["c", "a"])
+    assert table.names == ("c", "a")
+    assert table.columns["c"] == [3.0]
+
+
+def test_the_printed_digits_and_lines_are_kept(write):
+    table = read_table(write("# head\nlevel,other\n1.20,239\n\n-3e2,1.5e-3\n"))
+    np.testing.assert_allclose(table.steps["level"], [0.01, 100.0], rtol=1e-15)
+    np.testing.assert_allclose(table.steps["other"], [1.0, 1e-4], rtol=1e-15)
+    assert table.lines == (3, 5)
+
+
+def test_a_header_of_another_time_is_read(write):
+    assert read_table(write(b"Winkel (\xb0)\tI\n1\t2\n")).names == ("Winkel (°)", "I")
+
+
+REFUSED = [
+    ("1 2\n3 x\n", "line 2, column column_2: 'x' is not a finite number", "correct it"),
+    ("a b\n1 nan\n", "line 2, column b: 'nan' is not a finite number", "correct it"),
+    ("nan nan\n1 2\n", "line 1, column column_1: 'nan' is not", "correct it"),
+    ("1 2\n3 inf\n", "line 2, column column_2: 'inf' is not", "correct it"),
+    ("1 2\n3 1e999\n", "line 2, column column_2: '1e999' is not", "correct it"),
+    ("1 2\n3 1e9999\n", "line 2, column column_2: '1e9999' is not", "correct it"),
+    ("1 2\n3 1e-400\n", "line 2, column column_2: '1e-400' is not", "correct it"),
+    ("1 2\n3 0e999\n", "line 2, column column_2: '0e999' is not", "correct it"),
+    ("1 2\n3 1_0\n", "line 2, column column_2: '1_0' is not", "correct it"),
+    ("1 2\n3 0x10\n", "line 2, column column_2: '0x10' is not", "correct it"),
+    ("1 2\n3 ٣\n", "line 2, column column_2: '٣' is not", "correct it"),
+    ("1 2\n3 \N{MINUS SIGN}4\n", "line 2, column column_2: '\N{MINUS SIGN}4' is not", "correct it"),
+    ("1 2\n3 __import__('os')\n", 'line 2, column column_2: "__import__', "correct it"),
+    ("1 2\n3 " + "9" * 65 + "\n", "line 2, column column_2: '999", "correct it"),
+    ("1O 20\n10 20\n", "line 1, column column_1: '1O' is not", "correct it"),
+    ("a,b\ndeg,V\n1,2\n", "line 2, column a: 'deg' is not", "a # before it"),
+    ("1,2,\n", "line 1, column column_3: '' is not", "correct it"),
+    ("1 2\n\n3\n", "line 3: it has another number of cells (1) than the first (2)", "one cell for"),
+    ("a b\n1 2 3\n", "line 2: it has another number of cells (3) than the first (2)", "one cell"),
+    ("1;2,5\n3;4.5\n", "line 1: decimal commas stand beside decimal points", "no mark for thous"),
+    ("1;1,234.5\n", "line 1: decimal commas stand beside decimal points", "no mark for thousands"),
+    ("a a\n1 2\n", "line 1: two columns have the same name", "name each column once"),
+    ("a \x1bb\n1 2\n", "line 1: a name is not printable text", "UTF-8"),
+    (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "it is not text", "save the table as UTF-8 text"),
+    ("a b\n1 2\n".encode("utf-16"), "it is not text", "save the table as UTF-8 text"),
+    ("", "the file is empty", "write it again"),
+    ("# only\n\n", "it holds no rows", "give a line for each reading"),
+    ("a b\n", "it holds names but no rows", "give a line for each reading"),
+]
+
+
+@pytest.mark.parametrize(("content", "what", "mend"), REFUSED)
+def test_a_slip_is_named_with_its_line(write, content, what, mend):
+    with pytest.raises(CaptureError, match=r"table\.txt: " + re.escape(what)) as caught:
+        read_table(write(content))
+    assert mend in caught.value.mend
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_column_is_answered_with_the_known_ones(write):
+    with pytest.raises(CaptureError, match=r"table\.txt: there is no column 'S'; choose from a, b"):
+        read_table(write("a b\n1 2\n"), ["a", "S"])
+
+
+def test_a_table_too_large_is_not_read(write, monkeypatch):
+    monkeypatch.setattr(tables, "LARGEST_FILE", 5)
+    with pytest.raises(CaptureError, match="the file is too large; give a table of at most 50 MB"):
+        read_table(write("1 2\n3 4\n"))
+
+
+def test_a_path_that_holds_no_table_is_named(tmp_path):
+    with pytest.raises(CaptureError, match=r"gone\.txt: there is no such file; check the path"):
+        read_table(tmp_path / "gone.txt")
+    with pytest.raises(CaptureError, match="it is a folder or device; give the path of a file"):
+        read_table(tmp_path)
+    with pytest.raises(CaptureError, match="table: None is not a path; give the path of a file"):
+        read_table(None)
+
+
+def test_a_table_without_rights_is_named(write, monkeypatch):
+    path = write("1 2\n")
+
+    def refuse(*arguments):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(type(path), "read_bytes", refuse)
+    with pytest.raises(CaptureError, match=r"table\.txt: permission denied; check the path, its r"):
+        read_table(path)
+
+
+def test_a_long_table_is_read_in_reasonable_time(write):
+    rows = 100_000
+    table = read_table(write("angle,level\n" + "45.0,1.25\n" * rows))
+    assert table.columns["level"].shape == (rows,)
+
+
+@pytest.mark.parametrize("name", ["s1.txt", "p1.txt"])
+def test_a_measured_table_is_read(measured, name):
+    table = read_table(measured / "glass_fresnel" / name)
+    assert table.names == ("column_1", "column_2")
+    assert table.columns["column_2"].min() > 0.0

@@ -1,0 +1,116 @@
+"""Where the optics goes wrong if nobody takes care, as data: PHYSICS section 8.
+
+Every direction meets every material. A zenith of 90 degrees is outside the contract of a capture;
+the nearest to it are the last ones that single precision can tell from 90.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+# view zenith, light zenith, azimuth of the light against the viewer's; degrees
+DIRECTIONS = {
+    "both on the normal": (0.0, 0.0, 180.0),
+    "viewer on the normal": (0.0, 30.0, 180.0),
+    "light on the normal": (30.0, 0.0, 180.0),
+    "a hair off the normal": (1e-8, 1e-8, 180.0),
+    "nearly on the normal": (1e-3, 2e-3, 180.0),
+    "mirror direction": (45.0, 45.0, 180.0),
+    "Brewster's angle for 1.5": (56.309932474020215, 56.309932474020215, 180.0),
+    "light behind the viewer": (45.0, 45.0, 0.0),
+    "nearly behind the viewer": (45.0, 45.0 + 1e-6, 1e-6),
+    "out of the plane": (40.0, 60.0, 90.0),
+    "facet at 45 degrees to the plane": (30.0, 49.106605350869096, 90.0),
+    "azimuth the other way round": (60.0, 60.0, -180.0),
+    "azimuth past a full turn": (50.0, 60.0, 530.0),
+    "far from the mirror direction": (80.0, 10.0, 30.0),
+    "mirror direction, grazing": (89.0, 89.0, 180.0),
+    "light grazing from the side": (20.0, 89.9, 135.0),
+    "viewer grazing, light high": (89.9, 5.0, 180.0),
+    "both grazing, same side": (89.9, 89.8, 1.0),
+    "last angle before 90": (89.999, 89.999, 180.0),
+    "last angle before 90, viewer alone": (89.999, 45.0, 170.0),
+}
+
+
+class Material(NamedTuple):
+    """Material parameters, in the order of the scenes."""
+
+    roughness: float
+    subsurface_fraction: float
+    absorption: float
+    refractive_index: float
+
+
+MATERIALS = {
+    "ordinary": Material(0.1, 0.4, 0.3, 1.5),
+    "no index step": Material(0.1, 0.4, 0.3, 1.0),
+    "hardly an index step": Material(0.1, 0.4, 0.3, 1.0 + 1e-6),
+    "small index step": Material(0.2, 0.4, 0.3, 1.001),
+    "lowest index of the prior": Material(0.1, 0.4, 0.3, 1.2),
+    "highest index of the prior": Material(0.1, 0.4, 0.3, 2.0),
+    "diamond": Material(0.1, 0.4, 0.3, 2.42),
+    "perfectly smooth": Material(0.0, 0.4, 0.3, 1.5),
+    "perfectly smooth, surface alone": Material(0.0, 0.0, 0.3, 1.5),
+    "at the floor of roughness": Material(1e-5, 0.4, 0.3, 1.5),
+    "nearly smooth": Material(1e-3, 0.4, 0.3, 1.5),
+    "slightly rough": Material(0.02, 0.4, 0.3, 1.5),
+    "rough": Material(0.5, 0.4, 0.3, 1.5),
+    "rougher than one": Material(1.7, 0.4, 0.3, 1.5),
+    "surface alone": Material(0.1, 0.0, 0.3, 1.5),
+    "surface alone, smoothish": Material(0.02, 0.0, 0.3, 1.5),
+    "hardly any body": Material(0.02, 1e-12, 0.3, 1.5),
+    "body alone": Material(0.1, 1.0, 0.3, 1.5),
+    "body alone, smooth": Material(0.0, 1.0, 0.3, 1.5),
+    "hardly any surface": Material(0.1, 1.0 - 1e-7, 0.3, 1.5),
+    "no absorption": Material(0.1, 0.4, 0.0, 1.5),
+    "absorption at its floor": Material(0.1, 0.4, 1e-4, 1.5),
+    "strong absorption": Material(0.1, 0.4, 20.0, 1.5),
+    "black": Material(0.1, 0.4, 1e6, 1.5),
+    "everything at once": Material(0.0, 0.0, 0.0, 1.0),
+}
+
+# Instrument parameters: a perfect instrument, an ordinary one, and one far from perfect.
+INSTRUMENTS = {
+    "perfect": {
+        "dolp_gain": 1.0,
+        "channel_gain_ratio": 1.0,
+        "leakage": 0.0,
+        "dark_level": 0.0,
+        "angle_zero": 0.0,
+        "discrepancy_amplitude": 0.0,
+        "discrepancy_weights": np.zeros(4),
+    },
+    "ordinary": {
+        "dolp_gain": 0.9,
+        "channel_gain_ratio": 1.1,
+        "leakage": 0.02,
+        "dark_level": 1e-3,
+        "angle_zero": 0.2,
+        "discrepancy_amplitude": 0.1,
+        "discrepancy_weights": np.array([1.0, -0.5, 0.3, 1.2]),
+    },
+    "hopeless": {
+        "dolp_gain": 0.0,
+        "channel_gain_ratio": 20.0,
+        "leakage": 1.0,
+        "dark_level": 10.0,
+        "angle_zero": -3.0,
+        "discrepancy_amplitude": 5.0,
+        "discrepancy_weights": np.array([3.0, -3.0, 3.0, -3.0]),
+    },
+}
+
+CASES = [
+    f"{direction} / {material}"
+    for direction, material in itertools.product(DIRECTIONS, MATERIALS)
+]
+
+
+def every_case(dtype: type) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (case, 3) and materials (case, 4) of every case, in the order of `CASES`."""
+    pairs = list(itertools.product(DIRECTIONS.values(), MATERIALS.values()))
+    directions = np.array([direction for direction, _ in pairs], dtype)
+    materials = np.array([material for _, material in pairs], dtype)
+    return directions, materials
