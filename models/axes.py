@@ -4,8 +4,8 @@ import contextlib
 from collections.abc import Iterator
 
 import numpyro
-import numpyro.distributions as dist
 from jaxtyping import Array, Float
+from numpyro import distributions as dist
 
 from polar_bayes.observation.data import Observations
 

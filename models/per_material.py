@@ -8,9 +8,9 @@ turns them into what the instrument would record (eq. 1), the links say how read
 from collections.abc import Mapping
 
 import numpyro
-import numpyro.distributions as dist
-
+from numpyro import distributions as dist
 from polar_bayes.models.axes import draw, over_axes
+
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene

@@ -5,6 +5,7 @@ reading a capture does not load a sampler.
 """
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 _HOMES = {
@@ -62,10 +63,25 @@ def __getattr__(name: str) -> Any:
     """Load a public name from its home (PEP 562)."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'polar_bayes' has no attribute {name!r}")
+    _wake_numpyro()
     value = getattr(importlib.import_module(f"polar_bayes.{_MODULE_OF[name]}"), name)
     globals()[name] = value
     return value
 
 
+def _wake_numpyro() -> None:
+    """Load NumPyro for real where ArviZ was imported first.
+
+    ArviZ leaves a lazy stand-in for it; `import numpyro.infer` on a stand-in runs NumPyro twice,
+    and its modules no longer find each other. Looking at any attribute loads it once.
+    """
+    stand_in = sys.modules.get("numpyro")
+    if stand_in is not None:
+        stand_in.__path__  # noqa: B018
+
+
 def __dir__() -> list[str]:
     return __all__
+
+
+_wake_numpyro()

@@ -11,7 +11,7 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping
 
-import numpyro.distributions as dist
+from numpyro import distributions as dist
 from numpyro.distributions import constraints
 
 from polar_bayes.errors import FitError
@@ -28,14 +28,16 @@ PRIORS: dict[str, dist.Distribution] = {
     "leakage": dist.HalfNormal(0.01),
     "dark_level": dist.Normal(0.0, 0.001),
     "angle_zero": dist.Normal(0.0, 0.75),
-    "discrepancy_amplitude": dist.HalfNormal(0.1),
+    # No set-up is free of smooth errors of some percent: a prior that allows none would let a
+    # few lucky readings claim an accuracy that no goniometer has.
+    "discrepancy_amplitude": dist.LogNormal(math.log(0.08), 0.5),
     "discrepancy_weights": dist.Normal(0.0, 1.0).expand([4]).to_event(1),
     # The noise: scales that the data themselves determine.
     "concentration_scale": dist.LogNormal(math.log(200.0), 1.0),
     "logit_scale": dist.HalfNormal(0.5),
     "normal_scale": dist.HalfNormal(0.1),
     "stokes_scale": dist.HalfNormal(0.05),
-    "stokes_error_factor": dist.LogNormal(math.log(2.0), 1.0),
+    "stokes_error_factor": dist.LogNormal(math.log(1.5), 0.7),
     "exposure": dist.LogNormal(0.0, 3.0),
     "intensity_scale": dist.HalfNormal(0.05),
 }

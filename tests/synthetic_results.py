@@ -108,9 +108,7 @@ def make_result(
         "observed_data": xr.Dataset(
             {name: (dims[2:], reading) for name, reading in observed.items()}, coords
         ),
-        "constant_data": _constants(
-            zenith, azimuths, valid, saturated, truth, names, lead, coords
-        ),
+        "constant_data": _constants(zenith, azimuths, valid, saturated, truth, names, lead, coords),
     }
     if "intensity" in observed:
         groups["observed_data"]["intensity"].attrs["saturation_level"] = FULL_SCALE
@@ -178,9 +176,9 @@ def _parameters(lead):
     """Name and place of every entry of the parameter vector, with prior means and widths."""
     names, location, width = [], [], []
     for parameter, (mean, sd) in PRIOR.items():
-        dims = {
-            d: n for d, n in lead.items() if parameter != "exposure" and d != "wavelength"
-        } | {d: n for d, n in lead.items() if d == "wavelength" and parameter in SPECTRAL}
+        dims = {d: n for d, n in lead.items() if parameter != "exposure" and d != "wavelength"} | {
+            d: n for d, n in lead.items() if d == "wavelength" and parameter in SPECTRAL
+        }
         ordered = [dims[d] for d in lead if d in dims]
         for place in np.ndindex(*ordered):
             names.append((parameter, place))
@@ -210,16 +208,16 @@ def _design(variables, lead, names, zenith):
     dims = list(lead)
     for variable in variables:
         matrix = np.zeros((*shape, len(names)))
-        shift = np.zeros(shape) + (0.25 + 0.35 * np.sin(angle) ** 2 if variable != "intensity" else 0.0)
+        shift = np.zeros(shape) + (
+            0.25 + 0.35 * np.sin(angle) ** 2 if variable != "intensity" else 0.0
+        )
         for column, (parameter, place) in enumerate(names):
             if parameter not in slope[variable]:
                 continue
             own = [d for d in dims if parameter != "exposure" and d != "wavelength"]
             own += [d for d in dims if d == "wavelength" and parameter in SPECTRAL]
             own = [d for d in dims if d in own]
-            where = tuple(
-                place[own.index(d)] if d in own else slice(None) for d in dims
-            )
+            where = tuple(place[own.index(d)] if d in own else slice(None) for d in dims)
             matrix[(*where, slice(None), column)] = slope[variable][parameter]
             if variable != "intensity":
                 shift[where] -= slope[variable][parameter] * PRIOR[parameter][0]

@@ -39,7 +39,7 @@ HOMES = {
     "netCDF4": ("polar_bayes.capture",),
     "optimistix": ("polar_bayes.inference",),
     "arviz_base": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.report"),
-    "arviz_stats": ("polar_bayes.diagnostics", "polar_bayes.report"),
+    "arviz_stats": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.report"),
     "xarray": (
         "polar_bayes.capture",
         "polar_bayes.observation.data",

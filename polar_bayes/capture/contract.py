@@ -124,5 +124,5 @@ class Layout:
         if row.kind == "geometry":
             return tuple(dict.fromkeys([("view",), (*self.leading, "view")]))
         if row.kind == "label":
-            return ((), (row.name,)) if row.name in self.readings else ((),)
+            return ((row.name,),) if row.name in self.readings else ((),)
         return (self.readings,)

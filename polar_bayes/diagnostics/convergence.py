@@ -10,7 +10,7 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
-from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars
+from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars, stats_of
 from polar_bayes.inference.result import provenance_of
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
@@ -21,6 +21,7 @@ SMALLEST_ESS = 400
 LARGEST_K_HAT = 0.7
 LARGEST_SECOND_MODE = 0.01
 MANY_MASKED = 0.25
+MANY_DEEP = 0.01
 LONGEST_LIST = 4
 
 
@@ -143,7 +144,7 @@ def laplace_k_hat(result: xr.DataTree) -> float:
     Source:
         Vehtari et al. (2024), JMLR 25(72).
     """
-    stats = result["sample_stats"].data_vars if "sample_stats" in result.children else {}
+    stats = stats_of(result)
     if "log_weight" not in stats:
         return math.nan
     log_weight = stats["log_weight"].to_numpy().astype(float).ravel()
@@ -215,7 +216,7 @@ def _chains_disagree(table: pd.DataFrame) -> list[str]:
     if len(unequal):
         problems.append(
             f"R-hat above {LARGEST_R_HAT}: {_list(unequal, lambda x: f'{x:.4g}')}; the chains "
-            "have not found one distribution, so sample longer, as in Nuts(warmup=1000, draws=3000)"
+            "have not found one distribution, so sample longer, as in Nuts(warmup=1000, most_draws=20000)"
             ", and look at the pair plot for several modes."
         )
     for column, part, place in (("ess_bulk", "Bulk", "center"), ("ess_tail", "Tail", "interval")):
@@ -223,15 +224,15 @@ def _chains_disagree(table: pd.DataFrame) -> list[str]:
         if len(few):
             problems.append(
                 f"{part} ESS below {SMALLEST_ESS}: {_list(few, lambda x: f'{np.floor(x):.0f}')}; "
-                f"the {place} is not known well enough, so sample longer, as in Nuts(draws=3000)."
+                f"the {place} is not known well enough, so sample longer, as in Nuts(most_draws=20000)."
             )
     return problems
 
 
 def _divergences(result: xr.DataTree) -> list[str]:
-    diverging = result["sample_stats"].data_vars.get("diverging")
+    diverging = stats_of(result).get("diverging")
     count = 0 if diverging is None else int(diverging.sum())
-    if not count:
+    if diverging is None or not count:
         return []
     return [
         f"{count} of {diverging.size} draws diverged: the sampler could not follow a sharp corner "
@@ -243,7 +244,7 @@ def _divergences(result: xr.DataTree) -> list[str]:
 def _approximation(result: xr.DataTree, method: str) -> list[str]:
     if method != "laplace":
         return []
-    stats = result["sample_stats"].data_vars if "sample_stats" in result.children else {}
+    stats = stats_of(result)
     k_hat = laplace_k_hat(result)
     if "log_weight" in stats and not k_hat <= LARGEST_K_HAT:
         return [
@@ -267,14 +268,15 @@ def _several_modes(provenance: Mapping[str, Any]) -> list[str]:
 
 
 def _deep_trees(result: xr.DataTree) -> list[str]:
-    stats = result["sample_stats"].data_vars if "sample_stats" in result.children else {}
-    count = int(stats["reached_max_treedepth"].sum()) if "reached_max_treedepth" in stats else 0
-    if not count:
+    stats = stats_of(result)
+    if "reached_max_treedepth" not in stats:
         return []
-    size = stats["reached_max_treedepth"].size
+    count, size = int(stats["reached_max_treedepth"].sum()), stats["reached_max_treedepth"].size
+    if count <= MANY_DEEP * size:
+        return []
     return [
-        f"{count} of {size} draws reached the largest tree depth: sampling is slower than it "
-        "need be, but not wrong; raise it with Nuts(max_tree_depth=10)."
+        f"{count} of {size} draws reached the largest tree depth: steps were cut short, which "
+        "biases nothing but makes draws alike; raise it, as in Nuts(max_tree_depth=10)."
     ]
 
 
@@ -283,8 +285,8 @@ def _undetermined_point(table: pd.DataFrame, method: str) -> list[str]:
     if not len(open_):
         return []
     return [
-        f"No standard error: {_list(dict.fromkeys(open_, 0.0), None)}; the readings do not move "
-        "with them, so their values say nothing."
+        f"No standard error: {_list(dict.fromkeys(open_, 0.0), None)}; the readings hardly move "
+        "with it, so its value says nothing."
     ]
 
 

@@ -83,12 +83,19 @@ def truth_of(result: xr.DataTree, scalar: Scalar) -> float:
     return float(true.isel({dim: scalar.index[str(dim)] for dim in true.dims}))
 
 
+def stats_of(result: xr.DataTree) -> Mapping[str, xr.DataArray]:
+    """The sampler's own statistics by name, each (chain, draw); empty where there are none."""
+    if "sample_stats" not in result.children:
+        return {}
+    return {str(name): stat for name, stat in result["sample_stats"].data_vars.items()}
+
+
 def method_of(result: xr.DataTree) -> str:
     """How the fit was made: "nuts", "laplace" or "point"; told by its statistics if not said."""
     method = provenance_of(result).get("method")
     if method in ("nuts", "laplace", "point"):
         return str(method)
-    stats = result["sample_stats"].data_vars if "sample_stats" in result.children else ()
+    stats = stats_of(result)
     if "loss" in stats or result["posterior"].sizes.get("draw", 0) == 1:
         return "point"
     return "nuts" if "diverging" in stats else "laplace"

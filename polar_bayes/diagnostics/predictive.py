@@ -6,6 +6,7 @@ are compared with those predictions that are below full scale too.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 
@@ -18,6 +19,7 @@ from polar_bayes.diagnostics.parameters import (
     SAMPLE_DIMS,
     method_of,
     posterior_scalars,
+    stats_of,
 )
 
 PROBABILITIES = (0.5, 0.8, 0.95)
@@ -137,14 +139,21 @@ def pit_band(pit: np.ndarray) -> Band | None:
     if pit.size < 2:
         return None
     # Beyond a few hundred values a coarser grid draws the same curve at a fraction of the cost.
-    at, ecdf, lower, upper = ecdf_pit(
-        _thin(pit), BAND, BAND_SIMULATIONS, rng=np.random.default_rng(214)
-    )
+    pit = pit[:: -(-pit.size // LARGEST_BAND)]
+    at, lower, upper = _uniform_band(pit.size)
+    ecdf = np.searchsorted(np.sort(pit), at, side="right") / pit.size
+    ecdf[[0, -1]] = 0.0, 1.0
     return Band(at=at, difference=ecdf - at, lower=lower - at, upper=upper - at)
 
 
-def _thin(pit: np.ndarray) -> np.ndarray:
-    return pit if pit.size <= LARGEST_BAND else pit[:: -(-pit.size // LARGEST_BAND)]
+@functools.lru_cache(maxsize=64)
+def _uniform_band(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places and edges of the band; they depend on the number of values only."""
+    any_values = np.linspace(0.0, 1.0, size)
+    at, _, lower, upper = ecdf_pit(
+        any_values, BAND, BAND_SIMULATIONS, rng=np.random.default_rng(214)
+    )
+    return at, lower, upper
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -264,7 +273,7 @@ def _relative_efficiency(result: xr.DataTree) -> float:
 
 def _laplace_correction(result: xr.DataTree) -> np.ndarray | None:
     """Log weights that turn Laplace draws into posterior draws, where they were stored."""
-    stats = result["sample_stats"].data_vars if "sample_stats" in result.children else {}
+    stats = stats_of(result)
     if "log_weight" not in stats or method_of(result) != "laplace":
         return None
     log_weight = stats["log_weight"].to_numpy().astype(float).ravel()

@@ -29,7 +29,7 @@ COLUMNS = (
     "verdict",
     "prior_sensitivity",
     "likelihood_sensitivity",
-    "reading",
+    "remark",
 )
 
 
@@ -67,7 +67,7 @@ def sensitivity(result: xr.DataTree) -> pd.DataFrame:
     for scalar in found:
         widths = _compare(before.get(scalar.label), scalar.draws)
         bent = [_sense(scalar.draws, weights[group]) for group in weights]
-        rows.append([*widths, *bent, _read(*bent)])
+        rows.append([*widths, *bent, _remark(*bent)])
     index = pd.Index([scalar.label for scalar in found])
     return pd.DataFrame(rows, columns=list(COLUMNS), index=index)
 
@@ -127,7 +127,7 @@ def _sense(draws: np.ndarray, weights: list[np.ndarray] | None) -> float:
     return float(array_stats.power_scale_sense(draws, *weights, *POWERS))
 
 
-def _read(prior: float, likelihood: float) -> str:
+def _remark(prior: float, likelihood: float) -> str:
     if not prior >= SENSITIVE:
         return ""
     if likelihood >= SENSITIVE:

@@ -5,22 +5,22 @@ import platform
 import time
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
 import xarray as xr
 from jaxtyping import Array
+from numpyro import distributions as dist
 
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference import laplace, nuts, point
-from polar_bayes.inference.modes import Modes, climb, distinct
+from polar_bayes.inference.modes import Modes, ValueAndGradient, climb, distinct
 from polar_bayes.inference.program import Draw, Program, compile_program
-from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.inference.request import Method, Request, resolve
+from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.discrepancy import Discrepancy
@@ -29,6 +29,9 @@ from polar_bayes.priors import describe_prior
 
 STARTS = 16
 PRIOR_DRAWS = 500
+BLOCK = 500
+
+Progress = Callable[[str, float], None]
 
 
 def fit(
@@ -42,7 +45,7 @@ def fit(
     largest_view_zenith: float | None = None,
     seed: int = 0,
     precision: str = "double",
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> xr.DataTree:
     """Fit one capture.
 
@@ -73,53 +76,81 @@ def fit(
         capture, model, method, scene, priors, links, largest_view_zenith, seed, precision
     )
     with jax.enable_x64(precision == "double"):
-        return _run(request, progress or (lambda stage, fraction: None))
+        return _run(request, progress or _silent)
 
 
-def _run(request: Request, progress: Callable[[str, float], None]) -> xr.DataTree:
+class _Fitted(NamedTuple):
+    """One model, fitted: draws, their statistics, and what there is to say about them."""
+
+    program: Program
+    z: np.ndarray
+    stats: dict[str, np.ndarray]
+    problems: list[str]
+    extra: dict[str, Any]
+
+
+def _run(request: Request, progress: Progress) -> xr.DataTree:
     clock = _Clock()
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     if request.precision == "single":
         data = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, data)
-    keys = iter(jax.random.split(jax.random.key(request.seed), 8))
-    program = compile_program(request.bind(request.scene), data)
-    progress("searching for modes", 0.0)
-    starts = _prior_starts(program, data, next(keys))
-    problems: list[str] = []
-    extra: dict[str, Any] = {}
-
-    if isinstance(request.method, point.Point):
-        posterior_z, stats, problems, extra = _fit_point(program, data, starts, request.method)
-        clock.lap("point")
-    else:
-        modes = _search(program, data, starts)
-        progress("searching for modes", 1.0)
-        clock.lap("modes")
-        extra["modes"] = _describe_modes(modes)
-        posterior_z, stats = _draw(program, data, modes, next(keys), request.method, progress)
-        clock.lap("draws")
-
-    progress("predicting", 0.0)
-    describe = _per_draw(program)
-    key_describe, key_prior = next(keys), next(keys)
-    posterior = describe(key_describe, posterior_z, data)
-    prior = _prior(program, key_prior, data)
+    key_main, key_plain, key_posterior, key_prior = jax.random.split(
+        jax.random.key(request.seed), 4
+    )
+    fitted = _fit_scene(request, request.scene, data, key_main, progress, clock)
+    describe = _per_draw(fitted.program)
+    posterior = describe(key_posterior, fitted.z, data)
+    prior_z = np.asarray(_from_prior(fitted.program, key_prior, PRIOR_DRAWS, data))
+    prior = describe(key_prior, prior_z[None], data)
     clock.lap("prediction")
-    progress("predicting", 1.0)
 
-    tree_extra: dict[str, xr.Dataset] = {}
+    beside: dict[str, xr.Dataset] = {}
     if _has_discrepancy(request.scene) and not isinstance(request.method, point.Point):
-        plain = request.scene.without(Discrepancy)
-        progress("fitting without discrepancy", 0.0)
-        tree_extra["without_discrepancy"] = _fit_plain(request, plain, data, next(keys))
+        plain_scene = request.scene.without(Discrepancy)
+        plain = _fit_scene(request, plain_scene, data, key_plain, _silent, _Clock())
+        draws = _constrain(plain.program, plain.z)
+        beside["without_discrepancy"] = posterior_of(plain.program, draws, data)
         clock.lap("without_discrepancy")
-        progress("fitting without discrepancy", 1.0)
 
-    provenance = _provenance(request, data, clock, problems, extra)
-    tree = assemble(program, request.capture, data, posterior, prior, stats, provenance)
-    for name, dataset in tree_extra.items():
-        tree[name] = xr.DataTree(dataset)
-    return tree
+    provenance = _provenance(request, data, clock, fitted)
+    return assemble(
+        fitted.program, request.capture, data, posterior, prior, fitted.stats, beside, provenance
+    )
+
+
+def _fit_scene(
+    request: Request,
+    scene: Scene,
+    data: Observations,
+    key: Array,
+    progress: Progress,
+    clock: "_Clock",
+) -> _Fitted:
+    """Search for modes from prior draws, then do what the method asks."""
+    key_starts, key_draws = jax.random.split(key)
+    program = compile_program(request.bind(scene), data)
+    starts = np.asarray(_from_prior(program, key_starts, STARTS, data))
+    if isinstance(request.method, point.Point):
+        fitted = _fit_point(program, data, starts, request.method)
+        clock.lap("least squares")
+        return fitted
+    potential = _compile_potential(program, data)
+    modes = _search(potential, starts, progress)
+    clock.lap("modes")
+    if isinstance(request.method, laplace.Laplace):
+        z, stats = laplace.sample(program, data, potential, modes, key_draws, request.method)
+    else:
+        z, stats = nuts.sample(
+            program,
+            data,
+            potential,
+            modes,
+            key_draws,
+            request.method,
+            lambda done: progress("sampling", done),
+        )
+    clock.lap("draws")
+    return _Fitted(program, z, stats, [], {"modes": _describe_modes(modes)})
 
 
 class _Clock:
@@ -135,14 +166,31 @@ class _Clock:
         self._last = now
 
 
-def _prior_starts(program: Program, data: Observations, key: Array) -> Array:
+def _silent(stage: str, fraction: float) -> None:
+    """No progress to show."""
+
+
+def _from_prior(program: Program, key: Array, draws: int, data: Observations) -> Array:
     draw = jax.jit(lambda keys, data: jax.lax.map(lambda k: program.from_prior(k, data), keys))
-    return draw(jax.random.split(key, STARTS), data)
+    return draw(jax.random.split(key, draws), data)
 
 
-def _search(program: Program, data: Observations, starts: Array) -> Modes:
-    search = jax.jit(lambda starts, data: jax.lax.map(lambda z: climb(program, z, data), starts))
-    modes = distinct(search(starts, data), starts=len(starts))
+def _compile_potential(program: Program, data: Observations) -> ValueAndGradient:
+    compiled = jax.jit(jax.value_and_grad(program.potential))
+
+    def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = compiled(jnp.asarray(z, data.brightness.dtype), data)
+        return float(value), np.asarray(gradient, float)
+
+    return potential
+
+
+def _search(potential: ValueAndGradient, starts: np.ndarray, progress: Progress) -> Modes:
+    climbs = []
+    for number, start in enumerate(starts):
+        climbs.append(climb(potential, start))
+        progress("searching for modes", (number + 1) / len(starts))
+    modes = distinct(climbs)
     if modes is None:
         raise FitError(
             f"none of {len(starts)} starts reached a peak of the posterior",
@@ -161,76 +209,42 @@ def _describe_modes(modes: Modes) -> dict[str, Any]:
     }
 
 
-def _draw(
-    program: Program,
-    data: Observations,
-    modes: Modes,
-    key: Array,
-    method: Method,
-    progress: Callable[[str, float], None],
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Unconstrained draws (chain, draw, size) and their statistics."""
-    if isinstance(method, laplace.Laplace):
-        z = laplace.sample(program, data, modes, key, method)
-        densities = jax.jit(lambda z, data: jax.lax.map(lambda x: -program.potential(x, data), z))(
-            jnp.asarray(z.reshape(-1, program.size)), data
-        )
-        return z, {"lp": np.asarray(densities).reshape(z.shape[:2])}
-    assert isinstance(method, nuts.Nuts)
-    total = method.chains * -(-(method.warmup + method.draws) // method.block) * method.block
-    done = 0
-
-    def advance(draws: int) -> None:
-        nonlocal done
-        done += draws
-        progress("sampling", done / total)
-
-    progress("sampling", 0.0)
-    chains = nuts.sample(program, data, modes, key, method, advance)
-    stats = dict(chains.stats)
-    stats["step_size"] = np.broadcast_to(chains.step_size[:, None], chains.z.shape[:2])
-    return chains.z, stats
-
-
 def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], Draw]:
-    """Describe every draw, one at a time inside one compiled loop."""
+    """Describe every draw, a block at a time inside one compiled loop of fixed length."""
     compiled = jax.jit(
         lambda keys, z, data: jax.lax.map(lambda kz: program.describe(*kz, data), (keys, z))
     )
 
     def describe(key: Array, z: np.ndarray, data: Observations) -> Draw:
-        flat = jnp.asarray(z.reshape(-1, program.size))
-        draws = compiled(jax.random.split(key, len(flat)), flat, data)
-        return jax.tree.map(lambda x: np.asarray(x).reshape(*z.shape[:2], *x.shape[1:]), draws)
+        flat = jnp.asarray(z.reshape(-1, program.size), data.brightness.dtype)
+        keys = jax.random.split(key, len(flat))
+        # Posterior and prior have different lengths; blocks of one length compile once.
+        parts = []
+        for start in range(0, len(flat), BLOCK):
+            stop = min(start + BLOCK, len(flat))
+            index = jnp.clip(jnp.arange(start, start + BLOCK), max=len(flat) - 1)
+            draws = compiled(keys[index], flat[index], data)
+            parts.append(jax.tree.map(lambda x, n=stop - start: np.asarray(x)[:n], draws))
+        joined = jax.tree.map(lambda *blocks: np.concatenate(blocks), *parts)
+        return jax.tree.map(lambda x: x.reshape(*z.shape[:2], *x.shape[1:]), joined)
 
     return describe
 
 
-def _prior(program: Program, key: Array, data: Observations) -> Draw:
-    draws = jax.jit(lambda keys, data: jax.lax.map(lambda k: program.prior_draw(k, data), keys))(
-        jax.random.split(key, PRIOR_DRAWS), data
-    )
-    return jax.tree.map(lambda x: np.asarray(x)[None], draws)
+def _constrain(program: Program, z: np.ndarray) -> dict[str, np.ndarray]:
+    constrain = jax.jit(jax.vmap(jax.vmap(program.constrain)))
+    return {name: np.asarray(value) for name, value in constrain(jnp.asarray(z)).items()}
 
 
 def _fit_point(
-    program: Program, data: Observations, starts: Array, method: point.Point
-) -> tuple[np.ndarray, dict[str, np.ndarray], list[str], dict[str, Any]]:
+    program: Program, data: Observations, starts: np.ndarray, method: point.Point
+) -> _Fitted:
     solve = jax.jit(lambda starts, data: point.estimate(program, data, starts))
-    found = point.to_numpy(solve(starts[: method.starts], data))
+    found = point.to_numpy(solve(jnp.asarray(starts[: method.starts]), data))
+    errors = point.standard_errors(program, found)
     problems = [] if found.converged else ["least squares did not meet its tolerance"]
-    jacobian = jax.jacfwd(program.constrain)(jnp.asarray(found.z))
-    variance = np.where(np.isinf(np.diagonal(found.covariance)), 0.0, 1.0)
-    safe = np.where(np.isinf(found.covariance), 0.0, found.covariance)
-    sds = {}
-    for name, slope in jacobian.items():
-        slope = np.asarray(slope)
-        sd = np.sqrt(np.einsum("...i,ij,...j->...", slope, safe, slope))
-        moved = np.any((np.abs(slope) > 0.0) & (variance == 0.0), axis=-1)
-        sds[name] = np.where(moved, np.inf, sd).ravel().tolist()
     stats = {"loss": np.asarray(found.loss)[None, None]}
-    text = {name: [s if np.isfinite(s) else None for s in sd] for name, sd in sds.items()}
-    return found.z[None, None], stats, problems, {"standard_errors": text}
+    return _Fitted(program, found.z[None, None], stats, problems, {"standard_errors": errors})
 
 
 def _has_discrepancy(scene: Scene) -> bool:
@@ -238,21 +252,8 @@ def _has_discrepancy(scene: Scene) -> bool:
     return any(isinstance(term, Discrepancy) for term in terms)
 
 
-def _fit_plain(request: Request, scene: Scene, data: Observations, key: Array) -> xr.Dataset:
-    """The same fit without the discrepancy, to stand beside it in the report."""
-    program = compile_program(request.bind(scene), data)
-    key_starts, key_draws, key_describe = jax.random.split(key, 3)
-    modes = _search(program, data, _prior_starts(program, data, key_starts))
-    z, _ = _draw(program, data, modes, key_draws, request.method, lambda stage, fraction: None)
-    return posterior_of(program, _per_draw(program)(key_describe, z, data), data)
-
-
 def _provenance(
-    request: Request,
-    data: Observations,
-    clock: _Clock,
-    problems: list[str],
-    extra: Mapping[str, Any],
+    request: Request, data: Observations, clock: _Clock, fitted: _Fitted
 ) -> dict[str, Any]:
     counts = count(request.capture)
     used = int(np.sum(data.valid))
@@ -279,10 +280,10 @@ def _provenance(
         "machine": {"processor": platform.machine(), "python": platform.python_version()},
         "timings": {stage: round(seconds, 3) for stage, seconds in clock.laps.items()},
         "counts": {**counts, "used": used, "at_margin": at_boundary},
-        "problems": problems,
+        "problems": fitted.problems,
         "capture": {
             str(key): value if isinstance(value, str | int | float) else str(value)
             for key, value in request.capture.attrs.items()
         },
-        **extra,
+        **fitted.extra,
     }

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from numpyro import handlers
+from numpyro.infer import init_to_median
 from numpyro.infer.autoguide import AutoLaplaceApproximation
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.modes import Modes
+from polar_bayes.inference.modes import Modes, ValueAndGradient
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 
@@ -32,7 +33,7 @@ class Laplace:
         FitError: Fewer than 50 draws or than 1 chain.
     """
 
-    draws: int = 1000
+    draws: int = 500
     chains: int = 4
 
     def __post_init__(self) -> None:
@@ -45,35 +46,57 @@ class Laplace:
 
 
 def sample(
-    program: Program, data: Observations, modes: Modes, key: Array, settings: Laplace
-) -> np.ndarray:
+    program: Program,
+    data: Observations,
+    potential: ValueAndGradient,
+    modes: Modes,
+    key: Array,
+    settings: Laplace,
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Draw from NumPyro's guide at the heaviest mode.
 
     Args:
         program: The model.
         data: The capture.
+        potential: Minus the log density and its gradient, already compiled.
         modes: The peaks.
         key: Random key.
         settings: How many draws.
 
     Returns:
-        Unconstrained vectors (chain, draw, size); NaN where the guide has no width.
+        Unconstrained draws (chain, draw, size), NaN where the guide has no width; and their
+        statistics: the log density `lp` and the `log_weight` of posterior over approximation.
     """
-    guide = AutoLaplaceApproximation(program.model)
+    mode, precision = modes.z[0], np.linalg.inv(modes.covariance[0])
+    positions: list[np.ndarray] = []
+
+    def hessian(_: object, location: Array) -> Array:
+        order = positions[0]
+        return jnp.asarray(precision[np.ix_(order, order)], location.dtype)
+
+    guide = AutoLaplaceApproximation(
+        program.model, init_loc_fn=init_to_median(num_samples=1), hessian_fn=hessian
+    )
     handlers.seed(guide, key)(data)
-    # The guide orders its vector by site as the model declares them, ours by name.
     order = _guide_order(guide, program)
-    location = jnp.asarray(modes.z[0])[order]
-    covariance = guide.get_posterior({"auto_loc": location}).covariance_matrix
+    positions.append(order)
+    covariance = guide.get_posterior({"auto_loc": jnp.asarray(mode[order])}).covariance_matrix
     covariance = jnp.where(jnp.diagonal(covariance) > 0.0, covariance, jnp.nan)
     factor = jnp.linalg.cholesky(covariance)
     noise = jax.random.normal(key, (settings.chains, settings.draws, program.size))
-    drawn = location + noise @ factor.T
-    return np.asarray(drawn)[..., np.argsort(order)]
+    drawn = mode[order] + noise @ factor.T
+    z = np.asarray(drawn)[..., np.argsort(order)]
+    lp = -np.array([potential(draw)[0] for draw in z.reshape(-1, program.size)])
+    approximation = -0.5 * np.asarray(jnp.sum(noise**2, axis=-1))
+    lp = lp.reshape(z.shape[:2])
+    return z, {"lp": lp, "log_weight": lp - approximation}
 
 
 def _guide_order(guide: AutoLaplaceApproximation, program: Program) -> np.ndarray:
-    """For each entry of the guide's vector, its position in the program's."""
+    """For each entry of the guide's vector, its position in the program's.
+
+    The guide strings sites together as the model declares them, the program by name.
+    """
     positions = program.unravel(jnp.arange(program.size, dtype=float))
     unpacked = guide._unpack_latent(jnp.arange(program.size, dtype=float))
     order = np.empty(program.size, int)

@@ -109,3 +109,26 @@ def estimate(program: Program, data: Observations, starts: Float[Array, "start s
 def to_numpy(estimate: Estimate) -> Estimate:
     """The same with NumPy arrays."""
     return Estimate(*(np.asarray(part) for part in estimate))
+
+
+def standard_errors(program: Program, estimate: Estimate) -> dict[str, list[float | None]]:
+    """Standard errors of the parameters in their physical range, by the delta method.
+
+    Args:
+        program: The model.
+        estimate: The best fit.
+
+    Returns:
+        For each site a flat list; None where the readings do not determine the value.
+    """
+    free = np.isinf(np.diagonal(estimate.covariance))
+    covariance = np.where(np.isinf(estimate.covariance), 0.0, estimate.covariance)
+    errors = {}
+    for name, slope in jax.jit(jax.jacfwd(program.constrain))(jnp.asarray(estimate.z)).items():
+        rows = np.asarray(slope).reshape(-1, program.size)
+        sd = np.sqrt(np.einsum("ki,ij,kj->k", rows, covariance, rows))
+        undetermined = (rows[:, free] != 0.0).any(axis=1)
+        errors[name] = [
+            None if lost else float(x) for x, lost in zip(sd, undetermined, strict=True)
+        ]
+    return errors

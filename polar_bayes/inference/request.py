@@ -5,8 +5,8 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpyro.distributions as dist
 import xarray as xr
+from numpyro import distributions as dist
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError

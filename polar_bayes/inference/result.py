@@ -30,8 +30,9 @@ def assemble(
     capture: xr.Dataset,
     data: Observations,
     posterior: Draw,
-    prior: Draw | None,
+    prior: Draw,
     sample_stats: Mapping[str, np.ndarray],
+    beside: Mapping[str, xr.Dataset],
     provenance: Mapping[str, object],
 ) -> xr.DataTree:
     """Put draws, data and provenance into one tree.
@@ -41,8 +42,9 @@ def assemble(
         capture: The validated capture.
         data: The same as arrays, with the views that were set aside.
         posterior: Arrays of shape (chain, draw, ...).
-        prior: The same from the prior, or None.
+        prior: The same from the prior.
         sample_stats: Arrays of shape (chain, draw).
+        beside: Posteriors of other fits that stand beside this one, by group name.
         provenance: Whatever JSON can hold.
 
     Returns:
@@ -55,28 +57,24 @@ def assemble(
         "log_likelihood": {n: np.asarray(x) for n, x in posterior.log_likelihood.items()},
         "log_prior": {n: np.asarray(x) for n, x in posterior.log_prior.items()},
         "noise_free": _readings(posterior.center, data),
+        "prior": _latent(program, prior.latent, data),
+        "prior_predictive": _readings(prior.predictive, data),
     }
-    if prior is not None:
-        groups["prior"] = _latent(program, prior.latent, data)
-        groups["prior_predictive"] = _readings(prior.predictive, data)
     lengths = dict(data.dims)
-    dims = {
-        name: [*program.dims[name], *(f"{name}_{i}" for i, _ in enumerate(program.events[name]))]
-        for name in program.dims
-    }
     coords = {dim: capture[dim].to_numpy() for dim in lengths if dim in capture.coords}
     coords |= {dim: np.arange(length) for dim, length in lengths.items() if dim not in coords}
     # The log prior is one number per site and draw, whatever the site's own axes are.
     log_prior = xr.Dataset(
         {name: (("chain", "draw"), x) for name, x in groups.pop("log_prior").items()}
     )
-    tree = from_dict(groups, coords=coords, dims=dims)
+    tree = from_dict(groups, coords=coords, dims=_dims(program))
     tree["log_prior"] = xr.DataTree(log_prior)
     tree["observed_data"] = xr.DataTree(_observed(program, capture, data, coords))
     tree["constant_data"] = xr.DataTree(_constants(capture, data, coords))
+    for name, dataset in beside.items():
+        tree[name] = xr.DataTree(dataset)
     for group in ("posterior", "prior"):
-        if group in tree.children:
-            _annotate(tree[group])
+        _annotate(tree[group])
     tree.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
     return tree
 
@@ -93,14 +91,29 @@ def provenance_of(result: xr.DataTree) -> dict:
     return json.loads(result.attrs.get(PROVENANCE, "{}"))
 
 
-def posterior_of(program: Program, draw: Draw, data: Observations) -> xr.Dataset:
-    """The posterior group alone, for a fit that stands beside the main one."""
-    dims = {
-        name: [*program.dims[name], *(f"{name}_{i}" for i, _ in enumerate(program.events[name]))]
-        for name in program.supports
-    }
-    tree = from_dict({"posterior": _latent(program, draw.latent, data)}, dims=dims)
+def posterior_of(
+    program: Program, latent: Mapping[str, np.ndarray], data: Observations
+) -> xr.Dataset:
+    """A posterior group alone, for a fit that stands beside the main one.
+
+    Args:
+        program: The model that was fitted.
+        latent: Constrained draws, (chain, draw, ...).
+        data: The capture as arrays.
+
+    Returns:
+        A dataset like the group `posterior`.
+    """
+    tree = from_dict({"posterior": _latent(program, latent, data)}, dims=_dims(program))
     return tree["posterior"].to_dataset()
+
+
+def _dims(program: Program) -> dict[str, list[str]]:
+    """Axes of every site: those of its plates, then those of its own event."""
+    return {
+        name: [*program.dims[name], *(f"{name}_{i}" for i, _ in enumerate(program.events[name]))]
+        for name in program.dims
+    }
 
 
 def _latent(

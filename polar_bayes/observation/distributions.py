@@ -10,9 +10,9 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpyro.distributions as dist
-from jax.scipy.special import betainc, gammaln
+from jax.scipy.special import betainc
 from jaxtyping import Array, Float
+from numpyro import distributions as dist
 from numpyro.distributions import constraints
 from numpyro.distributions.util import promote_shapes
 
@@ -178,16 +178,34 @@ def _excess(step: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def _stirling_remainder(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`log gamma(z)` less Stirling's `(z - 1/2) log z - z + log(2 pi) / 2`."""
+    """`log gamma(z)` less Stirling's `(z - 1/2) log z - z + log(2 pi) / 2`, for z > 0.
+
+    Below 10 the recurrence of the gamma function moves the argument up by eight, so that only
+    logarithms are differentiated: polygamma functions take long to compile.
+    """
     large = z > 10.0
     big = jnp.where(large, z, 10.0)
-    inverse = 1.0 / big
+    small = jnp.where(large, 1.0, z)
+    shifted = small + 8.0
+    product = small
+    for step in range(1, 8):
+        product = product * (small + step)
+    moved = (
+        (shifted - 0.5) * jnp.log(shifted)
+        - (small - 0.5) * jnp.log(small)
+        - jnp.log(product)
+        - 8.0
+        + _stirling_series(shifted)
+    )
+    return jnp.where(large, _stirling_series(big), moved)
+
+
+def _stirling_series(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The remainder for z > 8: Bernoulli numbers over 2k(2k-1); the next term is below 2e-15."""
+    inverse = 1.0 / z
     square = inverse * inverse
-    # Bernoulli numbers over 2k(2k-1); the next term is below 1e-16 for z > 10.
     coefficients = (1 / 12, -1 / 360, 1 / 1260, -1 / 1680, 1 / 1188, -691 / 360360, 1 / 156)
     series = jnp.zeros_like(inverse)
     for coefficient in reversed(coefficients):
         series = series * square + coefficient
-    small = jnp.where(large, 1.0, z)
-    exact = gammaln(small) - ((small - 0.5) * jnp.log(small) - small + HALF_LOG_TWO_PI)
-    return jnp.where(large, inverse * series, exact)
+    return inverse * series

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from typing import ClassVar, override
 
 import jax.numpy as jnp
-import numpyro.distributions as dist
 from jaxtyping import Array, Float
+from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
@@ -243,7 +243,9 @@ class StudentTLink(AbstractLink):
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
     ) -> dist.Distribution:
         location = self.center(name, prediction, noise)
-        scale = self.schedule.scale(noise["intensity_scale"], location, cos_degrees(data.geometry.view_zenith))
+        scale = self.schedule.scale(
+            noise["intensity_scale"], location, cos_degrees(data.geometry.view_zenith)
+        )
         return SensorStudentT(
             self.degrees_of_freedom, location, scale, data.saturated, data.full_scale
         )

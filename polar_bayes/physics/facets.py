@@ -227,7 +227,7 @@ def sample_facets(
 
     shown = jnp.maximum(cos_view + sin_view * x, 0.0)
     cos_tilt = 1.0 / jnp.sqrt(1.0 + x**2 + y**2)
-    cos_incidence = jnp.maximum(cos_tilt * shown, 1e-9)
+    cos_incidence = jnp.maximum(cos_tilt * shown, 1e-6)
     in_plane = (cos_tilt * (sin_view - x * cos_view)) ** 2
     out_of_plane = (cos_tilt * y) ** 2
     return Facets(

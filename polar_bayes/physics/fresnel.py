@@ -45,6 +45,36 @@ def reflection(
     return mean, contrast
 
 
+def index_step(refractive_index: Array) -> Array:
+    """Factor (n^2-1)^2 of every reflectance. Any shape, 1, >= 0; zero where the index is 1."""
+    return ((refractive_index - 1.0) * (refractive_index + 1.0)) ** 2
+
+
+def relative_reflection(
+    cos_incidence: Array, sin_squared: Array, refractive_index: Array
+) -> tuple[Array, Array]:
+    """R+ and K without the factor (n^2-1)^2, so that their ratio of sums exists at n = 1.
+
+    Args:
+        cos_incidence: c. Any shape, 1, in (0, 1].
+        sin_squared: B, the squared sine of incidence. Same shape, 1, in [0, 1).
+        refractive_index: n, inside over outside. Broadcasts, 1, >= 1.
+
+    Returns:
+        `(R+, K)` divided by `index_step`. Broadcast shape, 1, > 0.
+
+    Raises:
+        Nothing.
+    """
+    c, b = cos_incidence, sin_squared
+    root = _inner(c, refractive_index)
+    a = c * root
+    s_reflectance = 1.0 / (c + root) ** 4
+    mean = s_reflectance * (a**2 + b**2) / (a + b) ** 2
+    contrast = 2.0 * s_reflectance * a / (a + b) ** 2
+    return mean, contrast
+
+
 def polarizance(cos_incidence: Array, sin_squared: Array, refractive_index: Array) -> Array:
     """Degree of polarization of reflected light divided by the squared sine: 2A/(A^2+B^2).
 

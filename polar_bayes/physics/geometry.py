@@ -120,8 +120,9 @@ def mirror_facet(geometry: Geometry) -> MirrorFacet:
 
     sin_squared = sin_degrees(half_difference) ** 2 + sin_sin * sin_half**2
     cos_squared = cos_degrees(half_sum) ** 2 + sin_sin * cos_half**2
-    sine_gap = 2.0 * cos_degrees(half_sum) * sin_degrees(half_difference)
-    slope_squared = (sine_gap**2 + 4.0 * sin_sin * cos_half**2) / (cos_view + cos_light) ** 2
+    cosine_sum = cos_view + cos_light
+    slope_in_plane = 2.0 * cos_degrees(half_sum) * sin_degrees(half_difference) / cosine_sum
+    slope_squared = slope_in_plane**2 + sin_sin * (2.0 * cos_half / cosine_sum) ** 2
 
     x = sin_degrees(2.0 * half_difference) + 2.0 * cos_view * sin_light * sin_half**2
     y = 2.0 * sin_light * sin_half * cos_half

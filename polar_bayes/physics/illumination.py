@@ -149,7 +149,7 @@ class AbstractExtendedSource(AbstractIllumination):
     ) -> Light:
         sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
         facets = sample_facets(distribution, quadrature, roughness, sin_view, cos_view, self.border)
-        mean, contrast = fresnel.reflection(
+        mean, contrast = fresnel.relative_reflection(
             facets.cos_incidence, facets.sin_squared, refractive_index[..., None]
         )
         cos_light = jnp.clip(facets.cos_light, 1e-6, 1.0)
@@ -158,7 +158,8 @@ class AbstractExtendedSource(AbstractIllumination):
         total = jnp.sum(lit * mean, axis=-1)
         polarized = jnp.sum(lit * contrast * facets.along_s, axis=-1)
         seen = distribution.shadowing((sin_view / cos_view) ** 2, roughness) / cos_view
-        return Light(seen * total, polarized / total, jnp.zeros_like(total))
+        brightness = seen * fresnel.index_step(refractive_index) * total
+        return Light(brightness, polarized / total, jnp.zeros_like(total))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,7 +208,7 @@ class Disc(AbstractExtendedSource):
         cos_view = cos_degrees(geometry.view_zenith)[..., None]
         cos_light = jnp.asarray(cosine, cos_view.dtype) * cos_view
         cos_light = cos_light + jnp.asarray(sine_cosine, cos_view.dtype) * sin_view
-        cos_light = jnp.clip(cos_light, 1e-9, 1.0)
+        cos_light = jnp.clip(cos_light, 1e-4, 1.0)
         passing = cos_light * fresnel.transmission(cos_light, refractive_index[..., None])
         return passing @ jnp.asarray(solid_angle, cos_view.dtype)
 

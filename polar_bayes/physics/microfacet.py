@@ -120,7 +120,8 @@ class Beckmann(AbstractMicrofacet):
         # with it; it stops just above the smallest number instead.
         darkest = -0.9 * np.log(np.finfo(jnp.result_type(tan_squared, alpha)).tiny).item()
         exponent = jnp.minimum(tan_squared / alpha**2, darkest)
-        return jnp.exp(-exponent) * ((1.0 + tan_squared) / alpha) ** 2 / jnp.pi
+        # The square is taken last: each factor alone overflows single precision in a Hessian.
+        return (jnp.exp(-0.5 * exponent) * (1.0 + tan_squared) / alpha) ** 2 / jnp.pi
 
     @override
     def shadowing(self, tan_squared: Array, roughness: Array) -> Array:

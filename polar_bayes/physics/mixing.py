@@ -94,7 +94,7 @@ def _share(fraction: Array, surface: Array, subsurface: Array) -> Array:
     part, below rounding, keeps value, gradient and Hessian finite. A common factor does not
     change the share, so intensities are scaled by a constant first.
     """
-    trace = jnp.finfo(jnp.result_type(surface, subsurface)).eps ** 1.5
+    trace = jnp.finfo(jnp.result_type(surface, subsurface)).eps ** 1.25
     smallest = jnp.finfo(jnp.result_type(surface, subsurface)).tiny
     scale = jax.lax.stop_gradient(jnp.maximum(surface + subsurface, smallest))
     surface, subsurface = surface / scale, subsurface / scale

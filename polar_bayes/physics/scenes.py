@@ -6,7 +6,6 @@ from polar_bayes.physics.illumination import PointSource
 from polar_bayes.physics.instrument import (
     AngleZero,
     ChannelGain,
-    DarkLevel,
     DolpGain,
     Instrument,
     Leakage,
@@ -36,7 +35,8 @@ SCENES: dict[str, Scene] = {
         surface=SmoothSurface(),
         subsurface=Unpolarized(),
         mixing=StokesMixing(),
-        instrument=Instrument((AngleZero(), ChannelGain(), Leakage(), DarkLevel(), Discrepancy())),
+        # No DarkLevel: over angle it looks like the unpolarized body, which is there already.
+        instrument=Instrument((AngleZero(), ChannelGain(), Leakage(), Discrepancy())),
     ),
 }
 

@@ -5,7 +5,6 @@ figure is the last line of a cell; `figure.savefig("name.pdf")` writes it.
 """
 
 import textwrap
-from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
@@ -15,10 +14,17 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from polar_bayes.diagnostics.parameters import Scalar, posterior_scalars, scalars, truth_of
+from polar_bayes.diagnostics.parameters import (
+    Scalar,
+    posterior_scalars,
+    scalars,
+    stats_of,
+    truth_of,
+)
 from polar_bayes.diagnostics.predictive import Check, pit_band, predictive_checks
 from polar_bayes.errors import FitError
 from polar_bayes.report.readings import readings as readings
+from polar_bayes.report.readings import residuals as residuals
 from polar_bayes.report.style import (
     BLACK,
     BLUE,
@@ -32,7 +38,6 @@ from polar_bayes.report.style import (
     quiet_ticks,
     styled,
     title_of,
-    unit_of,
 )
 
 MOST_PAIRED = 8
@@ -88,30 +93,14 @@ def pairs(result: xr.DataTree) -> Figure:
     if len(found) < 2:
         raise _nothing("pairs", "two material parameters with draws")
     posterior = result["posterior"].to_dataset()
+    labels = [_narrow(title_of(scalar, posterior)) for scalar in found]
     size = len(found)
-    # Placed by hand: a layout engine takes seconds for this many axes.
-    side = max(5.6, min(1.35 * size + 0.9, 9.6))
-    figure = Figure(figsize=(side, side))
-    left, bottom = 0.95 / side, 0.75 / side
-    panels = figure.subplots(
-        size,
-        size,
-        squeeze=False,
-        gridspec_kw={
-            "left": left,
-            "right": 0.99,
-            "bottom": bottom,
-            "top": 0.99,
-            "hspace": 0.12,
-            "wspace": 0.12,
-        },
-    )
+    figure, panels = _square(size, lines=max(label.count("\n") for label in labels) + 1)
     draws = np.stack([scalar.draws.ravel() for scalar in found])
     shown = np.linspace(0, draws.shape[1] - 1, min(MOST_POINTS, draws.shape[1])).astype(int)
     diverging = _diverging(result)
     correlation = np.corrcoef(draws)
     limits = [_range(values) for values in draws]
-    labels = [_narrow(title_of(scalar, posterior)) for scalar in found]
     truths = [truth_of(result, scalar) for scalar in found]
     for row in range(size):
         for column in range(size):
@@ -216,7 +205,6 @@ def prior_posterior(result: xr.DataTree) -> Figure:
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
         axes.set_title(title_of(scalar, posterior), loc="left")
-        axes.set_xlabel(unit_of(scalar, posterior), fontsize=8)
     quiet_ticks(panels)
     handles: list[Patch | Line2D] = [
         Patch(color=lighten(GRAY, 0.72), label="prior"),
@@ -260,6 +248,18 @@ def pit(result: xr.DataTree, checks: dict[str, Check] | None = None) -> Figure:
     return figure
 
 
+def _square(size: int, *, lines: int) -> tuple[Figure, np.ndarray]:
+    """Panels for pairs, placed by hand: a layout engine takes seconds for this many axes."""
+    side = max(5.6, min(1.35 * size + 0.9, 9.6))
+    margin = 0.42 + 0.16 * lines
+    figure = Figure(figsize=(side, side))
+    place = {"left": (margin + 0.25) / side, "bottom": margin / side, "right": 0.985, "top": 0.99}
+    panels = figure.subplots(
+        size, size, squeeze=False, gridspec_kw={**place, "hspace": 0.12, "wspace": 0.12}
+    )
+    return figure, panels
+
+
 def _pit_panel(axes: Axes, values: np.ndarray | None) -> None:
     band = pit_band(values) if values is not None else None
     if band is None:
@@ -273,7 +273,7 @@ def _pit_panel(axes: Axes, values: np.ndarray | None) -> None:
 
 
 def _diverging(result: xr.DataTree) -> np.ndarray:
-    stats = result["sample_stats"].data_vars if "sample_stats" in result.children else {}
+    stats = stats_of(result)
     if "diverging" not in stats:
         return np.empty(0, int)
     return np.flatnonzero(stats["diverging"].to_numpy().ravel())
@@ -325,7 +325,7 @@ def _correlation(axes: Axes, value: float) -> None:
     axes.text(
         0.5,
         0.5,
-        f"{value:+.2f}".replace("-", MINUS),
+        "0.00" if abs(value) < 0.005 else f"{value:+.2f}".replace("-", MINUS),
         ha="center",
         va="center",
         transform=axes.transAxes,
@@ -346,17 +346,9 @@ def _pair_ticks(axes: Axes, row: int, column: int, size: int) -> None:
 def _narrow(text: str) -> str:
     """Break a label at its commas, and long parts at a space, for narrow panels."""
     return "\n".join(
-        line for part in text.split(", ") for line in textwrap.wrap(part, 17, max_lines=2)
+        line for part in text.split(", ") for line in textwrap.wrap(part, 19, max_lines=2)
     )
 
 
 def _nothing(what: str, needed: str) -> FitError:
-    return FitError(
-        "there is nothing to draw", where=what, mend=f"give a result that has {needed}"
-    )
-
-
-def captioned(scalars_shown: Sequence[Scalar], total: int) -> str:
-    """A note on what a figure leaves out; empty when it shows everything."""
-    shown = len(scalars_shown)
-    return "" if shown == total else f"The first {shown} of {total} parameters are shown."
+    return FitError("there is nothing to draw", where=what, mend=f"give a result that has {needed}")

@@ -44,6 +44,7 @@ class Curve:
         azimuth: Angle between the planes of view and light, 0 to 180, 180 the mirror side.
         light_zenith: Unit degree.
         observed: Readings; NaN where masked.
+        fitted: False where a reading is masked or set aside.
         saturated: True where the sensor stopped.
         levels: Quantiles of the prediction at `LEVELS`, shape (level, view); NaN without draws.
         center: Median of the noise-free prediction.
@@ -54,6 +55,7 @@ class Curve:
     azimuth: np.ndarray
     light_zenith: np.ndarray
     observed: np.ndarray
+    fitted: np.ndarray
     saturated: np.ndarray
     levels: np.ndarray
     center: np.ndarray
@@ -68,6 +70,15 @@ class Curve:
             if field.name != "title"
         }
         return Curve(title=self.title, **arrays)
+
+    def minus_center(self) -> "Curve":
+        """Readings and predictions as distances from the fitted curve."""
+        return dataclasses.replace(
+            self,
+            observed=self.observed - self.center,
+            levels=self.levels - self.center,
+            center=np.zeros_like(self.center),
+        )
 
     @property
     def is_smooth(self) -> bool:
@@ -123,15 +134,36 @@ def readings(result: xr.DataTree, name: str) -> Figure:
     Raises:
         FitError: The result has no such variable.
     """
-    found = curves(result, name)
+    return _draw(result, curves(result, name), name, QUANTITIES[name])
+
+
+@styled
+def residuals(result: xr.DataTree, name: str) -> Figure:
+    """The same after subtracting the fitted curve: where the model misses, and by how much.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+        name: dop, q, u or intensity.
+
+    Returns:
+        The figure, with the layout of `readings`.
+
+    Raises:
+        FitError: The result has no such variable.
+    """
+    found = [curve.minus_center() for curve in curves(result, name)]
+    return _draw(result, found, name, f"{SHORT[name]} minus fit")
+
+
+def _draw(result: xr.DataTree, found: list[Curve], name: str, quantity: str) -> Figure:
     azimuths = _azimuths(found)
     apart = len(azimuths) > 1
     limit = float(provenance_of(result).get("largest_view_zenith", 90.0))
-    draw = _draw_by_azimuth if apart else _draw_wrapped
-    figure, shown, drawn = draw(found, azimuths, name, limit)
+    place = _draw_by_azimuth if apart else _draw_wrapped
+    figure, shown, drawn = place(found, azimuths, quantity, limit)
     for axes in figure.axes:
         quiet_ticks(axes)
-    _limits(figure.axes[0], found, name)
+    _limits(figure.axes[0], found, is_share=quantity == QUANTITIES["dop"])
     where = f", {_azimuth_title(azimuths[0])}" if len(azimuths) == 1 else ""
     figure.supxlabel(f"view zenith [degree]{where}", fontsize=9)
     if len(found) > shown:
@@ -143,15 +175,17 @@ def readings(result: xr.DataTree, name: str) -> Figure:
 
 
 def _draw_by_azimuth(
-    found: list[Curve], azimuths: list[float], name: str, limit: float
+    found: list[Curve], azimuths: list[float], quantity: str, limit: float
 ) -> tuple[Figure, int, set[str]]:
     """A row for each curve, a column for each azimuth."""
     shown = found[:MOST_ROWS]
     figure = Figure(figsize=(8.2, 1.75 * len(shown) + 0.9), layout="constrained")
     panels = figure.subplots(len(shown), len(azimuths), sharex=True, sharey=True, squeeze=False)
     drawn: set[str] = set()
+    shorter = {words: SHORT[name] for name, words in QUANTITIES.items()}
     for row, curve in zip(panels, shown, strict=True):
-        row[0].set_ylabel(plain(", ".join(filter(None, [SHORT[name], curve.title])), 34))
+        short = shorter.get(quantity, quantity)
+        row[0].set_ylabel("\n".join(plain(line, 24) for line in (short, curve.title) if line))
         for axes, azimuth in zip(row, azimuths, strict=True):
             drawn |= _panel(axes, curve.at(np.round(curve.azimuth) == azimuth), limit)
     for axes, azimuth in zip(panels[0], azimuths, strict=True):
@@ -160,11 +194,11 @@ def _draw_by_azimuth(
 
 
 def _draw_wrapped(
-    found: list[Curve], azimuths: list[float], name: str, limit: float
+    found: list[Curve], azimuths: list[float], quantity: str, limit: float
 ) -> tuple[Figure, int, set[str]]:
     """One panel for each curve, whatever its azimuths, three in a row."""
     shown = found[: MOST_ROWS // 2 * WRAP]
-    columns = min(WRAP, len(shown))
+    columns = {1: 1, 2: 2, 4: 2}.get(len(shown), WRAP)
     rows = -(-len(shown) // columns)
     size = (8.2, 2.1 * rows + 0.9) if columns > 1 else (6.6, 3.9)
     figure = Figure(figsize=size, layout="constrained")
@@ -174,7 +208,7 @@ def _draw_wrapped(
         drawn |= _panel(axes, curve.at(np.ones(curve.zenith.shape, bool)), limit)
         axes.set_title(plain(curve.title, 34))
     for row in panels:
-        row[0].set_ylabel(QUANTITIES[name])
+        row[0].set_ylabel(quantity)
     for axes in panels.flat[len(shown) :]:
         axes.set_axis_off()
     for axes in panels.flat[max(len(shown) - columns, 0) : len(shown)]:
@@ -185,9 +219,13 @@ def _draw_wrapped(
 def _curves(result: xr.DataTree, name: str) -> Iterator[Curve]:
     observed = result["observed_data"][name]
     lead = [str(dim) for dim in observed.dims if dim != "view"]
-    center = result["noise_free"][name].median(SAMPLE_DIMS).transpose(*lead, "view").to_numpy()
-    predicted = result["posterior_predictive"][name].transpose(*SAMPLE_DIMS, *lead, "view")
-    draws = predicted.to_numpy().reshape(-1, *center.shape)
+    values = observed.transpose(*lead, "view").to_numpy()
+    order = (*SAMPLE_DIMS, *lead, "view")
+    center, draws = (
+        result[group][name].transpose(*order).to_numpy().reshape(-1, *values.shape)
+        for group in ("noise_free", "posterior_predictive")
+    )
+    center = np.median(center, axis=0)
     # A point fit has a single draw, whose quantiles would look like certainty.
     levels = np.full((len(LEVELS), *center.shape), np.nan)
     if len(draws) > 1:
@@ -197,8 +235,10 @@ def _curves(result: xr.DataTree, name: str) -> Iterator[Curve]:
         key: constants[key].broadcast_like(observed).transpose(*lead, "view").to_numpy()
         for key in GEOMETRY
     }
-    saturated = constants["saturated"].transpose(*lead, "view").to_numpy().astype(bool)
-    values = observed.transpose(*lead, "view").to_numpy()
+    fitted, saturated = (
+        constants[flag].transpose(*lead, "view").to_numpy().astype(bool)
+        for flag in ("valid", "saturated")
+    )
     titles = _titles(observed, lead)
     turn = np.abs((angles["view_azimuth"] - angles["light_azimuth"] + 180.0) % 360.0 - 180.0)
     for place in np.ndindex(values.shape[:-1]):
@@ -208,6 +248,7 @@ def _curves(result: xr.DataTree, name: str) -> Iterator[Curve]:
             azimuth=turn[place],
             light_zenith=angles["light_zenith"][place],
             observed=values[place],
+            fitted=fitted[place],
             saturated=saturated[place],
             levels=levels[(slice(None), *place)],
             center=center[place],
@@ -263,30 +304,33 @@ def _panel(axes: Axes, curve: Curve, limit: float) -> set[str]:
 def _prediction(axes: Axes, curve: Curve) -> set[str]:
     if not curve.zenith.size:
         return set()
-    drawn = {"median"}
-    known = np.isfinite(curve.levels).all()
+    style = {"color": BLUE, "zorder": 3}
     if curve.is_smooth:
-        axes.plot(curve.zenith, curve.center, color=BLUE, lw=1.4, zorder=3)
-        if known:
-            for inner, share in ((0, 0.78), (1, 0.5)):
-                low, high = curve.levels[inner], curve.levels[-1 - inner]
-                axes.fill_between(curve.zenith, low, high, color=lighten(BLUE, share), lw=0)
+        axes.plot(curve.zenith, curve.center, lw=1.4, **style)
     else:
-        axes.plot(curve.zenith, curve.center, "_", color=BLUE, ms=7, mew=1.4, zorder=3)
-        if known:
-            for inner, share, width in ((0, 0.7, 2.0), (1, 0.4, 4.5)):
-                low, high = curve.levels[inner], curve.levels[-1 - inner]
-                axes.vlines(curve.zenith, low, high, color=lighten(BLUE, share), lw=width)
-    return drawn | ({"half", "most"} if known else set())
+        axes.plot(curve.zenith, curve.center, "_", ms=7, mew=1.4, **style)
+    # Where a reading is missing, so may be its error: the scatter there is not known.
+    known = curve.fitted & np.isfinite(curve.levels).all(axis=0)
+    if not known.any():
+        return {"median"}
+    zenith, levels = curve.zenith[known], curve.levels[:, known]
+    for inner, share, width in ((0, 0.78, 2.0), (1, 0.5, 4.5)):
+        low, high = levels[inner], levels[-1 - inner]
+        color = lighten(BLUE, share)
+        if curve.is_smooth:
+            axes.fill_between(zenith, low, high, color=color, lw=0)
+        else:
+            axes.vlines(zenith, low, high, color=color, lw=width)
+    return {"median", "half", "most"}
 
 
-def _limits(axes: Axes, found: list[Curve], name: str) -> None:
+def _limits(axes: Axes, found: list[Curve], *, is_share: bool) -> None:
     zenith = np.concatenate([curve.zenith for curve in found])
     zenith = zenith[np.isfinite(zenith)]
     low, high = (float(zenith.min()), float(zenith.max())) if zenith.size else (0.0, 90.0)
     margin = max(0.03 * (high - low), 1.0)
     axes.set_xlim(max(low - margin, -1.0), min(high + margin, 91.0))
-    if name == "dop":
+    if is_share:
         bottom, top = axes.get_ylim()
         axes.set_ylim(max(bottom, -0.03), min(top, 1.03))
 
@@ -312,7 +356,7 @@ def _legend() -> dict[str, Line2D | Patch]:
         ),
         "masked": Line2D([], [], label="masked: not fitted", **_masked_style()),
         "aside": Patch(color="#efefef", label="set aside: beyond the angle limit"),
-        "median": Line2D([], [], color=BLUE, lw=1.4, label="fitted curve (posterior median)"),
+        "median": Line2D([], [], color=BLUE, lw=1.4, label="fitted curve (median)"),
         "half": Patch(color=lighten(BLUE, 0.5), label="50% of new readings"),
         "most": Patch(color=lighten(BLUE, 0.78), label="95% of new readings"),
     }

@@ -55,11 +55,11 @@ STYLE: dict[str, Any] = {
 
 QUANTITIES = {
     "dop": "degree of polarization",
-    "q": "q (s positive)",
-    "u": "u",
+    "q": "signed polarization q",
+    "u": "signed polarization u",
     "intensity": "intensity",
 }
-SHORT = {**QUANTITIES, "dop": "DoP", "q": "q"}
+SHORT = {**QUANTITIES, "dop": "DoP", "q": "q", "u": "u"}
 GREEK = {"beta": "β"}
 
 
@@ -97,19 +97,15 @@ def grid(
 
 
 def title_of(scalar: Scalar, posterior: xr.Dataset) -> str:
-    """A parameter in words: `refractive index n, 450 nm`."""
+    """A parameter in words with its unit: `refractive index n, 450 nm`."""
     attributes = posterior[scalar.name].attrs
     words = str(attributes.get("long_name", scalar.name.replace("_", " ")))
     words = {"absorption relative to scattering": "absorption"}.get(words, words)
     symbol = str(attributes.get("symbol", ""))
     places = [place_of(dim, label) for dim, label in scalar.labels.items()]
-    return plain(", ".join([f"{words} {GREEK.get(symbol, symbol)}".strip(), *places]))
-
-
-def unit_of(scalar: Scalar, posterior: xr.Dataset) -> str:
-    """The unit of a parameter, empty for pure numbers."""
-    unit = str(posterior[scalar.name].attrs.get("units", "1"))
-    return "" if unit == "1" else plain(unit)
+    unit = str(attributes.get("units", "1"))
+    name = f"{words} {GREEK.get(symbol, symbol)}".strip() + (f" [{unit}]" if unit != "1" else "")
+    return plain(", ".join([name, *places]))
 
 
 def place_of(dim: str, label: str) -> str:

@@ -109,6 +109,13 @@ def test_the_truth_may_be_unknown_but_not_infinite(make_capture):
     assert "NaN where the truth is not known" in refused(capture, "true_roughness: .*infinite")
 
 
+def test_the_units_of_a_truth_are_text(make_capture):
+    capture = make_capture()
+    capture["true_roughness"].attrs |= {"units": 1, "long_name": "slope"}
+    attributes = validate(capture)["true_roughness"].attrs
+    assert attributes == {"units": "1", "long_name": "slope"}
+
+
 def test_an_error_takes_the_units_of_the_intensity(make_capture):
     capture = make_capture()
     del capture["intensity_error"].attrs["units"]
@@ -327,6 +334,13 @@ def test_only_real_numbers_are_readings(make_capture, name, values, what):
 def test_labels_tell_materials_apart(make_capture, labels, what):
     capture = make_capture("material").assign_coords(material=labels)
     assert "or drop the coordinate" in refused(capture, f"material: .*{what}")
+
+
+@pytest.mark.filterwarnings("ignore:rename 'one' to 'view'")
+def test_one_label_cannot_stand_for_many_views(make_capture):
+    capture = make_capture().assign_coords(one=1.0).rename(one="view")
+    message = refused(capture, re.escape("view: its dims are ()"))
+    assert message.endswith("give it (view)")
 
 
 @pytest.mark.parametrize("level", [0.0, -1.0, np.nan, np.inf, "full", [1.0, 2.0]])

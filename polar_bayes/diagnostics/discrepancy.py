@@ -1,0 +1,51 @@
+"""What would the fit claim if it denied that the instrument has smooth errors?"""
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from polar_bayes.diagnostics.parameters import posterior_scalars, scalars
+
+COLUMNS = (
+    "mean",
+    "q2.5",
+    "q97.5",
+    "mean_without",
+    "q2.5_without",
+    "q97.5_without",
+    "width_ratio",
+)
+INTERVAL = (0.025, 0.975)
+
+
+def compare_without_discrepancy(result: xr.DataTree) -> pd.DataFrame:
+    """The material's intervals with and without the discrepancy term, side by side.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+
+    Returns:
+        One row per material parameter that both fits have; `width_ratio` is the width of the 95%
+        interval without the term over that with it. Empty where the tree holds no such fit.
+
+    Raises:
+        FitError: The tree holds no posterior.
+    """
+    found = posterior_scalars(result)
+    rows, labels = [], []
+    plain = {}
+    if "without_discrepancy" in result.children:
+        plain = {s.label: s.draws for s in scalars(result["without_discrepancy"].to_dataset())}
+    for scalar in found:
+        other = plain.get(scalar.label)
+        if other is None or not scalar.is_material:
+            continue
+        if not (np.isfinite(scalar.draws).all() and np.isfinite(other).all()):
+            continue
+        (low, high), (bare_low, bare_high) = (
+            np.quantile(draws, INTERVAL) for draws in (scalar.draws, other)
+        )
+        ratio = (bare_high - bare_low) / (high - low) if high > low else np.nan
+        labels.append(scalar.label)
+        rows.append([scalar.draws.mean(), low, high, other.mean(), bare_low, bare_high, ratio])
+    return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index(labels, dtype=str))

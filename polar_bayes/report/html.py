@@ -1,0 +1,236 @@
+"""The standard report: one page that stands alone, with the result beside it."""
+
+import base64
+import dataclasses
+import io
+import os
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import xarray as xr
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from matplotlib.figure import Figure
+
+from polar_bayes.capture.paths import as_path
+from polar_bayes.diagnostics.convergence import judge, summary
+from polar_bayes.diagnostics.discrepancy import compare_without_discrepancy
+from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars
+from polar_bayes.diagnostics.predictive import Check, predictive_checks
+from polar_bayes.diagnostics.sensitivity import sensitivity
+from polar_bayes.errors import FitError, one_line
+from polar_bayes.inference.files import save_result
+from polar_bayes.inference.result import provenance_of
+from polar_bayes.report import figures, sentences, tables
+from polar_bayes.report.readings import variables
+from polar_bayes.report.style import QUANTITIES, STYLE
+
+PAGE = "index.html"
+RESULT = "result.nc"
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """A figure on the page.
+
+    Args:
+        source: The image itself, as a data URI.
+        alternative: What it shows, for readers who cannot see it.
+        caption: How to read it.
+        wide: True for many panels; small screens scroll it in its own box.
+    """
+
+    source: str
+    alternative: str
+    caption: str
+    wide: bool
+
+
+def report(result: xr.DataTree, directory: str | os.PathLike[str]) -> Path:
+    """Write the standard report of a fit: `index.html` and, beside it, `result.nc`.
+
+    The page needs no network, no script and no other file. Everything on it is computed from the
+    result, so a report of a file read back is the same report.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+        directory: The folder; made if it is not there. An older report in it is replaced.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        CaptureError: The directory is no path.
+        FitError: The tree holds no posterior, or the folder cannot be written.
+    """
+    folder = as_path(directory, "report")
+    page = render(result)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".report-") as unfinished:
+            (Path(unfinished) / PAGE).write_text(page, encoding="utf-8")
+            save_result(result, Path(unfinished) / RESULT)
+            for name in (RESULT, PAGE):
+                (Path(unfinished) / name).replace(folder / name)
+    except OSError as error:
+        raise FitError(
+            (error.strerror or str(error)).lower(),
+            where=str(folder),
+            mend="give a folder that can be written",
+        ) from error
+    return folder / PAGE
+
+
+def render(result: xr.DataTree) -> str:
+    """The page as text.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+
+    Returns:
+        A whole HTML document; every text of the capture is escaped.
+
+    Raises:
+        FitError: The tree holds no posterior.
+    """
+    found, table = posterior_scalars(result), summary(result)
+    prior, checks = sensitivity(result), predictive_checks(result)
+    method, provenance = method_of(result), provenance_of(result)
+    posterior = result["posterior"].to_dataset()
+    judged = judge(result, table)
+    is_point = method == "point"
+    name = one_line(str((provenance.get("capture") or {}).get("name", "capture")))
+    content: dict[str, Any] = {
+        "name": name,
+        "method": {"nuts": "NUTS", "laplace": "Laplace approximation"}.get(method, "least squares"),
+        "provenance": provenance,
+        "verdict": judged,
+        "headline": sentences.headline(method, judged.converged, judged.cautions),
+        # What a failed fit says about the material is not worth a sentence.
+        "said": [*sentences.determined(found, prior, posterior), *sentences.expected(checks)]
+        if judged.converged
+        else [],
+        "parameters": tables.estimate_table(result, found, table)
+        if is_point
+        else tables.parameter_table(result, found, table, prior),
+        "discrepancy": None if is_point else _discrepancy(result, found, posterior),
+        "sensitivity": None if is_point else tables.sensitivity_table(found, prior, posterior),
+        "convergence": tables.convergence_table(found, table, posterior)
+        if method == "nuts"
+        else None,
+        "sampler": tables.sampler_facts(result, method, provenance),
+        "checks": tables.check_table(checks) if checks else None,
+        "groups": tables.provenance_groups(provenance),
+        "pictures": _pictures(result, checks, method),
+    }
+    environment = Environment(
+        loader=PackageLoader("polar_bayes.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["plain_letters"] = lambda text: re.sub(r"[^a-z0-9]", "", text.lower())
+    return environment.get_template("report.html.j2").render(content)
+
+
+def _discrepancy(
+    result: xr.DataTree, found: list[Scalar], posterior: xr.Dataset
+) -> dict[str, Any] | None:
+    compared = compare_without_discrepancy(result)
+    if compared.empty:
+        return None
+    return {
+        "table": tables.discrepancy_table(result, found, compared),
+        "sentences": sentences.overconfidence(compared, found, posterior),
+    }
+
+
+def _pictures(
+    result: xr.DataTree, checks: dict[str, Check], method: str
+) -> dict[str, list[Picture]]:
+    """Every figure that applies, by the section where it stands."""
+    has_draws = method != "point" and bool(figures.drawable(result))
+    has_prior = has_draws and "prior" in result.children
+    return {
+        "readings": _reading_pictures(result, has_draws),
+        "pairs": _optional(
+            has_draws and len(figures.drawable(result, material=True)) > 1,
+            lambda: figures.pairs(result),
+            "Pair plot of the material parameters",
+            "Each dot is a joint draw. A long narrow cloud means that the data fix a combination "
+            "of the two better than either; numbers above the diagonal are correlations. Orange "
+            "dashes: true values, where known. Crosses: draws that diverged.",
+        ),
+        "prior": _optional(
+            has_prior,
+            lambda: figures.prior_posterior(result),
+            "Prior and posterior of each parameter",
+            "Curves are scaled to equal height. Where blue is as wide as gray, the data said "
+            "nothing about this parameter.",
+        ),
+        "ranks": _optional(
+            method == "nuts" and has_draws,
+            lambda: figures.ranks(result),
+            "Rank plot of each chain",
+            "Each line is one chain. Lines that are flat and overlap mean that all chains "
+            "describe one distribution; a chain that leans or piles up saw another part of it.",
+        ),
+        "pit": _optional(
+            any(check.pit.size > 1 for check in checks.values()),
+            lambda: figures.pit(result, checks),
+            "PIT and leave-one-out PIT of each variable",
+            "For a model that expects its readings the curve stays in the gray band in 95 of 100 "
+            "captures. Up, then down: readings scatter more than the model says; down, then up: "
+            "less; all on one side: the prediction is shifted. Red lines leave the band. The "
+            "leave-one-out panel predicts each reading from the others and is the stricter one.",
+        ),
+    }
+
+
+def _reading_pictures(result: xr.DataTree, has_draws: bool) -> list[Picture]:
+    pictures = []
+    bands = " Of new readings of the same material half should fall in the dark band and 95% in "
+    bands = f"{bands}the light one." if has_draws else ""
+    for name in variables(result):
+        quantity = QUANTITIES[name]
+        pictures.append(
+            _picture(
+                figures.readings(result, name),
+                f"Readings of {quantity} and the fitted curve against view zenith",
+                f"Readings of {quantity} with the fitted curve.{bands}",
+            )
+        )
+        if name != "intensity":
+            pictures.append(
+                _picture(
+                    figures.residuals(result, name),
+                    f"Readings of {quantity} minus the fitted curve against view zenith",
+                    "The same after subtracting the fitted curve. A wave that many neighbors "
+                    "share is a smooth error of the instrument or of the model.",
+                )
+            )
+    return pictures
+
+
+def _optional(
+    applies: bool, draw: Callable[[], Figure], alternative: str, caption: str
+) -> list[Picture]:
+    return [_picture(draw(), alternative, caption)] if applies else []
+
+
+def _picture(figure: Figure, alternative: str, caption: str) -> Picture:
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(STYLE):
+        # No date and a fixed salt: the same result gives the same page, byte for byte.
+        figure.savefig(buffer, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
+    encoded = base64.b64encode(buffer.getvalue()).decode("ascii")
+    return Picture(
+        source=f"data:image/svg+xml;base64,{encoded}",
+        alternative=alternative,
+        caption=caption,
+        wide=figure.get_figwidth() > 7.0,
+    )

@@ -1,0 +1,154 @@
+"""The report's conclusions in plain sentences, each true of the numbers beside it."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from polar_bayes.diagnostics.parameters import Scalar
+from polar_bayes.diagnostics.predictive import Band, Check, pit_band
+from polar_bayes.report.style import QUANTITIES, place_of, title_of
+from polar_bayes.report.text import spoken
+
+# Two intervals whose widths differ by less than this are equally wide, as far as draws can tell.
+EQUAL_WIDTHS = 0.05
+MOST_PLACES = 6
+
+HEADLINES = {
+    ("nuts", True): "The fit converged.",
+    ("nuts", False): "The fit did not converge: do not use these numbers.",
+    ("laplace", True): "The approximation raised no alarm.",
+    ("laplace", False): "The approximation failed: do not use these numbers.",
+    ("point", True): "Least squares met its tolerance.",
+    ("point", False): "Least squares failed: do not use these numbers.",
+}
+
+
+def headline(method: str, converged: bool, cautions: Sequence[str]) -> str:
+    """The verdict in one sentence."""
+    text = HEADLINES[method, converged]
+    return f"{text} Mind the cautions." if converged and cautions else text
+
+
+def determined(found: Sequence[Scalar], prior: pd.DataFrame, posterior: xr.Dataset) -> list[str]:
+    """Which material parameters the data determine, and which they do not."""
+    groups: dict[str, list[Scalar]] = {"determined": [], "partly": [], "not determined": []}
+    for scalar in found:
+        word = str(prior.loc[scalar.label, "verdict"]) if scalar.label in prior.index else ""
+        if scalar.is_material and word in groups:
+            groups[word].append(scalar)
+    phrases = {
+        "determined": "The data determine {}.",
+        "partly": "The data determine only in part: {}. There the prior still matters.",
+        "not determined": "The data do not determine {}. There the interval is mostly the prior's: "
+        "do not quote it as a measurement.",
+    }
+    return [
+        phrases[word].format(named(group, posterior)) for word, group in groups.items() if group
+    ]
+
+
+def named(found: Sequence[Scalar], posterior: xr.Dataset) -> str:
+    """Parameters in words: `roughness r and refractive index n at 450, 550 and 650 nm`."""
+    groups: dict[str, list[Scalar]] = {}
+    for scalar in found:
+        groups.setdefault(title_of(scalar, posterior).partition(", ")[0], []).append(scalar)
+    return spoken([f"{words}{_places(group, posterior)}" for words, group in groups.items()])
+
+
+def _places(group: Sequence[Scalar], posterior: xr.Dataset) -> str:
+    """` at 450 and 550 nm`, ` (material leaf, 450 nm; material fruit, 450 nm)` or nothing."""
+    if not group[0].labels:
+        return ""
+    if list(group[0].labels) == ["wavelength"]:
+        return f" at {spoken([scalar.labels['wavelength'] for scalar in group])} nm"
+    if len(group) > 1 and len(group) * group[0].draws.size == posterior[group[0].name].size:
+        return " (everywhere)"
+    places = [
+        ", ".join(place_of(dim, label) for dim, label in scalar.labels.items()) for scalar in group
+    ]
+    more = f"; {len(places) - MOST_PLACES} more" if len(places) > MOST_PLACES else ""
+    return f" ({'; '.join(places[:MOST_PLACES])}{more})"
+
+
+def expected(checks: Mapping[str, Check]) -> list[str]:
+    """Whether the readings are distributed as the model expects, variable by variable."""
+    sentences = []
+    for check in checks.values():
+        band = pit_band(check.loo.pit if check.loo else check.pit)
+        name = QUANTITIES[check.name]
+        if band is not None and band.leaves:
+            sentences.append(
+                f"The readings of {name} are not distributed as the model expects: {shape(band)}. "
+                "The intervals may be off."
+            )
+        elif band is not None:
+            sentences.append(f"The readings of {name} are distributed as the model expects.")
+        if check.loo and check.loo.unreliable:
+            sentences.append(
+                f"Pareto k is above 0.7 for {check.loo.unreliable} of {check.count} readings of "
+                f"{name}: they weigh so much that leaving them out cannot be imitated. Look at "
+                "them first."
+            )
+    return sentences
+
+
+def shape(band: Band) -> str:
+    """In which way the readings depart from the prediction, once the curve leaves its band."""
+    above = np.flatnonzero(band.difference > band.upper)
+    below = np.flatnonzero(band.difference < band.lower)
+    if above.size and below.size:
+        return f"they scatter {'more' if above[0] < below[0] else 'less'} than it says"
+    return f"more of them lie {'low' if above.size else 'high'} than it says"
+
+
+def overconfidence(
+    compared: pd.DataFrame, found: Sequence[Scalar], posterior: xr.Dataset
+) -> list[str]:
+    """What to make of the fit without the discrepancy term.
+
+    Args:
+        compared: The table of `compare_without_discrepancy`, not empty.
+        found: The scalars of the posterior.
+        posterior: The posterior.
+
+    Returns:
+        Sentences; they call it narrower only where it is.
+    """
+    gain = {
+        s: 1.0 - compared.loc[s.label, "width_ratio"] for s in found if s.label in compared.index
+    }
+    narrower = {scalar: share for scalar, share in gain.items() if share > EQUAL_WIDTHS}
+    others = [scalar for scalar in gain if scalar not in narrower]
+    sentences = []
+    if narrower:
+        least, most = min(narrower.values()), max(narrower.values())
+        by = f"{most:.0%}" if most - least < 0.01 else f"{least:.0%} to {most:.0%}"
+        sentences.append(
+            f"Without the discrepancy term the 95% {_interval_of(list(narrower), posterior)} "
+            f"narrower by {by}. That is overconfidence: the fit then counts smooth errors of the "
+            "instrument as knowledge about the material."
+        )
+    if others:
+        sentences.append(
+            f"Without the term the 95% {_interval_of(others, posterior)} not narrower, as it "
+            "happens; still, that fit has no room for smooth errors of the instrument and holds "
+            "only if there are none."
+        )
+    misses = (compared["mean"] < compared["q2.5_without"]) | (
+        compared["mean"] > compared["q97.5_without"]
+    )
+    apart = [scalar for scalar in gain if misses[scalar.label]]
+    if apart:
+        sentences.append(
+            f"The two fits disagree on {named(apart, posterior)}: the interval without the term "
+            "does not contain the mean with it."
+        )
+    return [*sentences, "Do not quote the numbers without the discrepancy term."]
+
+
+def _interval_of(found: Sequence[Scalar], posterior: xr.Dataset) -> str:
+    return f"interval{' of {} is' if len(found) == 1 else 's of {} are'}".format(
+        named(found, posterior)
+    )
