@@ -40,120 +40,65 @@ def make_result(
 ):
     """A result tree; `noise` scales the readings' scatter against the one that the fit assumes."""
     rng = np.random.default_rng(seed)
-    zenith = np.linspace(2.0, 85.0, views)
-    valid_view = (zenith <= limit) & ~np.isin(np.arange(views), masked)
     axes = {"material": materials, "wavelength": wavelengths}
-    lead = {dim: len(labels) for dim, labels in axes.items() if labels}
+    coords = {dim: np.asarray(labels) for dim, labels in axes.items() if len(labels)}
+    lead = {dim: len(labels) for dim, labels in coords.items()}
+    zenith = np.linspace(2.0, 85.0, views)
+    valid = np.broadcast_to(
+        (zenith <= limit) & ~np.isin(np.arange(views), masked), (*lead.values(), views)
+    )
     names, location, width = _parameters(lead)
     design, offset = _design(variables, lead, names, zenith)
-    shape = (*lead.values(), views)
-    valid = np.broadcast_to(valid_view, shape)
-
     truth = location + width * rng.standard_normal(len(location))
-    observed, saturated = {}, np.zeros(shape, bool)
-    for variable in variables:
-        signal = design[variable] @ truth + offset[variable]
-        reading = signal + noise * SCALE[variable] * rng.standard_normal(shape)
-        if variable == "intensity":
-            saturated = (reading >= FULL_SCALE) & valid
-            reading = np.minimum(reading, FULL_SCALE)
-        observed[variable] = np.where(valid, reading, np.nan)
+    observed, saturated = _observe(design, offset, truth, valid, noise, rng)
 
-    draw = _posterior(design, offset, observed, valid & ~saturated, location, width)
-    count = 1 if method == "point" else chains * draws
-    mean, factor = draw
-    theta = mean + (count > 1) * rng.standard_normal((count, len(mean))) @ factor.T
+    mean, factor = _posterior(design, offset, observed, valid & ~saturated, location, width)
     grid = (1, 1) if method == "point" else (chains, draws)
-
-    dims = ("chain", "draw", *lead, "view")
-    centers, predictive, density = {}, {}, {}
-    for variable in variables:
-        center = np.einsum("...p,sp->s...", design[variable], theta) + offset[variable]
-        scatter = SCALE[variable] * rng.standard_normal(center.shape)
-        predicted = center + scatter
-        if variable == "intensity":
-            predicted = np.minimum(predicted, FULL_SCALE)
-        z = (np.where(valid, observed[variable], 0.0) - center) / SCALE[variable]
-        log_density = -0.5 * z**2 - np.log(SCALE[variable] * np.sqrt(2 * np.pi))
-        density[variable] = (dims, np.where(valid, log_density, 0.0).reshape(*grid, *shape))
-        centers[variable] = (dims, center.reshape(*grid, *shape))
-        predictive[variable] = (dims, predicted.reshape(*grid, *shape))
-
-    coords = {dim: np.asarray(labels) for dim, labels in axes.items() if labels}
-    prior_theta = location + width * rng.standard_normal((500, len(location)))
-    posterior = _label(theta, names, lead, grid)
-    prior = _label(prior_theta, names, lead, (1, 500))
+    steps = rng.standard_normal((grid[0] * grid[1], len(mean))) @ factor.T
+    theta = mean + steps * (method != "point")
+    before = location + width * rng.standard_normal((500, len(location)))
+    posterior, prior = _label(theta, names, lead, grid), _label(before, names, lead, (1, 500))
     if discrepancy:
-        weights = rng.standard_normal((*grid, 4))
-        dim = "discrepancy_weights_0"
-        posterior["discrepancy_weights"] = (("chain", "draw", dim), weights)
-        prior["discrepancy_weights"] = (("chain", "draw", dim), rng.standard_normal((1, 500, 4)))
-    log_prior = {
-        parameter: (
-            ("chain", "draw"),
-            (-0.5 * ((theta[:, at] - location[at]) / width[at]) ** 2).sum(-1).reshape(grid),
-        )
-        for parameter in PRIOR
-        for at in [[i for i, (n, _) in enumerate(names) if n == parameter]]
-        if at
-    }
+        dims = ("chain", "draw", "discrepancy_weights_0")
+        posterior["discrepancy_weights"] = (dims, rng.standard_normal((*grid, 4)))
+        prior["discrepancy_weights"] = (dims, rng.standard_normal((1, 500, 4)))
+
     groups = {
-        "posterior": xr.Dataset(posterior, coords),
-        "prior": xr.Dataset(prior, coords),
-        "sample_stats": xr.Dataset(_stats(method, grid, rng)),
-        "posterior_predictive": xr.Dataset(predictive, coords),
-        "noise_free": xr.Dataset(centers, coords),
-        "log_likelihood": xr.Dataset(density, coords),
-        "log_prior": xr.Dataset(log_prior),
-        "observed_data": xr.Dataset(
-            {name: (dims[2:], reading) for name, reading in observed.items()}, coords
-        ),
-        "constant_data": _constants(zenith, azimuths, valid, saturated, truth, names, lead, coords),
+        "posterior": posterior,
+        "prior": prior,
+        "sample_stats": _stats(method, grid, rng),
+        "log_prior": _log_prior(theta, names, location, width, grid),
+        "observed_data": {name: ((*lead, "view"), values) for name, values in observed.items()},
+        **_predict(design, offset, theta, observed, valid, grid, lead, rng),
     }
+    groups = {group: xr.Dataset(content, coords) for group, content in groups.items()}
+    groups["constant_data"] = _constants(
+        zenith, azimuths, valid, saturated, _label(truth[None], names, lead, (1, 1)), coords
+    )
     if "intensity" in observed:
         groups["observed_data"]["intensity"].attrs["saturation_level"] = FULL_SCALE
     if discrepancy:
-        narrow = mean + 0.4 * (theta - mean)
-        groups["without_discrepancy"] = xr.Dataset(_label(narrow, names, lead, grid), coords)
+        narrow = _label(mean + 0.4 * (theta - mean), names, lead, grid)
+        groups["without_discrepancy"] = xr.Dataset(narrow, coords)
     tree = xr.DataTree.from_dict(groups)
-    errors = {
-        parameter: [
-            None if parameter == "exposure" else float(width[i])
-            for i, (n, _) in enumerate(names)
-            if n == parameter
-        ]
-        for parameter in dict.fromkeys(n for n, _ in names)
-    }
-    provenance = {
-        "method": method,
-        "settings": {"chains": chains, "draws": draws},
-        "model": "per_material",
-        "scene": "paper",
-        "scene_parts": "Scene(surface=SmoothSurface())",
-        "priors": {n: f"Normal(loc={m:g}, scale={s:g})" for n, (m, s) in PRIOR.items()},
-        "links": {variable: "NormalLink()" for variable in variables},
-        "swapped": ["prior of refractive_index"],
-        "largest_view_zenith": limit,
-        "seed": seed,
-        "precision": "double",
-        "chain_method": "threads",
-        "versions": {"polar_bayes": "0.1.0"},
-        "machine": {"processor": "x86_64", "python": "3.12"},
-        "timings": {"modes": 1.5, "draws": 2.25},
-        "counts": {
-            "views": int(valid.size),
-            "masked": int(len(masked) * valid.size // views),
-            "saturated": int(saturated.sum()),
-            "used": int(valid.sum()),
-            "at_margin": dict.fromkeys(variables, 0),
-        },
-        "problems": [],
-        "capture": {"name": name, "setup": "paper"},
+    provenance = _provenance(method, variables, limit, name, seed)
+    provenance["settings"] = {"chains": chains, "draws": draws}
+    provenance["counts"] = {
+        "views": int(valid.size),
+        "masked": int(len(masked) * valid.size // views),
+        "saturated": int(saturated.sum()),
+        "used": int(valid.sum()),
+        "at_margin": dict.fromkeys(variables, 0),
     }
     if method == "point":
-        provenance["standard_errors"] = errors
-    else:
-        provenance["modes"] = {"starts": 16, "failures": 0, "weights": [1.0]}
+        provenance["standard_errors"] = {
+            parameter: [
+                None if parameter == "exposure" else float(sd)
+                for (owner, _), sd in zip(names, width, strict=True)
+                if owner == parameter
+            ]
+            for parameter in PRIOR
+        }
     tree.attrs["polar_bayes"] = json.dumps(provenance)
     return tree
 
@@ -174,55 +119,83 @@ def replace(tree, group, name, values):
 
 def _parameters(lead):
     """Name and place of every entry of the parameter vector, with prior means and widths."""
-    names, location, width = [], [], []
-    for parameter, (mean, sd) in PRIOR.items():
-        dims = {d: n for d, n in lead.items() if parameter != "exposure" and d != "wavelength"} | {
-            d: n for d, n in lead.items() if d == "wavelength" and parameter in SPECTRAL
-        }
-        ordered = [dims[d] for d in lead if d in dims]
-        for place in np.ndindex(*ordered):
-            names.append((parameter, place))
-            location.append(mean)
-            width.append(sd)
-    return names, np.asarray(location), np.asarray(width)
+    names = [
+        (parameter, place)
+        for parameter in PRIOR
+        for place in np.ndindex(*(lead[dim] for dim in _own_dims(parameter, lead)))
+    ]
+    location, width = np.asarray([PRIOR[parameter] for parameter, _ in names]).T
+    return names, location, width
+
+
+def _own_dims(parameter, lead):
+    """The dims of one parameter: materials have all but the exposure, colors only two."""
+    if parameter == "exposure":
+        return []
+    return [dim for dim in lead if dim != "wavelength" or parameter in SPECTRAL]
 
 
 def _design(variables, lead, names, zenith):
     """Slopes (..., view, parameter) and offsets (..., view) of every variable."""
     angle = np.radians(zenith)
-    slope = {
-        "dop": {
-            "roughness": -0.3 * np.sin(angle) ** 4,
-            "subsurface_fraction": -0.5 * np.sin(angle) ** 2,
-            "absorption": 0.02 * np.cos(angle),
-            "refractive_index": 0.6 * np.sin(2 * angle),
-        },
-        "intensity": {
-            "exposure": 0.55 + 0.4 * np.exp(-(((zenith - 45.0) / 10.0) ** 2)),
-            "absorption": -0.3 * np.cos(angle),
-        },
+    polarization = {
+        "roughness": -0.3 * np.sin(angle) ** 4,
+        "subsurface_fraction": -0.5 * np.sin(angle) ** 2,
+        "absorption": 0.02 * np.cos(angle),
+        "refractive_index": 0.6 * np.sin(2 * angle),
     }
-    slope["q"] = slope["dop"]
+    brightness = {
+        "exposure": 0.55 + 0.4 * np.exp(-(((zenith - 45.0) / 10.0) ** 2)),
+        "absorption": -0.3 * np.cos(angle),
+    }
     designs, offsets = {}, {}
-    shape = (*lead.values(), len(zenith))
-    dims = list(lead)
     for variable in variables:
-        matrix = np.zeros((*shape, len(names)))
-        shift = np.zeros(shape) + (
-            0.25 + 0.35 * np.sin(angle) ** 2 if variable != "intensity" else 0.0
-        )
+        slopes = brightness if variable == "intensity" else polarization
+        matrix = np.zeros((*lead.values(), len(zenith), len(names)))
         for column, (parameter, place) in enumerate(names):
-            if parameter not in slope[variable]:
-                continue
-            own = [d for d in dims if parameter != "exposure" and d != "wavelength"]
-            own += [d for d in dims if d == "wavelength" and parameter in SPECTRAL]
-            own = [d for d in dims if d in own]
-            where = tuple(place[own.index(d)] if d in own else slice(None) for d in dims)
-            matrix[(*where, slice(None), column)] = slope[variable][parameter]
-            if variable != "intensity":
-                shift[where] -= slope[variable][parameter] * PRIOR[parameter][0]
-        designs[variable], offsets[variable] = matrix, shift
+            if parameter in slopes:
+                at = dict(zip(_own_dims(parameter, lead), place, strict=True))
+                where = tuple(at.get(dim, slice(None)) for dim in lead)
+                matrix[(*where, slice(None), column)] = slopes[parameter]
+        designs[variable] = matrix
+        offsets[variable] = np.zeros(matrix.shape[:-1])
+        if variable != "intensity":
+            center = matrix @ np.asarray([PRIOR[parameter][0] for parameter, _ in names])
+            offsets[variable] = 0.25 + 0.35 * np.sin(angle) ** 2 - center
     return designs, offsets
+
+
+def _observe(design, offset, truth, valid, noise, rng):
+    observed, saturated = {}, np.zeros(valid.shape, bool)
+    for variable, matrix in design.items():
+        scatter = noise * SCALE[variable] * rng.standard_normal(valid.shape)
+        reading = matrix @ truth + offset[variable] + scatter
+        if variable == "intensity":
+            saturated = (reading >= FULL_SCALE) & valid
+            reading = np.minimum(reading, FULL_SCALE)
+        observed[variable] = np.where(valid, reading, np.nan)
+    return observed, saturated
+
+
+def _predict(design, offset, theta, observed, valid, grid, lead, rng):
+    dims = ("chain", "draw", *lead, "view")
+    centers, predictive, density = {}, {}, {}
+    for variable, matrix in design.items():
+        center = np.einsum("...p,sp->s...", matrix, theta) + offset[variable]
+        predicted = center + SCALE[variable] * rng.standard_normal(center.shape)
+        if variable == "intensity":
+            predicted = np.minimum(predicted, FULL_SCALE)
+        z = (np.where(valid, observed[variable], 0.0) - center) / SCALE[variable]
+        log_density = -0.5 * z**2 - np.log(SCALE[variable] * np.sqrt(2 * np.pi))
+        shape = (*grid, *valid.shape)
+        centers[variable] = (dims, center.reshape(shape))
+        predictive[variable] = (dims, predicted.reshape(shape))
+        density[variable] = (dims, np.where(valid, log_density, 0.0).reshape(shape))
+    return {
+        "noise_free": centers,
+        "posterior_predictive": predictive,
+        "log_likelihood": density,
+    }
 
 
 def _posterior(design, offset, observed, used, location, width):
@@ -238,14 +211,45 @@ def _posterior(design, offset, observed, used, location, width):
 
 def _label(theta, names, lead, grid):
     labelled = {}
-    for parameter in dict.fromkeys(n for n, _ in names):
-        columns = [i for i, (n, _) in enumerate(names) if n == parameter]
-        own = [d for d in lead if parameter != "exposure" and d != "wavelength"]
-        own += [d for d in lead if d == "wavelength" and parameter in SPECTRAL]
-        own = [d for d in lead if d in own]
-        values = theta[:, columns].reshape(*grid, *(lead[d] for d in own))
+    for parameter in PRIOR:
+        columns = [i for i, (owner, _) in enumerate(names) if owner == parameter]
+        own = _own_dims(parameter, lead)
+        values = theta[:, columns].reshape(*grid, *(lead[dim] for dim in own))
         labelled[parameter] = (("chain", "draw", *own), values)
     return labelled
+
+
+def _log_prior(theta, names, location, width, grid):
+    scores = -0.5 * ((theta - location) / width) ** 2
+    owners = np.asarray([parameter for parameter, _ in names])
+    return {
+        parameter: (("chain", "draw"), scores[:, owners == parameter].sum(axis=1).reshape(grid))
+        for parameter in PRIOR
+    }
+
+
+def _provenance(method, variables, limit, name, seed):
+    provenance = {
+        "method": method,
+        "model": "per_material",
+        "scene": "paper",
+        "scene_parts": "Scene(surface=SmoothSurface())",
+        "priors": {n: f"Normal(loc={m:g}, scale={s:g})" for n, (m, s) in PRIOR.items()},
+        "links": {variable: "NormalLink()" for variable in variables},
+        "swapped": ["prior of refractive_index"],
+        "largest_view_zenith": limit,
+        "seed": seed,
+        "precision": "double",
+        "chain_method": "threads",
+        "versions": {"polar_bayes": "0.1.0"},
+        "machine": {"processor": "x86_64", "python": "3.12"},
+        "timings": {"modes": 1.5, "draws": 2.25},
+        "problems": [],
+        "capture": {"name": name, "setup": "paper"},
+    }
+    if method != "point":
+        provenance["modes"] = {"starts": 16, "failures": 0, "weights": [1.0]}
+    return provenance
 
 
 def _stats(method, grid, rng):
@@ -253,7 +257,8 @@ def _stats(method, grid, rng):
     if method == "point":
         return {"loss": (dims, np.zeros(grid))}
     if method == "laplace":
-        return {"lp": (dims, rng.standard_normal(grid))}
+        weight = 1e-3 * rng.standard_normal(grid)
+        return {"lp": (dims, rng.standard_normal(grid)), "log_weight": (dims, weight)}
     return {
         "diverging": (dims, np.zeros(grid, bool)),
         "acceptance_rate": (dims, np.full(grid, 0.9)),
@@ -265,8 +270,8 @@ def _stats(method, grid, rng):
     }
 
 
-def _constants(zenith, azimuths, valid, saturated, truth, names, lead, coords):
-    order = (*lead, "view")
+def _constants(zenith, azimuths, valid, saturated, truth, coords):
+    order = (*coords, "view")
     constants = {
         "view_zenith": ("view", zenith, {"units": "degree"}),
         "view_azimuth": ("view", np.resize(azimuths, len(zenith))),
@@ -275,8 +280,7 @@ def _constants(zenith, azimuths, valid, saturated, truth, names, lead, coords):
         "valid": (order, valid.astype("int8")),
         "saturated": (order, saturated.astype("int8")),
     }
-    labelled = _label(truth[None], names, lead, (1, 1))
-    for name, (dims, values) in labelled.items():
+    for name, (dims, values) in truth.items():
         if name != "exposure":
             constants[f"true_{name}"] = (dims[2:], values[0, 0])
     return xr.Dataset(constants, coords)

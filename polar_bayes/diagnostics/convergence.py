@@ -216,15 +216,16 @@ def _chains_disagree(table: pd.DataFrame) -> list[str]:
     if len(unequal):
         problems.append(
             f"R-hat above {LARGEST_R_HAT}: {_list(unequal, lambda x: f'{x:.4g}')}; the chains "
-            "have not found one distribution, so sample longer, as in Nuts(warmup=1000, most_draws=20000)"
-            ", and look at the pair plot for several modes."
+            "have not found one distribution, so sample longer, as in Nuts(warmup=1000, "
+            "most_draws=20000), and look at the pair plot for several modes."
         )
     for column, part, place in (("ess_bulk", "Bulk", "center"), ("ess_tail", "Tail", "interval")):
         few = table[column][~(table[column] >= SMALLEST_ESS)].sort_values()
         if len(few):
             problems.append(
                 f"{part} ESS below {SMALLEST_ESS}: {_list(few, lambda x: f'{np.floor(x):.0f}')}; "
-                f"the {place} is not known well enough, so sample longer, as in Nuts(most_draws=20000)."
+                f"the {place} is not known well enough, so sample longer, as in "
+                "Nuts(most_draws=20000)."
             )
     return problems
 

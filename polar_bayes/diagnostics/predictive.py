@@ -172,7 +172,7 @@ def _select(result: xr.DataTree, name: str) -> _Part | None:
     needed = ("posterior_predictive", "noise_free")
     if any(g not in result.children or name not in result[g].data_vars for g in needed):
         return None
-    observed = result["observed_data"][name]
+    observed = result["observed_data"].to_dataset()[name]
     keep = usable(result, name)
 
     def flat(group: str) -> np.ndarray:
@@ -200,7 +200,7 @@ def usable(result: xr.DataTree, name: str) -> np.ndarray:
     Returns:
         Booleans of that variable's shape.
     """
-    observed = result["observed_data"][name]
+    observed = result["observed_data"].to_dataset()[name]
     keep = np.isfinite(observed.to_numpy())
     constants = result["constant_data"].to_dataset() if "constant_data" in result.children else {}
     for flag, wanted in (("valid", True), ("saturated", False)):

@@ -1,6 +1,7 @@
 """What did the data say? Prior against posterior, and what a bent prior would change."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -97,7 +98,7 @@ def _total(result: xr.DataTree, group: str) -> np.ndarray | None:
     """The sum of a group of log densities, shape (chain, draw)."""
     if group not in result.children or not result[group].data_vars:
         return None
-    total = 0.0
+    total: Any = 0.0
     for density in result[group].data_vars.values():
         rest = [dim for dim in density.dims if dim not in SAMPLE_DIMS]
         total = total + density.sum(rest, skipna=False).transpose(*SAMPLE_DIMS).to_numpy()

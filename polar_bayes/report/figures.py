@@ -5,6 +5,7 @@ figure is the last line of a cell; `figure.savefig("name.pdf")` writes it.
 """
 
 import textwrap
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -312,7 +313,7 @@ def _scatter(axes: Axes, xy: np.ndarray, shown: np.ndarray, diverging: np.ndarra
 
 
 def _cross(axes: Axes, x: float, y: float) -> None:
-    style = {"color": ORANGE, "lw": 1.2, "ls": "--", "zorder": 3}
+    style: dict[str, Any] = {"color": ORANGE, "lw": 1.2, "ls": "--", "zorder": 3}
     if np.isfinite(x):
         axes.axvline(x, **style)
     if np.isfinite(y):

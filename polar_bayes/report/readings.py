@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -217,7 +218,7 @@ def _draw_wrapped(
 
 
 def _curves(result: xr.DataTree, name: str) -> Iterator[Curve]:
-    observed = result["observed_data"][name]
+    observed = result["observed_data"].to_dataset()[name]
     lead = [str(dim) for dim in observed.dims if dim != "view"]
     values = observed.transpose(*lead, "view").to_numpy()
     order = (*SAMPLE_DIMS, *lead, "view")
@@ -304,7 +305,7 @@ def _panel(axes: Axes, curve: Curve, limit: float) -> set[str]:
 def _prediction(axes: Axes, curve: Curve) -> set[str]:
     if not curve.zenith.size:
         return set()
-    style = {"color": BLUE, "zorder": 3}
+    style: dict[str, Any] = {"color": BLUE, "zorder": 3}
     if curve.is_smooth:
         axes.plot(curve.zenith, curve.center, lw=1.4, **style)
     else:
@@ -336,19 +337,19 @@ def _limits(axes: Axes, found: list[Curve], *, is_share: bool) -> None:
 
 
 def _mark(axes: Axes, key: str, x: np.ndarray, y: np.ndarray) -> None:
-    style = {
+    style: dict[str, Any] = {
         "reading": {"marker": "o", "ms": 3.4, "color": BLACK},
         "saturated": {"marker": "^", "ms": 5.5, "color": VERMILLION, "mec": BLACK, "mew": 0.5},
     }[key]
     axes.plot(x, y, ls="none", zorder=5, **style)
 
 
-def _masked_style() -> dict:
+def _masked_style() -> dict[str, Any]:
     return {"ls": "none", "marker": "x", "ms": 4.5, "color": GRAY, "mew": 1.1}
 
 
 def _legend() -> dict[str, Line2D | Patch]:
-    none = {"ls": "none"}
+    none: dict[str, Any] = {"ls": "none"}
     return {
         "reading": Line2D([], [], marker="o", ms=3.4, color=BLACK, label="reading", **none),
         "saturated": Line2D(

@@ -73,7 +73,7 @@ def estimate_table(result: xr.DataTree, found: Sequence[Scalar], table: pd.DataF
         rows.append(_row(scalar, posterior, cells))
     heads = ("parameter", "estimate", "standard error", *(["true value"] if known else []))
     caption = "Least squares; standard errors from the curvature and the residuals."
-    return Table(caption, heads, tuple(rows))
+    return Table(caption, tuple(heads), tuple(rows))
 
 
 def convergence_table(found: Sequence[Scalar], table: pd.DataFrame, posterior: xr.Dataset) -> Table:
@@ -90,7 +90,7 @@ def convergence_table(found: Sequence[Scalar], table: pd.DataFrame, posterior: x
         rows.append(_row(scalar, posterior, cells))
     heads = ("parameter", "R-hat", "ESS bulk", "ESS tail", "error of the mean")
     caption = "Wanted: R-hat at most 1.01 and both effective sample sizes (ESS) at least 400."
-    return Table(caption, heads, tuple(rows))
+    return Table(caption, tuple(heads), tuple(rows))
 
 
 def discrepancy_table(
@@ -111,13 +111,13 @@ def discrepancy_table(
         cells += [percent(row["width_ratio"])]
         cells += numbers([truths[scalar.label]], scale) if known else []
         rows.append(_row(scalar, posterior, cells))
-    heads = ("parameter", "mean", "95% interval", "mean without", "95% without", "width")
-    heads += ("true value",) if known else ()
+    heads = ["parameter", "mean", "95% interval", "mean without", "95% without", "width"]
+    heads += ["true value"] if known else []
     caption = (
         "The fit of this report beside the same fit without the discrepancy term. Width: that of "
         "the interval without the term over that with it."
     )
-    return Table(caption, heads, tuple(rows))
+    return Table(caption, tuple(heads), tuple(rows))
 
 
 def sensitivity_table(found: Sequence[Scalar], prior: pd.DataFrame, posterior: xr.Dataset) -> Table:
@@ -134,13 +134,13 @@ def sensitivity_table(found: Sequence[Scalar], prior: pd.DataFrame, posterior: x
             str(row["remark"]),
         )
         rows.append(_row(scalar, posterior, cells))
-    heads = ("parameter", "prior 95%", "posterior 95%", "width left")
-    heads += ("to the priors", "to the data", "remark")
+    heads = ["parameter", "prior 95%", "posterior 95%", "width left"]
+    heads += ["to the priors", "to the data", "remark"]
     caption = (
         "To the priors, to the data: how fast the posterior moves when all priors, or all data, "
         f"count a little more; from {SENSITIVE} on it matters."
     )
-    return Table(caption, heads, tuple(rows))
+    return Table(caption, tuple(heads), tuple(rows))
 
 
 def check_table(checks: Mapping[str, Check]) -> Table:
@@ -166,7 +166,7 @@ def check_table(checks: Mapping[str, Check]) -> Table:
         "all others, summed; p the effective number of parameters; k > 0.7 counts readings for "
         "which this cannot be trusted. Saturated readings are not compared."
     )
-    return Table(caption, heads, tuple(rows))
+    return Table(caption, tuple(heads), tuple(rows))
 
 
 def sampler_facts(result: xr.DataTree, method: str, provenance: Mapping[str, Any]) -> list[Row]:
@@ -195,8 +195,8 @@ def sampler_facts(result: xr.DataTree, method: str, provenance: Mapping[str, Any
 
 def provenance_groups(provenance: Mapping[str, Any]) -> list[tuple[str, list[Row]]]:
     """How the fit was made, in titled groups of name and text."""
-    keys = ("method", "settings", "model", "scene", "scene_parts", "seed", "precision")
-    keys += ("chain_method", "largest_view_zenith")
+    keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
+    keys += ["chain_method", "largest_view_zenith"]
     fit = {key.replace("_", " "): provenance[key] for key in keys if key in provenance}
     fit["swapped by the user"] = provenance.get("swapped") or "nothing: all defaults"
     timings = dict(provenance.get("timings") or {})
