@@ -110,9 +110,9 @@ def edit_provenance(tree, **changes):
 
 
 def replace(tree, group, name, values):
-    """Replace one variable of a group, in place, keeping its dims."""
+    """Replace one variable of a group, in place, keeping its dims and attributes."""
     dataset = tree[group].to_dataset()
-    dataset[name] = (dataset[name].dims, np.asarray(values))
+    dataset[name] = (dataset[name].dims, np.asarray(values), dataset[name].attrs)
     tree[group] = xr.DataTree(dataset)
     return tree
 

@@ -36,7 +36,7 @@ class Loo:
 
     Args:
         elpd: Expected log density of a new reading, summed over the readings, unit nat.
-        standard_error: Of `elpd`.
+        standard_error: Of `elpd`; NaN for a single reading.
         p_loo: Effective number of parameters.
         pareto_k: Of each reading; above 0.7 its own share cannot be trusted.
         pit: Share of the prediction from all other readings that lies below each reading.
@@ -248,11 +248,16 @@ def _loo(part: _Part, efficiency: float, correction: np.ndarray | None) -> Loo |
     p_loo = _log_sum(log_likelihood + flat - _log_sum(flat)) - elpd
     return Loo(
         elpd=float(np.sum(elpd)),
-        standard_error=float(np.sqrt(elpd.size * np.var(elpd))),
+        standard_error=_standard_error(elpd),
         p_loo=float(np.sum(p_loo)),
         pareto_k=pareto_k,
         pit=_pit(part, np.exp(log_weights)),
     )
+
+
+def _standard_error(parts: np.ndarray) -> float:
+    """Of a sum, from the spread of its parts."""
+    return float(np.sqrt(parts.size * np.var(parts, ddof=1))) if parts.size > 1 else math.nan
 
 
 def _log_sum(values: np.ndarray) -> np.ndarray:

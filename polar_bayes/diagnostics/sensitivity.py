@@ -114,7 +114,7 @@ def _bent_weights(log_density: np.ndarray | None) -> list[np.ndarray] | None:
     bent = []
     for power in POWERS:
         with np.errstate(all="ignore"):  # smoothing an extreme tail overflows inside ArviZ
-            log_weight = array_stats.power_scale_lw(log_density, power)
+            log_weight = array_stats.power_scale_lw(log_density, power, axis=(-2, -1))
         if not np.isfinite(log_weight).all():
             return None
         weight = np.exp(log_weight - log_weight.max())

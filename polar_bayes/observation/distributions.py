@@ -5,12 +5,13 @@ written as a divergence plus Stirling remainders, so that concentrations of 1e8 
 `SensorStudentT` is Student's t as a sensor records it, stopped at zero and at full scale.
 """
 
+import functools
 import math
-from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import betainc
+import numpy as np
+import scipy.special
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 from numpyro.distributions import constraints
@@ -138,7 +139,7 @@ class SensorStudentT(dist.Distribution):
         return jnp.clip(self.location, 0.0, self.full_scale)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(1,))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def log_survival(distance: Float[Array, "..."], degrees_of_freedom: float) -> Float[Array, "..."]:
     """Log probability that Student's t exceeds `distance`, finite far into the tail.
 
@@ -150,11 +151,14 @@ def log_survival(distance: Float[Array, "..."], degrees_of_freedom: float) -> Fl
         The log probability; its derivative is minus the hazard, exact at 0 too, where the
         incomplete beta function alone has none.
     """
-    tiny = jnp.finfo(jnp.result_type(distance)).tiny
-    argument = degrees_of_freedom / (degrees_of_freedom + distance**2)
-    tail = 0.5 * betainc(0.5 * degrees_of_freedom, 0.5, jnp.maximum(argument, tiny))
-    tail = jnp.maximum(tail, tiny)
-    return jnp.where(distance > 0.0, jnp.log(tail), jnp.log1p(-tail))
+    dtype = jnp.result_type(float, distance)
+    # With tan(angle) = sqrt(nu) / |t| the tail is an integral of sin(phi) ** (nu - 1) over phi up
+    # to the angle: smooth everywhere, so a Gauss-Jacobi rule replaces the incomplete beta function.
+    angle = jnp.arctan2(jnp.asarray(math.sqrt(degrees_of_freedom), dtype), jnp.abs(distance))
+    nodes, weights = (jnp.asarray(x, dtype) for x in _tail_rule(degrees_of_freedom))
+    rise = jnp.sinc(angle[..., None] * nodes / jnp.pi) ** (degrees_of_freedom - 1.0)
+    log_tail = degrees_of_freedom * jnp.log(angle) + jnp.log(rise @ weights)
+    return jnp.where(distance > 0.0, log_tail, jnp.log1p(-jnp.exp(log_tail)))
 
 
 @log_survival.defjvp
@@ -163,6 +167,14 @@ def _log_survival_derivative(degrees_of_freedom, primals, tangents):  # noqa: AN
     value = log_survival(distance, degrees_of_freedom)
     log_density = dist.StudentT(degrees_of_freedom, 0.0, 1.0).log_prob(distance)
     return value, -jnp.exp(log_density - value) * step
+
+
+@functools.cache
+def _tail_rule(degrees_of_freedom: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes on (0, 1) and weights of s ** (nu - 1), divided by the beta function of the tail."""
+    nodes, weights = scipy.special.roots_jacobi(12, 0.0, degrees_of_freedom - 1.0)
+    scale = 2.0**degrees_of_freedom * scipy.special.beta(0.5 * degrees_of_freedom, 0.5)
+    return 0.5 * (nodes + 1.0), weights / scale
 
 
 def _excess(step: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -172,7 +172,8 @@ def hemispherical_reflection(refractive_index: Array) -> Array:
         _like(sin_squared, refractive_index),
         refractive_index[..., None],
     )
-    return mean @ _like(2.0 * cosine * HEMISPHERE_WEIGHTS, refractive_index)
+    # A sum, since matrix products of accelerators drop digits in single precision.
+    return jnp.sum(mean * _like(2.0 * cosine * HEMISPHERE_WEIGHTS, refractive_index), axis=-1)
 
 
 def escape(refractive_index: Array) -> Array:

@@ -210,7 +210,7 @@ class Disc(AbstractExtendedSource):
         cos_light = cos_light + jnp.asarray(sine_cosine, cos_view.dtype) * sin_view
         cos_light = jnp.clip(cos_light, 1e-4, 1.0)
         passing = cos_light * fresnel.transmission(cos_light, refractive_index[..., None])
-        return passing @ jnp.asarray(solid_angle, cos_view.dtype)
+        return jnp.sum(passing * jnp.asarray(solid_angle, cos_view.dtype), axis=-1)
 
     def _directions(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cosine from the axis, sine times cosine of azimuth, and solid angle of each direction."""

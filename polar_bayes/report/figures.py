@@ -4,7 +4,6 @@
 figure is the last line of a cell; `figure.savefig("name.pdf")` writes it.
 """
 
-import textwrap
 from typing import Any
 
 import numpy as np
@@ -39,6 +38,7 @@ from polar_bayes.report.style import (
     quiet_ticks,
     styled,
     title_of,
+    wrapped,
 )
 
 MOST_PAIRED = 8
@@ -155,7 +155,7 @@ def ranks(result: xr.DataTree) -> Figure:
             axes.stairs(share, edges, color=color, lw=1.1, baseline=None)
         axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
         axes.set(xlim=(0, 1), ylim=(0, max(2.0, axes.get_ylim()[1])), xticks=[0, 0.5, 1])
-        axes.set_title(title_of(scalar, posterior), loc="left")
+        axes.set_title(wrapped(title_of(scalar, posterior), 36), loc="left")
     quiet_ticks(panels)
     figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)", fontsize=9)
     figure.supylabel("density", fontsize=9)
@@ -205,7 +205,7 @@ def prior_posterior(result: xr.DataTree) -> Figure:
         axes.set(xlim=limits, ylim=(-0.18, 1.08), yticks=[])
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
-        axes.set_title(title_of(scalar, posterior), loc="left")
+        axes.set_title(wrapped(title_of(scalar, posterior), 36), loc="left")
     quiet_ticks(panels)
     handles: list[Patch | Line2D] = [
         Patch(color=lighten(GRAY, 0.72), label="prior"),
@@ -346,9 +346,7 @@ def _pair_ticks(axes: Axes, row: int, column: int, size: int) -> None:
 
 def _narrow(text: str) -> str:
     """Break a label at its commas, and long parts at a space, for narrow panels."""
-    return "\n".join(
-        line for part in text.split(", ") for line in textwrap.wrap(part, 19, max_lines=2)
-    )
+    return "\n".join(wrapped(part, 19) for part in text.split(", "))
 
 
 def _nothing(what: str, needed: str) -> FitError:

@@ -26,6 +26,7 @@ from polar_bayes.report.style import (
     plain,
     quiet_ticks,
     styled,
+    wrapped,
 )
 
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
@@ -207,7 +208,7 @@ def _draw_wrapped(
     drawn: set[str] = set()
     for axes, curve in zip(panels.flat, shown, strict=False):
         drawn |= _panel(axes, curve.at(np.ones(curve.zenith.shape, bool)), limit)
-        axes.set_title(plain(curve.title, 34))
+        axes.set_title(wrapped(plain(curve.title), 34))
     for row in panels:
         row[0].set_ylabel(quantity)
     for axes in panels.flat[len(shown) :]:

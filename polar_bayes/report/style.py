@@ -6,6 +6,7 @@ belongs to pyplot, so drawing a report leaves a notebook as it was.
 
 import functools
 import math
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -121,6 +122,11 @@ def plain(text: str, longest: int = 60) -> str:
     known = _characters()
     drawn = "".join(c if ord(c) in known else "□" for c in line)
     return drawn if len(drawn) <= longest else f"{drawn[: longest - 1]}…"
+
+
+def wrapped(text: str, width: int, lines: int = 2) -> str:
+    """Text broken into short lines, cut where there are too many."""
+    return "\n".join(textwrap.wrap(text, width, max_lines=lines, placeholder="…"))
 
 
 def lighten(color: str, share: float) -> tuple[float, float, float]:

@@ -146,27 +146,34 @@ def sensitivity_table(found: Sequence[Scalar], prior: pd.DataFrame, posterior: x
 def check_table(checks: Mapping[str, Check]) -> Table:
     """Residuals, coverage, and leave-one-out results of every variable."""
     rows = []
+    has_draws = any(check.pit.size for check in checks.values())
     for check in checks.values():
-        chance = {p: 2.0 * math.sqrt(p * (1.0 - p) / check.count) for p in PROBABILITIES}
-        coverage = [
-            f"{check.coverage[p]:.0%} (±{chance[p]:.0%})" if p in check.coverage else DASH
-            for p in PROBABILITIES
-        ]
-        cells = [str(check.count), f"{check.residual_rms:.3g}", *coverage]
-        loo = check.loo
-        cells += [f"{loo.elpd:.1f} ± {loo.standard_error:.1f}" if loo else DASH]
-        cells += [f"{loo.p_loo:.1f}" if loo else DASH, str(loo.unreliable) if loo else DASH]
+        cells = [str(check.count), f"{check.residual_rms:.3g}"]
+        cells += _predictive_cells(check) if has_draws else []
         rows.append(Row(check.name, QUANTITIES[check.name], tuple(cells)))
-    inside = [f"inside {p:.0%}" for p in PROBABILITIES]
-    heads = ("variable", "readings", "residual RMS", *inside, "elpd", "p", "k > 0.7")
-    caption = (
-        "Residual: reading minus the mean noise-free prediction, in the unit of the reading. "
-        "Inside: share of the readings in the central predictive interval, and in brackets how "
-        "far chance alone moves it. Leave-one-out: elpd is the log density of each reading given "
-        "all others, summed; p the effective number of parameters; k > 0.7 counts readings for "
-        "which this cannot be trusted. Saturated readings are not compared."
-    )
+    heads = ["variable", "readings", "residual RMS"]
+    caption = "Residual: reading minus the noise-free prediction, in the unit of the reading."
+    if has_draws:
+        heads += [*(f"inside {p:.0%}" for p in PROBABILITIES), "elpd", "p", "k > 0.7"]
+        caption += (
+            " Inside: share of the readings in the central predictive interval, and in brackets "
+            "how far chance alone moves it. Leave-one-out: elpd is the log density of each reading "
+            "given all others, summed; p the effective number of parameters; k > 0.7 counts "
+            "readings for which this cannot be trusted. Saturated readings are not compared."
+        )
     return Table(caption, tuple(heads), tuple(rows))
+
+
+def _predictive_cells(check: Check) -> list[str]:
+    loo, cells = check.loo, []
+    for probability in PROBABILITIES:
+        chance = 2.0 * math.sqrt(probability * (1.0 - probability) / check.count)
+        share = check.coverage.get(probability, math.nan)
+        cells.append(f"{share:.0%} (±{chance:.0%})" if math.isfinite(share) else DASH)
+    if loo is None:
+        return [*cells, DASH, DASH, DASH]
+    error = or_dash(loo.standard_error, "{:.1f}")
+    return [*cells, f"{loo.elpd:.1f} ± {error}", f"{loo.p_loo:.1f}", str(loo.unreliable)]
 
 
 def sampler_facts(result: xr.DataTree, method: str, provenance: Mapping[str, Any]) -> list[Row]:

@@ -1,0 +1,246 @@
+"""The verdict: every way to fail is named, with its number and its remedy."""
+
+import json
+import re
+
+import arviz_stats
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+from synthetic_results import edit_provenance, make_result, replace
+
+from polar_bayes.diagnostics.convergence import (
+    json_summary,
+    laplace_k_hat,
+    summary,
+    verdict,
+)
+from polar_bayes.errors import FitError
+
+
+def posterior_of(tree, name):
+    return tree["posterior"].to_dataset()[name].to_numpy().copy()
+
+
+def _places(labels):
+    """The variable of each label, and its position in that variable."""
+    seen: dict[str, int] = {}
+    for label in labels:
+        name = label.split("[")[0]
+        yield name, seen.get(name, 0)
+        seen[name] = seen.get(name, 0) + 1
+
+
+def test_table_agrees_with_arviz() -> None:
+    tree = make_result(discrepancy=True)
+    ours = summary(tree)
+    theirs = arviz_stats.summary(tree, ci_prob=0.95, ci_kind="eti", round_to="none")
+    theirs.index = [label.replace(".0]", "]") for label in theirs.index]
+    # The summary takes its tails from ArviZ's default interval; Vehtari et al. define 5% and 95%.
+    tails = arviz_stats.ess(tree, method="tail", prob=(0.05, 0.95))
+    theirs["ess_tail"] = [tails[name].to_numpy().ravel()[at] for name, at in _places(theirs.index)]
+    columns = {"eti95_lb": "q2.5", "eti95_ub": "q97.5"}
+    theirs = theirs.rename(columns=columns).loc[ours.index, ours.columns]
+    np.testing.assert_allclose(ours.to_numpy(float), theirs.to_numpy(float), rtol=1e-10)
+
+
+def test_material_parameters_come_first_and_vectors_last() -> None:
+    labels = list(summary(make_result(discrepancy=True, wavelengths=(450.0, 532.5))).index)
+    assert labels == [
+        "roughness",
+        "subsurface_fraction",
+        "absorption[450]",
+        "absorption[532.5]",
+        "refractive_index[450]",
+        "refractive_index[532.5]",
+        "exposure",
+        *(f"discrepancy_weights[{i}]" for i in range(4)),
+    ]
+
+
+def test_materials_are_named() -> None:
+    labels = summary(make_result(materials=("leaf", "fruit"), wavelengths=(450.0,), views=6)).index
+    assert "refractive_index[fruit, 450]" in labels
+
+
+def test_two_readings_at_one_wavelength_keep_two_rows() -> None:
+    table = summary(make_result(wavelengths=(450.0, 450.0), views=6))
+    assert table.index.is_unique
+    assert "refractive_index[450]#2" in table.index
+
+
+def test_a_good_fit_converges_without_a_word() -> None:
+    judged = verdict(make_result())
+    assert judged.converged
+    assert judged.problems == judged.cautions == ()
+
+
+def test_a_stuck_chain_is_named() -> None:
+    tree = make_result()
+    draws = posterior_of(tree, "roughness")
+    draws[0] += 5.0 * draws.std()
+    judged = verdict(replace(tree, "posterior", "roughness", draws))
+    assert not judged.converged
+    assert any("R-hat above 1.01: roughness" in p and "sample longer" in p for p in judged.problems)
+
+
+def test_a_parameter_that_never_moves_fails() -> None:
+    tree = make_result(discrepancy=True)
+    draws = np.full_like(posterior_of(tree, "exposure"), 0.7)
+    judged = verdict(replace(tree, "posterior", "exposure", draws))
+    assert not judged.converged
+    assert any("exposure nan" in problem for problem in judged.problems)
+
+
+def test_chains_that_each_stand_still_fail() -> None:
+    tree = make_result()
+    draws = posterior_of(tree, "exposure") * 0.0 + np.arange(4.0)[:, None]
+    assert not verdict(replace(tree, "posterior", "exposure", draws)).converged
+
+
+def test_too_few_effective_draws_fail() -> None:
+    judged = verdict(make_result(draws=60))
+    assert not judged.converged
+    assert any("ESS below 400" in p and "most_draws" in p for p in judged.problems)
+
+
+def test_long_lists_are_cut() -> None:
+    problems = verdict(make_result(draws=60, discrepancy=True)).problems
+    problem = next(problem for problem in problems if problem.startswith("Bulk ESS"))
+    assert re.search(r"and \d more;", problem)
+    assert problem.count("[") <= 4
+
+
+def test_one_divergence_fails() -> None:
+    tree = make_result()
+    diverging = np.zeros((4, 250), bool)
+    diverging[2, 17] = True
+    judged = verdict(replace(tree, "sample_stats", "diverging", diverging))
+    assert judged.problems[0].startswith("1 of 1000 draws diverged")
+    assert "target_acceptance" in judged.problems[0]
+
+
+@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_one_draw_that_is_not_finite_fails(method: str, bad: float) -> None:
+    tree = make_result(method=method)
+    draws = posterior_of(tree, "refractive_index")
+    draws[0, 0, 1] = bad
+    tree = replace(tree, "posterior", "refractive_index", draws)
+    judged = verdict(tree)
+    assert not judged.converged
+    assert any("Not finite: refractive_index[550]" in problem for problem in judged.problems)
+    assert np.isfinite(summary(tree).loc["refractive_index[650]", "mean"])
+
+
+@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
+def test_what_the_fit_noted_itself_fails(method: str) -> None:
+    tree = edit_provenance(make_result(method=method), problems=["it never ended"])
+    judged = verdict(tree)
+    assert not judged.converged
+    assert judged.problems == ("It never ended.",)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"modes": {"weights": [0.9, 0.1]}}, "another mode, of weight 0.1"),
+        ({"counts": {"views": 100, "masked": 40}}, "40 of 100 readings are marked valid=False"),
+        ({"counts": {"at_margin": {"dop": 3}}}, "3 readings of dop lie at the edge"),
+    ],
+)
+def test_cautions_do_not_fail(change: dict, words: str) -> None:
+    judged = verdict(edit_provenance(make_result(), **change))
+    assert judged.converged
+    assert any(words in caution for caution in judged.cautions)
+
+
+def test_deep_trees_are_a_caution_once_they_are_many() -> None:
+    tree = make_result()
+    deep = np.zeros((4, 250), bool)
+    deep[0, :5] = True
+    assert not verdict(replace(tree, "sample_stats", "reached_max_treedepth", deep)).cautions
+    deep[0, :50] = True
+    cautions = verdict(replace(tree, "sample_stats", "reached_max_treedepth", deep)).cautions
+    assert "50 of 1000 draws reached the largest tree depth" in cautions[0]
+
+
+def laplace_tree(log_weight: np.ndarray) -> xr.DataTree:
+    tree = make_result(method="laplace", draws=1000)
+    return replace(tree, "sample_stats", "log_weight", log_weight)
+
+
+@pytest.mark.parametrize(("width", "trusted"), [(0.3, False), (2.0, True)])
+def test_k_hat_has_the_right_sign(width: float, trusted: bool) -> None:
+    """A standard normal: draws from a narrower one have unbounded weights, from a wider not."""
+    z = np.random.default_rng(3).normal(0.0, width, (4, 1000))
+    log_weight = stats.norm.logpdf(z) - stats.norm.logpdf(z, scale=width)
+    tree = laplace_tree(log_weight)
+    k_hat = laplace_k_hat(tree)
+    # Of a normal seen through a narrower one k tends to 1 - width^2; a wider one bounds weights.
+    assert k_hat == pytest.approx(1.0 - width**2, abs=0.2) if not trusted else k_hat < 0.2
+    judged = verdict(tree)
+    assert judged.converged
+    assert bool(judged.cautions) == (not trusted)
+    assert trusted or "Pareto k-hat" in judged.cautions[0]
+
+
+@pytest.mark.parametrize(
+    ("value", "cautious"), [(0.0, False), (np.nan, True), (np.inf, True), (-np.inf, True)]
+)
+def test_k_hat_of_weights_that_are_all_alike(value: float, cautious: bool) -> None:
+    judged = verdict(laplace_tree(np.full((4, 1000), value)))
+    assert bool(judged.cautions) == cautious
+
+
+def test_a_few_weights_of_zero_are_no_reason_to_worry() -> None:
+    log_weight = np.random.default_rng(0).normal(0.0, 0.01, (4, 1000))
+    log_weight[0, :3] = -np.inf
+    assert laplace_k_hat(laplace_tree(log_weight)) < 0.7
+
+
+def test_a_point_fit_has_standard_errors_and_no_chains() -> None:
+    tree = make_result(method="point")
+    table = summary(tree)
+    assert np.isfinite(table["mean"]).all()
+    assert table.loc["refractive_index[550]", "sd"] == pytest.approx(0.08)
+    assert np.isnan(table.loc["exposure", "sd"])
+    assert table[["q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail"]].isna().all(axis=None)
+    judged = verdict(tree)
+    assert judged.converged
+    assert judged.cautions[0].startswith("No standard error: exposure;")
+
+
+@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
+def test_json_is_valid_json(method: str) -> None:
+    tree = make_result(method=method)
+    said = json.loads(json.dumps(json_summary(tree), allow_nan=False))
+    assert set(said["parameters"]["roughness"]) == {
+        "mean",
+        "sd",
+        "q2.5",
+        "q97.5",
+        "r_hat",
+        "ess_bulk",
+        "ess_tail",
+    }
+    assert said["converged"] is True
+    assert (said["parameters"]["roughness"]["r_hat"] is None) == (method == "point")
+    for key in ("method", "model", "scene", "seed", "counts", "timings", "problems", "cautions"):
+        assert key in said
+
+
+def test_a_file_gives_the_same_table(tmp_path) -> None:
+    tree = make_result(discrepancy=True)
+    tree.to_netcdf(tmp_path / "r.nc", engine="netcdf4")
+    with xr.open_datatree(tmp_path / "r.nc", engine="netcdf4") as opened:
+        read = opened.load()
+    np.testing.assert_array_equal(summary(read).to_numpy(), summary(tree).to_numpy())
+    assert verdict(read) == verdict(tree)
+
+
+@pytest.mark.parametrize("wrong", [xr.DataTree(), "fit.nc", None])
+def test_what_is_no_result_is_refused(wrong: object) -> None:
+    with pytest.raises(FitError, match="result: it holds no posterior; give the tree"):
+        summary(wrong)

@@ -1,0 +1,156 @@
+"""Predictive checks: calm when the model is right, loud when not, steady when there is little."""
+
+import arviz_stats
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+from synthetic_results import SCALE, make_result, replace
+
+from polar_bayes.diagnostics.predictive import pit_band, predictive_checks, usable
+
+SMALL = {"wavelengths": (), "views": 20, "draws": 150}
+
+
+def test_a_calibrated_fit_raises_no_more_alarms_than_it_should() -> None:
+    """Of 60 calibrated fits 5% may leave the band: more than 9 has probability 0.0013."""
+    alarms = 0
+    for seed in range(60):
+        check = predictive_checks(make_result(**SMALL, variables=("dop",), seed=seed))["dop"]
+        alarms += pit_band(check.loo.pit).leaves
+    assert alarms <= stats.binom.isf(0.002, 60, 0.05)
+
+
+def test_pooled_pit_of_calibrated_fits_is_uniform() -> None:
+    """Kolmogorov-Smirnov on one reading from each of 100 fits, at a false-alarm rate of 0.001."""
+    values = [
+        predictive_checks(make_result(**SMALL, variables=("dop",), seed=seed))["dop"].loo.pit[7]
+        for seed in range(100)
+    ]
+    assert stats.kstest(values, "uniform").pvalue > 1e-3
+
+
+@pytest.mark.parametrize(("noise", "first_side"), [(3.0, "above"), (0.25, "below")])
+def test_readings_that_scatter_otherwise_leave_the_band(noise: float, first_side: str) -> None:
+    check = predictive_checks(make_result(noise=noise))["dop"]
+    band = pit_band(check.loo.pit)
+    assert band.leaves
+    early = band.difference[: len(band.at) // 4]
+    assert (early.mean() > 0.0) == (first_side == "above")
+
+
+def test_coverage_and_residuals() -> None:
+    check = predictive_checks(make_result(views=60))["dop"]
+    for probability, share in check.coverage.items():
+        chance = np.sqrt(probability * (1.0 - probability) / check.count)
+        assert abs(share - probability) < 4.0 * chance
+    assert check.residual_rms == pytest.approx(SCALE["dop"], rel=0.2)
+
+
+def test_leave_one_out_agrees_with_arviz() -> None:
+    tree = make_result(**SMALL, variables=("dop",))
+    loo = predictive_checks(tree)["dop"].loo
+    theirs = arviz_stats.loo(tree, var_name="dop", pointwise=True)
+    assert loo.elpd == pytest.approx(theirs.elpd, rel=1e-8)
+    assert loo.standard_error == pytest.approx(theirs.se, rel=1e-8)
+    assert loo.p_loo == pytest.approx(theirs.p, rel=1e-6)
+    np.testing.assert_allclose(loo.pareto_k, theirs.pareto_k.to_numpy(), atol=1e-8)
+    pit = arviz_stats.loo_pit(tree, var_names="dop")["dop"].to_numpy()
+    np.testing.assert_allclose(loo.pit, pit, atol=1e-8)
+
+
+def test_laplace_weights_correct_the_leave_one_out() -> None:
+    """Draws from a wrong normal with their weights say what draws from the posterior say."""
+    right = make_result(**SMALL, variables=("dop",))
+    rng = np.random.default_rng(5)
+    keep = rng.normal(size=(4, 150))
+    tree = make_result(**SMALL, variables=("dop",), method="laplace")
+    plain = predictive_checks(replace(tree, "sample_stats", "log_weight", 0.0 * keep))["dop"].loo
+    assert plain.elpd == pytest.approx(predictive_checks(right)["dop"].loo.elpd, abs=0.5)
+    tilted = predictive_checks(replace(tree, "sample_stats", "log_weight", keep))["dop"].loo
+    assert tilted.elpd != plain.elpd
+    assert np.isfinite(tilted.pit).all()
+
+
+def test_masked_set_aside_and_saturated_readings_are_left_out() -> None:
+    tree = make_result(masked=(3, 4), limit=70.0, wavelengths=())
+    saturated = tree["constant_data"].to_dataset()["saturated"].to_numpy().copy()
+    saturated[10] = 1
+    tree = replace(tree, "constant_data", "saturated", saturated)
+    keep = usable(tree, "intensity")
+    assert not keep[[3, 4, 10, -1]].any()
+    for check in predictive_checks(tree).values():
+        assert check.count == keep.sum() < 40
+
+
+def test_unsaturated_readings_are_compared_with_unsaturated_predictions() -> None:
+    """Half of the prediction is at full scale; a reading in the middle of the rest is typical."""
+    tree = make_result(**SMALL, variables=("intensity",))
+    shape = tree["posterior_predictive"].to_dataset()["intensity"].shape
+    rng = np.random.default_rng(2)
+    below = rng.uniform(0.8, 0.9, shape)
+    predicted = np.where(rng.uniform(size=shape) < 0.5, below, 1.0)
+    tree = replace(tree, "posterior_predictive", "intensity", predicted)
+    tree = replace(tree, "observed_data", "intensity", np.full(shape[-1], 0.85))
+    tree = replace(tree, "constant_data", "saturated", np.zeros(shape[-1], "int8"))
+    np.testing.assert_allclose(predictive_checks(tree)["intensity"].pit, 0.5, atol=0.15)
+
+
+@pytest.mark.parametrize("views", [2, 3, 5, 20])
+def test_few_readings(views: int) -> None:
+    checks = predictive_checks(make_result(wavelengths=(), views=views))
+    for check in checks.values():
+        assert check.count <= views
+        assert np.isfinite(check.residual_rms)
+        assert pit_band(check.pit) is not None
+
+
+def test_a_band_needs_two_values() -> None:
+    assert pit_band(np.array([0.5])) is None
+    assert pit_band(np.array([np.nan, 0.5])) is None
+    assert pit_band(np.array([])) is None
+    assert not pit_band(np.array([0.3, 0.8])).leaves
+    assert pit_band(np.full(50, 0.5)).leaves
+
+
+def test_many_readings_are_fast_and_calibrated() -> None:
+    values = np.random.default_rng(1).uniform(size=20_000)
+    band = pit_band(values)
+    assert not band.leaves
+    assert len(band.at) < 1000
+
+
+def test_constant_predictions_and_readings() -> None:
+    tree = make_result(**SMALL, variables=("dop",))
+    for group in ("posterior_predictive", "noise_free", "log_likelihood"):
+        shape = tree[group].to_dataset()["dop"].shape
+        tree = replace(tree, group, "dop", np.full(shape, 0.3))
+    tree = replace(tree, "observed_data", "dop", np.full(20, 0.3))
+    check = predictive_checks(tree)["dop"]
+    assert check.residual_rms < 1e-12
+    assert check.loo.unreliable == 0
+    assert ((check.pit >= 0.0) & (check.pit <= 1.0)).all()
+
+
+def test_predictions_that_are_not_numbers_give_no_check() -> None:
+    tree = make_result(**SMALL, variables=("dop",))
+    predicted = tree["posterior_predictive"].to_dataset()["dop"].to_numpy().copy()
+    predicted[0, 0] = np.nan
+    check = predictive_checks(replace(tree, "posterior_predictive", "dop", predicted))["dop"]
+    assert check.pit.size == 0
+    assert check.loo is None
+
+
+def test_a_point_fit_has_residuals_only() -> None:
+    check = predictive_checks(make_result(method="point"))["dop"]
+    assert check.residual_rms == pytest.approx(SCALE["dop"], rel=0.3)
+    assert check.pit.size == 0
+    assert check.coverage == {}
+    assert check.loo is None
+
+
+def test_nothing_observed_gives_no_checks() -> None:
+    tree = make_result(**SMALL, masked=range(20))
+    assert predictive_checks(tree) == {}
+    bare = xr.DataTree.from_dict({"posterior": tree["posterior"].to_dataset()})
+    assert predictive_checks(bare) == {}

@@ -1,0 +1,79 @@
+"""What the data determined, and what would move with the prior."""
+
+import arviz_stats
+import numpy as np
+import pytest
+import xarray as xr
+from synthetic_results import PRIOR, make_result, replace
+
+from polar_bayes.diagnostics.discrepancy import compare_without_discrepancy
+from polar_bayes.diagnostics.sensitivity import sensitivity
+
+
+def test_widths_are_those_of_normal_distributions() -> None:
+    tree = make_result(draws=1000)
+    table = sensitivity(tree)
+    sd = tree["posterior"].to_dataset()["subsurface_fraction"].std().item()
+    share = sd / PRIOR["subsurface_fraction"][1]
+    row = table.loc["subsurface_fraction"]
+    # 500 prior draws know their own 95% width to about 4%.
+    assert row["width_left"] == pytest.approx(share, rel=0.15)
+    assert row["contraction"] == pytest.approx(1.0 - share**2, abs=0.02)
+
+
+def test_verdicts() -> None:
+    table = sensitivity(make_result(discrepancy=True))
+    assert table.loc["refractive_index[550]", "verdict"] == "determined"
+    assert table.loc["discrepancy_weights[2]", "verdict"] == "not determined"
+    assert list(table.index[:2]) == ["roughness", "subsurface_fraction"]
+
+
+def test_a_posterior_equal_to_the_prior_is_not_determined() -> None:
+    tree = make_result()
+    draws = np.random.default_rng(0).normal(*PRIOR["exposure"], (4, 250))
+    table = sensitivity(replace(tree, "posterior", "exposure", draws))
+    assert table.loc["exposure", "verdict"] == "not determined"
+
+
+def test_power_scaling_agrees_with_arviz() -> None:
+    tree = make_result()
+    table = sensitivity(tree)
+    for group, column in (("prior", "prior_sensitivity"), ("likelihood", "likelihood_sensitivity")):
+        theirs = arviz_stats.psense(tree, group=group)
+        assert table.loc["roughness", column] == pytest.approx(theirs["roughness"].item())
+        index = theirs["refractive_index"].sel(wavelength=550.0).item()
+        assert table.loc["refractive_index[550]", column] == pytest.approx(index)
+
+
+def test_without_densities_or_prior_the_rest_stands() -> None:
+    tree = make_result()
+    for group in ("prior", "log_prior"):
+        del tree[group]
+    table = sensitivity(tree)
+    assert (table["verdict"] == "unknown").all()
+    assert table["prior_sensitivity"].isna().all()
+    assert table["likelihood_sensitivity"].notna().all()
+    assert table["q2.5"].notna().all()
+
+
+def test_constant_columns_and_draws_that_are_not_finite() -> None:
+    tree = make_result()
+    tree = replace(tree, "posterior", "roughness", np.full((4, 250), 0.2))
+    tree = replace(tree, "posterior", "exposure", np.full((4, 250), np.nan))
+    tree["log_prior"] = xr.DataTree(tree["log_prior"].to_dataset() * 0.0)
+    table = sensitivity(tree)
+    assert np.isnan(table.loc["roughness", "likelihood_sensitivity"])
+    assert np.isnan(table.loc["exposure", "width_left"])
+    assert table.loc["exposure", "verdict"] == "unknown"
+    assert table["prior_sensitivity"].isna().all()
+
+
+def test_a_point_fit_has_no_widths() -> None:
+    assert sensitivity(make_result(method="point")).empty
+
+
+def test_fits_without_the_discrepancy_stand_beside() -> None:
+    table = compare_without_discrepancy(make_result(discrepancy=True))
+    assert "exposure" not in table.index
+    np.testing.assert_allclose(table["width_ratio"], 0.4, rtol=1e-2)
+    assert compare_without_discrepancy(make_result()).empty

@@ -1,0 +1,166 @@
+"""Every figure draws for every kind of result, clips nothing and leaves matplotlib as it was."""
+
+import functools
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from synthetic_results import edit_provenance, make_result, replace
+
+from polar_bayes.errors import FitError
+from polar_bayes.report import figures
+from polar_bayes.report.readings import curves
+
+CASES = {
+    "three wavelengths, four azimuths": {"azimuths": (180.0, 150.0, 120.0, 60.0)},
+    "one wavelength": {"wavelengths": (550.0,)},
+    "no wavelength": {"wavelengths": ()},
+    "two views": {"wavelengths": (), "views": 2},
+    "signed": {"variables": ("q",), "wavelengths": ()},
+    "masked and set aside": {"masked": (0, 5, 6), "limit": 78.0},
+    "all directions": {"azimuths": tuple(np.linspace(-170.0, 180.0, 40)), "wavelengths": ()},
+    "materials": {"materials": ("leaf", "fr$ui_t^", "<script>"), "wavelengths": (450.0,)},
+    "many wavelengths": {"wavelengths": tuple(range(400, 700, 25))},
+    "unusual names": {"materials": ("\u53f6\u5b50", "a" * 300, "line\nbreak"), "wavelengths": ()},
+    "laplace": {"method": "laplace", "discrepancy": True},
+    "point": {"method": "point"},
+}
+
+
+@functools.cache
+def result_of(case: str):
+    return make_result(**{"draws": 50, "views": 10, **CASES[case]})
+
+
+def clipped(figure: Figure) -> list[str]:
+    """Texts that reach out of the figure."""
+    figure.draw_without_rendering()
+    frame = figure.bbox.padded(1.0)
+    hidden = {id(text) for axes in figure.axes for text in _not_drawn(axes)}
+    found = []
+    for text in figure.findobj(Text):
+        if text.get_visible() and text.get_text().strip() and id(text) not in hidden:
+            box = text.get_window_extent()
+            inside_x = frame.x0 <= box.x0 and box.x1 <= frame.x1
+            inside_y = frame.y0 <= box.y0 and box.y1 <= frame.y1
+            found += [] if inside_x and inside_y else [text.get_text()]
+    return found
+
+
+def _not_drawn(axes):
+    """Tick labels of axes that are switched off, and of ticks outside the limits."""
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = sorted(axis.get_view_interval())
+        for tick in axis.get_major_ticks():
+            if not axes.axison or not low <= tick.get_loc() <= high:
+                yield tick.label1
+                yield tick.label2
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_readings_of_every_layout(case: str) -> None:
+    result = result_of(case)
+    for draw, name in ((figures.readings, "dop"), (figures.residuals, "intensity")):
+        figure = draw(result, name if name in result["observed_data"].data_vars else "q")
+        assert clipped(figure) == []
+        assert figure.legends[0].get_texts()
+
+
+@pytest.mark.parametrize(
+    "draw", [figures.pairs, figures.ranks, figures.prior_posterior, figures.pit]
+)
+@pytest.mark.parametrize(
+    "case",
+    [
+        "three wavelengths, four azimuths",
+        "no wavelength",
+        "two views",
+        "materials",
+        "unusual names",
+        "laplace",
+    ],
+)
+def test_parameters_and_checks_of_every_layout(case: str, draw) -> None:
+    assert clipped(draw(result_of(case))) == []
+
+
+def test_nothing_global_changes() -> None:
+    before = dict(matplotlib.rcParams)
+    result = result_of("one wavelength")
+    figures.readings(result, "dop")
+    figures.pairs(result)
+    with pytest.raises(FitError):
+        figures.readings(result, "u")
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_saturated_masked_and_set_aside_views_are_marked() -> None:
+    result = make_result(wavelengths=(), masked=(3,), limit=78.0, draws=100)
+    saturated = np.zeros(40, "int8")
+    saturated[20] = 1
+    result = replace(result, "constant_data", "saturated", saturated)
+    figure = figures.readings(result, "intensity")
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    for expected in ("saturated", "masked: not fitted", "set aside: beyond the angle limit"):
+        assert expected in words
+    lines = {line.get_marker(): line.get_xdata() for line in figure.axes[0].lines}
+    assert len(lines["^"]) == 1
+    assert len(lines["x"]) == 1 + 4  # one masked, four beyond 78 degrees
+
+
+def test_bands_hold_their_share_of_new_readings() -> None:
+    curve = curves(make_result(wavelengths=(), draws=1000), "dop")[0]
+    assert np.all(np.diff(curve.levels, axis=0) > 0.0)
+    inside = (curve.levels[0] < curve.observed) & (curve.observed < curve.levels[-1])
+    assert inside.mean() > 0.85
+    moved = curve.minus_center()
+    np.testing.assert_allclose(moved.observed + curve.center, curve.observed)
+
+
+def test_no_band_where_the_scatter_is_not_known() -> None:
+    """A masked view has no stated error, so its predicted scatter means nothing."""
+    result = make_result(wavelengths=(), limit=70.0, draws=100)
+    axes = figures.readings(result, "dop").axes[0]
+    reach = max(path.vertices[:, 0].max() for band in axes.collections for path in band.get_paths())
+    assert reach <= 70.0
+    assert axes.lines[0].get_xdata().max() > 80.0
+
+
+def test_a_point_fit_has_a_curve_and_no_bands() -> None:
+    figure = figures.readings(result_of("point"), "dop")
+    assert not figure.axes[0].collections
+
+
+@pytest.mark.parametrize(
+    ("draw", "needed"),
+    [
+        (figures.pairs, "two material parameters with draws"),
+        (figures.ranks, "two chains"),
+        (figures.prior_posterior, "draws of the prior"),
+        (figures.pit, "two readings and 100 draws"),
+    ],
+)
+def test_nothing_to_draw_is_an_error_of_one_line(draw, needed: str) -> None:
+    with pytest.raises(FitError, match=f"nothing to draw; give a result that has {needed}"):
+        draw(result_of("point"))
+
+
+def test_parameters_that_do_not_move_are_left_out() -> None:
+    result = make_result(draws=100, discrepancy=True)
+    result = replace(result, "posterior", "roughness", np.full((4, 100), 0.2))
+    result = replace(result, "posterior", "subsurface_fraction", np.full((4, 100), np.nan))
+    names = [scalar.name for scalar in figures.drawable(result)]
+    assert "roughness" not in names
+    assert "subsurface_fraction" not in names
+    assert "discrepancy_weights" not in names
+    assert clipped(figures.pairs(result)) == []
+
+
+def test_figures_need_no_provenance() -> None:
+    result = edit_provenance(make_result(draws=100, wavelengths=()))
+    result.attrs.clear()
+    for draw in (figures.pairs, figures.ranks, figures.pit):
+        assert isinstance(draw(result), Figure)
+    assert isinstance(figures.readings(result, "dop"), Figure)

@@ -1,0 +1,264 @@
+"""The page stands alone, tells the truth first, and runs nothing that a capture smuggles in."""
+
+import html
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from synthetic_results import edit_provenance, make_result, replace
+
+from polar_bayes.diagnostics.convergence import summary
+from polar_bayes.diagnostics.discrepancy import compare_without_discrepancy
+from polar_bayes.diagnostics.parameters import posterior_scalars
+from polar_bayes.errors import FitError, PolarBayesError
+from polar_bayes.inference.files import load_result
+from polar_bayes.report.html import render, report
+from polar_bayes.report.sentences import overconfidence
+from polar_bayes.report.text import interval, numbers, percent, spoken
+
+SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+EVIL = '<script>alert(1)</script>"><img src=x onerror=alert(2)>'
+
+
+class Page(HTMLParser):
+    """Tags, attributes, visible text and balance of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags, self.attributes, self.texts, self.open = [], [], [], []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs) -> None:
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data) -> None:
+        if "style" not in self.open:
+            self.texts.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.texts).split())
+
+    def values(self, name: str) -> list[str]:
+        return [value for _, attribute, value in self.attributes if attribute == name]
+
+
+@pytest.fixture(scope="module")
+def page() -> Page:
+    return Page(render(make_result(wavelengths=(450.0, 550.0), views=20, discrepancy=True)))
+
+
+@pytest.fixture(scope="module")
+def small() -> tuple[xr.DataTree, Page]:
+    result = make_result(**SMALL)
+    return result, Page(render(result))
+
+
+def test_it_stands_alone(page: Page) -> None:
+    assert page.open == []
+    assert not {"script", "link", "iframe", "object", "embed", "base"} & set(page.tags)
+    assert all(value.startswith("data:image/svg+xml;base64,") for value in page.values("src"))
+    assert all(value.startswith("#") for value in page.values("href"))
+    assert not [name for _, name, _ in page.attributes if name.startswith("on")]
+    assert not page.values("srcset") + page.values("action") + page.values("style")
+
+
+def test_its_anchors_and_labels_lead_somewhere(page: Page) -> None:
+    ids = page.values("id")
+    assert len(ids) == len(set(ids))
+    assert {value[1:] for value in page.values("href")} <= set(ids)
+    assert set(page.values("aria-labelledby")) <= set(ids)
+    assert page.tags.count("img") == len([alt for alt in page.values("alt") if alt])
+
+
+def test_the_verdict_comes_first(page: Page) -> None:
+    assert page.text.index("The fit converged.") < page.text.index("parameter mean sd")
+    assert "The data determine" in page.text
+
+
+def test_every_number_of_the_table_is_the_tree_s(small) -> None:
+    result, page = small
+    row = summary(result).loc["refractive_index"]
+    for column in ("mean", "sd", "q2.5", "q97.5"):
+        assert numbers([row[column]], row["sd"])[0] in page.text
+
+
+@pytest.mark.parametrize(
+    ("method", "absent", "present"),
+    [
+        ("nuts", [], ["Convergence", "R-hat", "leave-one-out", "Each line is one chain"]),
+        ("laplace", ["R-hat"], ["Approximation", "Pareto k-hat", "What the prior said"]),
+        (
+            "point",
+            ["R-hat", "prior said", "95%", "Pareto", "Convergence", "Each dot", "band", "sd "],
+            ["Least squares met its tolerance", "standard error", "not determined"],
+        ),
+    ],
+)
+def test_sections_that_do_not_apply_are_left_out(method, absent, present) -> None:
+    text = Page(render(make_result(**SMALL, method=method))).text
+    assert [words for words in absent if words in text] == []
+    assert [words for words in present if words not in text] == []
+
+
+def test_a_failed_fit_says_so_first_and_claims_nothing_about_the_material() -> None:
+    result = make_result(**SMALL)
+    draws = result["posterior"].to_dataset()["roughness"].to_numpy().copy()
+    draws[0] += 1.0
+    text = Page(render(replace(result, "posterior", "roughness", draws))).text
+    assert "did not converge: do not use these numbers" in text
+    assert "R-hat above 1.01: roughness" in text
+    assert "The data determine" not in text
+
+
+@pytest.mark.parametrize("method", ["nuts", "laplace"])
+def test_a_fit_without_a_single_finite_draw_still_has_a_page(method: str) -> None:
+    result = make_result(**SMALL, method=method)
+    for group in ("posterior", "posterior_predictive", "noise_free", "log_likelihood"):
+        result[group] = xr.DataTree(result[group].to_dataset() * np.nan)
+    text = Page(render(result)).text
+    assert "do not use these numbers" in text
+    assert "Not finite: roughness 100% of its draws" in text
+
+
+def test_capture_metadata_is_text_and_nothing_else() -> None:
+    result = make_result(
+        **{**SMALL, "views": 6}, materials=(EVIL, "fruit"), name=EVIL, discrepancy=True
+    )
+    result = edit_provenance(
+        result,
+        capture={EVIL: EVIL, "name": EVIL},
+        scene=EVIL,
+        priors={EVIL: EVIL},
+        problems=[EVIL],
+    )
+    text = render(result)
+    page = Page(text)
+    assert "script" not in page.tags
+    assert not [name for _, name, _ in page.attributes if name.startswith("on")]
+    assert f"Fit report: {EVIL}" in page.text
+    assert "default-src 'none'" in text
+
+
+def test_the_fit_without_discrepancy_is_called_overconfident(page: Page) -> None:
+    assert "narrower by 60%. That is overconfidence" in page.text
+    assert "Do not quote the numbers without the discrepancy term" in page.text
+
+
+def test_it_is_not_called_narrower_where_it_is_not() -> None:
+    result = make_result(**SMALL, discrepancy=True)
+    plain = result["without_discrepancy"].to_dataset()
+    for name, factor in (("roughness", 4.0), ("refractive_index", 0.9)):
+        plain[name] = plain[name].mean() + factor * (plain[name] - plain[name].mean())
+    plain["absorption"] = plain["absorption"] + 10.0 * float(plain["absorption"].std())
+    result["without_discrepancy"] = xr.DataTree(plain)
+    said = overconfidence(
+        compare_without_discrepancy(result),
+        posterior_scalars(result),
+        result["posterior"].to_dataset(),
+    )
+    assert "intervals of subsurface fraction, absorption and refractive index are" in said[0]
+    assert "of roughness is not narrower, as it happens" in said[1]
+    assert said[2].startswith("The two fits disagree on absorption: ")
+    assert said[3] == "Do not quote the numbers without the discrepancy term."
+
+
+def test_no_comparison_without_one(small) -> None:
+    assert "Without the discrepancy" not in small[1].text
+
+
+def test_the_folder_holds_page_and_result_and_nothing_else(tmp_path: Path) -> None:
+    result, folder = make_result(**SMALL), tmp_path / "deep" / "er"
+    folder.mkdir(parents=True)
+    (folder / "index.html").write_text("an older report")
+    assert report(result, folder) == folder / "index.html"
+    assert sorted(path.name for path in folder.iterdir()) == ["index.html", "result.nc"]
+    assert (folder / "index.html").read_text().startswith("<!DOCTYPE html>")
+    # What was written gives the same numbers and the same page, byte for byte.
+    read = load_result(folder / "result.nc")
+    pd.testing.assert_frame_equal(summary(read), summary(result))
+    assert render(read) == (folder / "index.html").read_text()
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(PolarBayesError, match="give a folder that can be written") as error:
+            report(make_result(**SMALL, method="point"), place)
+        assert "\n" not in str(error.value)
+        assert str(place) in str(error.value)
+
+
+@pytest.mark.parametrize("wrong", [None, xr.DataTree(), "fit.nc"])
+def test_what_is_no_result_leaves_no_folder(tmp_path: Path, wrong: object) -> None:
+    with pytest.raises(FitError, match="it holds no posterior"):
+        report(wrong, tmp_path / "report")
+    assert not (tmp_path / "report").exists()
+
+
+@pytest.mark.parametrize("case", [{"views": 2}, {"views": 12, "masked": range(2, 12)}])
+def test_very_few_readings(case: dict) -> None:
+    assert "Predictive checks" in Page(render(make_result(**{**SMALL, **case}))).text
+
+
+def test_numbers_as_text() -> None:
+    assert numbers([1.48283, 0.04031], 0.0403) == ["1.483", "0.040"]
+    assert numbers([-0.001], 1.0) == ["0.00"]
+    assert numbers([np.nan, 1234.5], 300.0)[1] == "1234"
+    assert numbers([0.5], np.nan) == ["0.500"]
+    assert interval(1.4, 1.5) == "[1.400, 1.500]"
+    assert percent(0.084) == "8.4%"
+    assert percent(0.12) == "12%"
+    assert spoken(["a", "b", "c"]) == "a, b and c"
+
+
+@pytest.fixture(scope="module")
+def wide_page() -> str:
+    long_names = ("a" * 200, "b c " * 60)
+    return render(make_result(**SMALL, materials=long_names, name="n" * 300, discrepancy=True))
+
+
+@pytest.mark.parametrize("width", [390, 1200])
+def test_no_sideways_scrolling_in_a_browser(tmp_path: Path, wide_page: str, width: int) -> None:
+    browser = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
+    if browser is None:
+        pytest.skip("no chromium: install it to test the page in a browser")
+    # Scripts are forbidden on the page itself: it is measured inside a frame, without that rule.
+    page = re.sub(r"<meta http-equiv=[^>]*>", "", wide_page)
+    (tmp_path / "frame.html").write_text(
+        f'<!DOCTYPE html><iframe id="f" width="{width}" height="900" style="border:0"'
+        f' srcdoc="{html.escape(page)}"></iframe><p id="said"></p><script>'
+        'const f = document.getElementById("f"); f.onload = () => {'
+        "const d = f.contentDocument.documentElement;"
+        'document.getElementById("said").textContent = `seen ${d.clientWidth} ${d.scrollWidth}`};'
+        "</script>",
+        encoding="utf-8",
+    )
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000"]
+    done = subprocess.run(
+        [*command, (tmp_path / "frame.html").as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    seen = re.search(r"seen (\d+) (\d+)", done.stdout)
+    assert seen, done.stdout[-500:]
+    client, scroll = map(int, seen.groups())
+    assert width - 20 <= client <= width
+    assert scroll <= client
