@@ -55,7 +55,7 @@ def find_setup(name: str) -> Setup:
     Raises:
         SceneError: There is none of that name.
     """
-    if name not in SETUPS:
+    if not isinstance(name, str) or name not in SETUPS:
         raise SceneError(
             "no such scene",
             where=f"scene={name!r}",

@@ -1,4 +1,4 @@
-"""Shared by every test: double precision, and where measured data by others may be found."""
+"""Shared by every test: double precision, one compile cache, and where measured data may be."""
 
 import os
 from pathlib import Path
@@ -9,6 +9,14 @@ import pytest
 jax.config.update("jax_enable_x64", True)
 
 ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Fits of one model and layout compile once in the whole run."""
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 @pytest.fixture(scope="session")

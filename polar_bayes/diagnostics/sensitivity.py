@@ -15,8 +15,10 @@ from polar_bayes.diagnostics.parameters import (
     scalars,
 )
 
-DETERMINED = 0.35
-PARTLY = 0.8
+DETERMINED = 0.5
+"""Prior probability inside the posterior's 95% interval; normal ones, a third as wide, have it."""
+PARTLY = 0.85
+"""The same at three quarters of the width; a posterior equal to its prior has 0.95."""
 SENSITIVE = 0.05
 POWERS = (0.99, 1.01)
 INTERVAL = (0.025, 0.975)
@@ -25,6 +27,7 @@ COLUMNS = (
     "prior_q97.5",
     "q2.5",
     "q97.5",
+    "prior_inside",
     "width_left",
     "contraction",
     "verdict",
@@ -37,10 +40,13 @@ COLUMNS = (
 def sensitivity(result: xr.DataTree) -> pd.DataFrame:
     """How much of each answer came from the data, and how much from the prior.
 
-    `width_left` is the width of the posterior's 95% interval over the prior's; `contraction` is
-    1 - variance over prior variance. The verdict is "determined" up to a width of 0.35, "partly"
-    up to 0.8, else "not determined". The two sensitivities say how fast the posterior moves when
-    the log priors (all together) or the log likelihood are multiplied by a number near 1.
+    `prior_inside` is the prior probability of the posterior's 95% interval: 0.95 when the data
+    said nothing, small when they did. Unlike a ratio of widths it is the same for a parameter and
+    its logarithm, and it does not mistake a posterior in the prior's tail for the prior. The
+    verdict is "determined" up to 0.5, "partly" up to 0.85, else "not determined". `width_left` is
+    the interval's width over that of the prior, `contraction` 1 - variance over prior variance.
+    The two sensitivities say how fast the posterior moves when the log priors (all together) or
+    the log likelihood are multiplied by a number near 1.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
@@ -68,23 +74,23 @@ def sensitivity(result: xr.DataTree) -> pd.DataFrame:
     for scalar in found:
         widths = _compare(before.get(scalar.label), scalar.draws)
         bent = [_sense(scalar.draws, weights[group]) for group in weights]
-        rows.append([*widths, *bent, _remark(*bent)])
+        rows.append([*widths, *bent, _remark(scalar.draws, widths, *bent)])
     index = pd.Index([scalar.label for scalar in found])
     return pd.DataFrame(rows, columns=list(COLUMNS), index=index)
 
 
-def _compare(prior: np.ndarray | None, posterior: np.ndarray) -> list[float | str]:
-    after = _interval(posterior)
+def _compare(prior: np.ndarray | None, posterior: np.ndarray) -> list[Any]:
+    low, high = _interval(posterior)
     before = _interval(prior) if prior is not None else (math.nan, math.nan)
-    widths = [high - low for low, high in (before, after)]
+    widths = [before[1] - before[0], high - low]
     if prior is None or not np.isfinite(widths).all() or not widths[0] > 0.0:
-        return [*before, *after, math.nan, math.nan, "unknown"]
-    left = widths[1] / widths[0]
+        return [*before, low, high, math.nan, math.nan, math.nan, "unknown"]
+    inside = float(np.mean((prior >= low) & (prior <= high)))
     contraction = 1.0 - float(np.var(posterior) / np.var(prior))
     word = "not determined"
-    if left <= PARTLY:
-        word = "determined" if left <= DETERMINED else "partly"
-    return [*before, *after, left, contraction, word]
+    if inside <= PARTLY:
+        word = "determined" if inside <= DETERMINED else "partly"
+    return [*before, low, high, inside, widths[1] / widths[0], contraction, word]
 
 
 def _interval(draws: np.ndarray) -> tuple[float, float]:
@@ -128,9 +134,12 @@ def _sense(draws: np.ndarray, weights: list[np.ndarray] | None) -> float:
     return float(array_stats.power_scale_sense(draws, *weights, *POWERS))
 
 
-def _remark(prior: float, likelihood: float) -> str:
-    if not prior >= SENSITIVE:
-        return ""
-    if likelihood >= SENSITIVE:
-        return "priors and data may pull apart"
-    return "leans on the priors"
+def _remark(draws: np.ndarray, widths: list[Any], prior: float, likelihood: float) -> str:
+    middle = float(np.median(draws))
+    remarks = []
+    if middle < widths[0] or middle > widths[1]:
+        remarks.append("outside the prior's 95%")
+    if prior >= SENSITIVE:
+        pulled = likelihood >= SENSITIVE
+        remarks.append("priors and data may pull apart" if pulled else "leans on the priors")
+    return "; ".join(remarks)

@@ -5,6 +5,7 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax
 import xarray as xr
 from numpyro import distributions as dist
 
@@ -46,7 +47,9 @@ class Request:
     def bind(self, scene: Scene) -> Callable[[Observations], None]:
         """The model with everything but its data in place."""
         needed = (*scene.parameters, *noise_parameters(self.links))
-        priors = {name: self.priors[name] for name in needed}
+        # Distributions keep what they have computed once, in the precision of that day; a copy
+        # from their arguments alone takes the precision of this fit.
+        priors = {name: jax.tree.map(lambda x: x, self.priors[name]) for name in needed}
         return functools.partial(self.model, scene=scene, priors=priors, links=self.links)
 
 

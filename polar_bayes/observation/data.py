@@ -59,14 +59,16 @@ def observe(capture: xr.Dataset, *, largest_view_zenith: float = 90.0) -> Observ
     """
     names = [name for name in READINGS if name in capture]
     order = _axis_order(capture[names[0]])
-    valid = np.asarray(_values(capture, "valid", order, default=True), bool)
-    valid = valid & (_values(capture, "view_zenith", order) <= largest_view_zenith)
+    measured = np.asarray(_values(capture, "valid", order, default=True), bool)
+    largest, full_scale = _intensity_range(capture, order, measured)
+    valid = measured & (_values(capture, "view_zenith", order) <= largest_view_zenith)
     saturated = np.asarray(_values(capture, "saturated", order, default=False), bool)
+    if np.isfinite(full_scale):  # a reading at the stop has stopped, flagged or not
+        saturated = saturated | (_values(capture, "intensity", order) >= full_scale)
     shape = np.broadcast_shapes(
         valid.shape, *(_values(capture, name, order).shape for name in names)
     )
     valid, saturated = (np.broadcast_to(mask, shape) for mask in (valid, saturated))
-    largest, full_scale = _intensity_range(capture)
 
     readings, errors = {}, {}
     for name in names:
@@ -112,13 +114,16 @@ def _values(
     return values.reshape([variable.sizes.get(dim, 1) for dim in order])
 
 
-def _intensity_range(capture: xr.Dataset) -> tuple[float, float]:
+def _intensity_range(
+    capture: xr.Dataset, order: tuple[str, ...], measured: np.ndarray
+) -> tuple[float, float]:
     """The unit of intensity (largest reading or saturation level) and the full scale."""
     if "intensity" not in capture:
         return 1.0, np.inf
     level = capture["intensity"].attrs.get("saturation_level")
     if level is not None:
         return float(level), float(level)
-    # Over the whole capture, masked angles included: dropping a view changes no other's noise.
-    largest = float(np.nanmax(capture["intensity"].to_numpy()))
+    # Over the whole capture, angles set aside included: leaving out the views beyond a limit
+    # changes no other's noise. Missing entries hold anything, so they do not count.
+    largest = float(np.max(_values(capture, "intensity", order), where=measured, initial=0.0))
     return (largest if largest > 0.0 else 1.0), np.inf

@@ -62,7 +62,7 @@ class MeanConcentrationBeta(dist.Distribution):
         mean, concentration = self.mean_value, self.concentration
         other = 1.0 - mean
         step = value - mean
-        divergence = mean * _excess(step / mean) + other * _excess(-step / other)
+        divergence = _excess(mean, value, step) + _excess(other, 1.0 - value, -step)
         remainders = (
             _stirling_remainder(concentration)
             - _stirling_remainder(mean * concentration)
@@ -99,7 +99,7 @@ class SensorStudentT(dist.Distribution):
     arg_constraints = {"location": constraints.real, "scale": constraints.positive}
     support = constraints.nonnegative
     reparametrized_params = ["location", "scale"]
-    pytree_data_fields = ("saturated", "full_scale")
+    pytree_data_fields = ("location", "scale", "saturated", "full_scale")
     pytree_aux_fields = ("degrees_of_freedom",)
 
     def __init__(
@@ -157,7 +157,8 @@ def log_survival(distance: Float[Array, "..."], degrees_of_freedom: float) -> Fl
     angle = jnp.arctan2(jnp.asarray(math.sqrt(degrees_of_freedom), dtype), jnp.abs(distance))
     nodes, weights = (jnp.asarray(x, dtype) for x in _tail_rule(degrees_of_freedom))
     rise = jnp.sinc(angle[..., None] * nodes / jnp.pi) ** (degrees_of_freedom - 1.0)
-    log_tail = degrees_of_freedom * jnp.log(angle) + jnp.log(rise @ weights)
+    # A sum and not a matrix product, which some accelerators round to ten bits.
+    log_tail = degrees_of_freedom * jnp.log(angle) + jnp.log(jnp.sum(rise * weights, axis=-1))
     return jnp.where(distance > 0.0, log_tail, jnp.log1p(-jnp.exp(log_tail)))
 
 
@@ -177,16 +178,23 @@ def _tail_rule(degrees_of_freedom: float) -> tuple[np.ndarray, np.ndarray]:
     return 0.5 * (nodes + 1.0), weights / scale
 
 
-def _excess(step: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`step - log(1 + step)`, whose first-order terms would otherwise cancel near 0."""
-    near = jnp.abs(step) < 0.1
-    small = jnp.where(near, step, 0.0)
+def _excess(
+    mean: Float[Array, "..."], value: Float[Array, "..."], step: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """`step - mean log(value / mean)`, one half of the divergence, for `step = value - mean`.
+
+    The first-order terms cancel near the mean, hence the series; far from it the logarithm takes
+    the quotient itself, since `1 + step / mean` has lost its digits where that is nearly 0.
+    """
+    relative = step / mean
+    near = jnp.abs(relative) < 0.1
+    small = jnp.where(near, relative, 0.0)
     series = jnp.zeros_like(small)
     for power in range(17, 1, -1):  # 0.1 ** 17 / 17 is below double precision of step ** 2 / 2
         series = small * series + (-1.0) ** power / power
-    series = small * small * series
-    far = jnp.where(near, 1.0, step)
-    return jnp.where(near, series, far - jnp.log1p(far))
+    series = mean * small * small * series
+    quotient = jnp.where(near, 1.0, value / mean)
+    return jnp.where(near, series, step - mean * jnp.log(quotient))
 
 
 def _stirling_remainder(z: Float[Array, "..."]) -> Float[Array, "..."]:

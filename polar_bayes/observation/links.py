@@ -34,6 +34,11 @@ class AbstractLink(abc.ABC):
     parameters: ClassVar[tuple[str, ...]] = ()
     """The noise parameters that it reads, each sampled from its prior."""
 
+    @property
+    def reads_errors(self) -> bool:
+        """True where it needs the standard errors that a capture states of its readings."""
+        return False
+
     @abc.abstractmethod
     def distribution(
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
@@ -182,6 +187,11 @@ class StokesLink(AbstractLink):
     @override
     def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
         return ("stokes_error_factor",) if self.stated_errors else ("stokes_scale",)
+
+    @property
+    @override
+    def reads_errors(self) -> bool:
+        return self.stated_errors
 
     @override
     def distribution(

@@ -90,7 +90,8 @@ class Scene:
         Raises:
             SceneError: A material parameter that the scene reads is missing.
         """
-        return self._optics(self._per_view(parameters, MATERIAL_PARAMETERS), geometry)
+        per_view = self._per_view(parameters, MATERIAL_PARAMETERS, geometry)
+        return self._optics(per_view, geometry)
 
     def stokes(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> Array:
         """Stokes vector S0, S1, S2 that reaches the viewer, before any instrument.
@@ -122,7 +123,7 @@ class Scene:
         Raises:
             SceneError: A parameter that the scene reads is missing.
         """
-        per_view = self._per_view(parameters, self.parameters)
+        per_view = self._per_view(parameters, self.parameters, geometry)
         if self.instrument is None:
             light = self._optics(per_view, geometry)
         else:
@@ -165,9 +166,12 @@ class Scene:
         return Light(*jnp.broadcast_arrays(*mixture))
 
     def _per_view(
-        self, parameters: Mapping[str, ArrayLike], names: tuple[str, ...]
+        self, parameters: Mapping[str, ArrayLike], names: tuple[str, ...], geometry: Geometry
     ) -> dict[str, Array]:
-        """The parameters that the scene reads, each with a trailing view axis."""
+        """The parameters that the scene reads, in one precision, each with a trailing view axis.
+
+        A Python number takes the precision of the arrays beside it.
+        """
         needed = [name for name in self.parameters if name in names]
         missing = [name for name in needed if name not in parameters]
         if missing:
@@ -176,7 +180,8 @@ class Scene:
                 where="parameters",
                 mend=f"this scene reads {', '.join(needed)}",
             )
-        return {name: jnp.asarray(parameters[name])[..., None] for name in needed}
+        dtype = jnp.result_type(float, *geometry, *(parameters[name] for name in needed))
+        return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}
 
 
 def _check_part(part: object, where: str, kind: type, allowed: str) -> None:

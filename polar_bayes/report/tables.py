@@ -43,18 +43,19 @@ def parameter_table(
     truths = {scalar.label: truth_of(result, scalar) for scalar in found}
     known = any(math.isfinite(truth) for truth in truths.values())
     heads = ["parameter", "mean", "sd", "2.5%", "97.5%", *(["true value"] if known else [])]
-    heads += ["width left", "by the data"]
+    heads += ["prior inside", "by the data"]
     posterior, rows = result["posterior"].to_dataset(), []
     for scalar in found:
         row, gain = table.loc[scalar.label], prior.loc[scalar.label]
         cells = numbers([row["mean"], row["sd"], row["q2.5"], row["q97.5"]], row["sd"])
         cells += [_truth_cell(truths[scalar.label], row)] if known else []
-        cells += [percent(gain["width_left"]), str(gain["verdict"])]
+        cells += [percent(gain["prior_inside"]), str(gain["verdict"])]
         rows.append(_row(scalar, posterior, cells))
     caption = (
-        "Posterior mean, standard deviation and equal-tailed 95% interval. Width left: the "
-        f"interval's width over that of the prior; up to {DETERMINED:.0%} the parameter counts as "
-        f"determined by the data, up to {PARTLY:.0%} as partly determined."
+        "Posterior mean, standard deviation and equal-tailed 95% interval. Prior inside: the "
+        "prior's probability of that interval, 95% if the data said nothing; up to "
+        f"{DETERMINED:.0%} the parameter counts as determined by the data, up to {PARTLY:.0%} as "
+        "partly determined."
     )
     return Table(caption, tuple(heads), tuple(rows))
 
@@ -137,8 +138,9 @@ def sensitivity_table(found: Sequence[Scalar], prior: pd.DataFrame, posterior: x
     heads = ["parameter", "prior 95%", "posterior 95%", "width left"]
     heads += ["to the priors", "to the data", "remark"]
     caption = (
-        "To the priors, to the data: how fast the posterior moves when all priors, or all data, "
-        f"count a little more; from {SENSITIVE} on it matters."
+        "Width left: the posterior's interval over the prior's. To the priors, to the data: how "
+        "fast the posterior moves when all priors, or all data, count a little more; from "
+        f"{SENSITIVE} on it matters."
     )
     return Table(caption, tuple(heads), tuple(rows))
 

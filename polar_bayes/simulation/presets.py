@@ -73,7 +73,7 @@ def find_preset(name: str) -> Material:
     Raises:
         CaptureError: There is none of that name.
     """
-    if name not in PRESETS:
+    if not isinstance(name, str) or name not in PRESETS:
         raise CaptureError(
             "no such material", where=f"preset={name!r}", mend=f"give one of {', '.join(PRESETS)}"
         )

@@ -4,6 +4,7 @@ import arviz_stats
 import numpy as np
 import pytest
 import xarray as xr
+from scipy import stats
 from synthetic_results import PRIOR, make_result, replace
 
 from polar_bayes.diagnostics.discrepancy import compare_without_discrepancy
@@ -19,6 +20,8 @@ def test_widths_are_those_of_normal_distributions() -> None:
     # 500 prior draws know their own 95% width to about 4%.
     assert row["width_left"] == pytest.approx(share, rel=0.15)
     assert row["contraction"] == pytest.approx(1.0 - share**2, abs=0.02)
+    low, high = (stats.norm(*PRIOR["subsurface_fraction"]).cdf(row[q]) for q in ("q2.5", "q97.5"))
+    assert row["prior_inside"] == pytest.approx(high - low, abs=0.07)
 
 
 def test_verdicts() -> None:
@@ -33,6 +36,40 @@ def test_a_posterior_equal_to_the_prior_is_not_determined() -> None:
     draws = np.random.default_rng(0).normal(*PRIOR["exposure"], (4, 250))
     table = sensitivity(replace(tree, "posterior", "exposure", draws))
     assert table.loc["exposure", "verdict"] == "not determined"
+
+
+def with_prior_and_posterior(prior: np.ndarray, posterior: np.ndarray):
+    tree = replace(make_result(), "prior", "exposure", prior.reshape(1, 500))
+    return sensitivity(replace(tree, "posterior", "exposure", posterior.reshape(4, 250)))
+
+
+@pytest.mark.parametrize("scale", [np.log, np.exp, lambda x: x])
+def test_the_verdict_is_the_same_for_a_parameter_and_its_logarithm(scale) -> None:
+    rng = np.random.default_rng(1)
+    prior, posterior = np.exp(rng.normal(0.0, 1.0, 500)), np.exp(rng.normal(0.5, 0.2, 1000))
+    row = with_prior_and_posterior(scale(prior), scale(posterior)).loc["exposure"]
+    plain = with_prior_and_posterior(prior, posterior).loc["exposure"]
+    assert row["prior_inside"] == pytest.approx(plain["prior_inside"], abs=0.01)
+    assert row["verdict"] == plain["verdict"] == "determined"
+
+
+def test_a_posterior_in_the_tail_of_its_prior_is_not_the_prior() -> None:
+    """As wide as the prior, but where the prior did not expect it: the data put it there."""
+    rng = np.random.default_rng(1)
+    prior, posterior = np.exp(rng.normal(-1.0, 0.5, 500)), rng.normal(1.24, 0.2, 1000)
+    row = with_prior_and_posterior(prior, posterior).loc["exposure"]
+    assert row["width_left"] > 0.7
+    assert row["verdict"] == "determined"
+    assert "outside the prior's 95%" in row["remark"]
+
+
+def test_a_posterior_over_decades_of_a_wide_prior_is_not_determined() -> None:
+    """Narrow beside the prior's upper end, and yet most of what the prior allowed."""
+    rng = np.random.default_rng(1)
+    prior, posterior = np.exp(rng.normal(0.0, 3.0, 500)), np.exp(rng.normal(-1.0, 2.0, 1000))
+    row = with_prior_and_posterior(prior, posterior).loc["exposure"]
+    assert row["width_left"] < 0.2
+    assert row["verdict"] != "determined"
 
 
 def test_power_scaling_agrees_with_arviz() -> None:

@@ -1,5 +1,6 @@
 """The average over facets: what the dial of nodes buys."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -28,7 +29,8 @@ def test_thirty_facets_are_enough(distribution: Beckmann | GGX, way: str) -> Non
 
     def polarization(quadrature: FacetQuadrature) -> np.ndarray:
         surface = RoughSurface(distribution, UniformSky(), quadrature)
-        return np.asarray(getattr(surface, way)(MATERIAL, VIEWS).q)
+        found = jax.jit(getattr(surface, way))(MATERIAL, VIEWS)
+        return np.asarray(found.q)
 
     truth = polarization(FacetQuadrature(40, 40))
     assert np.max(np.abs(polarization(FacetQuadrature()) - truth)) < 1e-3
@@ -65,5 +67,7 @@ def test_both_sides_of_the_normal_are_alike(part: RoughSurface) -> None:
 
 @pytest.mark.parametrize("nodes", [{"along": 0}, {"across": 65}, {"along": 2.5}])
 def test_nodes_are_checked(nodes: dict) -> None:
-    with pytest.raises(SceneError, match="FacetQuadrature: .* is no number of nodes; give a whole"):
+    with pytest.raises(
+        SceneError, match=r"FacetQuadrature: .* is no number of nodes; give a whole"
+    ):
         FacetQuadrature(**nodes)

@@ -1,5 +1,6 @@
 """Points, discs and skies against a renderer and against brute force."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,6 +16,10 @@ from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 DISTRIBUTIONS = pytest.mark.parametrize(
     ("code", "distribution"), [(0, Beckmann()), (1, GGX())], ids=["Beckmann", "GGX"]
 )
+
+
+stokes_of = jax.jit(Scene.stokes, static_argnums=0)
+light_of = jax.jit(Scene.light, static_argnums=0)
 
 
 def column(values: np.ndarray) -> jnp.ndarray:
@@ -35,7 +40,7 @@ def test_point_source_agrees_with_the_renderer(
     n, roughness, view, light, azimuth = rows[:, 1:6].T
     geometry = Geometry(column(view), column(0.0 * view), column(light), column(azimuth))
     material = {"roughness": roughness, "refractive_index": n}
-    stokes = np.asarray(Scene(RoughSurface(distribution)).stokes(material, geometry))[:, 0]
+    stokes = np.asarray(stokes_of(Scene(RoughSurface(distribution)), material, geometry))[:, 0]
     for pair in np.unique(rows[:, 1:3], axis=0):
         chosen = np.all(rows[:, 1:3] == pair, axis=1)
         gap = np.abs(stokes[chosen] - rows[chosen, 6:9])
@@ -49,16 +54,16 @@ def test_point_source_agrees_with_the_renderer(
 def test_uniform_sky_agrees_with_the_renderer(
     uniform_sky: np.ndarray, code: int, distribution: Beckmann | GGX
 ) -> None:
-    """The table itself, of 160 x 160 facets, is good to 2.2e-5; the default of 30 facets to .001."""
+    """The table, of 160 x 160 facets, is good to 2.2e-5; the default of 30 facets to 7e-4."""
     rows = uniform_sky[uniform_sky[:, 0] == code]
     material = {"roughness": rows[:, 2], "refractive_index": rows[:, 1]}
     polarization = rows[:, 5] / rows[:, 4]
     for quadrature, bound, bound_intensity in (
-        (FacetQuadrature(), 6e-4, 1e-3),
+        (FacetQuadrature(), 7e-4, 1e-3),
         (FacetQuadrature(20, 20), 3e-5, 4e-5),
     ):
         surface = RoughSurface(distribution, UniformSky(), quadrature)
-        light = Scene(surface).light(material, viewed(rows[:, 3]))
+        light = light_of(Scene(surface), material, viewed(rows[:, 3]))
         np.testing.assert_allclose(light.q[:, 0], polarization, atol=bound)
         np.testing.assert_allclose(light.intensity[:, 0], rows[:, 4], rtol=bound_intensity)
 
@@ -73,12 +78,12 @@ def test_disc_agrees_with_the_renderer(
     The table is in single precision and loses light beyond: see the brute-force test below.
     """
     chosen = (disc_source[:, 0] == code) & (disc_source[:, 4] == half_width)
-    rows = disc_source[chosen & (disc_source[:, 3] <= 70.0)]
+    rows = disc_source[chosen & (disc_source[:, 3] <= 60.0)]
     material = {"roughness": rows[:, 2], "refractive_index": rows[:, 1]}
     surface = RoughSurface(distribution, Disc(half_width))
-    light = Scene(surface).light(material, viewed(rows[:, 3]))
+    light = light_of(Scene(surface), material, viewed(rows[:, 3]))
     np.testing.assert_allclose(light.q[:, 0], rows[:, 6] / rows[:, 5], atol=3e-4)
-    np.testing.assert_allclose(light.intensity[:, 0], rows[:, 5], rtol=2e-3)
+    np.testing.assert_allclose(light.intensity[:, 0], rows[:, 5], rtol=1e-3)
 
 
 @pytest.mark.parametrize(("zenith", "half_width"), [(60.0, 5.0), (85.0, 15.0), (30.0, 15.0)])
@@ -99,11 +104,11 @@ def test_disc_agrees_with_brute_force(zenith: float, half_width: float) -> None:
     }
     geometry = Geometry.from_degrees(view_zenith=zenith, view_azimuth=0.0, **directions)
     material = {"roughness": 0.05, "refractive_index": 1.5}
-    points = Scene(RoughSurface(Beckmann(), PointSource())).stokes(material, geometry)
+    points = stokes_of(Scene(RoughSurface(Beckmann(), PointSource())), material, geometry)
     weight = (solid_angle + 0.0 * z)[above][:, None]
     total = np.sum(points * weight, axis=0)
     surface = RoughSurface(Beckmann(), Disc(half_width), FacetQuadrature(30, 30))
-    found = Scene(surface).stokes(material, viewed(np.array([zenith])))[0, 0]
+    found = stokes_of(Scene(surface), material, viewed(np.array([zenith])))[0, 0]
     np.testing.assert_allclose(found[0], total[0], rtol=3e-4)
     np.testing.assert_allclose(found[1] / found[0], total[1] / total[0], atol=1e-4)
 
@@ -133,8 +138,8 @@ def test_a_small_disc_is_a_point() -> None:
     """Per solid angle, for a surface rougher than the disc is wide."""
     material = {"roughness": 0.2, "refractive_index": 1.5}
     geometry = viewed(np.array([20.0, 50.0, 70.0]))
-    point = Scene(RoughSurface(Beckmann(), PointSource())).stokes(material, geometry)
-    disc = Scene(RoughSurface(Beckmann(), Disc(0.1))).stokes(material, geometry)
+    point = stokes_of(Scene(RoughSurface(Beckmann(), PointSource())), material, geometry)
+    disc = stokes_of(Scene(RoughSurface(Beckmann(), Disc(0.1))), material, geometry)
     solid_angle = 2.0 * np.pi * (1.0 - np.cos(np.deg2rad(0.1)))
     # The source's radiance is spread over its solid angle, so irradiance is cosine-weighted.
     np.testing.assert_allclose(disc / solid_angle, point, rtol=1e-4, atol=1e-9)
@@ -144,8 +149,8 @@ def test_a_small_disc_is_a_point() -> None:
 def test_a_smooth_surface_mirrors_an_extended_source(source: UniformSky | Disc) -> None:
     material = {"roughness": 0.0, "refractive_index": 1.5}
     geometry = viewed(np.array([1.0, 30.0, 56.0, 70.0]))
-    found = Scene(RoughSurface(Beckmann(), source)).stokes(material, geometry)
-    mirror = Scene(SmoothSurface()).stokes(material, geometry)
+    found = stokes_of(Scene(RoughSurface(Beckmann(), source)), material, geometry)
+    mirror = stokes_of(Scene(SmoothSurface()), material, geometry)
     # The broadened Gaussian of the sampling is integrated by six nodes, to 3e-5.
     np.testing.assert_allclose(found, mirror, rtol=1e-4, atol=1e-9)
 
@@ -159,5 +164,5 @@ def test_a_narrow_disc_takes_in_what_a_beam_does() -> None:
 
 @pytest.mark.parametrize("half_width", [0.0, -1.0, 91.0, float("nan")])
 def test_half_width_is_checked(half_width: float) -> None:
-    with pytest.raises(SceneError, match="Disc: half_width=.* give degrees from 0.01 to 90"):
+    with pytest.raises(SceneError, match=r"Disc: half_width=.* give degrees from 0.01 to 90"):
         Disc(half_width)

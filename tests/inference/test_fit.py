@@ -1,0 +1,264 @@
+"""What a fit returns, refuses and records."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import pytest
+import xarray as xr
+from numpyro import distributions as dist
+from numpyro import handlers
+from numpyro.infer.autoguide import AutoLaplaceApproximation
+from plates import LINKS, PLATE, plate_capture
+
+import polar_bayes as pb
+from polar_bayes.inference.program import compile_program
+from polar_bayes.inference.request import resolve
+from polar_bayes.inference.result import PROVENANCE, provenance_of
+from polar_bayes.observation.data import observe
+
+SHORT = pb.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50)
+GROUPS = {
+    "posterior",
+    "sample_stats",
+    "log_likelihood",
+    "log_prior",
+    "posterior_predictive",
+    "noise_free",
+    "prior",
+    "prior_predictive",
+    "observed_data",
+    "constant_data",
+}
+
+
+@pytest.fixture(scope="module")
+def capture() -> xr.Dataset:
+    return plate_capture(np.linspace(20.0, 80.0, 12), 0.02, seed=3)
+
+
+@pytest.fixture(scope="module")
+def short(capture: xr.Dataset) -> xr.DataTree:
+    return pb.fit(capture, scene=PLATE, links=LINKS, method=SHORT, seed=7)
+
+
+def test_every_group_is_there_with_labels(short: xr.DataTree) -> None:
+    assert set(short.children) == GROUPS
+    assert dict(short["posterior"].sizes) == {"chain": 2, "draw": 100}
+    assert short["posterior_predictive"]["q"].dims == ("chain", "draw", "view")
+    assert short["log_likelihood"]["q"].dims == ("chain", "draw", "view")
+    assert short["posterior"]["refractive_index"].attrs["units"] == "1"
+
+
+def test_provenance_says_enough_to_repeat_the_fit(short: xr.DataTree, capture: xr.Dataset) -> None:
+    said = provenance_of(short)
+    assert said["seed"] == 7
+    assert said["swapped"] == ["scene", "links"]
+    assert set(said["versions"]) >= {"polar_bayes", "jax", "numpyro", "arviz"}
+    settings = pb.Nuts(**said["settings"])
+    again = pb.fit(capture, scene=PLATE, links=LINKS, method=settings, seed=said["seed"])
+    xr.testing.assert_equal(short["posterior"].to_dataset(), again["posterior"].to_dataset())
+
+
+def test_a_result_survives_a_file(short: xr.DataTree, tmp_path) -> None:
+    pb.save_result(short, tmp_path / "fit.nc")
+    back = pb.load_result(tmp_path / "fit.nc")
+    assert back.attrs[PROVENANCE] == short.attrs[PROVENANCE]
+    for group in GROUPS:
+        xr.testing.assert_identical(back[group].to_dataset(), short[group].to_dataset())
+
+
+def test_threads_do_not_change_a_bit(short: xr.DataTree, capture: xr.Dataset) -> None:
+    alone = pb.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50, threads=1)
+    other = pb.fit(capture, scene=PLATE, links=LINKS, method=alone, seed=7)
+    xr.testing.assert_equal(short["posterior"].to_dataset(), other["posterior"].to_dataset())
+
+
+def test_another_seed_gives_other_draws(short: xr.DataTree, capture: xr.Dataset) -> None:
+    other = pb.fit(capture, scene=PLATE, links=LINKS, method=SHORT, seed=8)
+    name = "refractive_index"
+    assert not np.array_equal(short["posterior"][name], other["posterior"][name])
+
+
+def test_a_fit_that_is_too_short_says_so(short: xr.DataTree) -> None:
+    verdict = pb.verdict(short)
+    assert not verdict.converged
+    assert any("ESS" in problem or "effective" in problem for problem in verdict.problems)
+
+
+def test_the_global_precision_is_left_alone(capture: xr.Dataset) -> None:
+    with jax.enable_x64(False):
+        result = pb.fit(capture, scene=PLATE, links=LINKS, method="laplace", seed=1)
+        assert jnp.zeros(()).dtype == jnp.float32
+    assert result["posterior"]["refractive_index"].dtype == np.float64
+
+
+def test_single_precision_finds_the_same_posterior(capture: xr.Dataset) -> None:
+    double = pb.fit(capture, scene=PLATE, links=LINKS, seed=1)
+    single = pb.fit(capture, scene=PLATE, links=LINKS, seed=1, precision="single")
+    assert single["posterior"]["refractive_index"].dtype == np.float32
+    for name in ("refractive_index", "subsurface_fraction"):
+        one, two = (tree["posterior"][name].to_numpy() for tree in (double, single))
+        # Two chains of at least 450 effective draws: four Monte Carlo errors of a difference.
+        assert abs(one.mean() - two.mean()) < 4.0 * np.sqrt(2.0 / 450.0) * one.std()
+
+
+def test_laplace_is_numpyros_guide(capture: xr.Dataset) -> None:
+    """Mean and covariance against `AutoLaplaceApproximation` with its own exact Hessian."""
+    settings = pb.Laplace(draws=50_000, chains=1)
+    ours = pb.fit(capture, scene=PLATE, links=LINKS, method=settings, seed=1)
+    request = resolve(capture, "per_material", settings, PLATE, None, LINKS, None, 1, "double")
+    data = observe(request.capture)
+    program = compile_program(request.bind(PLATE), data)
+    guide = AutoLaplaceApproximation(program.model)
+    with handlers.seed(rng_seed=0):
+        guide(data)
+    modes = provenance_of(ours)["modes"]
+    assert modes["newton_decrement"] < 1e-2
+    # The mode, by a route of its own: BFGS from the sample mean.
+    from scipy.optimize import minimize
+
+    start = {n: ours["posterior"][n].to_numpy().mean() for n in program.supports}
+    flat = np.concatenate(
+        [
+            np.ravel(dist.biject_to(program.supports[n]).inv(jnp.asarray(start[n])))
+            for n in sorted(start)
+        ]
+    )
+    found = minimize(lambda z: float(program.potential(jnp.asarray(z), data)), flat, tol=1e-10)
+    order = guide._unpack_latent(jnp.arange(3.0))
+    place = {name: int(value) for name, value in order.items()}
+    location = np.empty(3)
+    for index, name in enumerate(sorted(place)):
+        location[place[name]] = found.x[index]
+    exact = guide.sample_posterior(
+        jax.random.key(1), {"auto_loc": jnp.asarray(location)}, sample_shape=(50_000,)
+    )
+    for name in program.supports:
+        draws = ours["posterior"][name].to_numpy().ravel()
+        theirs = np.asarray(exact[name])
+        # 50,000 independent draws a side: four standard errors of a difference of means and sds.
+        assert abs(draws.mean() - theirs.mean()) < 4.0 * np.sqrt(2.0 / 5e4) * draws.std()
+        assert draws.std() == pytest.approx(theirs.std(), rel=4.0 * np.sqrt(1.0 / 5e4) + 1e-3)
+
+
+def conjugate(data, scene, priors, links) -> None:
+    """A normal mean with known variance: its posterior is known in closed form."""
+    del scene, priors, links
+    mean = numpyro.sample("mean", dist.Normal(0.0, 2.0))
+    with numpyro.plate("view", data.shape[-1]):
+        numpyro.sample("q", dist.Normal(mean, 0.5), obs=data.readings["q"])
+
+
+def test_a_model_of_ones_own_with_a_known_posterior(capture: xr.Dataset) -> None:
+    result = pb.fit(capture, model=conjugate, scene=PLATE, links=LINKS, seed=1)
+    q = capture["q"].to_numpy()
+    precision = 1.0 / 4.0 + q.size / 0.25
+    mean, sd = q.sum() / 0.25 / precision, precision**-0.5
+    draws = result["posterior"]["mean"].to_numpy()
+    # At least 450 effective draws: four Monte Carlo errors.
+    assert abs(draws.mean() - mean) < 4.0 * sd / np.sqrt(450.0)
+    assert draws.std() == pytest.approx(sd, rel=4.0 / np.sqrt(2.0 * 450.0))
+    assert provenance_of(result)["model"] == "conjugate"
+
+
+def test_least_squares_finds_the_plate(capture: xr.Dataset) -> None:
+    result = pb.fit(capture, scene=PLATE, links=LINKS, method="point", seed=1)
+    said = pb.json_summary(result)["parameters"]["refractive_index"]
+    # Five standard errors: one false alarm in a million.
+    assert abs(said["mean"] - 1.5) < 5.0 * said["sd"]
+    assert json.dumps(pb.json_summary(result), allow_nan=False)
+
+
+def test_masked_views_are_counted_and_do_not_matter(capture: xr.Dataset) -> None:
+    poisoned = capture.copy(deep=True)
+    poisoned["valid"] = ("view", np.arange(12) != 4)
+    poisoned["q"][4] = np.nan
+    result = pb.fit(poisoned, scene=PLATE, links=LINKS, method="laplace", seed=1)
+    counts = provenance_of(result)["counts"]
+    assert counts["masked"] == 1
+    assert counts["used"] == 11
+    assert np.isfinite(result["posterior"]["refractive_index"]).all()
+    assert np.isnan(result["observed_data"]["q"][4])
+    assert (result["log_likelihood"]["q"][..., 4] == 0.0).all()
+
+
+def test_views_beyond_the_limit_are_set_aside_and_counted(capture: xr.Dataset) -> None:
+    result = pb.fit(
+        capture, scene=PLATE, links=LINKS, method="laplace", largest_view_zenith=60.0, seed=1
+    )
+    counts = provenance_of(result)["counts"]
+    assert counts["used"] == int((capture["view_zenith"] <= 60.0).sum())
+
+
+def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:
+    before = capture.copy(deep=True)
+    pb.fit(capture, scene=PLATE, links=LINKS, method="laplace", seed=1)
+    xr.testing.assert_identical(before, capture)
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"model": "per_leaf"}, r"model='per_leaf': no such model; give one of per_material"),
+        ({"method": "magic"}, r"method='magic': no such method; give one of nuts, laplace, point"),
+        ({"scene": "moon"}, r"scene='moon': no such scene; give one of paper, camera, goniometer"),
+        ({"scene": 3}, r"a int is not a scene"),
+        ({"links": pb.BetaLink()}, r"no polarization that these links describe"),
+        ({"links": {"q": pb.BetaLink()}}, r"BetaLink does not describe q; it describes dop"),
+        ({"links": {"u": pb.StokesLink()}}, r"the capture has no variable u"),
+        ({"links": "beta"}, r"a str is not a link; give a link such as BetaLink\(\)"),
+        ({"priors": {"n": dist.Normal()}}, r"no such parameter in this model; .*refractive_index"),
+        ({"priors": {"refractive_index": dist.Normal(1.5, 0.1)}}, r"allows values outside 1 to"),
+        ({"precision": "half"}, r"precision is 'half'; give 'double' or 'single'"),
+        ({"seed": -1}, r"seed is -1; give an integer"),
+        ({"largest_view_zenith": 95.0}, r"largest_view_zenith is 95.0; give degrees"),
+        ({"largest_view_zenith": 22.0}, r"only 1 valid view up to 22 degrees; measure at two"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused_with_the_mend(
+    capture: xr.Dataset, settings: dict, says: str
+) -> None:
+    arguments = {"scene": PLATE, "links": LINKS, **settings}
+    with pytest.raises(pb.PolarBayesError, match=says) as caught:
+        pb.fit(capture, **arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_image_is_refused_with_the_way_out(capture: xr.Dataset) -> None:
+    image = capture.expand_dims(y=2, x=2)
+    image = image.drop_vars([n for n in image if "zenith" in n or "azimuth" in n]).merge(
+        capture[["view_zenith", "view_azimuth", "light_zenith", "light_azimuth"]]
+    )
+    with pytest.raises(pb.CaptureError, match="average a region"):
+        pb.fit(image, scene=PLATE, links=LINKS)
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"chains": 1}, "chains is 1; give at least 2"),
+        ({"draws": 10}, "draws is 10; give at least 50"),
+        ({"draws": 600, "most_draws": 500}, "most_draws is 500; give at least 600"),
+        ({"target_acceptance": 1.0}, "target_acceptance is 1.0"),
+    ],
+)
+def test_sampler_settings_are_checked(settings: dict, says: str) -> None:
+    with pytest.raises(pb.FitError, match=says):
+        pb.Nuts(**settings)
+
+
+def test_progress_reports_every_stage(capture: xr.Dataset) -> None:
+    heard: list[tuple[str, float]] = []
+    pb.fit(
+        capture,
+        scene=PLATE,
+        links=LINKS,
+        method=SHORT,
+        seed=7,
+        progress=lambda stage, fraction: heard.append((stage, fraction)),
+    )
+    assert {stage for stage, _ in heard} >= {"searching for modes", "sampling"}
+    assert all(0.0 <= fraction <= 1.0 for _, fraction in heard)

@@ -1,0 +1,104 @@
+"""Mixtures of surface and body: their ends, signs, and darkness."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from polar_bayes.physics.mixing import AbstractMixing, DopMixing, StokesMixing
+from polar_bayes.physics.stokes import Light, degree_of_linear_polarization
+
+RULES = pytest.mark.parametrize("rule", [DopMixing(), DopMixing(signed=True), StokesMixing()])
+component = st.floats(-0.7, 0.7)
+
+
+def light(intensity: float, q: float, u: float = 0.0) -> Light:
+    return Light(*(jnp.array([x]) for x in (intensity, q, u)))
+
+
+@RULES
+def test_fraction_0_is_the_surface_alone(rule: AbstractMixing) -> None:
+    mixture = rule.mix(jnp.array([0.0]), light(0.2, 0.5, 0.1), light(7.0, -0.3))
+    np.testing.assert_allclose(np.ravel(mixture), [0.2, 0.5, 0.1], rtol=1e-12)
+
+
+@RULES
+def test_fraction_1_is_the_body_alone(rule: AbstractMixing) -> None:
+    """The unsigned rule keeps only the body's degree of polarization."""
+    mixture = rule.mix(jnp.array([1.0]), light(0.2, 0.5, 0.1), light(7.0, -0.3))
+    np.testing.assert_allclose(mixture.intensity, 7.0)
+    dop = degree_of_linear_polarization(mixture.q, mixture.u)
+    np.testing.assert_allclose(dop, 0.3, rtol=1e-12)
+    if rule != DopMixing():
+        np.testing.assert_allclose(mixture.q, -0.3, rtol=1e-12)
+
+
+@given(q=component, u=component, body=component, fraction=st.floats(0.0, 1.0))
+@settings(deadline=None, max_examples=60)
+def test_the_papers_rule_mixes_degrees(q: float, u: float, body: float, fraction: float) -> None:
+    mixture = DopMixing().mix(jnp.array([fraction]), light(1.0, q, u), light(1.0, body))
+    expected = (1.0 - fraction) * np.hypot(q, u) + fraction * abs(body)
+    dop = degree_of_linear_polarization(mixture.q, mixture.u)
+    np.testing.assert_allclose(dop, expected, atol=5e-12)
+
+
+def test_the_papers_rule_hides_cancellation() -> None:
+    surface, body = light(1.0, 0.3), light(1.0, -0.3)
+    half = jnp.array([0.5])
+    assert DopMixing().mix(half, surface, body).q == pytest.approx(0.3)
+    assert DopMixing(signed=True).mix(half, surface, body).q == pytest.approx(0.0)
+    assert StokesMixing().mix(half, surface, body).q == pytest.approx(0.0)
+
+
+@given(
+    bright=st.floats(1e-6, 1e6),
+    q=component,
+    u=component,
+    body=component,
+    fraction=st.floats(0.0, 1.0),
+)
+@settings(deadline=None, max_examples=60)
+def test_stokes_vectors_add(
+    bright: float, q: float, u: float, body: float, fraction: float
+) -> None:
+    mixture = StokesMixing().mix(jnp.array([fraction]), light(bright, q, u), light(1.0, body))
+    total = (1.0 - fraction) * bright + fraction
+    np.testing.assert_allclose(mixture.intensity, total, rtol=1e-14)
+    sum_q = (1.0 - fraction) * bright * q + fraction * body
+    np.testing.assert_allclose(mixture.q * total, sum_q, atol=1e-14 * (bright + 1.0))
+    np.testing.assert_allclose(
+        mixture.u * total, (1.0 - fraction) * bright * u, atol=1e-14 * (bright + 1.0)
+    )
+
+
+@given(bright=st.floats(0.0, 10.0), angle=st.floats(0.0, 6.3), fraction=st.floats(0.0, 1.0))
+@settings(deadline=None, max_examples=40)
+def test_no_mixture_is_more_than_polarized(bright: float, angle: float, fraction: float) -> None:
+    surface = light(bright, np.cos(angle), np.sin(angle))
+    for rule in (DopMixing(), DopMixing(signed=True), StokesMixing()):
+        mixture = rule.mix(jnp.array([fraction]), surface, light(1.0, -1.0))
+        assert np.hypot(mixture.q, mixture.u)[0] <= 1.0 + 1e-11
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dark", [0.0, 1e-30, 1e-12])
+def test_a_dark_surface_keeps_its_polarization(dark: float, dtype: type) -> None:
+    """At fraction 0 the reading is the surface's, however dark, and has finite derivatives."""
+
+    def reading(inputs: jax.Array) -> jax.Array:
+        surface = Light(inputs[1:2], jnp.full(1, 0.6, dtype), jnp.zeros(1, dtype))
+        body = Light(inputs[2:3], jnp.full(1, -0.2, dtype), jnp.zeros(1, dtype))
+        return StokesMixing().mix(inputs[0:1], surface, body).q[0]
+
+    inputs = jnp.array([0.0, dark, 0.05], dtype)
+    assert reading(inputs) == pytest.approx(0.6, rel=1e-6)
+    assert np.all(np.isfinite(jax.grad(reading)(inputs)))
+    assert np.all(np.isfinite(jax.hessian(reading)(inputs)))
+
+
+def test_unpolarized_surface_points_along_s() -> None:
+    mixture = DopMixing().mix(jnp.array([0.5]), light(1.0, 0.0), light(1.0, -0.4))
+    assert mixture.q == pytest.approx(0.2, rel=1e-10)
+    assert mixture.u == pytest.approx(0.0)

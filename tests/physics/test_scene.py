@@ -1,0 +1,243 @@
+"""Scenes: parts in, readings out; what is off is absent; mistakes are told by name."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from polar_bayes.errors import SceneError
+from polar_bayes.physics.geometry import Geometry
+from polar_bayes.physics.illumination import PointSource, UniformSky
+from polar_bayes.physics.instrument import (
+    AbstractInstrumentTerm,
+    AngleZero,
+    DarkLevel,
+    DolpGain,
+    Instrument,
+)
+from polar_bayes.physics.microfacet import GGX
+from polar_bayes.physics.mixing import DopMixing, StokesMixing
+from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.scenes import SCENES, find_scene
+from polar_bayes.physics.subsurface import Depolarizer, Lambertian
+from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+
+predict = jax.jit(Scene.predict, static_argnums=0)
+stokes_of = jax.jit(Scene.stokes, static_argnums=0)
+
+VIEWS = Geometry.from_degrees(
+    view_zenith=[10.0, 45.0, 80.0], view_azimuth=180.0, light_zenith=45.0, light_azimuth=0.0
+)
+PARAMETERS = {
+    "roughness": 0.1,
+    "subsurface_fraction": 0.3,
+    "absorption": 0.3,
+    "refractive_index": 1.5,
+    "dolp_gain": 0.9,
+    "angle_zero": 0.1,
+    "channel_gain_ratio": 1.05,
+    "leakage": 0.01,
+    "dark_level": 0.001,
+    "discrepancy_amplitude": 0.1,
+    "discrepancy_weights": np.array([0.5, -0.5, 1.0, 0.2]),
+}
+
+
+def test_a_scene_of_the_design_reads_as_written() -> None:
+    scene = Scene(
+        surface=RoughSurface(distribution=GGX(), illumination=PointSource()),
+        subsurface=Lambertian(albedo=1.0),
+        mixing=StokesMixing(),
+        coat=None,
+        instrument=None,
+    )
+    assert scene.parameters == ("roughness", "subsurface_fraction", "refractive_index")
+    stokes = stokes_of(scene, {**PARAMETERS, "subsurface_fraction": 0.0}, VIEWS)
+    assert stokes.shape == (3, 3)
+    alone = stokes_of(Scene(surface=scene.surface), PARAMETERS, VIEWS)
+    np.testing.assert_allclose(stokes, alone, rtol=1e-12, atol=1e-30)
+
+
+def test_named_scenes_read_these_parameters() -> None:
+    material = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
+    assert SCENES["paper"].parameters == material
+    assert SCENES["camera"].parameters == (
+        "roughness",
+        "subsurface_fraction",
+        "refractive_index",
+        "dolp_gain",
+    )
+    assert SCENES["goniometer"].parameters == (
+        "subsurface_fraction",
+        "refractive_index",
+        "angle_zero",
+        "channel_gain_ratio",
+        "leakage",
+        "discrepancy_amplitude",
+        "discrepancy_weights",
+    )
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_leading_axes_of_parameters_and_geometry_broadcast(name: str) -> None:
+    """Patches by wavelengths, each with its own parameters, seen in the same views."""
+    scene = SCENES[name]
+    many = {
+        key: jnp.broadcast_to(jnp.asarray(value), (2, 5, *np.shape(value)))
+        for key, value in PARAMETERS.items()
+    }
+    many["refractive_index"] = jnp.linspace(1.3, 1.7, 10).reshape(2, 5)
+    found = predict(scene, many, VIEWS)
+    one = predict(scene, {**PARAMETERS, "refractive_index": many["refractive_index"][1, 2]}, VIEWS)
+    for reading in ("dop", "q", "u", "intensity"):
+        assert found[reading].shape == (2, 5, 3)
+        np.testing.assert_allclose(found[reading][1, 2], one[reading], rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_turning_everything_around_the_normal_changes_nothing(name: str) -> None:
+    turned = VIEWS._replace(
+        view_azimuth=VIEWS.view_azimuth + 123.0, light_azimuth=VIEWS.light_azimuth + 123.0
+    )
+    here, there = (predict(SCENES[name], PARAMETERS, views) for views in (VIEWS, turned))
+    for reading in ("dop", "q", "u", "intensity"):
+        np.testing.assert_allclose(here[reading], there[reading], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_single_precision_stays_single_and_agrees(name: str) -> None:
+    single = Geometry(*(angle.astype(jnp.float32) for angle in VIEWS))
+    small = {key: np.float32(value) for key, value in PARAMETERS.items()}
+    for parameters in (small, PARAMETERS | {"discrepancy_weights": np.zeros(4, np.float32)}):
+        found = predict(SCENES[name], parameters, single)
+        assert all(value.dtype == jnp.float32 for value in found.values())
+    full = predict(SCENES[name], PARAMETERS, VIEWS)
+    found = predict(SCENES[name], small, single)
+    for reading, value in full.items():
+        np.testing.assert_allclose(found[reading], value, rtol=1e-4, atol=1e-6)
+
+
+def test_a_scene_is_static_data() -> None:
+    """Hashable, equal by value, printable and picklable: it can be a static argument of jit."""
+    scene = SCENES["goniometer"]
+    assert hash(scene) == hash(pickle.loads(pickle.dumps(scene)))
+    assert scene == pickle.loads(pickle.dumps(scene))
+    copy = pickle.loads(pickle.dumps(scene))
+    stokes_of(scene, PARAMETERS, VIEWS)
+    traces = stokes_of._cache_size()
+    stokes_of(copy, PARAMETERS, VIEWS)
+    assert stokes_of._cache_size() == traces
+
+
+def operations(scene: Scene) -> list[str]:
+    """The primitives of the program that a scene becomes."""
+    program = jax.make_jaxpr(lambda p: scene.predict(p, VIEWS))(PARAMETERS)
+    return [str(equation.primitive) for equation in program.eqns]
+
+
+@pytest.mark.parametrize("term", SCENES["goniometer"].instrument.terms, ids=lambda t: str(t)[:9])
+def test_a_term_removed_is_absent_from_the_program(term: AbstractInstrumentTerm) -> None:
+    scene = SCENES["goniometer"]
+    rest = tuple(part for part in scene.instrument.terms if part != term)
+    never_there = Scene(scene.surface, scene.subsurface, scene.mixing, instrument=Instrument(rest))
+    removed = scene.without(type(term))
+    assert operations(removed) == operations(never_there)
+    assert len(operations(removed)) < len(operations(scene))
+    assert not set(term.parameters) & set(removed.parameters)
+
+
+def test_a_part_switched_off_costs_no_operation() -> None:
+    """Flops of the compiled program: no body, no instrument, nothing but the mirror."""
+
+    def flops(scene: Scene) -> float:
+        program = jax.jit(lambda p: scene.predict(p, VIEWS)["q"])
+        return program.lower(PARAMETERS).compile().cost_analysis()["flops"]
+
+    whole = SCENES["goniometer"]
+    bare = Scene(SmoothSurface(), None, None, None, None)
+    assert flops(bare) < 0.5 * flops(whole)
+    emptied = whole
+    for term in whole.instrument.terms:
+        emptied = emptied.without(type(term))
+    assert emptied.instrument is None
+    assert flops(emptied) == flops(Scene(whole.surface, whole.subsurface, whole.mixing))
+
+
+def test_the_instrument_is_not_in_the_optics() -> None:
+    camera = SCENES["camera"]
+    stokes, readings = stokes_of(camera, PARAMETERS, VIEWS), predict(camera, PARAMETERS, VIEWS)
+    np.testing.assert_allclose(readings["q"], 0.9 * stokes[:, 1] / stokes[:, 0], rtol=1e-12)
+    optics_only = {k: v for k, v in PARAMETERS.items() if k != "dolp_gain"}
+    np.testing.assert_array_equal(stokes_of(camera, optics_only, VIEWS), stokes)
+
+
+def test_angle_zero_moves_the_geometry() -> None:
+    scene = Scene(SmoothSurface(), instrument=Instrument((AngleZero(),)))
+    shifted = scene.predict({**PARAMETERS, "angle_zero": 2.0}, VIEWS)
+    moved = VIEWS._replace(
+        view_zenith=VIEWS.view_zenith + 2.0, light_zenith=VIEWS.light_zenith + 2.0
+    )
+    np.testing.assert_allclose(
+        shifted["q"],
+        scene.stokes(PARAMETERS, moved)[:, 1] / (scene.stokes(PARAMETERS, moved)[:, 0]),
+        rtol=1e-12,
+    )
+
+
+def test_figures_of_the_specification() -> None:
+    """PHYSICS section 2: degree of polarization under a uniform sky, n 1.5, Beckmann."""
+    table = {
+        45.0: (0.831, 0.810, 0.654, 0.429),
+        55.0: (0.996, 0.961, 0.774, 0.553),
+        75.0: (0.577, 0.575, 0.643, 0.598),
+        85.0: (0.198, 0.290, 0.475, 0.518),
+    }
+    scene = Scene(RoughSurface(illumination=UniformSky()))
+    views = Geometry.from_degrees(
+        view_zenith=list(table), view_azimuth=180.0, light_zenith=0.0, light_azimuth=0.0
+    )
+    found = predict(
+        scene,
+        {"roughness": np.array([0.02, 0.1, 0.3, 0.5]), "refractive_index": 1.5},
+        views,
+    )["dop"]
+    np.testing.assert_allclose(found.T, list(table.values()), atol=1.2e-3)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"surface": GGX()}, r"surface: GGX\(\) is no surface; give SmoothSurface\(\) or Rough"),
+        ({"subsurface": "lambertian"}, "subsurface: 'lambertian' is no subsurface; give Unpol"),
+        ({"mixing": Lambertian()}, r"mixing: .* is no mixing; give DopMixing\(\)"),
+        ({"instrument": DolpGain()}, r"instrument: .* give Instrument\(\(DolpGain\(\), ...\)\)"),
+        ({"coat": "clear"}, "coat: 'clear' cannot be used yet; leave coat=None"),
+        ({"mixing": DopMixing()}, "mixing: there is no subsurface to mix; give a subsurface"),
+        ({"subsurface": Depolarizer()}, "subsurface: nothing says how .* give mixing=Stokes"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(parts: dict, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        Scene(**{"surface": SmoothSurface(), **parts})
+
+
+def test_missing_parameters_are_named() -> None:
+    with pytest.raises(SceneError, match="parameters: absorption, refractive_index missing; this"):
+        SCENES["paper"].stokes({"roughness": 0.1, "subsurface_fraction": 0.2}, VIEWS)
+    with pytest.raises(SceneError, match="parameters: dolp_gain missing"):
+        SCENES["camera"].predict({k: 1.5 for k in SCENES["paper"].parameters}, VIEWS)
+
+
+def test_only_terms_that_are_there_can_be_removed() -> None:
+    with pytest.raises(SceneError, match="no DarkLevel; name one of its instrument terms: DolpG"):
+        SCENES["camera"].without(DarkLevel)
+    assert SCENES["camera"].without(DolpGain).instrument is None
+
+
+def test_scenes_are_found_by_name() -> None:
+    assert find_scene("paper") is SCENES["paper"]
+    assert find_scene(SCENES["camera"]) is SCENES["camera"]
+    with pytest.raises(SceneError, match="'lab' is no scene; give one of paper, camera, goniom"):
+        find_scene("lab")
