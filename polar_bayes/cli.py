@@ -15,6 +15,8 @@ from typing import Any
 
 import click
 import platformdirs
+from rich.console import Console
+from rich.progress import Progress
 
 import polar_bayes as pb
 
@@ -198,10 +200,8 @@ def _print_counts(capture: Any, out: Path) -> None:
 @contextmanager
 def _progress() -> Iterator[Callable[[str, float], None]]:
     """One bar per stage on the error stream; silent where that is not a terminal."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as bars:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bars:
         tasks: dict[str, Any] = {}
 
         def progress(stage: str, fraction: float) -> None:

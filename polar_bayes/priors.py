@@ -11,6 +11,7 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping
 
+import numpy as np
 from numpyro import distributions as dist
 from numpyro.distributions import constraints
 
@@ -75,10 +76,17 @@ def resolve_priors(
         A distribution for each name, in the order given.
 
     Raises:
-        FitError: An override is not a NumPyro distribution, names no parameter of this model,
-            or allows values outside the parameter's physical range; or a parameter has no prior.
+        FitError: An override is not a continuous NumPyro distribution of the right shape, names
+            no parameter of this model, or allows values outside the parameter's physical range;
+            or a parameter has no prior.
     """
     parameters = tuple(parameters)
+    if not isinstance(overrides, Mapping | None):
+        raise FitError(
+            f"a {type(overrides).__name__} does not name what it replaces",
+            where="priors",
+            mend="give a mapping such as {'roughness': HalfNormal(0.1)}",
+        )
     overrides = dict(overrides or {})
     for name, prior in overrides.items():
         _check_override(str(name), prior, parameters)
@@ -94,32 +102,87 @@ def resolve_priors(
 
 
 def describe_prior(prior: dist.Distribution) -> str:
-    """A prior as text, for reports: `TruncatedNormal(loc=1.45, scale=0.15, low=1.2, high=2)`."""
-    event = ""
-    while isinstance(prior, dist.Independent | dist.ExpandedDistribution):
-        event = f" x {tuple(prior.event_shape)}" if prior.event_shape else event
-        prior = prior.base_dist
-    name = type(prior).__name__
-    if isinstance(prior, dist.TransformedDistribution) and not prior.arg_constraints:
-        return f"{name}({describe_prior(prior.base_dist)}){event}"
-    arguments = {key: getattr(prior, key, None) for key in prior.arg_constraints}
-    base = getattr(prior, "base_dist", None)
-    if base is not None and type(prior).__name__.startswith(("TwoSided", "Left", "Right")):
-        return f"Truncated({describe_prior(base)}, {_bounds(prior)}){event}"
-    text = ", ".join(f"{key}={_number(value)}" for key, value in arguments.items())
-    return f"{name}({text}){event}"
+    """A prior as text, for reports: `TruncatedNormal(loc=1.45, scale=0.15, low=1.2, high=2)`.
 
+    Args:
+        prior: Any NumPyro distribution.
 
-def _number(value: object) -> str:
+    Returns:
+        One line; ` x (4,)` at its end means that many independent copies.
+
+    Raises:
+        Nothing: what cannot be read out of a distribution is left out.
+    """
     try:
-        return f"{float(value):g}"  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        return "..."
+        return _description(prior)
+    except Exception:
+        # A report must not fail because a distribution of the user's own describes itself badly.
+        return type(prior).__name__
 
 
-def _bounds(prior: dist.Distribution) -> str:
-    low, high = support_bounds(prior)
-    return f"low={low:g}, high={high:g}"
+def _description(prior: dist.Distribution) -> str:
+    shape = (*prior.batch_shape, *prior.event_shape)
+    while isinstance(
+        prior, dist.Independent | dist.ExpandedDistribution | dist.distribution.MaskedDistribution
+    ):
+        prior = prior.base_dist
+    copies = f" x {shape}" if shape != (*prior.batch_shape, *prior.event_shape) else ""
+    return f"{_name(prior)}({', '.join(_arguments(prior))}){copies}"
+
+
+def _name(prior: dist.Distribution) -> str:
+    if _is_truncated(prior):
+        return f"Truncated{type(prior.base_dist).__name__}"
+    if isinstance(prior, dist.MixtureSameFamily | dist.MixtureGeneral):
+        return "Mixture"
+    return type(prior).__name__
+
+
+def _arguments(prior: dist.Distribution) -> list[str]:
+    """What stands between the parentheses."""
+    if _is_truncated(prior):
+        bounds = zip(("low", "high"), support_bounds(prior), strict=True)
+        said = [f"{key}={bound:g}" for key, bound in bounds if math.isfinite(bound)]
+        return _arguments(prior.base_dist) + said
+    if isinstance(prior, dist.MixtureSameFamily | dist.MixtureGeneral):
+        same = isinstance(prior, dist.MixtureSameFamily)
+        parts = [prior.component_distribution] if same else prior.component_distributions
+        return [
+            f"weights={_text(np.asarray(prior.mixing_distribution.probs))}",
+            *map(_description, parts),
+        ]
+    if isinstance(prior, dist.TransformedDistribution) and not prior.arg_constraints:
+        steps = (f"{type(step).__name__}({_fields(vars(step))})" for step in prior.transforms)
+        return [_description(prior.base_dist), *steps]
+    return [_fields({key: getattr(prior, key, None) for key in prior.arg_constraints})]
+
+
+def _fields(values: Mapping[str, object]) -> str:
+    """What of these is numbers, as `loc=1, scale=2`."""
+    numbers = {
+        key: np.asarray(value)
+        for key, value in values.items()
+        if not key.startswith("_") and np.asarray(value).dtype.kind in "iuf"
+    }
+    return ", ".join(f"{key}={_text(number)}" for key, number in numbers.items())
+
+
+def _is_truncated(prior: dist.Distribution) -> bool:
+    return isinstance(
+        prior,
+        dist.LeftTruncatedDistribution
+        | dist.RightTruncatedDistribution
+        | dist.TwoSidedTruncatedDistribution,
+    )
+
+
+def _text(numbers: np.ndarray) -> str:
+    """A number in six digits, a short list in brackets, a longer one by its shape."""
+    if numbers.size == 1:
+        return f"{numbers.item():g}"
+    if numbers.ndim == 1 and numbers.size <= 8:
+        return f"[{', '.join(f'{number:g}' for number in numbers)}]"
+    return f"<array {numbers.shape}>"
 
 
 def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
@@ -129,7 +192,7 @@ def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
         support = support.base_constraint
     low = getattr(support, "lower_bound", -math.inf)
     high = getattr(support, "upper_bound", math.inf)
-    return float(low), float(high)
+    return float(np.min(low)), float(np.max(high))
 
 
 def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> None:
@@ -148,6 +211,7 @@ def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> No
             where=where,
             mend="give an object such as numpyro.distributions.Normal(0.0, 1.0)",
         )
+    _check_shape(name, prior, where)
     low, high = support_bounds(prior)
     least, most = RANGES.get(name, (-math.inf, math.inf))
     if low < least or high > most:
@@ -155,4 +219,30 @@ def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> No
             f"{type(prior).__name__} allows values outside {least:g} to {most:g}",
             where=where,
             mend="use a distribution of that support, for example TruncatedNormal or Beta",
+        )
+
+
+def _check_shape(name: str, prior: dist.Distribution, where: str) -> None:
+    """Refuse what would be repeated over the wrong axes, or cannot be differentiated."""
+    if prior.support.is_discrete:
+        raise FitError(
+            f"{type(prior).__name__} is discrete, and samplers follow gradients",
+            where=where,
+            mend="give a continuous distribution",
+        )
+    usual = PRIORS.get(name)
+    if usual is None:
+        return  # a parameter of the user's own has the shape that its reader expects
+    if len(prior.event_shape) != len(usual.event_shape):
+        to_event = "one number" if not usual.event_shape else "a vector: use .expand([n])"
+        raise FitError(
+            f"one draw of it has shape {tuple(prior.event_shape)}",
+            where=where,
+            mend=f"give a distribution of {to_event}{'.to_event(1)' if usual.event_shape else ''}",
+        )
+    if prior.batch_shape and prior.batch_shape[-1] != 1:
+        raise FitError(
+            f"it is {prior.batch_shape[-1]} distributions side by side",
+            where=where,
+            mend="give one, or one per wavelength in shape (wavelength, 1): views share it",
         )

@@ -286,8 +286,8 @@ def _undetermined_point(table: pd.DataFrame, method: str) -> list[str]:
     if not len(open_):
         return []
     return [
-        f"No standard error: {_list(dict.fromkeys(open_, 0.0), None)}; the readings hardly move "
-        "with it, so its value says nothing."
+        f"No standard error: {_list(dict.fromkeys(open_, 0.0), None)}; least squares does not "
+        "determine such values, so they say nothing."
     ]
 
 

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
 
@@ -49,7 +51,7 @@ class Request:
         needed = (*scene.parameters, *noise_parameters(self.links))
         # Distributions keep what they have computed once, in the precision of that day; a copy
         # from their arguments alone takes the precision of this fit.
-        priors = {name: jax.tree.map(lambda x: x, self.priors[name]) for name in needed}
+        priors = {name: jax.tree.map(_in_this_precision, self.priors[name]) for name in needed}
         return functools.partial(self.model, scene=scene, priors=priors, links=self.links)
 
 
@@ -107,6 +109,13 @@ def resolve(
         seed=seed,
         precision=precision,
     )
+
+
+def _in_this_precision(argument: object) -> object:
+    """An array argument of a prior in the floating type of this fit; others as they are."""
+    if hasattr(argument, "dtype") and jnp.issubdtype(argument.dtype, jnp.floating):
+        return jnp.asarray(np.asarray(argument).astype(jnp.result_type(float)))
+    return argument
 
 
 def _find(table: Mapping[str, Any], kind: str, name: object) -> Any:

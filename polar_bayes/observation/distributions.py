@@ -7,6 +7,7 @@ written as a divergence plus Stirling remainders, so that concentrations of 1e8 
 
 import functools
 import math
+from typing import override
 
 import jax
 import jax.numpy as jnp
@@ -53,11 +54,13 @@ class MeanConcentrationBeta(dist.Distribution):
         self.mean_value, self.concentration = promote_shapes(mean, concentration, shape=shape)
         super().__init__(batch_shape=shape, validate_args=validate_args)
 
+    @override
     def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
         first = self.mean_value * self.concentration
         second = (1.0 - self.mean_value) * self.concentration
         return dist.Beta(first, second).sample(key, sample_shape)
 
+    @override
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         mean, concentration = self.mean_value, self.concentration
         other = 1.0 - mean
@@ -74,10 +77,12 @@ class MeanConcentrationBeta(dist.Distribution):
         )
 
     @property
+    @override
     def mean(self) -> Array:
         return jnp.broadcast_to(self.mean_value, self.batch_shape)
 
     @property
+    @override
     def variance(self) -> Array:
         return self.mean_value * (1.0 - self.mean_value) / (1.0 + self.concentration)
 
@@ -119,12 +124,14 @@ class SensorStudentT(dist.Distribution):
         self.degrees_of_freedom = degrees_of_freedom
         super().__init__(batch_shape=shape, validate_args=validate_args)
 
+    @override
     def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
         noisy = dist.StudentT(self.degrees_of_freedom, self.location, self.scale).sample(
             key, sample_shape
         )
         return jnp.clip(noisy, 0.0, self.full_scale)
 
+    @override
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         distance = (value - self.location) / self.scale
         inside = dist.StudentT(self.degrees_of_freedom, self.location, self.scale).log_prob(value)
@@ -134,6 +141,7 @@ class SensorStudentT(dist.Distribution):
         return jnp.where(self.saturated | (value <= 0.0), stopped, inside)
 
     @property
+    @override
     def mean(self) -> Array:
         """The noise-free reading, stopped as the sensor stops it."""
         return jnp.clip(self.location, 0.0, self.full_scale)
@@ -163,7 +171,7 @@ def log_survival(distance: Float[Array, "..."], degrees_of_freedom: float) -> Fl
 
 
 @log_survival.defjvp
-def _log_survival_derivative(degrees_of_freedom, primals, tangents):  # noqa: ANN001, ANN202
+def _log_survival_derivative(degrees_of_freedom, primals, tangents):
     (distance,), (step,) = primals, tangents
     value = log_survival(distance, degrees_of_freedom)
     log_density = dist.StudentT(degrees_of_freedom, 0.0, 1.0).log_prob(distance)

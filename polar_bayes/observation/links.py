@@ -92,7 +92,8 @@ class _DopLink(AbstractLink):
 class BetaLink(_DopLink):
     r"""Beta noise of the degree of polarization, the paper's default.
 
-    $$ \rho \sim Beta(\mu\kappa, (1-\mu)\kappa), \quad \mu = clip(\rho_{model}, \epsilon, 1-\epsilon) $$
+    $$ \rho \sim Beta(\mu\kappa, (1-\mu)\kappa), \quad
+       \mu = clip(\rho_{model}, \epsilon, 1-\epsilon) $$
 
     Args:
         margin: $\epsilon$, unit 1, range [1e-6, 1e-3].
@@ -103,7 +104,7 @@ class BetaLink(_DopLink):
     """
 
     parameters: ClassVar[tuple[str, ...]] = ("concentration_scale",)
-    schedule: ConcentrationSchedule = ConcentrationSchedule()
+    schedule: ConcentrationSchedule = dataclasses.field(default_factory=ConcentrationSchedule)
 
     @override
     def distribution(
@@ -182,6 +183,12 @@ class StokesLink(AbstractLink):
                 where="StokesLink",
                 mend="give a number above 2, or None for normal noise",
             )
+        if not 0.0 < self.least_brightness <= 1.0:
+            raise FitError(
+                f"least_brightness is {self.least_brightness}",
+                where="StokesLink",
+                mend="give a number above 0 and up to 1",
+            )
 
     @property
     @override
@@ -234,7 +241,7 @@ class StudentTLink(AbstractLink):
     observables: ClassVar[tuple[str, ...]] = ("intensity",)
     parameters: ClassVar[tuple[str, ...]] = ("exposure", "intensity_scale")
     degrees_of_freedom: float = 5.0
-    schedule: ScaleSchedule = ScaleSchedule()
+    schedule: ScaleSchedule = dataclasses.field(default_factory=ScaleSchedule)
 
     def __post_init__(self) -> None:
         if not 3.0 <= self.degrees_of_freedom <= 7.0:

@@ -110,7 +110,7 @@ class Beckmann(AbstractMicrofacet):
     exact form with error functions.
 
     Source:
-        Walter et al. 2007, Microfacet models for refraction through rough surfaces, section 5.2.
+        Walter et al. 2007, Microfacet models for refraction through rough surfaces.
     """
 
     @override
@@ -157,7 +157,7 @@ class GGX(AbstractMicrofacet):
        G_1 = \frac{2}{1+\sqrt{1+\alpha^2\tan^2\theta}} $$
 
     Source:
-        Walter et al. 2007, Microfacet models for refraction through rough surfaces, section 5.2.
+        Walter et al. 2007, Microfacet models for refraction through rough surfaces.
     """
 
     @override

@@ -169,8 +169,8 @@ def _pictures(
             has_prior,
             lambda: figures.prior_posterior(result),
             "Prior and posterior of each parameter",
-            "Curves are scaled to equal height. Where blue is as wide as gray, the data said "
-            "nothing about this parameter.",
+            "Curves are scaled to equal height. Where blue covers gray, the data said nothing "
+            "about this parameter.",
         ),
         "ranks": _optional(
             method == "nuts" and has_draws,
@@ -193,15 +193,17 @@ def _pictures(
 
 def _reading_pictures(result: xr.DataTree, has_draws: bool) -> list[Picture]:
     pictures = []
-    bands = " Of new readings of the same material half should fall in the dark band and 95% in "
-    bands = f"{bands}the light one." if has_draws else ""
+    bands = (
+        " (posterior median). Of new readings of the same material half should fall in the dark "
+        "band and 95% in the light one."
+    )
     for name in variables(result):
         quantity = QUANTITIES[name]
         pictures.append(
             _picture(
                 figures.readings(result, name),
                 f"Readings of {quantity} and the fitted curve against view zenith",
-                f"Readings of {quantity} with the fitted curve.{bands}",
+                f"Readings of {quantity} with the fitted curve{bands if has_draws else '.'}",
             )
         )
         if name != "intensity":

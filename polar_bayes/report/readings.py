@@ -358,7 +358,7 @@ def _legend() -> dict[str, Line2D | Patch]:
         ),
         "masked": Line2D([], [], label="masked: not fitted", **_masked_style()),
         "aside": Patch(color="#efefef", label="set aside: beyond the angle limit"),
-        "median": Line2D([], [], color=BLUE, lw=1.4, label="fitted curve (median)"),
+        "median": Line2D([], [], color=BLUE, lw=1.4, label="fitted curve"),
         "half": Patch(color=lighten(BLUE, 0.5), label="50% of new readings"),
         "most": Patch(color=lighten(BLUE, 0.78), label="95% of new readings"),
     }

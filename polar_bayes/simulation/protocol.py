@@ -30,7 +30,10 @@ class Protocol:
 
     def __post_init__(self) -> None:
         checks = {
-            "views": (2 <= self.views <= 100_000, "give 2 to 100000 views"),
+            "views": (
+                isinstance(self.views, int) and 2 <= self.views <= 100_000,
+                "give a whole number from 2 to 100000",
+            ),
             "largest_view_zenith": (
                 0.0 < self.largest_view_zenith < 90.0,
                 "give degrees above 0 and below 90",

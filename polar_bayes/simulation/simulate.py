@@ -41,6 +41,9 @@ NEUTRAL: Mapping[str, np.ndarray] = {
 }
 """A perfect instrument, by the names of the terms' parameters."""
 
+UNITS: Mapping[str, str] = {"angle_zero": "degree"}
+"""Units of the truth, where it has one."""
+
 STATED_ERROR = 0.01
 """Standard error that the instrument states of every reading, for the links that read it."""
 
@@ -151,7 +154,9 @@ def _levels(
     for name in parameters:
         where = f"simulate: noise[{name!r}]"
         if name not in levels:
-            raise FitError("it has no value", where=where, mend=f"give noise={{{name!r}: <number>}}")
+            raise FitError(
+                "it has no value", where=where, mend=f"give noise={{{name!r}: <number>}}"
+            )
         if levels[name] is not None:
             _check_range(where, name, np.asarray(levels[name], float), above=True)
     return {name: levels[name] for name in parameters}
@@ -208,24 +213,32 @@ def _record(
     if "intensity" in links:
         link = links["intensity"]
         intensity = link.distribution("intensity", prediction, blank, levels).sample(key_intensity)
+        intensity = jnp.clip(intensity, 0.0, FULL_SCALE)
         recorded["intensity"] = intensity
         recorded["saturated"] = intensity >= FULL_SCALE
         data = _with_intensity(blank, intensity, recorded["saturated"])
     for name, key in zip(links, jax.random.split(key_rest, len(links)), strict=True):
         if name != "intensity":
             recorded[name] = links[name].distribution(name, prediction, data, levels).sample(key)
-    # Noise without bounds leaves the range of a reading; an instrument would not report that.
-    for name, least in (("dop", 0.0), ("q", -1.0), ("u", -1.0)):
-        if name in recorded:
-            recorded[name] = jnp.clip(recorded[name], least, 1.0)
+    recorded |= _possible(recorded)
     for name in (name for name, link in links.items() if link.reads_errors):
         recorded[f"{name}_error"] = blank.errors[name]
     return {name: np.asarray(value) for name, value in recorded.items()}
 
 
+def _possible(recorded: Mapping[str, Array]) -> dict[str, Array]:
+    """The polarization as an instrument reports it: noise carries it no further than fully."""
+    stokes = {name: recorded[name] for name in ("q", "u") if name in recorded}
+    length = jnp.sqrt(sum(value**2 for value in stokes.values()))
+    possible = {name: value / jnp.maximum(length, 1.0) for name, value in stokes.items()}
+    if "dop" in recorded:
+        possible["dop"] = jnp.clip(recorded["dop"], 0.0, 1.0)
+    return possible
+
+
 def _blank(protocol: Protocol, links: Mapping[str, AbstractLink]) -> Observations:
     """The layout of the capture before anything was recorded."""
-    dims = (("view", protocol.views),)
+    dims: tuple[tuple[str, int], ...] = (("view", protocol.views),)
     if protocol.wavelengths:
         dims = (("wavelength", len(protocol.wavelengths)), *dims)
     shape = tuple(length for _, length in dims)
@@ -262,7 +275,8 @@ def _label(
         capture[name] = (dims, value.T)
     for name, value in truth.items():
         if np.ndim(NEUTRAL.get(name, 0.0)) == 0:  # a capture has no dim for a vector of weights
-            capture[f"true_{name}"] = ("wavelength" if value.ndim else (), value)
+            units = {"units": UNITS.get(name, "1")}
+            capture[f"true_{name}"] = ("wavelength" if value.ndim else (), value, units)
     if protocol.wavelengths:
         capture = capture.assign_coords(wavelength=np.asarray(protocol.wavelengths, float))
     if "intensity" in capture:

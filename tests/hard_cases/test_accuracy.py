@@ -1,10 +1,10 @@
 """Closed forms agree with 50-digit arithmetic to 1e-10 in double and 1e-4 in single precision."""
 
 import mpmath as mp
-import multiprecision as twin
 import numpy as np
 import pytest
-from catalogue import MATERIALS, every_case
+from hard_cases import multiprecision as twin
+from hard_cases.catalogue import MATERIALS, every_case
 
 from polar_bayes.physics import fresnel
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees

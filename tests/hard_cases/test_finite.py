@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from catalogue import DIRECTIONS, INSTRUMENTS, MATERIALS, Cases, every_case
+from hard_cases.catalogue import DIRECTIONS, INSTRUMENTS, MATERIALS, Cases, every_case
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry
@@ -40,8 +40,10 @@ def instrument_columns(scene: Scene, settings: Mapping[str, object], dtype: type
 
 
 def rows(scene: Scene, cases: Cases, dtype: type) -> np.ndarray:
-    """Every case with every state of the instrument: one row of inputs each."""
-    settings = INSTRUMENTS.values() if scene.instrument else [INSTRUMENTS["perfect"]]
+    """Every case with every state of the instrument: one row of inputs each.
+
+    A scene without an instrument gets as many rows: operations of one shape compile once.
+    """
     count = len(cases.names)
     return np.concatenate(
         [
@@ -53,7 +55,7 @@ def rows(scene: Scene, cases: Cases, dtype: type) -> np.ndarray:
                 ],
                 axis=1,
             )
-            for setting in settings
+            for setting in INSTRUMENTS.values()
         ]
     )
 

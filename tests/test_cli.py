@@ -1,0 +1,160 @@
+"""The commands as a user types them: output, files, exit status, and one line for a mistake."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plates import plate_capture
+
+import polar_bayes as pb
+from polar_bayes.cli import main
+
+PLATES = {
+    "glass": (
+        ["--s", "glass_fresnel/s1.txt", "--p", "glass_fresnel/p1.txt"],
+        ["--s-incident", "1910", "--p-incident", "1630"],
+        1.509,
+    ),
+    "plexiglas": (
+        ["--table", "plexiglas_fresnel/plexiglas_A.csv"],
+        ["--angle", "angle_deg", "--s", "I_s_uA", "--p", "I_p_uA"],
+        1.489,
+    ),
+}
+
+
+@pytest.mark.parametrize("plate", PLATES)
+def test_a_measured_plate_from_table_to_interval(
+    plate: str, measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One and the same setting for both plates, as the commands' defaults have it."""
+    files, columns, index = PLATES[plate]
+    files = [str(measured / word) if "/" in word else word for word in files]
+    capture, fit = tmp_path / "capture.nc", tmp_path / "fit.nc"
+    assert main(["import", "goniometer", *files, *columns, "--out", str(capture)]) == 0
+    assert "views" in capsys.readouterr().out
+    status = main(["fit", str(capture), "--method", "nuts", "--json", "--out", str(fit)])
+    said = json.loads(capsys.readouterr().out)
+    assert status == 0, said["problems"]
+    assert said["converged"]
+    found = said["parameters"]["refractive_index"]
+    assert found["q2.5"] < index < found["q97.5"]
+    assert found["q97.5"] - found["q2.5"] < 0.2
+    # Nothing but the surface reflects from a polished plate with an opaque back.
+    assert said["parameters"]["subsurface_fraction"]["q97.5"] < 0.05
+    result = pb.load_result(fit)
+    assert "without_discrepancy" in result.children
+    assert main(["report", str(fit), "--out", str(tmp_path / "report")]) == 0
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert "overconfident" in page
+
+
+def test_every_preset_converges(tmp_path: Path) -> None:
+    for preset in pb.PRESETS:
+        result = pb.fit(pb.simulate(preset, seed=0), seed=0)
+        verdict = pb.verdict(result)
+        assert verdict.converged, (preset, verdict.problems)
+        rows = pb.json_summary(result)["parameters"]
+        assert max(row["r_hat"] for row in rows.values()) <= 1.01
+        assert min(row["ess_bulk"] for row in rows.values()) >= 400.0
+
+
+def test_simulate_writes_what_fit_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "leaf.nc"
+    assert main(["simulate", "--preset", "leaf", "--seed", "3", "--out", str(file)]) == 0
+    assert capsys.readouterr().out.startswith(str(file))
+    capture = pb.load_capture(file)
+    assert dict(capture.sizes) == {"view": 40, "wavelength": 3}
+
+
+@pytest.fixture(scope="module")
+def plate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("plate") / "plate.nc"
+    capture = plate_capture(np.linspace(20.0, 75.0, 20), 0.01, seed=2)
+    pb.save_capture(capture.assign_attrs(setup="goniometer"), file)
+    return file
+
+
+def test_the_table_has_a_row_per_parameter(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "fit.nc"
+    assert main(["fit", str(plate), "--method", "laplace", "--out", str(out)]) == 0
+    header, *rows = capsys.readouterr().out.splitlines()
+    assert header.split() == ["mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"]
+    names = [row.split()[0] for row in rows]
+    assert names[:2] == ["subsurface_fraction", "refractive_index"]
+    assert out.exists()
+
+
+def test_a_fit_whose_diagnostics_fail_is_written_and_exits_with_2(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    from polar_bayes.inference import request
+
+    short = pb.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
+    monkeypatch.setitem(request.METHODS, "nuts", short)
+    out = tmp_path / "fit.nc"
+    assert main(["fit", str(plate), "--out", str(out)]) == 2
+    assert "problem: " in capsys.readouterr().err
+    assert out.exists()
+
+
+WRONG = {
+    "no command": (["frob"], "No such command"),
+    "no file": (["fit", "nowhere.nc", "--out", "fit.nc"], "nowhere.nc: there is no such file"),
+    "no out": (["fit", "nowhere.nc"], "Missing option '--out'"),
+    "model": (["fit", "PLATE", "--model", "x", "--out", "OUT"], "no such model"),
+    "method": (["fit", "PLATE", "--method", "x", "--out", "OUT"], "no such method"),
+    "scene": (["fit", "PLATE", "--scene", "x", "--out", "OUT"], "no such scene"),
+    "seed": (["fit", "PLATE", "--seed", "-1", "--out", "OUT"], "--seed"),
+    "limit": (["fit", "PLATE", "--largest-view-zenith", "0", "--out", "OUT"], "give degrees"),
+    "one view": (
+        ["fit", "PLATE", "--largest-view-zenith", "21", "--out", "OUT"],
+        "only 1 valid view",
+    ),
+    "folder": (["fit", "PLATE", "--out", "/nowhere/fit.nc"], "cannot write there"),
+    "report of a capture": (["report", "PLATE", "--out", "OUT"], "it holds no fit"),
+    "preset": (["simulate", "--preset", "x", "--out", "OUT"], "no such material"),
+    "views": (["simulate", "--views", "1", "--out", "OUT"], "views is 1"),
+    "zenith": (["simulate", "--largest-view-zenith", "90", "--out", "OUT"], "below 90"),
+    "table": (["import", "goniometer", "--s", "x", "--p", "y", "--out", "OUT"], "no such file"),
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG)
+def test_a_mistake_gets_one_line_and_exit_status_1(
+    mistake: str, plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words, says = WRONG[mistake]
+    places = {"PLATE": str(plate), "OUT": str(tmp_path / "out.nc")}
+    assert main([places.get(word, word) for word in words]) == 1
+    told = capsys.readouterr()
+    assert says in told.err
+    assert told.err.count("\n") == 1
+    assert not told.out
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_truncated_capture_gets_one_line(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken.nc"
+    broken.write_bytes(plate.read_bytes()[:2000])
+    assert main(["fit", str(broken), "--out", str(tmp_path / "fit.nc")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_an_interrupt_says_that_nothing_was_written(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pb, "fit", interrupted)
+    assert main(["fit", str(plate), "--out", str(tmp_path / "fit.nc")]) == 130
+    assert "stopped" in capsys.readouterr().err
