@@ -1,4 +1,4 @@
-"""What would the fit claim if it denied that the instrument has smooth errors?"""
+"""What would the fit claim if it denied that the instrument errs?"""
 
 import numpy as np
 import pandas as pd
@@ -17,16 +17,20 @@ COLUMNS = (
 )
 INTERVAL = (0.025, 0.975)
 
+WITHOUT = {"discrepancy": "the discrepancy term", "instrument": "any instrument term"}
+"""Fits that may stand beside the main one, in the groups `without_<key>`: what they leave out."""
 
-def compare_without_discrepancy(result: xr.DataTree) -> pd.DataFrame:
-    """The material's intervals with and without the discrepancy term, side by side.
+
+def compare_without(result: xr.DataTree, part: str) -> pd.DataFrame:
+    """The material's intervals with and without a part of the instrument, side by side.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+        part: A key of `WITHOUT`.
 
     Returns:
         One row per material parameter that both fits have; `width_ratio` is the width of the 95%
-        interval without the term over that with it. Empty where the tree holds no such fit.
+        interval without the part over that with it. Empty where the tree holds no such fit.
 
     Raises:
         FitError: The tree holds no posterior.
@@ -34,8 +38,8 @@ def compare_without_discrepancy(result: xr.DataTree) -> pd.DataFrame:
     found = posterior_scalars(result)
     rows, labels = [], []
     plain = {}
-    if "without_discrepancy" in result.children:
-        plain = {s.label: s.draws for s in scalars(result["without_discrepancy"].to_dataset())}
+    if f"without_{part}" in result.children:
+        plain = {s.label: s.draws for s in scalars(result[f"without_{part}"].to_dataset())}
     for scalar in found:
         other = plain.get(scalar.label)
         if other is None or not scalar.is_material:

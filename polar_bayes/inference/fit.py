@@ -104,13 +104,8 @@ def _run(request: Request, progress: Progress) -> xr.DataTree:
     prior = describe(key_prior, prior_z[None], data)
     clock.lap("prediction")
 
-    beside: dict[str, xr.Dataset] = {}
-    if _has_discrepancy(request.scene) and not isinstance(request.method, point.Point):
-        plain_scene = request.scene.without(Discrepancy)
-        plain = _fit_scene(request, plain_scene, data, key_plain, _silent, _Clock())
-        draws = _constrain(plain.program, plain.z)
-        beside["without_discrepancy"] = posterior_of(plain.program, draws, data)
-        clock.lap("without_discrepancy")
+    beside = _fit_beside(request, data, key_plain, progress)
+    clock.lap("beside")
 
     provenance = _provenance(request, data, clock, fitted)
     return assemble(
@@ -247,9 +242,30 @@ def _fit_point(
     return _Fitted(program, found.z[None, None], stats, problems, {"standard_errors": errors})
 
 
-def _has_discrepancy(scene: Scene) -> bool:
-    terms = () if scene.instrument is None else scene.instrument.terms
-    return any(isinstance(term, Discrepancy) for term in terms)
+def _fit_beside(
+    request: Request, data: Observations, key: Array, progress: Progress
+) -> dict[str, xr.Dataset]:
+    """Posteriors of the same fit without what makes its intervals honest, for comparison."""
+    terms = () if request.scene.instrument is None else request.scene.instrument.terms
+    if isinstance(request.method, point.Point) or not any(
+        isinstance(term, Discrepancy) for term in terms
+    ):
+        return {}
+    scenes = {
+        "without_discrepancy": request.scene.without(Discrepancy),
+        "without_instrument": dataclasses.replace(request.scene, instrument=None),
+    }
+    beside = {}
+    for number, (name, scene) in enumerate(scenes.items()):
+        progress("comparing", number / len(scenes))
+        try:
+            fitted = _fit_scene(request, scene, data, key, _silent, _Clock())
+        except FitError:  # a comparison that finds no peak must not cost the user the fit
+            continue
+        draws = _constrain(fitted.program, fitted.z)
+        beside[name] = posterior_of(fitted.program, draws, data)
+    progress("comparing", 1.0)
+    return beside
 
 
 def _provenance(

@@ -1,6 +1,7 @@
-"""Light as brightness and normalized Stokes components, in the frame of PHYSICS section 0.
+"""Light as brightness and normalized Stokes components, in the viewer's frame.
 
-q > 0 is polarized perpendicular to the plane of normal and viewer (s), q < 0 parallel to it (p).
+Its first axis is e_s = (z x v)/|z x v|: q > 0 is polarized perpendicular to the plane of normal and
+viewer (s), q < 0 parallel to it (p), and u > 0 at 45 degrees from e_s.
 """
 
 from typing import NamedTuple

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from polar_bayes.capture.paths import as_path
 from polar_bayes.diagnostics.convergence import judge, summary
-from polar_bayes.diagnostics.discrepancy import compare_without_discrepancy
+from polar_bayes.diagnostics.discrepancy import WITHOUT, compare_without
 from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars
 from polar_bayes.diagnostics.predictive import Check, predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
@@ -116,7 +116,7 @@ def render(result: xr.DataTree) -> str:
         "parameters": tables.estimate_table(result, found, table)
         if is_point
         else tables.parameter_table(result, found, table, prior),
-        "discrepancy": None if is_point else _discrepancy(result, found, posterior),
+        "without": [] if is_point else _without(result, found, posterior),
         "sensitivity": None if is_point else tables.sensitivity_table(found, prior, posterior),
         "convergence": tables.convergence_table(found, table, posterior)
         if method == "nuts"
@@ -137,16 +137,20 @@ def render(result: xr.DataTree) -> str:
     return environment.get_template("report.html.j2").render(content)
 
 
-def _discrepancy(
+def _without(
     result: xr.DataTree, found: list[Scalar], posterior: xr.Dataset
-) -> dict[str, Any] | None:
-    compared = compare_without_discrepancy(result)
-    if compared.empty:
-        return None
-    return {
-        "table": tables.discrepancy_table(result, found, compared),
-        "sentences": sentences.overconfidence(compared, found, posterior),
-    }
+) -> list[dict[str, Any]]:
+    """Each fit that stands beside the main one, with what to make of it."""
+    compared = {what: compare_without(result, part) for part, what in WITHOUT.items()}
+    return [
+        {
+            "what": what,
+            "table": tables.discrepancy_table(result, found, table, what),
+            "sentences": sentences.overconfidence(table, found, posterior, what),
+        }
+        for what, table in compared.items()
+        if not table.empty
+    ]
 
 
 def _pictures(

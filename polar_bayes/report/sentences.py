@@ -104,14 +104,15 @@ def shape(band: Band) -> str:
 
 
 def overconfidence(
-    compared: pd.DataFrame, found: Sequence[Scalar], posterior: xr.Dataset
+    compared: pd.DataFrame, found: Sequence[Scalar], posterior: xr.Dataset, what: str
 ) -> list[str]:
-    """What to make of the fit without the discrepancy term.
+    """What to make of a fit that leaves out a part of the instrument.
 
     Args:
-        compared: The table of `compare_without_discrepancy`, not empty.
+        compared: The table of `compare_without`, not empty.
         found: The scalars of the posterior.
         posterior: The posterior.
+        what: What was left out, such as `the discrepancy term`.
 
     Returns:
         Sentences; they call it narrower only where it is.
@@ -126,14 +127,14 @@ def overconfidence(
         least, most = min(narrower.values()), max(narrower.values())
         by = f"{most:.0%}" if most - least < 0.01 else f"{least:.0%} to {most:.0%}"
         sentences.append(
-            f"Without the discrepancy term the 95% {_interval_of(list(narrower), posterior)} "
-            f"narrower by {by}. That is overconfidence: the fit then counts smooth errors of the "
+            f"Without {what} the 95% {_interval_of(list(narrower), posterior)} "
+            f"narrower by {by}. That is overconfident: the fit then counts errors of the "
             "instrument as knowledge about the material."
         )
     if others:
         sentences.append(
-            f"Without the term the 95% {_interval_of(others, posterior)} not narrower, as it "
-            "happens; still, that fit has no room for smooth errors of the instrument and holds "
+            f"Without {what} the 95% {_interval_of(others, posterior)} not narrower, as it "
+            "happens; still, that fit has no room for such errors of the instrument and holds "
             "only if there are none."
         )
     misses = (compared["mean"] < compared["q2.5_without"]) | (
@@ -145,7 +146,7 @@ def overconfidence(
             f"The two fits disagree on {named(apart, posterior)}: the interval without the term "
             "does not contain the mean with it."
         )
-    return [*sentences, "Do not quote the numbers without the discrepancy term."]
+    return [*sentences, f"Do not quote the numbers without {what}."]
 
 
 def _interval_of(found: Sequence[Scalar], posterior: xr.Dataset) -> str:

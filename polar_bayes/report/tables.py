@@ -95,9 +95,9 @@ def convergence_table(found: Sequence[Scalar], table: pd.DataFrame, posterior: x
 
 
 def discrepancy_table(
-    result: xr.DataTree, found: Sequence[Scalar], compared: pd.DataFrame
+    result: xr.DataTree, found: Sequence[Scalar], compared: pd.DataFrame, what: str
 ) -> Table:
-    """The fit of the report beside the same fit without the discrepancy term."""
+    """The fit of the report beside the same fit without a part of the instrument."""
     shown = [scalar for scalar in found if scalar.label in compared.index]
     truths = {scalar.label: truth_of(result, scalar) for scalar in shown}
     known = any(math.isfinite(truth) for truth in truths.values())
@@ -115,8 +115,8 @@ def discrepancy_table(
     heads = ["parameter", "mean", "95% interval", "mean without", "95% without", "width"]
     heads += ["true value"] if known else []
     caption = (
-        "The fit of this report beside the same fit without the discrepancy term. Width: that of "
-        "the interval without the term over that with it."
+        f"The fit of this report beside the same fit without {what}. Width: that of the interval "
+        "without it over that with it."
     )
     return Table(caption, tuple(heads), tuple(rows))
 

@@ -7,7 +7,7 @@ import xarray as xr
 from scipy import stats
 from synthetic_results import PRIOR, make_result, replace
 
-from polar_bayes.diagnostics.discrepancy import compare_without_discrepancy
+from polar_bayes.diagnostics.discrepancy import compare_without
 from polar_bayes.diagnostics.sensitivity import sensitivity
 
 
@@ -110,7 +110,7 @@ def test_a_point_fit_has_no_widths() -> None:
 
 
 def test_fits_without_the_discrepancy_stand_beside() -> None:
-    table = compare_without_discrepancy(make_result(discrepancy=True))
+    table = compare_without(make_result(discrepancy=True), "discrepancy")
     assert "exposure" not in table.index
     np.testing.assert_allclose(table["width_ratio"], 0.4, rtol=1e-2)
-    assert compare_without_discrepancy(make_result()).empty
+    assert compare_without(make_result(), "discrepancy").empty

@@ -1,4 +1,4 @@
-"""Where the optics goes wrong if nobody takes care, as data: PHYSICS section 8.
+"""Where the optics goes wrong if nobody takes care, as data.
 
 Every direction meets every material. A zenith of 90 degrees is outside the contract of a capture.
 """

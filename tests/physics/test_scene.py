@@ -187,7 +187,7 @@ def test_angle_zero_moves_the_geometry() -> None:
 
 
 def test_figures_of_the_specification() -> None:
-    """PHYSICS section 2: degree of polarization under a uniform sky, n 1.5, Beckmann."""
+    """Two digits and a half of the degree of polarization under a uniform sky, n 1.5, Beckmann."""
     table = {
         45.0: (0.831, 0.810, 0.654, 0.429),
         55.0: (0.996, 0.961, 0.774, 0.553),

@@ -48,7 +48,7 @@ def test_a_rough_way_out_depolarizes() -> None:
 
 
 def test_figures_of_the_specification() -> None:
-    """PHYSICS section 2: at 85 degrees -.309 smooth; -.159 at alpha .3, with an error of .007."""
+    """At 85 degrees -.309 smooth; -.159 at alpha .3, with an error of .007."""
     smooth = SmoothSurface().exit(MATERIAL, GEOMETRY).q[3]
     rough = RoughSurface().exit({**MATERIAL, "roughness": jnp.array([0.3])}, GEOMETRY).q[3]
     assert smooth == pytest.approx(-0.309, abs=5e-4)

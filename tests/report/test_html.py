@@ -14,7 +14,7 @@ import xarray as xr
 from synthetic_results import edit_provenance, make_result, replace
 
 from polar_bayes.diagnostics.convergence import summary
-from polar_bayes.diagnostics.discrepancy import compare_without_discrepancy
+from polar_bayes.diagnostics.discrepancy import compare_without
 from polar_bayes.diagnostics.parameters import posterior_scalars
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.files import load_result
@@ -164,7 +164,7 @@ def test_capture_metadata_is_text_and_nothing_else(evil_page: str) -> None:
 
 
 def test_the_fit_without_discrepancy_is_called_overconfident(page: Page) -> None:
-    assert "narrower by 60%. That is overconfidence" in page.text
+    assert "narrower by 60%. That is overconfident" in page.text
     assert "Do not quote the numbers without the discrepancy term" in page.text
 
 
@@ -176,9 +176,10 @@ def test_it_is_not_called_narrower_where_it_is_not() -> None:
     plain["absorption"] = plain["absorption"] + 10.0 * float(plain["absorption"].std())
     result["without_discrepancy"] = xr.DataTree(plain)
     said = overconfidence(
-        compare_without_discrepancy(result),
+        compare_without(result, "discrepancy"),
         posterior_scalars(result),
         result["posterior"].to_dataset(),
+        "the discrepancy term",
     )
     assert "intervals of subsurface fraction, absorption and refractive index are" in said[0]
     assert "of roughness is not narrower, as it happens" in said[1]
@@ -188,6 +189,7 @@ def test_it_is_not_called_narrower_where_it_is_not() -> None:
 
 def test_no_comparison_without_one(small) -> None:
     assert "Without the discrepancy" not in small[1].text
+    assert "trusting the instrument" not in small[1].text
 
 
 def test_the_folder_holds_page_and_result_and_nothing_else(tmp_path: Path) -> None:
