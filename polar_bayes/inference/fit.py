@@ -17,7 +17,7 @@ from numpyro import distributions as dist
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference import laplace, nuts, point
-from polar_bayes.inference.modes import Modes, ValueAndGradient, climb, distinct
+from polar_bayes.inference.modes import SETTLED, Modes, ValueAndGradient, climb, distinct
 from polar_bayes.inference.program import Draw, Program, compile_program
 from polar_bayes.inference.request import Method, Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
@@ -132,7 +132,13 @@ def _fit_scene(
     potential = _compile_potential(program, data)
     modes = _search(potential, starts, progress)
     clock.lap("modes")
+    problems = []
     if isinstance(request.method, laplace.Laplace):
+        if modes.decrement[0] > SETTLED:
+            problems.append(
+                f"the mode is not settled (Newton decrement {modes.decrement[0]:.2g} posterior "
+                "standard deviations): use method='nuts'"
+            )
         z, stats = laplace.sample(program, data, potential, modes, key_draws, request.method)
     else:
         z, stats = nuts.sample(
@@ -145,7 +151,7 @@ def _fit_scene(
             lambda done: progress("sampling", done),
         )
     clock.lap("draws")
-    return _Fitted(program, z, stats, [], {"modes": _describe_modes(modes)})
+    return _Fitted(program, z, stats, problems, {"modes": _describe_modes(modes)})
 
 
 class _Clock:

@@ -54,9 +54,7 @@ class Climb(NamedTuple):
 
     @property
     def log_evidence(self) -> float:
-        """Laplace's approximation, up to a constant of the dimension; only for status OK."""
-        if self.status is not Status.OK:
-            return -np.inf
+        """Laplace's approximation, up to a constant of the dimension; NaN without a width."""
         return -self.potential + 0.5 * np.linalg.slogdet(self.covariance)[1]
 
 
@@ -153,11 +151,12 @@ def distinct(climbs: list[Climb]) -> Modes | None:
         climbs: The ends of all climbs.
 
     Returns:
-        The peaks by weight, or None when no climb reached one.
+        The peaks by weight, or None when no climb came near one. Where none settled, those that
+        came within one posterior standard deviation stand in, and their decrement tells.
     """
-    arrived = sorted(
-        (end for end in climbs if end.status is Status.OK), key=lambda end: -end.log_evidence
-    )
+    near = [end for end in climbs if end.decrement < 1.0]
+    settled = [end for end in near if end.status is Status.OK]
+    arrived = sorted(settled or near, key=lambda end: -end.log_evidence)
     kept: list[Climb] = []
     for end in arrived:
         if all(_distance(end.z - peak.z, peak.covariance) > SAME_PEAK for peak in kept):
@@ -171,7 +170,7 @@ def distinct(climbs: list[Climb]) -> Modes | None:
         weight=weight / weight.sum(),
         decrement=np.array([end.decrement for end in kept]),
         starts=len(climbs),
-        failures=len(climbs) - len(arrived),
+        failures=len(climbs) - len(settled),
     )
 
 

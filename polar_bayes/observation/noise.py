@@ -7,10 +7,14 @@ fields, so that a user can see and move them.
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polar_bayes.errors import FitError
+
+SMOOTHING = 0.5
+"""Width of the bend at the least headroom, in units of the least headroom."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,8 +73,8 @@ class ScaleSchedule:
     Args:
         headroom_exponent: $\delta$, unit 1, range [0, 1].
         angle_exponent: $\zeta$, unit 1, range [0, 1].
-        least_headroom: Smallest $1 - I/I_{\max}$ that counts; the factor stays below
-            `least_headroom ** -headroom_exponent`. Unit 1, range (0, 1].
+        least_headroom: Smallest $1 - I/I_{\max}$ that counts, approached smoothly; the factor
+            stays below `least_headroom ** -headroom_exponent`. Unit 1, range (0, 1].
         least_cosine: Smallest cosine that counts (0.02 is 88.9 degrees). Unit 1, range (0, 1].
 
     Raises:
@@ -107,7 +111,11 @@ class ScaleSchedule:
         Returns:
             The scale, at least `base`.
         """
-        headroom = jnp.clip(1.0 - brightness, self.least_headroom, 1.0)
+        # A smooth bound: a corner here would put a corner, not a peak, on top of the posterior
+        # whenever a view is predicted close to full scale.
+        width = SMOOTHING * self.least_headroom
+        spare = (1.0 - brightness - self.least_headroom) / width
+        headroom = self.least_headroom + width * jax.nn.softplus(spare)
         cosine = jnp.maximum(cos_view, self.least_cosine)
         return base * headroom**-self.headroom_exponent * cosine**-self.angle_exponent
 
