@@ -60,9 +60,7 @@ def test_every_preset_converges(tmp_path: Path) -> None:
         assert min(row["ess_bulk"] for row in rows.values()) >= 400.0
 
 
-def test_simulate_writes_what_fit_reads(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_simulate_writes_what_fit_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "leaf.nc"
     assert main(["simulate", "--preset", "leaf", "--seed", "3", "--out", str(file)]) == 0
     assert capsys.readouterr().out.startswith(str(file))

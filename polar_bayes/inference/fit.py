@@ -213,7 +213,9 @@ def _describe_modes(modes: Modes) -> dict[str, Any]:
 def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], Draw]:
     """Describe every draw, a block at a time inside one compiled loop of fixed length."""
     compiled = jax.jit(
-        lambda keys, z, data: jax.lax.map(lambda kz: program.describe(*kz, data), (keys, z))
+        lambda keys, z, data: jax.lax.map(
+            lambda kz: program.describe(kz[0], kz[1], data), (keys, z)
+        )
     )
 
     def describe(key: Array, z: np.ndarray, data: Observations) -> Draw:
@@ -245,7 +247,9 @@ def _fit_point(
     errors = point.standard_errors(program, found)
     problems = [] if found.converged else ["least squares did not meet its tolerance"]
     stats = {"loss": np.asarray(found.loss)[None, None]}
-    return _Fitted(program, found.z[None, None], stats, problems, {"standard_errors": errors})
+    return _Fitted(
+        program, np.asarray(found.z)[None, None], stats, problems, {"standard_errors": errors}
+    )
 
 
 def _fit_beside(

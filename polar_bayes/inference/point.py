@@ -108,7 +108,7 @@ def estimate(program: Program, data: Observations, starts: Float[Array, "start s
 
 def to_numpy(estimate: Estimate) -> Estimate:
     """The same with NumPy arrays."""
-    return Estimate(*(np.asarray(part) for part in estimate))
+    return jax.tree.map(np.asarray, estimate)
 
 
 def standard_errors(program: Program, estimate: Estimate) -> dict[str, list[float | None]]:

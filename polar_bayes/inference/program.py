@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
@@ -22,14 +23,17 @@ from polar_bayes.observation.data import Observations
 Model = Callable[[Observations], None]
 
 
-class Draw(NamedTuple):
-    """All that one posterior draw says, by site name."""
+Values = dict[str, Array] | dict[str, np.ndarray]
 
-    latent: dict[str, Array]
-    center: dict[str, Array]
-    log_likelihood: dict[str, Array]
-    log_prior: dict[str, Array]
-    predictive: dict[str, Array]
+
+class Draw(NamedTuple):
+    """All that one posterior draw says, by site name; or a stack of draws, as NumPy arrays."""
+
+    latent: Values
+    center: Values
+    log_likelihood: Values
+    log_prior: Values
+    predictive: Values
 
 
 @dataclasses.dataclass(frozen=True)

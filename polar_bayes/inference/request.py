@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
+from numbers import Integral
 from typing import Any
 
 import jax
@@ -86,7 +87,7 @@ def resolve(
     _check_views(capture, limit)
     if precision not in ("double", "single"):
         raise FitError(f"precision is {precision!r}", where="fit", mend="give 'double' or 'single'")
-    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**32:
+    if not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed < 2**32:
         raise FitError(f"seed is {seed!r}", where="fit", mend="give an integer from 0 to 2**32 - 1")
     swapped = {
         "scene": not isinstance(scene, str),
@@ -106,7 +107,7 @@ def resolve(
         links=chosen,
         swapped=tuple(name for name, was_swapped in swapped.items() if was_swapped),
         largest_view_zenith=limit,
-        seed=seed,
+        seed=int(seed),
         precision=precision,
     )
 
@@ -159,24 +160,7 @@ def _choose_links(
             mend="give a link such as BetaLink(), or a mapping {'dop': BetaLink()}",
         )
     for name, link in chosen.items():
-        if not isinstance(link, AbstractLink):
-            raise FitError(
-                f"a {type(link).__name__} is not a link",
-                where=f"links[{name!r}]",
-                mend="give a link such as BetaLink()",
-            )
-        if name not in link.observables:
-            raise FitError(
-                f"{type(link).__name__} does not describe {name}",
-                where=f"links[{name!r}]",
-                mend=f"it describes {', '.join(link.observables)}",
-            )
-        if name not in capture:
-            raise FitError(
-                f"the capture has no variable {name}",
-                where=f"links[{name!r}]",
-                mend="leave that link out or measure the variable",
-            )
+        _check_link(name, link, capture)
     if not any(name in chosen for name in ("dop", "q", "u")):
         raise CaptureError(
             f"no polarization that these links describe (wanted {' or '.join(wanted)})",
@@ -184,6 +168,28 @@ def _choose_links(
             mend="choose another scene or link: BetaLink for dop, StokesLink for q and u",
         )
     return chosen
+
+
+def _check_link(name: str, link: object, capture: xr.Dataset) -> None:
+    where = f"links[{name!r}]"
+    if not isinstance(link, AbstractLink):
+        raise FitError(
+            f"a {type(link).__name__} is not a link",
+            where=where,
+            mend="give a link such as BetaLink()",
+        )
+    if name not in link.observables:
+        raise FitError(
+            f"{type(link).__name__} does not describe {name}",
+            where=where,
+            mend=f"it describes {', '.join(link.observables)}",
+        )
+    if name not in capture:
+        raise FitError(
+            f"the capture has no variable {name}",
+            where=where,
+            mend="leave that link out or measure the variable",
+        )
 
 
 def _check_views(capture: xr.Dataset, limit: float) -> None:

@@ -6,6 +6,7 @@ to repeat the fit.
 
 import json
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -74,7 +75,7 @@ def assemble(
     for name, dataset in beside.items():
         tree[name] = xr.DataTree(dataset)
     for group in ("posterior", "prior"):
-        _annotate(tree[group])
+        _annotate(tree.children[group])
     tree.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
     return tree
 
@@ -91,9 +92,7 @@ def provenance_of(result: xr.DataTree) -> dict:
     return json.loads(result.attrs.get(PROVENANCE, "{}"))
 
 
-def posterior_of(
-    program: Program, latent: Mapping[str, np.ndarray], data: Observations
-) -> xr.Dataset:
+def posterior_of(program: Program, latent: Mapping[str, Any], data: Observations) -> xr.Dataset:
     """A posterior group alone, for a fit that stands beside the main one.
 
     Args:
@@ -117,7 +116,7 @@ def _dims(program: Program) -> dict[str, list[str]]:
 
 
 def _latent(
-    program: Program, values: Mapping[str, np.ndarray], data: Observations
+    program: Program, values: Mapping[str, Any], data: Observations
 ) -> dict[str, np.ndarray]:
     """Drop the axes of length 1 that plates leave behind."""
     lengths = dict(data.dims)
@@ -131,7 +130,7 @@ def _latent(
     }
 
 
-def _readings(values: Mapping[str, np.ndarray], data: Observations) -> dict[str, np.ndarray]:
+def _readings(values: Mapping[str, Any], data: Observations) -> dict[str, np.ndarray]:
     unit = {"intensity": float(data.intensity_unit)}
     return {name: np.asarray(value) * unit.get(name, 1.0) for name, value in values.items()}
 
@@ -158,8 +157,8 @@ def _constants(
     order = [dim for dim, _ in data.dims]
     bare = capture.drop_vars(capture.coords)
     constants = {name: bare[name] for name in GEOMETRY}
-    constants |= {name: bare[name] for name in bare if str(name).startswith("true_")}
-    constants |= {name: bare[name] for name in bare if str(name).endswith("_error")}
+    constants |= {str(n): bare[n] for n in bare if str(n).startswith("true_")}
+    constants |= {str(n): bare[n] for n in bare if str(n).endswith("_error")}
     constants["valid"] = xr.DataArray(np.asarray(data.valid).astype("int8"), dims=order)
     constants["saturated"] = xr.DataArray(np.asarray(data.saturated).astype("int8"), dims=order)
     return xr.Dataset(constants, coords=dict(coords))

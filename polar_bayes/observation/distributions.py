@@ -134,7 +134,7 @@ class SensorStudentT(dist.Distribution):
     @override
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         distance = (value - self.location) / self.scale
-        inside = dist.StudentT(self.degrees_of_freedom, self.location, self.scale).log_prob(value)
+        inside = log_density(distance, self.degrees_of_freedom) - jnp.log(self.scale)
         beyond_full_scale = log_survival(distance, self.degrees_of_freedom)
         below_zero = log_survival(-distance, self.degrees_of_freedom)
         stopped = jnp.where(self.saturated, beyond_full_scale, below_zero)
@@ -145,6 +145,23 @@ class SensorStudentT(dist.Distribution):
     def mean(self) -> Array:
         """The noise-free reading, stopped as the sensor stops it."""
         return jnp.clip(self.location, 0.0, self.full_scale)
+
+
+def log_density(distance: Float[Array, "..."], degrees_of_freedom: float) -> Float[Array, "..."]:
+    """Log density of Student's t, in the precision of `distance`.
+
+    Args:
+        distance: In units of the scale.
+        degrees_of_freedom: A Python number > 0; NumPyro would turn it into an array of double
+            precision, and single precision would end there.
+
+    Returns:
+        The log density per unit of distance.
+    """
+    half = 0.5 * (degrees_of_freedom + 1.0)
+    constant = math.lgamma(half) - math.lgamma(0.5 * degrees_of_freedom)
+    constant -= 0.5 * math.log(math.pi * degrees_of_freedom)
+    return constant - half * jnp.log1p(distance**2 / degrees_of_freedom)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
@@ -174,8 +191,7 @@ def log_survival(distance: Float[Array, "..."], degrees_of_freedom: float) -> Fl
 def _log_survival_derivative(degrees_of_freedom, primals, tangents):
     (distance,), (step,) = primals, tangents
     value = log_survival(distance, degrees_of_freedom)
-    log_density = dist.StudentT(degrees_of_freedom, 0.0, 1.0).log_prob(distance)
-    return value, -jnp.exp(log_density - value) * step
+    return value, -jnp.exp(log_density(distance, degrees_of_freedom) - value) * step
 
 
 @functools.cache

@@ -217,7 +217,9 @@ class StokesLink(AbstractLink):
             scale = noise["stokes_scale"] / jnp.sqrt(brightness)
         if self.degrees_of_freedom is None:
             return dist.Normal(prediction[name], scale)
-        return dist.StudentT(self.degrees_of_freedom, prediction[name], scale)
+        # As a bare number it would become double precision whatever the rest of the program is.
+        freedom = jnp.asarray(self.degrees_of_freedom, jnp.result_type(scale))
+        return dist.StudentT(freedom, prediction[name], scale)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,7 +24,10 @@ def mixture_potential(centers: np.ndarray, shares: np.ndarray):
 
     def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
         densities = np.array(
-            [share * multivariate_normal(c, SPREAD).pdf(z) for c, share in zip(centers, shares)]
+            [
+                share * multivariate_normal(c, SPREAD).pdf(z)
+                for c, share in zip(centers, shares, strict=True)
+            ]
         )
         total = densities.sum() + 1e-300
         pulls = np.stack([np.linalg.solve(SPREAD, z - c) for c in centers])

@@ -1,0 +1,264 @@
+"""Every link goes through the same checks; one of a user's own takes one class in one file."""
+
+import dataclasses
+import functools
+from typing import ClassVar, override
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpyro import distributions as dist
+from numpyro.infer.util import log_density
+from polar_bayes.models.per_material import per_material
+from synthetic_observations import make_observations
+
+from polar_bayes.errors import FitError
+from polar_bayes.observation.data import observe
+from polar_bayes.observation.links import (
+    AbstractLink,
+    BetaLink,
+    LogitNormalLink,
+    NormalLink,
+    StokesLink,
+    StudentTLink,
+    noise_parameters,
+)
+from polar_bayes.observation.noise import ConcentrationSchedule, ScaleSchedule
+from polar_bayes.physics.scenes import SCENES
+from polar_bayes.priors import PRIORS, RANGES, resolve_priors
+from polar_bayes.simulation.protocol import Protocol
+from polar_bayes.simulation.simulate import NOISE, simulate
+
+LINKS = [
+    ("dop", BetaLink()),
+    ("dop", BetaLink(margin=1e-6, schedule=ConcentrationSchedule(1e-3, 0.5, 2.0))),
+    ("dop", LogitNormalLink()),
+    ("dop", NormalLink()),
+    ("q", NormalLink()),
+    ("q", StokesLink()),
+    ("u", StokesLink(degrees_of_freedom=4.0)),
+    ("q", StokesLink(stated_errors=True)),
+    ("u", StokesLink(degrees_of_freedom=4.0, stated_errors=True)),
+    ("intensity", StudentTLink()),
+    ("intensity", StudentTLink(3.0, ScaleSchedule(1.0, 1.0))),
+]
+EVERY_LINK = pytest.mark.parametrize(("name", "link"), LINKS, ids=lambda part: repr(part)[:60])
+
+ZENITHS = (0.0, 30.0, 55.0, 85.0)
+LEADING = (("wavelength", 3),)
+SHAPE = (3, 4)
+
+
+def make_prediction(dtype=np.float64):
+    """Every observable, spread over its range; (wavelength, view)."""
+    spread = jnp.linspace(0.05, 0.9, 12, dtype=dtype).reshape(SHAPE)
+    return {"dop": spread, "q": spread - 0.5, "u": 0.4 - spread, "intensity": spread}
+
+
+def make_noise(link, dtype=np.float64):
+    """The noise parameters that the link names, and no others."""
+    return {name: jnp.asarray({"exposure": 1.0, **NOISE}[name], dtype) for name in link.parameters}
+
+
+def make_data(dtype=np.float64):
+    """The views, without any reading: a link must not look at what it describes."""
+    return make_observations(ZENITHS, leading=LEADING, full_scale=1.0, dtype=dtype)
+
+
+@functools.cache
+def draw(name, link):
+    """400 draws of every view, made once for all tests."""
+    distribution = link.distribution(name, make_prediction(), make_data(), make_noise(link))
+    return jax.jit(lambda key: link.reading(distribution.sample(key, (400,))))(jax.random.key(1))
+
+
+@EVERY_LINK
+def test_a_draw_has_one_finite_reading_per_view(name, link):
+    distribution = link.distribution(name, make_prediction(), make_data(), make_noise(link))
+    assert distribution.batch_shape == SHAPE
+    assert distribution.event_shape == ()
+    draws = draw(name, link)
+    assert draws.shape == (400, *SHAPE)
+    assert np.all(np.isfinite(draws))
+    assert np.all(distribution.support(draws))
+
+
+@EVERY_LINK
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_density_and_gradient_are_finite_and_compiling_changes_nothing(name, link, dtype):
+    data, reading = make_data(dtype), draw(name, link)[0].astype(dtype)
+
+    def total(prediction, noise):
+        density = link.distribution(name, prediction, data, noise).log_prob(reading)
+        return density.sum(), density
+
+    arguments = (make_prediction(dtype), make_noise(link, dtype))
+    compiled = jax.jit(jax.value_and_grad(total, argnums=(0, 1), has_aux=True))
+    (_, density), (by_prediction, by_noise) = compiled(*arguments)
+    assert density.shape == SHAPE
+    assert density.dtype == dtype
+    assert np.all(np.isfinite(density))
+    assert np.all(np.isfinite(by_prediction[name]))
+    assert np.any(by_prediction[name] != 0.0)
+    # Every parameter that a link names matters, and it names every one that it reads.
+    assert all(np.isfinite(slope) and slope != 0.0 for slope in by_noise.values())
+    # Compiled arithmetic may be fused: some units in the last place, of sums up to about ten.
+    slack = 100 * np.finfo(dtype).eps
+    np.testing.assert_allclose(total(*arguments)[1], density, rtol=slack, atol=slack)
+
+
+@EVERY_LINK
+def test_draws_scatter_around_the_center(name, link):
+    center = link.center(name, make_prediction(), make_noise(link))
+    assert center.shape == SHAPE
+    # Above and below equally often, if the center is the median; means of skewed noise lie
+    # elsewhere, but not beyond its quartiles. 0.25 is 10 standard errors of a share of 400 draws.
+    share = np.mean(np.asarray(draw(name, link)) > np.asarray(center), axis=0)
+    assert np.all(np.abs(share - 0.5) < 0.25)
+
+
+@EVERY_LINK
+def test_every_noise_parameter_has_a_prior_and_a_range(name, link):
+    assert name in link.observables
+    assert set(link.parameters) <= set(PRIORS)
+    assert set(link.parameters) <= set(RANGES)
+
+
+@EVERY_LINK
+def test_a_link_is_a_constant_of_a_compiled_program(name, link):
+    twin = dataclasses.replace(link)
+    assert link == twin
+    assert hash(link) == hash(twin)
+    assert eval(repr(link)) == link  # what a report prints can be typed back in
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        link.margin = 0.5
+
+
+@EVERY_LINK
+def test_brightness_and_angle_of_one_view_do_not_reach_another(name, link):
+    prediction, noise, reading = make_prediction(), make_noise(link), draw(name, link)[0]
+    data = make_data()
+    changed = dataclasses.replace(data, brightness=data.brightness.at[1, 2].set(0.01))
+    plain, other = (
+        link.distribution(name, prediction, views, noise).log_prob(reading)
+        for views in (data, changed)
+    )
+    rest = np.ones(SHAPE, bool)
+    rest[1, 2] = False
+    np.testing.assert_array_equal(np.asarray(plain)[rest], np.asarray(other)[rest])
+
+
+@pytest.mark.parametrize("link", [BetaLink(margin=1e-3), LogitNormalLink(margin=1e-3)])
+def test_readings_at_0_and_1_come_to_the_margin_and_others_stay(link):
+    given = jnp.array([0.0, 1e-4, 0.3, 1.0 - 1e-4, 1.0])
+    np.testing.assert_allclose(link.reading(given), [1e-3, 1e-3, 0.3, 0.999, 0.999], rtol=1e-15)
+
+
+def test_stated_errors_set_the_scale_and_the_factor_stretches_it():
+    data = make_observations(ZENITHS, error=[0.1, 0.2, 0.3, 0.4])
+    prediction = {"q": jnp.zeros(4)}
+    noise = {"stokes_error_factor": jnp.asarray(2.0)}
+    found = StokesLink(stated_errors=True).distribution("q", prediction, data, noise)
+    np.testing.assert_allclose(found.scale, [0.2, 0.4, 0.6, 0.8], rtol=1e-15)
+
+
+def test_shot_noise_grows_as_the_view_darkens_down_to_a_floor():
+    data = make_observations(ZENITHS, brightness=[1.0, 0.25, 1e-3, 0.0])
+    prediction, noise = {"q": jnp.zeros(4)}, {"stokes_scale": jnp.asarray(0.01)}
+    found = StokesLink(least_brightness=0.01).distribution("q", prediction, data, noise)
+    np.testing.assert_allclose(found.scale, [0.01, 0.02, 0.1, 0.1], rtol=1e-15)
+
+
+def test_a_capture_without_errors_is_refused_where_they_are_needed():
+    data = dataclasses.replace(make_data(), errors={})
+    link = StokesLink(stated_errors=True)
+    with pytest.raises(FitError, match="states no q_error; add that variable") as caught:
+        link.distribution("q", make_prediction(), data, make_noise(link))
+    assert str(caught.value).startswith("StokesLink(stated_errors=True): ")
+
+
+def test_only_the_link_of_stated_errors_reads_them():
+    assert [link for _, link in LINKS if link.reads_errors] == [
+        link for _, link in LINKS if "stokes_error_factor" in link.parameters
+    ]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: BetaLink(margin=0.0), "^BetaLink: margin is 0.0; give a number from 1e-6"),
+        (lambda: LogitNormalLink(margin=0.1), "^LogitNormalLink: margin is 0.1; give"),
+        (lambda: StokesLink(2.0), "^StokesLink: degrees_of_freedom is 2.0; give a number above"),
+        (lambda: StokesLink(least_brightness=0.0), "^StokesLink: least_brightness is 0.0; give"),
+        (lambda: StudentTLink(2.9), "^StudentTLink: degrees_of_freedom is 2.9; give a number from"),
+        (lambda: StudentTLink(float("nan")), "^StudentTLink: degrees_of_freedom is nan; give"),
+    ],
+)
+def test_a_field_outside_its_range_is_refused_by_name(make, message):
+    with pytest.raises(FitError, match=message):
+        make()
+
+
+def test_noise_parameters_are_listed_once_in_the_order_of_the_links():
+    links = {"q": StokesLink(), "u": StokesLink(), "intensity": StudentTLink()}
+    assert noise_parameters(links) == ("stokes_scale", "exposure", "intensity_scale")
+
+
+def test_a_contract_left_open_cannot_be_used():
+    class Unfinished(AbstractLink):
+        observables = ("dop",)
+
+    with pytest.raises(TypeError, match="abstract"):
+        Unfinished()
+
+
+# --- a link of a user's own: this class is all that it takes --------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class LaplaceLink(AbstractLink):
+    """Noise with an absolute-value penalty: sharp at the prediction, forgiving far from it."""
+
+    observables: ClassVar[tuple[str, ...]] = ("q", "u")
+    parameters: ClassVar[tuple[str, ...]] = ("laplace_scale",)
+
+    @override
+    def distribution(self, name, prediction, data, noise):
+        return dist.Laplace(prediction[name], noise["laplace_scale"])
+
+
+def test_a_link_of_a_users_own_simulates_and_fits_in_a_model():
+    links = {"q": LaplaceLink(), "u": LaplaceLink()}
+    scene = SCENES["camera"]
+    protocol = Protocol(views=8, wavelengths=(450.0, 550.0))
+    capture = simulate(
+        "plastic",
+        scene=scene,
+        links=links,
+        protocol=protocol,
+        parameters={"dolp_gain": 0.95},  # 1 is the edge of its prior, where the density is 0
+        noise={"laplace_scale": 0.01},
+        seed=5,
+    )
+    data = observe(capture)
+    names = (*scene.parameters, *noise_parameters(links))
+    own = {"laplace_scale": dist.HalfNormal(0.05)}
+    arguments = (data, scene, resolve_priors(names, own), links)
+    with pytest.raises(FitError, match=r"laplace_scale.*no prior"):
+        resolve_priors(names)
+
+    def density(scale):
+        # On the axes of the plates: wavelength, then view, of length 1 where they do not repeat.
+        shapes = {name: (1, 1) for name in ("roughness", "subsurface_fraction")}
+        shapes |= {"refractive_index": (2, 1)}
+        values = {
+            name: capture[f"true_{name}"].values.reshape(shapes.get(name, ()))
+            for name in scene.parameters
+        }
+        return log_density(per_material, arguments, {}, {**values, "laplace_scale": scale})[0]
+
+    totals, slopes = jax.vmap(jax.value_and_grad(density))(jnp.array([0.001, 0.01, 0.1]))
+    assert np.all(np.isfinite(slopes))
+    # 32 readings drawn with a scale of 0.01 tell it from one ten times off by 30 and more.
+    assert totals[1] > max(totals[0], totals[2]) + 10.0

@@ -1,0 +1,288 @@
+"""What a reader may paste works: Python runs, commands parse, names, links and messages exist.
+
+Fits on the pages are done here with few draws. A fit of a capture with nothing swapped is done in
+full, and so is one that states its own small settings. The others are checked and compiled as far
+as the posterior density of a prior draw, and give back the page's latest result: each would
+compile a program of its own for half a minute.
+"""
+
+import ast
+import contextlib
+import importlib
+import inspect
+import re
+import shlex
+import unicodedata
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+from test_architecture import LAYERS
+
+import polar_bayes as pb
+from polar_bayes.capture.contract import CONTRACT
+from polar_bayes.cli import commands
+from polar_bayes.inference.fit import fit
+from polar_bayes.inference.program import compile_program
+from polar_bayes.inference.request import resolve
+from polar_bayes.observation.data import observe
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+PAGES = [README, ROOT / "CONTRIBUTING.md", *DOCS]
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"`([^`\n]+)`")
+TINY = pb.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
+CHANGED = (
+    "jax_enable_x64",
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+)
+
+of_every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+
+
+def blocks(page: Path, language: str) -> Iterator[tuple[int, str]]:
+    """Blocks of one language, each with the line on which it begins."""
+    text = page.read_text()
+    for block in BLOCK.finditer(text):
+        if block.group(1) == language:
+            yield text.count("\n", 0, block.start(2)), block.group(2)
+
+
+def prose(page: Path) -> str:
+    return BLOCK.sub("", page.read_text())
+
+
+def inline(page: Path) -> list[str]:
+    return CODE.findall(prose(page))
+
+
+# --- Python ---------------------------------------------------------------------------------
+
+
+class Fits:
+    """Stands in for `polar_bayes.fit` on the pages."""
+
+    def __init__(self) -> None:
+        self.done: list[tuple[xr.Dataset, xr.DataTree]] = []
+
+    def __call__(self, capture: xr.Dataset, **asked: object) -> xr.DataTree:
+        if "method" in asked and not isinstance(asked["method"], str):
+            return self._keep(capture, fit(capture, **asked))
+        if set(asked) <= {"seed", "progress"}:
+            known = [result for one, result in self.done if one.identical(capture)]
+            return known[0] if known else self._keep(capture, fit(capture, method=TINY, **asked))
+        rehearse(capture, asked)
+        return self.done[-1][1]
+
+    def _keep(self, capture: xr.Dataset, result: xr.DataTree) -> xr.DataTree:
+        self.done.append((capture, result))
+        return result
+
+
+def rehearse(capture: xr.Dataset, asked: dict[str, object]) -> None:
+    """Everything that a fit does before it searches for modes."""
+    options = inspect.signature(fit).bind(capture, **asked)
+    options.apply_defaults()
+    wanted = list(inspect.signature(resolve).parameters)
+    request = resolve(*(options.arguments[name] for name in wanted))
+    data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
+    program = compile_program(request.bind(request.scene), data)
+    density = jax.jit(lambda key, data: program.potential(program.from_prior(key, data), data))
+    assert np.isfinite(density(jax.random.key(0), data))
+
+
+@pytest.fixture(scope="module")
+def fits() -> Fits:
+    return Fits()
+
+
+@pytest.fixture
+def settings_of_jax() -> Iterator[None]:
+    saved = {name: getattr(jax.config, name) for name in CHANGED}
+    yield
+    for name, value in saved.items():
+        jax.config.update(name, value)
+
+
+@pytest.mark.usefixtures("settings_of_jax")
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if any(blocks(page, "python"))],
+    ids=lambda page: page.name,
+)
+def test_the_python_of_a_page_runs(
+    page: Path, fits: Fits, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(pb, "fit", fits)
+    namespace: dict[str, object] = {"__name__": page.stem}
+    for line, code in blocks(page, "python"):
+        exec(compile("\n" * line + code, str(page), "exec"), namespace)
+
+
+# --- commands -------------------------------------------------------------------------------
+
+
+def typed(page: Path) -> Iterator[list[str]]:
+    """Every call of the program in the shell blocks of a page, as words."""
+    for _, block in blocks(page, "sh"):
+        for line in block.replace("\\\n", " ").splitlines():
+            for command in line.split("&&"):
+                words = shlex.split(command)
+                if words and Path(words[0]).name == "polar-bayes":
+                    yield words
+
+
+@of_every_page
+def test_the_commands_of_a_page_parse(page: Path) -> None:
+    for program, *words in typed(page):
+        command: click.Command = commands
+        while isinstance(command, click.Group):
+            assert words, f"{program}: no command"
+            assert words[0] in command.commands, f"{program}: no command {words[0]}"
+            command, words = command.commands[words[0]], words[1:]
+        with contextlib.suppress(click.exceptions.Exit):  # --help ends the parsing
+            command.make_context(program, list(words))
+
+
+def every_option(command: click.Command) -> set[str]:
+    options = {option for part in command.params for option in part.opts}
+    children = command.commands.values() if isinstance(command, click.Group) else ()
+    return options.union(*map(every_option, children))
+
+
+@of_every_page
+def test_the_options_that_a_page_names_exist(page: Path) -> None:
+    known = every_option(commands) | {"--help"}
+    for code in inline(page):
+        named = set(re.findall(r"(?<!\S)--[a-z][a-z-]*", code))
+        assert named <= known, f"{page.name}: {named - known}"
+
+
+def test_two_commands_set_everything_up() -> None:
+    lines = [block.strip() for _, block in blocks(README, "sh") if "python3.12" in block]
+    assert len(lines) == 2
+    demo, tests = lines
+    assert "\n" not in demo + tests
+    assert demo.endswith("&& .venv/bin/polar-bayes demo")
+    assert tests in (ROOT / ".ci" / "run").read_text().splitlines()
+
+
+# --- names, paths, links --------------------------------------------------------------------
+
+
+def find(name: str) -> object:
+    """The object of a dotted name, whether module, class, function, method or table."""
+    parts = name.split(".")
+    for depth in range(len(parts), 0, -1):
+        with contextlib.suppress(ModuleNotFoundError):
+            found: object = importlib.import_module(".".join(parts[:depth]))
+            for attribute in parts[depth:]:
+                found = getattr(found, attribute)
+            return found
+    raise AttributeError(name)
+
+
+@of_every_page
+def test_the_names_of_a_page_exist(page: Path) -> None:
+    for code in inline(page):
+        for name in re.findall(r"\bpolar_bayes(?:\.\w+)+", code):
+            find(name)
+        for name in re.findall(r"\bpb\.(\w+)", code):
+            assert name in pb.__all__, f"{page.name}: pb.{name}"
+
+
+@of_every_page
+def test_the_paths_of_a_page_exist(page: Path) -> None:
+    for code in inline(page):
+        if re.fullmatch(r"(polar_bayes|models|tests|docs|\.ci)/[\w./-]*", code):
+            assert (ROOT / code).exists(), f"{page.name}: {code}"
+
+
+def anchors(page: Path) -> set[str]:
+    """What a heading is called in an address, as Python-Markdown has it."""
+    found = set()
+    for heading in re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE):
+        plain = unicodedata.normalize("NFKD", heading).encode("ascii", "ignore").decode()
+        plain = re.sub(r"[^\w\s-]", "", plain).strip().lower()
+        found.add(re.sub(r"[-\s]+", "-", plain))
+    return found
+
+
+@of_every_page
+def test_the_links_of_a_page_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{page.name}: {target}"
+        if page in DOCS:
+            assert file in DOCS, f"{page.name}: {target} is no page of the site"
+        assert not anchor or anchor in anchors(file), f"{page.name}: {target}"
+
+
+def test_the_site_shows_every_page_once() -> None:
+    shown = re.findall(r"^ +- .*: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    assert sorted(shown) == [page.name for page in DOCS]
+
+
+# --- what single pages promise --------------------------------------------------------------
+
+
+def test_every_formula_has_a_test() -> None:
+    """Each test that a section of the equations names stands in a file that the section names."""
+    _, *sections = (ROOT / "docs" / "equations.md").read_text().split("\n## ")
+    for section in sections:
+        files = re.findall(r"`(tests/[\w/]+\.py)`", section)
+        there = {
+            node.name
+            for file in files
+            for node in ast.walk(ast.parse((ROOT / file).read_text()))
+            if isinstance(node, ast.FunctionDef)
+        }
+        named = set(re.findall(r"`(test_\w+)`", section))
+        assert named <= there, f"{section.splitlines()[0]}: {named - there}"
+
+
+def test_the_messages_in_troubleshooting_are_those_of_the_code() -> None:
+    said = [
+        node.value
+        for file in (ROOT / "polar_bayes").rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+    page = (ROOT / "docs" / "troubleshooting.md").read_text()
+    for message in re.findall(r"^### `(.*)`$", page, re.MULTILINE):
+        assert any(message in text for text in said), message
+
+
+def test_the_picture_shows_the_layers_that_are_tested() -> None:
+    _, picture = next(blocks(ROOT / "docs" / "architecture.md", "text"))
+    drawn = re.findall(r"^(\w+(?:, \w+)*)  ", picture, re.MULTILINE)
+    assert drawn == [
+        ", ".join(name.removeprefix("polar_bayes.") for name in row) for row in LAYERS
+    ]
+
+
+def test_tables_are_complete() -> None:
+    conventions = inline(ROOT / "docs" / "conventions.md")
+    assert {row.name for row in CONTRACT} <= set(", ".join(conventions).split(", "))
+    assert set(pb.SETUPS) <= set(inline(ROOT / "docs" / "quickstart.md"))
+    packages = re.findall(
+        r'^    "([A-Za-z0-9]+)[>"]', (ROOT / "pyproject.toml").read_text(), re.MULTILINE
+    )
+    assert set(packages) <= set(inline(ROOT / "docs" / "dependencies.md"))
+
+
+def test_one_version_is_told_everywhere() -> None:
+    version = re.search(r'^version = "(.*)"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    assert version is not None
+    assert f"## [{version[1]}]" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"version: {version[1]}\n" in (ROOT / "CITATION.cff").read_text()
