@@ -10,21 +10,54 @@ the fit chooses the precision.
 import difflib
 import math
 from collections.abc import Iterable, Mapping
+from typing import override
 
 import numpy as np
+from jaxtyping import Array
 from numpyro import distributions as dist
 from numpyro.distributions import constraints
 
 from polar_bayes.errors import FitError
 
+
+class Beta(dist.Beta):
+    """The Beta distribution, two Python numbers until it is used.
+
+    NumPyro's own turns them into an array at once, in the precision of that moment: a table of
+    priors would start the array library on import and stay in single precision for ever.
+
+    Args:
+        concentration1: Unit 1, range > 0.
+        concentration0: Unit 1, range > 0.
+    """
+
+    def __init__(
+        self,
+        concentration1: float,
+        concentration0: float,
+        *,
+        validate_args: bool | None = None,
+    ) -> None:
+        self.concentration1, self.concentration0 = concentration1, concentration0
+        dist.Distribution.__init__(self, validate_args=validate_args)
+
+    @override
+    def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
+        return dist.Beta(self.concentration1, self.concentration0).sample(key, sample_shape)
+
+    @override
+    def log_prob(self, value: Array) -> Array:
+        return dist.Beta(self.concentration1, self.concentration0).log_prob(value)
+
+
 PRIORS: dict[str, dist.Distribution] = {
     # The material: the paper, section 2.
     "roughness": dist.HalfNormal(0.2),
-    "subsurface_fraction": dist.Beta(2.0, 2.0),
+    "subsurface_fraction": Beta(2.0, 2.0),
     "absorption": dist.LogNormal(-1.0, 0.5),
     "refractive_index": dist.TruncatedNormal(1.45, 0.15, low=1.2, high=2.0),
     # The instrument: what a careful set-up leaves unknown.
-    "dolp_gain": dist.Beta(10.0, 1.5),
+    "dolp_gain": Beta(10.0, 1.5),
     "channel_gain_ratio": dist.LogNormal(0.0, 0.1),
     "leakage": dist.HalfNormal(0.01),
     "dark_level": dist.Normal(0.0, 0.001),
@@ -33,14 +66,15 @@ PRIORS: dict[str, dist.Distribution] = {
     # few lucky readings claim an accuracy that no goniometer has.
     "discrepancy_amplitude": dist.LogNormal(math.log(0.08), 0.5),
     "discrepancy_weights": dist.Normal(0.0, 1.0).expand([4]).to_event(1),
-    # The noise: scales that the data themselves determine.
+    # The noise: scales that the data themselves determine. None may reach zero: where the scene
+    # can match a few readings exactly, a scale of zero would have infinite posterior density.
     "concentration_scale": dist.LogNormal(math.log(200.0), 1.0),
-    "logit_scale": dist.HalfNormal(0.5),
-    "normal_scale": dist.HalfNormal(0.1),
-    "stokes_scale": dist.HalfNormal(0.05),
+    "logit_scale": dist.LogNormal(math.log(0.15), 1.0),
+    "normal_scale": dist.LogNormal(math.log(0.03), 1.0),
+    "stokes_scale": dist.LogNormal(math.log(0.01), 1.0),
     "stokes_error_factor": dist.LogNormal(math.log(1.5), 0.7),
     "exposure": dist.LogNormal(0.0, 3.0),
-    "intensity_scale": dist.HalfNormal(0.05),
+    "intensity_scale": dist.LogNormal(math.log(0.02), 1.0),
 }
 
 RANGES: dict[str, tuple[float, float]] = {

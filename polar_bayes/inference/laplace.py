@@ -6,13 +6,13 @@ definite it silently returns zero width, and a fit that failed would look perfec
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from numpyro import handlers
-from numpyro.infer import init_to_median
 from numpyro.infer.autoguide import AutoLaplaceApproximation
 
 from polar_bayes.errors import FitError
@@ -67,39 +67,37 @@ def sample(
         Unconstrained draws (chain, draw, size), NaN where the guide has no width; and their
         statistics: the log density `lp` and the `log_weight` of posterior over approximation.
     """
-    mode, precision = modes.z[0], np.linalg.inv(modes.covariance[0])
-    positions: list[np.ndarray] = []
-
-    def hessian(_: object, location: Array) -> Array:
-        order = positions[0]
-        return jnp.asarray(precision[np.ix_(order, order)], location.dtype)
-
-    guide = AutoLaplaceApproximation(
-        program.model, init_loc_fn=init_to_median(num_samples=1), hessian_fn=hessian
+    location, factor, order = jax.jit(functools.partial(_guide, program))(
+        jnp.asarray(modes.z[0]), jnp.linalg.inv(jnp.asarray(modes.covariance[0])), data
     )
-    handlers.seed(guide, key)(data)
-    order = _guide_order(guide, program)
-    positions.append(order)
-    covariance = guide.get_posterior({"auto_loc": jnp.asarray(mode[order])}).covariance_matrix
-    covariance = jnp.where(jnp.diagonal(covariance) > 0.0, covariance, jnp.nan)
-    factor = jnp.linalg.cholesky(covariance)
+    # The guide's own sign of failure is a width of exactly zero.
+    factor = jnp.where(jnp.diagonal(factor) > 0.0, factor, jnp.nan)
     noise = jax.random.normal(key, (settings.chains, settings.draws, program.size))
-    drawn = mode[order] + noise @ factor.T
-    z = np.asarray(drawn)[..., np.argsort(order)]
+    drawn = location + noise @ factor.T
+    z = np.asarray(drawn)[..., np.argsort(np.asarray(order))]
     lp = -np.array([potential(draw)[0] for draw in z.reshape(-1, program.size)])
     approximation = -0.5 * np.asarray(jnp.sum(noise**2, axis=-1))
     lp = lp.reshape(z.shape[:2])
     return z, {"lp": lp, "log_weight": lp - approximation}
 
 
-def _guide_order(guide: AutoLaplaceApproximation, program: Program) -> np.ndarray:
-    """For each entry of the guide's vector, its position in the program's.
+def _guide(
+    program: Program, mode: Array, precision: Array, data: Observations
+) -> tuple[Array, Array, Array]:
+    """Location and Cholesky factor of NumPyro's guide, and the order of its coordinates.
 
-    The guide strings sites together as the model declares them, the program by name.
+    The guide strings sites together as the model declares them, the program by name. Inside one
+    compiled function the guide's search for a start of its own, which is not needed, drops out.
     """
-    positions = program.unravel(jnp.arange(program.size, dtype=float))
-    unpacked = guide._unpack_latent(jnp.arange(program.size, dtype=float))
-    order = np.empty(program.size, int)
-    for name, ours in positions.items():
-        order[np.asarray(unpacked[name], int).ravel()] = np.asarray(ours, int).ravel()
-    return order
+    order = jnp.zeros(program.size, int)
+    guide = AutoLaplaceApproximation(
+        program.model, hessian_fn=lambda _, location: precision[order][:, order]
+    )
+    handlers.seed(guide, jax.random.key(0))(data)
+    numbers = jnp.arange(program.size, dtype=mode.dtype)
+    unpacked = guide._unpack_latent(numbers)
+    for name, ours in program.unravel(numbers).items():
+        theirs = unpacked[name].ravel().astype(int)
+        order = order.at[theirs].set(ours.ravel().astype(int))
+    posterior = guide.get_posterior({"auto_loc": mode[order]})
+    return posterior.loc, posterior.scale_tril, order

@@ -122,13 +122,3 @@ def test_laplace_agrees_with_the_grid_where_the_posterior_is_near_normal() -> No
         # Monte Carlo error of 2,000 independent draws is 0.02 sd; the rest is Laplace's own error.
         assert abs(draws.mean() - grid.mean(name)) < 0.2 * grid.sd(name), name
         assert draws.std() == pytest.approx(grid.sd(name), rel=0.15), name
-
-
-@pytest.mark.parametrize(
-    ("case_name", "trusted"), [("near normal", True), ("far from normal", False)]
-)
-def test_laplace_says_where_it_is_not_to_be_trusted(case_name: str, trusted: bool) -> None:
-    result = pb.fit(CASES[case_name], scene=PLATE, links=LINKS, method="laplace", seed=1)
-    verdict = pb.verdict(result)
-    assert verdict.converged
-    assert any("k-hat" in caution for caution in verdict.cautions) != trusted

@@ -164,6 +164,26 @@ def test_a_model_of_ones_own_with_a_known_posterior(capture: xr.Dataset) -> None
     assert provenance_of(result)["model"] == "conjugate"
 
 
+@pytest.mark.parametrize(
+    ("belief", "trusted"), [(dist.Normal(0.0, 1.0), True), (dist.StudentT(1.5, 0.0, 1.0), False)]
+)
+def test_laplace_says_where_it_is_not_to_be_trusted(
+    capture: xr.Dataset, belief: dist.Distribution, trusted: bool
+) -> None:
+    """Tails heavier than normal have importance weights without a variance: k-hat above 0.7."""
+
+    def tails(data, scene, priors, links) -> None:
+        del scene, priors, links
+        numpyro.sample("x", belief)
+        with numpyro.plate("view", data.shape[-1]):
+            numpyro.sample("q", dist.Normal(0.0, 1.0), obs=data.readings["q"])
+
+    result = pb.fit(capture, model=tails, scene=PLATE, links=LINKS, method="laplace", seed=1)
+    verdict = pb.verdict(result)
+    assert verdict.converged
+    assert any("k-hat" in caution for caution in verdict.cautions) != trusted
+
+
 def test_least_squares_finds_the_plate(capture: xr.Dataset) -> None:
     result = pb.fit(capture, scene=PLATE, links=LINKS, method="point", seed=1)
     said = pb.json_summary(result)["parameters"]["refractive_index"]
@@ -191,6 +211,19 @@ def test_views_beyond_the_limit_are_set_aside_and_counted(capture: xr.Dataset) -
     )
     counts = provenance_of(result)["counts"]
     assert counts["used"] == int((capture["view_zenith"] <= 60.0).sum())
+
+
+def test_two_views_have_a_proper_posterior() -> None:
+    """A scene can match two readings exactly; a noise of zero must not swallow the posterior."""
+    capture = plate_capture(np.array([40.0, 70.0]), 0.02, seed=4)
+    capture["intensity"] = ("view", [0.02, 0.06])
+    links = {**LINKS, "intensity": pb.StudentTLink()}
+    result = pb.fit(capture, scene=PLATE, links=links, method="laplace", seed=1)
+    assert pb.verdict(result).converged
+    scale = result["posterior"]["intensity_scale"].to_numpy()
+    prior = result["prior"]["intensity_scale"].to_numpy()
+    # Two readings and a free exposure say little about their noise: within the prior's range.
+    assert np.quantile(prior, 0.005) < np.median(scale) < np.quantile(prior, 0.995)
 
 
 def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:

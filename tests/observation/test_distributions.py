@@ -147,7 +147,7 @@ def test_the_log_survival_agrees_with_fifty_digits(degrees_of_freedom, dtype):
 @PRECISIONS
 def test_the_slope_of_the_log_survival_is_minus_the_hazard(dtype):
     distances = np.array([-50.0, -1.0, -1e-9, 0.0, 1e-9, 1.0, 50.0, 1e8], dtype)
-    slopes = jax.vmap(jax.grad(lambda distance: log_survival(distance, 5.0)))(distances)
+    slopes = jax.jit(jax.vmap(jax.grad(lambda distance: log_survival(distance, 5.0))))(distances)
     truth = []
     for (distance,) in map(exactly, distances[:, None]):
         density = (1 + distance**2 / 5) ** -3 / (mp.sqrt(5) * mp.beta(mp.mpf(5) / 2, 0.5))
@@ -196,8 +196,9 @@ def test_the_beta_equals_numpyros_at_moderate_values():
     means, concentrations, readings = np.meshgrid([0.1, 0.5, 0.9], [2.0, 30.0], [0.2, 0.5, 0.8])
     ours = MeanConcentrationBeta(means, concentrations)
     theirs = dist.BetaProportion(means, concentrations)
+    found, expected = (jax.jit(each.log_prob)(readings) for each in (ours, theirs))
     # NumPyro's log gamma of 30 is 71 and carries 1e-14; 1e-12 leaves room for three of them.
-    np.testing.assert_allclose(ours.log_prob(readings), theirs.log_prob(readings), atol=1e-12)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
     np.testing.assert_allclose(ours.mean, theirs.mean, rtol=1e-15)
     np.testing.assert_allclose(ours.variance, theirs.variance, rtol=1e-14)
 
@@ -206,8 +207,14 @@ def test_the_sensor_equals_numpyros_student_t_between_the_stops():
     readings = np.linspace(0.1, 0.9, 9)
     ours = SensorStudentT(5.0, 0.4, 0.05, np.zeros(9, bool), 1.0)
     theirs = dist.StudentT(5.0, 0.4, 0.05)
-    # The same formula; compiled apart, its last digits may differ.
-    np.testing.assert_allclose(ours.log_prob(readings), theirs.log_prob(readings), rtol=1e-14)
+    found, expected = (jax.jit(each.log_prob)(readings) for each in (ours, theirs))
+    # Half a dozen roundings of numbers up to ten.
+    np.testing.assert_allclose(found, expected, atol=1e-14, rtol=0.0)
+
+
+@jax.jit
+def integrand(parameters, reading):
+    return MeanConcentrationBeta(*parameters, validate_args=False).log_prob(reading)
 
 
 @pytest.mark.parametrize(
@@ -218,9 +225,12 @@ def test_the_beta_integrates_to_one(mean, concentration):
     # left, and steps of 0.001 resolve a peak 0.007 wide. What remains is rounding.
     log_odds = np.linspace(-20.0, 20.0, 40_001)
     reading = 1.0 / (1.0 + np.exp(-log_odds))
-    density = np.exp(MeanConcentrationBeta(mean, concentration).log_prob(reading))
+    density = np.exp(integrand(np.array([mean, concentration]), reading))
     total = np.sum(density * reading * (1.0 - reading)) * (log_odds[1] - log_odds[0])
     assert total == pytest.approx(1.0, abs=1e-10)
+
+
+SENSOR = jax.jit(jax.vmap(lambda row: sensor_log_density(row, 5.0)))
 
 
 @pytest.mark.parametrize("location", [0.0, 0.02, 0.5, 1.0, 1.4])
@@ -230,8 +240,8 @@ def test_the_sensor_integrates_to_one_with_the_mass_at_its_stops(location, scale
     # 1.2 ** -400, far below rounding.
     nodes, weights = np.polynomial.legendre.leggauss(200)
     readings = np.array([0.0, *0.5 * (nodes + 1.0), 1.0])
-    saturated = readings >= 1.0
-    density = np.exp(SensorStudentT(5.0, location, scale, saturated, 1.0).log_prob(readings))
+    rows = np.stack(np.broadcast_arrays(location, scale, readings, readings >= 1.0), axis=1)
+    density = np.exp(SENSOR(rows))
     total = density[0] + density[1:-1] @ (0.5 * weights) + density[-1]
     assert total == pytest.approx(1.0, abs=1e-12)
 
@@ -239,6 +249,10 @@ def test_the_sensor_integrates_to_one_with_the_mass_at_its_stops(location, scale
 # Five standard errors are passed by chance once in 1.7 million; every seed is fixed.
 SIGMAS = 5.0
 DRAWS = 20_000
+
+
+def sample(distribution, seed):
+    return np.asarray(jax.jit(lambda key: distribution.sample(key, (DRAWS,)))(jax.random.key(seed)))
 
 
 def assert_moments(draws, mean, variance):
@@ -251,7 +265,7 @@ def assert_moments(draws, mean, variance):
 def test_beta_draws_have_the_stated_mean_and_variance():
     mean, concentration = (grid.ravel() for grid in np.meshgrid([0.1, 0.5, 0.9], [1e-3, 5.0, 1e5]))
     distribution = MeanConcentrationBeta(mean, concentration)
-    draws = np.asarray(distribution.sample(jax.random.key(1), (DRAWS,)))
+    draws = sample(distribution, 1)
     assert draws.min() >= 0.0
     assert draws.max() <= 1.0
     assert_moments(draws, np.asarray(distribution.mean), np.asarray(distribution.variance))
@@ -259,14 +273,14 @@ def test_beta_draws_have_the_stated_mean_and_variance():
 
 def test_sensor_draws_have_the_mean_and_variance_of_student_t_far_from_the_stops():
     distribution = SensorStudentT(5.0, jnp.array([0.5, 0.8]), 0.002, False, jnp.inf)
-    draws = np.asarray(distribution.sample(jax.random.key(2), (DRAWS,)))
+    draws = sample(distribution, 2)
     assert_moments(draws, np.asarray(distribution.mean), 0.002**2 * 5.0 / 3.0)
 
 
 @pytest.mark.parametrize("location", [0.01, 0.97])
 def test_sensor_draws_pile_up_at_the_stops_as_often_as_stated(location):
     distribution = SensorStudentT(5.0, location, 0.05, jnp.array([False, True]), 1.0)
-    draws = np.asarray(distribution.sample(jax.random.key(3), (DRAWS,)))
+    draws = sample(distribution, 3)
     assert draws.min() >= 0.0
     assert draws.max() <= 1.0
     share = np.exp(np.asarray(distribution.log_prob(jnp.array([0.0, 1.0]))))
@@ -306,11 +320,15 @@ def test_a_distribution_serves_as_a_site_with_mask_and_expand(make):
             numpyro.sample("reading", make(1.0).mask(valid), obs=readings)
         numpyro.sample("copies", make(1.0).expand([2]).to_event(1))
 
-    trace = handlers.trace(handlers.seed(model, jax.random.key(4))).get_trace()
-    assert trace["reading"]["value"].shape == (3,)
-    assert trace["copies"]["value"].shape == (2,)
-    total, _ = log_density(model, (readings,), {}, {"copies": readings[:2]})
-    expected = make(1.0).log_prob(readings[:2]).sum() + make(1.0).log_prob(readings)[valid].sum()
+    def draw():
+        trace = handlers.trace(handlers.seed(model, jax.random.key(4))).get_trace()
+        return {name: trace[name]["value"] for name in ("reading", "copies")}
+
+    shapes = jax.tree.map(lambda value: value.shape, jax.eval_shape(draw))
+    assert shapes == {"reading": (3,), "copies": (2,)}
+    total = jax.jit(lambda x: log_density(model, (x,), {}, {"copies": x[:2]})[0])(readings)
+    density = make(1.0).log_prob(readings)
+    expected = density[:2].sum() + density[valid].sum()
     assert float(total) == pytest.approx(float(expected), rel=1e-13)
 
 

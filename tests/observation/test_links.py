@@ -24,24 +24,24 @@ from polar_bayes.observation.links import (
     StudentTLink,
     noise_parameters,
 )
-from polar_bayes.observation.noise import ConcentrationSchedule, ScaleSchedule
-from polar_bayes.physics.scenes import SCENES
+from polar_bayes.observation.noise import ConcentrationSchedule, ScaleSchedule  # noqa: F401 (eval)
+from polar_bayes.physics.mixing import StokesMixing
+from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.subsurface import Unpolarized
+from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.priors import PRIORS, RANGES, resolve_priors
 from polar_bayes.simulation.protocol import Protocol
 from polar_bayes.simulation.simulate import NOISE, simulate
 
 LINKS = [
     ("dop", BetaLink()),
-    ("dop", BetaLink(margin=1e-6, schedule=ConcentrationSchedule(1e-3, 0.5, 2.0))),
     ("dop", LogitNormalLink()),
     ("dop", NormalLink()),
     ("q", NormalLink()),
     ("q", StokesLink()),
     ("u", StokesLink(degrees_of_freedom=4.0)),
     ("q", StokesLink(stated_errors=True)),
-    ("u", StokesLink(degrees_of_freedom=4.0, stated_errors=True)),
     ("intensity", StudentTLink()),
-    ("intensity", StudentTLink(3.0, ScaleSchedule(1.0, 1.0))),
 ]
 EVERY_LINK = pytest.mark.parametrize(("name", "link"), LINKS, ids=lambda part: repr(part)[:60])
 
@@ -230,17 +230,10 @@ class LaplaceLink(AbstractLink):
 
 def test_a_link_of_a_users_own_simulates_and_fits_in_a_model():
     links = {"q": LaplaceLink(), "u": LaplaceLink()}
-    scene = SCENES["camera"]
+    scene = Scene(SmoothSurface(), Unpolarized(), StokesMixing())
     protocol = Protocol(views=8, wavelengths=(450.0, 550.0))
-    capture = simulate(
-        "plastic",
-        scene=scene,
-        links=links,
-        protocol=protocol,
-        parameters={"dolp_gain": 0.95},  # 1 is the edge of its prior, where the density is 0
-        noise={"laplace_scale": 0.01},
-        seed=5,
-    )
+    noise = {"laplace_scale": 0.01}
+    capture = simulate("glass", scene=scene, links=links, protocol=protocol, noise=noise, seed=5)
     data = observe(capture)
     names = (*scene.parameters, *noise_parameters(links))
     own = {"laplace_scale": dist.HalfNormal(0.05)}
@@ -250,15 +243,14 @@ def test_a_link_of_a_users_own_simulates_and_fits_in_a_model():
 
     def density(scale):
         # On the axes of the plates: wavelength, then view, of length 1 where they do not repeat.
-        shapes = {name: (1, 1) for name in ("roughness", "subsurface_fraction")}
-        shapes |= {"refractive_index": (2, 1)}
         values = {
-            name: capture[f"true_{name}"].values.reshape(shapes.get(name, ()))
-            for name in scene.parameters
+            "subsurface_fraction": capture["true_subsurface_fraction"].values.reshape(1, 1),
+            "refractive_index": capture["true_refractive_index"].values.reshape(2, 1),
+            "laplace_scale": scale,
         }
-        return log_density(per_material, arguments, {}, {**values, "laplace_scale": scale})[0]
+        return log_density(per_material, arguments, {}, values)[0]
 
-    totals, slopes = jax.vmap(jax.value_and_grad(density))(jnp.array([0.001, 0.01, 0.1]))
+    totals, slopes = jax.jit(jax.vmap(jax.value_and_grad(density)))(jnp.array([0.001, 0.01, 0.1]))
     assert np.all(np.isfinite(slopes))
     # 32 readings drawn with a scale of 0.01 tell it from one ten times off by 30 and more.
     assert totals[1] > max(totals[0], totals[2]) + 10.0

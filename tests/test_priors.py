@@ -1,0 +1,295 @@
+"""What is believed before any data: the table, what may replace a row, and how it reads."""
+
+import math
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpyro import distributions as dist
+
+from polar_bayes.errors import FitError
+from polar_bayes.observation.links import noise_parameters
+from polar_bayes.priors import PRIORS, RANGES, describe_prior, resolve_priors, support_bounds
+from polar_bayes.setups import SETUPS
+
+KEY = jax.random.key(7)
+MATERIAL = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
+
+
+def refused(name, prior, parameters=tuple(PRIORS)):
+    """The one-line message of the refusal, which names the row and says what to do."""
+    with pytest.raises(FitError) as caught:
+        resolve_priors(parameters, {name: prior})
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(f"priors[{name!r}]: ")
+    assert message.count("; ") >= 1
+    return message
+
+
+# --- the table ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "arguments"),
+    [
+        ("roughness", dist.HalfNormal, {"scale": 0.2}),
+        ("subsurface_fraction", dist.Beta, {"concentration1": 2.0, "concentration0": 2.0}),
+        ("absorption", dist.LogNormal, {"loc": -1.0, "scale": 0.5}),
+    ],
+)
+def test_the_priors_of_the_material_are_the_papers(name, kind, arguments):
+    assert isinstance(PRIORS[name], kind)
+    assert {key: float(getattr(PRIORS[name], key)) for key in arguments} == arguments
+
+
+def test_the_prior_of_the_index_is_the_papers_truncated_normal():
+    prior = PRIORS["refractive_index"]
+    assert support_bounds(prior) == (1.2, 2.0)
+    assert float(prior.base_dist.loc) == 1.45
+    assert float(prior.base_dist.scale) == 0.15
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_every_row_stays_inside_the_range_of_its_parameter(name):
+    low, high = support_bounds(PRIORS[name])
+    least, most = RANGES.get(name, (-math.inf, math.inf))
+    assert least <= low < high <= most
+    assert resolve_priors([name], {name: PRIORS[name]}) == {name: PRIORS[name]}
+
+
+def test_every_range_has_a_row():
+    assert set(RANGES) <= set(PRIORS)
+    assert set(MATERIAL) <= set(RANGES)
+
+
+@pytest.mark.parametrize("name", SETUPS)
+def test_every_parameter_of_every_setup_has_a_row(name):
+    setup = SETUPS[name]
+    needed = (*setup.scene.parameters, *noise_parameters(setup.links))
+    assert tuple(resolve_priors(needed)) == needed
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_every_row_can_be_drawn_from(name):
+    draws = np.asarray(PRIORS[name].sample(KEY, (100,)))
+    assert np.all(np.isfinite(draws))
+
+
+def test_the_tables_beta_is_numpyros():
+    values = jnp.array([1e-6, 0.3, 1.0 - 1e-6])
+    ours, theirs = PRIORS["subsurface_fraction"], dist.Beta(2.0, 2.0)
+    np.testing.assert_array_equal(ours.log_prob(values), theirs.log_prob(values))
+    np.testing.assert_array_equal(ours.sample(KEY, (5,)), theirs.sample(KEY, (5,)))
+    assert (ours.mean, ours.support, ours.shape()) == (theirs.mean, theirs.support, theirs.shape())
+    copies = jax.tree.map(lambda number: number, ours.expand([3]))
+    assert copies.sample(KEY).shape == (3,)
+
+
+# --- replacing a row ------------------------------------------------------------------------------
+
+
+def test_an_override_replaces_its_row_and_no_other():
+    own = dist.TruncatedNormal(1.5, 0.02, low=1.0)
+    resolved = resolve_priors(MATERIAL, {"refractive_index": own})
+    assert resolved["refractive_index"] is own
+    assert all(resolved[name] is PRIORS[name] for name in MATERIAL[:3])
+    assert tuple(resolved) == MATERIAL
+
+
+@pytest.mark.parametrize(
+    ("name", "prior"),
+    [
+        ("roughness", dist.Uniform(0.01, 0.5)),
+        ("roughness", dist.Gamma(2.0, 10.0)),
+        ("subsurface_fraction", dist.Uniform(0.0, 1.0)),
+        ("refractive_index", dist.Uniform(1.0, 3.0)),
+        (
+            "refractive_index",
+            dist.TransformedDistribution(
+                dist.LogNormal(-1.0, 0.5),
+                dist.transforms.AffineTransform(1.0, 1.0, domain=dist.constraints.positive),
+            ),
+        ),
+        ("dark_level", dist.Cauchy(0.0, 0.01)),
+        ("discrepancy_weights", dist.Normal(0.0, 2.0).expand([6]).to_event(1)),
+        ("absorption", dist.LogNormal(jnp.zeros((3, 1)), 0.5)),
+    ],
+)
+def test_a_distribution_of_the_right_support_is_taken(name, prior):
+    assert resolve_priors([name], {name: prior})[name] is prior
+
+
+def test_a_parameter_of_a_users_own_takes_its_prior_from_the_caller():
+    own = dist.Normal(0.0, 1.0).expand([3]).to_event(1)
+    assert resolve_priors(["tilt"], {"tilt": own}) == {"tilt": own}
+
+
+def test_a_parameter_without_prior_is_named():
+    with pytest.raises(FitError, match=r"^priors\['tilt'\]: this parameter has no prior; give one"):
+        resolve_priors(["roughness", "tilt"])
+
+
+def test_a_misspelled_name_gets_a_suggestion_and_the_list():
+    message = refused("refractive_indx", dist.Uniform(1.2, 2.0), MATERIAL)
+    assert "did you mean 'refractive_index'?" in message
+    assert "the parameters are roughness, subsurface_fraction, absorption" in message
+
+
+def test_a_name_of_another_model_is_refused_without_a_wild_guess():
+    message = refused("zzz", dist.Normal(0.0, 1.0), MATERIAL)
+    assert "did you mean" not in message
+    assert "no such parameter in this model" in message
+
+
+@pytest.mark.parametrize("prior", [0.3, (0.0, 1.0), None, dist.Normal, np.zeros(2)])
+def test_what_is_no_distribution_is_refused(prior):
+    message = refused("roughness", prior)
+    assert f"a {type(prior).__name__} is not a NumPyro distribution" in message
+
+
+@pytest.mark.parametrize("priors", [[dist.Normal(0.0, 1.0)], dist.Normal(0.0, 1.0), "roughness"])
+def test_what_is_no_mapping_is_refused(priors):
+    with pytest.raises(FitError, match=r"^priors: a \w+ does not name what it replaces; give"):
+        resolve_priors(MATERIAL, priors)
+
+
+@pytest.mark.parametrize(
+    ("name", "prior"),
+    [
+        ("subsurface_fraction", dist.Normal(0.5, 0.1)),
+        ("subsurface_fraction", dist.HalfNormal(0.5)),
+        ("subsurface_fraction", dist.Uniform(0.0, 1.1)),
+        ("refractive_index", dist.HalfNormal(1.0)),
+        ("refractive_index", dist.Normal(1.5, 0.02)),
+        ("refractive_index", dist.LogNormal(0.4, 0.1)),
+        ("refractive_index", dist.TruncatedNormal(1.5, 0.02, high=2.0)),
+        ("refractive_index", dist.Uniform(jnp.array([[0.9], [1.2]]), 2.0)),
+        ("roughness", dist.Normal(0.2, 0.05)),
+        ("absorption", dist.Laplace(0.0, 1.0)),
+        ("dolp_gain", dist.LogNormal(0.0, 0.1)),
+        ("concentration_scale", dist.StudentT(3.0, 200.0, 50.0)),
+    ],
+)
+def test_values_outside_the_physical_range_are_refused(name, prior):
+    least, most = RANGES[name]
+    message = refused(name, prior)
+    assert f"allows values outside {least:g} to {most:g}" in message
+
+
+@pytest.mark.parametrize("prior", [dist.Poisson(3.0), dist.Bernoulli(0.5)])
+def test_a_discrete_distribution_is_refused(prior):
+    assert "is discrete" in refused("roughness", prior)
+
+
+@pytest.mark.parametrize(
+    ("name", "prior", "words"),
+    [
+        ("roughness", dist.HalfNormal(0.2).expand([4]).to_event(1), "one draw of it has shape"),
+        ("subsurface_fraction", dist.Dirichlet(jnp.ones(3)), "one draw of it has shape"),
+        ("discrepancy_weights", dist.Normal(0.0, 1.0), "one draw of it has shape"),
+        ("refractive_index", dist.Uniform(1.2, jnp.array([1.8, 2.0])), "2 distributions side"),
+    ],
+)
+def test_a_distribution_of_the_wrong_shape_is_refused(name, prior, words):
+    assert words in refused(name, prior)
+
+
+# --- as text --------------------------------------------------------------------------------------
+
+WEIGHTS = dist.Categorical(probs=jnp.array([0.25, 0.75]))
+SHIFTED = dist.TransformedDistribution(
+    dist.HalfNormal(0.5),
+    dist.transforms.AffineTransform(1.0, 2.0, domain=dist.constraints.positive),
+)
+
+
+@pytest.mark.parametrize(
+    ("prior", "text"),
+    [
+        (dist.HalfNormal(0.2), "HalfNormal(scale=0.2)"),
+        (dist.LogNormal(-1.0, 0.5), "LogNormal(loc=-1, scale=0.5)"),
+        (dist.Beta(2.0, 3.0), "Beta(concentration1=2, concentration0=3)"),
+        (dist.Uniform(1.2, 2.0), "Uniform(low=1.2, high=2)"),
+        (dist.Normal(np.float32(1.5), jnp.asarray(0.25)), "Normal(loc=1.5, scale=0.25)"),
+        (
+            PRIORS["refractive_index"],
+            "TruncatedNormal(loc=1.45, scale=0.15, low=1.2, high=2)",
+        ),
+        (
+            dist.TruncatedNormal(1.45, 0.15, low=1.0),
+            "TruncatedNormal(loc=1.45, scale=0.15, low=1)",
+        ),
+        (dist.TruncatedCauchy(0.0, 1.0, high=2.0), "TruncatedCauchy(loc=0, scale=1, high=2)"),
+        (dist.Normal(0.0, 1.0).expand([4]).to_event(1), "Normal(loc=0, scale=1) x (4,)"),
+        (dist.Normal(0.0, 1.0).expand([3]), "Normal(loc=0, scale=1) x (3,)"),
+        (dist.Normal(0.0, 1.0).mask(False), "Normal(loc=0, scale=1)"),
+        (dist.LogNormal(jnp.array([0.0, 1.0]), 0.5), "LogNormal(loc=[0, 1], scale=0.5)"),
+        (
+            dist.LogNormal(jnp.zeros((3, 1)), 0.5),
+            "LogNormal(loc=<array (3, 1)>, scale=0.5)",
+        ),
+        (
+            dist.MixtureSameFamily(WEIGHTS, dist.Normal(jnp.array([1.4, 1.6]), 0.1)),
+            "Mixture(weights=[0.25, 0.75], Normal(loc=[1.4, 1.6], scale=0.1))",
+        ),
+        (
+            dist.MixtureGeneral(WEIGHTS, [dist.Gamma(2.0, 3.0), dist.LogNormal(0.0, 1.0)]),
+            "Mixture(weights=[0.25, 0.75], Gamma(concentration=2, rate=3), "
+            "LogNormal(loc=0, scale=1))",
+        ),
+        (
+            SHIFTED,
+            "TransformedDistribution(HalfNormal(scale=0.5), AffineTransform(loc=1, scale=2))",
+        ),
+        (dist.ImproperUniform(dist.constraints.positive, (), ()), "ImproperUniform()"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_prior_reads_as_it_would_be_typed(prior, text):
+    assert describe_prior(prior) == text
+
+
+def test_a_prior_that_fails_to_describe_itself_still_has_a_name():
+    class Broken(dist.Normal):
+        @property
+        def arg_constraints(self):
+            raise RuntimeError("no")
+
+    broken = object.__new__(Broken)
+    broken._batch_shape = broken._event_shape = ()
+    assert describe_prior(broken) == "Broken"
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_every_row_is_described_in_one_line(name):
+    text = describe_prior(PRIORS[name])
+    assert "(" in text
+    assert "\n" not in text
+    assert "object at" not in text
+
+
+# --- the precision is chosen later ----------------------------------------------------------------
+
+FRESH = """
+import jax
+import polar_bayes.priors as priors
+from jax._src import xla_bridge
+
+assert not xla_bridge._backends, "importing the priors started a backend"
+jax.config.update("jax_enable_x64", True)
+draw = priors.PRIORS["refractive_index"].sample(jax.random.key(0))
+density = priors.PRIORS["absorption"].log_prob(jax.numpy.asarray(0.3))
+assert draw.dtype == density.dtype == "float64", (draw.dtype, density.dtype)
+"""
+
+
+def test_importing_the_table_makes_no_array_and_double_precision_may_come_later():
+    done = subprocess.run(
+        [sys.executable, "-c", FRESH], capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""

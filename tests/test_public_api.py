@@ -1,0 +1,148 @@
+"""The front door: what it offers, what opening it costs, and that it leaves others whole.
+
+Imports are counted in fresh processes, by the modules that are there afterwards; nothing is timed.
+"""
+
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+import polar_bayes as pb
+
+HEAVY = ("jax", "numpyro", "arviz", "matplotlib", "xarray", "netCDF4")
+
+
+def run(code):
+    """What a fresh interpreter prints; its errors fail the test."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+# --- names ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", pb.__all__)
+def test_every_public_name_loads_and_says_what_it_is(name):
+    thing = getattr(pb, name)
+    if callable(thing):
+        assert inspect.getdoc(thing)
+        assert thing.__module__.startswith("polar_bayes.")
+
+
+def test_the_list_of_public_names_is_sorted_and_complete():
+    assert list(pb.__all__) == sorted(set(pb.__all__))
+    assert dir(pb) == list(pb.__all__)
+    promised = {"load_capture", "simulate", "from_goniometer", "Scene", "Geometry", "fit", "report"}
+    assert promised <= set(pb.__all__)
+
+
+def test_a_name_that_does_not_exist_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'polar_bayes' has no attribute 'fitt'"):
+        pb.fitt  # noqa: B018
+
+
+def test_every_error_can_be_caught_as_one_kind():
+    for name in ("CaptureError", "SceneError", "FitError"):
+        assert issubclass(getattr(pb, name), pb.PolarBayesError)
+        assert issubclass(getattr(pb, name), ValueError)
+
+
+# --- what opening it costs ------------------------------------------------------------------------
+
+LOADED = f"""
+import sys
+heavy = {HEAVY!r}
+loaded = sorted({{name.split(".")[0] for name in sys.modules}} & set(heavy))
+assert not loaded, loaded
+"""
+
+
+def test_importing_the_package_loads_no_array_library():
+    assert run(f"import polar_bayes{LOADED}") == ""
+
+
+def test_asking_the_command_line_for_help_loads_no_array_library():
+    help_text = run(f"from polar_bayes.cli import main\nassert main(['--help']) == 0{LOADED}")
+    assert help_text.startswith("Usage: polar-bayes")
+
+
+def test_help_of_every_command_loads_no_array_library():
+    code = f"""
+from polar_bayes.cli import commands, main
+for name in commands.commands:
+    assert main([name, "--help"]) == 0
+{LOADED}"""
+    assert "Usage: polar-bayes fit" in run(code)
+
+
+def test_errors_of_the_package_load_no_array_library():
+    assert run(f"import polar_bayes\npolar_bayes.CaptureError{LOADED}") == ""
+
+
+# --- what importing leaves behind -----------------------------------------------------------------
+
+EVERY_MODULE = """
+import importlib, pkgutil, sys, warnings
+import jax, numpyro
+from jax._src import xla_bridge
+
+flags = dict(jax.config.values)
+validated = numpyro.distributions.Distribution._validate_args
+filters = list(warnings.filters)
+import polar_bayes, polar_bayes.models
+
+packages = [(package.__path__, package.__name__) for package in (polar_bayes, polar_bayes.models)]
+names = {
+    module.name
+    for path, package in packages
+    for module in pkgutil.walk_packages(path, f"{package}.")
+}
+for name in sorted(names):
+    importlib.import_module(name)
+count = sum(name.startswith("polar_bayes.") for name in sys.modules)
+assert count > 40, count
+assert not xla_bridge._backends, "an import started a backend, so it made an array"
+changed = {key for key, value in jax.config.values.items() if flags.get(key, value) != value}
+assert not changed, f"an import changed {changed}"
+assert numpyro.distributions.Distribution._validate_args is validated
+"""
+
+
+def test_importing_every_module_makes_no_array_flips_no_flag_and_prints_nothing():
+    assert run(EVERY_MODULE) == ""
+
+
+# --- others ---------------------------------------------------------------------------------------
+
+WHOLE = """
+import numpyro.distributions
+import numpyro.infer
+assert hasattr(numpyro.distributions, "distribution")
+assert numpyro.distributions.Normal is sys.modules["numpyro.distributions"].Normal
+polar_bayes.fit
+import polar_bayes.models.per_material as model
+assert isinstance(polar_bayes.PRIORS["roughness"], numpyro.distributions.Distribution)
+assert model.numpyro is sys.modules["numpyro"]
+"""
+
+
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "import arviz, polar_bayes",
+        "import polar_bayes, arviz",
+        "import polar_bayes; polar_bayes.load_capture; import arviz",
+        "import polar_bayes; polar_bayes.Scene; import arviz; polar_bayes.summary",
+        "import arviz; import polar_bayes.priors; import polar_bayes",
+        "import arviz, numpyro, polar_bayes",
+        "import numpyro, arviz, polar_bayes",
+    ],
+)
+def test_arviz_and_numpyro_stay_whole_in_any_order_of_imports(imports):
+    """ArviZ leaves a lazy stand-in for NumPyro, which `import numpyro.infer` would run twice."""
+    assert run(f"import sys\n{imports}\n{WHOLE}") == ""

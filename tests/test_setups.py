@@ -1,0 +1,71 @@
+"""The named set-ups hang together, and a wrong name is answered with the right ones."""
+
+import inspect
+
+import pytest
+
+from polar_bayes.errors import SceneError
+from polar_bayes.observation.links import AbstractLink
+from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.scenes import SCENES
+from polar_bayes.setups import SETUPS, Setup, find_setup
+
+EVERY_SETUP = pytest.mark.parametrize("name", SETUPS)
+
+
+@EVERY_SETUP
+def test_a_setup_is_found_by_its_name(name):
+    setup = find_setup(name)
+    assert setup is SETUPS[name]
+    assert isinstance(setup, Setup)
+    assert setup.scene == SCENES[name]
+
+
+@EVERY_SETUP
+def test_every_link_describes_its_variable_and_one_of_them_a_polarization(name):
+    links = SETUPS[name].links
+    for variable, link in links.items():
+        assert isinstance(link, AbstractLink)
+        assert variable in link.observables
+    assert {"dop", "q", "u"} & set(links)
+
+
+@EVERY_SETUP
+def test_material_parameters_come_first_and_none_twice(name):
+    scene = SETUPS[name].scene
+    assert isinstance(scene, Scene)
+    assert len(set(scene.parameters)) == len(scene.parameters)
+    assert "refractive_index" in scene.parameters
+
+
+@EVERY_SETUP
+def test_the_limit_of_the_view_zenith_is_an_angle(name):
+    assert 0.0 < SETUPS[name].largest_view_zenith <= 90.0
+
+
+def test_every_named_scene_has_a_setup():
+    assert set(SETUPS) == set(SCENES)
+
+
+def test_the_goniometer_sets_grazing_views_aside_and_trusts_stated_errors_by_a_factor():
+    setup = SETUPS["goniometer"]
+    assert setup.largest_view_zenith == 78.0
+    assert setup.links["q"].parameters == ("stokes_error_factor",)
+
+
+def test_the_table_cannot_be_changed_by_accident():
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        SETUPS["mine"] = SETUPS["paper"]
+
+
+@pytest.mark.parametrize("name", ["papper", "", "Paper", 3, None, ["paper"]])
+def test_an_unknown_name_is_answered_with_the_known_ones(name):
+    with pytest.raises(SceneError) as caught:
+        find_setup(name)
+    expected = "no such scene; give one of paper, camera, goniometer, or a polar_bayes.Scene"
+    assert str(caught.value) == f"scene={name!r}: {expected}"
+
+
+def test_the_docstring_of_a_setup_names_every_field():
+    for field in Setup.__dataclass_fields__:
+        assert f"{field}:" in inspect.getdoc(Setup)
