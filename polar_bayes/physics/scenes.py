@@ -1,6 +1,5 @@
 """Scenes by name: the paper's, a polarization camera's, a goniometer's."""
 
-from polar_bayes.errors import SceneError
 from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.illumination import PointSource
@@ -17,8 +16,8 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
-# Twenty facets for the way out of the body: DoP within 0.0004 and brightness within 0.1 % of 400
-# facets for every roughness up to 0.5 and zenith up to 85 degrees, at half the default's cost.
+# Twenty facets for the way out of the body: DoP within 0.0005 and brightness within 0.15 % of 400
+# facets for every roughness up to 0.5 and zenith up to 85 degrees (tests/physics/test_scenes.py).
 WAY_OUT = FacetQuadrature(along=5, across=4)
 
 SCENES: dict[str, Scene] = {
@@ -44,26 +43,3 @@ SCENES: dict[str, Scene] = {
         instrument=Instrument((AngleZero(), ChannelGain(), Leakage(), Discrepancy())),
     ),
 }
-
-
-def find_scene(scene: Scene | str) -> Scene:
-    """A scene, or the scene of that name.
-
-    Args:
-        scene: A Scene, or a key of `SCENES`.
-
-    Returns:
-        The scene.
-
-    Raises:
-        SceneError: There is no scene of that name, or it is no scene at all.
-    """
-    if isinstance(scene, Scene):
-        return scene
-    if scene not in SCENES:
-        raise SceneError(
-            f"{scene!r} is no scene",
-            where="scene",
-            mend=f"give one of {', '.join(SCENES)}, or a Scene(...)",
-        )
-    return SCENES[scene]

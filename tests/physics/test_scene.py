@@ -20,7 +20,7 @@ from polar_bayes.physics.instrument import (
 from polar_bayes.physics.microfacet import GGX
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.scene import Scene
-from polar_bayes.physics.scenes import SCENES, find_scene
+from polar_bayes.physics.scenes import SCENES
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
@@ -234,10 +234,3 @@ def test_only_terms_that_are_there_can_be_removed() -> None:
     with pytest.raises(SceneError, match="no DarkLevel; name one of its instrument terms: DolpG"):
         SCENES["camera"].without(DarkLevel)
     assert SCENES["camera"].without(DolpGain).instrument is None
-
-
-def test_scenes_are_found_by_name() -> None:
-    assert find_scene("paper") is SCENES["paper"]
-    assert find_scene(SCENES["camera"]) is SCENES["camera"]
-    with pytest.raises(SceneError, match="'lab' is no scene; give one of paper, camera, goniom"):
-        find_scene("lab")

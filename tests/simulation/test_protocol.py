@@ -1,0 +1,67 @@
+"""The paper's protocol: about 40 views to 85 degrees, several azimuths, three wavelengths."""
+
+import numpy as np
+import pytest
+
+from polar_bayes.errors import CaptureError
+from polar_bayes.simulation.protocol import Protocol
+
+
+def test_the_default_is_the_papers():
+    protocol = Protocol()
+    angles = protocol.angles()
+    assert {name: angle.shape for name, angle in angles.items()} == dict.fromkeys(angles, (40,))
+    assert angles["view_zenith"].max() == 85.0
+    assert len(np.unique(angles["view_azimuth"])) == 4
+    assert len(protocol.wavelengths) == 3
+
+
+def test_zeniths_step_evenly_up_to_the_largest():
+    zeniths = Protocol(views=5, largest_view_zenith=50.0).angles()["view_zenith"]
+    np.testing.assert_allclose(zeniths, [10.0, 20.0, 30.0, 40.0, 50.0], rtol=1e-15)
+
+
+def test_every_azimuth_sees_the_whole_range():
+    angles = Protocol().angles()
+    for azimuth in np.unique(angles["view_azimuth"]):
+        seen = angles["view_zenith"][angles["view_azimuth"] == azimuth]
+        assert seen.min() < 10.0
+        assert seen.max() > 75.0
+
+
+def test_the_light_stands_still():
+    angles = Protocol(views=3, light_zenith=30.0).angles()
+    np.testing.assert_array_equal(angles["light_zenith"], np.full(3, 30.0))
+    np.testing.assert_array_equal(angles["light_azimuth"], np.zeros(3))
+
+
+def test_more_azimuths_than_views_are_not_all_used():
+    angles = Protocol(views=2, azimuths=(180.0, 90.0, 0.0)).angles()
+    np.testing.assert_array_equal(angles["view_azimuth"], [180.0, 90.0])
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("views", 1),
+        ("views", 2.5),
+        ("views", True),
+        ("views", 100_001),
+        ("largest_view_zenith", 0.0),
+        ("largest_view_zenith", 90.0),
+        ("largest_view_zenith", float("nan")),
+        ("light_zenith", -1.0),
+        ("light_zenith", 90.0),
+        ("azimuths", ()),
+        ("azimuths", (361.0,)),
+        ("azimuths", (180.0, float("nan"))),
+        ("wavelengths", (0.0,)),
+        ("wavelengths", (550.0, float("inf"))),
+    ],
+)
+def test_a_field_outside_its_range_is_refused_by_name(field, value):
+    with pytest.raises(CaptureError) as caught:
+        Protocol(**{field: value})
+    message = str(caught.value)
+    assert message.startswith(f"Protocol: {field} is {value}; give ")
+    assert "\n" not in message
