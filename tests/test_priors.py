@@ -83,10 +83,9 @@ def test_the_tables_beta_is_numpyros():
     values = jnp.array([1e-6, 0.3, 1.0 - 1e-6])
     ours, theirs = PRIORS["subsurface_fraction"], dist.Beta(2.0, 2.0)
     np.testing.assert_array_equal(ours.log_prob(values), theirs.log_prob(values))
-    np.testing.assert_array_equal(ours.sample(KEY, (5,)), theirs.sample(KEY, (5,)))
     assert (ours.mean, ours.support, ours.shape()) == (theirs.mean, theirs.support, theirs.shape())
     copies = jax.tree.map(lambda number: number, ours.expand([3]))
-    assert copies.sample(KEY).shape == (3,)
+    assert jax.eval_shape(copies.sample, KEY).shape == (3,)
 
 
 # --- replacing a row ------------------------------------------------------------------------------

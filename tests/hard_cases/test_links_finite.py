@@ -36,11 +36,9 @@ FLAT = ConcentrationSchedule(minimum=1e-6, brightness_exponent=0.0, angle_expone
 
 # variable, link, predictions, readings, values of each noise parameter
 LINKS = {
-    "Beta": ("dop", BetaLink(), UNIT, UNIT, (CONCENTRATIONS,)),
     "Beta, steep": ("dop", BetaLink(1e-3, STEEP), UNIT, UNIT, (CONCENTRATIONS,)),
     "Beta, flat": ("dop", BetaLink(1e-6, FLAT), UNIT, UNIT, (CONCENTRATIONS,)),
-    "logit-normal": ("dop", LogitNormalLink(), UNIT, UNIT, (SCALES,)),
-    "logit-normal, least margin": ("dop", LogitNormalLink(margin=1e-6), UNIT, UNIT, (SCALES,)),
+    "logit-normal": ("dop", LogitNormalLink(margin=1e-6), UNIT, UNIT, (SCALES,)),
     "normal": ("q", NormalLink(), SIGNED, SIGNED, (SCALES,)),
     "Stokes": ("q", StokesLink(), SIGNED, SIGNED, (SCALES,)),
     "Stokes, Student's t": ("u", StokesLink(4.0), SIGNED, SIGNED, (SCALES,)),

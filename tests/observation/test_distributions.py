@@ -1,4 +1,4 @@
-"""The two distributions of the noise, against 50 digits, NumPyro, quadrature and their own draws."""
+"""The distributions of the noise, against 50 digits, NumPyro, quadrature and their own draws."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Captures of known truth: what is in them, that seeds rule them, and that the noise is the link's."""
+"""Captures of known truth: what they hold, that the seed decides, and whose noise it is."""
 
 import functools
 
@@ -32,7 +32,6 @@ from polar_bayes.simulation.simulate import NOISE, STATED_ERROR, simulate
 
 PLATE = Scene(SmoothSurface(), Unpolarized(), StokesMixing())  # the quickest optics
 MANY = Protocol(views=3000, wavelengths=())
-SMALL = Protocol(views=6, wavelengths=(450.0, 650.0))
 
 default_capture = functools.cache(simulate)
 
@@ -116,14 +115,14 @@ def test_the_bright_views_come_to_60_percent_of_full_scale():
 
 
 def test_a_stated_exposure_is_kept():
-    arguments = {"scene": PLATE, "protocol": SMALL, "links": {"intensity": StudentTLink()}}
+    arguments = {"scene": PLATE, "protocol": MANY, "links": {"intensity": StudentTLink()}}
     bright, dark = (
         simulate("glass", noise={"exposure": exposure, "intensity_scale": 1e-9}, **arguments)
         for exposure in (1.0, 0.5)
     )
-    # Scales of 1e-9 on readings above 1e-3 leave ratios to 1e-5, even 10 scales away.
+    # Noise of 1e-9, some hundred of these at the very worst of 3000, on readings above 1e-3.
     assert float(bright["intensity"].min()) > 1e-3
-    np.testing.assert_allclose(bright["intensity"] / dark["intensity"], 2.0, rtol=1e-5)
+    np.testing.assert_allclose(bright["intensity"] / dark["intensity"], 2.0, rtol=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -132,7 +131,7 @@ def test_strong_noise_stays_possible(seed):
     assert float((stokes["q"] ** 2 + stokes["u"] ** 2).max()) <= 1.0 + 1e-15
     links = {"dop": NormalLink(), "intensity": StudentTLink()}
     noise = {"normal_scale": 1.0, "intensity_scale": 1.0}
-    other = simulate("leaf", scene=PLATE, links=links, protocol=SMALL, noise=noise, seed=seed)
+    other = simulate("leaf", scene=PLATE, links=links, noise=noise, seed=seed)
     assert 0.0 <= float(other["dop"].min()) <= float(other["dop"].max()) <= 1.0
 
 
@@ -151,9 +150,9 @@ def test_the_truth_of_the_preset_rides_along():
 def test_replaced_parameters_and_a_material_of_ones_own_ride_along_too():
     scene = Scene(SmoothSurface(), Unpolarized(), StokesMixing(), None, Instrument((DolpGain(),)))
     material = Material(0.1, 0.2, (0.3, 0.3, 0.3), (1.5, 1.5, 1.5))
-    parameters = {"refractive_index": [1.6, 1.4], "dolp_gain": 0.8}
-    capture = simulate(material, scene=scene, protocol=SMALL, parameters=parameters)
-    np.testing.assert_array_equal(capture["true_refractive_index"], [1.6, 1.4])
+    parameters = {"refractive_index": [1.6, 1.5, 1.4], "dolp_gain": 0.8}
+    capture = simulate(material, scene=scene, parameters=parameters)
+    np.testing.assert_array_equal(capture["true_refractive_index"], [1.6, 1.5, 1.4])
     assert float(capture["true_dolp_gain"]) == 0.8
     assert float(capture["true_subsurface_fraction"]) == 0.2
     assert "true_roughness" not in capture  # a smooth plate has none
