@@ -136,8 +136,7 @@ assert program.potential_energy is numpyro.infer.util.potential_energy  # there 
     [
         "import arviz, polar_bayes",
         "import polar_bayes, arviz",
-        "import polar_bayes; polar_bayes.Scene; import arviz",
-        "import arviz, numpyro, polar_bayes",
+        "import arviz, numpyro, polar_bayes; polar_bayes.Scene",
     ],
 )
 def test_arviz_and_numpyro_stay_whole_in_any_order_of_imports(imports):

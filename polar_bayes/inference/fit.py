@@ -132,7 +132,8 @@ def _fit_scene(
     potential = _compile_potential(program, data)
     modes = _search(potential, starts, progress)
     clock.lap("modes")
-    problems = []
+    problems: list[str] = []
+    extra: dict[str, Any] = {"modes": _describe_modes(modes)}
     if isinstance(request.method, laplace.Laplace):
         if modes.decrement[0] > SETTLED:
             problems.append(
@@ -141,7 +142,7 @@ def _fit_scene(
             )
         z, stats = laplace.sample(program, data, potential, modes, key_draws, request.method)
     else:
-        z, stats = nuts.sample(
+        z, stats, extra["goals_reached"] = nuts.sample(
             program,
             data,
             potential,
@@ -151,7 +152,7 @@ def _fit_scene(
             lambda done: progress("sampling", done),
         )
     clock.lap("draws")
-    return _Fitted(program, z, stats, problems, {"modes": _describe_modes(modes)})
+    return _Fitted(program, z, stats, problems, extra)
 
 
 class _Clock:

@@ -101,7 +101,7 @@ def sample(
     key: Array,
     settings: Nuts,
     progress: Progress = lambda _: None,
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+) -> tuple[np.ndarray, dict[str, np.ndarray], bool]:
     """Draw from the posterior.
 
     Args:
@@ -115,7 +115,8 @@ def sample(
         progress: Called with the fraction of all draws that is done.
 
     Returns:
-        Unconstrained draws (chain, draw, size) and statistics, each (chain, draw).
+        Unconstrained draws (chain, draw, size); statistics, each (chain, draw); and whether the
+        goals for mixing were reached before `most_draws`.
     """
     kernel = _Kernel(program, settings)
     key_start, key_chains = jax.random.split(key)
@@ -129,6 +130,7 @@ def sample(
     advance = jax.jit(kernel.advance).lower(states[0], data).compile()
 
     rounds: list[Step] = []
+    mixed = False
     warmup_blocks, least, most = (
         -(-draws // settings.block)
         for draws in (settings.warmup, settings.draws, settings.most_draws)
@@ -150,14 +152,14 @@ def sample(
             if done >= warmup_blocks or (done == warmup_blocks - 1 and surplus):
                 rounds.append(steps)
             progress(min((done + 1) / (warmup_blocks + least), 1.0))
-            if done + 1 >= warmup_blocks + least and _mixed(rounds, settings):
+            if done + 1 >= warmup_blocks + least and (mixed := _mixed(rounds, settings)):
                 break
     stats = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *rounds)._asdict()
     z = stats.pop("z")
     step_size = np.array([float(state.adapt_state.step_size) for state in states])
     stats["step_size"] = np.broadcast_to(step_size[:, None], z.shape[:2])
     stats["reached_max_treedepth"] = stats["n_steps"] >= 2**settings.max_tree_depth - 1
-    return z, stats
+    return z, stats, mixed
 
 
 def _mixed(rounds: list[Step], settings: Nuts) -> bool:

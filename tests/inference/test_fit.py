@@ -85,6 +85,7 @@ def test_another_seed_gives_other_draws(short: xr.DataTree, capture: xr.Dataset)
 def test_a_fit_that_is_too_short_says_so(short: xr.DataTree) -> None:
     verdict = pb.verdict(short)
     assert not verdict.converged
+    assert provenance_of(short)["goals_reached"] is False
     assert any("ESS" in problem or "effective" in problem for problem in verdict.problems)
 
 
