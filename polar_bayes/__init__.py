@@ -45,7 +45,7 @@ _HOMES = {
     "physics.subsurface": ("Depolarizer", "Lambertian", "Unpolarized"),
     "physics.surface": ("RoughSurface", "SmoothSurface"),
     "priors": ("PRIORS",),
-    "report.html": ("report",),
+    "reporting.html": ("report",),
     "setups": ("SETUPS", "Setup"),
     "simulation.presets": ("PRESETS", "Material"),
     "simulation.protocol": ("Protocol",),

@@ -36,7 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         status = commands.main(arguments, prog_name="polar-bayes", standalone_mode=False)
     except click.exceptions.Abort:
-        click.echo("polar-bayes: stopped; nothing was written", err=True)
+        click.echo("polar-bayes: stopped", err=True)
         return 130
     except click.ClickException as error:
         context = getattr(error, "ctx", None)
@@ -65,7 +65,10 @@ def commands() -> None:
 
 
 @commands.command()
-@click.option("--out", type=click.Path(path_type=Path), default=Path("polar-bayes-demo"))
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("polar-bayes-demo"),
+    show_default=True, help="Folder to write.",
+)  # fmt: skip
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 def demo(out: Path, seed: int) -> int:
     """Capture, fit, diagnostics and report of an embedded example."""
@@ -86,7 +89,7 @@ def demo(out: Path, seed: int) -> int:
 @commands.command()
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Capture to write.")
 @click.option("--preset", default="leaf", show_default=True, help="Material to simulate.")
-@click.option("--scene", default="paper", show_default=True, help="Set-up to simulate.")
+@click.option("--scene", default="paper", show_default=True, help="Named scene to simulate.")
 @click.option("--views", type=int, default=40, show_default=True)
 @click.option("--largest-view-zenith", type=float, default=85.0, show_default=True, help="Degrees.")
 @click.option(
@@ -143,7 +146,7 @@ def goniometer(s: str, p: str, table: Path | None, out: Path, **settings: Any) -
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Result to write.")
 @click.option("--model", default="per_material", show_default=True)
 @click.option("--method", default="nuts", show_default=True, help="nuts, laplace or point.")
-@click.option("--scene", help="Set-up; by default the one that the capture names.")
+@click.option("--scene", help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")

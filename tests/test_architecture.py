@@ -19,7 +19,7 @@ LAYERS = (
     ("polar_bayes.simulation",),
     ("polar_bayes.inference",),
     ("polar_bayes.diagnostics",),
-    ("polar_bayes.report",),
+    ("polar_bayes.reporting",),
     ("polar_bayes.cli",),
 )
 
@@ -32,21 +32,21 @@ STRANGERS = (
 
 # Packages that only these rows may see; all others may be seen anywhere.
 HOMES = {
-    "matplotlib": ("polar_bayes.report",),
-    "arviz_plots": ("polar_bayes.report",),
-    "jinja2": ("polar_bayes.report",),
+    "matplotlib": ("polar_bayes.reporting",),
+    "arviz_plots": ("polar_bayes.reporting",),
+    "jinja2": ("polar_bayes.reporting",),
     "click": ("polar_bayes.cli",),
     "netCDF4": ("polar_bayes.capture",),
     "optimistix": ("polar_bayes.inference",),
-    "arviz_base": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.report"),
-    "arviz_stats": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.report"),
+    "arviz_base": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.reporting"),
+    "arviz_stats": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.reporting"),
     "xarray": (
         "polar_bayes.capture",
         "polar_bayes.observation.data",
         "polar_bayes.simulation",
         "polar_bayes.inference",
         "polar_bayes.diagnostics",
-        "polar_bayes.report",
+        "polar_bayes.reporting",
     ),
 }
 NEVER = {"polar_bayes.physics": {"numpyro", "xarray", "arviz"}, "polar_bayes.capture": {"jax"}}

@@ -147,7 +147,7 @@ def test_a_truncated_capture_gets_one_line(
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_an_interrupt_says_that_nothing_was_written(
+def test_an_interrupt_ends_with_one_word(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:
     def interrupted(*_: object, **__: object) -> None:

@@ -6,6 +6,7 @@ Imports are counted in fresh processes, by the modules that are there afterwards
 import inspect
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -56,6 +57,7 @@ def test_every_error_can_be_caught_as_one_kind():
 
 LOADED = f"""
 import sys
+from pathlib import Path
 heavy = {HEAVY!r}
 loaded = sorted({{name.split(".")[0] for name in sys.modules}} & set(heavy))
 assert not loaded, loaded
@@ -121,6 +123,7 @@ def test_importing_every_module_makes_no_array_flips_no_flag_and_prints_nothing(
 
 WHOLE = """
 import sys
+from pathlib import Path
 polar_bayes.fit
 import numpyro.distributions
 import numpyro.infer.util
@@ -142,3 +145,9 @@ assert program.potential_energy is numpyro.infer.util.potential_energy  # there 
 def test_arviz_and_numpyro_stay_whole_in_any_order_of_imports(imports):
     """ArviZ leaves a lazy stand-in for NumPyro, which `import numpyro.infer` would run twice."""
     assert run(f"{imports}{WHOLE}") == ""
+
+
+def test_no_public_name_is_shadowed_by_a_module_of_the_package() -> None:
+    """`import polar_bayes.x.y` sets the attribute `x`: no public function may be called so."""
+    rooms = {path.stem for path in Path(pb.__file__).parent.iterdir()} | {"models"}
+    assert not rooms & set(pb.__all__)

@@ -154,7 +154,8 @@ def sample(
             progress(min((done + 1) / (warmup_blocks + least), 1.0))
             if done + 1 >= warmup_blocks + least and (mixed := _mixed(rounds, settings)):
                 break
-    stats = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *rounds)._asdict()
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *rounds)
+    stats = jax.tree.map(lambda x: x[:, : settings.most_draws], joined)._asdict()
     z = stats.pop("z")
     step_size = np.array([float(state.adapt_state.step_size) for state in states])
     stats["step_size"] = np.broadcast_to(step_size[:, None], z.shape[:2])

@@ -140,7 +140,7 @@ def _read(trace: dict, latent: dict[str, Array], observed: tuple[str, ...], key:
     keys = dict(zip(observed, jax.random.split(key, len(observed)), strict=True))
     return Draw(
         latent=latent,
-        center={name: _center(trace, name) for name in observed},
+        center={n: jnp.broadcast_to(_center(trace, n), trace[n]["value"].shape) for n in observed},
         log_likelihood={n: trace[n]["fn"].log_prob(trace[n]["value"]) for n in observed},
         log_prior={n: jnp.sum(trace[n]["fn"].log_prob(latent[n])) for n in latent},
         predictive={name: trace[name]["fn"].sample(keys[name]) for name in observed},

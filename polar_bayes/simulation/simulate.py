@@ -100,8 +100,10 @@ def simulate(
     with jax.enable_x64(True):
         recorded = _record(setup.scene, links, protocol, truth, levels, seed)
     name = preset if isinstance(preset, str) else "simulated"
-    setup_name = scene if isinstance(scene, str) else "paper"
-    return _label(recorded, protocol, truth, {"name": name, "setup": setup_name, "seed": seed})
+    attributes = {"name": name, "seed": seed}
+    if isinstance(scene, str):  # a fit then takes the same set-up unless told otherwise
+        attributes["setup"] = scene
+    return _label(recorded, protocol, truth, attributes)
 
 
 def _truth(

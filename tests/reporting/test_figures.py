@@ -10,8 +10,8 @@ from matplotlib.text import Text
 from synthetic_results import edit_provenance, make_result, replace
 
 from polar_bayes.errors import FitError
-from polar_bayes.report import figures
-from polar_bayes.report.readings import curves
+from polar_bayes.reporting import figures
+from polar_bayes.reporting.readings import curves
 
 CASES = {
     "three wavelengths, four azimuths": {"azimuths": (180.0, 150.0, 120.0, 60.0)},

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from polar_bayes.diagnostics.parameters import SAMPLE_DIMS, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.report.style import (
+from polar_bayes.reporting.style import (
     BLACK,
     BLUE,
     GRAY,

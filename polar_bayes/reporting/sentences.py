@@ -8,8 +8,8 @@ import xarray as xr
 
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.predictive import Band, Check, pit_band
-from polar_bayes.report.style import QUANTITIES, place_of, title_of
-from polar_bayes.report.text import spoken
+from polar_bayes.reporting.style import QUANTITIES, place_of, title_of
+from polar_bayes.reporting.text import spoken
 
 # Two intervals whose widths differ by less than this are equally wide, as far as draws can tell.
 EQUAL_WIDTHS = 0.05
@@ -143,8 +143,8 @@ def overconfidence(
     apart = [scalar for scalar in gain if misses[scalar.label]]
     if apart:
         sentences.append(
-            f"The two fits disagree on {named(apart, posterior)}: the interval without the term "
-            "does not contain the mean with it."
+            f"The two fits disagree on {named(apart, posterior)}: the interval without {what} "
+            "does not contain the mean of this fit."
         )
     return [*sentences, f"Do not quote the numbers without {what}."]
 

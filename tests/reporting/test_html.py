@@ -18,9 +18,9 @@ from polar_bayes.diagnostics.discrepancy import compare_without
 from polar_bayes.diagnostics.parameters import posterior_scalars
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.files import load_result
-from polar_bayes.report.html import render, report
-from polar_bayes.report.sentences import overconfidence
-from polar_bayes.report.text import interval, numbers, percent, spoken
+from polar_bayes.reporting.html import render, report
+from polar_bayes.reporting.sentences import overconfidence
+from polar_bayes.reporting.text import interval, numbers, percent, spoken
 
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 VOID = {"meta", "img", "br", "hr", "link", "input"}

@@ -24,9 +24,9 @@ from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import save_result
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.report import figures, sentences, tables
-from polar_bayes.report.readings import variables
-from polar_bayes.report.style import QUANTITIES, STYLE
+from polar_bayes.reporting import figures, sentences, tables
+from polar_bayes.reporting.readings import variables
+from polar_bayes.reporting.style import QUANTITIES, STYLE
 
 PAGE = "index.html"
 RESULT = "result.nc"
@@ -127,7 +127,7 @@ def render(result: xr.DataTree) -> str:
         "pictures": _pictures(result, checks, method),
     }
     environment = Environment(
-        loader=PackageLoader("polar_bayes.report"),
+        loader=PackageLoader("polar_bayes.reporting"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

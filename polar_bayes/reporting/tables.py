@@ -13,8 +13,8 @@ from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, laplace_k_hat
 from polar_bayes.diagnostics.parameters import Scalar, stats_of, truth_of
 from polar_bayes.diagnostics.predictive import PROBABILITIES, Check
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE
-from polar_bayes.report.style import QUANTITIES, title_of
-from polar_bayes.report.text import DASH, interval, numbers, or_dash, percent
+from polar_bayes.reporting.style import QUANTITIES, title_of
+from polar_bayes.reporting.text import DASH, interval, numbers, or_dash, percent
 
 
 @dataclasses.dataclass(frozen=True)

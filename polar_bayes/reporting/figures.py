@@ -23,9 +23,9 @@ from polar_bayes.diagnostics.parameters import (
 )
 from polar_bayes.diagnostics.predictive import Check, pit_band, predictive_checks
 from polar_bayes.errors import FitError
-from polar_bayes.report.readings import readings as readings
-from polar_bayes.report.readings import residuals as residuals
-from polar_bayes.report.style import (
+from polar_bayes.reporting.readings import readings as readings
+from polar_bayes.reporting.readings import residuals as residuals
+from polar_bayes.reporting.style import (
     BLACK,
     BLUE,
     CHAIN_COLORS,
