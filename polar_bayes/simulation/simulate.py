@@ -100,7 +100,7 @@ def simulate(
     with jax.enable_x64(True):
         recorded = _record(setup.scene, links, protocol, truth, levels, seed)
     name = preset if isinstance(preset, str) else "simulated"
-    attributes = {"name": name, "seed": seed}
+    attributes: dict[str, str | int] = {"name": name, "seed": seed}
     if isinstance(scene, str):  # a fit then takes the same set-up unless told otherwise
         attributes["setup"] = scene
     return _label(recorded, protocol, truth, attributes)
