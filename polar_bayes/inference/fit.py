@@ -104,7 +104,9 @@ def _run(request: Request, progress: Progress) -> xr.DataTree:
     prior = describe(key_prior, prior_z[None], data)
     clock.lap("prediction")
 
-    beside = _fit_beside(request, data, key_plain, progress)
+    beside, comparisons_failed = _fit_beside(request, data, key_plain, progress)
+    if comparisons_failed:
+        fitted.extra["comparisons_failed"] = comparisons_failed
     clock.lap("beside")
 
     provenance = _provenance(request, data, clock, fitted)
@@ -255,28 +257,30 @@ def _fit_point(
 
 def _fit_beside(
     request: Request, data: Observations, key: Array, progress: Progress
-) -> dict[str, xr.Dataset]:
-    """Posteriors of the same fit without what makes its intervals honest, for comparison."""
+) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
+    """Posteriors of the same fit without what makes its intervals honest, and which ones failed."""
     terms = () if request.scene.instrument is None else request.scene.instrument.terms
     if isinstance(request.method, point.Point) or not any(
         isinstance(term, Discrepancy) for term in terms
     ):
-        return {}
+        return {}, {}
     scenes = {
         "without_discrepancy": request.scene.without(Discrepancy),
         "without_instrument": dataclasses.replace(request.scene, instrument=None),
     }
-    beside = {}
+    beside: dict[str, xr.Dataset] = {}
+    comparisons_failed: dict[str, str] = {}
     for number, (name, scene) in enumerate(scenes.items()):
         progress("comparing", number / len(scenes))
         try:
             fitted = _fit_scene(request, scene, data, key, _silent, _Clock())
-        except FitError:  # a comparison that finds no peak must not cost the user the fit
+        except FitError as error:  # a failed comparison must not cost the user the fit, but is told
+            comparisons_failed[name] = str(error)
             continue
         draws = _constrain(fitted.program, fitted.z)
         beside[name] = posterior_of(fitted.program, draws, data)
     progress("comparing", 1.0)
-    return beside
+    return beside, comparisons_failed
 
 
 def _provenance(

@@ -296,3 +296,24 @@ def test_progress_reports_every_stage(capture: xr.Dataset) -> None:
     )
     assert {stage for stage, _ in heard} >= {"searching for modes", "sampling"}
     assert all(0.0 <= fraction <= 1.0 for _, fraction in heard)
+
+
+def test_a_comparison_that_fails_is_told_and_costs_nothing(
+    capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from polar_bayes.inference import fit as fitting
+
+    whole = fitting._fit_scene
+
+    def fails_without_instrument(request, scene, *rest):
+        if scene.instrument is None:
+            raise pb.FitError("no peak", where="fit", mend="nothing")
+        return whole(request, scene, *rest)
+
+    monkeypatch.setattr(fitting, "_fit_scene", fails_without_instrument)
+    result = pb.fit(capture, scene="goniometer", method="laplace", seed=1)
+    assert "without_discrepancy" in result.children
+    assert "without_instrument" not in result.children
+    assert provenance_of(result)["comparisons_failed"] == {
+        "without_instrument": "fit: no peak; nothing"
+    }
