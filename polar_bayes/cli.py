@@ -148,14 +148,32 @@ def goniometer(s: str, p: str, table: Path | None, out: Path, **settings: Any) -
 @click.option("--method", default="nuts", show_default=True, help="nuts, laplace or point.")
 @click.option("--scene", help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
+@click.option("--choose-effects", "choose", is_flag=True, help="Fit what `effects` would keep.")
+@click.option("--tolerance", type=float, help="Of --choose-effects; 0.1 posterior sd by default.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
-def fit(capture: Path, out: Path, as_json: bool, **settings: Any) -> int:
+def fit(
+    capture: Path,
+    out: Path,
+    as_json: bool,
+    choose: bool,
+    tolerance: float | None,
+    scene: Any,
+    **settings: Any,
+) -> int:
     """Fit a capture; prints a row per parameter and writes everything to --out."""
+    if tolerance is not None and not choose:
+        raise click.UsageError("--tolerance needs --choose-effects")
     data = pb.load_capture(capture)
     _check_writable(out)
     with _progress() as progress:
-        result = pb.fit(data, progress=progress, **settings)
+        if choose:
+            data = _in_setup(data, scene)
+            options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
+            options |= {} if tolerance is None else {"tolerance": tolerance}
+            scene = pb.choose_effects(data, progress=progress, **options)
+            click.echo(pb.ledger_sentence(scene.ledger), err=True)
+        result = pb.fit(data, scene=scene, progress=progress, **settings)
     pb.save_result(result, out)
     if as_json:
         click.echo(json.dumps(pb.json_summary(result), indent=2, allow_nan=False))
@@ -165,11 +183,43 @@ def fit(capture: Path, out: Path, as_json: bool, **settings: Any) -> int:
 
 
 @commands.command()
+@click.argument("capture", type=click.Path(path_type=Path))
+@click.option("--scene", help="Named set-up; by default the one that the capture names.")
+@click.option("--tolerance", type=float, default=0.1, show_default=True, help="Posterior sd.")
+@click.option("--keep", multiple=True, help="Effect that stays; give it once per effect.")
+@click.option("--drop", multiple=True, help="Effect that goes; give it once per effect.")
+@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@click.option("--json", "as_json", is_flag=True, help="Print the ledger as JSON.")
+@click.option("--out", type=click.Path(path_type=Path), help="Ledger to write.")
+def effects(
+    capture: Path, scene: str | None, as_json: bool, out: Path | None, **settings: Any
+) -> None:
+    """What each effect changes and costs; which of them this capture can see."""
+    data = _in_setup(pb.load_capture(capture), scene)
+    if out is not None:
+        _check_writable(out)
+    with _progress() as progress:
+        ledger = pb.choose_effects(data, progress=progress, **settings).ledger
+    if out is not None:
+        pb.save_result(ledger, out)
+    if as_json:
+        click.echo(json.dumps(pb.ledger_summary(ledger), indent=2, allow_nan=False))
+    else:
+        click.echo(f"{pb.ledger_table(ledger)}\n\n{pb.ledger_sentence(ledger)}")
+
+
+@commands.command()
 @click.argument("fit", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write.")
 def report(fit: Path, out: Path) -> None:
     """Write the standardized report of a fit."""
     click.echo(f"report: {pb.report(pb.load_result(fit), out)}")
+
+
+def _in_setup(capture: Any, setup: str | None) -> Any:
+    """The capture as if it named that set-up, so that scene, links and limits fit together."""
+    return capture if setup is None else capture.assign_attrs(setup=setup)
 
 
 def _status(result: Any) -> int:

@@ -19,6 +19,7 @@ LAYERS = (
     ("polar_bayes.simulation",),
     ("polar_bayes.inference",),
     ("polar_bayes.diagnostics",),
+    ("polar_bayes.budget",),
     ("polar_bayes.reporting",),
     ("polar_bayes.cli",),
 )
@@ -46,6 +47,7 @@ HOMES = {
         "polar_bayes.simulation",
         "polar_bayes.inference",
         "polar_bayes.diagnostics",
+        "polar_bayes.budget",
         "polar_bayes.reporting",
     ),
 }

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from plates import plate_capture
 
 import polar_bayes as pb
@@ -101,6 +102,40 @@ def test_a_fit_whose_diagnostics_fail_is_written_and_exits_with_2(
     assert out.exists()
 
 
+def test_effects_prints_the_ledger_and_writes_it(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "ledger.nc"
+    assert main(["effects", str(plate), "--keep", "BeamOverlap", "--out", str(out)]) == 0
+    head, *rows, space, sentence = capsys.readouterr().out.splitlines()
+    assert head.split()[:2] == ["effect", "data"]
+    assert not space
+    assert f"of {len(rows)} effects are kept" in sentence
+    kept = next(row for row in rows if row.startswith("BeamOverlap"))
+    assert "kept: by your choice; alone no parameter changes" in kept
+    with xr.open_dataset(out) as ledger:
+        assert ledger.sizes["effect"] == len(rows)
+
+
+def test_effects_as_json_are_what_a_fit_of_the_chosen_scene_keeps(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["effects", str(plate), "--tolerance", "0.2", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["tolerance"] == 0.2
+    assert not said["effects"]["BeamOverlap"]["kept"]
+    out = tmp_path / "fit.nc"
+    words = ["fit", str(plate), "--choose-effects", "--tolerance", "0.2", "--method", "point"]
+    assert main([*words, "--out", str(out)]) in (0, 2)
+    assert "effects are kept" in capsys.readouterr().err
+    result = pb.load_result(out)
+    kept = result["effects"]["kept"]
+    assert {
+        name: bool(row) for name, row in zip(kept["effect"].values, kept.values, strict=True)
+    } == {name: row["kept"] for name, row in said["effects"].items()}
+    assert "beam_overlap_zenith" not in result["posterior"]
+
+
 WRONG = {
     "no command": (["frob"], "No such command"),
     "no file": (["fit", "nowhere.nc", "--out", "fit.nc"], "nowhere.nc: there is no such file"),
@@ -115,6 +150,13 @@ WRONG = {
         "only 1 valid view",
     ),
     "folder": (["fit", "PLATE", "--out", "/nowhere/fit.nc"], "cannot write there"),
+    "effect": (["effects", "PLATE", "--drop", "Fog"], "drop='Fog': the scene has no such effect"),
+    "set-up": (["effects", "PLATE", "--scene", "x"], "no such scene"),
+    "tolerance": (["effects", "PLATE", "--tolerance", "0"], "tolerance is 0.0"),
+    "tolerance of what": (
+        ["fit", "PLATE", "--tolerance", "0.2", "--out", "OUT"],
+        "--tolerance needs --choose-effects",
+    ),
     "report of a capture": (["report", "PLATE", "--out", "OUT"], "it holds no fit"),
     "preset": (["simulate", "--preset", "x", "--out", "OUT"], "no such material"),
     "views": (["simulate", "--views", "1", "--out", "OUT"], "views is 1"),

@@ -17,10 +17,11 @@ from numpyro import distributions as dist
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference import laplace, nuts, point
-from polar_bayes.inference.modes import SETTLED, Modes, ValueAndGradient, climb, distinct
+from polar_bayes.inference.modes import SETTLED, Modes, ValueAndGradient
 from polar_bayes.inference.program import Draw, Program, compile_program
 from polar_bayes.inference.request import Method, Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
+from polar_bayes.inference.search import Progress, find_modes, from_prior
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.discrepancy import Discrepancy
@@ -30,8 +31,6 @@ from polar_bayes.priors import describe_prior
 STARTS = 16
 PRIOR_DRAWS = 500
 BLOCK = 500
-
-Progress = Callable[[str, float], None]
 
 
 def fit(
@@ -65,7 +64,8 @@ def fit(
     Returns:
         A DataTree with the groups posterior, sample_stats, log_likelihood, log_prior,
         posterior_predictive, noise_free, prior, prior_predictive, observed_data and
-        constant_data; `polar_bayes.diagnostics.convergence.verdict` says whether it converged.
+        constant_data, and effects for a scene of `polar_bayes.choose_effects`;
+        `polar_bayes.diagnostics.convergence.verdict` says whether it converged.
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.
@@ -100,11 +100,13 @@ def _run(request: Request, progress: Progress) -> xr.DataTree:
     fitted = _fit_scene(request, request.scene, data, key_main, progress, clock)
     describe = _per_draw(fitted.program)
     posterior = describe(key_posterior, fitted.z, data)
-    prior_z = np.asarray(_from_prior(fitted.program, key_prior, PRIOR_DRAWS, data))
+    prior_z = np.asarray(from_prior(fitted.program, key_prior, PRIOR_DRAWS, data))
     prior = describe(key_prior, prior_z[None], data)
     clock.lap("prediction")
 
     beside, comparisons_failed = _fit_beside(request, data, key_plain, progress)
+    if isinstance(request.scene.ledger, xr.Dataset):
+        beside["effects"] = request.scene.ledger  # how the scene was chosen stays with the result
     if comparisons_failed:
         fitted.extra["comparisons_failed"] = comparisons_failed
     clock.lap("beside")
@@ -126,13 +128,13 @@ def _fit_scene(
     """Search for modes from prior draws, then do what the method asks."""
     key_starts, key_draws = jax.random.split(key)
     program = compile_program(request.bind(scene), data)
-    starts = np.asarray(_from_prior(program, key_starts, STARTS, data))
+    starts = np.asarray(from_prior(program, key_starts, STARTS, data))
     if isinstance(request.method, point.Point):
         fitted = _fit_point(program, data, starts, request.method)
         clock.lap("least squares")
         return fitted
     potential = _compile_potential(program, data)
-    modes = _search(potential, starts, progress)
+    modes = find_modes(potential, starts, progress)
     clock.lap("modes")
     problems: list[str] = []
     extra: dict[str, Any] = {"modes": _describe_modes(modes)}
@@ -174,11 +176,6 @@ def _silent(stage: str, fraction: float) -> None:
     """No progress to show."""
 
 
-def _from_prior(program: Program, key: Array, draws: int, data: Observations) -> Array:
-    draw = jax.jit(lambda keys, data: jax.lax.map(lambda k: program.from_prior(k, data), keys))
-    return draw(jax.random.split(key, draws), data)
-
-
 def _compile_potential(program: Program, data: Observations) -> ValueAndGradient:
     compiled = jax.jit(jax.value_and_grad(program.potential))
 
@@ -187,21 +184,6 @@ def _compile_potential(program: Program, data: Observations) -> ValueAndGradient
         return float(value), np.asarray(gradient, float)
 
     return potential
-
-
-def _search(potential: ValueAndGradient, starts: np.ndarray, progress: Progress) -> Modes:
-    climbs = []
-    for number, start in enumerate(starts):
-        climbs.append(climb(potential, start))
-        progress("searching for modes", (number + 1) / len(starts))
-    modes = distinct(climbs)
-    if modes is None:
-        raise FitError(
-            f"none of {len(starts)} starts reached a peak of the posterior",
-            where="fit",
-            mend="check the capture against the prior predictive, or give narrower priors",
-        )
-    return modes
 
 
 def _describe_modes(modes: Modes) -> dict[str, Any]:

@@ -96,7 +96,7 @@ class Program:
         fixed = handlers.substitute(self.model, data=self.constrain(z))
         trace = handlers.trace(handlers.seed(fixed, jax.random.key(0))).get_trace(data)
         return {
-            name: jnp.where(data.valid, trace[name]["value"] - _center(trace, name), 0.0)
+            name: jnp.where(data.valid, trace[name]["value"] - noise_free(trace, name), 0.0)
             for name in self.observed
         }
 
@@ -140,14 +140,16 @@ def _read(trace: dict, latent: dict[str, Array], observed: tuple[str, ...], key:
     keys = dict(zip(observed, jax.random.split(key, len(observed)), strict=True))
     return Draw(
         latent=latent,
-        center={n: jnp.broadcast_to(_center(trace, n), trace[n]["value"].shape) for n in observed},
+        center={
+            n: jnp.broadcast_to(noise_free(trace, n), trace[n]["value"].shape) for n in observed
+        },
         log_likelihood={n: trace[n]["fn"].log_prob(trace[n]["value"]) for n in observed},
         log_prior={n: jnp.sum(trace[n]["fn"].log_prob(latent[n])) for n in latent},
         predictive={name: trace[name]["fn"].sample(keys[name]) for name in observed},
     )
 
 
-def _center(trace: dict, name: str) -> Array:
+def noise_free(trace: dict, name: str) -> Array:
     """The noise-free reading: the site that says so, or the mean of the likelihood."""
     said = trace.get(f"{name}_mean")
     return said["value"] if said is not None else trace[name]["fn"].mean

@@ -14,15 +14,9 @@ from arviz_base import from_dict
 
 from polar_bayes.inference.program import Draw, Program
 from polar_bayes.observation.data import Observations
+from polar_bayes.physics.notation import notation
 
 PROVENANCE = "polar_bayes"
-SYMBOLS = {
-    "roughness": ("r", "roughness"),
-    "subsurface_fraction": ("beta", "subsurface fraction"),
-    "absorption": ("a", "absorption relative to scattering"),
-    "refractive_index": ("n", "refractive index"),
-    "angle_zero": ("", "offset of both zenith angles", "degree"),
-}
 GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
 
 
@@ -166,7 +160,7 @@ def _constants(
 
 def _annotate(group: xr.DataTree) -> None:
     for name, variable in group.data_vars.items():
-        symbol, long_name, *unit = SYMBOLS.get(str(name), ("", str(name).replace("_", " ")))
-        variable.attrs |= {"long_name": long_name, "units": unit[0] if unit else "1"}
+        symbol, meaning, unit = notation(str(name))
+        variable.attrs |= {"long_name": meaning, "units": unit}
         if symbol:
             variable.attrs["symbol"] = symbol

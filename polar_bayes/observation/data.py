@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from polar_bayes.physics.geometry import Geometry
 
 READINGS = ("dop", "q", "u", "intensity")
+ANGLES = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
 
 
 class Observations(eqx.Module):
@@ -81,9 +82,11 @@ def observe(capture: xr.Dataset, *, largest_view_zenith: float = 90.0) -> Observ
     brightness = readings.get("intensity", np.ones(shape))
     angles = {
         name: np.where(np.isfinite(angle), angle, 0.0)
-        for name in Geometry._fields
+        for name in ANGLES
         for angle in [_values(capture, name, order)]
     }
+    if "wavelength" in capture.coords:
+        angles["wavelength"] = _values(capture, "wavelength", order)
     return Observations(
         geometry=Geometry.from_degrees(**{name: jnp.asarray(x) for name, x in angles.items()}),
         readings={name: jnp.asarray(x) for name, x in readings.items()},

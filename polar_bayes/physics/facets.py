@@ -13,7 +13,7 @@ border to border: the horizon, which costs a plain rule most of its accuracy, is
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, override
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,30 +21,34 @@ from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.microfacet import AbstractMicrofacet
+from polar_bayes.physics.part import Part
+from polar_bayes.physics.slopes import SlopeEllipse
 
 # Facets steeper than this are not met by any distribution in use.
 STEEPEST = 1e6
 
-# How much denser the nodes stand at the borders: found by trial, flat around the best values.
-EDGES, CROWDING = 0.4, 1.75
+# How much denser the nodes stand at the borders, 0 (not) to 1: by trial, flat around the best.
+CROWDING_ALONG, CROWDING_ACROSS = 0.4, 0.85
 
 
 @dataclasses.dataclass(frozen=True)
-class FacetQuadrature:
+class FacetQuadrature(Part):
     """How many facets stand for all: one dial of what accuracy costs in time.
 
     Largest error of the degree of polarization for roughness .01 to .3, index 1.2 to 2, and zenith
-    angles up to 89 degrees, against 64 x 64 facets:
+    angles up to 89 degrees, against 64 x 64 facets (tests/benchmarks/facet_quadrature.py):
 
-        along x across     4x4    5x4    6x5    8x6   10x8   16x16
-        Beckmann, sky     .012  .0018  .0002 .00006 .00003 .000006
-        Beckmann, exit    .003  .0004 .00003      -      -       -
-        GGX, sky          .013  .0036  .0011  .0004  .0001  .00002
-        GGX, exit         .006  .0057  .0019  .0011  .0003  .00001
+        along x across        4x4     5x4     5x5     6x5     8x6    10x8   16x16
+        Beckmann, sky       .0034   .0004   .0004   .0002  .00007  .00003  .00001
+        Beckmann, exit      .0008  .00005  .00004  .00002  .00001       -       -
+        Beckmann, Disc(15)  .0004  .00007  .00007  .00005  .00002  .00001       -
+        GGX, sky            .0100   .0009   .0010   .0008   .0003   .0001  .00002
+        GGX, exit           .0028   .0012   .0007   .0004   .0001  .00001       -
+        GGX, Disc(15)       .0015   .0014   .0005   .0004   .0001  .00008  .00001
 
-    The errors of GGX belong to the smallest roughness, whose tail is the longest against its
-    peak: from .02 on, and for an index up to 1.5, 6x5 leaves .0007. Rougher surfaces cost more:
-    Beckmann under a sky has .0003 at .5, .0013 at .8 and .004 at 1.5 (6x5).
+    Narrower discs have smaller errors. From roughness .003 to .8 the default stays within .001, or
+    .002 for GGX and discs that the horizon cuts. It may be off by .003 at 1; at 1.5 by .008, or by
+    .04 for such discs.
 
     Args:
         along: Number of slopes in the plane of the viewer, 1 to 64.
@@ -67,19 +71,24 @@ class FacetQuadrature:
                     mend="give a whole number from 1 to 64",
                 )
 
+    @override
+    def simpler(self) -> tuple[Part | None, ...]:
+        fewer = (FacetQuadrature(), FacetQuadrature(along=5, across=4))
+        nodes = self.along * self.across
+        return tuple(rule for rule in fewer if rule.along * rule.across < nodes)
+
     def rule_along(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights on (0, 1), somewhat denser at both borders."""
-        node, weight = _gauss_legendre(self.along)
-        return (
-            (1.0 - EDGES) * node + EDGES * node**2 * (3.0 - 2.0 * node),
-            weight * ((1.0 - EDGES) + EDGES * 6.0 * node * (1.0 - node)),
-        )
+        """Nodes and weights on (0, 1), denser at both borders."""
+        node, weight = _crowded_gauss_legendre(self.along, CROWDING_ALONG)
+        return 0.5 * (1.0 + node), 0.5 * weight
 
     def rule_across(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights on (0, 1), denser at the limit, where chords shrink to nothing."""
-        node, weight = _gauss_legendre(self.across)
-        rest = 1.0 - node
-        return 1.0 - rest**CROWDING, weight * CROWDING * rest ** (CROWDING - 1.0)
+        """Nodes and weights on (0, 1), denser at the limit, where chords shrink to nothing.
+
+        Slopes of both signs are alike: half of a rule over both is exact to twice the order.
+        """
+        node, weight = _crowded_gauss_legendre(2 * self.across, CROWDING_ACROSS)
+        return node[self.across :], weight[self.across :]
 
 
 class Window(NamedTuple):
@@ -102,14 +111,21 @@ class Facets(NamedTuple):
         cos_incidence: Cosine between facet and viewer.
         sin_squared: Its squared sine.
         along_s: Squared sine times cos(2 psi), psi turning the facet's s axis to the viewer's.
+        across_s: Squared sine times sin(2 psi); None where both sides of the plane are alike and
+            only one was sampled, so that it sums to zero.
         cos_light: Cosine of the zenith of the mirrored ray.
+        light_in_plane: Sine of that zenith, projected onto the plane of the viewer.
+        light_out_of_plane: The same across it.
     """
 
     weight: Array
     cos_incidence: Array
     sin_squared: Array
     along_s: Array
+    across_s: Array | None
     cos_light: Array
+    light_in_plane: Array
+    light_out_of_plane: Array
 
 
 def seen(sin_view: Array, cos_view: Array) -> Window:
@@ -192,7 +208,7 @@ def inside_disc(sin_view: Array, cos_view: Array, sin_half: float) -> Window:
 def sample_facets(
     distribution: AbstractMicrofacet,
     quadrature: FacetQuadrature,
-    roughness: Array,
+    ellipse: SlopeEllipse,
     sin_view: Array,
     cos_view: Array,
     border: Callable[[Array, Array], Window],
@@ -205,46 +221,61 @@ def sample_facets(
     Args:
         distribution: How facets tilt.
         quadrature: How many facets.
-        roughness: Slope parameter. Broadcasts with (..., view), 1.
+        ellipse: Slopes in the frame of each viewer. Broadcasts with (..., view).
         sin_view: Sine of the view zenith. Shape (..., view), 1.
         cos_view: Its cosine. Same shape, 1, > 0.
         border: Window of a view, from its sine and cosine.
 
     Returns:
-        Facets of shape (..., view, along * across).
+        Facets of shape (..., view, along * across); twice as many for a sheared ellipse.
 
     Raises:
         Nothing.
     """
-    dtype = jnp.result_type(float, roughness, cos_view)
-    share_across, weight_across = (
-        jnp.asarray(np.repeat(row, quadrature.along), dtype) for row in quadrature.rule_across()
+    dtype = jnp.result_type(float, ellipse.across, cos_view)
+    sides = 1 if ellipse.shear is None else 2
+    rows = [np.tile(np.repeat(row, quadrature.along), sides) for row in quadrature.rule_across()]
+    rows += [np.tile(row, sides * quadrature.across) for row in quadrature.rule_along()]
+    share_across, weight_across, share_along, weight_along = (
+        jnp.asarray(row, dtype) for row in rows
     )
-    share_along, weight_along = (
-        jnp.asarray(np.tile(row, quadrature.across), dtype) for row in quadrature.rule_along()
-    )
-    sin_view, cos_view, roughness = sin_view[..., None], cos_view[..., None], roughness[..., None]
+    sin_view, cos_view, ellipse = sin_view[..., None], cos_view[..., None], ellipse.per_facet()
 
     window = border(sin_view, cos_view)
-    y, density_y = distribution.across(window.limit, roughness, share_across)
+    y, density_y = distribution.across(window.limit, ellipse.across, share_across)
     lower, upper = window.edges(y)
-    x, density_x = distribution.along(lower, upper, y, roughness, share_along)
+    if ellipse.shear is None:
+        x, density_x = distribution.along(lower, upper, y, ellipse.across, share_along)
+    else:
+        # Both sides of the plane, in slopes that are stretched and sheared to an isotropic pair.
+        side = jnp.asarray(np.repeat([1.0, -1.0], len(rows[0]) // 2), dtype)
+        density_y, y = 0.5 * density_y, side * y
+        stretch = ellipse.across / ellipse.along
+        shift = ellipse.shear / ellipse.across * y
+        x, density_x = distribution.along(
+            (lower - shift) * stretch, (upper - shift) * stretch, y, ellipse.across, share_along
+        )
+        x = x / stretch + shift
 
     shown = jnp.maximum(cos_view + sin_view * x, 0.0)
     cos_tilt = 1.0 / jnp.sqrt(1.0 + x**2 + y**2)
     cos_incidence = jnp.maximum(cos_tilt * shown, 1e-6)
-    in_plane = (cos_tilt * (sin_view - x * cos_view)) ** 2
-    out_of_plane = (cos_tilt * y) ** 2
+    in_plane = cos_tilt * (sin_view - x * cos_view)
+    out_of_plane = cos_tilt * y
     return Facets(
         weight=weight_across * density_y * weight_along * density_x * shown,
         cos_incidence=cos_incidence,
-        sin_squared=in_plane + out_of_plane,
-        along_s=in_plane - out_of_plane,
+        sin_squared=in_plane**2 + out_of_plane**2,
+        along_s=in_plane**2 - out_of_plane**2,
+        across_s=None if ellipse.shear is None else 2.0 * in_plane * out_of_plane,
         cos_light=2.0 * cos_incidence * cos_tilt - cos_view,
+        light_in_plane=2.0 * cos_incidence * cos_tilt * x - sin_view,
+        light_out_of_plane=2.0 * cos_incidence * cos_tilt * y,
     )
 
 
-def _gauss_legendre(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre nodes and weights on (0, 1)."""
+def _crowded_gauss_legendre(nodes: int, crowding: float) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Legendre nodes and weights on (-1, 1), moved outwards by an odd cubic."""
     node, weight = np.polynomial.legendre.leggauss(nodes)
-    return 0.5 * (node + 1.0), 0.5 * weight
+    moved = node * (1.0 + 0.5 * crowding * (1.0 - node**2))
+    return moved, weight * (1.0 + 0.5 * crowding * (1.0 - 3.0 * node**2))

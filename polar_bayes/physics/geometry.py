@@ -7,6 +7,7 @@ differences of directions from half angles.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
@@ -22,12 +23,14 @@ class Geometry(NamedTuple):
         view_azimuth: Azimuth of the viewer. Shape (..., view), degree.
         light_zenith: Angle of the light from the normal. Shape (..., view), degree, |.| < 90.
         light_azimuth: Azimuth of the light. Shape (..., view), degree.
+        wavelength: Wavelength in air, nm, broadcasts with (..., view); None where it is not known.
     """
 
     view_zenith: Array
     view_azimuth: Array
     light_zenith: Array
     light_azimuth: Array
+    wavelength: Array | None = None
 
     @classmethod
     def from_degrees(
@@ -37,6 +40,7 @@ class Geometry(NamedTuple):
         view_azimuth: ArrayLike,
         light_zenith: ArrayLike,
         light_azimuth: ArrayLike,
+        wavelength: ArrayLike | None = None,
     ) -> "Geometry":
         """Directions broadcast to one shape; a viewer on the normal looks away from the light.
 
@@ -48,6 +52,8 @@ class Geometry(NamedTuple):
             view_azimuth: Azimuth of the viewer. Any shape, degree.
             light_zenith: Angle of the light from the normal. Any shape, degree, 0 <= . < 90.
             light_azimuth: Azimuth of the light. Any shape, degree.
+            wavelength: Wavelength in air. Broadcasts with (..., view), nm: several colors have
+                shape (wavelength, 1).
 
         Returns:
             Geometry of shape (..., view); a lone angle counts as one view.
@@ -62,7 +68,28 @@ class Geometry(NamedTuple):
         angles = [jnp.atleast_1d(angle).astype(dtype) for angle in angles]
         view_zenith, view_azimuth, light_zenith, light_azimuth = jnp.broadcast_arrays(*angles)
         view_azimuth = jnp.where(view_zenith == 0.0, light_azimuth + 180.0, view_azimuth)
-        return cls(view_zenith, view_azimuth, light_zenith, light_azimuth)
+        if wavelength is not None:
+            wavelength = jnp.asarray(wavelength, dtype)
+        return cls(view_zenith, view_azimuth, light_zenith, light_azimuth, wavelength)
+
+    def reversed(self) -> "Geometry":
+        """Light and viewer in each other's place."""
+        return Geometry(
+            self.light_zenith,
+            self.light_azimuth,
+            self.view_zenith,
+            self.view_azimuth,
+            self.wavelength,
+        )
+
+    def per_facet(self) -> "Geometry":
+        """The same with a trailing axis, for many facets or rays of one view."""
+        return jax.tree.map(lambda array: array[..., None], self)
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        """Floating type of the angles."""
+        return jnp.result_type(float, *(array for array in self if array is not None))
 
 
 class MirrorFacet(NamedTuple):
@@ -134,6 +161,57 @@ def mirror_facet(geometry: Geometry) -> MirrorFacet:
         along_s=(x**2 - y**2) / scale,
         across_s=2.0 * x * y / scale,
     )
+
+
+def mirror_slopes(geometry: Geometry) -> tuple[Array, Array]:
+    """Slopes of the mirror facet in the viewer's frame: towards it, and across.
+
+    Args:
+        geometry: Directions. Shape (..., view), degree.
+
+    Returns:
+        `(in_plane, out_of_plane)`, each (..., view), 1.
+
+    Raises:
+        Nothing.
+    """
+    sin_half, cos_half = _half_azimuth(geometry.light_azimuth - geometry.view_azimuth)
+    sin_light = sin_degrees(geometry.light_zenith)
+    cosine_sum = cos_degrees(geometry.view_zenith) + cos_degrees(geometry.light_zenith)
+    half_difference = sin_degrees(0.5 * (geometry.view_zenith - geometry.light_zenith))
+    half_sum = cos_degrees(0.5 * (geometry.view_zenith + geometry.light_zenith))
+    in_plane = 2.0 * (half_difference * half_sum + sin_light * cos_half**2)
+    return in_plane / cosine_sum, 2.0 * sin_light * sin_half * cos_half / cosine_sum
+
+
+def turn_between_frames(geometry: Geometry) -> tuple[Array, Array]:
+    r"""Cosine and sine of twice the angle from the light's s axis to the viewer's, over a mirror.
+
+    $$ \tan\frac{\psi_v+\psi_l}{2} = \frac{\cos\frac{\theta_v-\theta_l}{2}}
+       {\cos\frac{\theta_v+\theta_l}{2}} \cot\frac{\varphi}{2} $$
+
+    Regular wherever viewer and light are above the surface, also where they coincide.
+
+    Args:
+        geometry: Directions. Shape (..., view), degree.
+
+    Returns:
+        `(cos, sin)` of 2 (psi_v + psi_l), each (..., view).
+
+    Raises:
+        Nothing.
+
+    Source:
+        Napier's analogies for the triangle of normal, viewer and light.
+    """
+    sin_half, cos_half = _half_azimuth(geometry.light_azimuth - geometry.view_azimuth)
+    half_difference = 0.5 * (geometry.view_zenith - geometry.light_zenith)
+    half_sum = 0.5 * (geometry.view_zenith + geometry.light_zenith)
+    up = cos_degrees(half_difference) * cos_half
+    down = cos_degrees(half_sum) * sin_half
+    length = up**2 + down**2
+    cos, sin = (down - up) * (down + up) / length, 2.0 * up * down / length
+    return (cos - sin) * (cos + sin), 2.0 * sin * cos
 
 
 def _half_azimuth(azimuth: Array) -> tuple[Array, Array]:

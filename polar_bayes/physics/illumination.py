@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import override
 
 import jax.numpy as jnp
@@ -10,16 +11,13 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics import fresnel
-from polar_bayes.physics.facets import (
-    FacetQuadrature,
-    Window,
-    above_horizon,
-    inside_disc,
-    sample_facets,
-)
+from polar_bayes.physics.facets import Window, above_horizon, inside_disc
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
-from polar_bayes.physics.microfacet import AbstractMicrofacet
+from polar_bayes.physics.microsurface import Microsurface
+from polar_bayes.physics.part import Part, check_part, like, parameters_of
+from polar_bayes.physics.polarization import LinearPolarization, let_in, mirror_light
+from polar_bayes.physics.slopes import SlopeEllipse
+from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light
 
 # Directions in a disc, by angle from its center and by azimuth, when counting the light that
@@ -27,28 +25,31 @@ from polar_bayes.physics.stokes import Light
 # width 15, 89 degrees) where the horizon cuts it.
 DISC_NODES = 8
 
+# Zenith angles of the sky's rays, where a body asks for them.
+SKY_NODES = 8
+
 
 @dataclasses.dataclass(frozen=True)
-class AbstractIllumination(abc.ABC):
-    """Unpolarized light from a point, a disc or the whole sky."""
+class AbstractIllumination(Part):
+    """Light from a point, a disc or the whole sky."""
 
     @abc.abstractmethod
     def reflect(
         self,
-        distribution: AbstractMicrofacet,
-        quadrature: FacetQuadrature,
-        roughness: Array,
-        refractive_index: Array,
+        facets: Microsurface,
+        ellipse: SlopeEllipse,
+        stack: Stack,
         geometry: Geometry,
+        parameters: Mapping[str, Array],
     ) -> Light:
         """Light that facets mirror to the viewer.
 
         Args:
-            distribution: How facets tilt.
-            quadrature: How many facets stand for all, where an average is taken.
-            roughness: Slope parameter. Broadcasts with (..., view), 1.
-            refractive_index: n. Broadcasts with (..., view), 1.
+            facets: How they tilt, which are seen, and how many stand for all.
+            ellipse: Their slopes in the frame of each viewer. Broadcasts with (..., view).
+            stack: What one facet is made of. Broadcasts with (..., view).
             geometry: Directions. Shape (..., view), degree.
+            parameters: Material parameters by name, for those of the light itself.
 
         Returns:
             Light per unit irradiance (point) or unit radiance (disc, sky). Shape (..., view).
@@ -58,69 +59,131 @@ class AbstractIllumination(abc.ABC):
         """
 
     @abc.abstractmethod
-    def entering(self, refractive_index: Array, geometry: Geometry) -> Array:
-        """Irradiance that passes the interface into the body.
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
+        """Irradiance that passes the interface into the body, in the frame of the light.
 
         Args:
-            refractive_index: n. Broadcasts with (..., view), 1.
+            stack: What the surface is made of. Broadcasts with (..., view).
             geometry: Directions. Shape (..., view), degree.
+            parameters: Material parameters by name, for those of the light itself.
 
         Returns:
-            Power per area, for unit irradiance (point) or unit radiance (disc, sky). (..., view).
+            Power per area, for unit irradiance (point) or unit radiance (disc, sky), with its
+            polarization in the light's own plane. Shape (..., view).
 
         Raises:
             Nothing.
         """
+
+    @abc.abstractmethod
+    def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
+        """Beams that stand for the source, for a body that asks where its light comes from.
+
+        Args:
+            geometry: Directions. Shape (..., view), degree.
+
+        Returns:
+            `(geometry, irradiance)` with a ray axis: directions of shape (..., view, ray), and what
+            each beam brings across itself. Broadcasts with them.
+
+        Raises:
+            Nothing.
+        """
+
+    def incident(self, parameters: Mapping[str, Array]) -> tuple[Array, Array] | None:
+        """Components q and u of the light in its own frame; None for unpolarized light."""
+        del parameters
+        return None
+
+    def beams(
+        self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]
+    ) -> tuple[Geometry, Light]:
+        """Light that passes into the body, ray by ray; see `rays` and `entering`."""
+        rays, irradiance = self.rays(geometry)
+        cos_light = cos_degrees(rays.light_zenith)
+        passing = stack.per_facet().transmission(cos_light, sin_degrees(rays.light_zenith) ** 2)
+        incident = self.incident({name: value[..., None] for name, value in parameters.items()})
+        light = let_in(passing, cos_light, incident)
+        return rays, light._replace(intensity=irradiance * light.intensity)
 
 
 @dataclasses.dataclass(frozen=True)
 class PointSource(AbstractIllumination):
     r"""A collimated beam of unit irradiance from the light's direction.
 
-    $$ S = \frac{D(h) G_1(v) G_1(l)}{4 \cos\theta_v}
+    $$ S = \frac{D(h) G(v, l)}{4 \cos\theta_v}
        [R_+, R_- \cos 2\psi, -R_- \sin 2\psi](\theta_d) $$
 
     Roughness changes the brightness but not the polarization: only one facet mirrors the light.
+
+    Args:
+        polarization: How the beam is polarized; None for unpolarized light.
+
+    Raises:
+        SceneError: The polarization is not such a part.
     """
+
+    polarization: LinearPolarization | None = None
+
+    def __post_init__(self) -> None:
+        if self.polarization is not None:
+            allowed = "LinearPolarization(degree=1.0, angle=0.0) or None"
+            check_part(self.polarization, "PointSource: polarization", LinearPolarization, allowed)
+
+    @property
+    @override
+    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
+        return parameters_of(self.polarization)
 
     @override
     def reflect(
         self,
-        distribution: AbstractMicrofacet,
-        quadrature: FacetQuadrature,
-        roughness: Array,
-        refractive_index: Array,
+        facets: Microsurface,
+        ellipse: SlopeEllipse,
+        stack: Stack,
         geometry: Geometry,
+        parameters: Mapping[str, Array],
     ) -> Light:
         facet = mirror_facet(geometry)
         cos_view, cos_light = cos_degrees(geometry.view_zenith), cos_degrees(geometry.light_zenith)
-        view_slope = (sin_degrees(geometry.view_zenith) / cos_view) ** 2
-        light_slope = (sin_degrees(geometry.light_zenith) / cos_light) ** 2
-        mean, _ = fresnel.reflection(facet.cos_incidence, facet.sin_squared, refractive_index)
-        facets_seen = (
-            distribution.density(facet.tan_squared_tilt, roughness)
-            * distribution.shadowing(view_slope, roughness)
-            * distribution.shadowing(light_slope, roughness)
-            / (4.0 * cos_view)
+        to_viewer = sin_degrees(geometry.view_zenith) / cos_view
+        to_light = sin_degrees(geometry.light_zenith) / cos_light
+        azimuth = geometry.light_azimuth - geometry.view_azimuth
+        seen = facets.shadowing.both(
+            facets.visible(ellipse, to_viewer, jnp.zeros_like(to_viewer)),
+            facets.visible(
+                ellipse, to_light * cos_degrees(azimuth), to_light * sin_degrees(azimuth)
+            ),
         )
-        polarizance = fresnel.polarizance(facet.cos_incidence, facet.sin_squared, refractive_index)
-        return Light(facets_seen * mean, polarizance * facet.along_s, -polarizance * facet.across_s)
+        mirrored = mirror_light(stack, facet, geometry, self.incident(parameters))
+        density = facets.density(ellipse, geometry, facet.tan_squared_tilt)
+        return mirrored._replace(intensity=density * seen / (4.0 * cos_view) * mirrored.intensity)
 
     @override
-    def entering(self, refractive_index: Array, geometry: Geometry) -> Array:
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
         cos_light = cos_degrees(geometry.light_zenith)
-        return cos_light * fresnel.transmission(cos_light, refractive_index)
+        passing = stack.transmission(cos_light, sin_degrees(geometry.light_zenith) ** 2)
+        return let_in(passing, cos_light, self.incident(parameters))
+
+    @override
+    def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
+        rays = geometry.per_facet()
+        return rays, jnp.ones_like(rays.light_zenith)
+
+    @override
+    def incident(self, parameters: Mapping[str, Array]) -> tuple[Array, Array] | None:
+        return None if self.polarization is None else self.polarization.stokes(parameters)
 
 
 @dataclasses.dataclass(frozen=True)
 class AbstractExtendedSource(AbstractIllumination):
-    r"""A source of unit radiance that is symmetric about the plane of the viewer.
+    r"""A source of unit radiance, unpolarized, symmetric about the plane of the viewer.
 
-    $$ S_0 = \frac{G_1(v)}{\cos\theta_v} \sum_i w_i G_1(l_i) R_+, \qquad
-       S_1 = \frac{G_1(v)}{\cos\theta_v} \sum_i w_i G_1(l_i) K \sin^2\theta_i \cos 2\psi_i $$
+    $$ S_0 = \frac{1}{\cos\theta_v} \sum_i w_i G(v, l_i) R_+, \qquad
+       S_1 = \frac{1}{\cos\theta_v} \sum_i w_i G(v, l_i) K \sin^2\theta_i \cos 2\psi_i $$
 
-    The light's direction in the geometry is not used. The factor in front is what one over the
-    seen area is in Smith's theory, so nothing has to be normalized by a sum.
+    The light's direction in the geometry is not used. The factor in front of G1(v) is what one
+    over the seen area is in Smith's theory, so nothing has to be normalized by a sum.
     """
 
     @abc.abstractmethod
@@ -141,25 +204,34 @@ class AbstractExtendedSource(AbstractIllumination):
     @override
     def reflect(
         self,
-        distribution: AbstractMicrofacet,
-        quadrature: FacetQuadrature,
-        roughness: Array,
-        refractive_index: Array,
+        facets: Microsurface,
+        ellipse: SlopeEllipse,
+        stack: Stack,
         geometry: Geometry,
+        parameters: Mapping[str, Array],
     ) -> Light:
         sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
-        facets = sample_facets(distribution, quadrature, roughness, sin_view, cos_view, self.border)
-        mean, contrast = fresnel.relative_reflection(
-            facets.cos_incidence, facets.sin_squared, refractive_index[..., None]
+        sample = facets.sample(ellipse, geometry, self.border)
+        power = stack.per_facet().relative_reflection(sample.cos_incidence, sample.sin_squared)
+        cos_light = jnp.clip(sample.cos_light, 1e-6, 1.0)
+        to_viewer = sin_view / cos_view
+        seen = facets.shadowing.both(
+            facets.visible(ellipse, to_viewer, jnp.zeros_like(to_viewer))[..., None],
+            facets.visible(
+                ellipse.per_facet(),
+                sample.light_in_plane / cos_light,
+                sample.light_out_of_plane / cos_light,
+            ),
         )
-        cos_light = jnp.clip(facets.cos_light, 1e-6, 1.0)
-        light_slope = (1.0 - cos_light) * (1.0 + cos_light) / cos_light**2
-        lit = facets.weight * distribution.shadowing(light_slope, roughness[..., None])
-        total = jnp.sum(lit * mean, axis=-1)
-        polarized = jnp.sum(lit * contrast * facets.along_s, axis=-1)
-        seen = distribution.shadowing((sin_view / cos_view) ** 2, roughness) / cos_view
-        brightness = seen * fresnel.index_step(refractive_index) * total
-        return Light(brightness, polarized / total, jnp.zeros_like(total))
+        lit = sample.weight * seen
+        # A trace, far below any reading: no facet may be left where grooves are far too deep.
+        total = jnp.maximum(jnp.sum(lit * power.mean, axis=-1), jnp.finfo(lit.dtype).eps ** 1.75)
+        q = jnp.sum(lit * power.contrast * sample.along_s, axis=-1) / total
+        if sample.across_s is None:
+            u = jnp.zeros_like(total)
+        else:
+            u = -jnp.sum(lit * power.contrast * sample.across_s, axis=-1) / total
+        return Light(stack.scale / cos_view * total, q, u)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,9 +243,27 @@ class UniformSky(AbstractExtendedSource):
         return above_horizon(sin_view, cos_view)
 
     @override
-    def entering(self, refractive_index: Array, geometry: Geometry) -> Array:
-        reflected = fresnel.hemispherical_reflection(refractive_index)
-        return jnp.pi * (1.0 - reflected) + jnp.zeros_like(geometry.view_zenith)
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
+        passing = jnp.pi * stack.hemispherical_transmission() + jnp.zeros_like(geometry.view_zenith)
+        return Light(passing, jnp.zeros_like(passing), jnp.zeros_like(passing))
+
+    @override
+    def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
+        # A squared cosine for the nodes, since transmission is steep at grazing. Four azimuths sum
+        # up once and twice around to nothing, which is all that scattering knows of azimuth.
+        node, weight = np.polynomial.legendre.leggauss(SKY_NODES)
+        cosine = (0.5 * (node + 1.0)) ** 2
+        solid_angle = 0.5 * np.pi * (0.5 * (node + 1.0)) * weight
+        rays = geometry.per_facet()
+        zenith, azimuth = np.degrees(np.arccos(cosine)), 90.0 * np.arange(4.0)
+        around = like(np.tile(azimuth, SKY_NODES), rays.view_azimuth)
+        return (
+            rays._replace(
+                light_zenith=like(np.repeat(zenith, 4), rays.view_zenith),
+                light_azimuth=rays.view_azimuth + around,
+            ),
+            like(np.repeat(solid_angle, 4), rays.view_zenith),
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,15 +292,44 @@ class Disc(AbstractExtendedSource):
         return inside_disc(sin_view, cos_view, math.sin(math.radians(self.half_width) / 2.0))
 
     @override
-    def entering(self, refractive_index: Array, geometry: Geometry) -> Array:
+    def simpler(self) -> tuple[Part | None, ...]:
+        return (PointSource(),)
+
+    @override
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
         cosine, sine_cosine, solid_angle = self._directions()
         sin_view = sin_degrees(geometry.view_zenith)[..., None]
         cos_view = cos_degrees(geometry.view_zenith)[..., None]
         cos_light = jnp.asarray(cosine, cos_view.dtype) * cos_view
         cos_light = cos_light + jnp.asarray(sine_cosine, cos_view.dtype) * sin_view
         cos_light = jnp.clip(cos_light, 1e-4, 1.0)
-        passing = cos_light * fresnel.transmission(cos_light, refractive_index[..., None])
-        return jnp.sum(passing * jnp.asarray(solid_angle, cos_view.dtype), axis=-1)
+        sin_squared = (1.0 - cos_light) * (1.0 + cos_light)
+        through = stack.per_facet().transmission(cos_light, sin_squared)
+        passing = jnp.sum(cos_light * through.mean * like(solid_angle, cos_view), axis=-1)
+        # Around the light's own plane the disc is nearly symmetric: what polarization is left
+        # after averaging belongs to its middle.
+        return Light(passing, jnp.zeros_like(passing), jnp.zeros_like(passing))
+
+    @override
+    def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
+        rays = geometry.per_facet()
+        sin_view, cos_view = sin_degrees(rays.view_zenith), cos_degrees(rays.view_zenith)
+        cosine, along, solid_angle = (like(x, cos_view) for x in self._directions())
+        across = jnp.sqrt(jnp.maximum((1.0 - cosine) * (1.0 + cosine) - along**2, 0.0))
+        up = cosine * cos_view + along * sin_view
+        forwards = along * cos_view - cosine * sin_view
+        zenith = jnp.rad2deg(jnp.arctan2(jnp.hypot(forwards, across), jnp.maximum(up, 1e-4)))
+        azimuth = jnp.rad2deg(jnp.arctan2(across, forwards))
+        irradiance = jnp.where(up > 0.0, 0.5 * solid_angle, 0.0)
+        # Both sides of the plane of the viewer.
+        both = jnp.concatenate([azimuth, -azimuth], axis=-1)
+        return (
+            rays._replace(
+                light_zenith=jnp.concatenate([zenith, zenith], axis=-1),
+                light_azimuth=rays.view_azimuth + both,
+            ),
+            jnp.concatenate([irradiance, irradiance], axis=-1),
+        )
 
     def _directions(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cosine from the axis, sine times cosine of azimuth, and solid angle of each direction."""

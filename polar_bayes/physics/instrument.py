@@ -4,7 +4,6 @@ Terms aim first (the angles a light path really has), then record in the order g
 reach a term with a trailing view axis.
 """
 
-import abc
 import dataclasses
 from collections.abc import Mapping
 from typing import ClassVar, override
@@ -13,7 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.geometry import Geometry
+from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
+from polar_bayes.physics.part import Part, check_setting
 from polar_bayes.physics.stokes import Light
 
 # Nearest to grazing, in degrees, that a shifted angle may come.
@@ -21,10 +21,12 @@ STEEPEST_ZENITH = 89.999
 
 
 @dataclasses.dataclass(frozen=True)
-class AbstractInstrumentTerm(abc.ABC):
+class AbstractInstrumentTerm(Part):
     """One imperfection of an instrument. Override `aim`, `record`, or both."""
 
-    parameters: ClassVar[tuple[str, ...]]
+    @override
+    def simpler(self) -> tuple[Part | None, ...]:
+        return (None,)
 
     def aim(self, parameters: Mapping[str, Array], geometry: Geometry) -> Geometry:
         """Directions the light really takes, from those that were read off.
@@ -179,6 +181,96 @@ class DarkLevel(AbstractInstrumentTerm):
         trace = jnp.finfo(intensity.dtype).eps ** 1.5
         lit = (light.intensity + trace) / jnp.maximum(intensity + trace, trace)
         return Light(intensity, lit * light.q, lit * light.u)
+
+
+@dataclasses.dataclass(frozen=True)
+class BeamOverlap(AbstractInstrumentTerm):
+    r"""Towards grazing the beam's footprint outgrows the sample, and light is lost.
+
+    $$ I' = I \Big(1 + \Big(\frac{\cos\theta_o}{\cos\theta_v}\Big)^{8}\Big)^{-1/8} $$
+
+    a smooth form of min(1, cos(theta_v)/cos(theta_o)), where the footprint fills the sample at
+    `beam_overlap_zenith` degrees.
+    """
+
+    parameters: ClassVar[tuple[str, ...]] = ("beam_overlap_zenith",)
+
+    @override
+    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+        fills = cos_degrees(parameters["beam_overlap_zenith"])
+        # In the smaller of the two ratios, since the eighth power of the other may overflow.
+        view = cos_degrees(geometry.view_zenith)
+        larger = jnp.maximum(fills, view)
+        kept = ((view / larger) ** 8 + (fills / larger) ** 8) ** -0.125 * view / larger
+        return light._replace(intensity=kept * light.intensity)
+
+
+@dataclasses.dataclass(frozen=True)
+class Analyzer(AbstractInstrumentTerm):
+    r"""Intensity is recorded behind a linear polarizer.
+
+    $$ I' = I (1 + q \cos 2\chi + u \sin 2\chi)/2 $$
+
+    Polarization is what the polarizer was turned to measure, and stays.
+
+    Args:
+        angle: Angle of the polarizer from the viewer's s axis, degree; one for all views, or a
+            tuple with one for each.
+
+    Raises:
+        SceneError: An angle is no number.
+    """
+
+    angle: float | tuple[float, ...] = 0.0
+
+    parameters: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        angles = self.angle if isinstance(self.angle, tuple) else (self.angle,)
+        for angle in angles:
+            if isinstance(angle, str):
+                raise SceneError(
+                    f"{angle!r} is no angle",
+                    where="Analyzer",
+                    mend="give degrees, or a tuple with one number for each view",
+                )
+            check_setting(angle, "Analyzer: angle", -360.0, 360.0)
+
+    @override
+    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+        twice = 2.0 * jnp.asarray(self.angle, light.q.dtype)
+        passed = 1.0 + light.q * cos_degrees(twice) + light.u * sin_degrees(twice)
+        return light._replace(intensity=0.5 * passed * light.intensity)
+
+
+@dataclasses.dataclass(frozen=True)
+class Saturation(AbstractInstrumentTerm):
+    """The sensor stops at a level: brighter views are recorded as that level.
+
+    For predictions and simulations; `StudentTLink` knows the level of a capture by itself.
+
+    Args:
+        level: Full scale, in units of the predicted intensity, > 0.
+
+    Raises:
+        SceneError: The level is no positive number.
+    """
+
+    level: float
+
+    parameters: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.level, str) or not self.level > 0.0:
+            raise SceneError(
+                f"level={self.level!r} is no full scale",
+                where="Saturation",
+                mend="give a number above 0",
+            )
+
+    @override
+    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+        return light._replace(intensity=jnp.minimum(light.intensity, self.level))
 
 
 def diattenuate(light: Light, contrast: Array, balance: Array) -> Light:

@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polar_bayes.physics.part import Part
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization, direction
 
 
 @dataclasses.dataclass(frozen=True)
-class AbstractMixing(abc.ABC):
+class AbstractMixing(Part):
     """A rule that mixes surface and body by one fraction: 0 is surface alone, 1 body alone."""
 
     parameters: ClassVar[tuple[str, ...]] = ("subsurface_fraction",)
@@ -96,8 +97,9 @@ def _share(fraction: Array, surface: Array, subsurface: Array) -> Array:
     share, so intensities are scaled by a constant first.
     """
     trace = jnp.finfo(jnp.result_type(surface, subsurface)).eps ** 1.25
-    smallest = jnp.finfo(jnp.result_type(surface, subsurface)).tiny
-    scale = jax.lax.stop_gradient(jnp.maximum(surface + subsurface, smallest))
+    # Darker than any reading: a black body on a surface far from its highlight is the surface's.
+    surface = surface + jnp.finfo(jnp.result_type(surface, subsurface)).eps ** 2
+    scale = jax.lax.stop_gradient(surface + subsurface)
     surface, subsurface = surface / scale, subsurface / scale
     from_surface = (1.0 - fraction) * surface + trace * subsurface
     from_body = fraction * subsurface + trace * surface

@@ -2,20 +2,43 @@
 
 import dataclasses
 from collections.abc import Mapping
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from polar_bayes.errors import SceneError
+from polar_bayes.physics.coat import AbstractCoat
+from polar_bayes.physics.dispersion import AbstractDispersion
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.instrument import AbstractInstrumentTerm, Instrument
 from polar_bayes.physics.mixing import AbstractMixing
+from polar_bayes.physics.part import Part, check_part, parameters_of
+from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization, to_stokes
 from polar_bayes.physics.subsurface import AbstractSubsurface
-from polar_bayes.physics.surface import AbstractSurface
+from polar_bayes.physics.surface import AbstractSurface, Interface
 
-# The order in which material parameters are listed.
-MATERIAL_PARAMETERS = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
+# Parameters of a material, in the order in which they are listed; every other one that a scene
+# reads belongs to the whole capture.
+MATERIAL_PARAMETERS = (
+    "roughness",
+    "subsurface_fraction",
+    "absorption",
+    "refractive_index",
+    "roughness_across",
+    "roughness_azimuth",
+    "albedo",
+    "polarized_fraction",
+    "cauchy_a",
+    "cauchy_b",
+    "sellmeier_strength",
+    "sellmeier_resonance",
+    "coat_refractive_index",
+    "coat_absorbance",
+    "film_refractive_index",
+    "film_thickness",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,10 +47,13 @@ class Scene:
 
     Args:
         surface: SmoothSurface() or RoughSurface(...).
-        subsurface: Unpolarized(), Lambertian(), Depolarizer(), or None for no light from below.
+        subsurface: Unpolarized(), Lambertian(), Depolarizer(), TurbidMedium(), or None for no
+            light from below.
         mixing: DopMixing() or StokesMixing(); needed with a subsurface, and only then.
-        coat: None; coats come with a later version.
+        coat: ClearCoat(), ThinFilm(), CoatStack((...)), or None for a bare surface.
         instrument: Instrument((...)), or None for a perfect one.
+        dispersion: Cauchy() or Sellmeier(), whose parameters then replace `refractive_index`; or
+            None for one index per wavelength.
 
     Raises:
         SceneError: A part is of the wrong kind, or one is missing beside another.
@@ -36,25 +62,28 @@ class Scene:
     surface: AbstractSurface
     subsurface: AbstractSubsurface | None = None
     mixing: AbstractMixing | None = None
-    coat: None = None
+    coat: AbstractCoat | None = None
     instrument: Instrument | None = None
+    dispersion: AbstractDispersion | None = None
+
+    ledger: ClassVar[object | None] = None
+    """What is known of how the scene was chosen; see `polar_bayes.choose_effects`."""
 
     def __post_init__(self) -> None:
-        _check_part(self.surface, "surface", AbstractSurface, "SmoothSurface() or RoughSurface()")
-        if self.subsurface is not None:
-            allowed = "Unpolarized(), Lambertian(), Depolarizer() or None"
-            _check_part(self.subsurface, "subsurface", AbstractSubsurface, allowed)
-        if self.mixing is not None:
-            _check_part(
-                self.mixing, "mixing", AbstractMixing, "DopMixing(), StokesMixing() or None"
-            )
-        if self.instrument is not None:
-            allowed = "Instrument((DolpGain(), ...)) or None"
-            _check_part(self.instrument, "instrument", Instrument, allowed)
-        if self.coat is not None:
-            raise SceneError(
-                f"{self.coat!r} cannot be used yet", where="coat", mend="leave coat=None"
-            )
+        check_part(self.surface, "surface", AbstractSurface, "SmoothSurface() or RoughSurface()")
+        for name, kind, allowed in (
+            (
+                "subsurface",
+                AbstractSubsurface,
+                "Unpolarized(), Lambertian(), Depolarizer() or None",
+            ),
+            ("mixing", AbstractMixing, "DopMixing(), StokesMixing() or None"),
+            ("coat", AbstractCoat, "ClearCoat(), ThinFilm(), CoatStack((...)) or None"),
+            ("instrument", Instrument, "Instrument((DolpGain(), ...)) or None"),
+            ("dispersion", AbstractDispersion, "Cauchy(), Sellmeier() or None"),
+        ):
+            if getattr(self, name) is not None:
+                check_part(getattr(self, name), name, kind, allowed)
         if self.mixing is not None and self.subsurface is None:
             raise SceneError(
                 "there is no subsurface to mix",
@@ -70,11 +99,18 @@ class Scene:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that the scene reads: the material's, then the instrument's."""
-        parts = (self.surface, self.subsurface, self.mixing)
-        read = {name for part in parts if part is not None for name in part.parameters}
+        """Names of the parameters that the scene reads: the material's, then all others."""
+        index = self.dispersion or _FREE_INDEX
+        read = parameters_of(self.surface, self.subsurface, self.mixing, index, self.coat)
+        read = (*read, *(() if self.instrument is None else self.instrument.parameters))
         material = tuple(name for name in MATERIAL_PARAMETERS if name in read)
-        return material + (() if self.instrument is None else self.instrument.parameters)
+        return (*material, *(name for name in read if name not in MATERIAL_PARAMETERS))
+
+    @property
+    def optical_parameters(self) -> tuple[str, ...]:
+        """Those of `parameters` that are not the instrument's."""
+        instrument = () if self.instrument is None else self.instrument.parameters
+        return tuple(name for name in self.parameters if name not in instrument)
 
     def light(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> Light:
         """Light that reaches the viewer, before any instrument.
@@ -90,7 +126,7 @@ class Scene:
         Raises:
             SceneError: A material parameter that the scene reads is missing.
         """
-        per_view = self._per_view(parameters, MATERIAL_PARAMETERS, geometry)
+        per_view = self._per_view(parameters, self.optical_parameters, geometry)
         return self._optics(per_view, geometry)
 
     def stokes(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> Array:
@@ -158,12 +194,27 @@ class Scene:
 
     def _optics(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
         """Surface, body and their mixture, for parameters that have a view axis."""
-        surface = self.surface.light(parameters, geometry)
+        if self.dispersion is not None:
+            index = self.dispersion.index(parameters, self._wavelength(geometry))
+            parameters = {**parameters, "refractive_index": index}
+        layers = () if self.coat is None else self.coat.layers(parameters, geometry.wavelength)
+        stack = Stack(parameters["refractive_index"], layers)
+        surface = self.surface.light(parameters, geometry, stack)
         if self.subsurface is None or self.mixing is None:
             return Light(*jnp.broadcast_arrays(*surface))
-        subsurface = self.subsurface.light(parameters, geometry, self.surface)
+        interface = Interface(self.surface, stack)
+        subsurface = self.subsurface.light(parameters, geometry, interface)
         mixture = self.mixing.mix(parameters["subsurface_fraction"], surface, subsurface)
         return Light(*jnp.broadcast_arrays(*mixture))
+
+    def _wavelength(self, geometry: Geometry) -> Array:
+        if geometry.wavelength is None:
+            raise SceneError(
+                "a law of dispersion needs a wavelength, and there is none",
+                where="dispersion",
+                mend="give the geometry a wavelength in nm, or the capture such a coordinate",
+            )
+        return geometry.wavelength
 
     def _per_view(
         self, parameters: Mapping[str, ArrayLike], names: tuple[str, ...], geometry: Geometry
@@ -180,11 +231,15 @@ class Scene:
                 where="parameters",
                 mend=f"this scene reads {', '.join(needed)}",
             )
-        dtype = jnp.result_type(float, *geometry, *(parameters[name] for name in needed))
+        dtype = jnp.result_type(geometry.dtype, *(parameters[name] for name in needed))
         return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}
 
 
-def _check_part(part: object, where: str, kind: type, allowed: str) -> None:
-    """Refuse a part of the wrong kind, naming the right ones."""
-    if not isinstance(part, kind):
-        raise SceneError(f"{part!r} is no {where}", where=where, mend=f"give {allowed}")
+@dataclasses.dataclass(frozen=True)
+class _FreeIndex(Part):
+    """The index itself is a parameter, one for each wavelength."""
+
+    parameters: ClassVar[tuple[str, ...]] = ("refractive_index",)
+
+
+_FREE_INDEX = _FreeIndex()

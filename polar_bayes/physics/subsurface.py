@@ -8,11 +8,11 @@ from typing import ClassVar, override
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polar_bayes.errors import SceneError
-from polar_bayes.physics import fresnel
 from polar_bayes.physics.geometry import Geometry
+from polar_bayes.physics.internal_reflection import InternalReflection
+from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
 from polar_bayes.physics.stokes import Light
-from polar_bayes.physics.surface import AbstractSurface
+from polar_bayes.physics.surface import Interface
 
 # The reflectance of a body changes with the square root of absorption: its slope at zero is
 # infinite, so absorption below this counts as this.
@@ -20,21 +20,19 @@ CLEAREST = 1e-4
 
 
 @dataclasses.dataclass(frozen=True)
-class AbstractSubsurface(abc.ABC):
+class AbstractSubsurface(Part):
     """A body that scatters. Parameters broadcast with (..., view)."""
-
-    parameters: ClassVar[tuple[str, ...]]
 
     @abc.abstractmethod
     def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: AbstractSurface
+        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
     ) -> Light:
         """Light from the body that reaches the viewer.
 
         Args:
             parameters: Material parameters by name. Each broadcasts with (..., view).
             geometry: Directions. Shape (..., view), degree.
-            interface: The surface that lets light in and out.
+            interface: The surface, with what lies on it, that lets light in and out.
 
         Returns:
             Light; q < 0 is polarized along the plane of the viewer. Shape (..., view).
@@ -45,63 +43,87 @@ class AbstractSubsurface(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True)
-class Unpolarized(AbstractSubsurface):
-    """A diffuse body whose light leaves without polarization: rho = 0.
+class DiffuseBody(AbstractSubsurface):
+    r"""A body that sends back a share of the light, alike in all directions.
 
-    Porous bodies without a smooth interface behave so; white PTFE was measured to.
+    $$ S_0 = \frac{A}{\pi} \cos\theta_l T_+(l) T_+(v), \qquad \text{with internal reflection }
+       S_0 = \frac{A}{\pi n^2 (1 - A F_i)} \cos\theta_l T_+(l) T_+(v) $$
 
     Args:
-        albedo: Share of entering light that comes back to the interface, 1, 0 to 1.
+        albedo: A, the share of entering light that comes back to the interface, 1, 0 to 1; a
+            name fits it.
+        internal_reflection: InternalReflection(), or None for an albedo that includes all that
+            happens under the interface.
 
     Raises:
-        SceneError: The albedo is outside 0 to 1.
+        SceneError: The albedo is neither a number from 0 to 1 nor a name.
     """
 
-    albedo: float = 1.0
-
-    parameters: ClassVar[tuple[str, ...]] = ("refractive_index",)
+    albedo: Setting = 1.0
+    internal_reflection: InternalReflection | None = None
 
     def __post_init__(self) -> None:
-        _check_albedo(self)
+        check_setting(self.albedo, f"{type(self).__name__}: albedo", 0.0, 1.0)
+
+    @property
+    @override
+    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
+        return names_in(self.albedo)
+
+    def diffuse(
+        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
+    ) -> tuple[Array, Light]:
+        """Brightness inside, and what the way out does to it."""
+        albedo = value_of(self.albedo, parameters)
+        entering = interface.entering(parameters, geometry).intensity
+        brightness = albedo / jnp.pi * entering
+        if self.internal_reflection is not None:
+            escape = self.internal_reflection.escape(interface)
+            # 1 - A Fi, as a sum of two positive terms.
+            not_trapped = (1.0 - albedo) + albedo * escape
+            brightness = brightness / (parameters["refractive_index"] ** 2 * not_trapped)
+        return brightness, interface.exit(parameters, geometry)
+
+
+@dataclasses.dataclass(frozen=True)
+class Unpolarized(DiffuseBody):
+    """A diffuse body whose light leaves without polarization: rho = 0.
+
+    Porous bodies without a smooth interface behave so; white PTFE was measured to. Fields and
+    errors are those of `DiffuseBody`.
+    """
 
     @override
     def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: AbstractSurface
+        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
     ) -> Light:
-        brightness = _diffuse(self.albedo, parameters, geometry, interface)
+        brightness, leaving = self.diffuse(parameters, geometry, interface)
+        brightness = brightness * leaving.intensity
         return Light(brightness, jnp.zeros_like(brightness), jnp.zeros_like(brightness))
 
 
 @dataclasses.dataclass(frozen=True)
-class Lambertian(AbstractSubsurface):
+class Lambertian(DiffuseBody):
     r"""A diffuse body whose light is polarized only on its way out.
 
-    $$ S = \frac{\text{albedo}}{\pi} \cos\theta_l T_+(l) [T_+(v), T_-(v), 0] $$
+    $$ S = \frac{A}{\pi} \cos\theta_l T_+(l) [T_+(v), T_-(v), 0] $$
 
-    Args:
-        albedo: Share of entering light that comes back to the interface, 1, 0 to 1.
-
-    Raises:
-        SceneError: The albedo is outside 0 to 1.
+    Fields and errors are those of `DiffuseBody`.
 
     Source:
         Baek et al. 2018, Simultaneous acquisition of polarimetric SVBRDF and normals.
     """
 
-    albedo: float = 1.0
-
-    parameters: ClassVar[tuple[str, ...]] = ("refractive_index",)
-
-    def __post_init__(self) -> None:
-        _check_albedo(self)
+    @override
+    def simpler(self) -> tuple[Part | None, ...]:
+        return (Unpolarized(self.albedo, self.internal_reflection),)
 
     @override
     def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: AbstractSurface
+        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
     ) -> Light:
-        leaving = interface.exit(parameters, geometry)
-        entering = interface.entering(parameters, geometry)
-        return leaving._replace(intensity=self.albedo / jnp.pi * entering * leaving.intensity)
+        brightness, leaving = self.diffuse(parameters, geometry, interface)
+        return leaving._replace(intensity=brightness * leaving.intensity)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,22 +134,33 @@ class Depolarizer(AbstractSubsurface):
        S_0 = \text{entering} \frac{R_d(a)}{\pi n^2 (1 - F_i R_d)} T_\text{exit}(v) $$
 
     An absorbing body scatters light few times, so that more of its polarization is kept.
+
+    Args:
+        internal_reflection: InternalReflection(), or None for an interface that turns nothing
+            back: then R_b = R_d.
     """
 
-    parameters: ClassVar[tuple[str, ...]] = ("absorption", "refractive_index")
+    internal_reflection: InternalReflection | None = dataclasses.field(
+        default_factory=InternalReflection
+    )
+
+    parameters: ClassVar[tuple[str, ...]] = ("absorption",)
 
     @override
     def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: AbstractSurface
+        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
     ) -> Light:
-        absorption, n = parameters["absorption"], parameters["refractive_index"]
+        lost = half_space_loss(parameters["absorption"])
+        if self.internal_reflection is None:
+            not_trapped, kept = jnp.ones_like(lost), lost
+        else:
+            escape = self.internal_reflection.escape(interface)
+            # 1 - Fi Rd, as a sum of two positive terms.
+            not_trapped = lost + (1.0 - lost) * escape
+            kept = body_loss(parameters["absorption"], escape)
+        returned = (1.0 - lost) / (jnp.pi * parameters["refractive_index"] ** 2 * not_trapped)
+        entering = interface.entering(parameters, geometry).intensity
         leaving = interface.exit(parameters, geometry)
-        entering = interface.entering(parameters, geometry)
-        lost = half_space_loss(absorption)
-        # 1 - Fi Rd, as a sum of two positive terms.
-        not_trapped = lost + (1.0 - lost) * fresnel.escape(n)
-        returned = (1.0 - lost) / (jnp.pi * n**2 * not_trapped)
-        kept = body_loss(absorption, n)
         return Light(entering * returned * leaving.intensity, kept * leaving.q, kept * leaving.u)
 
 
@@ -155,7 +188,7 @@ def half_space_loss(absorption: Array) -> Array:
     return g * (2.309 - 0.139 * g) / (1.0 + 1.170 * g)
 
 
-def body_loss(absorption: Array, refractive_index: Array) -> Array:
+def body_loss(absorption: Array, escape: Array | float) -> Array:
     r"""Share of diffuse light that a body behind its interface absorbs, 1 - Rb.
 
     $$ R_b = \frac{(1-F_i) R_d}{1 - F_i R_d}, \qquad
@@ -163,7 +196,7 @@ def body_loss(absorption: Array, refractive_index: Array) -> Array:
 
     Args:
         absorption: a. Any shape, 1, >= 0.
-        refractive_index: n. Broadcasts, 1, >= 1.
+        escape: 1 - F_i, what the interface does not turn back. Broadcasts, 1, in (0, 1].
 
     Returns:
         1 - Rb. Broadcast shape, 1, in (0, 1).
@@ -172,25 +205,4 @@ def body_loss(absorption: Array, refractive_index: Array) -> Array:
         Nothing.
     """
     lost = half_space_loss(absorption)
-    return lost / (lost + (1.0 - lost) * fresnel.escape(refractive_index))
-
-
-def _diffuse(
-    albedo: float,
-    parameters: Mapping[str, Array],
-    geometry: Geometry,
-    interface: AbstractSurface,
-) -> Array:
-    """Brightness of a diffuse body seen through its interface."""
-    entering = interface.entering(parameters, geometry)
-    return albedo / jnp.pi * entering * interface.exit(parameters, geometry).intensity
-
-
-def _check_albedo(part: Unpolarized | Lambertian) -> None:
-    """Refuse an albedo that creates light."""
-    if not 0.0 <= part.albedo <= 1.0:
-        raise SceneError(
-            f"albedo={part.albedo!r} is no share of light",
-            where=type(part).__name__,
-            mend="give a number from 0 to 1",
-        )
+    return lost / (lost + (1.0 - lost) * escape)

@@ -15,6 +15,7 @@ import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
+from polar_bayes.budget.ledger import ledger_sentence
 from polar_bayes.capture.paths import as_path
 from polar_bayes.diagnostics.convergence import judge, summary
 from polar_bayes.diagnostics.discrepancy import WITHOUT, compare_without
@@ -123,6 +124,7 @@ def render(result: xr.DataTree) -> str:
         else None,
         "sampler": tables.sampler_facts(result, method, provenance),
         "checks": tables.check_table(checks) if checks else None,
+        "effects": _effects(result),
         "groups": tables.provenance_groups(provenance),
         "pictures": _pictures(result, checks, method),
     }
@@ -151,6 +153,14 @@ def _without(
         for what, table in compared.items()
         if not table.empty
     ]
+
+
+def _effects(result: xr.DataTree) -> dict[str, Any] | None:
+    """How the scene was chosen, where it was."""
+    if "effects" not in result.children:
+        return None
+    ledger = result["effects"].to_dataset()
+    return {"table": tables.effect_table(ledger), "sentence": ledger_sentence(ledger)}
 
 
 def _pictures(

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from polar_bayes.budget.ledger import ledger_rows
 from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, laplace_k_hat
 from polar_bayes.diagnostics.parameters import Scalar, stats_of, truth_of
 from polar_bayes.diagnostics.predictive import PROBABILITIES, Check
@@ -200,6 +201,24 @@ def sampler_facts(result: xr.DataTree, method: str, provenance: Mapping[str, Any
         facts["weights of the modes found"] = [f"{weight:.3g}" for weight in modes["weights"]]
         facts["climbs towards modes"] = f"{modes.get('starts')}, failed: {modes.get('failures')}"
     return _facts(facts)
+
+
+def effect_table(ledger: xr.Dataset) -> Table:
+    """What each effect of the scene changes and costs, and whether it was kept."""
+    paths = map(str, ledger["path"].to_numpy())
+    rows = tuple(
+        Row(name, path, cells)
+        for path, (name, cells) in zip(paths, ledger_rows(ledger).items(), strict=True)
+    )
+    heads = ("effect", "data", "shift", "sd", "operations", "time", "kept or dropped, and why")
+    caption = (
+        "What leaving out one effect alone changes. Data: the prediction that moves most, in "
+        "standard deviations of its noise. Shift and sd: the posterior that moves most, in its "
+        "standard deviations, and the one whose standard deviation changes most, both taken as "
+        "normal. Operations and time: the effect's share of one log density with everything on. "
+        f"What changes no parameter by more than {ledger.attrs['tolerance']:g} may go."
+    )
+    return Table(caption, heads, rows)
 
 
 def provenance_groups(provenance: Mapping[str, Any]) -> list[tuple[str, list[Row]]]:

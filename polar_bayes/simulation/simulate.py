@@ -14,6 +14,7 @@ from polar_bayes.errors import CaptureError, FitError, SceneError
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
 from polar_bayes.physics.geometry import Geometry
+from polar_bayes.physics.notation import notation
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import RANGES
 from polar_bayes.setups import SETUPS, Setup, find_setup
@@ -36,13 +37,11 @@ NEUTRAL: Mapping[str, np.ndarray] = {
     "leakage": np.asarray(0.0),
     "dark_level": np.asarray(0.0),
     "angle_zero": np.asarray(0.0),
+    "beam_overlap_zenith": np.asarray(90.0),
     "discrepancy_amplitude": np.asarray(0.0),
     "discrepancy_weights": np.zeros(4),
 }
 """A perfect instrument, by the names of the terms' parameters."""
-
-UNITS: Mapping[str, str] = {"angle_zero": "degree"}
-"""Units of the truth, where it has one."""
 
 STATED_ERROR = 0.01
 """Standard error that the instrument states of every reading, for the links that read it."""
@@ -245,8 +244,9 @@ def _blank(protocol: Protocol, links: Mapping[str, AbstractLink]) -> Observation
         dims = (("wavelength", len(protocol.wavelengths)), *dims)
     shape = tuple(length for _, length in dims)
     angles = {name: jnp.asarray(angle) for name, angle in protocol.angles().items()}
+    colors = jnp.asarray(protocol.wavelengths)[:, None] if protocol.wavelengths else None
     return Observations(
-        geometry=Geometry.from_degrees(**angles),
+        geometry=Geometry.from_degrees(**angles, wavelength=colors),
         readings={},
         errors={name: jnp.full(shape, STATED_ERROR) for name in links},
         brightness=jnp.ones(shape),
@@ -277,7 +277,7 @@ def _label(
         capture[name] = (dims, value.T)
     for name, value in truth.items():
         if np.ndim(NEUTRAL.get(name, 0.0)) == 0:  # a capture has no dim for a vector of weights
-            units = {"units": UNITS.get(name, "1")}
+            units = {"units": notation(name).unit}
             capture[f"true_{name}"] = ("wavelength" if value.ndim else (), value, units)
     if protocol.wavelengths:
         capture = capture.assign_coords(wavelength=np.asarray(protocol.wavelengths, float))

@@ -107,6 +107,68 @@ INSTRUMENTS = {
     },
 }
 
+# Parameters of all other effects, in ordinary states and where they go wrong. A name and a factor
+# in place of a number mean so many times that parameter. Color is that of 550 nm.
+WAVELENGTH = 550.0
+ORDINARY: dict[str, float] = {
+    "roughness_across": 0.3,
+    "roughness_azimuth": 25.0,
+    "albedo": 0.7,
+    "polarized_fraction": 0.5,
+    "coat_refractive_index": 1.45,
+    "coat_absorbance": 0.2,
+    "film_refractive_index": 1.38,
+    "film_thickness": 230.0,
+    "cauchy_a": 1.45,
+    "cauchy_b": 0.005,
+    "sellmeier_strength": 1.2,
+    "sellmeier_resonance": 0.011,
+    "light_degree": 0.6,
+    "light_angle": 30.0,
+    "beam_overlap_zenith": 80.0,
+}
+EFFECTS: dict[str, dict[str, float | tuple[str, float]]] = {
+    "ordinary": {},
+    "coat like the body": {"coat_refractive_index": ("refractive_index", 1.0)},
+    "clear coat like the body": {
+        "coat_refractive_index": ("refractive_index", 1.0),
+        "coat_absorbance": 0.0,
+    },
+    "coat like air": {"coat_refractive_index": 1.0, "coat_absorbance": 0.0},
+    "dense coat": {"coat_refractive_index": 2.4},
+    "clear coat": {"coat_absorbance": 0.0},
+    "black coat": {"coat_absorbance": 50.0},
+    "no film": {"film_thickness": 0.0},
+    "thick film": {"film_thickness": 1e4},
+    "half-wave film": {"film_thickness": WAVELENGTH / (2.0 * 1.38)},
+    "quarter-wave film without a reflection": {
+        "film_refractive_index": 1.5**0.5,
+        "film_thickness": WAVELENGTH / (4.0 * 1.5**0.5),
+    },
+    "film like the body": {"film_refractive_index": ("refractive_index", 1.0)},
+    "film and coat like air": {
+        "film_refractive_index": 1.0,
+        "coat_refractive_index": 1.0,
+        "coat_absorbance": 0.0,
+    },
+    "grooves as rough as their walls": {"roughness_across": ("roughness", 1.0)},
+    "grooves a thousand times as steep as long": {"roughness_across": ("roughness", 1e3)},
+    "grooves a thousandth as steep as long": {"roughness_across": ("roughness", 1e-3)},
+    "grooves towards the viewer": {"roughness_azimuth": 0.0},
+    "grooves across the viewer": {"roughness_azimuth": 90.0},
+    "unpolarized beam": {"light_degree": 0.0},
+    "s beam": {"light_degree": 1.0, "light_angle": 0.0},
+    "p beam": {"light_degree": 1.0, "light_angle": 90.0},
+    "diagonal beam": {"light_degree": 1.0, "light_angle": -45.0},
+    "white, polarizing body": {"albedo": 1.0, "polarized_fraction": 1.0},
+    "black, depolarizing body under absorbing air": {
+        "albedo": 0.0,
+        "polarized_fraction": 0.0,
+        "coat_refractive_index": 1.0,
+    },
+    "colorless body like air": {"cauchy_a": 1.0, "cauchy_b": 0.0, "sellmeier_strength": 0.0},
+}
+
 # Here second derivatives leave the range of single precision, 3e38: the highlight is 1e-5 wide and
 # 1e13 bright, or the inner angle turns by 90 degrees within an index change of 1e-10.
 BEYOND_SINGLE = {
@@ -114,6 +176,10 @@ BEYOND_SINGLE = {
     for direction in ("close to 90", "viewer alone close to 90")
     for material in ("at the floor of roughness", "everything at once")
 }
+
+
+# Effects that leave less light than single precision can divide by.
+TOO_DARK_FOR_SINGLE = {"black coat", "black, depolarizing body under absorbing air"}
 
 
 class Cases(NamedTuple):
@@ -134,3 +200,37 @@ def every_case(dtype: type) -> Cases:
     ]
     names, angles, materials = zip(*pairs, strict=True)
     return Cases(list(names), np.array(angles, dtype), np.array(materials, dtype))
+
+
+class EffectCases(NamedTuple):
+    """Named cases with their directions (case, 3) and all their parameters, each (case,)."""
+
+    names: list[str]
+    directions: np.ndarray
+    parameters: dict[str, np.ndarray]
+
+
+def every_effect(dtype: type, count: int) -> EffectCases:
+    """Every direction with every effect, on the ordinary material and on two more by turns.
+
+    The cases are repeated up to a count: operations of one shape compile once.
+    """
+    directions = DIRECTIONS | (DOUBLE_ONLY if dtype == np.float64 else {})
+    effects = [e for e in EFFECTS if dtype == np.float64 or e not in TOO_DARK_FOR_SINGLE]
+    others = [name for name in MATERIALS if name != "ordinary"]
+    rows = []
+    for turn, (direction, effect) in enumerate(itertools.product(directions, effects)):
+        # Steps without a common factor: each direction and each effect meets every material.
+        for material in ("ordinary", *(others[(turn * step) % len(others)] for step in (5, 7))):
+            if dtype == np.float64 or f"{direction} / {material}" not in BEYOND_SINGLE:
+                values = ORDINARY | EFFECTS[effect] | MATERIALS[material]._asdict()
+                values = {
+                    name: values[value[0]] * value[1] if isinstance(value, tuple) else value
+                    for name, value in values.items()
+                }
+                name = f"{direction} / {material} / {effect}"
+                rows.append((name, directions[direction], values))
+    rows = [rows[i % len(rows)] for i in range(max(count, len(rows)))]
+    names, angles, values = zip(*rows, strict=True)
+    parameters = {name: np.array([one[name] for one in values], dtype) for name in values[0]}
+    return EffectCases(list(names), np.array(angles, dtype), parameters)

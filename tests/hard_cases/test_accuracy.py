@@ -4,13 +4,13 @@ import mpmath as mp
 import numpy as np
 import pytest
 from hard_cases import multiprecision as twin
-from hard_cases.catalogue import MATERIALS, every_case
+from hard_cases.catalogue import MATERIALS, Material, every_case
 
 from polar_bayes.physics import fresnel
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.microfacet import GGX, Beckmann
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
-from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
+from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.subsurface import Lambertian, body_loss, half_space_loss
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
@@ -148,7 +148,9 @@ def test_body(dtype: type) -> None:
     behind = [(1 - inside) * rd / (1 - inside * rd) for rd in albedo]
     assert_accurate(half_space_loss(absorption), [1 - rd for rd in albedo], dtype, names)
     # The floor of absorption is rounded to the precision before its square root is taken.
-    assert_accurate(body_loss(absorption, index), [1 - rb for rb in behind], dtype, names)
+    assert_accurate(
+        body_loss(absorption, fresnel.escape(index)), [1 - rb for rb in behind], dtype, names
+    )
 
 
 def surface_truth(direction: np.ndarray, n: mp.mpf, roughness: mp.mpf) -> tuple:
@@ -168,7 +170,7 @@ def surface_truth(direction: np.ndarray, n: mp.mpf, roughness: mp.mpf) -> tuple:
 def test_scene_of_a_rough_surface(dtype: type) -> None:
     """Intensity against its own size, q and u against the degree of polarization."""
     cases = every_case(dtype)
-    parameters = dict(zip(MATERIAL_PARAMETERS, cases.materials.T, strict=True))
+    parameters = dict(zip(Material._fields, cases.materials.T, strict=True))
     light = Scene(RoughSurface(Beckmann())).light(parameters, geometry_of(cases.directions))
     for i, name in enumerate(cases.names):
         roughness, _, _, n = (mp.mpf(float(value)) for value in cases.materials[i])
@@ -194,7 +196,7 @@ def test_scene_of_a_plate_over_a_diffuse_body(
     keep = [i for i, name in enumerate(cases.names) if cases.materials[i, 0] == dtype(0.1)]
     directions, materials = cases.directions[keep], cases.materials[keep]
     scene = Scene(SmoothSurface(), Lambertian(albedo=0.5), mixing)
-    parameters = dict(zip(MATERIAL_PARAMETERS, materials.T, strict=True))
+    parameters = dict(zip(Material._fields, materials.T, strict=True))
     light = scene.light(parameters, geometry_of(directions))
     for i, (direction, material) in enumerate(zip(directions, materials, strict=True)):
         _, b, _, n = (mp.mpf(float(value)) for value in material)

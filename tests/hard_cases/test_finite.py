@@ -1,75 +1,141 @@
 """Value, gradient and Hessian are finite in every hard case, in both precisions."""
 
-from collections.abc import Mapping
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hard_cases.catalogue import DIRECTIONS, INSTRUMENTS, MATERIALS, Cases, every_case
+from hard_cases.catalogue import (
+    DIRECTIONS,
+    EFFECTS,
+    INSTRUMENTS,
+    MATERIALS,
+    ORDINARY,
+    WAVELENGTH,
+    Material,
+    every_case,
+    every_effect,
+)
 from jaxtyping import Array
 
+from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.dispersion import Cauchy, Sellmeier
+from polar_bayes.physics.exit import SmoothExit
+from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.illumination import Disc, UniformSky
+from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
+from polar_bayes.physics.instrument import Analyzer, BeamOverlap, Instrument, Saturation
+from polar_bayes.physics.internal_reflection import InternalReflection
 from polar_bayes.physics.microfacet import GGX, Beckmann
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
-from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
+from polar_bayes.physics.polarization import LinearPolarization
+from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.scenes import SCENES
-from polar_bayes.physics.subsurface import Depolarizer, Lambertian
-from polar_bayes.physics.surface import RoughSurface
+from polar_bayes.physics.shadowing import HeightCorrelatedShadowing
+from polar_bayes.physics.slopes import AnisotropicSlopes
+from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
+from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+from polar_bayes.physics.turbid import TurbidMedium
 
 READINGS = ("dop", "q", "u", "intensity")
 
-ALL_SCENES = SCENES | {
-    "GGX, point": Scene(RoughSurface(GGX()), Depolarizer(), StokesMixing()),
-    "GGX, sky": Scene(RoughSurface(GGX(), UniformSky()), Lambertian(), StokesMixing()),
-    "Beckmann, sky": Scene(
-        RoughSurface(Beckmann(), UniformSky()), Depolarizer(), DopMixing(signed=True)
+stokes_of = jax.jit(Scene.stokes, static_argnums=0)
+
+FEW = FacetQuadrature(along=5, across=4)
+BEAM = PointSource(LinearPolarization("light_degree", "light_angle"))
+GROOVED = AnisotropicSlopes("roughness_azimuth")
+
+# A new part belongs into one of these scenes; every state of the catalogue then meets it.
+EFFECT_SCENES = {
+    "lacquered grooves under a polarized beam": Scene(
+        RoughSurface(Beckmann(), BEAM, FEW, GROOVED, HeightCorrelatedShadowing()),
+        Lambertian("albedo", InternalReflection()),
+        StokesMixing(),
+        ClearCoat(),
+        Instrument((BeamOverlap(),)),
     ),
-    "Beckmann, disc": Scene(
-        RoughSurface(Beckmann(), Disc(half_width=5.0)), Depolarizer(), StokesMixing()
+    "grooves under a sky, with a film": Scene(
+        RoughSurface(GGX(), UniformSky(), FEW, GROOVED, HeightCorrelatedShadowing()),
+        Depolarizer(),
+        DopMixing(signed=True),
+        ThinFilm(),
+    ),
+    "grooves under a disc, of their own color": Scene(
+        RoughSurface(Beckmann(), Disc(5.0), FEW, GROOVED, way_out=SmoothExit()),
+        Depolarizer(internal_reflection=None),
+        StokesMixing(),
+        dispersion=Sellmeier(),
+    ),
+    "a plate under film and coat": Scene(
+        SmoothSurface(BEAM),
+        Unpolarized("albedo", InternalReflection()),
+        StokesMixing(),
+        CoatStack((ThinFilm(), ClearCoat())),
+        Instrument((Analyzer(30.0), Saturation(0.5))),
+        Cauchy(),
+    ),
+    "a turbid body under coat and film": Scene(
+        SmoothSurface(BEAM),
+        TurbidMedium("polarized_fraction"),
+        StokesMixing(),
+        CoatStack((ClearCoat(), ThinFilm())),
     ),
 }
 
+ALL_SCENES = (
+    SCENES
+    | EFFECT_SCENES
+    | {
+        "GGX, point": Scene(RoughSurface(GGX()), Depolarizer(), StokesMixing()),
+        "GGX, sky": Scene(RoughSurface(GGX(), UniformSky()), Lambertian(), StokesMixing()),
+        "Beckmann, sky": Scene(
+            RoughSurface(Beckmann(), UniformSky()), Depolarizer(), DopMixing(signed=True)
+        ),
+        "Beckmann, disc": Scene(
+            RoughSurface(Beckmann(), Disc(half_width=5.0)), Depolarizer(), StokesMixing()
+        ),
+    }
+)
 
-def instrument_columns(scene: Scene, settings: Mapping[str, object], dtype: type) -> np.ndarray:
-    """The instrument parameters that a scene reads, laid out in one row."""
-    names = [name for name in scene.parameters if name not in MATERIAL_PARAMETERS]
-    parts = [np.atleast_1d(np.asarray(settings[name], dtype)) for name in names]
-    return np.concatenate([np.zeros(0, dtype), *parts])
+
+def size(name: str) -> int:
+    """Columns that a parameter takes."""
+    return np.size(INSTRUMENTS["perfect"].get(name, 0.0))
 
 
-def rows(scene: Scene, cases: Cases, dtype: type) -> np.ndarray:
-    """Every case with every state of the instrument: one row of inputs each.
+def rows(scene: Scene, dtype: type) -> tuple[list[str], np.ndarray]:
+    """Names, and one row of inputs for each: directions, then the scene's parameters.
 
-    A scene without an instrument gets as many rows: operations of one shape compile once.
+    Cases of the first scenes come with every state of the instrument, those of the others with
+    every effect. All scenes get as many rows: operations of one shape compile once.
     """
-    count = len(cases.names)
-    return np.concatenate(
-        [
-            np.concatenate(
-                [
-                    cases.directions,
-                    cases.materials,
-                    np.tile(instrument_columns(scene, setting, dtype), (count, 1)),
-                ],
-                axis=1,
-            )
-            for setting in INSTRUMENTS.values()
-        ]
-    )
+    cases, count = every_case(dtype), len(INSTRUMENTS)
+    total = count * len(cases.names)
+    if scene in EFFECT_SCENES.values():
+        effects = every_effect(dtype, total)
+        columns = [effects.directions, *(effects.parameters[n][:, None] for n in scene.parameters)]
+        return effects.names, np.concatenate(columns, axis=1)
+    material = dict(zip(Material._fields, cases.materials.T, strict=True))
+    columns = [np.tile(cases.directions, (count, 1))]
+    for name in scene.parameters:
+        if name in material:
+            columns.append(np.tile(material[name], count)[:, None])
+        else:
+            settings = [np.atleast_1d(state[name]).astype(dtype) for state in INSTRUMENTS.values()]
+            columns.append(np.repeat(settings, len(cases.names), axis=0))
+    return cases.names * count, np.concatenate(columns, axis=1)
 
 
 def readings(scene: Scene, row: Array) -> Array:
     """All readings of one view, from one row of inputs."""
-    geometry = Geometry(row[0:1], jnp.zeros_like(row[0:1]), row[1:2], row[2:3])
-    parameters = dict(zip(MATERIAL_PARAMETERS, row[3:7], strict=True))
-    start = 7
-    for name in scene.parameters[len([n for n in scene.parameters if n in MATERIAL_PARAMETERS]) :]:
-        size = np.size(INSTRUMENTS["perfect"][name])
-        piece = row[start : start + size]
-        parameters[name] = piece if name == "discrepancy_weights" else piece[0]
-        start += size
+    color = jnp.asarray([WAVELENGTH], row.dtype) if scene in EFFECT_SCENES.values() else None
+    geometry = Geometry(row[0:1], jnp.zeros_like(row[0:1]), row[1:2], row[2:3], color)
+    parameters, start = {}, 3
+    for name in scene.parameters:
+        piece = row[start : start + size(name)]
+        parameters[name] = piece if size(name) > 1 else piece[0]
+        start += size(name)
     predicted = scene.predict(parameters, geometry)
     return jnp.concatenate([predicted[name] for name in READINGS])
 
@@ -77,8 +143,8 @@ def readings(scene: Scene, row: Array) -> Array:
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("name", ALL_SCENES)
 def test_value_gradient_and_hessian_are_finite(name: str, dtype: type) -> None:
-    scene, cases = ALL_SCENES[name], every_case(dtype)
-    inputs = rows(scene, cases, dtype)
+    scene = ALL_SCENES[name]
+    names, inputs = rows(scene, dtype)
     generator = np.random.default_rng(20)
     # A sum over readings, and a Hessian times a vector, hide nothing: one entry that is not
     # finite spoils its row. They compile in a fraction of the time of the full Hessian.
@@ -100,18 +166,23 @@ def test_value_gradient_and_hessian_are_finite(name: str, dtype: type) -> None:
     ):
         assert result.dtype == dtype
         broken = np.unique(np.nonzero(~np.isfinite(np.asarray(result)))[0])
-        names = [cases.names[row % len(cases.names)] for row in broken]
-        assert not names, f"{what} of scene {name} is not finite at {names[:8]}"
+        where = [names[row] for row in broken]
+        assert not where, f"{what} of scene {name} is not finite at {len(where)}: {where[:8]}"
 
 
 @pytest.mark.parametrize("name", ALL_SCENES)
 def test_light_is_possible(name: str) -> None:
     """S0 >= |S|: no reading of an ideal instrument is more than fully polarized, or negative."""
-    cases = every_case(np.float64)
-    view, light, azimuth = (jnp.asarray(column)[:, None] for column in cases.directions.T)
-    geometry = Geometry(view, jnp.zeros_like(view), light, azimuth)
-    parameters = dict(zip(MATERIAL_PARAMETERS, cases.materials.T, strict=True))
-    stokes = np.asarray(ALL_SCENES[name].stokes(parameters, geometry))[:, 0]
+    scene = dataclasses.replace(ALL_SCENES[name], instrument=None)
+    _, inputs = rows(ALL_SCENES[name], np.float64)
+    start, parameters = 3, {}
+    for parameter in ALL_SCENES[name].parameters:
+        parameters[parameter] = inputs[:, start]
+        start += size(parameter)
+    view, light, azimuth = (jnp.asarray(column)[:, None] for column in inputs[:, :3].T)
+    color = jnp.full_like(view, WAVELENGTH)
+    geometry = Geometry(view, jnp.zeros_like(view), light, azimuth, color)
+    stokes = np.asarray(stokes_of(scene, parameters, geometry))[:, 0]
     assert np.all(stokes[:, 0] >= 0.0)
     slack = 1e-14 * stokes[:, 0] + 1e-300
     assert np.all(np.hypot(stokes[:, 1], stokes[:, 2]) <= stokes[:, 0] + slack)
@@ -128,3 +199,6 @@ def test_the_catalogue_reaches_every_end() -> None:
     assert materials[:, 2].min() == 0.0
     assert materials[:, 2].max() > 10.0
     assert materials[:, 3].min() == 1.0
+    read = {name for scene in EFFECT_SCENES.values() for name in scene.parameters}
+    assert read == set(ORDINARY) | set(Material._fields)
+    assert {name for changes in EFFECTS.values() for name in changes} <= read

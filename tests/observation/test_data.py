@@ -7,8 +7,7 @@ import pytest
 import xarray as xr
 
 from polar_bayes.capture.schema import validate
-from polar_bayes.observation.data import READINGS, observe
-from polar_bayes.physics.geometry import Geometry
+from polar_bayes.observation.data import ANGLES, READINGS, observe
 
 SIZES = {"material": 2, "patch": 3, "y": 2, "x": 3, "view": 4, "wavelength": 3}
 ZENITHS = np.array([0.0, 30.0, 60.0, 80.0])
@@ -58,8 +57,13 @@ def test_axes_are_leading_then_wavelength_then_view(leading, wavelength):
     np.testing.assert_array_equal(data.errors["q"], capture["q_error"].transpose(*order))
     for array in (data.brightness, data.valid, data.saturated):
         assert array.shape == data.shape
-    for angle in data.geometry:
-        assert np.broadcast_shapes(angle.shape, data.shape) == data.shape
+    for direction in jax.tree.leaves(data.geometry):
+        assert np.broadcast_shapes(direction.shape, data.shape) == data.shape
+    if wavelength:
+        np.testing.assert_array_equal(data.geometry.wavelength.ravel(), [450.0, 550.0, 650.0])
+        assert data.geometry.wavelength.shape == (*(1,) * len(leading), 3, 1)
+    else:
+        assert data.geometry.wavelength is None
 
 
 def test_the_order_of_the_captures_axes_does_not_matter():
@@ -202,7 +206,7 @@ def test_directions_may_differ_from_pixel_to_pixel():
     zeniths = np.linspace(1.0, 80.0, 24).reshape(2, 3, 4)
     capture = validate(capture.assign(view_zenith=(("y", "x", "view"), zeniths)))
     data = observe(capture, largest_view_zenith=40.0)
-    for name in Geometry._fields:
+    for name in ANGLES:
         assert getattr(data.geometry, name).shape == (2, 3, 1, 4)
     np.testing.assert_array_equal(data.geometry.view_zenith[:, :, 0], zeniths)
     expected = np.broadcast_to(zeniths[:, :, None] <= 40.0, (2, 3, 3, 4))

@@ -45,3 +45,13 @@ def height_field_exit() -> np.ndarray:
 @pytest.fixture(scope="session")
 def height_field_sky() -> np.ndarray:
     return read("eradiate_heightfield_uniform.csv")
+
+
+@pytest.fixture(scope="session")
+def thick_coats() -> np.ndarray:
+    return read("coat_incoherent_inc_tmm.csv")
+
+
+@pytest.fixture(scope="session")
+def thin_films() -> np.ndarray:
+    return read("thinfilm_coherent_tmm.csv")

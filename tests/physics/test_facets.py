@@ -10,6 +10,8 @@ from polar_bayes.physics.facets import FacetQuadrature, sample_facets, seen
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.illumination import UniformSky
 from polar_bayes.physics.microfacet import GGX, Beckmann
+from polar_bayes.physics.slopes import SlopeEllipse
+from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.surface import RoughSurface
 
 ANGLES = np.array([5.0, 25, 40, 50, 57, 65, 75, 80, 85, 89])
@@ -27,7 +29,9 @@ def polarization(surface: RoughSurface, views: Geometry) -> np.ndarray:
 
     @jax.jit
     def both(material: dict) -> tuple:
-        return surface.light(material, views).q, surface.exit(material, views).q
+        stack = Stack(material["refractive_index"])
+        reflected = surface.light(material, views, stack)
+        return reflected.q, surface.exit(material, views, stack).q
 
     return np.stack(both(MATERIAL))
 
@@ -50,7 +54,7 @@ def test_no_facet_turns_its_back(zenith: float, side: float) -> None:
     facets = sample_facets(
         Beckmann(),
         FacetQuadrature(),
-        jnp.array([0.5]),
+        SlopeEllipse(jnp.array([0.5]), jnp.array([0.5]), None),
         sin_degrees(view),
         cos_degrees(view),
         seen,

@@ -1,5 +1,6 @@
 """Instrument terms: what a perfect one leaves alone, and what each does to channels s and p."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,12 +9,16 @@ from polar_bayes.errors import SceneError
 from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.instrument import (
+    AbstractInstrumentTerm,
+    Analyzer,
     AngleZero,
+    BeamOverlap,
     ChannelGain,
     DarkLevel,
     DolpGain,
     Instrument,
     Leakage,
+    Saturation,
 )
 from polar_bayes.physics.stokes import Light
 
@@ -39,8 +44,7 @@ def channels(light: Light) -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_perfect_instrument_changes_nothing() -> None:
     instrument = Instrument(TERMS)
-    for there, here in zip(instrument.aim(PERFECT, GEOMETRY), GEOMETRY, strict=True):
-        np.testing.assert_allclose(there, here)
+    jax.tree.map(np.testing.assert_allclose, instrument.aim(PERFECT, GEOMETRY), GEOMETRY)
     for there, here in zip(instrument.record(PERFECT, GEOMETRY, TILTED), TILTED, strict=True):
         np.testing.assert_allclose(there, here, rtol=1e-14)
 
@@ -146,3 +150,109 @@ def test_a_term_acts_once() -> None:
 def test_discrepancy_is_checked(bad: dict) -> None:
     with pytest.raises(SceneError, match=r"Discrepancy: .* make no smooth function"):
         Discrepancy(**bad)
+
+
+# --- where light is lost on the way to the number -------------------------------------------------
+
+
+def kept(view_zenith: float, fills: float) -> float:
+    """Share of the light that overlap leaves."""
+    geometry = Geometry(*(jnp.array([x]) for x in (view_zenith, 0.0, 30.0, 180.0)))
+    light = Light(*(jnp.array([x]) for x in (1.0, 0.4, -0.2)))
+    recorded = BeamOverlap().record({"beam_overlap_zenith": jnp.array([fills])}, geometry, light)
+    assert (recorded.q, recorded.u) == (light.q, light.u)
+    return float(recorded.intensity[0])
+
+
+def test_overlap_takes_nothing_from_steep_views_and_the_cosine_from_grazing_ones() -> None:
+    """A smooth minimum of 1 and the ratio of cosines; 2^(-1/8), 8 % less, where they meet."""
+    assert kept(0.0, 80.0) == pytest.approx(1.0, abs=1e-6)
+    assert kept(60.0, 80.0) == pytest.approx(1.0, abs=1e-3)
+    assert kept(80.0, 80.0) == pytest.approx(2.0**-0.125, rel=1e-12)
+    for view in (87.0, 89.0, 89.99):
+        ratio = np.cos(np.deg2rad(view)) / np.cos(np.deg2rad(80.0))
+        assert kept(view, 80.0) == pytest.approx(ratio, rel=2e-5)
+    shares = [kept(view, 80.0) for view in np.linspace(0.0, 90.0, 91)]
+    assert np.all(np.diff(shares) <= 0.0)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_overlap_and_its_derivatives_are_finite_up_to_grazing(dtype: type) -> None:
+    def share(inputs: jax.Array) -> jax.Array:
+        geometry = Geometry(inputs[:1], *(jnp.zeros(1, dtype) for _ in range(3)))
+        light = Light(*(jnp.ones(1, dtype) for _ in range(3)))
+        parameters = {"beam_overlap_zenith": inputs[1:]}
+        return BeamOverlap().record(parameters, geometry, light).intensity[0]
+
+    views = [(90.0, 80.0), (80.0, 90.0), (0.0, 90.0), (89.9999, 1.0), (45.0, 45.0), (89.999, 90.0)]
+    orders = jax.jit(jax.vmap(lambda x: (share(x), jax.grad(share)(x), jax.hessian(share)(x))))
+    for order in orders(jnp.array(views, dtype)):
+        assert order.dtype == dtype
+        assert np.all(np.isfinite(order))
+
+
+def test_an_analyzer_obeys_malus() -> None:
+    """Fully polarized light at 20 degrees passes as the squared cosine of what is between."""
+    angles = (0.0, 20.0, 65.0, 110.0)
+    turn = np.deg2rad(40.0)
+    light = Light(jnp.full(4, 2.0), jnp.full(4, np.cos(turn)), jnp.full(4, np.sin(turn)))
+    recorded = Analyzer(angles).record({}, GEOMETRY, light)
+    expected = 2.0 * np.cos(np.deg2rad(np.array(angles) - 20.0)) ** 2
+    np.testing.assert_allclose(recorded.intensity, expected, rtol=1e-14, atol=3e-16)
+    np.testing.assert_array_equal(recorded.q, light.q)
+
+
+@pytest.mark.parametrize("angle", [0.0, 17.0, 45.0, -120.0])
+def test_two_crossed_analyzers_share_the_light(angle: float) -> None:
+    one, other = (Analyzer(a).record({}, GEOMETRY, TILTED) for a in (angle, angle + 90.0))
+    np.testing.assert_allclose(one.intensity + other.intensity, TILTED.intensity, rtol=1e-14)
+    plain = TILTED._replace(q=jnp.zeros(4), u=jnp.zeros(4))
+    half = Analyzer(angle).record({}, GEOMETRY, plain).intensity
+    np.testing.assert_allclose(half, 0.5 * plain.intensity, rtol=1e-15)
+
+
+def test_four_analyzers_measure_the_polarization() -> None:
+    readings = [
+        Analyzer(a).record({}, GEOMETRY, TILTED).intensity for a in (0.0, 45.0, 90.0, 135.0)
+    ]
+    total = readings[0] + readings[2]
+    np.testing.assert_allclose((readings[0] - readings[2]) / total, TILTED.q, atol=1e-15)
+    np.testing.assert_allclose((readings[1] - readings[3]) / total, TILTED.u, atol=1e-15)
+
+
+def test_a_sensor_stops_at_its_level() -> None:
+    recorded = Saturation(0.3).record({}, GEOMETRY, TILTED)
+    np.testing.assert_array_equal(recorded.intensity, [0.1, 0.2, 0.3, 0.3])
+    np.testing.assert_array_equal(recorded.q, TILTED.q)
+    assert Saturation(0.3).parameters == ()
+
+
+def test_light_meets_the_terms_in_their_order() -> None:
+    """A polarizer before the sensor's stop, or behind it."""
+    first = Instrument((Analyzer(0.0), Saturation(0.3))).record({}, GEOMETRY, LIGHT)
+    last = Instrument((Saturation(0.3), Analyzer(0.0))).record({}, GEOMETRY, LIGHT)
+    np.testing.assert_allclose(first.intensity, [0.05, 0.14, 0.3, 0.3], rtol=1e-14)
+    np.testing.assert_allclose(last.intensity, [0.05, 0.14, 0.3, 0.105], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "term", [*TERMS, BeamOverlap(), Analyzer(30.0), Saturation(1.0)], ids=lambda t: type(t).__name__
+)
+def test_every_term_can_be_left_out(term: AbstractInstrumentTerm) -> None:
+    assert term.simpler() == (None,)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Analyzer("angle"), "Analyzer: 'angle' is no angle; give degrees, or a tuple"),
+        (lambda: Analyzer((0.0, "x")), "Analyzer: 'x' is no angle"),
+        (lambda: Analyzer(1e3), "Analyzer: angle: 1000.0 is neither a number from -360 to 360"),
+        (lambda: Saturation(0.0), "Saturation: level=0.0 is no full scale; give a number above 0"),
+        (lambda: Saturation(float("nan")), "Saturation: level=nan is no full scale"),
+        (lambda: Saturation("full"), "Saturation: level='full' is no full scale"),
+    ],
+)
+def test_settings_of_terms_are_checked(make, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        make()

@@ -8,19 +8,25 @@ import numpy as np
 import pytest
 
 from polar_bayes.errors import SceneError
+from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.dispersion import Cauchy
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.illumination import PointSource, UniformSky
+from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
 from polar_bayes.physics.instrument import (
     AbstractInstrumentTerm,
+    Analyzer,
     AngleZero,
+    BeamOverlap,
     DarkLevel,
     DolpGain,
     Instrument,
 )
 from polar_bayes.physics.microfacet import GGX
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
-from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.polarization import LinearPolarization
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.physics.scenes import SCENES
+from polar_bayes.physics.slopes import AnisotropicSlopes
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
@@ -108,7 +114,7 @@ def test_turning_everything_around_the_normal_changes_nothing(name: str) -> None
 
 @pytest.mark.parametrize("name", SCENES)
 def test_single_precision_stays_single_and_agrees(name: str) -> None:
-    single = Geometry(*(angle.astype(jnp.float32) for angle in VIEWS))
+    single = jax.tree.map(lambda angle: angle.astype(jnp.float32), VIEWS)
     small = {key: np.float32(value) for key, value in PARAMETERS.items()}
     for parameters in (small, PARAMETERS | {"discrepancy_weights": np.zeros(4, np.float32)}):
         found = predict(SCENES[name], parameters, single)
@@ -209,11 +215,12 @@ def test_figures_of_the_specification() -> None:
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"surface": GGX()}, r"surface: GGX\(\) is no surface; give SmoothSurface\(\) or Rough"),
-        ({"subsurface": "lambertian"}, "subsurface: 'lambertian' is no subsurface; give Unpol"),
-        ({"mixing": Lambertian()}, r"mixing: .* is no mixing; give DopMixing\(\)"),
+        ({"surface": GGX()}, r"surface: GGX\(\) is no such part; give SmoothSurface\(\) or Ro"),
+        ({"subsurface": "lambertian"}, "subsurface: 'lambertian' is no such part; give Unpolar"),
+        ({"mixing": Lambertian()}, r"mixing: .* is no such part; give DopMixing\(\)"),
         ({"instrument": DolpGain()}, r"instrument: .* give Instrument\(\(DolpGain\(\), ...\)\)"),
-        ({"coat": "clear"}, "coat: 'clear' cannot be used yet; leave coat=None"),
+        ({"coat": "clear"}, r"coat: 'clear' is no such part; give ClearCoat\(\), ThinFilm\(\)"),
+        ({"dispersion": "Cauchy"}, r"dispersion: .* give Cauchy\(\), Sellmeier\(\) or None"),
         ({"mixing": DopMixing()}, "mixing: there is no subsurface to mix; give a subsurface"),
         ({"subsurface": Depolarizer()}, "subsurface: nothing says how .* give mixing=Stokes"),
     ],
@@ -234,3 +241,87 @@ def test_only_terms_that_are_there_can_be_removed() -> None:
     with pytest.raises(SceneError, match="no DarkLevel; name one of its instrument terms: DolpG"):
         SCENES["camera"].without(DarkLevel)
     assert SCENES["camera"].without(DolpGain).instrument is None
+
+
+EVERYTHING = Scene(
+    RoughSurface(
+        GGX(),
+        PointSource(LinearPolarization("light_degree", "light_angle")),
+        slopes=AnisotropicSlopes("roughness_azimuth"),
+    ),
+    Lambertian("albedo"),
+    StokesMixing(),
+    CoatStack((ThinFilm(), ClearCoat())),
+    Instrument((AngleZero(), BeamOverlap(), DolpGain())),
+    Cauchy(),
+)
+
+
+def test_parameters_are_the_materials_in_their_order_then_the_light_then_the_instrument() -> None:
+    material = (
+        "roughness",
+        "subsurface_fraction",
+        "roughness_across",
+        "roughness_azimuth",
+        "albedo",
+        "cauchy_a",
+        "cauchy_b",
+        "coat_refractive_index",
+        "coat_absorbance",
+        "film_refractive_index",
+        "film_thickness",
+    )
+    instrument = ("angle_zero", "beam_overlap_zenith", "dolp_gain")
+    assert EVERYTHING.parameters == (*material, "light_degree", "light_angle", *instrument)
+    assert EVERYTHING.optical_parameters == EVERYTHING.parameters[:-3]
+    listed = [name for name in MATERIAL_PARAMETERS if name in material]
+    assert tuple(listed) == material
+    assert len(set(MATERIAL_PARAMETERS)) == len(MATERIAL_PARAMETERS)
+
+
+def test_a_scene_of_everything_is_static_data_and_predicts() -> None:
+    copy = pickle.loads(pickle.dumps(EVERYTHING))
+    assert copy == EVERYTHING
+    assert hash(copy) == hash(EVERYTHING)
+    values = dict.fromkeys(EVERYTHING.parameters, 0.3)
+    values |= {"cauchy_a": 1.45, "cauchy_b": 0.005, "film_thickness": 200.0}
+    values |= {"coat_refractive_index": 1.5, "film_refractive_index": 1.4}
+    values |= {"beam_overlap_zenith": 80.0, "roughness_azimuth": 30.0}
+    colors = VIEWS._replace(wavelength=jnp.array([[450.0], [650.0]]))
+    found = predict(EVERYTHING, values, colors)
+    for reading in found.values():
+        assert reading.shape == (2, 3)
+        assert np.all(np.isfinite(reading))
+    stokes = stokes_of(EVERYTHING, {k: values[k] for k in EVERYTHING.optical_parameters}, colors)
+    np.testing.assert_array_less(np.hypot(stokes[..., 1], stokes[..., 2]), stokes[..., 0])
+    missing = {k: v for k, v in values.items() if k not in ("light_angle", "film_thickness")}
+    with pytest.raises(SceneError, match="parameters: film_thickness, light_angle missing; this"):
+        EVERYTHING.predict(missing, colors)
+
+
+def test_a_name_used_twice_is_one_parameter() -> None:
+    """A coat of the body's index, whatever that is: the same number for both."""
+    scene = Scene(SmoothSurface(), coat=ClearCoat("refractive_index", 0.0))
+    assert scene.parameters == ("refractive_index",)
+    np.testing.assert_allclose(
+        stokes_of(scene, PARAMETERS, VIEWS),
+        stokes_of(Scene(SmoothSurface()), PARAMETERS, VIEWS),
+        rtol=1e-12,
+        atol=1e-17,
+    )
+
+
+def test_an_analyzer_of_each_view_is_read_in_its_order() -> None:
+    turned = Scene(SmoothSurface(), instrument=Instrument((Analyzer((0.0, 90.0, 45.0)),)))
+    plain = predict(Scene(SmoothSurface()), PARAMETERS, VIEWS)
+    found = predict(turned, PARAMETERS, VIEWS)
+    share = (1.0 + np.array([1.0, -1.0, 0.0]) * plain["q"]) / 2.0
+    np.testing.assert_allclose(found["intensity"], share * plain["intensity"], rtol=1e-12)
+
+
+def test_an_extended_source_needs_no_direction_of_the_light() -> None:
+    moved = VIEWS._replace(light_zenith=VIEWS.light_zenith + 20.0, light_azimuth=VIEWS.view_azimuth)
+    for source in (UniformSky(), Disc(10.0)):
+        scene = Scene(RoughSurface(GGX(), source), Depolarizer(), StokesMixing())
+        here, there = (stokes_of(scene, PARAMETERS, views) for views in (VIEWS, moved))
+        np.testing.assert_allclose(here, there, rtol=1e-15)

@@ -10,12 +10,14 @@ from polar_bayes.errors import SceneError
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import UniformSky
 from polar_bayes.physics.microfacet import GGX, Beckmann
+from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
 zenith = st.floats(0.0, 89.0)
 azimuth = st.floats(0.0, 360.0)
 POINT = RoughSurface(Beckmann())
 MATERIAL = {"roughness": jnp.array([0.3]), "refractive_index": jnp.array([1.5])}
+BARE = Stack(MATERIAL["refractive_index"])
 
 
 def at(view: float, light: float, difference: float) -> Geometry:
@@ -26,8 +28,8 @@ def at(view: float, light: float, difference: float) -> Geometry:
 @settings(deadline=None, max_examples=40)
 def test_viewer_and_light_may_change_places(view: float, light: float, difference: float) -> None:
     """Helmholtz: brightness per irradiance on the plane is symmetric, and so is polarization."""
-    there = POINT.light(MATERIAL, at(view, light, difference))
-    back = POINT.light(MATERIAL, at(light, view, -difference))
+    there = POINT.light(MATERIAL, at(view, light, difference), BARE)
+    back = POINT.light(MATERIAL, at(light, view, -difference), BARE)
     cosines = np.cos(np.deg2rad(light)) / np.cos(np.deg2rad(view))
     np.testing.assert_allclose(there.intensity, back.intensity * cosines, rtol=1e-9)
     np.testing.assert_allclose(
@@ -40,8 +42,8 @@ def test_viewer_and_light_may_change_places(view: float, light: float, differenc
 def test_the_other_side_of_the_plane_is_a_mirror_image(
     view: float, light: float, difference: float
 ) -> None:
-    left = POINT.light(MATERIAL, at(view, light, difference))
-    right = POINT.light(MATERIAL, at(view, light, -difference))
+    left = POINT.light(MATERIAL, at(view, light, difference), BARE)
+    right = POINT.light(MATERIAL, at(view, light, -difference), BARE)
     np.testing.assert_allclose(left.q, right.q, atol=1e-12)
     np.testing.assert_allclose(left.u, -right.u, atol=1e-12)
 
@@ -52,10 +54,10 @@ def test_roughness_does_not_change_what_one_facet_polarizes(
 ) -> None:
     geometry = at(40.0, 60.0, 150.0)
     rough, smooth = (
-        RoughSurface(distribution).light({**MATERIAL, "roughness": jnp.array([r])}, geometry)
+        RoughSurface(distribution).light({**MATERIAL, "roughness": jnp.array([r])}, geometry, BARE)
         for r in (0.5, 0.01)
     )
-    mirror = SmoothSurface().light(MATERIAL, geometry)
+    mirror = SmoothSurface().light(MATERIAL, geometry, BARE)
     for light in (rough, smooth):
         np.testing.assert_allclose(light.q, mirror.q, rtol=1e-14)
         np.testing.assert_allclose(light.u, mirror.u, rtol=1e-14)
@@ -65,8 +67,9 @@ def test_roughness_does_not_change_what_one_facet_polarizes(
 def test_a_smooth_exit_is_the_limit_of_a_rough_one(distribution: Beckmann | GGX) -> None:
     """GGX keeps a tail of steep facets at any roughness: its limit is reached more slowly."""
     views = Geometry(*(jnp.array([0.0, 30.0, 60.0, 80.0]) for _ in range(4)))
-    rough = RoughSurface(distribution).exit({**MATERIAL, "roughness": jnp.array([1e-4])}, views)
-    smooth = SmoothSurface().exit(MATERIAL, views)
+    nearly = {**MATERIAL, "roughness": jnp.array([1e-4])}
+    rough = RoughSurface(distribution).exit(nearly, views, BARE)
+    smooth = SmoothSurface().exit(MATERIAL, views, BARE)
     bound = 1e-4 if isinstance(distribution, GGX) else 1e-6
     np.testing.assert_allclose(rough.q, smooth.q, atol=bound)
     np.testing.assert_allclose(rough.intensity, smooth.intensity, rtol=10 * bound)
@@ -75,7 +78,7 @@ def test_a_smooth_exit_is_the_limit_of_a_rough_one(distribution: Beckmann | GGX)
 def test_intensity_of_a_highlight_grows_as_the_inverse_square_of_roughness() -> None:
     geometry = at(30.0, 30.0, 180.0)
     narrow, wide = (
-        POINT.light({**MATERIAL, "roughness": jnp.array([r])}, geometry) for r in (1e-4, 1e-3)
+        POINT.light({**MATERIAL, "roughness": jnp.array([r])}, geometry, BARE) for r in (1e-4, 1e-3)
     )
     np.testing.assert_allclose(narrow.intensity, 100.0 * wide.intensity, rtol=1e-9)
 
@@ -85,8 +88,8 @@ def test_rough_exit_is_near_the_truth(height_field_exit: np.ndarray) -> None:
     roughness, zenith_ = height_field_exit[:, 1], height_field_exit[:, 2]
     truth = height_field_exit[:, 5] / height_field_exit[:, 4]
     views = Geometry(*(jnp.asarray(zenith_) for _ in range(4)))
-    material = {"roughness": jnp.asarray(roughness), "refractive_index": jnp.full(14, 1.5)}
-    found = RoughSurface(Beckmann()).exit(material, views).q
+    material = {**MATERIAL, "roughness": jnp.asarray(roughness)}
+    found = RoughSurface(Beckmann()).exit(material, views, BARE).q
     bound = np.where(roughness == 0.1, 0.0027, 0.0112)
     assert np.all(np.abs(found - truth) <= bound)
 
@@ -96,8 +99,8 @@ def test_rough_reflection_is_near_the_truth(height_field_sky: np.ndarray) -> Non
     rows = height_field_sky[height_field_sky[:, 3] == 0]
     bound = np.where(rows[:, 1] == 0.1, 0.0036, 0.0155)
     views = Geometry(*(jnp.asarray(rows[:, 2]) for _ in range(4)))
-    material = {"roughness": jnp.asarray(rows[:, 1]), "refractive_index": jnp.full(len(rows), 1.5)}
-    light = RoughSurface(Beckmann(), UniformSky()).light(material, views)
+    material = {**MATERIAL, "roughness": jnp.asarray(rows[:, 1])}
+    light = RoughSurface(Beckmann(), UniformSky()).light(material, views, BARE)
     assert np.all(np.abs(light.q - rows[:, 5] / rows[:, 4]) <= bound)
 
 
@@ -107,8 +110,17 @@ def test_rough_reflection_is_near_the_truth(height_field_sky: np.ndarray) -> Non
         ({"distribution": UniformSky()}, r"Beckmann\(\) or GGX\(\)"),
         ({"illumination": GGX()}, r"PointSource\(\), Disc\(5.0\) or UniformSky\(\)"),
         ({"quadrature": 32}, r"FacetQuadrature\(along=6, across=5\)"),
+        ({"slopes": 0.1}, r"IsotropicSlopes\(\) or AnisotropicSlopes\(azimuth=0.0\)"),
+        ({"shadowing": None}, r"SeparableShadowing\(\), NoShadowing\(\)"),
+        ({"way_out": "rough"}, r"RoughExit\(\) or SmoothExit\(\)"),
     ],
 )
 def test_parts_are_checked(part: dict, mend: str) -> None:
-    with pytest.raises(SceneError, match=rf"RoughSurface: .* is not such a part; give {mend}"):
+    name = next(iter(part))
+    with pytest.raises(SceneError, match=rf"RoughSurface: {name}: .* is no such part; give {mend}"):
         RoughSurface(**part)
+
+
+def test_a_smooth_surface_takes_a_beam_only() -> None:
+    with pytest.raises(SceneError, match=r"SmoothSurface: beam: UniformSky\(\) is no such part; g"):
+        SmoothSurface(UniformSky())

@@ -1,0 +1,1 @@
+"""What each effect of a scene changes, and what it costs."""

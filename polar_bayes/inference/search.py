@@ -1,0 +1,58 @@
+"""The way to the modes that every fit begins with: climbs from many prior draws."""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.modes import Modes, ValueAndGradient, climb, distinct
+from polar_bayes.inference.program import Program
+from polar_bayes.observation.data import Observations
+
+Progress = Callable[[str, float], None]
+
+
+def from_prior(program: Program, key: Array, draws: int, data: Observations) -> Array:
+    """Unconstrained vectors drawn from the prior.
+
+    Args:
+        program: The model.
+        key: Random key.
+        draws: How many.
+        data: A capture of the program's layout.
+
+    Returns:
+        Shape (draws, size).
+    """
+    draw = jax.jit(lambda keys, data: jax.lax.map(lambda k: program.from_prior(k, data), keys))
+    return draw(jax.random.split(key, draws), data)
+
+
+def find_modes(potential: ValueAndGradient, starts: np.ndarray, progress: Progress) -> Modes:
+    """Climb from every start and keep the distinct peaks.
+
+    Args:
+        potential: Minus the log density and its gradient.
+        starts: Unconstrained vectors, (start, size).
+        progress: Called with the name of the stage and the fraction of it that is done.
+
+    Returns:
+        The peaks, heaviest first.
+
+    Raises:
+        FitError: No start reached a peak.
+    """
+    climbs = []
+    for number, start in enumerate(starts):
+        climbs.append(climb(potential, start))
+        progress("searching for modes", (number + 1) / len(starts))
+    modes = distinct(climbs)
+    if modes is None:
+        raise FitError(
+            f"none of {len(starts)} starts reached a peak of the posterior",
+            where="fit",
+            mend="check the capture against the prior predictive, or give narrower priors",
+        )
+    return modes

@@ -1,0 +1,217 @@
+r"""One plane boundary between two media, bare or with thin films, for light that comes from air.
+
+Media on one path share the squared sine B of the angle in air. With Q = n cos(angle inside)
+= sqrt((n-1)(n+1) + c^2) for each medium, A = Q_1 Q_2 and rho = (n_2^2 - n_1^2)/(Q_1 + Q_2)^2,
+
+    r_s = -rho,    r_p = -rho (A-B)/(A+B)
+
+in the sign that makes both alike at normal incidence. For n_1 = 1 this is `fresnel.reflection`.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from polar_bayes.physics.diattenuation import Diattenuation
+
+# Smallest squared cosine in a medium: light that cannot enter it is let in by 1e-6.
+EVANESCENT = 1e-12
+
+
+class Medium(NamedTuple):
+    """A medium on the path of light.
+
+    Args:
+        refractive_index: Refractive index. Broadcasts with (..., view[, facet]), 1, >= 1.
+        normal: Q, the index times the cosine inside. Same shape, 1.
+    """
+
+    refractive_index: Array
+    normal: Array
+
+
+class Film(NamedTuple):
+    """A layer thin enough for interference.
+
+    Args:
+        medium: What it is made of.
+        phase: exp(2 i delta), the phase of one round trip. Complex.
+    """
+
+    medium: Medium
+    phase: Array
+
+
+class Amplitude(NamedTuple):
+    """Field reflected along s and p: mean +- contrast B. Real for a bare boundary."""
+
+    mean: Array
+    contrast: Array
+
+    def times(self, other: "Amplitude", sin_squared: Array) -> "Amplitude":
+        """One after the other."""
+        return Amplitude(
+            self.mean * other.mean + self.contrast * other.contrast * sin_squared**2,
+            self.mean * other.contrast + self.contrast * other.mean,
+        )
+
+    def over(self, other: "Amplitude", sin_squared: Array) -> "Amplitude":
+        """Divided by another, which is zero neither along s nor along p."""
+        difference = other.contrast * sin_squared
+        product = (other.mean - difference) * (other.mean + difference)
+        inverse = Amplitude(other.mean / product, -other.contrast / product)
+        return self.times(inverse, sin_squared)
+
+    def power(self, sin_squared: Array) -> Diattenuation:
+        """Squared moduli."""
+        straight, crossed = _square(self.mean), _square(self.contrast)
+        both = jnp.real(self.mean) * jnp.real(self.contrast)
+        both = both + jnp.imag(self.mean) * jnp.imag(self.contrast)
+        return Diattenuation(
+            straight + crossed * sin_squared**2, 2.0 * both, 2.0 * crossed, sin_squared
+        )
+
+
+def medium(refractive_index: Array, cos_squared: Array) -> Medium:
+    """The medium of an index, for light whose squared cosine in air is given.
+
+    Below zero it belongs to light that is trapped and would not reach the air; where it does not
+    reach this medium either, next to nothing passes.
+    """
+    normal_squared = (refractive_index - 1.0) * (refractive_index + 1.0) + cos_squared
+    # Light from the air reaches every medium, however close to grazing it comes.
+    least = jnp.where(cos_squared > 0.0, 0.0, EVANESCENT)
+    return Medium(refractive_index, jnp.sqrt(jnp.maximum(normal_squared, least)))
+
+
+def step(above: Medium, below: Medium) -> Array:
+    """Factor (n_2^2 - n_1^2)^2 of every reflectance of a bare boundary. Any shape, 1, >= 0."""
+    return (
+        (below.refractive_index - above.refractive_index)
+        * (below.refractive_index + above.refractive_index)
+    ) ** 2
+
+
+def relative_reflection(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
+    """Power that a bare boundary reflects, without the factor `step`.
+
+    Args:
+        above: Medium that the light comes from.
+        below: Medium that it goes to.
+        sin_squared: B, the squared sine in air. Shape (..., view[, facet]), 1.
+
+    Returns:
+        Reflectance over `step`: regular, and not zero, where the media are alike.
+
+    Raises:
+        Nothing.
+    """
+    a, b = above.normal * below.normal, sin_squared
+    # Squared last: near grazing the derivatives of the whole would overflow single precision.
+    shape = (1.0 / ((above.normal + below.normal) ** 2 * (a + b))) ** 2
+    return Diattenuation(shape * (a**2 + b**2), 2.0 * shape * a, 2.0 * shape, b)
+
+
+def reflection(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
+    """Power that a bare boundary reflects; see `relative_reflection`."""
+    b, a = sin_squared, above.normal * below.normal
+    scale = (_rho(above, below) / (a + b)) ** 2
+    return Diattenuation(scale * (a**2 + b**2), 2.0 * scale * a, 2.0 * scale, b)
+
+
+def transmission(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
+    """Power that a bare boundary lets pass, the same in both directions.
+
+    Args:
+        above: Medium that the light comes from.
+        below: Medium that it goes to.
+        sin_squared: B, the squared sine in air. Shape (..., view[, facet]), 1.
+
+    Returns:
+        Transmittance, in [0, 1].
+
+    Raises:
+        Nothing.
+    """
+    a, b, total = above.normal * below.normal, sin_squared, above.normal + below.normal
+    indexes = above.refractive_index * below.refractive_index
+    p_like = indexes / (total * (a + b))
+    scale = (_rho(above, below) / (a + b)) ** 2
+    # sqrt(s) - sqrt(p) of the transmittances, over B.
+    change = below.refractive_index - above.refractive_index
+    ratio = change / total
+    roots = 2.0 * ratio**2 / (total * (a + b) * (1.0 - ratio) * (1.0 + ratio))
+    return Diattenuation(
+        mean=2.0 * a * (1.0 / total**2 + p_like**2),
+        contrast=-2.0 * scale * a,
+        shortfall=2.0 * a * roots**2,
+        sin_squared=b,
+    )
+
+
+def filmed(
+    above: Medium, films: tuple[Film, ...], below: Medium, sin_squared: Array
+) -> tuple[Diattenuation, Diattenuation]:
+    r"""Power that a boundary with thin films reflects and lets pass (Airy's formulas).
+
+    $$ r = \frac{r_1 + r_2 e^{2i\delta}}{1 + r_1 r_2 e^{2i\delta}}, \qquad
+       T = \frac{T_1 T_2}{|1 + r_1 r_2 e^{2i\delta}|^2} $$
+
+    from the deepest film upwards, where r_2 and T_2 are what lies below.
+
+    Args:
+        above: Medium that the light comes from.
+        films: From the top down; without absorption.
+        below: Medium that it goes to.
+        sin_squared: B, the squared sine in air. Shape (..., view[, facet]), 1.
+
+    Returns:
+        `(reflectance, transmittance)`.
+
+    Raises:
+        Nothing.
+
+    Source:
+        Born and Wolf, Principles of Optics, on a dielectric film; layers by recursion.
+    """
+    media = (above, *(film.medium for film in films), below)
+    amplitude = _amplitude(media[-2], media[-1], sin_squared)
+    passed = transmission(media[-2], media[-1], sin_squared)
+    for upper, film in zip(reversed(media[:-2]), reversed(films), strict=True):
+        first = _amplitude(upper, film.medium, sin_squared)
+        later = Amplitude(amplitude.mean * film.phase, amplitude.contrast * film.phase)
+        trip = first.times(later, sin_squared)
+        trips = Amplitude(1.0 + trip.mean, trip.contrast)
+        amplitude = Amplitude(first.mean + later.mean, first.contrast + later.contrast)
+        amplitude = amplitude.over(trips, sin_squared)
+        echoes = Amplitude(jnp.ones_like(trips.mean), jnp.zeros_like(trips.mean))
+        echo = echoes.over(trips, sin_squared).power(sin_squared)
+        passed = transmission(upper, film.medium, sin_squared).times(passed).times(echo)
+    return amplitude.power(sin_squared), passed
+
+
+def _rho(above: Medium, below: Medium) -> Array:
+    """Field reflected along s, without its sign."""
+    difference = (below.refractive_index - above.refractive_index) * (
+        below.refractive_index + above.refractive_index
+    )
+    return difference / (above.normal + below.normal) ** 2
+
+
+def _square_difference(above: Medium, below: Medium) -> Array:
+    """n_2^2 - n_1^2."""
+    first, second = above.refractive_index, below.refractive_index
+    return (second - first) * (second + first)
+
+
+def _amplitude(above: Medium, below: Medium, sin_squared: Array) -> Amplitude:
+    """Field reflected by a bare boundary."""
+    a = above.normal * below.normal
+    share = -_rho(above, below) / (a + sin_squared)
+    return Amplitude(share * a, share)
+
+
+def _square(number: Array) -> Array:
+    """Squared modulus, smooth at zero."""
+    return jnp.real(number) ** 2 + jnp.imag(number) ** 2

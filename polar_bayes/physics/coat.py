@@ -1,0 +1,175 @@
+"""What lies on the body: clear coats, thin films, and stacks of them.
+
+A coat lies on every facet of a rough surface alike. One of your own says which layers it adds.
+"""
+
+import abc
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import override
+
+from jaxtyping import Array
+
+from polar_bayes.errors import SceneError
+from polar_bayes.physics.part import (
+    Part,
+    Setting,
+    check_part,
+    check_setting,
+    names_in,
+    parameters_of,
+    value_of,
+)
+from polar_bayes.physics.stack import Layer
+
+
+@dataclasses.dataclass(frozen=True)
+class AbstractCoat(Part):
+    """One or more layers on the body."""
+
+    @abc.abstractmethod
+    def layers(
+        self, parameters: Mapping[str, Array], wavelength: Array | None
+    ) -> tuple[Layer, ...]:
+        """Layers from the top down.
+
+        Args:
+            parameters: Material parameters by name. Each broadcasts with (..., view).
+            wavelength: Wavelength in air, nm, broadcasts with (..., view); None where the
+                capture has none.
+
+        Returns:
+            Layers.
+
+        Raises:
+            SceneError: The coat needs a wavelength and there is none.
+        """
+
+    @override
+    def simpler(self) -> tuple[Part | None, ...]:
+        return (None,)
+
+
+@dataclasses.dataclass(frozen=True)
+class ClearCoat(AbstractCoat):
+    r"""A coat much thicker than the coherence of the light: reflections add as powers.
+
+    $$ R = R_{12} + \frac{(1-R_{12})^2 R_{23} t^2}{1 - R_{12} R_{23} t^2}, \qquad
+       t = e^{-\text{absorbance}/\cos\theta_\text{coat}} $$
+
+    for s and p, over any base; light scattered in the body passes the coat twice and is partly
+    turned back by it.
+
+    Args:
+        refractive_index: Of the coat, 1, 1 to 3; a name fits it.
+        absorbance: Minus the log of the share that passes once at normal incidence, 1, >= 0; a
+            name fits it, and 0 leaves it out.
+
+    Raises:
+        SceneError: A setting is neither a number in its range nor a name.
+    """
+
+    refractive_index: Setting = "coat_refractive_index"
+    absorbance: Setting = "coat_absorbance"
+
+    def __post_init__(self) -> None:
+        check_setting(self.refractive_index, "ClearCoat: refractive_index", 1.0, 3.0)
+        check_setting(self.absorbance, "ClearCoat: absorbance", 0.0, 100.0)
+
+    @property
+    @override
+    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
+        return names_in(self.refractive_index, self.absorbance)
+
+    @override
+    def layers(
+        self, parameters: Mapping[str, Array], wavelength: Array | None
+    ) -> tuple[Layer, ...]:
+        clear = self.absorbance == 0.0
+        index = value_of(self.refractive_index, parameters)
+        return (Layer(index, None if clear else value_of(self.absorbance, parameters)),)
+
+
+@dataclasses.dataclass(frozen=True)
+class ThinFilm(AbstractCoat):
+    """A film without absorption, thin enough for fringes over wavelength (Airy's formulas).
+
+    Args:
+        refractive_index: Of the film, 1, 1 to 3; a name fits it.
+        thickness_nm: Thickness, nm, 0 to 1e5; a name fits it.
+
+    Raises:
+        SceneError: A setting is neither a number in its range nor a name.
+    """
+
+    refractive_index: Setting = "film_refractive_index"
+    thickness_nm: Setting = "film_thickness"
+
+    def __post_init__(self) -> None:
+        check_setting(self.refractive_index, "ThinFilm: refractive_index", 1.0, 3.0)
+        check_setting(self.thickness_nm, "ThinFilm: thickness_nm", 0.0, 1e5)
+
+    @property
+    @override
+    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
+        return names_in(self.refractive_index, self.thickness_nm)
+
+    @override
+    def layers(
+        self, parameters: Mapping[str, Array], wavelength: Array | None
+    ) -> tuple[Layer, ...]:
+        if wavelength is None:
+            raise SceneError(
+                "fringes depend on the wavelength, and there is none",
+                where="ThinFilm",
+                mend="give the geometry a wavelength in nm, or the capture such a coordinate",
+            )
+        thickness = value_of(self.thickness_nm, parameters)
+        index = value_of(self.refractive_index, parameters)
+        return (Layer(index, wavenumber=4.0 * math.pi * thickness / wavelength),)
+
+
+@dataclasses.dataclass(frozen=True)
+class CoatStack(AbstractCoat):
+    """Several coats, one on the other.
+
+    Args:
+        coats: From the top down.
+
+    Raises:
+        SceneError: Something in the tuple is no coat, or two coats would share a parameter.
+    """
+
+    coats: tuple[AbstractCoat, ...]
+
+    def __post_init__(self) -> None:
+        check_part(self.coats, "CoatStack", tuple, "a tuple: CoatStack((ThinFilm(), ClearCoat()))")
+        for coat in self.coats:
+            check_part(coat, "CoatStack", AbstractCoat, "coats such as ClearCoat() or ThinFilm()")
+        names = [name for coat in self.coats for name in coat.parameters]
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise SceneError(
+                f"two coats read {', '.join(repeated)}",
+                where="CoatStack",
+                mend="name the parameters apart: ClearCoat(absorbance='lacquer_absorbance')",
+            )
+
+    @property
+    @override
+    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
+        return parameters_of(*self.coats)
+
+    @override
+    def simpler(self) -> tuple[Part | None, ...]:
+        others = [
+            tuple(coat for coat in self.coats if coat is not left_out) for left_out in self.coats
+        ]
+        return tuple(CoatStack(coats) if coats else None for coats in others)
+
+    @override
+    def layers(
+        self, parameters: Mapping[str, Array], wavelength: Array | None
+    ) -> tuple[Layer, ...]:
+        return tuple(layer for coat in self.coats for layer in coat.layers(parameters, wavelength))

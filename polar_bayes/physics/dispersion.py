@@ -1,0 +1,126 @@
+"""How the index of the body changes with color: laws that replace one index per wavelength."""
+
+import abc
+import dataclasses
+from collections.abc import Mapping
+from typing import override
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from polar_bayes.errors import SceneError
+from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
+
+# Wavelengths are in nm outside and in micrometers inside, as coefficients are tabulated.
+NANOMETERS = 1e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class AbstractDispersion(Part):
+    """A law for the refractive index over wavelength."""
+
+    @abc.abstractmethod
+    def index(self, parameters: Mapping[str, Array], wavelength: Array) -> Array:
+        """Refractive index.
+
+        Args:
+            parameters: The law's parameters by name. Each broadcasts with (..., view).
+            wavelength: Wavelength in air. Broadcasts with (..., view), nm, > 0.
+
+        Returns:
+            n. Broadcast shape, 1.
+
+        Raises:
+            Nothing.
+        """
+
+
+@dataclasses.dataclass(frozen=True)
+class Cauchy(AbstractDispersion):
+    r"""Cauchy's law, for transparent bodies in the visible.
+
+    $$ n(\lambda) = A + B/\lambda^2 + C/\lambda^4 $$
+
+    with the wavelength in micrometers, as A, B and C are tabulated.
+
+    Args:
+        a: A, the index towards long waves, 1, 1 to 3; a name fits it.
+        b: B, micrometer^2, 0 to 1; a name fits it.
+        c: C, micrometer^4, -1 to 1; a name fits it.
+
+    Raises:
+        SceneError: A setting is neither a number in its range nor a name.
+    """
+
+    a: Setting = "cauchy_a"
+    b: Setting = "cauchy_b"
+    c: Setting = 0.0
+
+    def __post_init__(self) -> None:
+        check_setting(self.a, "Cauchy: a", 1.0, 3.0)
+        check_setting(self.b, "Cauchy: b", 0.0, 1.0)
+        check_setting(self.c, "Cauchy: c", -1.0, 1.0)
+
+    @property
+    @override
+    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
+        return names_in(self.a, self.b, self.c)
+
+    @override
+    def index(self, parameters: Mapping[str, Array], wavelength: Array) -> Array:
+        a, b = value_of(self.a, parameters), value_of(self.b, parameters)
+        inverse = 1.0 / (NANOMETERS * wavelength) ** 2
+        if self.c == 0.0:
+            return a + b * inverse
+        return a + inverse * (b + value_of(self.c, parameters) * inverse)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sellmeier(AbstractDispersion):
+    r"""Sellmeier's law, one resonance or more.
+
+    $$ n^2(\lambda) = 1 + \sum_i \frac{B_i \lambda^2}{\lambda^2 - C_i} $$
+
+    with the wavelength in micrometers. One resonance in the ultraviolet fits most bodies over the
+    visible; the tabulated glasses have three.
+
+    Args:
+        strengths: B_i, 1, 0 to 10 each; names fit them.
+        resonances: C_i, the squared wavelengths of the resonances, micrometer^2, 0 to 0.1 (or
+            above 1, for one in the infrared); names fit them.
+
+    Raises:
+        SceneError: The two are not tuples of one length, or a setting is neither a number in its
+            range nor a name.
+    """
+
+    strengths: tuple[Setting, ...] = ("sellmeier_strength",)
+    resonances: tuple[Setting, ...] = ("sellmeier_resonance",)
+
+    def __post_init__(self) -> None:
+        both = (self.strengths, self.resonances)
+        if not all(isinstance(each, tuple) and each for each in both) or len(both[0]) != len(
+            both[1]
+        ):
+            raise SceneError(
+                f"strengths={self.strengths!r} and resonances={self.resonances!r} do not pair",
+                where="Sellmeier",
+                mend="give two tuples of one length: Sellmeier((1.04, 0.23), (0.006, 0.02))",
+            )
+        for strength, resonance in zip(*both, strict=True):
+            check_setting(strength, "Sellmeier: strengths", 0.0, 10.0)
+            check_setting(resonance, "Sellmeier: resonances", 0.0, 1e4)
+
+    @property
+    @override
+    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
+        return names_in(*self.strengths, *self.resonances)
+
+    @override
+    def index(self, parameters: Mapping[str, Array], wavelength: Array) -> Array:
+        inverse = 1.0 / (NANOMETERS * wavelength) ** 2
+        square = jnp.ones_like(inverse)
+        for strength, resonance in zip(self.strengths, self.resonances, strict=True):
+            depth = 1.0 - value_of(resonance, parameters) * inverse
+            square = square + value_of(strength, parameters) / depth
+        return jnp.sqrt(jnp.maximum(square, 1.0))

@@ -1,0 +1,44 @@
+"""Parameters of scenes as readers see them: symbol, meaning, unit."""
+
+from typing import NamedTuple
+
+
+class Quantity(NamedTuple):
+    """How a parameter is written.
+
+    Args:
+        symbol: The paper's or the field's letter; empty where there is none.
+        meaning: In words.
+        unit: As xarray and ArviZ show it.
+    """
+
+    symbol: str
+    meaning: str
+    unit: str = "1"
+
+
+NOTATION: dict[str, Quantity] = {
+    "roughness": Quantity("r", "roughness"),
+    "subsurface_fraction": Quantity("beta", "subsurface fraction"),
+    "absorption": Quantity("a", "absorption relative to scattering"),
+    "refractive_index": Quantity("n", "refractive index"),
+    "roughness_across": Quantity("", "roughness across the direction of `roughness`"),
+    "roughness_azimuth": Quantity("", "azimuth along which `roughness` is meant", "degree"),
+    "albedo": Quantity("A", "albedo of the body"),
+    "polarized_fraction": Quantity("", "share of scattering that polarizes"),
+    "cauchy_a": Quantity("A", "Cauchy's A"),
+    "cauchy_b": Quantity("B", "Cauchy's B", "micrometer^2"),
+    "sellmeier_strength": Quantity("B", "Sellmeier's strength"),
+    "sellmeier_resonance": Quantity("C", "Sellmeier's squared resonance", "micrometer^2"),
+    "coat_refractive_index": Quantity("", "refractive index of the coat"),
+    "coat_absorbance": Quantity("", "absorbance of the coat at normal incidence"),
+    "film_refractive_index": Quantity("", "refractive index of the film"),
+    "film_thickness": Quantity("", "thickness of the film", "nm"),
+    "angle_zero": Quantity("", "offset of both zenith angles", "degree"),
+    "beam_overlap_zenith": Quantity("", "zenith where the beam fills the sample", "degree"),
+}
+
+
+def notation(name: str) -> Quantity:
+    """The row of a parameter, or one made of its name."""
+    return NOTATION.get(name, Quantity("", name.replace("_", " ")))

@@ -1,0 +1,259 @@
+"""All that lies between air and the body on one facet: bare, or under coats and films.
+
+A coat describes itself by layers (`polar_bayes.physics.coat`); this file stacks them. Thick layers
+add powers, thin ones add fields. Without layers it is one Fresnel boundary and nothing else.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from polar_bayes.physics import boundary, fresnel
+from polar_bayes.physics.boundary import EVANESCENT, Film, Medium
+from polar_bayes.physics.diattenuation import Diattenuation
+from polar_bayes.physics.part import like
+
+# Squared sines of inner angles that reach a coat but not the air, crowded towards grazing.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+TRAPPED_SHARE = 1.0 - (0.5 * (1.0 - _NODES)) ** 2
+TRAPPED_WEIGHT = 0.5 * (1.0 - _NODES) * _WEIGHTS
+
+
+class Layer(NamedTuple):
+    """One layer on the body.
+
+    Args:
+        refractive_index: Refractive index. Broadcasts with (..., view), 1, >= 1.
+        absorbance: Minus the log of what passes at normal incidence; None for a clear layer.
+        wavenumber: 4 pi thickness/wavelength for a film thin enough for interference, so that
+            the phase of a round trip is wavenumber times Q; None for a thick layer.
+    """
+
+    refractive_index: Array
+    absorbance: Array | None = None
+    wavenumber: Array | None = None
+
+
+class Stack(NamedTuple):
+    """Layers on a body.
+
+    Args:
+        refractive_index: Refractive index of the body. Broadcasts with (..., view), 1, >= 1.
+        layers: From the top down; none for a bare surface.
+    """
+
+    refractive_index: Array
+    layers: tuple[Layer, ...] = ()
+
+    def per_facet(self) -> "Stack":
+        """The same with a trailing axis, for many facets of one view."""
+        return jax.tree.map(lambda array: array[..., None] if array.ndim else array, self)
+
+    def reflection(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
+        """Share of the light that comes back from the whole stack.
+
+        Args:
+            cos_incidence: Cosine of incidence in air. Shape (..., view[, facet]), 1, in (0, 1].
+            sin_squared: B, its squared sine. Same shape, 1.
+
+        Returns:
+            Reflectance.
+
+        Raises:
+            Nothing.
+        """
+        if not self.layers:
+            air, body = (
+                _air(cos_incidence),
+                boundary.medium(self.refractive_index, cos_incidence**2),
+            )
+            return boundary.reflection(air, body, sin_squared)
+        return self._respond(cos_incidence, sin_squared)[0]
+
+    def relative_reflection(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
+        """Reflectance over `scale`: its ratios exist for a body that reflects nothing, too."""
+        if not self.layers:
+            air, body = (
+                _air(cos_incidence),
+                boundary.medium(self.refractive_index, cos_incidence**2),
+            )
+            return boundary.relative_reflection(air, body, sin_squared)
+        power = self._respond(cos_incidence, sin_squared)[0]
+        # A trace, far below any reading: layers like air on a body like air reflect nothing.
+        trace = jnp.finfo(power.mean.dtype).eps ** 1.75
+        return power._replace(mean=jnp.maximum(power.mean, trace))
+
+    @property
+    def scale(self) -> Array:
+        """Factor that `relative_reflection` leaves out, shape of the index."""
+        return (
+            jnp.ones_like(self.refractive_index)
+            if self.layers
+            else fresnel.index_step(self.refractive_index)
+        )
+
+    def transmission(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
+        """Share of the light that passes the whole stack, the same inwards and outwards."""
+        if not self.layers:
+            air, body = (
+                _air(cos_incidence),
+                boundary.medium(self.refractive_index, cos_incidence**2),
+            )
+            return boundary.transmission(air, body, sin_squared)
+        return self._respond(cos_incidence, sin_squared)[1]
+
+    def hemispherical_transmission(self) -> Array:
+        """Share of diffuse light from outside that reaches the body, shape of the index."""
+        if not self.layers:
+            return 1.0 - fresnel.hemispherical_reflection(self.refractive_index)
+        cosine = like(fresnel.HEMISPHERE_COSINES, self.refractive_index)
+        weight = like(
+            2.0 * fresnel.HEMISPHERE_COSINES * fresnel.HEMISPHERE_WEIGHTS, self.refractive_index
+        )
+        through = self.per_facet().transmission(cosine, (1.0 - cosine) * (1.0 + cosine))
+        return jnp.sum(weight * through.mean, axis=-1)
+
+    def escape(self) -> Array:
+        r"""Share of diffuse light in the body that the stack does not turn back, 1 - F_i.
+
+        $$ 1 - F_i = \frac{1}{n^2}\int_0^{n^2} (1 - R'(B))\, dB $$
+
+        over the squared sine B in air: up to 1 light leaves, beyond it a coat may absorb it.
+
+        Returns:
+            Shape of the index, 1, in (0, 1].
+
+        Raises:
+            Nothing.
+        """
+        if not self.layers:
+            return fresnel.escape(self.refractive_index)
+        cosine = like(fresnel.HEMISPHERE_COSINES, self.refractive_index)
+        weight = like(
+            2.0 * fresnel.HEMISPHERE_COSINES * fresnel.HEMISPHERE_WEIGHTS, self.refractive_index
+        )
+        left = self.per_facet()._not_returned(cosine**2, (1.0 - cosine) * (1.0 + cosine))
+        # Sums, since matrix products of accelerators drop digits in single precision.
+        lost = jnp.sum(weight * left, axis=-1)
+        if any(layer.absorbance is not None for layer in self.layers):
+            lost = lost + self._absorbed_under_total_reflection()
+        return lost / self.refractive_index**2
+
+    def _absorbed_under_total_reflection(self) -> Array:
+        """Part of that integral over the angles that reach the lowest coat but not the air."""
+        lowest = [layer for layer in self.layers if layer.wavenumber is None][-1]
+        end = jnp.minimum(self.refractive_index, lowest.refractive_index) ** 2
+        beyond = (end - 1.0)[..., None] * like(TRAPPED_SHARE, self.refractive_index)
+        absorbed = self.per_facet()._not_returned(-beyond, 1.0 + beyond, reaches_air=False)
+        return (end - 1.0) * jnp.sum(
+            like(TRAPPED_WEIGHT, self.refractive_index) * absorbed, axis=-1
+        )
+
+    def _bare(self, cos_incidence: Array) -> tuple[Medium, Medium]:
+        """Air and body."""
+        return _air(cos_incidence), boundary.medium(self.refractive_index, cos_incidence**2)
+
+    def _hemisphere(self) -> tuple[Array, Array]:
+        """Cosines in air, and weights that average over diffuse light."""
+        cosine = fresnel.HEMISPHERE_COSINES
+        weight = 2.0 * cosine * fresnel.HEMISPHERE_WEIGHTS
+        return like(cosine, self.refractive_index), like(weight, self.refractive_index)
+
+    def _respond(
+        self, cos_incidence: Array, sin_squared: Array
+    ) -> tuple[Diattenuation, Diattenuation]:
+        """Reflectance and transmittance, layer by layer from the body upwards."""
+        cos_squared = cos_incidence**2
+        sections = self._sections()
+        powers = _boundaries(sections, _air(cos_incidence), cos_squared, sin_squared)
+        back, passed = powers[-1]
+        for (mirrored, through), (_, coat) in zip(powers[-2::-1], sections[-2::-1], strict=True):
+            below = back
+            if coat.absorbance is not None:
+                # Light darker than any reading, e^-13 or e^-106, still has a polarization.
+                darkest = -0.15 * np.log(np.finfo(cos_squared.dtype).tiny).item()
+                depth = coat.absorbance * _slant(coat, cos_squared)
+                remaining = jnp.exp(-jnp.minimum(depth, darkest))
+                below, passed = back.scaled(remaining**2), passed.scaled(remaining)
+            trips = mirrored.times(below).repeated()
+            back = mirrored.plus(through.times(through).times(below).times(trips))
+            passed = through.times(passed).times(trips)
+        return back, passed
+
+    def _not_returned(
+        self, cos_squared: Array, sin_squared: Array, *, reaches_air: bool = True
+    ) -> Array:
+        """1 - R' for light from the body, mean of s and p; beyond 1 its sine in air is formal."""
+        sections = self._sections()
+        air = Medium(jnp.ones_like(sin_squared), jnp.sqrt(jnp.maximum(cos_squared, EVANESCENT)))
+        powers = _boundaries(sections, air, cos_squared, sin_squared)
+        lost = _s_and_p(powers[0][1]) if reaches_air else jnp.zeros_like(_s_and_p(powers[0][1]))
+        for (back, through), (_, coat) in zip(powers[1:], sections[:-1], strict=True):
+            if coat.absorbance is not None:
+                twice = (2.0 * coat.absorbance * _slant(coat, cos_squared))[..., None]
+                lost = jnp.exp(-twice) * lost - jnp.expm1(-twice)
+            passed, reflected = _s_and_p(through), _s_and_p(back)
+            lost = passed * lost / (passed + reflected * lost)
+        return jnp.mean(lost, axis=-1)
+
+    def _sections(self) -> list[tuple[tuple[Layer, ...], Layer]]:
+        """Boundaries from the top down: the films on each, and the coat or body below it."""
+        sections: list[tuple[tuple[Layer, ...], Layer]] = []
+        films: list[Layer] = []
+        for layer in (*self.layers, Layer(self.refractive_index)):
+            if layer.wavenumber is not None:
+                films.append(layer)
+            else:
+                sections.append((tuple(films), layer))
+                films = []
+        return sections
+
+
+def _air(cos_incidence: Array) -> Medium:
+    return Medium(jnp.ones_like(cos_incidence), cos_incidence)
+
+
+def _boundaries(
+    sections: list[tuple[tuple[Layer, ...], Layer]],
+    air: Medium,
+    cos_squared: Array,
+    sin_squared: Array,
+) -> list[tuple[Diattenuation, Diattenuation]]:
+    """Reflectance and transmittance of every boundary, from the top down."""
+    powers, above = [], air
+    for films, layer in sections:
+        below = boundary.medium(layer.refractive_index, cos_squared)
+        if films:
+            thin = tuple(_film(film, cos_squared) for film in films)
+            powers.append(boundary.filmed(above, thin, below, sin_squared))
+        else:
+            powers.append(
+                (
+                    boundary.reflection(above, below, sin_squared),
+                    boundary.transmission(above, below, sin_squared),
+                )
+            )
+        above = below
+    return powers
+
+
+def _film(layer: Layer, cos_squared: Array) -> Film:
+    inside = boundary.medium(layer.refractive_index, cos_squared)
+    phase = jnp.asarray(layer.wavenumber) * inside.normal
+    return Film(inside, jax.lax.complex(jnp.cos(phase), jnp.sin(phase)))
+
+
+def _slant(coat: Layer, cos_squared: Array) -> Array:
+    """Length of the path through a coat, in units of its thickness."""
+    inside = boundary.medium(coat.refractive_index, cos_squared)
+    return inside.refractive_index / inside.normal
+
+
+def _s_and_p(power: Diattenuation) -> Array:
+    """Both powers, on a new last axis."""
+    difference = power.contrast * power.sin_squared
+    both = jnp.broadcast_arrays(power.mean + difference, power.mean - difference)
+    return jnp.stack(both, axis=-1)

@@ -1,0 +1,109 @@
+"""What each effect costs: compilation, operations and time of one gradient, on against off.
+
+    python -m tests.benchmarks.effect_costs
+
+Every effect of two scenes is switched on alone in the plain scene that is left when all are off.
+Prints a Markdown table.
+"""
+
+import jax
+import numpy as np
+import xarray as xr
+
+import polar_bayes as pb
+from polar_bayes.budget.cost import Cost, compile_and_count, run_seconds
+from polar_bayes.budget.variants import Effect, effects_of, simplify
+from polar_bayes.inference.program import compile_program
+from polar_bayes.inference.request import resolve
+from polar_bayes.observation.data import observe
+from polar_bayes.physics.scenes import MANY_FACETS
+
+FILM, COAT = pb.ThinFilm(1.38, 120.0), pb.ClearCoat(1.5, 0.05)
+
+ROUGH = pb.Scene(
+    surface=pb.RoughSurface(
+        pb.Beckmann(),
+        pb.Disc(5.0),
+        MANY_FACETS,
+        pb.AnisotropicSlopes(),
+        pb.HeightCorrelatedShadowing(),
+    ),
+    subsurface=pb.Lambertian(internal_reflection=pb.InternalReflection()),
+    mixing=pb.StokesMixing(),
+    coat=pb.CoatStack((FILM, COAT)),
+    instrument=pb.Instrument(
+        (
+            pb.AngleZero(),
+            pb.BeamOverlap(),
+            pb.DolpGain(),
+            pb.ChannelGain(),
+            pb.Leakage(),
+            pb.DarkLevel(),
+            pb.Discrepancy(),
+        )
+    ),
+)
+POLARIZED = pb.Scene(
+    surface=pb.RoughSurface(illumination=pb.PointSource(pb.LinearPolarization(0.5, 30.0))),
+    subsurface=pb.Unpolarized(),
+    mixing=pb.StokesMixing(),
+)
+
+
+def capture() -> xr.Dataset:
+    """Forty views in three colors, with q, u and intensity."""
+    return pb.simulate("plastic", scene="camera", seed=0)
+
+
+def gradients(scenes: list[pb.Scene], data: xr.Dataset) -> list[Cost]:
+    """Cost of one value and gradient of the log posterior density, scene by scene."""
+    compiled, calls = [], []
+    for scene in scenes:
+        request = resolve(data, "per_material", "laplace", scene, None, None, None, 0, "double")
+        readings = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
+        program = compile_program(request.bind(scene), readings)
+        z = np.zeros(program.size)
+        compiled.append(compile_and_count(jax.value_and_grad(program.potential), z, readings))
+        calls.append(lambda call=compiled[-1].call, z=z, readings=readings: call(z, readings))
+    return [
+        Cost(one.operations, one.compile_seconds, seconds)
+        for one, seconds in zip(compiled, run_seconds(calls), strict=True)
+    ]
+
+
+def plain_with(scene: pb.Scene, effect: Effect | None) -> pb.Scene:
+    """The scene with all its effects off but one."""
+    off = {other.place: other for other in effects_of(scene)}
+    if effect is not None:
+        del off[effect.place]
+    return simplify(scene, off.values())
+
+
+def table(scene: pb.Scene, data: xr.Dataset) -> list[str]:
+    """A row for the plain scene and one for each effect switched on."""
+    effects = list({effect.place: effect for effect in effects_of(scene)}.values())
+    costs = gradients([plain_with(scene, effect) for effect in (None, *effects)], data)
+    plain = costs[0]
+    lines = []
+    for name, cost in zip(("none", *(type(e.part).__name__ for e in effects)), costs, strict=True):
+        more = cost.operations / plain.operations
+        longer = cost.run_seconds / plain.run_seconds
+        lines.append(
+            f"| {name} | {cost.operations:,.0f} | {more:.2f} | {cost.compile_seconds:.1f} s "
+            f"| {1e3 * cost.run_seconds:.3f} ms | {longer:.2f} |"
+        )
+    return lines
+
+
+def main() -> None:
+    """Print the table."""
+    jax.config.update("jax_enable_x64", True)
+    data = capture()
+    print("| effect on | operations | ratio | compilation | one gradient | ratio |")
+    print("|---|---|---|---|---|---|")
+    for scene in (ROUGH, POLARIZED):
+        print("\n".join(table(scene, data)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+"""The table of hard cases in the documentation is what its command prints."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hard_cases.table import CASES, error
+
+PAGE = Path(__file__).parents[2] / "docs" / "hard_cases.md"
+BOUND = {np.float64: 1e-10, np.float32: 1e-4}
+
+of_every_case = pytest.mark.parametrize(
+    "case", CASES, ids=lambda case: f"{case.what}, {case.where}"
+)
+
+
+@of_every_case
+@pytest.mark.parametrize("dtype", BOUND, ids=["double", "single"])
+def test_ours_holds_where_the_textbook_may_not(case, dtype):
+    assert error(case, case.ours, dtype) <= BOUND[dtype]
+
+
+@of_every_case
+def test_the_textbook_is_worse(case):
+    textbook = max(error(case, case.textbook, dtype) for dtype in BOUND)
+    assert textbook > 10.0 * max(error(case, case.ours, dtype) for dtype in BOUND)
+
+
+def test_the_page_shows_every_case():
+    rows = [line for line in PAGE.read_text().splitlines() if line.startswith("| ")]
+    shown = [tuple(cell.strip() for cell in row.split("|")[1:3]) for row in rows[1:]]
+    assert shown == [(case.where, case.what) for case in CASES]

@@ -1,0 +1,205 @@
+"""One boundary, bare or with films: against Fresnel, against 80 digits, against matrices."""
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+import vector_optics as twin
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from polar_bayes.physics import boundary, fresnel
+from polar_bayes.physics.boundary import Film, Medium
+from polar_bayes.physics.diattenuation import Diattenuation
+from polar_bayes.physics.geometry import cos_degrees, sin_degrees
+
+RUN = settings(deadline=None, max_examples=60, derandomize=True)
+zenith = st.floats(0.0, 89.9)
+index = st.floats(1.0, 3.0)
+film = st.tuples(index, st.floats(0.0, 30.0))
+
+
+def media(degrees: float, *indexes: float) -> list[Medium]:
+    cos_squared = cos_degrees(degrees) ** 2
+    return [boundary.medium(jnp.asarray(n), cos_squared) for n in indexes]
+
+
+def s_and_p(power: Diattenuation) -> np.ndarray:
+    difference = power.contrast * power.sin_squared
+    return np.array([power.mean + difference, power.mean - difference])
+
+
+@jax.jit
+def respond(cosine, sin_squared, indexes, wavenumbers) -> tuple[Diattenuation, Diattenuation]:
+    """Air, films, body."""
+    above, *inside, below = (boundary.medium(n, cosine**2) for n in indexes)
+    layers = tuple(
+        Film(medium, jnp.exp(1j * wavenumber * medium.normal))
+        for medium, wavenumber in zip(inside, wavenumbers, strict=True)
+    )
+    return boundary.filmed(above, layers, below, sin_squared)
+
+
+def filmed(degrees: float, layers: list, below: float) -> tuple[Diattenuation, Diattenuation]:
+    indexes = [jnp.asarray(n) for n in (1.0, *(layer[0] for layer in layers), below)]
+    wavenumbers = [jnp.asarray(2.0 * layer[1]) for layer in layers]
+    return respond(cos_degrees(degrees), sin_degrees(degrees) ** 2, indexes, wavenumbers)
+
+
+@given(theta=zenith, n=index)
+@RUN
+def test_under_air_it_is_fresnels_law(theta: float, n: float) -> None:
+    c, b = cos_degrees(theta), sin_degrees(theta) ** 2
+    air, body = media(theta, 1.0, n)
+    mean, contrast = fresnel.reflection(c, b, n)
+    found = boundary.reflection(air, body, b)
+    np.testing.assert_allclose(found.mean, mean, rtol=1e-13)
+    np.testing.assert_allclose(found.contrast, contrast, rtol=1e-13)
+    relative, _ = fresnel.relative_reflection(c, b, n)
+    found = boundary.relative_reflection(air, body, b)
+    np.testing.assert_allclose(found.mean, relative, rtol=1e-13)
+    passing = boundary.transmission(air, body, b)
+    np.testing.assert_allclose(passing.mean, fresnel.transmission(c, n), rtol=1e-13)
+    leaving = -fresnel.exit_polarization(c, b, n)
+    found_leaving = passing.contrast * b / passing.mean
+    np.testing.assert_allclose(found_leaving, leaving, rtol=1e-12, atol=1e-16)
+
+
+@given(theta=zenith, first=index, second=index)
+@RUN
+def test_what_is_not_reflected_passes(theta: float, first: float, second: float) -> None:
+    b = sin_degrees(theta) ** 2
+    above, below = media(theta, first, second)
+    reflected, passed = boundary.reflection(above, below, b), boundary.transmission(above, below, b)
+    np.testing.assert_allclose(s_and_p(reflected) + s_and_p(passed), 1.0, atol=3e-14)
+
+
+@given(theta=zenith, first=index, second=index)
+@RUN
+def test_as_much_passes_upwards_as_downwards(theta: float, first: float, second: float) -> None:
+    b = sin_degrees(theta) ** 2
+    above, below = media(theta, first, second)
+    for law in (boundary.reflection, boundary.transmission):
+        there, back = law(above, below, b), law(below, above, b)
+        for one, other in zip(there, back, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-14)
+
+
+@pytest.mark.parametrize("theta", [0.0, 1e-6, 1.0, 40.0, 56.3, 75.0, 89.0, 89.999])
+@pytest.mark.parametrize(
+    "indexes", [(1.0, 1.5), (1.0, 1.0 + 1e-6), (1.4, 1.6), (1.6, 1.4), (1.5, 1.5001), (2.4, 1.0)]
+)
+def test_no_digit_is_lost_against_eighty(theta: float, indexes: tuple[float, float]) -> None:
+    """Contrast and shortfall are quotients of differences; here they are taken in 80 digits.
+
+    1e-12 is 5,000 roundings: a shortfall near n = 1 is the square of one.
+    """
+    with mp.workdps(80):
+        c = mp.cos(mp.radians(mp.mpf(theta)))
+        b = 1 - c**2
+        n, m = (mp.mpf(x) for x in indexes)
+        inside, outside = (mp.sqrt(1 - b / x**2) for x in (n, m))
+        r_s = (n * inside - m * outside) / (n * inside + m * outside)
+        r_p = (n * outside - m * inside) / (n * outside + m * inside)
+        truths = []
+        for s, p, cross in (
+            (r_s**2, r_p**2, r_s * r_p),
+            (1 - r_s**2, 1 - r_p**2, mp.sqrt((1 - r_s**2) * (1 - r_p**2))),
+        ):
+            truths.append([(s + p) / 2, (s - p) / 2, (s + p) / 2 - cross])
+        above, below = media(theta, *indexes)
+        sin_squared = sin_degrees(theta) ** 2
+        for law, truth in zip((boundary.reflection, boundary.transmission), truths, strict=True):
+            power = law(above, below, sin_squared)
+            for power_of_b, (value, true) in enumerate(zip(power, truth, strict=False)):
+                assert abs(mp.mpf(float(value)) * b**power_of_b - true) <= 1e-12 * abs(true)
+
+
+def test_no_p_light_at_the_brewster_angle_of_two_media() -> None:
+    """tan of the angle in the upper medium is the ratio of the indexes."""
+    n, m = 1.3, 1.6
+    b = (n * np.sin(np.arctan(m / n))) ** 2
+    above, below = (boundary.medium(jnp.asarray(x), 1.0 - b) for x in (n, m))
+    _, p = s_and_p(boundary.reflection(above, below, b))
+    assert abs(p) < 1e-17
+
+
+@pytest.mark.parametrize("n", [1.0, 1.5])
+def test_alike_media_have_no_boundary(n: float) -> None:
+    b = sin_degrees(50.0) ** 2
+    above, below = media(50.0, n, n)
+    np.testing.assert_array_equal(s_and_p(boundary.reflection(above, below, b)), 0.0)
+    np.testing.assert_allclose(s_and_p(boundary.transmission(above, below, b)), 1.0, rtol=1e-15)
+    assert boundary.step(above, below) == 0.0
+    assert boundary.relative_reflection(above, below, b).mean > 0.0
+
+
+@given(theta=zenith, layers=st.lists(film, min_size=1, max_size=3), body=index)
+@settings(parent=RUN, max_examples=100)
+def test_films_agree_with_characteristic_matrices(theta: float, layers: list, body: float) -> None:
+    """Fields reflected, powers passed. 1e-12 of 1: phases of 30 carry 30 roundings."""
+    reflected, passed = filmed(theta, layers, body)
+    b = float(sin_degrees(theta) ** 2)
+    fields, _, through = twin.films(1.0, layers, body, b)
+    s, p, cross = twin.powers(fields)
+    np.testing.assert_allclose(s_and_p(reflected), [s, p], atol=1e-12)
+    np.testing.assert_allclose(reflected.cross, np.real(cross), atol=1e-12)
+    np.testing.assert_allclose(s_and_p(passed), through, atol=1e-12)
+
+
+@given(theta=zenith, layer=film, body=index)
+@RUN
+def test_a_film_turns_passing_light_as_its_fields_do(
+    theta: float, layer: tuple, body: float
+) -> None:
+    _, passed = filmed(theta, [layer], body)
+    _, fields, through = twin.films(1.0, [layer], body, float(sin_degrees(theta) ** 2))
+    cross = fields[0] * np.conj(fields[1]) * np.sqrt(np.prod(through / np.abs(fields) ** 2))
+    np.testing.assert_allclose(passed.cross, cross.real, atol=1e-12)
+
+
+@given(theta=zenith, layers=st.lists(film, min_size=1, max_size=3), body=index)
+@RUN
+def test_clear_films_lose_no_light(theta: float, layers: list, body: float) -> None:
+    reflected, passed = filmed(theta, layers, body)
+    np.testing.assert_allclose(s_and_p(reflected) + s_and_p(passed), 1.0, atol=1e-12)
+
+
+@given(theta=zenith, n=index, body=index)
+@RUN
+def test_a_film_without_thickness_is_not_there(theta: float, n: float, body: float) -> None:
+    reflected, passed = filmed(theta, [(n, 0.0)], body)
+    air, below = media(theta, 1.0, body)
+    b = sin_degrees(theta) ** 2
+    for found, law in ((reflected, boundary.reflection), (passed, boundary.transmission)):
+        np.testing.assert_allclose(s_and_p(found), s_and_p(law(air, below, b)), atol=1e-13)
+        np.testing.assert_allclose(found.cross, law(air, below, b).cross, atol=1e-13)
+
+
+@given(theta=zenith, thickness=st.floats(0.0, 30.0), body=index)
+@RUN
+def test_a_film_like_the_body_or_like_the_air_is_not_there(
+    theta: float, thickness: float, body: float
+) -> None:
+    air, below = media(theta, 1.0, body)
+    bare = s_and_p(boundary.reflection(air, below, sin_degrees(theta) ** 2))
+    for n in (1.0, body):
+        reflected, _ = filmed(theta, [(n, thickness)], body)
+        np.testing.assert_allclose(s_and_p(reflected), bare, atol=1e-13)
+
+
+def test_a_quarter_wave_of_the_mean_index_reflects_nothing() -> None:
+    """At normal incidence, for n = sqrt(body); a half wave is not there."""
+    n, body = np.sqrt(1.7), 1.7
+    quarter, half = (filmed(0.0, [(n, turn / n)], body)[0] for turn in (np.pi / 2.0, np.pi))
+    assert abs(quarter.mean) < 1e-30
+    np.testing.assert_allclose(half.mean, (0.7 / 2.7) ** 2, rtol=1e-13)
+
+
+def test_trapped_light_next_to_does_not_pass() -> None:
+    """Squared sines in air beyond 1 belong to light that a boundary turns back as a whole."""
+    beyond = jnp.asarray(1.2)
+    body = boundary.medium(jnp.asarray(1.5), 1.0 - beyond)
+    air = boundary.medium(jnp.asarray(1.0), 1.0 - beyond)
+    assert np.all(s_and_p(boundary.transmission(air, body, beyond)) < 1e-5)

@@ -1,0 +1,206 @@
+"""Coats and films as a user writes them: against tables, and as parts of a scene."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from polar_bayes.errors import SceneError
+from polar_bayes.physics.coat import AbstractCoat, ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
+from polar_bayes.physics.internal_reflection import InternalReflection
+from polar_bayes.physics.mixing import StokesMixing
+from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.stack import Layer, Stack
+from polar_bayes.physics.subsurface import Lambertian
+from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+
+stokes_of = jax.jit(Scene.stokes, static_argnums=0)
+
+VIEWS = Geometry.from_degrees(
+    view_zenith=[0.0, 20.0, 45.0, 60.0, 85.0],
+    view_azimuth=[180.0, 180.0, 170.0, 60.0, 180.0],
+    light_zenith=[0.0, 30.0, 45.0, 60.0, 85.0],
+    light_azimuth=0.0,
+    wavelength=550.0,
+)
+MATERIAL = {
+    "roughness": 0.2,
+    "refractive_index": 1.6,
+    "coat_refractive_index": 1.45,
+    "coat_absorbance": 0.3,
+    "film_refractive_index": 1.38,
+    "film_thickness": 230.0,
+    "subsurface_fraction": 0.4,
+}
+
+
+def reflected(coat: AbstractCoat, zenith: np.ndarray, body: np.ndarray, parameters: dict, **color):
+    """s and p of one facet."""
+    wavelength = color.get("wavelength")
+    stack = Stack(jnp.asarray(body), coat.layers(parameters, wavelength))
+    b = sin_degrees(zenith) ** 2
+    power = stack.reflection(cos_degrees(zenith), b)
+    return power.mean + power.contrast * b, power.mean - power.contrast * b
+
+
+def test_a_thick_coat_agrees_with_the_table(thick_coats: np.ndarray) -> None:
+    """The closed form to the table's ten digits; the transfer-matrix code without absorption.
+
+    With absorption that code's index is complex, so that its boundaries reflect up to 4.7e-7 more.
+    """
+    coat, body, absorbance, zenith, s_code, p_code, s_closed, p_closed, dolp = thick_coats.T
+    parameters = {
+        "coat_refractive_index": jnp.asarray(coat),
+        "coat_absorbance": jnp.asarray(absorbance),
+    }
+    s, p = reflected(ClearCoat(), zenith, body, parameters)
+    np.testing.assert_allclose(s, s_closed, atol=6e-11)
+    np.testing.assert_allclose(p, p_closed, atol=6e-11)
+    clear = absorbance == 0.0
+    assert 0 < clear.sum() < clear.size
+    for found, code in ((s, s_code), (p, p_code)):
+        np.testing.assert_allclose(found[clear], code[clear], atol=1e-9)
+        np.testing.assert_allclose(found[~clear], code[~clear], atol=5e-7)
+    np.testing.assert_allclose(((s - p) / (s + p))[clear], dolp[clear], atol=1e-9)
+
+
+def test_a_film_agrees_with_the_table(thin_films: np.ndarray) -> None:
+    n, body, thickness, wavelength, zenith, s_code, p_code, s_airy, p_airy, dolp = thin_films.T
+    parameters = {"film_refractive_index": jnp.asarray(n), "film_thickness": jnp.asarray(thickness)}
+    s, p = reflected(ThinFilm(), zenith, body, parameters, wavelength=jnp.asarray(wavelength))
+    for found, code, airy in ((s, s_code, s_airy), (p, p_code, p_airy)):
+        np.testing.assert_allclose(found, code, atol=1e-9)
+        np.testing.assert_allclose(found, airy, atol=1e-9)
+    np.testing.assert_allclose((s - p) / (s + p), dolp, atol=2e-9)
+
+
+def test_a_coat_adds_its_parameters_to_the_scene() -> None:
+    scene = Scene(RoughSurface(), coat=CoatStack((ThinFilm(), ClearCoat(1.5))))
+    assert scene.parameters == (
+        "roughness",
+        "refractive_index",
+        "coat_absorbance",
+        "film_refractive_index",
+        "film_thickness",
+    )
+    assert Scene(SmoothSurface(), coat=ClearCoat(1.5, 0.0)).parameters == ("refractive_index",)
+    named = ClearCoat("lacquer_index", "lacquer_absorbance")
+    assert named.parameters == ("lacquer_index", "lacquer_absorbance")
+
+
+@pytest.mark.parametrize("surface", [SmoothSurface(), RoughSurface()], ids=["smooth", "rough"])
+def test_known_numbers_and_parameters_of_that_value_are_alike(surface: object) -> None:
+    fitted = Scene(surface, coat=CoatStack((ThinFilm(), ClearCoat())))
+    known = Scene(surface, coat=CoatStack((ThinFilm(1.38, 230.0), ClearCoat(1.45, 0.3))))
+    np.testing.assert_allclose(
+        stokes_of(fitted, MATERIAL, VIEWS), stokes_of(known, MATERIAL, VIEWS), rtol=1e-14
+    )
+
+
+@pytest.mark.parametrize(
+    "coat",
+    [
+        ClearCoat(1.0, 0.0),
+        ClearCoat(1.6, 0.0),
+        ThinFilm(1.0, 300.0),
+        ThinFilm(1.6, 300.0),
+        ThinFilm(1.3, 0.0),
+        CoatStack((ThinFilm(1.6, 300.0), ClearCoat(1.6, 0.0))),
+    ],
+    ids=str,
+)
+def test_a_coat_without_effect_is_no_coat(coat: AbstractCoat) -> None:
+    body = Lambertian(0.7, InternalReflection())
+    parts = (SmoothSurface(), body, StokesMixing())
+    bare, coated = (stokes_of(Scene(*parts, coat=c), MATERIAL, VIEWS) for c in (None, coat))
+    np.testing.assert_allclose(coated, bare, rtol=1e-8, atol=1e-14)
+
+
+def test_a_body_under_a_coat_of_its_own_index() -> None:
+    """T+(l) e^(-tau/mu_l) [T+, T-](v) e^(-tau/mu_v) A/(pi n^2 (1 - A Fi_tau)).
+
+    Fi_tau is the integral over the cosine inside of what the air boundary returns, twice filtered.
+    """
+    n, tau, albedo = 1.6, 0.3, 0.7
+    scene = Scene(
+        SmoothSurface(),
+        Lambertian(albedo, InternalReflection()),
+        StokesMixing(),
+        coat=ClearCoat(n, tau),
+    )
+    found = stokes_of(scene, {**MATERIAL, "subsurface_fraction": 1.0}, VIEWS)
+    critical = np.sqrt(1.0 - 1.0 / n**2)
+
+    def mirrored(inner: float) -> float:
+        outer = np.sqrt(1.0 - n**2 * (1.0 - inner**2) + 0j)
+        s = np.abs((n * inner - outer) / (n * inner + outer)) ** 2
+        p = np.abs((n * outer - inner) / (n * outer + inner)) ** 2
+        return (s + p) * inner * np.exp(-2.0 * tau / inner)
+
+    returned = sum(quad(mirrored, *ends)[0] for ends in ((1e-9, critical), (critical, 1.0)))
+    bare = Stack(jnp.asarray(n))
+    sines = [sin_degrees(z) ** 2 for z in (VIEWS.light_zenith, VIEWS.view_zenith)]
+    into, out = (
+        bare.transmission(cos_degrees(z), b)
+        for z, b in zip((VIEWS.light_zenith, VIEWS.view_zenith), sines, strict=True)
+    )
+    slant = sum(1.0 / np.sqrt(1.0 - b / n**2) for b in sines)
+    bright = albedo / (np.pi * n**2 * (1.0 - albedo * returned)) * np.exp(-tau * slant)
+    bright = bright * cos_degrees(VIEWS.light_zenith) * into.mean
+    np.testing.assert_allclose(found[:, 0], bright * out.mean, rtol=1e-6)
+    expected = bright * out.contrast * sines[1]
+    np.testing.assert_allclose(found[:, 1], expected, rtol=1e-6, atol=1e-16)
+
+
+def test_fringes_move_with_color_and_angle() -> None:
+    """At normal incidence a half wave is missing; the next is as bright as no film."""
+    colors = jnp.array([[460.0], [920.0]])  # 230 nm of 2.0 are a full and a half wave
+    views = VIEWS._replace(wavelength=colors)
+    film = Scene(SmoothSurface(), coat=ThinFilm(2.0, 230.0))
+    found = stokes_of(film, MATERIAL, views)
+    bare = stokes_of(Scene(SmoothSurface()), MATERIAL, views)
+    assert found.shape == (2, 5, 3)
+    np.testing.assert_allclose(found[:, 0, 0], bare[0, 0], rtol=1e-12)
+    assert np.all(np.abs(found[:, 2:, 0] / bare[None, 2:, 0] - 1.0) > 1e-3)
+
+
+@pytest.mark.parametrize("coat", [ThinFilm(), CoatStack((ClearCoat(), ThinFilm()))], ids=str)
+def test_a_film_needs_a_wavelength(coat: AbstractCoat) -> None:
+    scene = Scene(SmoothSurface(), coat=coat)
+    with pytest.raises(SceneError, match=r"ThinFilm: fringes .*; give the geometry a wavelength"):
+        scene.stokes(MATERIAL, VIEWS._replace(wavelength=None))
+
+
+def test_a_clear_coat_has_no_filter_in_the_program() -> None:
+    assert ClearCoat(1.5, 0.0).layers({}, None) == (Layer(jnp.asarray(1.5), None, None),)
+    assert ClearCoat(1.5, 0.1).layers({}, None)[0].absorbance is not None
+
+
+def test_simpler_coats_leave_one_out() -> None:
+    film, lacquer = ThinFilm(), ClearCoat()
+    assert ClearCoat().simpler() == (None,)
+    assert CoatStack((film, lacquer)).simpler() == (CoatStack((lacquer,)), CoatStack((film,)))
+    assert CoatStack((film,)).simpler() == (None,)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ClearCoat(0.5), "ClearCoat: refractive_index: 0.5 is neither a number from 1 to"),
+        (lambda: ClearCoat(absorbance=-1.0), "ClearCoat: absorbance: -1.0 is neither a number fr"),
+        (lambda: ClearCoat("two words"), "ClearCoat: refractive_index: 'two words' is neither"),
+        (lambda: ThinFilm(True), "ThinFilm: refractive_index: True is neither"),
+        (lambda: ThinFilm(thickness_nm=float("nan")), "ThinFilm: thickness_nm: nan is neither"),
+        (lambda: CoatStack(ClearCoat()), r"CoatStack: .* is no such part; give a tuple: CoatStack"),
+        (lambda: CoatStack((ClearCoat(), None)), r"CoatStack: None is no such part; give coats"),
+        (
+            lambda: CoatStack((ClearCoat(), ClearCoat(1.5))),
+            r"CoatStack: two coats read coat_absorbance; name the parameters apart: ClearCoat\(",
+        ),
+    ],
+)
+def test_coats_are_checked(make, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        make()

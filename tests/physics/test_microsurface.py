@@ -1,0 +1,118 @@
+"""Facets as a population: their density covers the surface, their shares are those of vectors."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vector_optics as twin
+
+from polar_bayes.physics.facets import FacetQuadrature, seen
+from polar_bayes.physics.geometry import Geometry, mirror_facet
+from polar_bayes.physics.microfacet import GGX, Beckmann
+from polar_bayes.physics.microsurface import Microsurface
+from polar_bayes.physics.shadowing import SeparableShadowing
+from polar_bayes.physics.slopes import AnisotropicSlopes, IsotropicSlopes
+
+DISTRIBUTIONS = {"Beckmann": Beckmann(), "GGX": GGX()}
+named = pytest.mark.parametrize("name", DISTRIBUTIONS)
+
+
+def surface(name: str, quadrature: FacetQuadrature | None = None) -> Microsurface:
+    return Microsurface(DISTRIBUTIONS[name], SeparableShadowing(), quadrature or FacetQuadrature())
+
+
+def roughness(along: float, across: float) -> dict:
+    return {"roughness": jnp.asarray(along), "roughness_across": jnp.asarray(across)}
+
+
+def towards(rays: np.ndarray) -> Geometry:
+    """Viewer and light in one direction, so that the mirror facet looks there."""
+    zenith = jnp.rad2deg(jnp.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2]))
+    azimuth = jnp.rad2deg(jnp.arctan2(rays[..., 1], rays[..., 0]))
+    return Geometry(zenith, azimuth, zenith, azimuth)
+
+
+@named
+@pytest.mark.parametrize(("along", "across"), [(0.3, 0.3), (0.4, 0.1), (0.1, 1.0)])
+def test_facets_cover_the_surface(name: str, along: float, across: float) -> None:
+    """The integral of D cos(m) over the hemisphere is one, grooves or not."""
+    node, weight = np.polynomial.legendre.leggauss(200)
+    angle = 0.25 * np.pi * (node + 1.0)
+    turn = 2.0 * np.pi * (np.arange(300) + 0.5) / 300
+    angle, turn = np.meshgrid(angle, turn)
+    rays = np.stack(
+        [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=-1
+    )
+    geometry = towards(rays)
+    ellipse = AnisotropicSlopes(35.0).ellipse(roughness(along, across), geometry)
+    tilt = mirror_facet(geometry).tan_squared_tilt
+    density = surface(name).density(ellipse, geometry, tilt)
+    measure = np.sin(angle) * np.cos(angle) * 0.25 * np.pi * weight * 2.0 * np.pi / 300
+    np.testing.assert_allclose(np.sum(density * measure), 1.0, rtol=1e-6)
+
+
+@named
+def test_density_of_grooves_agrees_with_vectors(name: str) -> None:
+    """Between any two directions: the facet looks half-way. Beckmann's floor is far below 1e-30."""
+    generator = np.random.default_rng(4)
+    view = np.array([generator.uniform(0, 85, 50), generator.uniform(-180, 180, 50)])
+    light = np.array([generator.uniform(0, 85, 50), generator.uniform(-180, 180, 50)])
+    rays = np.array([[twin.ray(*v), twin.ray(*s)] for v, s in zip(view.T, light.T, strict=True)])
+    half = rays.sum(axis=1)
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    population = twin.Population(name, 0.4, 0.15, 35.0, steps=2)
+    geometry = Geometry(*(jnp.asarray(x) for x in (*view, *light)))
+    ellipse = AnisotropicSlopes(35.0).ellipse(roughness(0.4, 0.15), geometry)
+    found = surface(name).density(ellipse, geometry, mirror_facet(geometry).tan_squared_tilt)
+    np.testing.assert_allclose(found, population.density(half), rtol=1e-9, atol=1e-30)
+
+
+@named
+def test_visible_shares_of_grooves_agree_with_vectors(name: str) -> None:
+    """A direction meets the roughness of its own azimuth."""
+    generator = np.random.default_rng(5)
+    zenith, azimuth = generator.uniform(0, 89, 60), generator.uniform(-180, 180, 60)
+    rays = np.array([twin.ray(*pair) for pair in zip(zenith, azimuth, strict=True)])
+    population = twin.Population(name, 0.6, 0.1, 35.0, steps=2)
+    viewer = Geometry.from_degrees(
+        view_zenith=50.0, view_azimuth=-20.0, light_zenith=0.0, light_azimuth=0.0
+    )
+    ellipse = AnisotropicSlopes(35.0).ellipse(roughness(0.6, 0.1), viewer)
+    turn = np.deg2rad(azimuth + 20.0)
+    tangent = np.tan(np.deg2rad(zenith))
+    found = surface(name).visible(ellipse, tangent * np.cos(turn), tangent * np.sin(turn))
+    np.testing.assert_allclose(found, population.visible(rays), rtol=1e-12)
+
+
+@named
+@pytest.mark.parametrize("view", [0.0, 40.0, 80.0])
+def test_seen_facets_show_the_area_of_the_plane(name: str, view: float) -> None:
+    """The weights sum to cos(v)/G1(v); Beckmann's G1 is a fit within .6 %."""
+    geometry = Geometry.from_degrees(
+        view_zenith=view, view_azimuth=10.0, light_zenith=0.0, light_azimuth=0.0
+    )
+    for slopes in (IsotropicSlopes(), AnisotropicSlopes(35.0)):
+        facets = surface(name, FacetQuadrature(40, 40))
+        ellipse = slopes.ellipse(roughness(0.4, 0.15), geometry)
+        sample = facets.sample(jax.tree.map(jnp.atleast_1d, ellipse), geometry, seen)
+        area = np.sum(sample.weight)
+        shares = facets.visible(ellipse, jnp.tan(jnp.deg2rad(view)), 0.0)
+        bound = 6e-3 if name == "Beckmann" else 3e-4
+        np.testing.assert_allclose(area * shares / np.cos(np.deg2rad(view)), 1.0, rtol=bound)
+
+
+@named
+def test_equal_roughnesses_have_the_isotropic_density_and_share(name: str) -> None:
+    geometry = Geometry(*(jnp.asarray(x) for x in ([30.0], [0.0], [60.0], [140.0])))
+    tilt = mirror_facet(geometry).tan_squared_tilt
+    same = roughness(0.3, 0.3)
+    one, other = (
+        slopes.ellipse(same, geometry) for slopes in (IsotropicSlopes(), AnisotropicSlopes(35.0))
+    )
+    facets = surface(name)
+    np.testing.assert_allclose(
+        facets.density(other, geometry, tilt), facets.density(one, geometry, tilt), rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        facets.visible(other, 2.0, 1.0), facets.visible(one, 2.0, 1.0), rtol=1e-13
+    )

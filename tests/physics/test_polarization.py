@@ -1,0 +1,259 @@
+"""Polarized light: against fields and vectors, and the laws that every mirror obeys."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vector_optics as twin
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from polar_bayes.errors import SceneError
+from polar_bayes.physics.coat import ClearCoat, ThinFilm
+from polar_bayes.physics.geometry import Geometry, cos_degrees
+from polar_bayes.physics.illumination import PointSource, UniformSky
+from polar_bayes.physics.polarization import LinearPolarization
+from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.stack import Stack
+from polar_bayes.physics.stokes import to_stokes
+from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+
+RUN = settings(deadline=None, max_examples=100, derandomize=True)
+zenith = st.floats(0.0, 89.5)
+azimuth = st.floats(-360.0, 360.0)
+direction = st.tuples(zenith, azimuth)
+degree = st.floats(0.0, 1.0)
+angle = st.floats(-180.0, 180.0)
+index = st.floats(1.01, 3.0)
+
+BEAM = PointSource(LinearPolarization("degree", "angle"))
+MIRROR = Scene(SmoothSurface(BEAM))
+stokes_of = jax.jit(Scene.stokes, static_argnums=0)
+BREWSTER = float(np.rad2deg(np.arctan(1.5)))
+
+
+def at(view: tuple[float, float], light: tuple[float, float]) -> Geometry:
+    return Geometry(*(jnp.array([x]) for x in (*view, *light)), wavelength=jnp.array([550.0]))
+
+
+def mirrored(
+    view: tuple, light: tuple, n: float, degree: float, angle: float, scene: Scene = MIRROR
+) -> np.ndarray:
+    parameters = {"refractive_index": n, "degree": degree, "angle": angle, "roughness": 0.3}
+    return np.asarray(stokes_of(scene, parameters, at(view, light)))[0]
+
+
+def components(degree: float, angle: float) -> tuple[float, float]:
+    return degree * np.cos(np.deg2rad(2 * angle)), degree * np.sin(np.deg2rad(2 * angle))
+
+
+@given(view=direction, light=direction, n=index, degree=degree, angle=angle)
+@settings(parent=RUN, max_examples=300)
+@example(view=(0.0, 30.0), light=(0.0, -50.0), n=1.5, degree=1.0, angle=20.0)
+@example(view=(40.0, 30.0), light=(40.0, 30.0), n=1.5, degree=1.0, angle=20.0)
+@example(view=(40.0, 30.0), light=(40.0, 210.0), n=1.5, degree=1.0, angle=20.0)
+@example(view=(0.0, 30.0), light=(60.0, 10.0), n=1.5, degree=1.0, angle=-70.0)
+@example(view=(60.0, 30.0), light=(0.0, 10.0), n=1.5, degree=0.5, angle=100.0)
+def test_a_facet_turns_the_field_as_vectors_do(
+    view: tuple, light: tuple, n: float, degree: float, angle: float
+) -> None:
+    """Fresnel's amplitudes along explicit axes: all three components, in and out of the plane."""
+    powers = twin.bare(n, twin.facet_of(view, light)[0])
+    expected = twin.mirrored(powers, view, light, components(degree, angle))
+    found = mirrored(view, light, n, degree, angle)
+    size = np.real(powers[0] + powers[1])
+    np.testing.assert_allclose(found, expected, atol=1e-12 * size + 1e-16)
+
+
+FILM, COAT = (1.38, 230.0), (1.7, 0.3)
+
+
+@given(view=direction, light=direction, degree=degree, angle=angle)
+@RUN
+def test_a_facet_under_a_film_or_coat_does_so_too(
+    view: tuple, light: tuple, degree: float, angle: float
+) -> None:
+    b, _ = twin.facet_of(view, light)
+    film = twin.powers(twin.films(1.0, ((FILM[0], 2.0 * np.pi * FILM[1] / 550.0),), 1.5, b)[0])
+    coat = tuple(twin.bounced((1.0, COAT[0], 1.5), COAT[1:], b, bounces=60)[0])
+    for layer, powers in ((ThinFilm(*FILM), film), (ClearCoat(*COAT), coat)):
+        expected = twin.mirrored(powers, view, light, components(degree, angle))
+        scene = Scene(SmoothSurface(BEAM), coat=layer)
+        found = mirrored(view, light, 1.5, degree, angle, scene)
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@given(view=direction, light=direction, n=index, angle=angle)
+@RUN
+def test_degree_0_and_orthogonal_pairs_are_unpolarized_light(
+    view: tuple, light: tuple, n: float, angle: float
+) -> None:
+    for surface, beam in (
+        (SmoothSurface(), SmoothSurface(BEAM)),
+        (RoughSurface(), RoughSurface(illumination=BEAM)),
+    ):
+        plain = mirrored(view, light, n, 0.0, 0.0, Scene(surface))
+        none = mirrored(view, light, n, 0.0, angle, Scene(beam))
+        across = angle - 90.0 if angle > 0.0 else angle + 90.0
+        pair = [mirrored(view, light, n, 1.0, a, Scene(beam)) for a in (angle, across)]
+        slack = 1e-13 * plain[0] + 1e-300
+        np.testing.assert_allclose(none, plain, rtol=1e-13, atol=slack)
+        np.testing.assert_allclose(0.5 * (pair[0] + pair[1]), plain, rtol=1e-12, atol=10 * slack)
+
+
+def mueller(view: tuple, light: tuple, n: float, scene: Scene = MIRROR) -> np.ndarray:
+    """Matrix from light to viewer (3 x 3), from four incident states."""
+    none, s, diagonal, p = (
+        mirrored(view, light, n, *state, scene)
+        for state in ((0.0, 0.0), (1.0, 0.0), (1.0, 45.0), (1.0, 90.0))
+    )
+    np.testing.assert_allclose(s + p, 2.0 * none, rtol=1e-12, atol=1e-12 * none[0] + 1e-300)
+    return np.stack([none, 0.5 * (s - p), diagonal - none], axis=1)
+
+
+@given(view=direction, light=direction, n=index)
+@RUN
+def test_no_light_that_is_possible_becomes_impossible(view: tuple, light: tuple, n: float) -> None:
+    """S0 >= |S| for every incident state, and the answer is linear in it."""
+    matrix = mueller(view, light, n)
+    turn = np.deg2rad(np.linspace(0.0, 360.0, 73))
+    states = np.stack([np.ones(73), np.cos(turn), np.sin(turn)])
+    out = matrix @ states
+    assert np.all(out[0] >= -1e-15)
+    assert np.all(np.hypot(out[1], out[2]) <= out[0] + 1e-13 * matrix[0, 0])
+    direct = mirrored(view, light, n, 0.7, 33.0)
+    q, u = components(0.7, 33.0)
+    np.testing.assert_allclose(direct, matrix @ [1.0, q, u], atol=1e-13 * matrix[0, 0] + 1e-300)
+
+
+@given(view=direction, light=direction, n=index)
+@RUN
+def test_viewer_and_light_may_change_places(view: tuple, light: tuple, n: float) -> None:
+    """Helmholtz: the matrix of the way back is the transpose; of a rough surface, over cosines."""
+    forth, back = mueller(view, light, n), mueller(light, view, n)
+    np.testing.assert_allclose(back, forth.T, atol=1e-12 * forth[0, 0])
+    rough = Scene(RoughSurface(illumination=BEAM))
+    forth, back = mueller(view, light, n, rough), mueller(light, view, n, rough)
+    cosines = np.cos(np.deg2rad(view[0])) / np.cos(np.deg2rad(light[0]))
+    np.testing.assert_allclose(back / cosines, forth.T, atol=1e-9 * forth[0, 0] + 1e-300)
+
+
+def test_at_brewsters_angle_s_light_is_reflected_and_p_light_is_not() -> None:
+    view, light = (BREWSTER, 180.0), (BREWSTER, 0.0)
+    power = ((1.5**2 - 1.0) / (1.5**2 + 1.0)) ** 2
+    s, p = (mirrored(view, light, 1.5, 1.0, a) for a in (0.0, 90.0))
+    np.testing.assert_allclose(s, [power, power, 0.0], atol=1e-15)
+    np.testing.assert_allclose(p, 0.0, atol=1e-16)
+    plain = mirrored(view, light, 1.5, 0.0, 0.0)
+    np.testing.assert_allclose(plain, [0.5 * power, 0.5 * power, 0.0], atol=1e-15)
+
+
+@given(va=azimuth, la=azimuth, degree=degree, angle=angle)
+@RUN
+def test_at_normal_incidence_the_field_keeps_its_direction_in_the_laboratory(
+    va: float, la: float, degree: float, angle: float
+) -> None:
+    """Both axes turn with the azimuth of their ray, so only the difference of azimuths counts."""
+    q, u = components(degree, la - va + angle)
+    found = mirrored((0.0, va), (0.0, la), 1.5, degree, angle)
+    np.testing.assert_allclose(found, 0.04 * np.array([1.0, q, u]), atol=1e-13)
+
+
+@given(incidence=st.floats(0.0, 85.0), degree=degree, angle=angle)
+@RUN
+def test_in_the_plane_of_incidence_diagonal_light_keeps_its_share(
+    incidence: float, degree: float, angle: float
+) -> None:
+    """q mixes with the difference of s and p; u is multiplied by r_s r_p.
+
+    On the mirror side both axes look the other way: u changes sign at Brewster's angle only.
+    """
+    found = mirrored((incidence, 180.0), (incidence, 0.0), 1.5, degree, angle)
+    s, p, cross = np.real(twin.bare(1.5, float(np.sin(np.deg2rad(incidence)) ** 2)))
+    q, u = components(degree, angle)
+    expected = [
+        0.5 * (s + p) + 0.5 * (s - p) * q,
+        0.5 * (s - p) + 0.5 * (s + p) * q,
+        cross * u,
+    ]
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("v", [0.0, 1e-3, 40.0, 85.0])
+def test_nothing_jumps_where_viewer_and_light_coincide(v: float) -> None:
+    """The mirror facet looks at both: its s axis is undefined there, but no reading is."""
+    here = mirrored((v, 20.0), (v, 20.0), 1.5, 0.8, 25.0)
+    np.testing.assert_allclose(here[0], 0.04, rtol=1e-13)
+    for dv, da in ((1e-6, 0.0), (0.0, 1e-6), (-1e-6, 1e-6), (1e-6, -1e-6)):
+        near = mirrored((v + dv, 20.0 + da), (v, 20.0), 1.5, 0.8, 25.0)
+        np.testing.assert_allclose(near, here, atol=1e-8)
+
+
+@pytest.mark.parametrize("view", [(0.0, 20.0), (40.0, 20.0), (85.0, 20.0), (40.0, 200.0)], ids=str)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_derivatives_exist_where_viewer_and_light_coincide(view: tuple, dtype: type) -> None:
+    """The gradient over both directions, the polarization and the index; and it is a limit."""
+
+    def reading(row: jax.Array) -> jax.Array:
+        parameters = {"refractive_index": row[4], "degree": row[5], "angle": row[6]}
+        geometry = Geometry(*(row[i : i + 1] for i in range(4)))
+        return MIRROR.stokes(parameters, geometry)[0] @ jnp.asarray([0.3, 1.0, -0.7], dtype)
+
+    row = jnp.array([*view, 40.0, 20.0, 1.5, 0.8, 25.0], dtype)
+    gradient = jax.jit(jax.grad(reading))
+    assert np.all(np.isfinite(gradient(row)))
+    if dtype == np.float64:
+        step = 1e-4
+        for i, basis in enumerate(np.eye(row.size)):
+            slope = (reading(row + step * basis) - reading(row - step * basis)) / (2.0 * step)
+            np.testing.assert_allclose(gradient(row)[i], slope, atol=1e-8)
+
+
+@given(incidence=zenith, n=index, degree=degree, angle=angle)
+@RUN
+def test_what_enters_is_what_the_transmittances_of_s_and_p_let_through(
+    incidence: float, n: float, degree: float, angle: float
+) -> None:
+    b = float(np.sin(np.deg2rad(incidence)) ** 2)
+    _, fields, (s, p) = twin.films(1.0, (), n, b)
+    # The product of both fields grows in power as each does.
+    cross = np.real(fields[0] * np.conj(fields[1])) * np.sqrt(s * p) / np.abs(np.prod(fields))
+    q, u = components(degree, angle)
+    source = PointSource(LinearPolarization(degree, angle))
+    light = source.entering(Stack(jnp.array([n])), at((10.0, 0.0), (incidence, 0.0)), {})
+    expected = [
+        0.5 * (s * (1.0 + q) + p * (1.0 - q)),
+        0.5 * (s * (1.0 + q) - p * (1.0 - q)),
+        cross * u,
+    ]
+    found = np.asarray(to_stokes(light))[0] / cos_degrees(incidence)
+    np.testing.assert_allclose(found, expected, atol=1e-13)
+
+
+def test_p_light_enters_a_body_whole_at_brewsters_angle() -> None:
+    source = PointSource(LinearPolarization(1.0, 90.0))
+    light = source.entering(Stack(jnp.array([1.5])), at((0.0, 0.0), (BREWSTER, 0.0)), {})
+    np.testing.assert_allclose(light.intensity, np.cos(np.deg2rad(BREWSTER)), rtol=1e-14)
+    np.testing.assert_allclose(light.q, -1.0, rtol=1e-14)
+
+
+def test_polarization_adds_its_parameters_and_can_be_left_out() -> None:
+    assert MIRROR.parameters == ("refractive_index", "degree", "angle")
+    assert Scene(RoughSurface(illumination=BEAM)).parameters[-2:] == ("degree", "angle")
+    assert PointSource(LinearPolarization(0.5, 10.0)).parameters == ()
+    assert LinearPolarization().simpler() == (None,)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: LinearPolarization(1.5), "LinearPolarization: degree: 1.5 is neither a number fr"),
+        (lambda: LinearPolarization(1.0, 200.0), "LinearPolarization: angle: 200.0 is neither"),
+        (lambda: LinearPolarization("a b"), "LinearPolarization: degree: 'a b' is neither"),
+        (lambda: PointSource(0.5), "PointSource: polarization: 0.5 is no such part; give Linear"),
+        (lambda: PointSource(UniformSky()), "PointSource: polarization: .* is no such part"),
+    ],
+)
+def test_polarizations_are_checked(make, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        make()

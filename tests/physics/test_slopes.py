@@ -1,0 +1,188 @@
+"""Roughness by direction: its limits, its symmetries, and brute force over all slopes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vector_optics as twin
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from polar_bayes.errors import SceneError
+from polar_bayes.physics.facets import FacetQuadrature
+from polar_bayes.physics.geometry import Geometry
+from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
+from polar_bayes.physics.microfacet import GGX, Beckmann
+from polar_bayes.physics.mixing import StokesMixing
+from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.shadowing import HeightCorrelatedShadowing
+from polar_bayes.physics.slopes import AnisotropicSlopes, IsotropicSlopes
+from polar_bayes.physics.stack import Stack
+from polar_bayes.physics.subsurface import Lambertian
+from polar_bayes.physics.surface import RoughSurface
+
+RUN = settings(deadline=None, max_examples=40, derandomize=True)
+zenith = st.floats(0.0, 89.0)
+azimuth = st.floats(-180.0, 180.0)
+roughness = st.floats(0.02, 1.0)
+stokes_of = jax.jit(Scene.stokes, static_argnums=0)
+DISTRIBUTIONS = {"Beckmann": Beckmann(), "GGX": GGX()}
+ALONG = AnisotropicSlopes("roughness_azimuth")
+
+
+def scene(source: object, slopes: object, distribution: object = None, **parts: object) -> Scene:
+    """Surface and body, so that the way out is seen, too."""
+    surface = RoughSurface(distribution or GGX(), source, slopes=slopes, **parts)
+    return Scene(surface, Lambertian(0.5), StokesMixing())
+
+
+POINT = scene(PointSource(), ALONG)
+SOURCES = pytest.mark.parametrize(
+    "source", [PointSource(), Disc(20.0), UniformSky()], ids=["point", "disc", "sky"]
+)
+VIEWS = {
+    "view_zenith": np.array([0.0, 30.0, 60.0, 80.0]),
+    "view_azimuth": np.array([0.0, 20.0, -70.0, 160.0]),
+    "light_zenith": np.array([10.0, 40.0, 60.0, 80.0]),
+    "light_azimuth": np.array([180.0, 230.0, 100.0, 10.0]),
+}
+
+
+def seen(turn: float = 0.0, sign: float = 1.0) -> Geometry:
+    """The views turned about the normal, or mirrored at the plane of azimuth 0."""
+    angles = {
+        name: sign * angle + turn if "azimuth" in name else angle for name, angle in VIEWS.items()
+    }
+    return Geometry(**{name: jnp.asarray(angle) for name, angle in angles.items()})
+
+
+def material(along: float, across: float, turn: float = 0.0) -> dict[str, float]:
+    return {
+        "roughness": along,
+        "roughness_across": across,
+        "roughness_azimuth": turn,
+        "refractive_index": 1.5,
+        "subsurface_fraction": 0.3,
+    }
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [(PointSource(), "Beckmann"), (Disc(20.0), "GGX"), (UniformSky(), "GGX")],
+    ids=["point", "disc", "sky"],
+)
+def test_equal_roughnesses_are_isotropic(source: object, name: str) -> None:
+    """To rounding for every source: both sides of the plane are sampled at the same slopes."""
+    same = material(0.3, 0.3, 37.0)
+    both, one = (
+        stokes_of(scene(source, slopes, DISTRIBUTIONS[name]), same, seen())
+        for slopes in (ALONG, IsotropicSlopes())
+    )
+    np.testing.assert_allclose(both, one, rtol=1e-11, atol=1e-15)
+
+
+@SOURCES
+def test_turning_sample_viewer_and_light_together_changes_nothing(source: object) -> None:
+    still = stokes_of(scene(source, ALONG), material(0.4, 0.15, 25.0), seen())
+    turned = stokes_of(scene(source, ALONG), material(0.4, 0.15, 25.0 + 77.0), seen(77.0))
+    np.testing.assert_allclose(turned, still, rtol=1e-11, atol=1e-14)
+
+
+@SOURCES
+def test_a_right_angle_turns_one_roughness_into_the_other(source: object) -> None:
+    one = stokes_of(scene(source, ALONG), material(0.4, 0.15, 25.0), seen())
+    other = stokes_of(scene(source, ALONG), material(0.15, 0.4, 115.0), seen())
+    np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-14)
+
+
+@SOURCES
+def test_a_mirror_image_has_the_other_sign_of_u(source: object) -> None:
+    here = stokes_of(scene(source, ALONG), material(0.4, 0.15, 25.0), seen())
+    there = stokes_of(scene(source, ALONG), material(0.4, 0.15, -25.0), seen(sign=-1.0))
+    np.testing.assert_allclose(there, here * np.array([1.0, 1.0, -1.0]), rtol=1e-11, atol=1e-14)
+    assert np.max(np.abs(here[:, 2] / here[:, 0])) > 0.01
+
+
+@SOURCES
+def test_along_an_axis_of_symmetry_there_is_no_u(source: object) -> None:
+    """The viewer, the light and the grooves in one plane."""
+    plane = seen()._replace(view_azimuth=jnp.full(4, 40.0), light_azimuth=jnp.full(4, 220.0))
+    for turn in (40.0, 130.0):
+        found = stokes_of(scene(source, ALONG), material(0.4, 0.15, turn), plane)
+        np.testing.assert_allclose(found[:, 2], 0.0, atol=1e-14)
+
+
+@given(
+    view=zenith, light=zenith, one=azimuth, other=azimuth, turn=azimuth, r=roughness, s=roughness
+)
+@RUN
+def test_viewer_and_light_may_change_places(
+    view: float, light: float, one: float, other: float, turn: float, r: float, s: float
+) -> None:
+    """The brightness of a point source over both cosines; the body has no such law when rough."""
+    there = Geometry(*(jnp.array([x]) for x in (view, one, light, other)))
+    mirror = Scene(POINT.surface)
+    forth, back = (
+        stokes_of(mirror, material(r, s, turn), geometry)[0]
+        for geometry in (there, there.reversed())
+    )
+    cosines = np.cos(np.deg2rad(light)) / np.cos(np.deg2rad(view))
+    np.testing.assert_allclose(forth[0], back[0] * cosines, rtol=1e-9)
+
+
+# Roughness along, across, its azimuth, and the view zenith; the last three are ten times as steep.
+GROOVES = np.array(
+    [
+        (*grooves, view)
+        for grooves in ((0.3, 0.1, 20.0), (0.1, 0.4, -50.0), (0.5, 0.05, 90.0))
+        for view in (20.0, 60.0, 82.0)
+    ]
+)
+
+
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+def test_sky_and_way_out_agree_with_brute_force(name: str) -> None:
+    """360,000 facets by vectors, to 1e-5, against 30 x 30; and what the default of 30 costs.
+
+    Up to a ratio of 4 that is 6e-4 in every number; at a ratio of 10 seen from the side, 3.5 % of
+    the brightness and .022 of q and u.
+    """
+    along, across, turn, view = (jnp.asarray(column)[:, None] for column in GROOVES.T)
+    geometry = Geometry(view, jnp.full_like(view, 30.0), view, jnp.zeros_like(view))
+    parameters = {"roughness": along, "roughness_across": across, "roughness_azimuth": turn}
+    stack = Stack(jnp.array([1.5]))
+    skies, exits = [], []
+    for row in GROOVES:
+        population = twin.Population(name, *row[:3], steps=600)
+        skies.append(population.sky(row[3], 30.0, 1.5, correlated=True))
+        exits.append(population.way_out(row[3], 30.0, 1.5))
+    steep = GROOVES[:, :1] > 0.45
+    for quadrature, bright, polarized in (
+        (FacetQuadrature(30, 30), 2e-5, 5e-6),
+        (FacetQuadrature(), np.where(steep, 0.036, 6e-4), np.where(steep, 0.023, 6e-4)),
+    ):
+        surface = RoughSurface(
+            DISTRIBUTIONS[name], UniformSky(), quadrature, ALONG, HeightCorrelatedShadowing()
+        )
+        mirrored, leaving = jax.jit(
+            lambda p, surface=surface: (
+                surface.light(p, geometry, stack),
+                surface.exit(p, geometry, stack),
+            )
+        )(parameters)
+        for light, truth in ((mirrored, np.array(skies)), (leaving, np.array(exits))):
+            total, q, u = (truth[:, i : i + 1] for i in range(3))
+            assert np.all(np.abs(light.intensity / total - 1.0) <= bright)
+            assert np.all(np.abs(light.q - q / total) <= polarized)
+            assert np.all(np.abs(light.u - u / total) <= polarized)
+
+
+def test_the_azimuth_is_a_number_or_a_parameter() -> None:
+    assert AnisotropicSlopes(30.0).parameters == ("roughness", "roughness_across")
+    assert ALONG.parameters == ("roughness", "roughness_across", "roughness_azimuth")
+    assert ALONG.simpler() == (IsotropicSlopes(),)
+    fixed = stokes_of(scene(PointSource(), AnisotropicSlopes(30.0)), material(0.4, 0.1), seen())
+    fitted = stokes_of(POINT, material(0.4, 0.1, 30.0), seen())
+    np.testing.assert_allclose(fixed, fitted, rtol=1e-12)
+    with pytest.raises(SceneError, match=r"AnisotropicSlopes: azimuth: 400.0 is neither a number"):
+        AnisotropicSlopes(400.0)
