@@ -32,7 +32,7 @@ PAINT = pb.Scene(
     ),
     subsurface=pb.Lambertian(internal_reflection=pb.InternalReflection()),
     mixing=pb.StokesMixing(),
-    coat=pb.ClearCoat(),
+    coat=pb.ClearCoat(1.49, 0.05),  # the lacquer of a data sheet
     instrument=pb.Instrument((pb.AngleZero(), pb.DolpGain(), pb.DarkLevel())),
 )
 
@@ -112,8 +112,6 @@ CASES = {
         {
             "roughness": 0.15,
             "subsurface_fraction": 0.4,
-            "coat_refractive_index": 1.49,
-            "coat_absorbance": 0.05,
             "angle_zero": 0.2,
             "dolp_gain": 0.97,
             "dark_level": 0.0005,

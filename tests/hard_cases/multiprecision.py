@@ -113,3 +113,117 @@ def half_space_albedo(absorption: mp.mpf) -> mp.mpf:
 
 def hemispherical_reflection(n: mp.mpf, nodes: list, weights: list) -> mp.mpf:
     return mp.fsum(2 * w * x * interface(x, n).mean for x, w in zip(nodes, weights, strict=True))
+
+
+class Boundary(NamedTuple):
+    """Fields and powers at a boundary, with or without films: s, then p."""
+
+    reflected: tuple[mp.mpc, mp.mpc]
+    passed: tuple[mp.mpf, mp.mpf]
+    cross_passed: mp.mpf
+
+
+def boundary(sin_squared: mp.mpf, above: mp.mpf, films: list, below: mp.mpf) -> Boundary:
+    """By characteristic matrices; films are (index, 2 pi thickness/wavelength), top down."""
+
+    def admittances(n: mp.mpf) -> tuple[mp.mpf, mp.mpf]:
+        inside = mp.sqrt(1 - sin_squared / n**2)
+        return n * inside, n / inside
+
+    fields, passed, through = [], [], []
+    for k in (0, 1):
+        electric, magnetic = mp.mpc(1), mp.mpc(admittances(below)[k])
+        for n, wavenumber in reversed(films):
+            y = admittances(n)[k]
+            delta = wavenumber * mp.sqrt(n**2 - sin_squared)
+            electric, magnetic = (
+                mp.cos(delta) * electric - 1j * mp.sin(delta) / y * magnetic,
+                mp.cos(delta) * magnetic - 1j * mp.sin(delta) * y * electric,
+            )
+        first, last = admittances(above)[k], admittances(below)[k]
+        total = first * electric + magnetic
+        fields.append((first * electric - magnetic) / total)
+        through.append(2 * first / total * mp.sqrt(last / first))
+        passed.append(abs(through[-1]) ** 2)
+    cross = mp.re(through[0] * mp.conj(through[1]))
+    return Boundary(tuple(fields), tuple(passed), cross)
+
+
+class Powers(NamedTuple):
+    """What a stack does to power along s, along p, and to the product of their fields."""
+
+    s: mp.mpf
+    p: mp.mpf
+    cross: mp.mpf
+
+
+def coated(
+    sin_squared: mp.mpf, films: list, coat: mp.mpf, absorbance: mp.mpf, n: mp.mpf
+) -> tuple[Powers, Powers]:
+    """Reflectance and transmittance of films on a thick coat on a body: the sum of all bounces."""
+    top = boundary(sin_squared, mp.mpf(1), films, coat)
+    # From below the films stand in the other order; the same power passes.
+    under = boundary(sin_squared, coat, films[::-1], mp.mpf(1))
+    base = boundary(sin_squared, coat, [], n)
+    kept = mp.exp(-absorbance / mp.sqrt(1 - sin_squared / coat**2))
+
+    def both(one: mp.mpc, other: mp.mpc) -> mp.mpf:
+        return mp.re(one * mp.conj(other))
+
+    back, through = [], []
+    for i, j, first, last in (
+        (0, 0, top.passed[0], base.passed[0]),
+        (1, 1, top.passed[1], base.passed[1]),
+        (0, 1, top.cross_passed, base.cross_passed),
+    ):
+        trip = both(base.reflected[i], base.reflected[j]) * kept**2
+        trips = 1 / (1 - trip * both(under.reflected[i], under.reflected[j]))
+        back.append(both(top.reflected[i], top.reflected[j]) + first**2 * trip * trips)
+        through.append(first * kept * last * trips)
+    return Powers(*back), Powers(*through)
+
+
+def ray(zenith: float, azimuth: float) -> mp.matrix:
+    return mp.matrix([sine(zenith) * cosine(azimuth), sine(zenith) * sine(azimuth), cosine(zenith)])
+
+
+def cross_product(a: mp.matrix, b: mp.matrix) -> mp.matrix:
+    return mp.matrix(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
+def mirrored(
+    powers: Powers,
+    view: tuple[float, float],
+    light: tuple[float, float],
+    q: mp.mpf,
+    u: mp.mpf,
+) -> tuple[mp.mpf, mp.mpf, mp.mpf]:
+    """Stokes vector that a facet sends to the viewer, from fields along explicit axes."""
+    towards, from_ = ray(*view), ray(*light)
+    frames = []
+    for direction, (_, azimuth) in ((towards, view), (from_, light)):
+        s = mp.matrix([-sine(azimuth), cosine(azimuth), 0])
+        frames.append((s, cross_product(direction, s)))
+    half = towards + from_
+    axis = cross_product(half, from_)
+    axis = axis / mp.norm(axis) if mp.norm(axis) > mp.mpf("1e-40") else frames[1][0]
+    arriving = [[dot(a, b) for b in frames[1]] for a in (axis, cross_product(from_, axis))]
+    leaving = [[dot(a, b) for b in (axis, cross_product(towards, axis))] for a in frames[0]]
+    into, out = mp.matrix(arriving), mp.matrix(leaving)
+    fields = into * mp.matrix([[1 + q, u], [u, 1 - q]]) * into.T / 2
+    factor = mp.matrix([[powers.s, powers.cross], [powers.cross, powers.p]])
+    for i in (0, 1):
+        for j in (0, 1):
+            fields[i, j] *= factor[i, j]
+    fields = out * fields * out.T
+    return fields[0, 0] + fields[1, 1], fields[0, 0] - fields[1, 1], 2 * fields[0, 1]
+
+
+def groove_density(kind: str, x: mp.mpf, y: mp.mpf, along: mp.mpf, across: mp.mpf) -> mp.mpf:
+    """Facet area per steradian, from slopes along and across the grooves' azimuth."""
+    along, across = max(along, SMOOTHEST), max(across, SMOOTHEST)
+    square = (x / along) ** 2 + (y / across) ** 2
+    bell = mp.exp(-square) if kind == "beckmann" else (1 + square) ** -2
+    return bell * (1 + x**2 + y**2) ** 2 / (mp.pi * along * across)

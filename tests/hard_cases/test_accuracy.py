@@ -1,16 +1,30 @@
 """Closed forms agree with 50-digit arithmetic to 1e-10 in double and 1e-4 in single precision."""
 
+import itertools
+
+import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
 from hard_cases import multiprecision as twin
-from hard_cases.catalogue import MATERIALS, Material, every_case
+from hard_cases.catalogue import MATERIALS, WAVELENGTH, Material, every_case
 
 from polar_bayes.physics import fresnel
+from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.dispersion import Cauchy, Sellmeier
+from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
+from polar_bayes.physics.illumination import PointSource
+from polar_bayes.physics.instrument import BeamOverlap
 from polar_bayes.physics.microfacet import GGX, Beckmann
+from polar_bayes.physics.microsurface import Microsurface
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
+from polar_bayes.physics.polarization import LinearPolarization
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.shadowing import HeightCorrelatedShadowing, SeparableShadowing
+from polar_bayes.physics.slopes import AnisotropicSlopes
+from polar_bayes.physics.stack import Layer, Stack
+from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.subsurface import Lambertian, body_loss, half_space_loss
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
@@ -241,3 +255,197 @@ def mixed(mixing: StokesMixing | DopMixing, b: mp.mpf, first: tuple, second: tup
 
 def test_every_material_of_the_catalogue_is_named_once() -> None:
     assert len(set(MATERIALS.values())) == len(MATERIALS)
+
+
+# --- layers, grooves, polarized light, color ------------------------------------------------------
+
+# Minus the log of the least light that leaves a coat.
+DEEPEST = {np.float64: 106.0, np.float32: 13.0}
+
+LAYERED = (
+    # index and 2 pi thickness/wavelength of a film; index and absorbance of a coat; the body
+    (1.38, 2.6, 1.45, 0.2, 1.5),
+    (1.38, 0.0, 1.45, 0.0, 1.5),
+    (1.5, 30.0, 1.5, 0.0, 1.5),
+    (1.0, 2.6, 1.0, 0.2, 1.5),
+    (1.5**0.5, 0.25 * np.pi / 1.5**0.5, 1.5, 0.0, 1.5),
+    (1.38, np.pi / 1.38, 1.45, 50.0, 2.42),
+    (2.4, 1.3, 1.6, 1.0, 1.2),
+    (1.38, 110.0, 1.7, 0.3, 1.001),
+    (1.45, 2.6, 1.0 + 1e-6, 0.2, 1.0 + 1e-6),
+)
+
+
+@PRECISIONS
+def test_layers(dtype: type) -> None:
+    """s, p and the product of their fields, reflected and passed, against the larger of s and p.
+
+    Fields cancel between layers: what is reflected is measured against the square of the strongest
+    field at any boundary. The phase of the thick film, 220, has 220 roundings, which leaves 2e-3 in
+    single precision, so that only double is tested; so are paths on which a coat lets pass less
+    than is kept, e^-106 or e^-13. The product of fields under a film on a coat counts
+    circular light as unpolarized, which costs 1e-3 at most.
+    """
+    zeniths = np.array([0.0, 1e-3, 30.0, 56.3, 80.0, 89.0, 89.9], dtype)
+    cosines, b = cos_degrees(zeniths), sin_degrees(zeniths) ** 2
+    for case in LAYERED:
+        film, wavenumber, coat, absorbance, n = (jnp.asarray(dtype(x)) for x in case)
+        layers = (Layer(film, wavenumber=2.0 * wavenumber), Layer(coat, absorbance))
+        stack = Stack(n, layers)
+        found = stack.reflection(cosines, b), stack.transmission(cosines, b)
+        exact = [mp.mpf(float(x)) for x in (film, wavenumber, coat, absorbance, n)]
+        for i, zenith in enumerate(zeniths):
+            square = twin.sine(zenith) ** 2
+            depth = exact[3] / mp.sqrt(1 - square / exact[2] ** 2)
+            if depth > DEEPEST[dtype] or (dtype == np.float32 and wavenumber > 50.0):
+                continue
+            truth = twin.coated(square, [tuple(exact[:2])], *exact[2:])
+            media = (mp.mpf(1), exact[0], exact[2], exact[4])
+            fields = [
+                abs(field)
+                for above, below in itertools.pairwise(media)
+                for field in twin.boundary(square, above, [], below).reflected
+            ]
+            sizes = max(fields) ** 2, max(truth[1].s, truth[1].p)
+            for power, true, size in zip(found, truth, sizes, strict=True):
+                assert power.mean.dtype == dtype
+                difference = power.contrast * power.sin_squared
+                straight = power.mean + difference, power.mean - difference, power.cross
+                bounds = BOUND[dtype], BOUND[dtype], 1e-3
+                for value, one, bound in zip(straight, true, bounds, strict=True):
+                    gap = abs(mp.mpf(float(value[i])) - one)
+                    assert gap <= bound * size, f"{case}, {zenith} degrees: {float(gap):.1e}"
+
+
+@PRECISIONS
+def test_scene_in_polarized_light(dtype: type) -> None:
+    """Every direction of the catalogue, bare and under film and coat, against the brightness.
+
+    Near Brewster's angle hardly any p light is reflected: errors are measured against the
+    reflectance of unpolarized light, whose rounding remains.
+    """
+    names, directions = unique_directions(dtype)
+    geometry = geometry_of(directions)
+    geometry = geometry._replace(wavelength=np.full_like(geometry.view_zenith, WAVELENGTH))
+    beam = PointSource(LinearPolarization("light_degree", "light_angle"))
+    film, coat = (1.38, 230.0), (1.45, 0.2)
+    for layers in (None, CoatStack((ThinFilm(*film), ClearCoat(*coat)))):
+        scene = Scene(SmoothSurface(beam), coat=layers)
+        for degree, angle in ((0.0, 0.0), (0.6, 30.0), (1.0, 90.0), (1.0, -45.0)):
+            parameters = {
+                "refractive_index": dtype(1.5),
+                "light_degree": dtype(degree),
+                "light_angle": dtype(angle),
+            }
+            found = np.asarray(scene.stokes(parameters, geometry))[:, 0]
+            assert found.dtype == dtype
+            share, turn = mp.mpf(float(dtype(degree))), 2.0 * angle
+            for i, (view, light, azimuth) in enumerate(directions):
+                b = twin.facet(view, light, azimuth).sin_squared
+                if layers is None:
+                    s, p = twin.boundary(b, mp.mpf(1), [], mp.mpf(1.5)).reflected
+                    powers = twin.Powers(abs(s) ** 2, abs(p) ** 2, mp.re(s * mp.conj(p)))
+                else:
+                    n, thickness, m, absorbance = (mp.mpf(float(dtype(x))) for x in (*film, *coat))
+                    wavenumber = 2 * mp.pi * thickness / mp.mpf(WAVELENGTH)
+                    powers, _ = twin.coated(b, [(n, wavenumber)], m, absorbance, mp.mpf(1.5))
+                truth = twin.mirrored(
+                    powers,
+                    (view, 0.0),
+                    (light, azimuth),
+                    share * twin.cosine(turn),
+                    share * twin.sine(turn),
+                )
+                size = (powers.s + powers.p) / 2
+                for value, true in zip(found[i], truth, strict=True):
+                    assert abs(mp.mpf(float(value)) - true) <= BOUND[dtype] * size, names[i]
+
+
+@PRECISIONS
+@pytest.mark.parametrize("distribution", [Beckmann(), GGX()])
+def test_density_of_grooves(distribution: Beckmann | GGX, dtype: type) -> None:
+    """Down to 1e-20 of the peak; at 1e-30 the exponent alone, 69, takes 69 roundings of a slope.
+
+    A slope in grooves a thousand times as steep as long is a difference of two slopes a thousand
+    times as large: its bound is a thousand roundings more, times the steps in the exponent (46).
+    """
+    names, directions = unique_directions(dtype)
+    geometry = geometry_of(directions)
+    kind = type(distribution).__name__.lower()
+    surface = Microsurface(distribution, SeparableShadowing(), FacetQuadrature())
+    tilt = mirror_facet(geometry).tan_squared_tilt
+    for along, across, azimuth in (
+        (0.3, 0.3, 25.0),
+        (0.1, 0.4, 25.0),
+        (0.3, 0.1, 0.0),
+        (1.0, 1e-3, 90.0),
+    ):
+        values = {"roughness": along, "roughness_across": across, "roughness_azimuth": azimuth}
+        parameters = {key: jnp.asarray(dtype(value)) for key, value in values.items()}
+        ellipse = AnisotropicSlopes("roughness_azimuth").ellipse(parameters, geometry)
+        found = surface.density(ellipse, geometry, tilt)
+        assert found.dtype == dtype
+        exact = [mp.mpf(float(parameters[key])) for key in values]
+        peak = twin.groove_density(kind, mp.mpf(0), mp.mpf(0), *exact[:2])
+        ratio = max(along, across) / min(along, across)
+        steps = 46.0 if kind == "beckmann" else 4.0
+        bound = max(BOUND[dtype], 4.0 * ratio * steps * float(np.finfo(dtype).eps))
+        for i, (view, light, turn) in enumerate(directions):
+            half = twin.ray(view, 0.0) + twin.ray(light, turn)
+            x, y = half[0] / half[2], half[1] / half[2]
+            cos, sin = twin.cosine(azimuth), twin.sine(azimuth)
+            truth = twin.groove_density(kind, x * cos + y * sin, y * cos - x * sin, *exact[:2])
+            if truth > peak * mp.mpf("1e-20"):
+                error = abs(mp.mpf(float(found[i, 0])) - truth) / truth
+                assert error <= bound, f"{names[i]}: {float(error):.1e}"
+
+
+@PRECISIONS
+def test_shadowing(dtype: type) -> None:
+    shares = np.array([1e-6, 1e-3, 0.3, 1.0 - 1e-6, 1.0], dtype)
+    view, light = (grid.ravel() for grid in np.meshgrid(shares, shares))
+    pairs = [(mp.mpf(float(v)), mp.mpf(float(l_))) for v, l_ in zip(view, light, strict=True)]
+    names = [f"{v}, {l_}" for v, l_ in zip(view, light, strict=True)]
+    for rule, truth in (
+        (SeparableShadowing(), [v * l_ for v, l_ in pairs]),
+        (HeightCorrelatedShadowing(), [1 / (1 / v + 1 / l_ - 1) for v, l_ in pairs]),
+    ):
+        assert_accurate(rule.both(view, light), truth, dtype, names)
+
+
+@PRECISIONS
+def test_dispersion(dtype: type) -> None:
+    colors = np.array([300.0, 450.0, 587.5618, 700.0, 2000.0], dtype)
+    precision = {"any parameter": jnp.zeros((), dtype)}
+    names = [f"{color} nm" for color in colors]
+    squares = [(mp.mpf(float(color)) / 1000) ** 2 for color in colors]
+    a, b, c = (mp.mpf(float(dtype(x))) for x in (1.45, 0.005, 1e-4))
+    truth = [a + b / square + c / square**2 for square in squares]
+    assert_accurate(Cauchy(1.45, 0.005, 1e-4).index(precision, colors), truth, dtype, names)
+    glass = Sellmeier((1.03961212, 0.231792344), (0.00600069867, 0.0200179144))
+    strengths, resonances = (
+        [mp.mpf(float(dtype(x))) for x in values] for values in (glass.strengths, glass.resonances)
+    )
+    truth = [
+        mp.sqrt(
+            1 + sum(s * square / (square - r) for s, r in zip(strengths, resonances, strict=True))
+        )
+        for square in squares
+    ]
+    assert_accurate(glass.index(precision, colors), truth, dtype, names)
+
+
+@PRECISIONS
+def test_overlap_of_the_beam(dtype: type) -> None:
+    """Where the footprint fills the sample and far beyond; view and overlap up to 89.99 degrees."""
+    zeniths = np.array([0.0, 45.0, 79.9, 80.0, 80.1, 88.0, 89.99], dtype)
+    view, fills = (grid.ravel()[:, None] for grid in np.meshgrid(zeniths, zeniths[1:]))
+    geometry = Geometry(view, *(np.zeros_like(view) for _ in range(3)))
+    light = Light(*(jnp.ones_like(view) for _ in range(3)))
+    found = BeamOverlap().record({"beam_overlap_zenith": fills}, geometry, light).intensity
+    truth = [
+        (1 + (twin.cosine(f) / twin.cosine(v)) ** 8) ** (-mp.mpf(1) / 8)
+        for v, f in zip(view.ravel(), fills.ravel(), strict=True)
+    ]
+    names = [f"{v}, fills at {f}" for v, f in zip(view.ravel(), fills.ravel(), strict=True)]
+    assert_accurate(found, truth, dtype, names)
