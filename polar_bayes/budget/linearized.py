@@ -31,6 +31,9 @@ STARTS = 6
 FIRST_STEP, STEP = 1e-5, 1e-3
 """Steps of differences: before the width of the posterior is known, and in units of it."""
 
+ROUNDS = 2
+"""Climbs to one peak; the second knows the width that the first has found."""
+
 NEW_WIDTH = 0.1
 """A first guess at the width of a parameter that only the simpler scene has."""
 
@@ -146,16 +149,18 @@ def _moves(peak: Peak, noise_sd: Readings, other: Density, start: np.ndarray) ->
     return np.concatenate(rows)
 
 
-def _climb(density: Density, start: np.ndarray, covariance: np.ndarray) -> Peak:
-    """Climb in coordinates in which the guessed posterior is round and of width one."""
-    width = np.linalg.cholesky(covariance)
-    end = climb(_with_gradient(density, start, width, STEP), np.zeros(start.size))
-    return Peak(
-        density=density,
-        z=start + width @ end.z,
-        covariance=width @ end.covariance @ width.T,
-        found=end.status is Status.OK,
-    )
+def _climb(density: Density, z: np.ndarray, covariance: np.ndarray) -> Peak:
+    """Climb in coordinates in which the posterior is round and of width one, as far as known."""
+    for _ in range(ROUNDS):
+        width = np.linalg.cholesky(covariance)
+        potential = _with_gradient(density, z, width, STEP)
+        end = climb(potential, np.zeros(z.size))
+        if not np.isfinite(end.covariance).all():
+            return Peak(density, z, np.full_like(covariance, np.nan), found=False)
+        # A climb ends within a hundredth of a width; one more step makes that nothing.
+        z = z + width @ (end.z - end.covariance @ potential(end.z)[1])
+        covariance = width @ end.covariance @ width.T
+    return Peak(density, z, covariance, found=end.status is Status.OK)
 
 
 def _with_gradient(

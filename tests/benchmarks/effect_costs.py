@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.effect_costs
 
-Every effect of two scenes is switched on alone in the plain scene that is left when all are off.
+Every effect of three scenes is switched on alone in the plain scene that is left when all are off.
 Prints a Markdown table.
 """
 
@@ -44,8 +44,18 @@ ROUGH = pb.Scene(
     ),
 )
 POLARIZED = pb.Scene(
-    surface=pb.RoughSurface(illumination=pb.PointSource(pb.LinearPolarization(0.5, 30.0))),
+    surface=pb.RoughSurface(
+        illumination=pb.PointSource(pb.LinearPolarization(0.5, 30.0)),
+        quadrature=pb.FacetQuadrature(5, 4),
+        way_out=pb.SmoothExit(),
+    ),
     subsurface=pb.Unpolarized(),
+    mixing=pb.StokesMixing(),
+)
+
+TURBID = pb.Scene(
+    surface=pb.RoughSurface(quadrature=pb.FacetQuadrature(5, 4), way_out=pb.SmoothExit()),
+    subsurface=pb.TurbidMedium(internal_reflection=None),
     mixing=pb.StokesMixing(),
 )
 
@@ -101,7 +111,7 @@ def main() -> None:
     data = capture()
     print("| effect on | operations | ratio | compilation | one gradient | ratio |")
     print("|---|---|---|---|---|---|")
-    for scene in (ROUGH, POLARIZED):
+    for scene in (ROUGH, POLARIZED, TURBID):
         print("\n".join(table(scene, data)), flush=True)
 
 
