@@ -87,10 +87,7 @@ def medium(refractive_index: Array, cos_squared: Array) -> Medium:
 
 def step(above: Medium, below: Medium) -> Array:
     """Factor (n_2^2 - n_1^2)^2 of every reflectance of a bare boundary. Any shape, 1, >= 0."""
-    return (
-        (below.refractive_index - above.refractive_index)
-        * (below.refractive_index + above.refractive_index)
-    ) ** 2
+    return _square_difference(above, below) ** 2
 
 
 def relative_reflection(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
@@ -109,15 +106,13 @@ def relative_reflection(above: Medium, below: Medium, sin_squared: Array) -> Dia
     """
     a, b = above.normal * below.normal, sin_squared
     # Squared last: near grazing the derivatives of the whole would overflow single precision.
-    shape = (1.0 / ((above.normal + below.normal) ** 2 * (a + b))) ** 2
-    return Diattenuation(shape * (a**2 + b**2), 2.0 * shape * a, 2.0 * shape, b)
+    return _of_shape((1.0 / ((above.normal + below.normal) ** 2 * (a + b))) ** 2, a, b)
 
 
 def reflection(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
     """Power that a bare boundary reflects; see `relative_reflection`."""
-    b, a = sin_squared, above.normal * below.normal
-    scale = (_rho(above, below) / (a + b)) ** 2
-    return Diattenuation(scale * (a**2 + b**2), 2.0 * scale * a, 2.0 * scale, b)
+    a, b = above.normal * below.normal, sin_squared
+    return _of_shape((_rho(above, below) / (a + b)) ** 2, a, b)
 
 
 def transmission(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
@@ -193,10 +188,12 @@ def filmed(
 
 def _rho(above: Medium, below: Medium) -> Array:
     """Field reflected along s, without its sign."""
-    difference = (below.refractive_index - above.refractive_index) * (
-        below.refractive_index + above.refractive_index
-    )
-    return difference / (above.normal + below.normal) ** 2
+    return _square_difference(above, below) / (above.normal + below.normal) ** 2
+
+
+def _of_shape(scale: Array, a: Array, b: Array) -> Diattenuation:
+    """The reflectance of s and p that A and B give, times a common factor."""
+    return Diattenuation(scale * (a**2 + b**2), 2.0 * scale * a, 2.0 * scale, b)
 
 
 def _square_difference(above: Medium, below: Medium) -> Array:

@@ -163,9 +163,7 @@ class CoatStack(AbstractCoat):
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
-        others = [
-            tuple(coat for coat in self.coats if coat is not left_out) for left_out in self.coats
-        ]
+        others = [self.coats[:at] + self.coats[at + 1 :] for at in range(len(self.coats))]
         return tuple(CoatStack(coats) if coats else None for coats in others)
 
     @override

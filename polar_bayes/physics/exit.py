@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from polar_bayes.physics.facets import Facets, seen
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.microsurface import Microsurface
+from polar_bayes.physics.microsurface import Microsurface, gather
 from polar_bayes.physics.part import Part
 from polar_bayes.physics.slopes import SlopeEllipse
 from polar_bayes.physics.stack import Stack
@@ -72,14 +72,9 @@ class RoughExit(AbstractExit):
         sample = Facets(*jax.lax.optimization_barrier(tuple(sample)))
         passing = stack.per_facet().transmission(sample.cos_incidence, sample.sin_squared)
         area = jnp.sum(sample.weight, axis=-1)
-        total = jnp.sum(sample.weight * passing.mean, axis=-1)
-        polarized = sample.weight * passing.contrast
-        q = jnp.sum(polarized * sample.along_s, axis=-1) / total
-        if sample.across_s is None:
-            u = jnp.zeros_like(q)
-        else:
-            u = -jnp.sum(polarized * sample.across_s, axis=-1) / total
-        return Light(*jax.lax.optimization_barrier((total / area, q, u)))
+        light = gather(sample, sample.weight, passing)
+        light = light._replace(intensity=light.intensity / area)
+        return Light(*jax.lax.optimization_barrier(tuple(light)))
 
 
 def exit_through_plane(stack: Stack, geometry: Geometry) -> Light:

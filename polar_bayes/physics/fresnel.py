@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from polar_bayes.physics.quadrature import squared_rule
+
 # Cosines and weights for integrals over the hemisphere: 24 Gauss-Legendre nodes in the square root
 # of the cosine, because near n = 1 all reflection gathers at grazing. The error of Fe is 1e-15 from
 # n = 1.1 on, 2e-14 at 1.01 and at most 3e-9 anywhere.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-HEMISPHERE_COSINES = (0.5 * (_NODES + 1.0)) ** 2
-HEMISPHERE_WEIGHTS = 0.5 * (_NODES + 1.0) * _WEIGHTS
+HEMISPHERE_COSINES, HEMISPHERE_WEIGHTS = squared_rule(24)
 
 
 def reflection(

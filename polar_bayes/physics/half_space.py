@@ -36,6 +36,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import cos_degrees, sin_degrees
+from polar_bayes.physics.quadrature import squared_rule, unit_rule
 
 # Scattered light changes with the square root of absorption, whose slope at zero is infinite: less
 # absorption than this counts as this.
@@ -54,24 +55,12 @@ NODES, ROUNDS = 6, 6
 BEYOND, WITHIN = 3, 4
 
 
-def _rule(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre nodes and weights on (0, 1)."""
-    node, weight = np.polynomial.legendre.leggauss(count)
-    return 0.5 * (node + 1.0), 0.5 * weight
-
-
-def _squared_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same in the square root: denser at 0, where H and transmission are steep."""
-    node, weight = _rule(count)
-    return node**2, 2.0 * node * weight
-
-
 def _p_apart[T: (np.ndarray, Array)](cosine: T) -> T:
     """The second function of pair 0 for p light; for s light it is -1."""
     return 2.0 - 3.0 * cosine**2
 
 
-_COSINES, _WEIGHTS = _squared_rule(NODES)
+_COSINES, _WEIGHTS = squared_rule(NODES)
 _ZEROS, _APART = np.zeros(NODES), _p_apart(_COSINES)
 # The part mu'/(mu + mu') of an integral over mu' at each mu.
 _PARTS = _COSINES / (_COSINES[:, None] + _COSINES)
@@ -314,14 +303,14 @@ def _at_nodes(moments: _Moments) -> _Moments:
 def _interface(n: Array) -> _Interface:
     """Nodes in the cosine beyond the critical angle; within it, in that of the light outside."""
     step = (n - 1.0) * (n + 1.0)
-    node, weight = (_column(x, n) for x in _rule(BEYOND))
+    node, weight = (_column(x, n) for x in unit_rule(BEYOND))
     critical = (step + STEP_FLOOR) / n**2
     cosine = jnp.sqrt(critical) * node
     # Squared tangent of half the phase between s and p in total reflection.
     tangent = (critical * node / (1.0 - cosine**2)) ** 2 * (1.0 - node**2)
     one, kept = jnp.ones_like(cosine), (1.0 - tangent) / (1.0 + tangent)
     beyond = _Interface(cosine, critical * node * weight, one, one, kept)
-    node, weight = (_column(x, n) for x in _squared_rule(WITHIN))
+    node, weight = (_column(x, n) for x in squared_rule(WITHIN))
     root = jnp.sqrt(step + node**2)
     s = step / (root + node) ** 2
     p = step * (1.0 - (n**2 + 1.0) * node**2) / (root + n**2 * node) ** 2

@@ -13,9 +13,10 @@ from jaxtyping import Array
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import Window, above_horizon, inside_disc
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
-from polar_bayes.physics.microsurface import Microsurface
+from polar_bayes.physics.microsurface import Microsurface, gather
 from polar_bayes.physics.part import Part, check_part, like, parameters_of
 from polar_bayes.physics.polarization import LinearPolarization, let_in, mirror_light
+from polar_bayes.physics.quadrature import squared_rule, unit_rule
 from polar_bayes.physics.slopes import SlopeEllipse
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light
@@ -225,13 +226,8 @@ class AbstractExtendedSource(AbstractIllumination):
         )
         lit = sample.weight * seen
         # A trace, far below any reading: no facet may be left where grooves are far too deep.
-        total = jnp.maximum(jnp.sum(lit * power.mean, axis=-1), jnp.finfo(lit.dtype).eps ** 1.75)
-        q = jnp.sum(lit * power.contrast * sample.along_s, axis=-1) / total
-        if sample.across_s is None:
-            u = jnp.zeros_like(total)
-        else:
-            u = -jnp.sum(lit * power.contrast * sample.across_s, axis=-1) / total
-        return Light(stack.scale / cos_view * total, q, u)
+        light = gather(sample, lit, power, least=float(jnp.finfo(lit.dtype).eps) ** 1.75)
+        return light._replace(intensity=stack.scale / cos_view * light.intensity)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -251,9 +247,8 @@ class UniformSky(AbstractExtendedSource):
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
         # A squared cosine for the nodes, since transmission is steep at grazing. Four azimuths sum
         # up once and twice around to nothing, which is all that scattering knows of azimuth.
-        node, weight = np.polynomial.legendre.leggauss(SKY_NODES)
-        cosine = (0.5 * (node + 1.0)) ** 2
-        solid_angle = 0.5 * np.pi * (0.5 * (node + 1.0)) * weight
+        cosine, weight = squared_rule(SKY_NODES)
+        solid_angle = 0.5 * np.pi * weight
         rays = geometry.per_facet()
         zenith, azimuth = np.degrees(np.arccos(cosine)), 90.0 * np.arange(4.0)
         around = like(np.tile(azimuth, SKY_NODES), rays.view_azimuth)
@@ -333,14 +328,14 @@ class Disc(AbstractExtendedSource):
 
     def _directions(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cosine from the axis, sine times cosine of azimuth, and solid angle of each direction."""
-        node, weight = np.polynomial.legendre.leggauss(DISC_NODES)
+        node, weight = unit_rule(DISC_NODES)
         # Equal steps in the squared sine of half the angle are equal solid angles.
         square = math.sin(math.radians(self.half_width) / 2.0) ** 2
-        ring = 0.5 * (node + 1.0) * square
+        ring = node * square
         cosine = 1.0 - 2.0 * ring
         sine = 2.0 * np.sqrt(ring * (1.0 - ring))
         azimuth = np.pi * (np.arange(DISC_NODES) + 0.5) / DISC_NODES
-        ring_solid_angle = 2.0 * np.pi * weight * square / DISC_NODES
+        ring_solid_angle = 4.0 * np.pi * weight * square / DISC_NODES
         return (
             np.repeat(cosine, DISC_NODES),
             np.outer(sine, np.cos(azimuth)).ravel(),

@@ -10,11 +10,13 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polar_bayes.physics.diattenuation import Diattenuation
 from polar_bayes.physics.facets import FacetQuadrature, Facets, Window, sample_facets
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_slopes, sin_degrees
 from polar_bayes.physics.microfacet import AbstractMicrofacet
 from polar_bayes.physics.shadowing import AbstractShadowing
 from polar_bayes.physics.slopes import SlopeEllipse
+from polar_bayes.physics.stokes import Light
 
 Border = Callable[[Array, Array], Window]
 
@@ -100,3 +102,30 @@ class Microsurface:
             cos_degrees(geometry.view_zenith),
             border,
         )
+
+
+def gather(
+    sample: Facets, weight: Array, power: Diattenuation, *, least: float | None = None
+) -> Light:
+    """Light of all facets together.
+
+    Args:
+        sample: The facets. Shape (..., view, facet).
+        weight: How much each counts. Same shape.
+        power: What each reflects or lets pass. Same shape.
+        least: Smallest sum that counts, where there may be no facet; None where there always is.
+
+    Returns:
+        Light whose intensity is the weighted sum. Shape (..., view).
+
+    Raises:
+        Nothing.
+    """
+    total = jnp.sum(weight * power.mean, axis=-1)
+    if least is not None:
+        total = jnp.maximum(total, least)
+    polarized = weight * power.contrast
+    q = jnp.sum(polarized * sample.along_s, axis=-1) / total
+    if sample.across_s is None:
+        return Light(total, q, jnp.zeros_like(q))
+    return Light(total, q, -jnp.sum(polarized * sample.across_s, axis=-1) / total)

@@ -15,11 +15,11 @@ from polar_bayes.physics import boundary, fresnel
 from polar_bayes.physics.boundary import EVANESCENT, Film, Medium
 from polar_bayes.physics.diattenuation import Diattenuation
 from polar_bayes.physics.part import like
+from polar_bayes.physics.quadrature import squared_rule
 
 # Squared sines of inner angles that reach a coat but not the air, crowded towards grazing.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-TRAPPED_SHARE = 1.0 - (0.5 * (1.0 - _NODES)) ** 2
-TRAPPED_WEIGHT = 0.5 * (1.0 - _NODES) * _WEIGHTS
+_FROM_END, TRAPPED_WEIGHT = squared_rule(24)
+TRAPPED_SHARE = 1.0 - _FROM_END
 
 
 class Layer(NamedTuple):
@@ -66,20 +66,14 @@ class Stack(NamedTuple):
             Nothing.
         """
         if not self.layers:
-            air, body = (
-                _air(cos_incidence),
-                boundary.medium(self.refractive_index, cos_incidence**2),
-            )
+            air, body = self._bare(cos_incidence)
             return boundary.reflection(air, body, sin_squared)
         return self._respond(cos_incidence, sin_squared)[0]
 
     def relative_reflection(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
         """Reflectance over `scale`: its ratios exist for a body that reflects nothing, too."""
         if not self.layers:
-            air, body = (
-                _air(cos_incidence),
-                boundary.medium(self.refractive_index, cos_incidence**2),
-            )
+            air, body = self._bare(cos_incidence)
             return boundary.relative_reflection(air, body, sin_squared)
         power = self._respond(cos_incidence, sin_squared)[0]
         # A trace, far below any reading: layers like air on a body like air reflect nothing.
@@ -89,19 +83,14 @@ class Stack(NamedTuple):
     @property
     def scale(self) -> Array:
         """Factor that `relative_reflection` leaves out, shape of the index."""
-        return (
-            jnp.ones_like(self.refractive_index)
-            if self.layers
-            else fresnel.index_step(self.refractive_index)
-        )
+        if not self.layers:
+            return fresnel.index_step(self.refractive_index)
+        return jnp.ones_like(self.refractive_index)
 
     def transmission(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
         """Share of the light that passes the whole stack, the same inwards and outwards."""
         if not self.layers:
-            air, body = (
-                _air(cos_incidence),
-                boundary.medium(self.refractive_index, cos_incidence**2),
-            )
+            air, body = self._bare(cos_incidence)
             return boundary.transmission(air, body, sin_squared)
         return self._respond(cos_incidence, sin_squared)[1]
 
@@ -109,10 +98,7 @@ class Stack(NamedTuple):
         """Share of diffuse light from outside that reaches the body, shape of the index."""
         if not self.layers:
             return 1.0 - fresnel.hemispherical_reflection(self.refractive_index)
-        cosine = like(fresnel.HEMISPHERE_COSINES, self.refractive_index)
-        weight = like(
-            2.0 * fresnel.HEMISPHERE_COSINES * fresnel.HEMISPHERE_WEIGHTS, self.refractive_index
-        )
+        cosine, weight = self._hemisphere()
         through = self.per_facet().transmission(cosine, (1.0 - cosine) * (1.0 + cosine))
         return jnp.sum(weight * through.mean, axis=-1)
 
@@ -131,10 +117,7 @@ class Stack(NamedTuple):
         """
         if not self.layers:
             return fresnel.escape(self.refractive_index)
-        cosine = like(fresnel.HEMISPHERE_COSINES, self.refractive_index)
-        weight = like(
-            2.0 * fresnel.HEMISPHERE_COSINES * fresnel.HEMISPHERE_WEIGHTS, self.refractive_index
-        )
+        cosine, weight = self._hemisphere()
         left = self.per_facet()._not_returned(cosine**2, (1.0 - cosine) * (1.0 + cosine))
         # Sums, since matrix products of accelerators drop digits in single precision.
         lost = jnp.sum(weight * left, axis=-1)

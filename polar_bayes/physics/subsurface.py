@@ -9,14 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry
+from polar_bayes.physics.half_space import CLEAREST
 from polar_bayes.physics.internal_reflection import InternalReflection
 from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import Interface
-
-# The reflectance of a body changes with the square root of absorption: its slope at zero is
-# infinite, so absorption below this counts as this.
-CLEAREST = 1e-4
 
 
 @dataclasses.dataclass(frozen=True)
