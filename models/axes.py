@@ -9,6 +9,9 @@ from numpyro import distributions as dist
 
 from polar_bayes.observation.data import Observations
 
+SPECTRAL = ("absorption", "refractive_index")
+"""What has a value of its own at every wavelength."""
+
 
 @contextlib.contextmanager
 def over_axes(data: Observations, *, without: tuple[str, ...] = ()) -> Iterator[None]:
@@ -22,5 +25,14 @@ def over_axes(data: Observations, *, without: tuple[str, ...] = ()) -> Iterator[
 
 def draw(name: str, prior: dist.Distribution, data: Observations) -> Float[Array, "..."]:
     """Sample a parameter inside `over_axes(data, without=("view", ...))`; drops the view axis."""
-    value = numpyro.sample(name, prior)
+    return drop_view(numpyro.sample(name, prior), data)
+
+
+def drop_view(value: Float[Array, "..."], data: Observations) -> Float[Array, "..."]:
+    """A parameter without the view axis of length 1 that plates left behind."""
     return value[..., 0] if len(data.dims) > 1 and value.ndim == len(data.dims) else value
+
+
+def unchanging(name: str) -> tuple[str, ...]:
+    """The axes of a capture over which a parameter of a material stays the same."""
+    return ("view",) if name in SPECTRAL else ("wavelength", "view")

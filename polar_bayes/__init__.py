@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 _HOMES = {
     "budget.effects": ("ChosenScene", "choose_effects"),
     "budget.ledger": ("ledger_sentence", "ledger_summary", "ledger_table"),
+    "capture.combine": ("combine",),
     "capture.files": ("load_capture", "save_capture"),
     "capture.goniometer": ("from_goniometer",),
     "capture.schema": ("count", "validate"),
@@ -21,6 +22,10 @@ _HOMES = {
     "inference.laplace": ("Laplace",),
     "inference.nuts": ("Nuts",),
     "inference.point": ("Point",),
+    "inference.spectrum": ("predict_spectrum",),
+    "models.gp_spectral": ("GpSpectral",),
+    "models.spectral_process": ("SpectralProcess",),
+    "models.hierarchical": ("Hierarchical",),
     "observation.links": (
         "BetaLink",
         "LogitNormalLink",
@@ -56,6 +61,7 @@ _HOMES = {
     "physics.slopes": ("AnisotropicSlopes", "IsotropicSlopes"),
     "physics.subsurface": ("Depolarizer", "Lambertian", "Unpolarized"),
     "physics.surface": ("RoughSurface", "SmoothSurface"),
+    "physics.tilt": ("TiltedNormal",),
     "physics.turbid": ("TurbidMedium",),
     "priors": ("PRIORS",),
     "reporting.html": ("report",),

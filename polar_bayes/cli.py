@@ -142,6 +142,29 @@ def goniometer(s: str, p: str, table: Path | None, out: Path, **settings: Any) -
 
 
 @commands.command()
+@click.argument("captures", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.option("--dim", default="material", show_default=True, help="material or patch.")
+@click.option("--drop", multiple=True, help="Variable to leave out; give it once per variable.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Capture to write.")
+def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Path) -> None:
+    """Put captures side by side, to be fitted together; each is labeled by its name."""
+    named: dict[str, Any] = {}
+    for path in captures:
+        capture = pb.load_capture(path)
+        label = str(capture.attrs["name"])
+        if label in named:
+            raise pb.CaptureError(
+                f"a capture named {label} is there already",
+                where=str(path),
+                mend="import or simulate one of the two again under another --name or file name",
+            )
+        named[label] = capture
+    capture = pb.combine(named, dim=dim, drop=drop)
+    pb.save_capture(capture, out)
+    _print_counts(capture, out)
+
+
+@commands.command()
 @click.argument("capture", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Result to write.")
 @click.option("--model", default="per_material", show_default=True)

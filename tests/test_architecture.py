@@ -39,6 +39,7 @@ HOMES = {
     "click": ("polar_bayes.cli",),
     "netCDF4": ("polar_bayes.capture",),
     "optimistix": ("polar_bayes.inference",),
+    "tinygp": ("polar_bayes.models",),
     "arviz_base": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.reporting"),
     "arviz_stats": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.reporting"),
     "xarray": (

@@ -136,6 +136,26 @@ def test_effects_as_json_are_what_a_fit_of_the_chosen_scene_keeps(
     assert "beam_overlap_zenith" not in result["posterior"]
 
 
+def test_combine_puts_captures_side_by_side(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Labels are the captures' names; two of one name are refused."""
+    other, both = tmp_path / "other.nc", tmp_path / "both.nc"
+    pb.save_capture(pb.load_capture(plate).isel(view=slice(12)).assign_attrs(name="thin"), other)
+    assert main(["combine", str(plate), str(other), "--out", str(both)]) == 0
+    assert capsys.readouterr().out == f"{both}: 40 views, 8 masked, 0 saturated\n"
+    capture = pb.load_capture(both)
+    assert capture["material"].values.tolist() == ["plate", "thin"]
+    assert capture.attrs["setup"] == "goniometer"
+    words = ["combine", str(plate), str(plate), "--dim", "patch", "--out", str(both)]
+    assert main(words) == 1
+    error = capsys.readouterr().err
+    assert "a capture named plate is there already" in error
+    assert error.count("\n") == 1
+    assert main(["combine", str(plate), "--drop", "q", "--drop", "dop", "--out", str(both)]) == 1
+    assert "no reading is there" in capsys.readouterr().err
+
+
 WRONG = {
     "no command": (["frob"], "No such command"),
     "no file": (["fit", "nowhere.nc", "--out", "fit.nc"], "nowhere.nc: there is no such file"),

@@ -143,7 +143,7 @@ def coordinates(
         shape = tuple(n for d, n in data.dims if d in program.dims[name]) + program.events[name]
         if flat.size != np.prod(shape, initial=1):
             continue  # a simplex, say, has fewer free coordinates than numbers
-        group = posterior_of(program, {name: np.reshape(flat, (1, 1, *shape))}, data)
+        group = posterior_of(program, {name: np.reshape(flat, (1, 1, *shape))})
         known = {str(dim): capture[dim] for dim in group.dims if dim in capture.coords}
         for scalar in scalars(group.assign_coords(known)):
             labels[int(scalar.draws[0, 0])] = scalar.label

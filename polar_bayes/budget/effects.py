@@ -16,7 +16,7 @@ from polar_bayes.budget.variants import effects_of, simplify
 from polar_bayes.errors import FitError
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.search import Progress
-from polar_bayes.observation.links import AbstractLink, noise_parameters
+from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.scenes import FULL_SCENES
 from polar_bayes.priors import resolve_priors
@@ -97,13 +97,13 @@ def choose_effects(
     )
     named = not isinstance(scene, Scene)
     full = simplify(FULL_SCENES[request.scene_name] if named else request.scene, ())
-    # What is refused here is refused before minutes are spent.
-    resolve_priors((*full.parameters, *noise_parameters(request.links)), priors)
     effects = effects_of(full)
     wishes = Wishes.of(effects, keep, drop)
     names = None if parameters is None else tuple(parameters)
     with jax.enable_x64(True):
-        scales = Scales(request, priors or {}, progress or _silent)
+        scales = Scales(request, priors, progress or _silent)
+        # What is refused here is refused before minutes are spent.
+        resolve_priors(scales.priors(full).read, priors)
         weighed = weigh(scales, full, effects, names)
         verdict = decide(scales, full, weighed, wishes, float(tolerance))
         costs = scales.costs()

@@ -13,10 +13,10 @@ from polar_bayes.budget.density import Density, Readings, compile_density
 from polar_bayes.budget.linearized import Change, Peak, compare, find_peak
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.search import Progress
+from polar_bayes.inference.story import read_story
 from polar_bayes.observation.data import observe
-from polar_bayes.observation.links import noise_parameters
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import resolve_priors
+from polar_bayes.priors import PriorTable
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class Scales:
     """
 
     def __init__(
-        self, request: Request, priors: Mapping[str, dist.Distribution], progress: Progress
+        self, request: Request, priors: Mapping[str, dist.Distribution] | None, progress: Progress
     ) -> None:
         self.progress = progress
         self._request, self._priors = request, priors
@@ -101,13 +101,17 @@ class Scales:
     def density(self, scene: Scene) -> Density:
         """The density of a scene; a prior for a parameter that it lacks is not used."""
         if scene not in self._densities:
-            needed = (*scene.parameters, *noise_parameters(self._request.links))
-            priors = {name: prior for name, prior in self._priors.items() if name in needed}
-            request = dataclasses.replace(
-                self._request, scene=scene, priors=resolve_priors(needed, priors)
-            )
+            table = self.priors(scene)
+            priors = {name: table[name] for name in table.read}
+            request = dataclasses.replace(self._request, scene=scene, priors=priors)
             self._densities[scene] = compile_density(request, self._data)
         return self._densities[scene]
+
+    def priors(self, scene: Scene) -> PriorTable:
+        """The priors, with a note of which ones the model reads with that scene."""
+        table = PriorTable(self._priors)
+        read_story(self._request.model, self._data, scene, table, self._request.links)
+        return table
 
     def reference(self, scene: Scene, parameters: tuple[str, ...] | None) -> Reference:
         """A scene to compare with.

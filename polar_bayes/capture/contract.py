@@ -45,7 +45,7 @@ class Variable:
 
     Args:
         name: Name of the variable in the capture.
-        kind: "geometry", "reading", "flag" or "label": decides its dims.
+        kind: "geometry", "trust", "reading", "flag" or "label": decides its dims.
         units: The unit, or None for any.
         range: Numbers that it may take (a flag: 0 and 1).
         meaning: Its `long_name`.
@@ -54,7 +54,7 @@ class Variable:
     """
 
     name: str
-    kind: Literal["geometry", "reading", "flag", "label"]
+    kind: Literal["geometry", "trust", "reading", "flag", "label"]
     units: str | None
     range: Interval
     meaning: str
@@ -65,6 +65,7 @@ class Variable:
 ZENITH = Interval(0.0, 90.0, open_high=True)
 AZIMUTH = Interval(-360.0, 360.0)
 UNIT = Interval(0.0, 1.0)
+SHARE = Interval(0.0, 1.0, open_low=True)
 SIGNED_UNIT = Interval(-1.0, 1.0)
 BRIGHTNESS = Interval(0.0, 1e30, open_high=True)
 POSITIVE = Interval(0.0, 1e30, open_low=True, open_high=True)
@@ -75,6 +76,7 @@ FROM_NORMAL = "give degrees from the surface normal"
 AROUND_NORMAL = "give degrees around the surface normal"
 MASK = "correct it or mark it valid=False"
 FRACTION = f"give a fraction, not percent; {MASK}"
+TRUST = "give 1 where the normal is sure; what is not to be trusted at all is valid=False"
 SIGMA = f"give a standard deviation above zero; {MASK}"
 ZERO_ONE = "give True or False, or 1 or 0"
 NANOMETERS = "give nanometers above zero"
@@ -84,6 +86,7 @@ CONTRACT = (
     Variable("view_azimuth", "geometry", "degree", AZIMUTH, "view azimuth", AROUND_NORMAL),
     Variable("light_zenith", "geometry", "degree", ZENITH, "light zenith angle", FROM_NORMAL),
     Variable("light_azimuth", "geometry", "degree", AZIMUTH, "light azimuth", AROUND_NORMAL),
+    Variable("normal_confidence", "trust", "1", SHARE, "trust in the stated normal", TRUST),
     Variable("dop", "reading", "1", UNIT, "degree of linear polarization", FRACTION),
     Variable("q", "reading", "1", SIGNED_UNIT, "normalized Stokes q, s positive", FRACTION),
     Variable("u", "reading", "1", SIGNED_UNIT, "normalized Stokes u", FRACTION, "q"),
@@ -123,6 +126,8 @@ class Layout:
         """The dims, in canonical order, that a variable of the contract may have."""
         if row.kind == "geometry":
             return tuple(dict.fromkeys([("view",), (*self.leading, "view")]))
+        if row.kind == "trust":
+            return tuple(dict.fromkeys([self.leading, ("view",), (*self.leading, "view")]))
         if row.kind == "label":
             return ((row.name,),) if row.name in self.readings else ((),)
         return (self.readings,)

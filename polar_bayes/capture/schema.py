@@ -2,7 +2,8 @@
 
 A capture is an `xarray.Dataset`; `polar_bayes.capture.contract` lists its variables. *Readings*,
 their errors and flags share the dims (leading..., view[, wavelength]); *geometry* has (view) or
-(leading..., view). Leading dims are none (one material), material, patch, or y and x. A dim may
+(leading..., view); how far the stated normal is to be *trusted* has (leading...), (view) or both.
+Leading dims are none (one material), material, patch, or y and x. A dim may
 carry labels: a coordinate of its own name, or the single label that `isel` leaves behind; the dim
 wavelength must, in nanometers. Known truth rides along as `true_<anything>`, over any of the
 capture's dims, NaN where it is not known.

@@ -1,7 +1,7 @@
 """The scalar parameters of a fit: one label and one block of draws each, the material first."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 import xarray as xr
@@ -11,6 +11,8 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 SAMPLE_DIMS = ("chain", "draw")
+OF_POPULATIONS = ("_location", "_spread")
+OF_PROCESSES = ("_level", "_amplitude", "_length")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,6 +39,20 @@ class Scalar:
         return self.name in MATERIAL_PARAMETERS
 
 
+def is_hyperparameter(name: str, names: Collection[str]) -> bool:
+    """True for what describes a population, or a process over wavelength, of another parameter.
+
+    Args:
+        name: The variable.
+        names: All variables of the posterior: `x_spread` is a spread where `x` is beside it.
+
+    Returns:
+        False for parameters of the material, the instrument and the noise.
+    """
+    owners = [name.removesuffix(end) for end in OF_POPULATIONS + OF_PROCESSES if name.endswith(end)]
+    return any(owner in names for owner in owners)
+
+
 def scalars(group: xr.Dataset) -> list[Scalar]:
     """Every scalar of a group of draws.
 
@@ -44,10 +60,12 @@ def scalars(group: xr.Dataset) -> list[Scalar]:
         group: The dataset of `posterior` or `prior`, with dims chain and draw.
 
     Returns:
-        Material parameters first, then other single numbers, then the entries of vectors. Equal
-        labels (two readings at one wavelength) are told apart by `#2`, `#3`.
+        Material parameters first, then those of populations and processes, then other single
+        numbers, then the entries of vectors. Equal labels (two readings at one wavelength) are
+        told apart by `#2`, `#3`.
     """
-    ordered = sorted(group.data_vars, key=lambda name: _rank(str(name), group[name]))
+    names = set(map(str, group.data_vars))
+    ordered = sorted(group.data_vars, key=lambda name: _rank(str(name), group[name], names))
     found = [scalar for name in ordered for scalar in _entries(str(name), group[name])]
     seen: dict[str, int] = {}
     for position, scalar in enumerate(found):
@@ -101,10 +119,12 @@ def method_of(result: xr.DataTree) -> str:
     return "nuts" if "diverging" in stats else "laplace"
 
 
-def _rank(name: str, variable: xr.DataArray) -> tuple[int, int]:
+def _rank(name: str, variable: xr.DataArray, names: Collection[str]) -> tuple[int, int]:
     if name in MATERIAL_PARAMETERS:
         return 0, MATERIAL_PARAMETERS.index(name)
-    return (2 if _has_event(name, variable) else 1), 0
+    if is_hyperparameter(name, names):
+        return 1, 0
+    return (3 if _has_event(name, variable) else 2), 0
 
 
 def _has_event(name: str, variable: xr.DataArray) -> bool:

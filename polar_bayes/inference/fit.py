@@ -1,10 +1,14 @@
 """The one public verb of inference: a capture in, an ArviZ DataTree out."""
 
 import dataclasses
+import functools
+import inspect
+import json
 import platform
 import time
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import jax
@@ -13,22 +17,23 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 from numpyro import distributions as dist
+from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference import laplace, nuts, point
-from polar_bayes.inference.modes import SETTLED, Modes, ValueAndGradient
+from polar_bayes.inference.ground import STARTS, find_ground
+from polar_bayes.inference.modes import SETTLED
 from polar_bayes.inference.program import Draw, Program, compile_program
-from polar_bayes.inference.request import Method, Request, resolve
+from polar_bayes.inference.request import MODELS, Method, Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
-from polar_bayes.inference.search import Progress, find_modes, from_prior
+from polar_bayes.inference.search import Progress, from_prior
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior
 
-STARTS = 16
 PRIOR_DRAWS = 500
 BLOCK = 500
 
@@ -127,33 +132,29 @@ def _fit_scene(
 ) -> _Fitted:
     """Search for modes from prior draws, then do what the method asks."""
     key_starts, key_draws = jax.random.split(key)
-    program = compile_program(request.bind(scene), data)
-    starts = np.asarray(from_prior(program, key_starts, STARTS, data))
+    model = request.bind(scene)
+    program = compile_program(model, data)
     if isinstance(request.method, point.Point):
+        starts = np.asarray(from_prior(program, key_starts, STARTS, data))
         fitted = _fit_point(program, data, starts, request.method)
         clock.lap("least squares")
         return fitted
-    potential = _compile_potential(program, data)
-    modes = find_modes(potential, starts, progress)
+    ground = find_ground(model, program, data, key_starts, progress)
     clock.lap("modes")
     problems: list[str] = []
-    extra: dict[str, Any] = {"modes": _describe_modes(modes)}
+    extra: dict[str, Any] = {"modes": ground.said}
     if isinstance(request.method, laplace.Laplace):
-        if modes.decrement[0] > SETTLED:
+        if ground.decrement > SETTLED:
             problems.append(
-                f"the mode is not settled (Newton decrement {modes.decrement[0]:.2g} posterior "
+                f"the mode is not settled (Newton decrement {ground.decrement:.2g} posterior "
                 "standard deviations): use method='nuts'"
             )
-        z, stats = laplace.sample(program, data, potential, modes, key_draws, request.method)
+        z, stats = ground.laplace(key_draws, request.method)
     else:
+        key_first, key_chains = jax.random.split(key_draws)
+        target = ground.target(key_first, request.method.chains)
         z, stats, extra["goals_reached"] = nuts.sample(
-            program,
-            data,
-            potential,
-            modes,
-            key_draws,
-            request.method,
-            lambda done: progress("sampling", done),
+            target, key_chains, request.method, lambda done: progress("sampling", done)
         )
     clock.lap("draws")
     return _Fitted(program, z, stats, problems, extra)
@@ -174,25 +175,6 @@ class _Clock:
 
 def _silent(stage: str, fraction: float) -> None:
     """No progress to show."""
-
-
-def _compile_potential(program: Program, data: Observations) -> ValueAndGradient:
-    compiled = jax.jit(jax.value_and_grad(program.potential))
-
-    def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = compiled(jnp.asarray(z, data.brightness.dtype), data)
-        return float(value), np.asarray(gradient, float)
-
-    return potential
-
-
-def _describe_modes(modes: Modes) -> dict[str, Any]:
-    return {
-        "starts": modes.starts,
-        "failures": modes.failures,
-        "weights": [round(float(weight), 6) for weight in modes.weight[:8]],
-        "newton_decrement": float(modes.decrement[0]),
-    }
 
 
 def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], Draw]:
@@ -219,9 +201,10 @@ def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], D
     return describe
 
 
-def _constrain(program: Program, z: np.ndarray) -> dict[str, np.ndarray]:
-    constrain = jax.jit(jax.vmap(jax.vmap(program.constrain)))
-    return {name: np.asarray(value) for name, value in constrain(jnp.asarray(z)).items()}
+def _parameters(program: Program, z: np.ndarray, data: Observations) -> dict[str, np.ndarray]:
+    of_draw = functools.partial(program.parameters, data=data)
+    found = jax.jit(jax.vmap(jax.vmap(of_draw)))(jnp.asarray(z))
+    return {name: np.asarray(value) for name, value in found.items()}
 
 
 def _fit_point(
@@ -259,10 +242,31 @@ def _fit_beside(
         except FitError as error:  # a failed comparison must not cost the user the fit, but is told
             comparisons_failed[name] = str(error)
             continue
-        draws = _constrain(fitted.program, fitted.z)
-        beside[name] = posterior_of(fitted.program, draws, data)
+        draws = _parameters(fitted.program, fitted.z, data)
+        beside[name] = posterior_of(fitted.program, draws)
     progress("comparing", 1.0)
     return beside, comparisons_failed
+
+
+def _settings_of(model: Callable) -> dict[str, Any]:
+    """The fields of a model that is a value, in what JSON can hold."""
+    if not dataclasses.is_dataclass(model) or isinstance(model, type):
+        return {}
+    return json.loads(json.dumps(dataclasses.asdict(model), default=repr))
+
+
+def _source_of(request: Request) -> str:
+    """The text of a model of the user's own, so that a result says what was fitted."""
+    model = request.model
+    while isinstance(model, Messenger):
+        model = model.fn
+    ours = [story if isinstance(story, FunctionType) else type(story) for story in MODELS.values()]
+    if model in ours or type(model) in ours:
+        return ""
+    try:
+        return inspect.getsource(model if isinstance(model, FunctionType) else type(model))
+    except (OSError, TypeError):
+        return ""
 
 
 def _provenance(
@@ -280,9 +284,13 @@ def _provenance(
         "method": request.method_name,
         "settings": dataclasses.asdict(request.method),
         "model": request.model_name,
+        "model_settings": _settings_of(request.model),
+        "model_source": _source_of(request),
         "scene": request.scene_name,
         "scene_parts": repr(request.scene),
         "priors": {name: describe_prior(prior) for name, prior in request.priors.items()},
+        "declared": request.declared,
+        "fixed": request.fixed,
         "links": {name: repr(link) for name, link in request.links.items()},
         "swapped": list(request.swapped),
         "largest_view_zenith": request.largest_view_zenith,

@@ -10,7 +10,7 @@ threads there are.
 import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,6 @@ from numpyro import infer
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.modes import Modes, ValueAndGradient
-from polar_bayes.inference.program import Program
-from polar_bayes.observation.data import Observations
 
 Progress = Callable[[float], None]
 
@@ -36,11 +34,13 @@ class Nuts:
 
     Args:
         chains: Independent chains, at least 2.
-        warmup: Draws spent on step size and metric, per chain.
+        warmup: Draws spent on step size and metric, per chain. None: 300; 150 for the patches of
+            a capture, whose metric is known before.
         draws: Draws kept at least, per chain.
         most_draws: Draws kept at most, per chain; set it to `draws` for a fixed length.
         effective_draws: Goal for the bulk and tail effective sample size of every coordinate.
-        target_acceptance: Higher means smaller steps, range [0.5, 1).
+        target_acceptance: Higher means smaller steps, range [0.5, 1). None: 0.9; 0.7 for the
+            patches of a capture, whose coordinates are close to normal.
         max_tree_depth: A trajectory has at most 2 ** this steps.
         threads: Chains that run at once.
         block: Draws between two looks at the progress, per chain.
@@ -50,11 +50,11 @@ class Nuts:
     """
 
     chains: int = 4
-    warmup: int = 300
+    warmup: int | None = None
     draws: int = 500
     most_draws: int = 4000
     effective_draws: float = 450.0
-    target_acceptance: float = 0.9
+    target_acceptance: float | None = None
     max_tree_depth: int = 8
     threads: int = 2
     block: int = 100
@@ -70,11 +70,13 @@ class Nuts:
             "block": 1,
         }
         for name, least in limits.items():
-            if getattr(self, name) < least:
+            given = getattr(self, name)
+            if given is not None and given < least:
                 raise FitError(
                     f"{name} is {getattr(self, name)}", where="Nuts", mend=f"give at least {least}"
                 )
-        if not 0.5 <= self.target_acceptance < 1.0:
+        wanted = self.target_acceptance
+        if wanted is not None and not 0.5 <= wanted < 1.0:
             raise FitError(
                 f"target_acceptance is {self.target_acceptance}",
                 where="Nuts",
@@ -93,11 +95,33 @@ class Step(NamedTuple):
     lp: Array
 
 
+class Target(NamedTuple):
+    """What is sampled.
+
+    Args:
+        density: Minus the log density of a vector, given data (any tree of arrays).
+        given: Those data.
+        potential: The same with its gradient, already compiled, for those data.
+        starts: Where each chain starts, (chain, size).
+        metric: Covariance, (size, size), to begin with; or variances, (size,), to stay with.
+        place: From vectors (chain, draw, size) to the model's unconstrained coordinates.
+    """
+
+    density: Callable[[Array, Any], Array]
+    given: Any
+    potential: ValueAndGradient
+    starts: np.ndarray
+    metric: np.ndarray
+    place: Callable[[np.ndarray], np.ndarray]
+
+    @property
+    def knows_its_metric(self) -> bool:
+        """True where nothing is left to be learned but the step size."""
+        return self.metric.ndim == 1
+
+
 def sample(
-    program: Program,
-    data: Observations,
-    potential: ValueAndGradient,
-    modes: Modes,
+    target: Target,
     key: Array,
     settings: Nuts,
     progress: Progress = lambda _: None,
@@ -105,43 +129,35 @@ def sample(
     """Draw from the posterior.
 
     Args:
-        program: The model.
-        data: The capture.
-        potential: Minus the log density and its gradient, already compiled.
-        modes: Where chains start: each at a draw from the Laplace approximation, the modes
-            chosen by their weights; the heaviest mode gives the metric.
+        target: Density, starts and metric.
         key: Random key.
         settings: Lengths and limits.
         progress: Called with the fraction of all draws that is done.
 
     Returns:
-        Unconstrained draws (chain, draw, size); statistics, each (chain, draw); and whether the
-        goals for mixing were reached before `most_draws`.
+        Unconstrained draws of the model (chain, draw, size); statistics, each (chain, draw); and
+        whether the goals for mixing were reached before `most_draws`.
     """
-    kernel = _Kernel(program, settings)
-    key_start, key_chains = jax.random.split(key)
-    starts = draw_starts(potential, modes, key_start, settings.chains)
-    keys = jax.random.split(key_chains, settings.chains)
-    states = [
-        kernel.begin(keys[chain], starts[chain], potential, modes.covariance[0], data)
-        for chain in range(settings.chains)
-    ]
+    warmup, acceptance = _warmup(settings, target)
+    kernel = _Kernel(target, settings, warmup, acceptance)
+    keys = jax.random.split(key, settings.chains)
+    states = [kernel.begin(key, start) for key, start in zip(keys, target.starts, strict=True)]
     # Compiled before the threads start: all then share one executable.
-    advance = jax.jit(kernel.advance).lower(states[0], data).compile()
+    advance = jax.jit(kernel.advance).lower(states[0], target.given).compile()
 
     rounds: list[Step] = []
     mixed = False
     warmup_blocks, least, most = (
-        -(-draws // settings.block)
-        for draws in (settings.warmup, settings.draws, settings.most_draws)
+        -(-draws // settings.block) for draws in (warmup, settings.draws, settings.most_draws)
     )
     # Blocks are whole: warm-up ends inside the first kept block only if it does not divide.
-    surplus = warmup_blocks * settings.block - settings.warmup
+    surplus = warmup_blocks * settings.block - warmup
 
     def advance_all(states: list[infer.hmc.HMCState]) -> tuple[list[infer.hmc.HMCState], Step]:
-        advanced = list(pool.map(lambda state: advance(state, data), states))
+        advanced = list(pool.map(lambda state: advance(state, target.given), states))
         steps = [jax.tree.map(np.asarray, step) for _, step in advanced]
-        return [state for state, _ in advanced], jax.tree.map(lambda *x: np.stack(x), *steps)
+        joined = jax.tree.map(lambda *x: np.stack(x), *steps)
+        return [state for state, _ in advanced], joined._replace(z=target.place(joined.z))
 
     progress(0.0)
     with ThreadPoolExecutor(settings.threads) as pool:
@@ -161,6 +177,15 @@ def sample(
     stats["step_size"] = np.broadcast_to(step_size[:, None], z.shape[:2])
     stats["reached_max_treedepth"] = stats["n_steps"] >= 2**settings.max_tree_depth - 1
     return z, stats, mixed
+
+
+def _warmup(settings: Nuts, target: Target) -> tuple[int, float]:
+    """Length and goal of the warm-up, where the settings leave them open."""
+    warmup, acceptance = (150, 0.7) if target.knows_its_metric else (300, 0.9)
+    return (
+        warmup if settings.warmup is None else settings.warmup,
+        acceptance if settings.target_acceptance is None else settings.target_acceptance,
+    )
 
 
 def _mixed(rounds: list[Step], settings: Nuts) -> bool:
@@ -203,41 +228,34 @@ def draw_starts(
 class _Kernel:
     """NumPyro's NUTS as two functions of arrays: begin a chain, advance it by a block."""
 
-    def __init__(self, program: Program, settings: Nuts) -> None:
-        self.settings = settings
+    def __init__(self, target: Target, settings: Nuts, warmup: int, acceptance: float) -> None:
+        self.target, self.settings = target, settings
+        self.warmup, self.acceptance = warmup, acceptance
         self.init, self.next = infer.hmc.hmc(
-            potential_fn_gen=lambda data: lambda z: program.potential(z, data), algo="NUTS"
+            potential_fn_gen=lambda given: lambda z: target.density(z, given), algo="NUTS"
         )
 
-    def begin(
-        self,
-        key: Array,
-        start: np.ndarray,
-        potential: ValueAndGradient,
-        metric: np.ndarray,
-        data: Observations,
-    ) -> infer.hmc.HMCState:
-        value, gradient = potential(start)
+    def begin(self, key: Array, start: np.ndarray) -> infer.hmc.HMCState:
+        value, gradient = self.target.potential(start)
         # Value and gradient are given, so that beginning a chain compiles no model.
         given = infer.util.ParamInfo(jnp.asarray(start), jnp.asarray(value), jnp.asarray(gradient))
         return self.init(
             given,
-            self.settings.warmup,
+            self.warmup,
             step_size=0.5,
-            inverse_mass_matrix=jnp.asarray(metric),
-            dense_mass=True,
-            target_accept_prob=self.settings.target_acceptance,
+            inverse_mass_matrix=jnp.asarray(self.target.metric),
+            dense_mass=not self.target.knows_its_metric,
+            adapt_mass_matrix=not self.target.knows_its_metric,
+            target_accept_prob=self.acceptance,
             trajectory_length=None,
             max_tree_depth=self.settings.max_tree_depth,
-            model_args=(data,),
+            model_args=(self.target.given,),
             rng_key=key,
         )
 
-    def advance(
-        self, state: infer.hmc.HMCState, data: Observations
-    ) -> tuple[infer.hmc.HMCState, Step]:
+    def advance(self, state: infer.hmc.HMCState, given: Any) -> tuple[infer.hmc.HMCState, Step]:
         def step(state: infer.hmc.HMCState, _: None) -> tuple[infer.hmc.HMCState, Step]:
-            state = self.next(state, model_args=(data,))
+            state = self.next(state, model_args=(given,))
             return state, Step(
                 z=state.z,
                 diverging=state.diverging,

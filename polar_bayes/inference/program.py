@@ -6,8 +6,9 @@ shapes do not compiles nothing.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +30,8 @@ Values = dict[str, Array] | dict[str, np.ndarray]
 class Draw(NamedTuple):
     """All that one posterior draw says, by site name; or a stack of draws, as NumPy arrays."""
 
-    latent: Values
+    parameters: Values
+    coordinates: Values
     center: Values
     log_likelihood: Values
     log_prior: Values
@@ -42,18 +44,28 @@ class Program:
 
     Args:
         model: A NumPyro model of the data alone; scene, priors and links are already in it.
-        dims: For each sampled site, the axes that its plates gave it.
-        events: For each sampled site, the shape of its own event.
+        dims: For each site, the axes that its plates gave it.
+        plates: Length of every plate.
+        events: For each site, the shape of its own event.
         supports: For each latent site, where its values live.
+        auxiliary: Latent sites that are coordinates, not parameters; see `is_auxiliary`.
+        derived: Deterministic sites, other than noise-free readings.
         observed: The sites that the data fix.
+        fixed: Sites that the model itself fixes, as `numpyro.handlers.condition` does.
+        families: For each latent site, the name of its distribution.
         size: Length of the flat vector.
     """
 
     model: Model
     dims: Mapping[str, tuple[str, ...]]
+    plates: Mapping[str, int]
     events: Mapping[str, tuple[int, ...]]
     supports: Mapping[str, dist.constraints.Constraint]
+    auxiliary: tuple[str, ...]
+    derived: tuple[str, ...]
     observed: tuple[str, ...]
+    fixed: tuple[str, ...]
+    families: Mapping[str, str]
     size: int
     unravel: Callable[[Float[Array, " size"]], dict[str, Array]]
 
@@ -62,11 +74,22 @@ class Program:
         return potential_energy(self.model, (data,), {}, self.unravel(z))
 
     def constrain(self, z: Float[Array, " size"]) -> dict[str, Array]:
-        """The latent sites in their physical range."""
+        """The latent sites in their supports."""
         return {
             name: dist.biject_to(self.supports[name])(value)
             for name, value in self.unravel(z).items()
         }
+
+    def parameters(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
+        """What the model is about: latent sites that are parameters, and what derives from them."""
+        latent = self.constrain(z)
+        fixed = handlers.substitute(self.model, data=latent)
+        trace = handlers.trace(handlers.seed(fixed, jax.random.key(0))).get_trace(data)
+        return self._parameters(trace)
+
+    def _parameters(self, trace: dict) -> dict[str, Array]:
+        names = (*(name for name in self.supports if name not in self.auxiliary), *self.derived)
+        return {name: trace[name]["value"] for name in names}
 
     def from_prior(self, key: Array, data: Observations) -> Float[Array, " size"]:
         """An unconstrained vector drawn from the prior."""
@@ -80,16 +103,29 @@ class Program:
 
     def describe(self, key: Array, z: Float[Array, " size"], data: Observations) -> Draw:
         """Everything that is stored of one draw: parameters, densities, predicted readings."""
-        latent = self.constrain(z)
-        fixed = handlers.substitute(self.model, data=latent)
-        trace = handlers.trace(handlers.seed(fixed, key)).get_trace(data)
-        return _read(trace, latent, self.observed, key)
+        fixed = handlers.substitute(self.model, data=self.constrain(z))
+        return self._read(handlers.trace(handlers.seed(fixed, key)).get_trace(data), key)
 
     def prior_draw(self, key: Array, data: Observations) -> Draw:
         """The same for one draw from the prior."""
-        trace = handlers.trace(handlers.seed(self.model, key)).get_trace(data)
-        latent = {name: trace[name]["value"] for name in self.supports}
-        return _read(trace, latent, self.observed, key)
+        return self._read(handlers.trace(handlers.seed(self.model, key)).get_trace(data), key)
+
+    def _read(self, trace: dict, key: Array) -> Draw:
+        keys = dict(zip(self.observed, jax.random.split(key, len(self.observed)), strict=True))
+        shapes = {name: trace[name]["value"].shape for name in self.observed}
+        return Draw(
+            parameters=self._parameters(trace),
+            coordinates={name: trace[name]["value"] for name in self.auxiliary},
+            center={n: jnp.broadcast_to(noise_free(trace, n), shapes[n]) for n in self.observed},
+            log_likelihood={n: trace[n]["fn"].log_prob(trace[n]["value"]) for n in self.observed},
+            # A population's members are not priors of anything: their spread says it all.
+            log_prior={
+                n: jnp.sum(trace[n]["fn"].log_prob(trace[n]["value"]))
+                for n in self.supports
+                if n not in self.auxiliary
+            },
+            predictive={name: trace[name]["fn"].sample(keys[name]) for name in self.observed},
+        )
 
     def residuals(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
         """Reading minus noise-free reading of every observed site; 0 where not valid."""
@@ -115,10 +151,18 @@ def compile_program(model: Model, data: Observations) -> Program:
 
     def walk(data: Observations) -> None:
         trace = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(data)
-        sites.update({name: site for name, site in trace.items() if site["type"] == "sample"})
+        sites.update(trace)
 
     jax.eval_shape(walk, data)
-    latent = {name: site for name, site in sites.items() if not site["is_observed"]}
+    sampled = {name: site for name, site in sites.items() if site["type"] == "sample"}
+    latent = {name: site for name, site in sampled.items() if not site["is_observed"]}
+    observed = tuple(n for n, site in sampled.items() if site["is_observed"] and n in data.readings)
+    said = {f"{name}_mean" for name in observed}
+    derived = {
+        name: site
+        for name, site in sites.items()
+        if site["type"] == "deterministic" and name not in said
+    }
     supports = {name: site["fn"].support for name, site in latent.items()}
     prototype = {
         name: jnp.zeros(jax.eval_shape(dist.biject_to(supports[name]).inv, site["value"]).shape)
@@ -127,32 +171,53 @@ def compile_program(model: Model, data: Observations) -> Program:
     flat, unravel = ravel_pytree(prototype)
     return Program(
         model=model,
-        dims={name: _plate_names(site) for name, site in sites.items()},
-        events={name: tuple(site["fn"].event_shape) for name, site in sites.items()},
+        dims={name: _plate_names(site) for name, site in (sampled | derived).items()},
+        plates={
+            frame.name: frame.size
+            for site in (sampled | derived).values()
+            for frame in site["cond_indep_stack"]
+        },
+        events={name: tuple(site["fn"].event_shape) for name, site in sampled.items()}
+        | {name: _own_shape(site) for name, site in derived.items()},
         supports=supports,
-        observed=tuple(name for name, site in sites.items() if site["is_observed"]),
+        auxiliary=tuple(name for name, site in latent.items() if is_auxiliary(site)),
+        derived=tuple(derived),
+        observed=observed,
+        fixed=tuple(
+            n for n, site in sampled.items() if site["is_observed"] and n not in data.readings
+        ),
+        families={name: family_of(site["fn"]) for name, site in latent.items()},
         size=flat.size,
         unravel=unravel,
     )
 
 
-def _read(trace: dict, latent: dict[str, Array], observed: tuple[str, ...], key: Array) -> Draw:
-    keys = dict(zip(observed, jax.random.split(key, len(observed)), strict=True))
-    return Draw(
-        latent=latent,
-        center={
-            n: jnp.broadcast_to(noise_free(trace, n), trace[n]["value"].shape) for n in observed
-        },
-        log_likelihood={n: trace[n]["fn"].log_prob(trace[n]["value"]) for n in observed},
-        log_prior={n: jnp.sum(trace[n]["fn"].log_prob(latent[n])) for n in latent},
-        predictive={name: trace[name]["fn"].sample(keys[name]) for name in observed},
-    )
+def is_auxiliary(site: Mapping[str, Any]) -> bool:
+    """True for a latent site that says `infer={"auxiliary": True}`: a coordinate, no parameter."""
+    return bool(site["infer"].get("auxiliary", False))
 
 
 def noise_free(trace: dict, name: str) -> Array:
     """The noise-free reading: the site that says so, or the mean of the likelihood."""
     said = trace.get(f"{name}_mean")
     return said["value"] if said is not None else trace[name]["fn"].mean
+
+
+def _own_shape(site: dict) -> tuple[int, ...]:
+    """The axes of a deterministic site that no plate gave it."""
+    repeated = math.prod(frame.size for frame in site["cond_indep_stack"])
+    shape = tuple(site["value"].shape)
+    if math.prod(shape) == repeated:
+        return ()
+    outer = max((-frame.dim for frame in site["cond_indep_stack"]), default=0)
+    return shape[outer:]
+
+
+def family_of(distribution: dist.Distribution) -> str:
+    """The name of a distribution's class, without what plates have wrapped around it."""
+    while isinstance(distribution, dist.Independent | dist.ExpandedDistribution):
+        distribution = distribution.base_dist
+    return type(distribution).__name__
 
 
 def _plate_names(site: dict) -> tuple[str, ...]:

@@ -11,21 +11,29 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
+from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.laplace import Laplace
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.point import Point
+from polar_bayes.inference.story import read_story
+from polar_bayes.models.gp_spectral import gp_spectral
+from polar_bayes.models.hierarchical import Hierarchical
 from polar_bayes.models.per_material import per_material
-from polar_bayes.observation.data import Observations
-from polar_bayes.observation.links import AbstractLink, noise_parameters
+from polar_bayes.observation.data import Observations, observe
+from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import resolve_priors
+from polar_bayes.priors import PriorTable, resolve_priors
 from polar_bayes.setups import SETUPS, Setup, find_setup
 
 Method = Nuts | Laplace | Point
-MODELS: dict[str, Callable] = {"per_material": per_material}
+MODELS: dict[str, Callable] = {
+    "per_material": per_material,
+    "hierarchical": Hierarchical(),
+    "gp_spectral": gp_spectral,
+}
 METHODS: dict[str, Method] = {"nuts": Nuts(), "laplace": Laplace(), "point": Point()}
 
 
@@ -41,6 +49,8 @@ class Request:
     scene: Scene
     scene_name: str
     priors: dict[str, dist.Distribution]
+    declared: dict[str, str]
+    fixed: dict[str, Any]
     links: dict[str, AbstractLink]
     swapped: tuple[str, ...]
     largest_view_zenith: float
@@ -49,10 +59,9 @@ class Request:
 
     def bind(self, scene: Scene) -> Callable[[Observations], None]:
         """The model with everything but its data in place."""
-        needed = (*scene.parameters, *noise_parameters(self.links))
         # Distributions keep what they have computed once, in the precision of that day; a copy
         # from their arguments alone takes the precision of this fit.
-        priors = {name: jax.tree.map(_in_this_precision, self.priors[name]) for name in needed}
+        priors = {n: jax.tree.map(_in_this_precision, prior) for n, prior in self.priors.items()}
         return functools.partial(self.model, scene=scene, priors=priors, links=self.links)
 
 
@@ -97,7 +106,6 @@ def resolve(
         scene = str(capture.attrs.get("setup", "paper"))
     setup = find_setup(scene) if isinstance(scene, str) else _setup_around(scene, capture)
     chosen = _choose_links(capture, setup, links)
-    needed = (*setup.scene.parameters, *noise_parameters(chosen))
     limit = setup.largest_view_zenith if largest_view_zenith is None else largest_view_zenith
     if not 0.0 < limit <= 90.0:
         raise FitError(
@@ -108,27 +116,44 @@ def resolve(
         raise FitError(f"precision is {precision!r}", where="fit", mend="give 'double' or 'single'")
     if not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed < 2**32:
         raise FitError(f"seed is {seed!r}", where="fit", mend="give an integer from 0 to 2**32 - 1")
+    story = model if callable(model) else _find(MODELS, "model", model)
+    with jax.enable_x64(precision == "double"):
+        data = observe(capture, largest_view_zenith=limit)
+        found = read_story(story, data, setup.scene, PriorTable(priors), chosen)
     swapped = {
         "scene": not isinstance(scene, str),
         "model": callable(model),
         "links": links is not None,
         **{f"prior of {name}": True for name in priors or {}},
+        **{f"{name} held fixed": True for name in found.fixed},
     }
     return Request(
         capture=capture,
-        model=model if callable(model) else _find(MODELS, "model", model),
-        model_name=getattr(model, "__name__", type(model).__name__) if callable(model) else model,
+        model=story,
+        model_name=_name_of(model) if callable(model) else model,
         method=method if isinstance(method, Method) else _find(METHODS, "method", method),
         method_name=type(method).__name__.lower() if isinstance(method, Method) else method,
         scene=setup.scene,
         scene_name=scene if isinstance(scene, str) else "custom",
-        priors=resolve_priors(needed, priors),
+        priors=resolve_priors(found.priors, priors),
+        declared=found.declared,
+        fixed=found.fixed,
         links=chosen,
         swapped=tuple(name for name, was_swapped in swapped.items() if was_swapped),
         largest_view_zenith=limit,
         seed=int(seed),
         precision=precision,
     )
+
+
+def _name_of(model: Callable) -> str:
+    """The name of a model of the user's own; handlers around it are part of the name."""
+    if isinstance(model, functools.partial):
+        return _name_of(model.func)
+    inner = getattr(model, "fn", None) if isinstance(model, Messenger) else None
+    if inner is not None:
+        return f"{type(model).__name__}({_name_of(inner)})"
+    return getattr(model, "__name__", type(model).__name__)
 
 
 def _in_this_precision(argument: object) -> object:

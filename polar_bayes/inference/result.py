@@ -46,15 +46,17 @@ def assemble(
         The tree of DESIGN section 4.
     """
     groups: dict[str, dict[str, np.ndarray]] = {
-        "posterior": _latent(program, posterior.latent, data),
+        "posterior": _shaped(program, posterior.parameters),
         "sample_stats": {name: np.asarray(x) for name, x in sample_stats.items()},
         "posterior_predictive": _readings(posterior.predictive, data),
         "log_likelihood": {n: np.asarray(x) for n, x in posterior.log_likelihood.items()},
         "log_prior": {n: np.asarray(x) for n, x in posterior.log_prior.items()},
         "noise_free": _readings(posterior.center, data),
-        "prior": _latent(program, prior.latent, data),
+        "prior": _shaped(program, prior.parameters),
         "prior_predictive": _readings(prior.predictive, data),
     }
+    if program.auxiliary:
+        groups["unconstrained_posterior"] = _shaped(program, posterior.coordinates)
     lengths = dict(data.dims)
     coords = {dim: capture[dim].to_numpy() for dim in lengths if dim in capture.coords}
     coords |= {dim: np.arange(length) for dim, length in lengths.items() if dim not in coords}
@@ -86,18 +88,17 @@ def provenance_of(result: xr.DataTree) -> dict:
     return json.loads(result.attrs.get(PROVENANCE, "{}"))
 
 
-def posterior_of(program: Program, latent: Mapping[str, Any], data: Observations) -> xr.Dataset:
+def posterior_of(program: Program, parameters: Mapping[str, Any]) -> xr.Dataset:
     """A posterior group alone, for a fit that stands beside the main one.
 
     Args:
         program: The model that was fitted.
-        latent: Constrained draws, (chain, draw, ...).
-        data: The capture as arrays.
+        parameters: Draws of its parameters, (chain, draw, ...).
 
     Returns:
         A dataset like the group `posterior`.
     """
-    tree = from_dict({"posterior": _latent(program, latent, data)}, dims=_dims(program))
+    tree = from_dict({"posterior": _shaped(program, parameters)}, dims=_dims(program))
     return tree["posterior"].to_dataset()
 
 
@@ -109,15 +110,12 @@ def _dims(program: Program) -> dict[str, list[str]]:
     }
 
 
-def _latent(
-    program: Program, values: Mapping[str, Any], data: Observations
-) -> dict[str, np.ndarray]:
+def _shaped(program: Program, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Drop the axes of length 1 that plates leave behind."""
-    lengths = dict(data.dims)
     return {
         name: np.asarray(value).reshape(
             *np.shape(value)[:2],
-            *(lengths[dim] for dim in program.dims[name]),
+            *(program.plates[dim] for dim in program.dims[name]),
             *program.events[name],
         )
         for name, value in values.items()

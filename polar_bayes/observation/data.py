@@ -29,6 +29,8 @@ class Observations(eqx.Module):
         valid: False where a view is missing or set aside.
         saturated: True where the sensor stopped.
         dims: Names and lengths of all axes, outermost first, ending with the view.
+        confidence: Trust in the stated normal, in (0, 1], which broadcasts with the readings; None
+            where the capture states none, and then nothing of it is in the program.
     """
 
     geometry: Geometry
@@ -40,6 +42,7 @@ class Observations(eqx.Module):
     valid: Bool[Array, "... view"]
     saturated: Bool[Array, "... view"]
     dims: tuple[tuple[str, int], ...] = eqx.field(static=True)
+    confidence: Float[Array, "... #view"] | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -87,6 +90,9 @@ def observe(capture: xr.Dataset, *, largest_view_zenith: float = 90.0) -> Observ
     }
     if "wavelength" in capture.coords:
         angles["wavelength"] = _values(capture, "wavelength", order)
+    confidence = None
+    if "normal_confidence" in capture:
+        confidence = jnp.asarray(_values(capture, "normal_confidence", order))
     return Observations(
         geometry=Geometry.from_degrees(**{name: jnp.asarray(x) for name, x in angles.items()}),
         readings={name: jnp.asarray(x) for name, x in readings.items()},
@@ -97,6 +103,7 @@ def observe(capture: xr.Dataset, *, largest_view_zenith: float = 90.0) -> Observ
         valid=jnp.asarray(valid),
         saturated=jnp.asarray(saturated),
         dims=tuple(zip(order, shape, strict=True)),
+        confidence=confidence,
     )
 
 

@@ -2,8 +2,11 @@
 
 A link answers one question, `distribution`: given the prediction and what is known about each
 view, where may the reading fall? The simulator draws from the same object that the fit
-evaluates. A link of your own is one frozen dataclass with that method; the noise parameters
-that it names in `parameters` get their priors from `polar_bayes.priors` or from the caller.
+evaluates. Where a capture states how far its normals can be trusted (`normal_confidence`), the
+links here lower their precision by that. A link of your own is one frozen dataclass with that
+method (`polar_bayes.observation.noise.trusted_scale` lowers its precision too); the noise
+parameters that it names in `parameters` get their priors from `polar_bayes.priors` or from the
+caller.
 """
 
 import abc
@@ -18,7 +21,12 @@ from numpyro import distributions as dist
 from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
-from polar_bayes.observation.noise import ConcentrationSchedule, ScaleSchedule
+from polar_bayes.observation.noise import (
+    ConcentrationSchedule,
+    ScaleSchedule,
+    trusted_precision,
+    trusted_scale,
+)
 from polar_bayes.physics.geometry import cos_degrees
 
 Prediction = Mapping[str, Float[Array, "... view"]]
@@ -111,7 +119,9 @@ class BetaLink(_DopLink):
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
     ) -> dist.Distribution:
         concentration = self.schedule.concentration(
-            noise["concentration_scale"], data.brightness, cos_degrees(data.geometry.view_zenith)
+            trusted_precision(noise["concentration_scale"], data.confidence),
+            data.brightness,
+            cos_degrees(data.geometry.view_zenith),
         )
         return MeanConcentrationBeta(self._mean(prediction), concentration)
 
@@ -137,8 +147,9 @@ class LogitNormalLink(_DopLink):
     ) -> dist.Distribution:
         mean = self._mean(prediction)
         log_odds = jnp.log(mean) - jnp.log1p(-mean)
+        scale = trusted_scale(noise["logit_scale"], data.confidence)
         return dist.TransformedDistribution(
-            dist.Normal(log_odds, noise["logit_scale"]), dist.transforms.SigmoidTransform()
+            dist.Normal(log_odds, scale), dist.transforms.SigmoidTransform()
         )
 
 
@@ -153,7 +164,8 @@ class NormalLink(AbstractLink):
     def distribution(
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
     ) -> dist.Distribution:
-        return dist.Normal(prediction[name], noise["normal_scale"])
+        scale = trusted_scale(noise["normal_scale"], data.confidence)
+        return dist.Normal(prediction[name], scale)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,6 +227,7 @@ class StokesLink(AbstractLink):
         else:
             brightness = jnp.maximum(data.brightness, self.least_brightness)
             scale = noise["stokes_scale"] / jnp.sqrt(brightness)
+        scale = trusted_scale(scale, data.confidence)
         if self.degrees_of_freedom is None:
             return dist.Normal(prediction[name], scale)
         # As a bare number it would become double precision whatever the rest of the program is.
@@ -265,6 +278,7 @@ class StudentTLink(AbstractLink):
         scale = self.schedule.scale(
             noise["intensity_scale"], location, cos_degrees(data.geometry.view_zenith)
         )
+        scale = trusted_scale(scale, data.confidence)
         return SensorStudentT(
             self.degrees_of_freedom, location, scale, data.saturated, data.full_scale
         )

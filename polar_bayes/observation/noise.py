@@ -120,6 +120,42 @@ class ScaleSchedule:
         return base * headroom**-self.headroom_exponent * cosine**-self.angle_exponent
 
 
+def trusted_precision(
+    precision: Float[Array, "..."], confidence: Float[Array, "... view"] | None
+) -> Float[Array, "..."]:
+    """A precision, less where the stated normal is less trusted: precision times confidence.
+
+    Args:
+        precision: Of a reading at directions that are sure, any unit, range > 0.
+        confidence: Trust in the stated normal, unit 1, range (0, 1]; None where it is sure.
+
+    Returns:
+        The precision that is left, broadcast; the same object where the normal is sure.
+
+    Raises:
+        Nothing.
+    """
+    return precision if confidence is None else precision * confidence
+
+
+def trusted_scale(
+    scale: Float[Array, "..."], confidence: Float[Array, "... view"] | None
+) -> Float[Array, "..."]:
+    """The same for the scale of noise, one over the root of a precision.
+
+    Args:
+        scale: Of a reading at directions that are sure, any unit, range > 0.
+        confidence: Trust in the stated normal, unit 1, range (0, 1]; None where it is sure.
+
+    Returns:
+        scale/sqrt(confidence), broadcast; the same object where the normal is sure.
+
+    Raises:
+        Nothing.
+    """
+    return scale if confidence is None else scale / jnp.sqrt(confidence)
+
+
 def _check_range(schedule: object, field: str, low: float, high: float) -> None:
     value = getattr(schedule, field)
     if not low <= value <= high:

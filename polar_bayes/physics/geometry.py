@@ -24,6 +24,8 @@ class Geometry(NamedTuple):
         light_zenith: Angle of the light from the normal. Shape (..., view), degree, |.| < 90.
         light_azimuth: Azimuth of the light. Shape (..., view), degree.
         wavelength: Wavelength in air, nm, broadcasts with (..., view); None where it is not known.
+        light_turn: Cosine and sine of twice the angle from the s axis in which polarized light is
+            stated to the light's own, (..., view); None where they are one.
     """
 
     view_zenith: Array
@@ -31,6 +33,7 @@ class Geometry(NamedTuple):
     light_zenith: Array
     light_azimuth: Array
     wavelength: Array | None = None
+    light_turn: tuple[Array, Array] | None = None
 
     @classmethod
     def from_degrees(
@@ -89,7 +92,7 @@ class Geometry(NamedTuple):
     @property
     def dtype(self) -> jnp.dtype:
         """Floating type of the angles."""
-        return jnp.result_type(float, *(array for array in self if array is not None))
+        return jnp.result_type(float, *jax.tree.leaves(self))
 
 
 class MirrorFacet(NamedTuple):

@@ -19,7 +19,7 @@ from polar_bayes.physics.polarization import LinearPolarization, let_in, mirror_
 from polar_bayes.physics.quadrature import squared_rule, unit_rule
 from polar_bayes.physics.slopes import SlopeEllipse
 from polar_bayes.physics.stack import Stack
-from polar_bayes.physics.stokes import Light
+from polar_bayes.physics.stokes import Light, in_turned_frame
 
 # Directions in a disc, by angle from its center and by azimuth, when counting the light that
 # enters the body: exact to 1e-6 of it while the disc is above the horizon, and to .002 (half
@@ -91,9 +91,11 @@ class AbstractIllumination(Part):
             Nothing.
         """
 
-    def incident(self, parameters: Mapping[str, Array]) -> tuple[Array, Array] | None:
+    def incident(
+        self, parameters: Mapping[str, Array], geometry: Geometry
+    ) -> tuple[Array, Array] | None:
         """Components q and u of the light in its own frame; None for unpolarized light."""
-        del parameters
+        del parameters, geometry
         return None
 
     def beams(
@@ -103,8 +105,8 @@ class AbstractIllumination(Part):
         rays, irradiance = self.rays(geometry)
         cos_light = cos_degrees(rays.light_zenith)
         passing = stack.per_facet().transmission(cos_light, sin_degrees(rays.light_zenith) ** 2)
-        incident = self.incident({name: value[..., None] for name, value in parameters.items()})
-        light = let_in(passing, cos_light, incident)
+        per_ray = {name: value[..., None] for name, value in parameters.items()}
+        light = let_in(passing, cos_light, self.incident(per_ray, rays))
         return rays, light._replace(intensity=irradiance * light.intensity)
 
 
@@ -156,7 +158,7 @@ class PointSource(AbstractIllumination):
                 ellipse, to_light * cos_degrees(azimuth), to_light * sin_degrees(azimuth)
             ),
         )
-        mirrored = mirror_light(stack, facet, geometry, self.incident(parameters))
+        mirrored = mirror_light(stack, facet, geometry, self.incident(parameters, geometry))
         density = facets.density(ellipse, geometry, facet.tan_squared_tilt)
         return mirrored._replace(intensity=density * seen / (4.0 * cos_view) * mirrored.intensity)
 
@@ -164,7 +166,7 @@ class PointSource(AbstractIllumination):
     def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
         cos_light = cos_degrees(geometry.light_zenith)
         passing = stack.transmission(cos_light, sin_degrees(geometry.light_zenith) ** 2)
-        return let_in(passing, cos_light, self.incident(parameters))
+        return let_in(passing, cos_light, self.incident(parameters, geometry))
 
     @override
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
@@ -172,8 +174,14 @@ class PointSource(AbstractIllumination):
         return rays, jnp.ones_like(rays.light_zenith)
 
     @override
-    def incident(self, parameters: Mapping[str, Array]) -> tuple[Array, Array] | None:
-        return None if self.polarization is None else self.polarization.stokes(parameters)
+    def incident(
+        self, parameters: Mapping[str, Array], geometry: Geometry
+    ) -> tuple[Array, Array] | None:
+        if self.polarization is None:
+            return None
+        q, u = self.polarization.stokes(parameters)
+        turn = geometry.light_turn
+        return (q, u) if turn is None else in_turned_frame(q, u, turn)
 
 
 @dataclasses.dataclass(frozen=True)

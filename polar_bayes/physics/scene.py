@@ -18,6 +18,7 @@ from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization, to_stokes
 from polar_bayes.physics.subsurface import AbstractSubsurface
 from polar_bayes.physics.surface import AbstractSurface, Interface
+from polar_bayes.physics.tilt import TiltedNormal
 
 # Parameters of a material, in the order in which they are listed; every other one that a scene
 # reads belongs to the whole capture.
@@ -38,6 +39,8 @@ MATERIAL_PARAMETERS = (
     "coat_absorbance",
     "film_refractive_index",
     "film_thickness",
+    "normal_tilt_x",
+    "normal_tilt_y",
 )
 
 
@@ -54,6 +57,7 @@ class Scene:
         instrument: Instrument((...)), or None for a perfect one.
         dispersion: Cauchy() or Sellmeier(), whose parameters then replace `refractive_index`; or
             None for one index per wavelength.
+        normal: TiltedNormal(), where the stated normal may be wrong; or None where it is right.
 
     Raises:
         SceneError: A part is of the wrong kind, or one is missing beside another.
@@ -65,6 +69,7 @@ class Scene:
     coat: AbstractCoat | None = None
     instrument: Instrument | None = None
     dispersion: AbstractDispersion | None = None
+    normal: TiltedNormal | None = None
 
     ledger: ClassVar[object | None] = None
     """What is known of how the scene was chosen; see `polar_bayes.choose_effects`."""
@@ -81,6 +86,7 @@ class Scene:
             ("coat", AbstractCoat, "ClearCoat(), ThinFilm(), CoatStack((...)) or None"),
             ("instrument", Instrument, "Instrument((DolpGain(), ...)) or None"),
             ("dispersion", AbstractDispersion, "Cauchy(), Sellmeier() or None"),
+            ("normal", TiltedNormal, "TiltedNormal() or None"),
         ):
             if getattr(self, name) is not None:
                 check_part(getattr(self, name), name, kind, allowed)
@@ -101,7 +107,9 @@ class Scene:
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters that the scene reads: the material's, then all others."""
         index = self.dispersion or _FREE_INDEX
-        read = parameters_of(self.surface, self.subsurface, self.mixing, index, self.coat)
+        read = parameters_of(
+            self.surface, self.subsurface, self.mixing, index, self.coat, self.normal
+        )
         read = (*read, *(() if self.instrument is None else self.instrument.parameters))
         material = tuple(name for name in MATERIAL_PARAMETERS if name in read)
         return (*material, *(name for name in read if name not in MATERIAL_PARAMETERS))
@@ -193,7 +201,14 @@ class Scene:
         return dataclasses.replace(self, instrument=Instrument(rest) if rest else None)
 
     def _optics(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
-        """Surface, body and their mixture, for parameters that have a view axis."""
+        """Light in the stated frame of the viewer, for parameters that have a view axis."""
+        if self.normal is None:
+            return self._material(parameters, geometry)
+        inside, turn = self.normal.enter(parameters, geometry)
+        return self.normal.leave(self._material(parameters, inside), turn)
+
+    def _material(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
+        """Surface, body and their mixture, in directions from the true normal."""
         if self.dispersion is not None:
             index = self.dispersion.index(parameters, self._wavelength(geometry))
             parameters = {**parameters, "refractive_index": index}

@@ -76,6 +76,26 @@ def direction(q: Array, u: Array) -> tuple[Array, Array]:
     return q / length, u / length
 
 
+def in_turned_frame(q: Array, u: Array, turn: tuple[Array, Array]) -> tuple[Array, Array]:
+    r"""Components along an s axis that is turned by an angle, towards the second axis.
+
+    $$ q' + i u' = (q + i u) e^{-2i\chi} $$
+
+    Args:
+        q: Normalized Stokes component. Any shape.
+        u: Normalized Stokes component. Same shape.
+        turn: Cosine and sine of twice the angle. Each broadcasts with them.
+
+    Returns:
+        `(q', u')`. Broadcast shape.
+
+    Raises:
+        Nothing.
+    """
+    cos, sin = turn
+    return q * cos + u * sin, u * cos - q * sin
+
+
 def angle_of_linear_polarization(q: Array, u: Array) -> Array:
     """Angle of polarization from the s axis, atan2(u, q)/2; 0 where there is none.
 

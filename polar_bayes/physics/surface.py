@@ -121,7 +121,8 @@ class SmoothSurface(AbstractSurface):
 
     @override
     def light(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
-        return mirror_light(stack, mirror_facet(geometry), geometry, self.beam.incident(parameters))
+        incident = self.beam.incident(parameters, geometry)
+        return mirror_light(stack, mirror_facet(geometry), geometry, incident)
 
     @override
     def entering(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:

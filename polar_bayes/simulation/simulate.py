@@ -40,8 +40,10 @@ NEUTRAL: Mapping[str, np.ndarray] = {
     "beam_overlap_zenith": np.asarray(90.0),
     "discrepancy_amplitude": np.asarray(0.0),
     "discrepancy_weights": np.zeros(4),
+    "normal_tilt_x": np.asarray(0.0),
+    "normal_tilt_y": np.asarray(0.0),
 }
-"""A perfect instrument, by the names of the terms' parameters."""
+"""A perfect instrument and a level sample, by the names of the terms' parameters."""
 
 STATED_ERROR = 0.01
 """Standard error that the instrument states of every reading, for the links that read it."""

@@ -21,14 +21,18 @@ SCENE = pb.Scene(
 )
 
 
+# These parameters have no bounds here, so they do not go by the names of ones that do.
+STANDS_FOR = {"body": "subsurface_fraction", "slope": "refractive_index", "gain": "dolp_gain"}
+
+
 def columns(x):
     """How the reading follows each parameter; x runs from 0 to 1."""
     return {
-        "subsurface_fraction": np.ones_like(x),
-        "refractive_index": x,
+        "body": np.ones_like(x),
+        "slope": x,
         "angle_zero": 0.03 * x**2,
         "dark_level": 0.025 * x**3,
-        "dolp_gain": np.sin(20.0 * x),
+        "gain": np.sin(20.0 * x),
     }
 
 
@@ -37,7 +41,7 @@ def model(data, scene, priors, links):
     mean = sum(
         numpyro.sample(name, dist.Normal(0.0, 1.0)) * jnp.asarray(column)
         for name, column in columns(x).items()
-        if name in scene.parameters
+        if STANDS_FOR.get(name, name) in scene.parameters
     )
     with numpyro.plate("view", x.size):
         noisy = dist.Normal(mean, NOISE).mask(data.valid)

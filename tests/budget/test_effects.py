@@ -15,7 +15,7 @@ from polar_bayes.budget.ledger import ledger_rows, ledger_sentence, ledger_table
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting.html import render
 
-MATERIAL = ("subsurface_fraction", "refractive_index")
+MATERIAL = ("body", "slope")
 TINY = pb.Laplace(chains=2, draws=50)
 
 
@@ -37,12 +37,12 @@ def q() -> np.ndarray:
     x = np.linspace(0.0, 1.0, 15)
     column = linear.columns(x)
     noise = np.random.default_rng(3).normal(0.0, 0.01, x.size)
-    return 0.2 + 0.3 * x + 0.5 * column["dolp_gain"] + noise
+    return 0.2 + 0.3 * x + 0.5 * column["gain"] + noise
 
 
 def exact(q, *gone):
     """Largest change of the material's two parameters without some of the columns."""
-    names = ["subsurface_fraction", "refractive_index", "angle_zero", "dark_level", "dolp_gain"]
+    names = ["body", "slope", "angle_zero", "dark_level", "gain"]
     mean, covariance = linear.posterior(q, names)
     sd = np.sqrt(np.diagonal(covariance))[:2]
     less, narrower = linear.posterior(q, [name for name in names if name not in gone])
@@ -118,12 +118,12 @@ def test_what_the_user_keeps_stays_and_what_the_user_drops_goes(q: np.ndarray) -
 
 def test_the_rule_asks_what_the_rest_changes_beside_what_the_user_drops(q: np.ndarray) -> None:
     choice = straight(q, drop="DolpGain", tolerance=1e6)
-    names = ["subsurface_fraction", "refractive_index", "angle_zero", "dark_level"]
+    names = ["body", "slope", "angle_zero", "dark_level"]
     (mean, covariance), (less, _) = linear.posterior(q, names), linear.posterior(q, names[:2])
     shift = (less - mean[:2]) / np.sqrt(np.diagonal(covariance))[:2]
     found = choice.ledger["combined_shift"].sel(parameter=names[:2])
     np.testing.assert_allclose(found, shift, atol=1e-3)
-    assert np.isnan(choice.ledger["combined_shift"].sel(parameter="dolp_gain"))
+    assert np.isnan(choice.ledger["combined_shift"].sel(parameter="gain"))
 
 
 def test_a_parameter_that_the_user_names_is_not_given_up(q: np.ndarray) -> None:

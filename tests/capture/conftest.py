@@ -31,6 +31,7 @@ def make_capture() -> MakeCapture:
                 "view_azimuth": ("view", np.full_like(zenith, 180.0)),
                 "light_zenith": ("view", zenith.copy()),
                 "light_azimuth": ("view", np.zeros_like(zenith)),
+                "normal_confidence": (leading, np.full([SIZES[dim] for dim in leading], 0.5)),
                 "dop": (dims, dop),
                 "q": (dims, 0.8 * dop),
                 "u": (dims, -0.6 * dop),

@@ -29,7 +29,7 @@ def test_a_valid_capture_comes_out_canonical_and_stays_so(make_capture, leading,
     dims = (*leading, "view", *(("wavelength",) if spectral else ()))
     for row in CONTRACT:
         variable = capture[row.name]
-        assert variable.dims == (("view",) if row.kind == "geometry" else dims)
+        assert variable.dims == {"geometry": ("view",), "trust": leading}.get(row.kind, dims)
         assert variable.dtype == (bool if row.kind == "flag" else np.float64)
         np.testing.assert_array_equal(variable, given[row.name].transpose(*variable.dims))
         assert variable.attrs["units"] == (row.units or "uA")
@@ -132,6 +132,28 @@ def test_count_tells_what_was_masked_and_saturated(make_capture):
     assert counted["saturated"] == int(capture["saturated"].sum()) > 0
     bare = capture.drop_vars(["valid", "saturated"])
     assert count(bare) == {"views": 30, "masked": 0, "saturated": 0}
+
+
+@pytest.mark.parametrize("leading", LEADING, ids=str)
+def test_trust_in_the_normal_may_be_of_patches_of_views_or_of_both(make_capture, leading):
+    capture = make_capture(*leading, spectral=True)
+    sizes = {**{dim: capture.sizes[dim] for dim in leading}, "view": 5}
+    for dims in (leading, ("view",), (*leading, "view")):
+        trust = np.full([sizes[dim] for dim in dims], 0.25)
+        found = validate(capture.assign(normal_confidence=(dims, trust)))["normal_confidence"]
+        assert found.dims == dims
+        assert found.attrs == {"units": "1", "long_name": "trust in the stated normal"}
+    colored = capture["normal_confidence"].expand_dims(wavelength=2)
+    message = refused(capture.assign(normal_confidence=colored), "normal_confidence: its dims are")
+    assert message.endswith(f"or ({', '.join((*leading, 'view'))})")
+
+
+@pytest.mark.parametrize("value", [0.0, -0.1, 1.0001, np.nan, np.inf])
+def test_trust_in_the_normal_is_a_share_above_none(make_capture, value):
+    capture = make_capture("patch")
+    capture["normal_confidence"][1] = value
+    message = refused(capture, r"normal_confidence\[patch=1\]: .* is outside 0 < value <= 1")
+    assert "what is not to be trusted at all is valid=False" in message
 
 
 OUT_OF_RANGE = [

@@ -126,6 +126,8 @@ ORDINARY: dict[str, float] = {
     "light_degree": 0.6,
     "light_angle": 30.0,
     "beam_overlap_zenith": 80.0,
+    "normal_tilt_x": 0.0,
+    "normal_tilt_y": 0.0,
 }
 EFFECTS: dict[str, dict[str, float | tuple[str, float]]] = {
     "ordinary": {},
@@ -166,6 +168,12 @@ EFFECTS: dict[str, dict[str, float | tuple[str, float]]] = {
         "polarized_fraction": 0.0,
         "coat_refractive_index": 1.0,
     },
+    "leaning normal": {"normal_tilt_x": 3.0, "normal_tilt_y": -2.0},
+    "normal a hair off": {"normal_tilt_x": 1e-9, "normal_tilt_y": -1e-9},
+    "normal leaning to viewers at 30 degrees": {"normal_tilt_x": 30.0},
+    "normal leaning to viewers at 45 degrees": {"normal_tilt_x": 45.0},
+    "normal leaning beyond grazing light": {"normal_tilt_x": -30.0, "normal_tilt_y": 20.0},
+    "normal lying on its side": {"normal_tilt_x": -90.0, "normal_tilt_y": 180.0},
     "colorless body like air": {"cauchy_a": 1.0, "cauchy_b": 0.0, "sellmeier_strength": 0.0},
 }
 

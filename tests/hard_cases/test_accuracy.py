@@ -15,7 +15,7 @@ from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.illumination import PointSource
-from polar_bayes.physics.instrument import BeamOverlap
+from polar_bayes.physics.instrument import STEEPEST_ZENITH, BeamOverlap
 from polar_bayes.physics.microfacet import GGX, Beckmann
 from polar_bayes.physics.microsurface import Microsurface
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
@@ -27,6 +27,7 @@ from polar_bayes.physics.stack import Layer, Stack
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.subsurface import Lambertian, body_loss, half_space_loss
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+from polar_bayes.physics.tilt import lean
 
 BOUND = {np.float64: 1e-10, np.float32: 1e-4}
 PRECISIONS = pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -129,6 +130,40 @@ def test_mirror_facet(dtype: type) -> None:
             )
         ]
         assert max(error) <= BOUND[dtype], names[int(np.argmax(error))]
+
+
+@PRECISIONS
+def test_lean(dtype: type) -> None:
+    """Directions to the rounding of the angles that go in, whatever the normal does.
+
+    Close to the true normal an azimuth is known as well as the direction, so that its turn is
+    measured against the sine of the angle from there; a sine that small is kept as it is.
+    """
+    names, directions = unique_directions(dtype)
+    for tilts in ((0.0, 0.0), (1e-9, -1e-9), (3.0, -2.0), (30.0, 0.0), (-25.0, 20.0)):
+        slopes = [jnp.tan(jnp.deg2rad(jnp.asarray(dtype(tilt)))) for tilt in tilts]
+        normal = mp.matrix([*(mp.mpf(float(slope)) for slope in slopes), 1])
+        normal /= mp.norm(normal)
+        zenith, azimuth = directions[:, 1], directions[:, 2]
+        found = lean(zenith, azimuth, *slopes)
+        assert found.zenith.dtype == dtype
+        for i, (down, around) in enumerate(zip(zenith, azimuth, strict=True)):
+            light, s = (
+                twin.ray(down, around),
+                mp.matrix([-twin.sine(around), twin.cosine(around), 0]),
+            )
+            across = twin.cross_product(normal, light)
+            cosine, sine = twin.dot(normal, light), mp.norm(across)
+            truth = mp.degrees(mp.atan2(sine, cosine))
+            truth = min(truth, max(mp.mpf(STEEPEST_ZENITH), mp.mpf(float(down))))
+            at = f"{names[i]}, tilt {tilts}"
+            assert abs(mp.mpf(float(found.zenith[i])) - truth) <= BOUND[dtype], at
+            if sine > mp.mpf("1e-4"):
+                along, aside = twin.dot(across, s), twin.dot(across, twin.cross_product(light, s))
+                for turn, true in zip(
+                    found.turn, (along**2 - aside**2, 2 * along * aside), strict=True
+                ):
+                    assert abs(mp.mpf(float(turn[i])) - true / sine**2) * sine <= BOUND[dtype], at
 
 
 @PRECISIONS

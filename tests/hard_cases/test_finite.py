@@ -36,6 +36,7 @@ from polar_bayes.physics.shadowing import HeightCorrelatedShadowing
 from polar_bayes.physics.slopes import AnisotropicSlopes
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+from polar_bayes.physics.tilt import TiltedNormal
 from polar_bayes.physics.turbid import TurbidMedium
 
 READINGS = ("dop", "q", "u", "intensity")
@@ -54,12 +55,14 @@ EFFECT_SCENES = {
         StokesMixing(),
         ClearCoat(),
         Instrument((BeamOverlap(),)),
+        normal=TiltedNormal(),
     ),
     "grooves under a sky, with a film": Scene(
         RoughSurface(GGX(), UniformSky(), FEW, GROOVED, HeightCorrelatedShadowing()),
         Depolarizer(),
         DopMixing(signed=True),
         ThinFilm(),
+        normal=TiltedNormal(),
     ),
     "grooves under a disc, of their own color": Scene(
         RoughSurface(Beckmann(), Disc(5.0), FEW, GROOVED, way_out=SmoothExit()),
@@ -74,6 +77,7 @@ EFFECT_SCENES = {
         CoatStack((ThinFilm(), ClearCoat())),
         Instrument((Analyzer(30.0), Saturation(0.5))),
         Cauchy(),
+        TiltedNormal(),
     ),
     "a turbid body": Scene(SmoothSurface(BEAM), TurbidMedium("polarized_fraction"), StokesMixing()),
 }

@@ -192,6 +192,32 @@ def test_a_reading_at_the_stated_level_has_stopped_whether_flagged_or_not():
     np.testing.assert_array_equal(data.readings["intensity"], INTENSITY / 20.0)
 
 
+# --- trust in the normal --------------------------------------------------------------------------
+
+
+def test_without_a_stated_trust_there_is_none():
+    data = observe(make_capture())
+    assert data.confidence is None
+    assert len(jax.tree.leaves(data)) < len(jax.tree.leaves(observe(trusted((), 0.5))))
+
+
+def trusted(dims, value, *leading, **options):
+    return validate(make_capture(*leading, **options).assign(normal_confidence=(dims, value)))
+
+
+@pytest.mark.parametrize("leading", [(), ("material",), ("patch",), ("y", "x")], ids=str)
+def test_trust_stands_beside_the_readings_and_broadcasts_with_them(leading):
+    for dims in (leading, ("view",), (*leading, "view")):
+        value = np.random.default_rng(1).uniform(0.1, 1.0, [SIZES[dim] for dim in dims])
+        capture = trusted(dims, value, *leading, wavelength=True)
+        data = observe(capture)
+        order = (*leading, "wavelength", "view")
+        expected = capture["normal_confidence"].broadcast_like(capture["dop"]).transpose(*order)
+        np.testing.assert_array_equal(np.broadcast_to(data.confidence, data.shape), expected)
+        assert data.confidence.ndim == len(data.shape)
+        assert data.confidence.size == value.size
+
+
 # --- directions -----------------------------------------------------------------------------------
 
 

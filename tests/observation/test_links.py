@@ -149,6 +149,60 @@ def test_brightness_and_angle_of_one_view_do_not_reach_another(name, link):
     np.testing.assert_array_equal(np.asarray(plain)[rest], np.asarray(other)[rest])
 
 
+# --- trust in the normal ------------------------------------------------------------------------
+
+TRUST = jnp.array([[1.0, 0.25, 0.04, 1e-12]])
+
+
+def trusting(data, confidence):
+    return dataclasses.replace(data, confidence=confidence)
+
+
+@EVERY_LINK
+def test_full_trust_is_as_if_nothing_were_said(name, link):
+    prediction, noise, reading = make_prediction(), make_noise(link), draw(name, link)[0]
+    plain, sure = (
+        link.distribution(name, prediction, data, noise).log_prob(reading)
+        for data in (make_data(), trusting(make_data(), jnp.ones((1, 4))))
+    )
+    np.testing.assert_array_equal(sure, plain)
+
+
+@EVERY_LINK
+def test_trust_of_one_view_is_its_precision(name, link):
+    """Twice the noise at a quarter of the trust; a quarter of the concentration that is gained."""
+    data = trusting(make_data(), TRUST)
+    found, plain = (
+        link.distribution(name, make_prediction(), each, make_noise(link))
+        for each in (data, make_data())
+    )
+    assert found.batch_shape == SHAPE
+    if isinstance(link, BetaLink):
+        gained, sure = (each.concentration - link.schedule.minimum for each in (found, plain))
+        np.testing.assert_allclose(gained, sure * TRUST, rtol=1e-3, atol=1e-12)
+    else:
+        wide, sure = (getattr(each, "base_dist", each).scale for each in (found, plain))
+        np.testing.assert_allclose(
+            jnp.broadcast_to(wide, SHAPE), sure / jnp.sqrt(TRUST) * jnp.ones(SHAPE), rtol=1e-13
+        )
+
+
+@EVERY_LINK
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_density_and_slopes_stay_finite_down_to_no_trust_at_all(name, link, dtype):
+    data = trusting(make_data(dtype), TRUST.astype(dtype))
+    reading = draw(name, link)[0].astype(dtype)
+
+    def total(prediction, noise):
+        return link.distribution(name, prediction, data, noise).log_prob(reading).sum()
+
+    compiled = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))
+    value, slopes = compiled(make_prediction(dtype), make_noise(link, dtype))
+    assert value.dtype == dtype
+    for slope in jax.tree.leaves((value, slopes)):
+        assert np.all(np.isfinite(slope))
+
+
 @pytest.mark.parametrize("link", [BetaLink(margin=1e-3), LogitNormalLink(margin=1e-3)])
 def test_readings_at_0_and_1_come_to_the_margin_and_others_stay(link):
     given = jnp.array([0.0, 1e-4, 0.3, 1.0 - 1e-4, 1.0])

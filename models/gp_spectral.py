@@ -1,0 +1,132 @@
+"""Colors that know of each other: a Gaussian process over wavelength (the paper's section 2).
+
+The refractive index, the logarithm of the absorption, or both are smooth functions of wavelength:
+a level, and a departure from it whose size (amplitude) and smoothness (length) are inferred with
+it. What one color cannot tell, its neighbors can, and wavelengths that were not measured have a
+posterior too (`polar_bayes.predict_spectrum`).
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpyro
+from jaxtyping import Array, Float
+from numpyro import distributions as dist
+from polar_bayes.models.axes import draw, over_axes, unchanging
+from polar_bayes.models.population import check_members, check_pooled, draw_pooled
+from polar_bayes.models.readings import declare_readings
+from polar_bayes.models.spectra import (
+    SPECTRA,
+    around,
+    check_capture,
+    check_processes,
+    check_spectra,
+    wavelengths_of,
+    widening_of,
+)
+from polar_bayes.models.spectral_process import SpectralProcess
+
+from polar_bayes.observation.data import Observations
+from polar_bayes.observation.links import AbstractLink
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
+from polar_bayes.priors import support_bounds
+
+OF_A_PATCH = ("wavelength", "view")
+
+
+@dataclasses.dataclass(frozen=True)
+class GpSpectral:
+    """Spectra of one material, or of many patches, as Gaussian processes over wavelength.
+
+    Args:
+        coupled: Which of refractive_index and absorption are processes; the other, if the scene
+            reads it, is free at every wavelength.
+        process: The process of all of them, or a tuple with one for each.
+        pooled: Parameters whose values (for spectra: levels) patches draw from one population.
+
+    Raises:
+        FitError: A name is no spectrum, or processes and names do not pair.
+    """
+
+    coupled: tuple[str, ...] = SPECTRA
+    process: SpectralProcess | tuple[SpectralProcess, ...] = dataclasses.field(
+        default_factory=SpectralProcess
+    )
+    pooled: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_pooled(self.pooled, where="GpSpectral")
+        check_spectra(self.coupled)
+        check_processes(self.coupled, self.process)
+
+    def process_of(self, name: str) -> SpectralProcess:
+        """The process of one spectrum."""
+        if isinstance(self.process, tuple):
+            return self.process[self.coupled.index(name)]
+        return self.process
+
+    def __call__(
+        self,
+        data: Observations,
+        scene: Scene,
+        priors: Mapping[str, dist.Distribution],
+        links: Mapping[str, AbstractLink],
+    ) -> None:
+        """Declare the story of a capture with a wavelength axis.
+
+        Args:
+            data: The capture as arrays.
+            scene: The optics; with a law of dispersion in it, the law gives the index.
+            priors: A distribution for every parameter, the levels, amplitudes and lengths of the
+                processes among them.
+            links: For each recorded variable, how it scatters.
+        """
+        check_capture(self.coupled, data, scene)
+        check_members(self.pooled, data, scene)
+        parameters = {}
+        for name in (name for name in MATERIAL_PARAMETERS if name in scene.parameters):
+            if name in self.coupled:
+                parameters[name] = self._spectrum(name, data, priors)
+            elif name in self.pooled:
+                parameters[name] = draw_pooled(name, data, priors, without=unchanging(name))
+            else:
+                with over_axes(data, without=unchanging(name)):
+                    parameters[name] = draw(name, priors[name], data)
+
+        declare_readings(parameters, data, scene, priors, links)
+
+    def _spectrum(
+        self, name: str, data: Observations, priors: Mapping[str, dist.Distribution]
+    ) -> Float[Array, "... wavelength"]:
+        """Sample one spectrum, for each patch its own."""
+        process, wavelength = self.process_of(name), wavelengths_of(data)
+
+        # How much and how smoothly bodies of this kind change with color: one for the capture.
+        amplitude = numpyro.sample(f"{name}_amplitude", priors[f"{name}_amplitude"])
+        length = None
+        if process.fits_length:
+            length = numpyro.sample(f"{name}_length", priors[f"{name}_length"])
+
+        # Where this body lies, and how it departs from there.
+        places = process.places(wavelength)
+        widening = widening_of(name, amplitude * process.scales(length, places))
+        if name in self.pooled:
+            level = draw_pooled(f"{name}_level", data, priors, without=OF_A_PATCH)
+        with over_axes(data, without=OF_A_PATCH):
+            if name not in self.pooled:
+                level = draw(f"{name}_level", priors[f"{name}_level"], data)
+            weights = numpyro.sample(
+                f"{name}_weights", dist.Normal(0.0, widening).to_event(1), infer={"auxiliary": True}
+            )
+        patches = [size for axis, size in data.dims if axis not in OF_A_PATCH]
+        standard = (weights / widening).reshape(*patches, -1)
+        departure = process.values(standard, length, places, wavelength)
+        departure = departure - jnp.mean(departure, axis=-1, keepdims=True)
+        prior = f"{name}_level_location" if name in self.pooled else f"{name}_level"
+        spectrum = around(name, level, amplitude, departure, support_bounds(priors[prior]))
+        with over_axes(data, without=("view",)):
+            return numpyro.deterministic(name, spectrum)
+
+
+gp_spectral = GpSpectral()

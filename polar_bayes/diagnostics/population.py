@@ -1,0 +1,315 @@
+"""How much do the members of a population differ, and how much does each lean on the others?
+
+A parameter is pooled where the posterior holds `<parameter>_location` and `<parameter>_spread`
+beside it. The population is normal on the parameter's own scale: log for what is positive, log
+odds for a share, plain (cut at its bounds) for an index.
+"""
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import scipy.special
+import xarray as xr
+
+from polar_bayes.diagnostics.alone import estimate_alone
+from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars
+from polar_bayes.inference.result import provenance_of
+from polar_bayes.priors import RANGES
+
+INTERVAL = (0.025, 0.975)
+NEW_MEMBERS = 20_000
+SUMMARY_COLUMNS = (
+    "members",
+    "location",
+    "location_sd",
+    "location_q2.5",
+    "location_q97.5",
+    "spread",
+    "spread_sd",
+    "spread_q2.5",
+    "spread_q97.5",
+    "new_q2.5",
+    "new_q97.5",
+    "pooling",
+    "meaning",
+)
+MEMBER_COLUMNS = (
+    "mean",
+    "q2.5",
+    "q97.5",
+    "alone",
+    "alone_q2.5",
+    "alone_q97.5",
+    "leaning",
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Population:
+    """One pooled parameter, at one wavelength where it has several.
+
+    Args:
+        label: Such as `refractive_index` or `refractive_index[450]`.
+        location: Its location.
+        spread: Its spread.
+        members: The parameter of every member.
+        low: Least value that a member can have.
+        high: Largest value that a member can have.
+    """
+
+    label: str
+    location: Scalar
+    spread: Scalar
+    members: tuple[Scalar, ...]
+    low: float
+    high: float
+
+    @property
+    def name(self) -> str:
+        """The pooled parameter."""
+        return self.members[0].name
+
+    @property
+    def scale(self) -> str:
+        """Where the population is normal: "log", "log odds" or "plain"."""
+        limits = RANGES.get(self.name, (-math.inf, math.inf))
+        return {(0.0, math.inf): "log", (0.0, 1.0): "log odds"}.get(limits, "plain")
+
+    def to_scale(self, value: np.ndarray) -> np.ndarray:
+        """From the unit of the parameter to the scale on which the population is normal."""
+        value = np.asarray(value, float)
+        with np.errstate(divide="ignore"):
+            if self.scale == "log":
+                return np.log(value)
+            return scipy.special.logit(value) if self.scale == "log odds" else value
+
+    def from_scale(self, value: np.ndarray) -> np.ndarray:
+        """Back to the unit of the parameter."""
+        if self.scale == "log":
+            return np.exp(value)
+        return scipy.special.expit(value) if self.scale == "log odds" else np.asarray(value)
+
+    def new_members(self, count: int = NEW_MEMBERS, seed: int = 0) -> np.ndarray:
+        """Draws of members that were not measured, shape (count,), unit of the parameter."""
+        location, spread = self.location.draws.ravel(), self.spread.draws.ravel()
+        # Evenly through the draws; as many ranks of the population as there are draws of it.
+        at = np.linspace(0, location.size - 1, count).round().astype(int)
+        rank = (np.arange(count) + 0.5) / count
+        rank = np.random.default_rng(seed).permutation(rank)
+        center, width = self.to_scale(location[at]), np.maximum(spread[at], 1e-12)
+        if self.scale == "plain":
+            # The population is cut at the bounds, not heaped up at them.
+            below, above = (
+                scipy.special.ndtr((bound - center) / width) for bound in (self.low, self.high)
+            )
+            rank = below + rank * (above - below)
+            inside = np.clip(center + width * scipy.special.ndtri(rank), self.low, self.high)
+            return np.asarray(inside)
+        return self.from_scale(center + width * scipy.special.ndtri(rank))
+
+
+def populations(result: xr.DataTree) -> list[Population]:
+    """Every pooled parameter of a result, wavelength by wavelength.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+
+    Returns:
+        The populations; none where nothing is pooled.
+
+    Raises:
+        FitError: The tree holds no posterior.
+    """
+    found: dict[str, list[Scalar]] = {}
+    for scalar in posterior_scalars(result):
+        found.setdefault(scalar.name, []).append(scalar)
+    priors = provenance_of(result).get("priors") or {}
+    return [
+        each
+        for name in found
+        if {f"{name}_location", f"{name}_spread"} <= set(found)
+        for each in _of_parameter(name, found, priors)
+    ]
+
+
+def population_summary(result: xr.DataTree) -> pd.DataFrame:
+    r"""How much the members of each population differ, and where a new one would lie.
+
+    The location is the population's median in the unit of the parameter, the spread the standard
+    deviation between members on the scale on which the population is normal; `meaning` says what
+    it means in the unit of the parameter. The range of a new member has both uncertainties in it;
+    an index is drawn from the normal distribution cut at the bounds of its prior. The pooling
+    factor compares the members' estimated departures $\epsilon_m$ with all of their variance:
+
+    $$ \lambda = 1 - \frac{Var_m(E[\epsilon_m])}{E[Var_m(\epsilon_m)]} $$
+
+    It is 0 where each member is estimated alone and 1 where all share one value; above 0.5 the
+    population says more than the readings of a member.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+
+    Returns:
+        A row for each pooled parameter and wavelength with members (a count), location,
+        location_sd, location_q2.5 and location_q97.5, the same of the spread, new_q2.5 and
+        new_q97.5 (the 95% range of a new member), pooling (unit 1, at most 1) and meaning (text).
+        Empty where nothing is pooled and for a point fit; NaN where draws are not finite.
+
+    Raises:
+        FitError: The tree holds no posterior.
+
+    Source:
+        Gelman & Pardoe (2006), Technometrics 48(2), 241-251: the pooling factor.
+    """
+    found = [] if method_of(result) == "point" else populations(result)
+    rows = [
+        [
+            len(each.members),
+            *_described(each.location.draws),
+            *_described(each.spread.draws),
+            *(_interval(each.new_members()) if _is_whole(each) else (math.nan, math.nan)),
+            _pooling_factor(each),
+            _meaning(each),
+        ]
+        for each in found
+    ]
+    labels = pd.Index([each.label for each in found], dtype=object)
+    return pd.DataFrame(rows, columns=list(SUMMARY_COLUMNS), index=labels)
+
+
+def shrinkage(result: xr.DataTree) -> pd.DataFrame:
+    r"""How far the population pulls each member, and where its own readings alone would put it.
+
+    The estimate of a member alone is not fitted again: the population is taken out of the draws.
+    If the readings of a member say $x_m \sim Normal(a, 1/p)$ on the population's scale, its
+    posterior given the population is
+
+    $$ x_m | \mu, s \sim Normal\Big(\frac{p a + \mu / s^2}{p + 1 / s^2},
+       \frac{1}{p + 1 / s^2}\Big) $$
+
+    and $a$ and $p$ are those under which the draws are likeliest, so that the uncertainty of
+    location and spread is accounted for. This holds where what a member's readings say is about
+    normal on that scale, and the bounds of an index are far; elsewhere it is an approximation.
+    The other parameters of the member keep their priors.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+
+    Returns:
+        A row for each member with mean, q2.5 and q97.5 of its posterior; alone, alone_q2.5 and
+        alone_q97.5 without the population, NaN where the member's own readings say nothing (p
+        within two standard errors of zero); and leaning, the share of the population in the
+        precision of the posterior, from 0 (its own readings decide) to 1. Empty where nothing is
+        pooled and for a point fit.
+
+    Raises:
+        FitError: The tree holds no posterior.
+    """
+    found = [] if method_of(result) == "point" else populations(result)
+    rows, labels = [], []
+    for each in found:
+        labels += [scalar.label for scalar in each.members]
+        rows += _member_rows(each)
+    index = pd.Index(labels, dtype=object)
+    return pd.DataFrame(rows, columns=list(MEMBER_COLUMNS), index=index, dtype=float)
+
+
+def bounds_of(name: str, priors: Mapping[str, str]) -> tuple[float, float]:
+    """Where the population of a parameter is cut: the bounds of its location's prior.
+
+    Args:
+        name: The parameter.
+        priors: Priors as text, as the provenance has them.
+
+    Returns:
+        Least and largest value; the physical range where the text names no bound.
+    """
+    low, high = RANGES.get(name, (-math.inf, math.inf))
+    text = priors.get(f"{name}_location", "")
+    said = {key: float(number) for key, number in re.findall(r"\b(low|high)=([-+.\de]+)", text)}
+    return said.get("low", low), said.get("high", high)
+
+
+def _of_parameter(
+    name: str, found: Mapping[str, list[Scalar]], priors: Mapping[str, str]
+) -> Iterator[Population]:
+    for location in found[f"{name}_location"]:
+        place = location.index
+        members = tuple(s for s in found[name] if _stands_at(s, place))
+        # A spread over wavelength is allowed, although the models of this package have one.
+        spread = next((s for s in found[f"{name}_spread"] if _agrees(s, place)), None)
+        if spread is not None and len(members) > 1:
+            label = location.label.replace(f"{name}_location", name, 1)
+            yield Population(label, location, spread, members, *bounds_of(name, priors))
+
+
+def _stands_at(scalar: Scalar, place: Mapping[str, int]) -> bool:
+    return all(scalar.index.get(dim) == at for dim, at in place.items())
+
+
+def _agrees(scalar: Scalar, place: Mapping[str, int]) -> bool:
+    return all(place.get(dim) == at for dim, at in scalar.index.items())
+
+
+def _is_whole(population: Population) -> bool:
+    """True where every draw is finite, also on the population's scale."""
+    on_scale = (population.to_scale(s.draws) for s in (population.location, *population.members))
+    return all(bool(np.isfinite(draws).all()) for draws in (population.spread.draws, *on_scale))
+
+
+def _interval(draws: np.ndarray) -> tuple[float, float]:
+    low, high = np.quantile(draws, INTERVAL)
+    return float(low), float(high)
+
+
+def _described(draws: np.ndarray) -> list[float]:
+    if not np.isfinite(draws).all():
+        return [math.nan] * 4
+    return [float(draws.mean()), float(draws.std(ddof=1)), *_interval(draws)]
+
+
+def _departures(population: Population) -> np.ndarray:
+    """Of every member from the location, on the population's scale: (member, draw)."""
+    members = np.stack([scalar.draws.ravel() for scalar in population.members])
+    return population.to_scale(members) - population.to_scale(population.location.draws.ravel())
+
+
+def _pooling_factor(population: Population) -> float:
+    if not _is_whole(population):
+        return math.nan
+    departures = _departures(population)
+    estimated = np.var(departures.mean(axis=1), ddof=1)
+    return float(1.0 - estimated / np.var(departures, axis=0, ddof=1).mean())
+
+
+def _meaning(population: Population) -> str:
+    """What the spread is in the unit of the parameter, at its posterior mean."""
+    spread = float(population.spread.draws.mean())
+    if not math.isfinite(spread):
+        return ""
+    if population.scale == "log":
+        return f"members differ by a factor of about {math.exp(spread):.3g}"
+    if population.scale == "log odds":
+        location = float(population.location.draws.mean())
+        return f"members differ by about {location * (1.0 - location) * spread:.2g}"
+    return f"members differ by about {spread:.2g}"
+
+
+def _member_rows(population: Population) -> list[list[Any]]:
+    if not _is_whole(population):
+        return [[math.nan] * len(MEMBER_COLUMNS) for _ in population.members]
+    location = population.to_scale(population.location.draws.ravel())
+    spread = population.spread.draws.ravel()
+    rows = []
+    for scalar in population.members:
+        draws = scalar.draws.ravel()
+        alone = estimate_alone(population.to_scale(draws), location, spread)
+        middle = [alone.mean, *(alone.mean + np.array([-1.96, 1.96]) * alone.sd)]
+        back = population.from_scale(np.array(middle))
+        rows.append([draws.mean(), *_interval(draws), *back, alone.leaning])
+    return rows

@@ -1,0 +1,140 @@
+"""One patch of a capture by itself: its peaks, and the shape of its density around a point."""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.groups import Groups, find_groups, group_of
+from polar_bayes.inference.modes import Modes, ValueAndGradient, climb, distinct
+from polar_bayes.inference.program import Model, compile_program
+from polar_bayes.observation.data import Observations
+
+Starts = tuple[np.ndarray, np.ndarray]
+"""Coordinates of a patch, (start, local), and common ones, (start, common)."""
+
+
+class Alone:
+    """The model on one patch, compiled once for all.
+
+    Args:
+        model: The model of the data alone.
+        data: The whole capture.
+        threads: Patches that are climbed at once.
+    """
+
+    def __init__(self, model: Model, data: Observations, threads: int = 2) -> None:
+        first = group_of(data, 0)
+        self._program = compile_program(model, first)
+        groups = find_groups(self._program, first)
+        assert groups is not None, "the capture has a leading axis"
+        self._groups: Groups = groups
+        self._parts = [group_of(data, number) for number in range(data.dims[0][1])]
+        self._compiled = jax.jit(jax.value_and_grad(self._program.potential))
+        self._dtype = data.brightness.dtype
+        self._threads = threads
+
+    @property
+    def common(self) -> np.ndarray:
+        """Where common coordinates stand in the vector of one patch."""
+        return self._groups.common
+
+    def potential(self, patch: int) -> ValueAndGradient:
+        """Minus the log density of one patch and what is common, with its gradient."""
+
+        def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
+            value, gradient = self._compiled(jnp.asarray(z, self._dtype), self._parts[patch])
+            return float(value), np.asarray(gradient, float)
+
+        return potential
+
+    def peaks(
+        self,
+        starts: Callable[[int], Starts],
+        common: np.ndarray,
+        movable: np.ndarray,
+        tell: Callable[[float], None],
+    ) -> list[Modes]:
+        """The peaks of every patch over its own coordinates and the movable common ones.
+
+        Args:
+            starts: For each patch, where to climb from.
+            common: Where the common coordinates stand that do not move.
+            movable: True for those that do, (common,).
+            tell: Called with the fraction that is done.
+
+        Returns:
+            For each patch its distinct peaks: its own coordinates first, then the movable ones.
+
+        Raises:
+            FitError: A patch has no peak.
+        """
+
+        def climb_one(patch: int) -> Modes:
+            # A thread starts with the settings of the process, not with those of this fit.
+            with jax.enable_x64(self._dtype == jnp.float64):
+                return self._climb(patch, starts(patch), common, movable)
+
+        found: list[Modes] = []
+        with ThreadPoolExecutor(self._threads) as pool:
+            for modes in pool.map(climb_one, range(len(self._parts))):
+                found.append(modes)
+                tell(len(found) / len(self._parts))
+        return found
+
+    def expand(
+        self, patch: int, local: np.ndarray, common: np.ndarray, spread: Iterable[float]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gradient and second derivatives of the potential, by central differences.
+
+        Args:
+            patch: Which one.
+            local: Its coordinates, (local,).
+            common: The common ones, (common,).
+            spread: About one posterior standard deviation of each coordinate, (local,).
+
+        Returns:
+            Gradient (local,), Hessian (local, local) and mixed derivatives (local, common).
+        """
+        potential, z = self.potential(patch), self._join(local, common)
+        mine = self._groups.local[0]
+        # As in `modes.curvature`: truncation and rounding are then of one size.
+        step_of = np.finfo(self._dtype).eps ** 0.25
+        rows = []
+        for index, sd in zip(mine, spread, strict=True):
+            shift = np.zeros_like(z)
+            shift[index] = step_of * min(max(sd, 1e-6), 1.0)
+            rows.append((potential(z + shift)[1] - potential(z - shift)[1]) / (2 * shift[index]))
+        hessian = np.nan_to_num(np.stack(rows))
+        own = 0.5 * (hessian[:, mine] + hessian[:, mine].T)
+        return np.nan_to_num(potential(z)[1][mine]), own, hessian[:, self._groups.common]
+
+    def _climb(self, patch: int, starts: Starts, common: np.ndarray, movable: np.ndarray) -> Modes:
+        whole, size = self.potential(patch), self._groups.local.shape[1]
+        moving = np.concatenate([self._groups.local[0], self._groups.common[movable]])
+
+        def potential(x: np.ndarray) -> tuple[float, np.ndarray]:
+            at = common.copy()
+            at[movable] = x[size:]
+            value, gradient = whole(self._join(x[:size], at))
+            return value, gradient[moving]
+
+        local, start_common = starts
+        points = np.concatenate([local, start_common[:, movable]], axis=1)
+        modes = distinct([climb(potential, point) for point in points])
+        if modes is None:
+            raise FitError(
+                f"none of {len(points)} starts reached a peak of the posterior",
+                where=f"fit: {self._parts[0].dims[0][0]} {patch}",
+                mend="check its readings against the prior predictive, mark them valid=False, or "
+                "give narrower priors",
+            )
+        return modes
+
+    def _join(self, local: np.ndarray, common: np.ndarray) -> np.ndarray:
+        z = np.zeros(self._program.size, local.dtype)
+        z[self._groups.local[0]], z[self._groups.common] = local, common
+        return z

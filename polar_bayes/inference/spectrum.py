@@ -1,0 +1,235 @@
+"""Spectra at wavelengths that were not measured, from a finished fit."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.result import provenance_of
+from polar_bayes.models.gp_spectral import GpSpectral
+from polar_bayes.models.spectra import SPECTRA, around, widening_of
+from polar_bayes.models.spectral_process import SpectralProcess
+from polar_bayes.physics.notation import notation
+from polar_bayes.physics.scene import Scene
+from polar_bayes.priors import RANGES
+from polar_bayes.setups import SETUPS
+
+BATCH = 64
+
+
+def predict_spectrum(
+    result: xr.DataTree,
+    wavelengths: Any,
+    *,
+    model: GpSpectral | None = None,
+    scene: Scene | None = None,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Draws of n and a at any wavelengths.
+
+    A process is conditioned on each posterior draw and drawn between and beyond the measured
+    colors, so bands widen away from them; a law of dispersion is evaluated. What the knots leave
+    open is computed in double precision whatever the fit's, which the answer has again.
+
+    Args:
+        result: Of a fit with `GpSpectral`, or of any model in a scene with a law of dispersion;
+            fresh or loaded.
+        wavelengths: One number or a list. nm, > 0.
+        model: The model of the fit; needed where its kernel is no name.
+        scene: The scene of the fit; needed where it has a law of dispersion and no name.
+        seed: The same seed gives the same draws.
+
+    Returns:
+        `refractive_index`, `absorption` or both, as far as the fit couples them, with dims
+        (chain, draw, [patch or material,] wavelength).
+
+    Raises:
+        FitError: The result has neither a process nor a law, a wavelength is none, or the model
+            or scene must be given.
+    """
+    new = _checked(wavelengths)
+    told = provenance_of(result)
+    found: dict[str, xr.DataArray] = {}
+    law = _scene_of(told, scene).dispersion if _has_law(told, scene) else None
+    if law is not None:
+        found["refractive_index"] = _follow(law, result["posterior"].dataset, new)
+    processes = [n for n in SPECTRA if f"{n}_amplitude" in result["posterior"].data_vars]
+    if processes:
+        fitted = _model_of(told, model)
+        for number, name in enumerate(processes):
+            key = [seed, number]
+            found[name] = _condition(name, fitted.process_of(name), result, told, new, key)
+    if not found:
+        raise FitError(
+            "the fit ties no color to another",
+            where=f"predict_spectrum: result of model {told.get('model', 'unknown')!r}",
+            mend="fit with model='gp_spectral', or in a scene with a law of dispersion",
+        )
+    for name, spectrum in found.items():
+        symbol, meaning, unit = notation(name)
+        spectrum.attrs = {"long_name": meaning, "units": unit, "symbol": symbol}
+    return xr.Dataset(found)
+
+
+def _checked(wavelengths: Any) -> np.ndarray:
+    try:
+        new = np.atleast_1d(np.asarray(wavelengths, float))
+    except (TypeError, ValueError):
+        new = np.array([np.nan])
+    if new.ndim != 1 or new.size == 0 or not np.all(np.isfinite(new) & (new > 0.0)):
+        raise FitError(
+            f"{wavelengths!r} is no list of wavelengths",
+            where="predict_spectrum: wavelengths",
+            mend="give numbers above zero in nm, such as [500.0, 600.0]",
+        )
+    return new
+
+
+def _has_law(told: Mapping[str, Any], scene: Scene | None) -> bool:
+    if scene is not None:
+        return scene.dispersion is not None
+    parts = str(told.get("scene_parts", ""))
+    return "dispersion=" in parts and "dispersion=None" not in parts
+
+
+def _scene_of(told: Mapping[str, Any], scene: Scene | None) -> Scene:
+    if scene is not None:
+        return scene
+    if told.get("scene") not in SETUPS:
+        raise FitError(
+            "the fit's scene has a law of dispersion and no name",
+            where="predict_spectrum: scene",
+            mend="give the same scene again: predict_spectrum(result, wavelengths, scene=...)",
+        )
+    return SETUPS[told["scene"]].scene
+
+
+def _model_of(told: Mapping[str, Any], model: GpSpectral | None) -> GpSpectral:
+    """The model of the fit, from its settings unless it is given."""
+    if model is not None:
+        if not isinstance(model, GpSpectral):
+            raise FitError(
+                f"a {type(model).__name__} is not a GpSpectral",
+                where="predict_spectrum: model",
+                mend="give the model of the fit, such as GpSpectral()",
+            )
+        return model
+    settings = told.get("model_settings") or {}
+    process = settings.get("process", {})
+    several = isinstance(process, list)
+    rebuilt = tuple(_process_of(each) for each in (process if several else [process]))
+    return GpSpectral(
+        coupled=tuple(settings.get("coupled", SPECTRA)),
+        process=rebuilt if several else rebuilt[0],
+        pooled=tuple(settings.get("pooled", ())),
+    )
+
+
+def _process_of(settings: Mapping[str, Any]) -> SpectralProcess:
+    try:
+        return SpectralProcess(**settings)
+    except (FitError, TypeError) as error:
+        raise FitError(
+            "the fit's kernel has no name to find it by",
+            where="predict_spectrum: model",
+            mend="give the model again: predict_spectrum(result, wavelengths, model=...)",
+        ) from error
+
+
+def _follow(law: Any, posterior: xr.Dataset, new: np.ndarray) -> xr.DataArray:
+    """A law of dispersion with the coefficients of every draw."""
+    draws = xr.DataArray(
+        np.zeros((posterior.sizes["chain"], posterior.sizes["draw"])),
+        coords={name: posterior[name] for name in ("chain", "draw")},
+        dims=("chain", "draw"),
+    )
+    first, *rest = xr.broadcast(draws, *(posterior[name] for name in law.parameters))
+    dtype = np.result_type(*(posterior[name] for name in law.parameters), np.float32)
+    with jax.enable_x64(True):
+        coefficients = {
+            name: jnp.asarray(each.to_numpy())[..., None]
+            for name, each in zip(law.parameters, rest, strict=True)
+        }
+        index = np.asarray(law.index(coefficients, jnp.asarray(new)), dtype)
+    return _label(np.broadcast_to(index, (*first.shape, new.size)), first, new)
+
+
+def _condition(
+    name: str,
+    process: SpectralProcess,
+    result: xr.DataTree,
+    told: Mapping[str, Any],
+    new: np.ndarray,
+    seed: list[int],
+) -> xr.DataArray:
+    """A process given each draw of its weights, amplitude and length, drawn at `new`."""
+    posterior, coordinates = result["posterior"].dataset, result["unconstrained_posterior"].dataset
+    level = posterior[f"{name}_level"]
+    leading = [dim for dim in level.dims if dim not in ("chain", "draw")]
+    level = level.transpose("chain", "draw", *leading)
+    weights = coordinates[f"{name}_weights"].transpose("chain", "draw", *leading, ...).to_numpy()
+    measured = posterior[name].coords["wavelength"].to_numpy()
+    if process.fits_length != (f"{name}_length" in posterior):
+        raise FitError(
+            "the model given does not read the length that the fit has, or the other way round",
+            where="predict_spectrum: model",
+            mend="give the model of the fit",
+        )
+    bounds = _bounds(name, told)
+    # A wavelength given twice is one wavelength: both get the same draw.
+    distinct, again = np.unique(new, return_inverse=True)
+    dtype = weights.dtype
+    old, at = (np.asarray(part, dtype) for part in (measured, distinct))
+
+    def one(draw: dict[str, Array]) -> Array:
+        length, places = draw.get("length"), process.places(jnp.asarray(old))
+        widening = widening_of(name, draw["amplitude"] * process.scales(length, places))
+        both = jnp.concatenate([jnp.asarray(old), jnp.asarray(at)])
+        values = process.values(draw["weights"] / widening, length, places, both)
+        mean = jnp.mean(values[..., : old.size], axis=-1, keepdims=True)
+        factor = process.remainder(
+            None if length is None else length.astype(float),
+            places.astype(float),
+            jnp.asarray(distinct),
+        )
+        left = draw["noise"] @ factor.T
+        departure = values[..., old.size :] - mean + left.astype(dtype)
+        return around(name, draw["level"][..., None], draw["amplitude"], departure, bounds)
+
+    flat = (-1, *level.shape[2:])
+    count = level.shape[0] * level.shape[1]
+    draws = {
+        "weights": weights.reshape(*flat, weights.shape[-1]),
+        "level": level.to_numpy().reshape(flat),
+        "amplitude": posterior[f"{name}_amplitude"].transpose("chain", "draw").to_numpy().ravel(),
+        "noise": np.random.default_rng(seed).normal(size=(count, *flat[1:], distinct.size)),
+    }
+    if process.fits_length:
+        draws["length"] = posterior[f"{name}_length"].transpose("chain", "draw").to_numpy().ravel()
+    with jax.enable_x64(True):
+        found = jax.jit(lambda all_draws: jax.lax.map(one, all_draws, batch_size=BATCH))(draws)
+    spectra = np.asarray(found, dtype)[..., again]
+    return _label(spectra.reshape(*level.shape, new.size), level, new)
+
+
+def _bounds(name: str, told: Mapping[str, Any]) -> tuple[float, float]:
+    """The range of the index in the fit: what the prior of its level allows."""
+    priors = told.get("priors", {})
+    text = priors.get(f"{name}_level_location", priors.get(f"{name}_level", ""))
+    low, high = RANGES[f"{name}_level"]
+    said = {key: float(number) for key, number in re.findall(r"\b(low|high)=([-+.\de]+)", text)}
+    return said.get("low", low), said.get("high", high)
+
+
+def _label(values: np.ndarray, draws: xr.DataArray, new: np.ndarray) -> xr.DataArray:
+    return xr.DataArray(
+        values,
+        coords={**{dim: draws.coords[dim] for dim in draws.dims}, "wavelength": new},
+        dims=(*draws.dims, "wavelength"),
+    )

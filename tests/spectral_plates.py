@@ -1,0 +1,65 @@
+"""Captures of a smooth plate in several colors, and tabulated indices of real materials."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+import polar_bayes as pb
+
+# The plate of tests/plates.py: one color more.
+PLATE = pb.Scene(surface=pb.SmoothSurface(), subsurface=pb.Unpolarized(), mixing=pb.StokesMixing())
+LINKS = {"q": pb.StokesLink(stated_errors=True)}
+FRACTION = 0.02
+VIEWS = np.linspace(30.0, 78.0, 12)
+
+TABLE = Path(__file__).parent / "reference" / "refractive_index_dielectrics.csv"
+
+
+def tabulated() -> dict[str, dict[float, float]]:
+    """Index by material and wavelength (nm)."""
+    with TABLE.open() as file:
+        return {
+            row["material"]: {float(key[1:]): float(row[key]) for key in row if key[1:].isdigit()}
+            for row in csv.DictReader(file)
+        }
+
+
+def spectral_plate(
+    index: Mapping[float, float] | tuple[np.ndarray, np.ndarray],
+    *,
+    error: float,
+    seed: int,
+    views: np.ndarray = VIEWS,
+) -> xr.Dataset:
+    """A plate with normal errors of q in every color.
+
+    Args:
+        index: Index by wavelength (nm), or wavelengths and indices (these may repeat).
+        error: Standard error of every reading.
+        seed: Of the errors.
+        views: Zeniths of viewer and light, degree.
+    """
+    if isinstance(index, Mapping):
+        index = (np.array(list(index)), np.array(list(index.values())))
+    wavelengths, values = (np.asarray(part, float) for part in index)
+    angles = {
+        "view_zenith": views,
+        "view_azimuth": np.full(views.size, 180.0),
+        "light_zenith": views,
+        "light_azimuth": np.zeros(views.size),
+    }
+    truth = {"subsurface_fraction": FRACTION, "refractive_index": values}
+    q = np.asarray(PLATE.predict(truth, pb.Geometry.from_degrees(**angles))["q"])
+    noise = np.random.default_rng(seed).normal(0.0, error, q.shape)
+    return xr.Dataset(
+        {name: ("view", angle) for name, angle in angles.items()}
+        | {
+            "q": (("view", "wavelength"), np.clip(q + noise, -1.0, 1.0).T),
+            "q_error": (("view", "wavelength"), np.full(q.T.shape, error)),
+        },
+        coords={"wavelength": wavelengths},
+        attrs={"name": "plate"},
+    )
