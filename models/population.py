@@ -17,7 +17,7 @@ import numpyro
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 from polar_bayes.models.axes import drop_view, over_axes
-from polar_bayes.models.truncation import onto_interval
+from polar_bayes.models.bounds import Bent
 
 from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
@@ -30,12 +30,12 @@ class AbstractScale(abc.ABC):
     """The scale on which a population is normal."""
 
     @abc.abstractmethod
-    def center(self, location: Array) -> Array:
-        """The population's mean on this scale."""
+    def population(self, location: Array, spread: Array) -> dist.Distribution:
+        """Where a member stands on this scale."""
 
     @abc.abstractmethod
-    def value(self, base: Array, location: Array, spread: Array) -> Array:
-        """A member of the population in the parameter's unit, from its place on this scale."""
+    def value(self, place: Array) -> Array:
+        """The parameter of a member, in its own unit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,12 +43,12 @@ class LogScale(AbstractScale):
     """For positive parameters: roughness, absorption."""
 
     @override
-    def center(self, location: Array) -> Array:
-        return jnp.log(location)
+    def population(self, location: Array, spread: Array) -> dist.Distribution:
+        return dist.Normal(jnp.log(location), spread)
 
     @override
-    def value(self, base: Array, location: Array, spread: Array) -> Array:
-        return jnp.exp(base)
+    def value(self, place: Array) -> Array:
+        return jnp.exp(place)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,20 +56,33 @@ class LogitScale(AbstractScale):
     """For shares: the subsurface fraction."""
 
     @override
-    def center(self, location: Array) -> Array:
-        return jnp.log(location) - jnp.log1p(-location)
+    def population(self, location: Array, spread: Array) -> dist.Distribution:
+        return dist.Normal(jnp.log(location) - jnp.log1p(-location), spread)
 
     @override
-    def value(self, base: Array, location: Array, spread: Array) -> Array:
-        return jax.nn.sigmoid(base)
+    def value(self, place: Array) -> Array:
+        return jax.nn.sigmoid(place)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlainScale(AbstractScale):
+    """The parameter itself, which may take any value."""
+
+    @override
+    def population(self, location: Array, spread: Array) -> dist.Distribution:
+        return dist.Normal(location, spread)
+
+    @override
+    def value(self, place: Array) -> Array:
+        return place
 
 
 @dataclasses.dataclass(frozen=True)
 class CutScale(AbstractScale):
-    """The plain scale between bounds: the refractive index.
+    """The parameter itself between bounds, its population cut off there: the refractive index.
 
     Args:
-        low: Lower bound, or -inf.
+        low: Lower bound, finite.
         high: Upper bound, or inf.
     """
 
@@ -77,14 +90,14 @@ class CutScale(AbstractScale):
     high: float
 
     @override
-    def center(self, location: Array) -> Array:
-        return location
+    def population(self, location: Array, spread: Array) -> dist.Distribution:
+        high = None if math.isinf(self.high) else self.high
+        cut = dist.TruncatedNormal(location, spread, low=self.low, high=high)
+        return dist.TransformedDistribution(cut, Bent(self.low, self.high).inv)
 
     @override
-    def value(self, base: Array, location: Array, spread: Array) -> Array:
-        if math.isinf(self.low) and math.isinf(self.high):
-            return base
-        return onto_interval(base, location, spread, self.low, self.high)
+    def value(self, place: Array) -> Array:
+        return Bent(self.low, self.high)(place)
 
 
 def natural_scale(name: str, location: dist.Distribution) -> AbstractScale:
@@ -105,7 +118,8 @@ def natural_scale(name: str, location: dist.Distribution) -> AbstractScale:
         return LogScale()
     if limits == (0.0, 1.0):
         return LogitScale()
-    return CutScale(*support_bounds(location))
+    low, high = support_bounds(location)
+    return PlainScale() if math.isinf(low) else CutScale(low, high)
 
 
 def draw_pooled(
@@ -142,11 +156,10 @@ def draw_pooled(
     spread = numpyro.sample(f"{name}_spread", priors[f"{name}_spread"])
     scale = natural_scale(name, priors[f"{name}_location"])
     with over_axes(data, without=without):
-        # The place on the normal scale is a coordinate; the parameter is what it stands for.
-        base = numpyro.sample(
-            f"{name}_base", dist.Normal(scale.center(location), spread), infer={"auxiliary": True}
-        )
-        value = numpyro.deterministic(name, scale.value(base, location, spread))
+        # The place on the scale is a coordinate; the parameter is what it stands for.
+        population = scale.population(location, spread)
+        place = numpyro.sample(f"{name}_base", population, infer={"auxiliary": True})
+        value = numpyro.deterministic(name, scale.value(place))
     return drop_view(value, data)
 
 

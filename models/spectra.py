@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from polar_bayes.models.bounds import Bent
 from polar_bayes.models.spectral_process import SpectralProcess
-from polar_bayes.models.truncation import onto_interval
 
 from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
@@ -25,8 +25,8 @@ def around(
 
     with the mean of f over the measured wavelengths taken off, so that the level is the mean over
     them (of a, the geometric mean), which readings determine; one wavelength alone is its level.
-    T maps the normal distribution around l onto the range of the index, so that n stays in it;
-    away from the ends T changes nothing.
+    T is `Bent`: it bends what comes near the ends of the range of the index. It does not depend on
+    the amplitude, which would tie the two together.
 
     Args:
         name: refractive_index or absorption.
@@ -43,7 +43,7 @@ def around(
     """
     if name == "absorption":
         return level * jnp.exp(amplitude * departure)
-    return onto_interval(level + amplitude * departure, level, amplitude, *bounds)
+    return Bent(*bounds)(level + amplitude * departure)
 
 
 def widening_of(name: str, scales: Float[Array, " knots"]) -> Float[Array, " knots"]:

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
@@ -175,8 +176,10 @@ class SpectralProcess:
         return share * jnp.max(jnp.diag(covariance)) * np.eye(count, dtype=covariance.dtype)
 
 
-def _polynomials(places: Array) -> np.ndarray:
-    """Orthonormal polynomials over the ranks of the knots, one a column, the constant last."""
-    ranks = np.linspace(-1.0, 1.0, len(places))
-    turn, _ = np.linalg.qr(np.polynomial.legendre.legvander(ranks, len(places) - 1))
-    return np.roll(turn, -1, axis=1).astype(places.dtype)
+def _polynomials(places: Array) -> Array:
+    """Orthonormal polynomials over the knots, one a column, the constant last."""
+    # Householder's turn is orthogonal even where equal knots leave fewer polynomials.
+    span = jnp.maximum(places[-1] - places[0], jnp.finfo(places.dtype).tiny)
+    inside = jnp.clip(2.0 * (places - places[0]) / span - 1.0, -1.0, 1.0)
+    chebyshev = jnp.cos(jnp.arccos(inside)[:, None] * np.arange(len(places), dtype=places.dtype))
+    return jax.lax.stop_gradient(jnp.roll(jnp.linalg.qr(chebyshev)[0], -1, axis=1))

@@ -16,6 +16,7 @@ _HOMES = {
     "capture.goniometer": ("from_goniometer",),
     "capture.schema": ("count", "validate"),
     "diagnostics.convergence": ("json_summary", "summary", "verdict"),
+    "diagnostics.population": ("population_summary",),
     "errors": ("CaptureError", "FitError", "PolarBayesError", "SceneError"),
     "inference.files": ("load_result", "save_result"),
     "inference.fit": ("fit",),

@@ -103,6 +103,21 @@ def make_result(
     return tree
 
 
+def pool(tree, *parameters, spread=0.05, seed=0):
+    """Add a population to parameters of a tree with materials, in place."""
+    rng = np.random.default_rng(seed)
+    for group in ("posterior", "prior"):
+        dataset = tree[group].to_dataset()
+        for parameter in parameters:
+            center = dataset[parameter].mean("material")
+            dataset[f"{parameter}_location"] = center
+            dims = ("chain", "draw")
+            width = spread * np.exp(0.3 * rng.standard_normal([dataset.sizes[d] for d in dims]))
+            dataset[f"{parameter}_spread"] = (dims, width)
+        tree[group] = xr.DataTree(dataset)
+    return tree
+
+
 def edit_provenance(tree, **changes):
     """Replace entries of the provenance of a tree, in place."""
     tree.attrs["polar_bayes"] = json.dumps({**json.loads(tree.attrs["polar_bayes"]), **changes})

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import scipy.special
+import scipy.stats
 import xarray as xr
 
 from polar_bayes.diagnostics.alone import estimate_alone
@@ -35,8 +36,11 @@ SUMMARY_COLUMNS = (
     "spread_q97.5",
     "new_q2.5",
     "new_q97.5",
-    "pooling",
+    "between",
+    "between_q2.5",
+    "between_q97.5",
     "meaning",
+    "pooling",
 )
 MEMBER_COLUMNS = (
     "mean",
@@ -83,7 +87,7 @@ class Population:
     def to_scale(self, value: np.ndarray) -> np.ndarray:
         """From the unit of the parameter to the scale on which the population is normal."""
         value = np.asarray(value, float)
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             if self.scale == "log":
                 return np.log(value)
             return scipy.special.logit(value) if self.scale == "log odds" else value
@@ -93,6 +97,15 @@ class Population:
         if self.scale == "log":
             return np.exp(value)
         return scipy.special.expit(value) if self.scale == "log odds" else np.asarray(value)
+
+    def differences(self) -> np.ndarray:
+        """Draws of what the spread is in the unit of the parameter; a factor on the log scale."""
+        location, spread = self.location.draws.ravel(), self.spread.draws.ravel()
+        if self.scale == "log":
+            with np.errstate(over="ignore"):
+                return np.exp(spread)
+        # Near the location a unit of log odds is worth location (1 - location).
+        return location * (1.0 - location) * spread if self.scale == "log odds" else spread
 
     def new_members(self, count: int = NEW_MEMBERS, seed: int = 0) -> np.ndarray:
         """Draws of members that were not measured, shape (count,), unit of the parameter."""
@@ -104,12 +117,8 @@ class Population:
         center, width = self.to_scale(location[at]), np.maximum(spread[at], 1e-12)
         if self.scale == "plain":
             # The population is cut at the bounds, not heaped up at them.
-            below, above = (
-                scipy.special.ndtr((bound - center) / width) for bound in (self.low, self.high)
-            )
-            rank = below + rank * (above - below)
-            inside = np.clip(center + width * scipy.special.ndtri(rank), self.low, self.high)
-            return np.asarray(inside)
+            low, high = (self.low - center) / width, (self.high - center) / width
+            return center + width * scipy.stats.truncnorm.ppf(rank, low, high)
         return self.from_scale(center + width * scipy.special.ndtri(rank))
 
 
@@ -141,8 +150,10 @@ def population_summary(result: xr.DataTree) -> pd.DataFrame:
     r"""How much the members of each population differ, and where a new one would lie.
 
     The location is the population's median in the unit of the parameter, the spread the standard
-    deviation between members on the scale on which the population is normal; `meaning` says what
-    it means in the unit of the parameter. The range of a new member has both uncertainties in it;
+    deviation between members on the scale on which the population is normal. `between` is what it
+    means in the unit of the parameter (median and 95%): a factor exp(spread) where the scale is
+    log, location (1 - location) spread where it is log odds, the spread itself where it is plain;
+    `meaning` says it in words. The range of a new member has both uncertainties in it;
     an index is drawn from the normal distribution cut at the bounds of its prior. The pooling
     factor compares the members' estimated departures $\epsilon_m$ with all of their variance:
 
@@ -157,7 +168,8 @@ def population_summary(result: xr.DataTree) -> pd.DataFrame:
     Returns:
         A row for each pooled parameter and wavelength with members (a count), location,
         location_sd, location_q2.5 and location_q97.5, the same of the spread, new_q2.5 and
-        new_q97.5 (the 95% range of a new member), pooling (unit 1, at most 1) and meaning (text).
+        new_q97.5 (the 95% range of a new member), between, between_q2.5 and between_q97.5, meaning
+        (text) and pooling (unit 1, at most 1).
         Empty where nothing is pooled and for a point fit; NaN where draws are not finite.
 
     Raises:
@@ -167,18 +179,8 @@ def population_summary(result: xr.DataTree) -> pd.DataFrame:
         Gelman & Pardoe (2006), Technometrics 48(2), 241-251: the pooling factor.
     """
     found = [] if method_of(result) == "point" else populations(result)
-    rows = [
-        [
-            len(each.members),
-            *_described(each.location.draws),
-            *_described(each.spread.draws),
-            *(_interval(each.new_members()) if _is_whole(each) else (math.nan, math.nan)),
-            _pooling_factor(each),
-            _meaning(each),
-        ]
-        for each in found
-    ]
     labels = pd.Index([each.label for each in found], dtype=object)
+    rows = [_summary_row(each) for each in found]
     return pd.DataFrame(rows, columns=list(SUMMARY_COLUMNS), index=labels)
 
 
@@ -280,24 +282,33 @@ def _departures(population: Population) -> np.ndarray:
 
 
 def _pooling_factor(population: Population) -> float:
-    if not _is_whole(population):
-        return math.nan
     departures = _departures(population)
     estimated = np.var(departures.mean(axis=1), ddof=1)
     return float(1.0 - estimated / np.var(departures, axis=0, ddof=1).mean())
 
 
-def _meaning(population: Population) -> str:
-    """What the spread is in the unit of the parameter, at its posterior mean."""
-    spread = float(population.spread.draws.mean())
-    if not math.isfinite(spread):
-        return ""
-    if population.scale == "log":
-        return f"members differ by a factor of about {math.exp(spread):.3g}"
-    if population.scale == "log odds":
-        location = float(population.location.draws.mean())
-        return f"members differ by about {location * (1.0 - location) * spread:.2g}"
-    return f"members differ by about {spread:.2g}"
+def _summary_row(population: Population) -> list[Any]:
+    count = len(population.members)
+    if not _is_whole(population):
+        parts = [*_described(population.location.draws), *_described(population.spread.draws)]
+        return [count, *parts, *[math.nan] * 5, "", math.nan]
+    differences = population.differences()
+    middle, low, high = float(np.median(differences)), *_interval(differences)
+    return [
+        count,
+        *_described(population.location.draws),
+        *_described(population.spread.draws),
+        *_interval(population.new_members()),
+        *(middle, low, high),
+        _meaning(population.scale, middle),
+        _pooling_factor(population),
+    ]
+
+
+def _meaning(scale: str, between: float) -> str:
+    if scale == "log":
+        return f"members differ by a factor of about {between:.3g}"
+    return f"members differ by about {between:.2g}"
 
 
 def _member_rows(population: Population) -> list[list[Any]]:

@@ -9,12 +9,35 @@ import numpy as np
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.groups import Groups, find_groups, group_of
-from polar_bayes.inference.modes import Modes, ValueAndGradient, climb, distinct
+from polar_bayes.inference.modes import Modes, ValueAndGradient, climb, distinct, quiet_line_search
 from polar_bayes.inference.program import Model, compile_program
 from polar_bayes.observation.data import Observations
 
 Starts = tuple[np.ndarray, np.ndarray]
 """Coordinates of a patch, (start, local), and common ones, (start, common)."""
+
+
+def can_be_alone(model: Model, groups: Groups, data: Observations) -> bool:
+    """Whether the model can be told for one patch: not where a prior names every patch.
+
+    Args:
+        model: The model of the data alone.
+        groups: The patches of the whole capture.
+        data: The whole capture.
+
+    Returns:
+        False where the shapes of one patch do not fit the model.
+    """
+    first = group_of(data, 0)
+    try:
+        program = compile_program(model, first)
+    except (TypeError, ValueError):  # arrays of the wrong length for one patch
+        return False
+    alone = find_groups(program, first)
+    if alone is None:
+        return False
+    same_local = alone.local.shape == (1, groups.local.shape[1])
+    return same_local and alone.common.size == groups.common.size
 
 
 class Alone:
@@ -30,7 +53,7 @@ class Alone:
         first = group_of(data, 0)
         self._program = compile_program(model, first)
         groups = find_groups(self._program, first)
-        assert groups is not None, "the capture has a leading axis"
+        assert groups is not None, "see `can_be_alone`"
         self._groups: Groups = groups
         self._parts = [group_of(data, number) for number in range(data.dims[0][1])]
         self._compiled = jax.jit(jax.value_and_grad(self._program.potential))
@@ -79,7 +102,7 @@ class Alone:
                 return self._climb(patch, starts(patch), common, movable)
 
         found: list[Modes] = []
-        with ThreadPoolExecutor(self._threads) as pool:
+        with quiet_line_search(), ThreadPoolExecutor(self._threads) as pool:
             for modes in pool.map(climb_one, range(len(self._parts))):
                 found.append(modes)
                 tell(len(found) / len(self._parts))

@@ -25,7 +25,7 @@ from polar_bayes.inference.transport import Anchored, Anchors, Transport
 from polar_bayes.observation.data import Observations
 
 TYPICAL_DRAWS = 200
-FEWEST_STARTS, MOST_STARTS, ALL_STARTS = 4, 16, 512
+FEWEST_STARTS, MOST_STARTS, ALL_STARTS = 4, 16, 256
 MOST_ROUNDS = 4
 
 WIDEST = 3.0

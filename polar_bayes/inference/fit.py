@@ -7,6 +7,7 @@ import json
 import platform
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from types import FunctionType
 from typing import Any, NamedTuple
@@ -36,6 +37,7 @@ from polar_bayes.priors import describe_prior
 
 PRIOR_DRAWS = 500
 BLOCK = 500
+THREADS = 2
 
 
 def fit(
@@ -188,14 +190,21 @@ def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], D
     def describe(key: Array, z: np.ndarray, data: Observations) -> Draw:
         flat = jnp.asarray(z.reshape(-1, program.size), data.brightness.dtype)
         keys = jax.random.split(key, len(flat))
-        # Posterior and prior have different lengths; blocks of one length compile once.
-        parts = []
+        # Posterior and prior have different lengths; blocks of one length compile once, and run on
+        # threads as the chains do.
+        blocks = []
         for start in range(0, len(flat), BLOCK):
-            stop = min(start + BLOCK, len(flat))
             index = jnp.clip(jnp.arange(start, start + BLOCK), max=len(flat) - 1)
-            draws = compiled(keys[index], flat[index], data)
-            parts.append(jax.tree.map(lambda x, n=stop - start: np.asarray(x)[:n], draws))
-        joined = jax.tree.map(lambda *blocks: np.concatenate(blocks), *parts)
+            blocks.append((keys[index], flat[index]))
+
+        def run(block: tuple[Array, Array]) -> Draw:
+            with jax.enable_x64(flat.dtype == jnp.float64):  # a thread does not inherit it
+                return jax.tree.map(np.asarray, compiled(*block, data))
+
+        done = [run(blocks[0])]  # compiled before the threads start
+        with ThreadPoolExecutor(THREADS) as pool:
+            done += pool.map(run, blocks[1:])
+        joined = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(flat)], *done)
         return jax.tree.map(lambda x: x.reshape(*z.shape[:2], *x.shape[1:]), joined)
 
     return describe

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference import anchoring, laplace, nuts
+from polar_bayes.inference.alone import can_be_alone
 from polar_bayes.inference.groups import find_groups
 from polar_bayes.inference.modes import Modes, ValueAndGradient
 from polar_bayes.inference.program import Model, Program
@@ -22,6 +23,10 @@ from polar_bayes.inference.search import Progress, find_modes, from_prior
 from polar_bayes.observation.data import Observations
 
 STARTS = 16
+
+LARGEST_DENSE = 60
+"""Most coordinates whose covariance a warm-up of some hundred draws can learn. With few patches
+what they share may bend as it likes; with many it is known so well that it is close to normal."""
 
 Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 """Unconstrained draws (chain, draw, size), and statistics, each (chain, draw)."""
@@ -75,20 +80,23 @@ class WholeGround(AbstractGround):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PatchGround(AbstractGround):
-    """Many patches: the coordinates of `transport`, in which the metric starts as the identity."""
+    """Many patches: the coordinates of `transport`, in which the metric is about the identity."""
 
     found: anchoring.Anchoring
     said: dict[str, Any]
 
     @override
     def target(self, key: Array, chains: int) -> nuts.Target:
+        size, dtype = self.found.transport.size, self.found.given.anchors.common.dtype
+        few = size <= LARGEST_DENSE
         return nuts.Target(
             density=self.found.transport.potential,
             given=self.found.given,
             potential=self.found.potential,
             starts=self.found.draw_starts(key, chains),
-            metric=np.ones(self.found.transport.size, self.found.given.anchors.common.dtype),
+            metric=np.eye(size, dtype=dtype) if few else np.ones(size, dtype),
             place=self._place,
+            acceptance=0.98 if few else 0.7,
         )
 
     @override
@@ -132,7 +140,7 @@ def find_ground(
         FitError: No start reached a peak.
     """
     groups = find_groups(program, data)
-    if groups is None:
+    if groups is None or not can_be_alone(model, groups, data):
         potential = _compile(program, data)
         starts = np.asarray(from_prior(program, key, STARTS, data))
         modes = find_modes(potential, starts, progress)

@@ -9,9 +9,11 @@ compiled, and curvature comes from differences of the gradient. An exact Hessian
 takes five times as long to compile as all the climbs take to run.
 """
 
+import contextlib
 import dataclasses
 import enum
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -77,6 +79,17 @@ class Modes:
     decrement: np.ndarray
     starts: int
     failures: int
+
+
+@contextlib.contextmanager
+def quiet_line_search() -> Iterator[None]:
+    """Climbs judge their own ends, so SciPy's warning of a poor step says nothing more.
+
+    To be opened around all climbs, outside of any threads: filters belong to the process.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The line search algorithm did not converge")
+        yield
 
 
 def climb(potential: ValueAndGradient, start: np.ndarray) -> Climb:

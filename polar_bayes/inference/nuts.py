@@ -34,13 +34,13 @@ class Nuts:
 
     Args:
         chains: Independent chains, at least 2.
-        warmup: Draws spent on step size and metric, per chain. None: 300; 150 for the patches of
-            a capture, whose metric is known before.
+        warmup: Draws spent on step size and metric, per chain. None: 300; 150 for many patches,
+            whose metric is known before.
         draws: Draws kept at least, per chain.
         most_draws: Draws kept at most, per chain; set it to `draws` for a fixed length.
         effective_draws: Goal for the bulk and tail effective sample size of every coordinate.
-        target_acceptance: Higher means smaller steps, range [0.5, 1). None: 0.9; 0.7 for the
-            patches of a capture, whose coordinates are close to normal.
+        target_acceptance: Higher means smaller steps, range [0.5, 1). None: 0.9 for one material,
+            0.98 for a few patches, 0.7 for many, whose coordinates are close to normal.
         max_tree_depth: A trajectory has at most 2 ** this steps.
         threads: Chains that run at once.
         block: Draws between two looks at the progress, per chain.
@@ -105,6 +105,7 @@ class Target(NamedTuple):
         starts: Where each chain starts, (chain, size).
         metric: Covariance, (size, size), to begin with; or variances, (size,), to stay with.
         place: From vectors (chain, draw, size) to the model's unconstrained coordinates.
+        acceptance: What to aim at where the settings leave it open.
     """
 
     density: Callable[[Array, Any], Array]
@@ -113,6 +114,7 @@ class Target(NamedTuple):
     starts: np.ndarray
     metric: np.ndarray
     place: Callable[[np.ndarray], np.ndarray]
+    acceptance: float = 0.9
 
     @property
     def knows_its_metric(self) -> bool:
@@ -181,10 +183,10 @@ def sample(
 
 def _warmup(settings: Nuts, target: Target) -> tuple[int, float]:
     """Length and goal of the warm-up, where the settings leave them open."""
-    warmup, acceptance = (150, 0.7) if target.knows_its_metric else (300, 0.9)
+    usual = 150 if target.knows_its_metric else 300
     return (
-        warmup if settings.warmup is None else settings.warmup,
-        acceptance if settings.target_acceptance is None else settings.target_acceptance,
+        usual if settings.warmup is None else settings.warmup,
+        target.acceptance if settings.target_acceptance is None else settings.target_acceptance,
     )
 
 

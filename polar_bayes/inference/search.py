@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.modes import Modes, ValueAndGradient, climb, distinct
+from polar_bayes.inference.modes import Modes, ValueAndGradient, climb, distinct, quiet_line_search
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 
@@ -45,9 +45,10 @@ def find_modes(potential: ValueAndGradient, starts: np.ndarray, progress: Progre
         FitError: No start reached a peak.
     """
     climbs = []
-    for number, start in enumerate(starts):
-        climbs.append(climb(potential, start))
-        progress("searching for modes", (number + 1) / len(starts))
+    with quiet_line_search():
+        for number, start in enumerate(starts):
+            climbs.append(climb(potential, start))
+            progress("searching for modes", (number + 1) / len(starts))
     modes = distinct(climbs)
     if modes is None:
         raise FitError(

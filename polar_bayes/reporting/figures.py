@@ -16,6 +16,7 @@ from matplotlib.patches import Patch
 
 from polar_bayes.diagnostics.parameters import (
     Scalar,
+    is_hyperparameter,
     posterior_scalars,
     scalars,
     stats_of,
@@ -175,7 +176,8 @@ def prior_posterior(result: xr.DataTree) -> Figure:
         result: A tree with draws of the prior.
 
     Returns:
-        The figure, a panel for each parameter (at most 12). Each curve is scaled to the same
+        The figure, a panel for each parameter (at most 12, at most 6 of them of populations and
+        processes). Each curve is scaled to the same
         height; the bar below is the posterior's 95% interval.
 
     Raises:
@@ -184,10 +186,15 @@ def prior_posterior(result: xr.DataTree) -> Figure:
     before = {}
     if "prior" in result.children:
         before = {s.label: s.draws for s in scalars(result["prior"].to_dataset())}
-    found = [scalar for scalar in drawable(result) if scalar.label in before][:MOST_PANELS]
+    found = [scalar for scalar in drawable(result) if scalar.label in before]
     if not found:
         raise _nothing("prior_posterior", "draws of the prior")
     posterior = result["posterior"].to_dataset()
+    # Populations and processes, which concern all members, before the first members.
+    names = set(map(str, posterior.data_vars))
+    common = [s for s in found if is_hyperparameter(s.name, names)][: MOST_PANELS // 2]
+    own = [s for s in found if not is_hyperparameter(s.name, names)]
+    found = [*common, *own][:MOST_PANELS]
     figure, panels = grid(len(found), columns=3, width=8.2, panel_height=1.5, header=0.5)
     any_truth = False
     for axes, scalar in zip(panels, found, strict=True):

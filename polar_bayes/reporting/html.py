@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import io
+import math
 import os
 import re
 import tempfile
@@ -20,17 +21,22 @@ from polar_bayes.capture.paths import as_path
 from polar_bayes.diagnostics.convergence import judge, summary
 from polar_bayes.diagnostics.discrepancy import WITHOUT, compare_without
 from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars
+from polar_bayes.diagnostics.population import population_summary, populations, shrinkage
 from polar_bayes.diagnostics.predictive import Check, predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import save_result
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import figures, sentences, tables
+from polar_bayes.reporting.population import shrinkage_plot
+from polar_bayes.reporting.provenance import provenance_groups, swapped_sentence
 from polar_bayes.reporting.readings import variables
+from polar_bayes.reporting.spectrum import spectra, spectrum
 from polar_bayes.reporting.style import QUANTITIES, STYLE
 
 PAGE = "index.html"
 RESULT = "result.nc"
+MOST_POPULATIONS = 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,6 +109,7 @@ def render(result: xr.DataTree) -> str:
     posterior = result["posterior"].to_dataset()
     judged = judge(result, table)
     is_point = method == "point"
+    population = None if is_point else _population(result, posterior)
     name = one_line(str((provenance.get("capture") or {}).get("name", "capture")))
     content: dict[str, Any] = {
         "name": name,
@@ -111,9 +118,15 @@ def render(result: xr.DataTree) -> str:
         "verdict": judged,
         "headline": sentences.headline(method, judged.converged, judged.cautions),
         # What a failed fit says about the material is not worth a sentence.
-        "said": [*sentences.determined(found, prior, posterior), *sentences.expected(checks)]
+        "said": [
+            *sentences.determined(found, prior, posterior),
+            *(population["said"] if population else []),
+            *sentences.expected(checks),
+        ]
         if judged.converged
         else [],
+        "swapped": swapped_sentence(provenance),
+        "population": population,
         "parameters": tables.estimate_table(result, found, table)
         if is_point
         else tables.parameter_table(result, found, table, prior),
@@ -125,7 +138,8 @@ def render(result: xr.DataTree) -> str:
         "sampler": tables.sampler_facts(result, method, provenance),
         "checks": tables.check_table(checks) if checks else None,
         "effects": _effects(result),
-        "groups": tables.provenance_groups(provenance),
+        "groups": provenance_groups(provenance),
+        "model_source": str(provenance.get("model_source") or ""),
         "pictures": _pictures(result, checks, method),
     }
     environment = Environment(
@@ -155,6 +169,58 @@ def _without(
     ]
 
 
+def _population(result: xr.DataTree, posterior: xr.Dataset) -> dict[str, Any] | None:
+    """What the members of each population have in common, where anything is pooled."""
+    found = populations(result)
+    if not found:
+        return None
+    summary, members = population_summary(result), shrinkage(result)
+    drawn = [each.label for each in found if math.isfinite(summary.loc[each.label, "pooling"])]
+    caption = (
+        "Each member twice: above, hollow, about where its own readings alone would put it; "
+        "below, filled, its estimate in this fit, which leans on the others. The less a member's "
+        "readings say, the closer it is drawn to the population. Dark gray: the population's "
+        "location; light gray: where a new member would lie; both 95%. An arrowhead stands for an "
+        "estimate beyond the axis."
+    )
+    return {
+        "said": sentences.varied(summary, found, posterior),
+        "leaning": sentences.leaning(summary, found, posterior),
+        "table": tables.population_table(summary, found),
+        "members": tables.member_table(result, members, found),
+        "left_out": max(len(drawn) - MOST_POPULATIONS, 0),
+        "pictures": [
+            _picture(
+                shrinkage_plot(result, label, summary, members),
+                f"Shrinkage of {label}: each member alone and pooled",
+                caption if at == 0 else "The same.",
+            )
+            for at, label in enumerate(drawn[:MOST_POPULATIONS])
+        ],
+    }
+
+
+def _spectrum_pictures(result: xr.DataTree) -> list[Picture]:
+    found = spectra(result)
+    tied = (
+        "Median, 50% and 95% of the posterior at every wavelength; between and beyond the measured "
+        "ones (dashed lines) the fit knows it only from its assumption about how colors hang "
+        "together. Orange: true values, where known."
+    )
+    free = (
+        "Median, 50% and 95% of the posterior at each measured wavelength. Nothing in this fit "
+        "ties the colors together, so it says nothing in between. Orange: true values, where known."
+    )
+    return [
+        _picture(
+            spectrum(result, name, found),
+            f"{name.replace('_', ' ').capitalize()} against wavelength",
+            tied if found[name][0].between.size else free,
+        )
+        for name in found
+    ]
+
+
 def _effects(result: xr.DataTree) -> dict[str, Any] | None:
     """How the scene was chosen, where it was."""
     if "effects" not in result.children:
@@ -170,6 +236,7 @@ def _pictures(
     has_draws = method != "point" and bool(figures.drawable(result))
     has_prior = has_draws and "prior" in result.children
     return {
+        "spectrum": _spectrum_pictures(result) if has_draws else [],
         "readings": _reading_pictures(result, has_draws),
         "pairs": _optional(
             has_draws and len(figures.drawable(result, material=True)) > 1,

@@ -76,7 +76,9 @@ def shrinkage_plot(
     rows = members.loc[[scalar.label for scalar in population.members]].reset_index(drop=True)
     if not np.isfinite(rows["mean"]).all():
         raise FitError(
-            "its draws are not finite", where=f"shrinkage_plot: {label}", mend="see the verdict"
+            "its draws are not finite on the population's scale",
+            where=f"shrinkage_plot: {label}",
+            mend="see the verdict",
         )
     rows["true"] = [truth_of(result, scalar) for scalar in population.members]
     rows["name"] = _names(population)
@@ -120,11 +122,10 @@ def _draw(
     first = population.members[0]
     places = [place_of(dim, text) for dim, text in population.location.labels.items()]
     words = title_of(first, posterior).partition(", ")[0]
-    axes.set_xlabel(", ".join([words, *map(plain, places)]))
+    part = f" ({len(rows)} of {count}, evenly from low to high)" if count > len(rows) else ""
+    axes.set_xlabel(", ".join([words, *map(plain, places)]) + part)
     quiet_ticks(axes)
     axes.tick_params(axis="y", length=0, labelsize=6.0 if is_dense else 7.5)
-    if count > len(rows):
-        figure.suptitle(f"{len(rows)} of {count}, evenly from low to high", fontsize=8, color=GRAY)
     figure.legend(handles=_legend(rows), loc="outside upper left", ncols=2, frameon=False)
     return figure
 

@@ -167,9 +167,9 @@ def _draw(result: xr.DataTree, found: list[Curve], name: str, quantity: str) -> 
         quiet_ticks(axes)
     _limits(figure.axes[0], found, is_share=quantity == QUANTITIES["dop"])
     where = f", {_azimuth_title(azimuths[0])}" if len(azimuths) == 1 else ""
-    figure.supxlabel(f"view zenith [degree]{where}", fontsize=9)
-    if len(found) > shown:
-        figure.suptitle(f"the first {shown} of {len(found)}", fontsize=8, color=GRAY)
+    # Not as a title: there it would lie under the legend.
+    part = f" (the first {shown} of {len(found)})" if len(found) > shown else ""
+    figure.supxlabel(f"view zenith [degree]{where}{part}", fontsize=9)
     handles = [handle for key, handle in _legend().items() if key in drawn]
     wide = figure.get_figwidth() > 7.0
     figure.legend(handles=handles, loc="outside upper left", ncols=4 if wide else 3, frameon=False)

@@ -7,13 +7,16 @@ import pandas as pd
 import xarray as xr
 
 from polar_bayes.diagnostics.parameters import Scalar
+from polar_bayes.diagnostics.population import Population
 from polar_bayes.diagnostics.predictive import Band, Check, pit_band
 from polar_bayes.reporting.style import QUANTITIES, place_of, title_of
-from polar_bayes.reporting.text import spoken
+from polar_bayes.reporting.text import numbers, spoken
 
 # Two intervals whose widths differ by less than this are equally wide, as far as draws can tell.
 EQUAL_WIDTHS = 0.05
 MOST_PLACES = 6
+PLURALS = {"patch": "patches", "material": "materials"}
+HALF = 0.5
 
 HEADLINES = {
     ("nuts", True): "The fit converged.",
@@ -47,6 +50,64 @@ def determined(found: Sequence[Scalar], prior: pd.DataFrame, posterior: xr.Datas
     return [
         phrases[word].format(named(group, posterior)) for word, group in groups.items() if group
     ]
+
+
+def varied(summary: pd.DataFrame, found: Sequence[Population], posterior: xr.Dataset) -> list[str]:
+    """How much the members of each population differ, and where a new one would lie."""
+    groups: dict[str, list[Population]] = {}
+    for each in found:
+        if np.isfinite(summary.loc[each.label, "between"]):
+            groups.setdefault(each.name, []).append(each)
+    return [_varied(summary, group, posterior) for group in groups.values()]
+
+
+def _varied(summary: pd.DataFrame, group: Sequence[Population], posterior: xr.Dataset) -> str:
+    first = group[0]
+    # Members stand along one axis: what tells them apart is what they are called.
+    dims = [dim for dim in first.members[0].index if dim not in first.location.index]
+    member = dims[0] if len(dims) == 1 and dims[0] in PLURALS else "member"
+    row = summary.loc[first.label]
+    scale = (row["between_q97.5"] - row["between_q2.5"]) / 4.0
+    between, low, high = numbers([row["between"], row["between_q2.5"], row["between_q97.5"]], scale)
+    factor = "a factor of about" if first.scale == "log" else "about"
+    words = _words(first.members[0], posterior)
+    count = len(first.members)
+    said = (
+        f"Between the {count} {PLURALS.get(member, 'members')} the {words} varies by {factor} "
+        f"{between} (95%: {low} to {high})"
+    )
+    # Of many colors the first and the last.
+    shown = [group[0], group[-1]] if len(group) > 1 else [group[0]]
+    ranges = []
+    for each in shown:
+        row = summary.loc[each.label]
+        bounds = [row["new_q2.5"], row["new_q97.5"]]
+        ends = spoken(numbers(bounds, (bounds[1] - bounds[0]) / 4.0))
+        places = [place_of(dim, label) for dim, label in each.location.labels.items()]
+        ranges.append(f"between {ends}{' at ' + spoken(places) if places else ''}")
+    return f"{said}; a new {member} would lie {spoken(ranges)} (95%)."
+
+
+def _words(scalar: Scalar, posterior: xr.Dataset) -> str:
+    return title_of(scalar, posterior).partition(", ")[0]
+
+
+def leaning(summary: pd.DataFrame, found: Sequence[Population], posterior: xr.Dataset) -> list[str]:
+    """Whether the members' own readings or their population decide, population by population."""
+    groups: dict[bool, list[str]] = {}
+    for each in found:
+        pooling = summary.loc[each.label, "pooling"]
+        if np.isfinite(pooling):
+            places = [place_of(dim, label) for dim, label in each.location.labels.items()]
+            name = ", ".join([_words(each.members[0], posterior), *places])
+            groups.setdefault(bool(pooling > HALF), []).append(f"{name} ({pooling:.2f})")
+    phrases = {
+        True: "For {} the population says more than the readings of a single member (pooling "
+        "factor in brackets): quote such estimates as those of a member of this population.",
+        False: "For {} the readings of a single member say more than the population (pooling "
+        "factor in brackets).",
+    }
+    return [phrases[leans].format(spoken(names)) for leans, names in groups.items()]
 
 
 def named(found: Sequence[Scalar], posterior: xr.Dataset) -> str:
@@ -86,10 +147,17 @@ def expected(checks: Mapping[str, Check]) -> list[str]:
         elif band is not None:
             sentences.append(f"The readings of {name} are distributed as the model expects.")
         if check.loo and check.loo.unreliable:
+            many = check.loo.unreliable > HALF * check.count
             sentences.append(
                 f"Pareto k is above 0.7 for {check.loo.unreliable} of {check.count} readings of "
-                f"{name}: they weigh so much that leaving them out cannot be imitated. Look at "
-                "them first."
+                f"{name}: "
+                + (
+                    "leaving one out cannot be imitated with these draws, so what the report says "
+                    "about leaving out means little."
+                    if many
+                    else "they weigh so much that leaving them out cannot be imitated. Look at "
+                    "them first."
+                )
             )
     return sentences
 

@@ -1,6 +1,8 @@
 """The optical constants over wavelength: bands where a fit ties colors together, else intervals."""
 
+import ast
 import dataclasses
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -18,7 +20,10 @@ from polar_bayes.diagnostics.parameters import (
     truth_of,
 )
 from polar_bayes.errors import FitError
+from polar_bayes.inference.result import provenance_of
 from polar_bayes.inference.spectrum import predict_spectrum
+from polar_bayes.physics.dispersion import Cauchy, Sellmeier
+from polar_bayes.physics.scene import Scene
 from polar_bayes.reporting.style import (
     BLUE,
     GRAY,
@@ -32,6 +37,7 @@ from polar_bayes.reporting.style import (
     title_of,
     wrapped,
 )
+from polar_bayes.setups import SETUPS
 
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
 MOST_MEMBERS = 12
@@ -88,7 +94,7 @@ def spectra(result: xr.DataTree) -> dict[str, list[Spectrum]]:
     found = {name: members for name, members in found.items() if _applies(members)}
     if not found or method_of(result) == "point":
         return {}
-    measured = result["posterior"]["wavelength"].to_numpy().astype(float)
+    measured = result["posterior"].to_dataset()["wavelength"].to_numpy().astype(float)
     between = _fine(measured)
     bands = _bands(result, between)
     posterior = result["posterior"].to_dataset()
@@ -139,15 +145,14 @@ def spectrum(
     )
     for axes, each in zip(panels, shown, strict=True):
         _panel(axes, each)
-        axes.set_title(wrapped(each.title, 34), loc="left")
+        axes.set_title(wrapped(each.title, 34) if many else "", loc="left")
     _share(panels)
     quiet_ticks(panels)
-    figure.supxlabel("wavelength [nm]", fontsize=9)
-    figure.supylabel(shown[0].words, fontsize=9)
     every = _count(result, name)
-    if every > len(shown):
-        figure.suptitle(f"the first {len(shown)} of {every}", fontsize=8, color=GRAY)
-    figure.legend(handles=_legend(shown), loc="outside upper left", ncols=4, frameon=False)
+    part = f" (the first {len(shown)} of {every})" if every > len(shown) else ""
+    figure.supxlabel(f"wavelength [nm]{part}", fontsize=9)
+    figure.supylabel(shown[0].words, fontsize=9)
+    figure.legend(handles=_legend(shown), loc="outside upper left", ncols=5, frameon=False)
     return figure
 
 
@@ -173,12 +178,9 @@ def _fine(measured: np.ndarray) -> np.ndarray:
 
 def _bands(result: xr.DataTree, between: np.ndarray) -> dict[str, dict[int, np.ndarray]]:
     """Quantiles between the colors, by parameter and number of the member."""
-    posterior = result["posterior"]
-    keep = {
-        "draw": slice(
-            None, None, max(1, posterior["chain"].size * posterior["draw"].size // MOST_DRAWS)
-        )
-    }
+    posterior = result["posterior"].to_dataset()
+    step = max(1, posterior.sizes["chain"] * posterior.sizes["draw"] // MOST_DRAWS)
+    keep = {"draw": slice(None, None, step)}
     lead = [str(d) for d in posterior.dims if d in ("patch", "material")]
     if len(lead) == 1:
         keep[lead[0]] = slice(MOST_MEMBERS)
@@ -191,17 +193,34 @@ def _bands(result: xr.DataTree, between: np.ndarray) -> dict[str, dict[int, np.n
     )
     thin.attrs = dict(result.attrs)
     try:
-        predicted = predict_spectrum(thin, between)
+        predicted = predict_spectrum(thin, between, scene=_scene_of(result))
     except (FitError, KeyError):
         # Nothing ties the colors together, or what does is known only to the user's own model.
         return {}
     found: dict[str, dict[int, np.ndarray]] = {}
     for name, variable in predicted.data_vars.items():
-        lead = [d for d in variable.dims if d not in (*SAMPLE_DIMS, "wavelength")]
+        lead = [str(d) for d in variable.dims if d not in (*SAMPLE_DIMS, "wavelength")]
         draws = variable.transpose(*SAMPLE_DIMS, *lead, "wavelength").to_numpy()
         draws = draws.reshape(draws.shape[0] * draws.shape[1], -1, between.size)
         found[str(name)] = dict(enumerate(np.quantile(draws, LEVELS, axis=0).transpose(1, 0, 2)))
     return found
+
+
+def _scene_of(result: xr.DataTree) -> Scene | None:
+    """A scene with the fit's law of dispersion, read from its text; None where it has none."""
+    told = provenance_of(result)
+    try:
+        scene = ast.parse(str(told.get("scene_parts", "")), mode="eval")
+    except SyntaxError:  # a part that does not describe itself as Python would
+        return None
+    laws = {"Cauchy": Cauchy, "Sellmeier": Sellmeier}
+    for node in ast.walk(scene):
+        law = node.value if isinstance(node, ast.keyword) and node.arg == "dispersion" else None
+        if isinstance(law, ast.Call) and isinstance(law.func, ast.Name) and law.func.id in laws:
+            fields = {str(part.arg): ast.literal_eval(part.value) for part in law.keywords}
+            found = laws[law.func.id](**fields)
+            return dataclasses.replace(SETUPS["paper"].scene, dispersion=found)
+    return None
 
 
 def _spectrum(
@@ -238,12 +257,12 @@ def _panel(axes: Axes, each: Spectrum) -> None:
     else:
         axes.vlines(each.measured, each.levels[0], each.levels[4], color=BLUE, lw=1.1)
         axes.vlines(each.measured, each.levels[1], each.levels[3], color=BLUE, lw=3.6)
-        style = {"mfc": "white", "mec": BLUE, "ms": 4.5}
-        axes.plot(each.measured, each.levels[2], "o", ls="", **style)
+        ring: dict[str, Any] = {"mfc": "white", "mec": BLUE, "ms": 4.5}
+        axes.plot(each.measured, each.levels[2], "o", ls="", **ring)
         margin = 0.08 * np.ptp(each.measured)
         axes.set_xlim(each.measured.min() - margin, each.measured.max() + margin)
     known = np.isfinite(each.true)
-    style = {"mfc": ORANGE, "mec": "white", "mew": 0.6, "ms": 6.5}
+    style: dict[str, Any] = {"mfc": ORANGE, "mec": "white", "mew": 0.6, "ms": 6.5}
     axes.plot(each.measured[known], each.true[known], "d", ls="", zorder=6, **style)
     if each.between.size:
         axes.set_xlim(each.between[0], each.between[-1])

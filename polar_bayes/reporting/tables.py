@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,21 +11,38 @@ import xarray as xr
 
 from polar_bayes.budget.ledger import ledger_rows
 from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, laplace_k_hat
-from polar_bayes.diagnostics.parameters import Scalar, stats_of, truth_of
+from polar_bayes.diagnostics.parameters import (
+    Scalar,
+    is_hyperparameter,
+    stats_of,
+    truth_of,
+)
+from polar_bayes.diagnostics.population import Population
 from polar_bayes.diagnostics.predictive import PROBABILITIES, Check
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE
 from polar_bayes.reporting.style import QUANTITIES, title_of
 from polar_bayes.reporting.text import DASH, interval, numbers, or_dash, percent
 
+MAIN = ""
+BETWEEN = "Populations and spectra"
+INSTRUMENT = "Instrument and noise"
+SCALES = {
+    "log": "on the scale of its logarithm",
+    "log odds": "on the scale of its log odds",
+    "plain": "on its own scale",
+}
+LONG = 40
+"""Tables with more rows scroll in a box of their own."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One row: a name, what it means, its cells as text, and whether it is about the material."""
+    """One row: a name, what it means, its cells as text, and the block of rows it belongs to."""
 
     name: str
     words: str
     cells: tuple[str, ...]
-    is_main: bool = True
+    block: str = MAIN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +52,19 @@ class Table:
     caption: str
     heads: tuple[str, ...]
     rows: tuple[Row, ...]
+
+    @property
+    def blocks(self) -> list[tuple[str, list[Row]]]:
+        """Rows by the title of their block, in order; the main one has none."""
+        found: dict[str, list[Row]] = {}
+        for row in self.rows:
+            found.setdefault(row.block, []).append(row)
+        return list(found.items())
+
+    @property
+    def is_long(self) -> bool:
+        """True where a page would be mostly this table."""
+        return len(self.rows) > LONG
 
 
 def parameter_table(
@@ -146,6 +176,53 @@ def sensitivity_table(found: Sequence[Scalar], prior: pd.DataFrame, posterior: x
     return Table(caption, tuple(heads), tuple(rows))
 
 
+def population_table(summary: pd.DataFrame, found: Sequence[Population]) -> Table:
+    """Location, spread and the range of a new member, for every pooled parameter."""
+    rows = []
+    for each in found:
+        row = summary.loc[each.label]
+        cells = []
+        for part in ("location", "spread"):
+            low, high = row[f"{part}_q2.5"], row[f"{part}_q97.5"]
+            scale = (high - low) / 2.0
+            cells.append(f"{numbers([row[part]], scale)[0]} {interval(low, high, scale)}")
+        cells += [str(row["meaning"]).removeprefix("members differ by ") or DASH]
+        cells += [interval(row["new_q2.5"], row["new_q97.5"]), or_dash(row["pooling"], "{:.2f}")]
+        words = f"{row['members']} members, {SCALES[each.scale]}"
+        rows.append(Row(each.label, words, tuple(cells)))
+    heads = ("parameter", "location", "spread", "members differ by")
+    caption = (
+        "Location: the median of the population, in the unit of the parameter. Spread: the "
+        "standard deviation between members on the scale named under the parameter; what it means "
+        "in the unit of the parameter stands beside it. Brackets: 95% intervals. A new member: "
+        "where one that was not measured would lie with 95%, the uncertainty of location and "
+        "spread included. Pooling factor (Gelman and Pardoe 2006): 0 where each member stands "
+        "alone, 1 where all share one value; above 0.5 the population says more than the readings "
+        "of a member."
+    )
+    return Table(caption, (*heads, "a new member", "pooling factor"), tuple(rows))
+
+
+def member_table(result: xr.DataTree, members: pd.DataFrame, found: Sequence[Population]) -> Table:
+    """Every member of every population, with and without it."""
+    posterior, rows = result["posterior"].to_dataset(), []
+    for scalar in (scalar for each in found for scalar in each.members):
+        row = members.loc[scalar.label]
+        scale = (row["q97.5"] - row["q2.5"]) / 4.0
+        cells = [*numbers([row["mean"]], scale), interval(row["q2.5"], row["q97.5"])]
+        cells += numbers([row["alone"]], scale)
+        cells += [interval(row["alone_q2.5"], row["alone_q97.5"], scale)]
+        cells.append(percent(row["leaning"]))
+        rows.append(Row(scalar.label, title_of(scalar, posterior), tuple(cells)))
+    caption = (
+        "Alone: about where the readings of a member would put it without the population, taken "
+        "out of the draws as if both were normal; a dash where they say nothing. Leaning: the "
+        "population's share in the precision of the estimate."
+    )
+    heads = ("parameter", "mean", "95% interval", "alone", "95% alone", "leaning")
+    return Table(caption, heads, tuple(rows))
+
+
 def check_table(checks: Mapping[str, Check]) -> Table:
     """Residuals, coverage, and leave-one-out results of every variable."""
     rows = []
@@ -200,7 +277,7 @@ def sampler_facts(result: xr.DataTree, method: str, provenance: Mapping[str, Any
     if modes.get("weights"):
         facts["weights of the modes found"] = [f"{weight:.3g}" for weight in modes["weights"]]
         facts["climbs towards modes"] = f"{modes.get('starts')}, failed: {modes.get('failures')}"
-    return _facts(facts)
+    return fact_rows(facts)
 
 
 def effect_table(ledger: xr.Dataset) -> Table:
@@ -221,42 +298,11 @@ def effect_table(ledger: xr.Dataset) -> Table:
     return Table(caption, heads, rows)
 
 
-def provenance_groups(provenance: Mapping[str, Any]) -> list[tuple[str, list[Row]]]:
-    """How the fit was made, in titled groups of name and text."""
-    keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
-    keys += ["chain_method", "largest_view_zenith"]
-    fit = {key.replace("_", " "): provenance[key] for key in keys if key in provenance}
-    fit["swapped by the user"] = provenance.get("swapped") or "nothing: all defaults"
-    timings = dict(provenance.get("timings") or {})
-    if timings:
-        timings["total"] = round(sum(timings.values()), 3)
-    versions = {**(provenance.get("versions") or {}), **(provenance.get("machine") or {})}
-    groups = {
-        "Fit": fit,
-        "Readings": _counts(provenance.get("counts") or {}),
-        "Capture": provenance.get("capture"),
-        "Priors": provenance.get("priors"),
-        "Likelihood links": provenance.get("links"),
-        "Seconds, compilation included": timings,
-        "Versions": versions,
-    }
-    return [(title, _facts(values)) for title, values in groups.items() if values]
-
-
-def _counts(counts: Mapping[str, Any]) -> dict[str, Any]:
-    said = {"all": counts.get("views"), "fitted": counts.get("used")}
-    said |= {"masked (valid=False)": counts.get("masked")}
-    if None not in said.values():
-        aside = counts["views"] - counts["masked"] - counts["used"]
-        said["set aside (beyond the angle limit)"] = aside
-    said["saturated"] = counts.get("saturated")
-    margin = counts.get("at_margin") or {}
-    said |= {f"{name} at the margin of its link": count for name, count in margin.items()}
-    return {name: count for name, count in said.items() if count is not None}
-
-
 def _row(scalar: Scalar, posterior: xr.Dataset, cells: Sequence[str]) -> Row:
-    return Row(scalar.label, title_of(scalar, posterior), tuple(cells), scalar.is_material)
+    block = MAIN if scalar.is_material else INSTRUMENT
+    if is_hyperparameter(scalar.name, set(map(str, posterior.data_vars))):
+        block = BETWEEN
+    return Row(scalar.label, title_of(scalar, posterior), tuple(cells), block)
 
 
 def _truth_cell(truth: float, row: pd.Series) -> str:
@@ -266,13 +312,17 @@ def _truth_cell(truth: float, row: pd.Series) -> str:
     return text if row["q2.5"] <= truth <= row["q97.5"] else f"{text} (outside)"
 
 
-def _facts(values: Mapping[str, Any]) -> list[Row]:
-    return [Row(str(name), "", (_as_text(value),)) for name, value in values.items()]
+def fact_rows(values: Mapping[str, Any], marked: Collection[str] = (), mark: str = "") -> list[Row]:
+    """Names and texts; `mark` stands behind those whose names are marked."""
+    return [
+        Row(str(name), mark if name in marked else "", (_as_text(value),))
+        for name, value in values.items()
+    ]
 
 
 def _as_text(value: object) -> str:
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {item}" for key, item in value.items())
+        return ", ".join(f"{key} {_as_text(item)}" for key, item in value.items())
     if isinstance(value, list | tuple):
-        return ", ".join(str(item) for item in value)
+        return ", ".join(_as_text(item) for item in value) or "none"
     return str(value)

@@ -180,7 +180,7 @@ def test_the_posterior_is_that_of_another_density_and_another_sampler() -> None:
     capture = spectral_plate(colors, error=TWIN_ERROR, seed=21, views=np.linspace(35.0, 75.0, 6))
     theirs, independent = twin_draws(capture)
     assert independent > 1000.0
-    settings = pb.Nuts(draws=1000, most_draws=2000, effective_draws=1000.0, target_acceptance=0.97)
+    settings = pb.Nuts(draws=1000, most_draws=2000, effective_draws=1000.0)
     result = fit(capture, method=settings, seed=4)
     assert pb.verdict(result).converged
     posterior = result["posterior"]

@@ -1,0 +1,47 @@
+"""The map onto an interval: the identity inside, finite wherever a sampler may go."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from polar_bayes.models.bounds import Bent
+
+LOW, HIGH = 1.2, 2.0
+INTERVALS = {"both": (LOW, HIGH), "one": (1.0, np.inf)}
+
+
+@pytest.mark.parametrize("interval", INTERVALS.values(), ids=INTERVALS)
+def test_it_goes_there_and_back_with_its_volume(interval: tuple[float, float]) -> None:
+    bent = Bent(*interval)
+    x = jnp.linspace(0.9, 2.3, 57)
+    y = bent(x)
+    inside = (y - LOW > 1e-6) & (HIGH - y > 1e-6)  # closer, the way back has no digits left
+    np.testing.assert_allclose(jnp.where(inside, bent.inv(y), x), x, atol=1e-8)
+    slope = jax.vmap(jax.grad(lambda x: bent(x)))(x)
+    np.testing.assert_allclose(bent.log_abs_det_jacobian(x, y), np.log(slope), atol=1e-8)
+
+
+def test_inside_nothing_moves() -> None:
+    x = jnp.linspace(1.4, 1.8, 9)
+    # At twenty widths of the bend, 0.01 each: exp(-20) of one.
+    np.testing.assert_allclose(Bent(LOW, HIGH)(x), x, atol=3e-11)
+
+
+@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize("interval", INTERVALS.values(), ids=INTERVALS)
+def test_value_slope_and_curvature_are_finite_far_out_and_at_the_bounds(interval, double) -> None:
+    with jax.enable_x64(double):
+        bent = Bent(*interval)
+        x = jnp.asarray(
+            np.concatenate([np.linspace(-50.0, 50.0, 400), interval[:1], [HIGH, -1e6, 1e6]]), float
+        )
+        y = bent(x)
+        assert y.dtype == (jnp.float64 if double else jnp.float32)
+        assert (y >= jnp.asarray(interval[0], y.dtype)).all()
+        assert (y <= jnp.asarray(interval[1], y.dtype)).all()
+        for derivative in (jax.grad, lambda f: jax.grad(jax.grad(f))):
+            assert np.isfinite(jax.vmap(derivative(lambda x: bent(x)))(x)).all()
+            volume = derivative(lambda x: bent.log_abs_det_jacobian(x, None))
+            assert np.isfinite(jax.vmap(volume)(x)).all()
+        at_ends = jnp.asarray([interval[0], min(interval[1], 1e6)], y.dtype)
+        assert np.isfinite(bent.inv(at_ends)).all()

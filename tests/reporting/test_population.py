@@ -1,0 +1,231 @@
+"""Shrinkage plots, and what the page says about populations and about what was swapped."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from clipping import clipped
+from synthetic_results import edit_provenance, make_result, pool
+
+from polar_bayes.diagnostics.population import population_summary, populations, shrinkage
+from polar_bayes.errors import FitError
+from polar_bayes.reporting import sentences, tables
+from polar_bayes.reporting.html import render
+from polar_bayes.reporting.population import MOST_MEMBERS, shrinkage_plot
+from polar_bayes.reporting.provenance import provenance_groups, swapped_sentence
+
+EVIL = '<script>alert(1)</script>"><img src=x onerror=alert(2)>'
+
+
+def pooled(count, *parameters, names=None, **settings):
+    materials = names or tuple(f"leaf {i}" for i in range(count))
+    chosen = {"wavelengths": (), "views": 8, "draws": 60, "variables": ("dop",), **settings}
+    return pool(make_result(materials=materials, **chosen), *(parameters or ("refractive_index",)))
+
+
+@pytest.mark.parametrize("count", [2, 12, 35, 75])
+def test_members_of_every_number_are_drawn(count: int) -> None:
+    figure = shrinkage_plot(pooled(count, views=4), "refractive_index")
+    assert clipped(figure) == []
+    (axes,) = figure.axes
+    assert len(axes.get_yticks()) == min(count, MOST_MEMBERS)
+    label = axes.get_xlabel()
+    assert label.startswith("refractive index")
+    assert ("60 of 75, evenly" in label) == (count > MOST_MEMBERS)
+    said = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "pooled: mean and 95%" in said
+    assert "true value" in said
+
+
+def test_members_stand_in_order_of_their_estimates() -> None:
+    result = pooled(5)
+    means = shrinkage(result)["mean"].to_numpy()
+    names = [f"leaf {i}" for i in np.argsort(means)]
+    axes = shrinkage_plot(result, "refractive_index").axes[0]
+    assert [text.get_text() for text in axes.get_yticklabels()] == names
+
+
+def test_a_member_that_says_nothing_alone_is_drawn_as_such() -> None:
+    result = pooled(4)
+    posterior = result["posterior"].to_dataset()
+    rng = np.random.default_rng(3)
+    location, spread = (posterior[f"refractive_index_{part}"] for part in ("location", "spread"))
+    drawn = location + spread * rng.standard_normal(location.shape)
+    posterior["refractive_index"][{"material": 2}] = drawn.to_numpy()
+    result["posterior"] = xr.DataTree(posterior)
+    assert np.isnan(shrinkage(result)["alone"].iloc[2])
+    figure = shrinkage_plot(result, "refractive_index")
+    said = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "alone it says nothing" in said
+
+
+def test_a_wide_population_of_a_positive_parameter_has_a_log_axis() -> None:
+    result = pooled(6, "roughness")
+    posterior = result["posterior"].to_dataset()
+    width = np.exp(np.linspace(-3.0, 3.0, 6))
+    posterior["roughness"] = np.abs(posterior["roughness"]) * xr.DataArray(width, dims="material")
+    posterior["roughness_spread"] = 2.0 + 0.0 * posterior["roughness_spread"]
+    result["posterior"] = xr.DataTree(posterior)
+    figure = shrinkage_plot(result, "roughness")
+    assert figure.axes[0].get_xscale() == "log"
+    assert clipped(figure) == []
+
+
+def test_what_is_not_pooled_cannot_be_drawn() -> None:
+    with pytest.raises(FitError, match="choose one of refractive_index"):
+        shrinkage_plot(pooled(3), "roughness")
+    with pytest.raises(FitError, match="choose one of none"):
+        shrinkage_plot(make_result(wavelengths=(), views=4, draws=20), "roughness")
+
+
+# --- the page -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    result = pooled(12, "refractive_index", "roughness", method="laplace")
+    return render(result)
+
+
+def test_the_page_has_a_section_on_populations(page: str) -> None:
+    assert 'id="population"' in page
+    assert page.count('alt="Shrinkage of ') == 2
+    assert "Between the 12 materials the refractive index varies by about" in page
+    assert "the roughness varies by a factor of about" in page
+    assert "Every member in numbers" in page
+
+
+def test_populations_are_not_listed_as_instrument(page: str) -> None:
+    # Of the parameter table: the material first, then what members share, then the instrument.
+    part = page[page.index('id="parameter-table"') :]
+    part = part[: part.index("</table>")]
+    between, instrument = part.index("Populations and spectra"), part.index("Instrument and noise")
+    assert part.index("roughness[leaf 11]") < between
+    assert between < part.index("refractive_index_spread") < instrument < part.index("exposure")
+
+
+def test_long_tables_scroll_and_say_so(page: str) -> None:
+    assert 'class="scroll tall"' in page
+    assert "53 rows: the table scrolls." in page
+
+
+def test_no_section_where_nothing_is_pooled() -> None:
+    for result in (
+        make_result(wavelengths=(), views=8, draws=60),
+        pooled(2, method="point"),
+    ):
+        text = render(result)
+        assert 'id="population"' not in text
+        assert 'href="#population"' not in text
+        assert 'class="scroll tall"' not in text
+
+
+def test_names_of_members_are_text() -> None:
+    text = render(pooled(2, names=(EVIL, "a" * 300), views=4))
+    assert 'id="population"' in text
+    assert "<script" not in text
+    assert "<img src=x" not in text
+
+
+def test_a_failed_fit_claims_nothing_about_its_population() -> None:
+    text = render(edit_provenance(pooled(3), problems=["the mode is not settled"]))
+    assert 'id="population-table"' in text
+    assert "Between the 3 materials" not in text
+    assert "pooling factor in brackets" not in text
+
+
+def test_draws_that_are_not_finite_leave_a_page() -> None:
+    result = pooled(3)
+    posterior = result["posterior"].to_dataset()
+    posterior["refractive_index"][{"material": 1, "draw": 3}] = np.nan
+    result["posterior"] = xr.DataTree(posterior)
+    text = render(result)
+    assert 'id="population-table"' in text
+    assert "Shrinkage of" not in text
+
+
+def test_sentences_of_many_colors_name_the_first_and_the_last() -> None:
+    result = pooled(3, wavelengths=(450.0, 550.0, 650.0))
+    found, table = populations(result), population_summary(result)
+    posterior = result["posterior"].to_dataset()
+    (said,) = sentences.varied(table, found, posterior)
+    assert "a new material would lie between" in said
+    assert "at 450 nm and between" in said
+    assert said.endswith("at 650 nm (95%).")
+    assert "550" not in said
+    decided = " ".join(sentences.leaning(table, found, posterior))
+    assert decided.count("refractive index, ") == 3
+
+
+def test_tables_have_a_cell_for_every_head() -> None:
+    result = pooled(3, "roughness", "refractive_index")
+    found = populations(result)
+    for table in (
+        tables.population_table(population_summary(result), found),
+        tables.member_table(result, shrinkage(result), found),
+    ):
+        assert {len(row.cells) + 1 for row in table.rows} == {len(table.heads)}
+
+
+# --- what was swapped -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("swapped", "said"),
+    [
+        ([], "Nothing was swapped: all parts and priors are as shipped."),
+        (["scene"], "Swapped by the user: the scene."),
+        (
+            ["scene", "model", "prior of roughness", "prior of absorption"],
+            "Swapped by the user: the scene, the model and the priors of roughness and absorption.",
+        ),
+        (["refractive_index held fixed"], "Held fixed: refractive_index."),
+        (
+            ["links", *(f"prior of p{i}" for i in range(8))],
+            "Swapped by the user: the links and the priors of p0, p1, p2, p3, p4, p5 and 2 more.",
+        ),
+    ],
+)
+def test_what_was_swapped_is_a_sentence(swapped, said) -> None:
+    assert swapped_sentence({"swapped": swapped}) == said
+
+
+def test_nothing_is_said_of_a_result_that_does_not_tell() -> None:
+    assert swapped_sentence({}) == ""
+
+
+def test_provenance_marks_what_was_swapped() -> None:
+    groups = dict(
+        provenance_groups(
+            {
+                "model": "my_story",
+                "scene": "paper",
+                "priors": {"roughness": "HalfNormal(0.1)", "absorption": "LogNormal(-1, 0.5)"},
+                "links": {"dop": "BetaLink()"},
+                "declared": {"tilt": "Normal"},
+                "model_settings": {"pooled": ["roughness"], "process": {"kernel": "matern52"}},
+                "swapped": ["model", "prior of roughness", "refractive_index held fixed"],
+            }
+        )
+    )
+    marked = {row.name for rows in groups.values() for row in rows if row.words == "swapped"}
+    assert marked == {"model", "roughness"}
+    assert groups["Priors that stand in the model itself"][0].cells == ("Normal",)
+    assert [row.name for row in groups["Held fixed, by the model or around it"]] == [
+        "refractive_index"
+    ]
+    assert [row.cells[0] for row in groups["Settings of the model"]] == [
+        "roughness",
+        "kernel matern52",
+    ]
+
+
+def test_the_source_of_a_model_is_folded_and_escaped() -> None:
+    source = f"def story(data):\n    # {EVIL}\n    return 1 < 2\n"
+    result = make_result(wavelengths=(), views=4, draws=20, variables=("dop",))
+    text = render(edit_provenance(result, model_source=source, swapped=["model", EVIL]))
+    folded = text[text.index("Source of the model") :]
+    assert "return 1 &lt; 2" in folded
+    assert "<script" not in text
+    assert "<img src=x" not in text
+    assert "Swapped by the user: the model and the &lt;script" in text
+    assert "Source of the model" not in render(edit_provenance(result, model_source=""))

@@ -1,0 +1,136 @@
+"""Optical constants over wavelength: bands where colors are tied, intervals where they are not."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from clipping import clipped
+from synthetic_results import edit_provenance, make_result, replace
+
+import polar_bayes as pb
+from polar_bayes.errors import FitError
+from polar_bayes.reporting import spectrum as module
+from polar_bayes.reporting.html import render
+from polar_bayes.reporting.spectrum import LEVELS, spectra, spectrum
+
+SMALL = {"views": 6, "draws": 60, "variables": ("dop",)}
+
+
+def with_law(scene=None, **settings):
+    """A result whose index follows Cauchy's law, with the coefficients of every draw."""
+    result = make_result(**{**SMALL, **settings})
+    posterior = result["posterior"].to_dataset()
+    rng = np.random.default_rng(5)
+    grid = (posterior.sizes["chain"], posterior.sizes["draw"])
+    a, b = (
+        xr.DataArray(x + s * rng.standard_normal(grid), dims=("chain", "draw"))
+        for x, s in ((1.45, 0.01), (0.005, 0.001))
+    )
+    posterior["cauchy_a"], posterior["cauchy_b"] = a, b
+    index = a + b / (posterior["wavelength"] / 1e3) ** 2
+    posterior["refractive_index"] = index.transpose("chain", "draw", "wavelength")
+    result["posterior"] = xr.DataTree(posterior)
+    parts = pb.Scene(surface=pb.SmoothSurface(), dispersion=pb.Cauchy())
+    return edit_provenance(
+        result, scene="custom", scene_parts=repr(parts) if scene is None else scene
+    )
+
+
+def test_intervals_where_nothing_ties_the_colors() -> None:
+    result = make_result(**SMALL)
+    found = spectra(result)
+    assert set(found) == {"absorption", "refractive_index"}
+    (index,) = found["refractive_index"]
+    draws = result["posterior"]["refractive_index"].to_numpy().reshape(-1, 3)
+    assert index.levels == pytest.approx(np.quantile(draws, LEVELS, axis=0))
+    assert index.between.size == 0
+    true = result["constant_data"]["true_refractive_index"].to_numpy()
+    assert index.true == pytest.approx(true)
+    figure = spectrum(result, "refractive_index")
+    assert clipped(figure) == []
+
+
+def test_a_law_of_dispersion_has_bands_between_and_beyond_the_colors() -> None:
+    result = with_law()
+    found = spectra(result)
+    (index,) = found["refractive_index"]
+    assert index.between.min() == pytest.approx(440.0)
+    assert index.between.max() == pytest.approx(660.0)
+    at = np.searchsorted(index.between, [450.0, 550.0, 650.0])
+    assert index.band[:, at] == pytest.approx(index.levels)
+    assert found["absorption"][0].between.size == 0
+    for name in found:
+        assert clipped(spectrum(result, name, found)) == []
+
+
+@pytest.mark.parametrize(
+    "scene", ["Scene(dispersion=<function law at 0x7f>)", "Scene(dispersion=Mine(a=1))"]
+)
+def test_a_law_that_cannot_be_read_leaves_intervals(scene: str) -> None:
+    assert spectra(with_law(scene))["refractive_index"][0].between.size == 0
+
+
+def test_a_process_is_drawn_from_its_prediction(monkeypatch) -> None:
+    """Of many draws and members only some are asked for; what comes back is what is drawn."""
+    result = make_result(**{**SMALL, "draws": 600}, materials=tuple("abcdefghijklmn"))
+    asked = {}
+
+    def predict(tree, wavelengths, *, scene=None):
+        asked["draws"] = tree["posterior"].sizes["draw"] * tree["posterior"].sizes["chain"]
+        posterior = tree["posterior"]["absorption"]
+        return xr.Dataset(
+            {
+                "absorption": posterior.interp(
+                    wavelength=wavelengths, kwargs={"fill_value": "extrapolate"}
+                )
+            }
+        )
+
+    monkeypatch.setattr(module, "predict_spectrum", predict)
+    found = spectra(edit_provenance(result, scene_parts=""))
+    assert asked["draws"] == 1200
+    assert len(found["absorption"]) == module.MOST_MEMBERS
+    assert found["absorption"][3].between.size > module.FINE
+    assert found["absorption"][3].title == "material d"
+    assert found["refractive_index"][0].between.size == 0
+    figure = spectrum(result, "absorption", found)
+    assert clipped(figure) == []
+    assert len(figure.axes) == module.MOST_MEMBERS
+    assert figure.get_supxlabel() == "wavelength [nm] (the first 12 of 14)"
+    assert len({axes.get_ylim() for axes in figure.axes}) == 1
+
+
+def test_a_fit_that_cannot_be_predicted_has_intervals(monkeypatch) -> None:
+    def predict(tree, wavelengths, *, scene=None):
+        raise FitError("the fit's kernel has no name", where="x", mend="y")
+
+    monkeypatch.setattr(module, "predict_spectrum", predict)
+    assert spectra(make_result(**SMALL))["absorption"][0].between.size == 0
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"wavelengths": ()}, {"wavelengths": (550.0,)}, {"method": "point"}],
+    ids=["no wavelength", "one wavelength", "point fit"],
+)
+def test_no_spectrum_where_there_is_none(settings) -> None:
+    result = make_result(**{**SMALL, **settings})
+    assert spectra(result) == {}
+    text = render(result)
+    assert 'id="spectrum"' not in text
+    assert 'href="#spectrum"' not in text
+    with pytest.raises(FitError, match="choose one of none"):
+        spectrum(result, "absorption")
+
+
+def test_draws_that_are_not_finite_are_not_drawn() -> None:
+    result = make_result(**SMALL)
+    draws = result["posterior"]["absorption"].to_numpy().copy()
+    draws[0, 0, 1] = np.nan
+    assert set(spectra(replace(result, "posterior", "absorption", draws))) == {"refractive_index"}
+
+
+def test_the_page_says_what_ties_the_colors() -> None:
+    text = render(with_law())
+    assert 'id="spectrum"' in text
+    assert "between and beyond the measured" in text
+    assert "Nothing in this fit ties the colors together" in text
