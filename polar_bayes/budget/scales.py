@@ -102,7 +102,7 @@ class Scales:
         """The density of a scene; a prior for a parameter that it lacks is not used."""
         if scene not in self._densities:
             table = self.priors(scene)
-            priors = {name: table[name] for name in table.read}
+            priors = {name: table.row(name) for name in table.read}
             request = dataclasses.replace(self._request, scene=scene, priors=priors)
             self._densities[scene] = compile_density(request, self._data)
         return self._densities[scene]

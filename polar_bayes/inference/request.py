@@ -7,8 +7,6 @@ from numbers import Integral
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
 from numpyro.primitives import Messenger
@@ -25,7 +23,7 @@ from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import PriorTable, resolve_priors
+from polar_bayes.priors import PriorTable, in_this_precision, resolve_priors
 from polar_bayes.setups import SETUPS, Setup, find_setup
 
 Method = Nuts | Laplace | Point
@@ -59,9 +57,7 @@ class Request:
 
     def bind(self, scene: Scene) -> Callable[[Observations], None]:
         """The model with everything but its data in place."""
-        # Distributions keep what they have computed once, in the precision of that day; a copy
-        # from their arguments alone takes the precision of this fit.
-        priors = {n: jax.tree.map(_in_this_precision, prior) for n, prior in self.priors.items()}
+        priors = {name: in_this_precision(prior) for name, prior in self.priors.items()}
         return functools.partial(self.model, scene=scene, priors=priors, links=self.links)
 
 
@@ -154,13 +150,6 @@ def _name_of(model: Callable) -> str:
     if inner is not None:
         return f"{type(model).__name__}({_name_of(inner)})"
     return getattr(model, "__name__", type(model).__name__)
-
-
-def _in_this_precision(argument: object) -> object:
-    """An array argument of a prior in the floating type of this fit; others as they are."""
-    if hasattr(argument, "dtype") and jnp.issubdtype(argument.dtype, jnp.floating):
-        return jnp.asarray(np.asarray(argument).astype(jnp.result_type(float)))
-    return argument
 
 
 def _find(table: Mapping[str, Any], kind: str, name: object) -> Any:

@@ -1,7 +1,13 @@
 """What is believed before any data: the table, what may replace a row, and how it reads."""
 
 from polar_bayes.priors.describe import describe_prior
-from polar_bayes.priors.resolve import PriorTable, check_support, resolve_priors, support_bounds
+from polar_bayes.priors.resolve import (
+    PriorTable,
+    check_support,
+    in_this_precision,
+    resolve_priors,
+    support_bounds,
+)
 from polar_bayes.priors.table import PRIORS, RANGES, Beta
 
 __all__ = [
@@ -11,6 +17,7 @@ __all__ = [
     "PriorTable",
     "check_support",
     "describe_prior",
+    "in_this_precision",
     "resolve_priors",
     "support_bounds",
 ]

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import override
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpyro import distributions as dist
 from numpyro.distributions import constraints
@@ -43,6 +44,14 @@ class PriorTable(Mapping[str, dist.Distribution]):
 
     @override
     def __getitem__(self, name: str) -> dist.Distribution:
+        return in_this_precision(self.row(name))
+
+    def row(self, name: str) -> dist.Distribution:
+        """The prior as it was given.
+
+        Raises:
+            FitError: There is none of that name.
+        """
         if name not in self._rows:
             raise FitError(
                 "this parameter has no prior",
@@ -59,6 +68,21 @@ class PriorTable(Mapping[str, dist.Distribution]):
     @override
     def __len__(self) -> int:
         return len(self._rows)
+
+
+def in_this_precision(prior: dist.Distribution) -> dist.Distribution:
+    """A copy of a prior in the floating type of this fit.
+
+    Distributions keep what they have computed once, in the precision of that day; a copy made from
+    their arguments alone does not.
+    """
+
+    def convert(argument: object) -> object:
+        if hasattr(argument, "dtype") and jnp.issubdtype(argument.dtype, jnp.floating):
+            return jnp.asarray(np.asarray(argument).astype(jnp.result_type(float)))
+        return argument
+
+    return jax.tree.map(convert, prior)
 
 
 def resolve_priors(
@@ -82,7 +106,7 @@ def resolve_priors(
     table = PriorTable(overrides)
     for name, prior in (overrides or {}).items():
         _check_override(str(name), prior, parameters)
-    return {name: table[name] for name in parameters}
+    return {name: table.row(name) for name in parameters}
 
 
 def check_support(name: str, prior: dist.Distribution, where: str) -> None:
