@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 from polar_bayes.models.gp_spectral import gp_spectral
 from scipy import stats
 from spectral_plates import FRACTION, LINKS, PLATE, spectral_plate, tabulated
+from textbook import mirror_and_body
 from tinygp import kernels
 
 import polar_bayes as pb
@@ -95,15 +96,6 @@ TWIN_PRIORS = (
     stats.lognorm(0.7, scale=0.02),
     stats.lognorm(0.5, scale=300.0),
 )
-
-
-def mirror_and_body(index: np.ndarray, zenith: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Fresnel's formulas as in a textbook: reflected s and p, and what a white body returns."""
-    inside = np.sqrt(1.0 - (np.sin(zenith) / index) ** 2)
-    s = ((np.cos(zenith) - index * inside) / (np.cos(zenith) + index * inside)) ** 2
-    p = ((index * np.cos(zenith) - inside) / (index * np.cos(zenith) + inside)) ** 2
-    through = 1.0 - 0.5 * (s + p)
-    return s, p, np.cos(zenith) / np.pi * through * through
 
 
 class Twin:
