@@ -2,6 +2,7 @@
 
 import numpy as np
 import xarray as xr
+from textbook import plate_q
 
 import polar_bayes as pb
 
@@ -28,4 +29,26 @@ def plate_capture(zeniths: np.ndarray, error: float, seed: int) -> xr.Dataset:
             "q_error": ("view", np.full(zeniths.size, error)),
         },
         attrs={"name": "plate"},
+    )
+
+
+VIEWS = np.linspace(35.0, 75.0, 6)
+
+
+def plates(index, error, views=VIEWS, fraction=0.02, seed=0) -> xr.Dataset:
+    """Smooth plates of their own index, with normal errors of q."""
+    rng = np.random.default_rng(seed)
+    index = np.asarray(index, float)
+    q = plate_q(index[:, None], fraction, np.radians(views))
+    q = np.clip(q + error * rng.normal(size=q.shape), -1.0, 1.0)
+    geometry = {"view_zenith": views, "view_azimuth": np.full(views.size, 180.0)}
+    geometry |= {"light_zenith": views, "light_azimuth": np.zeros(views.size)}
+    return xr.Dataset(
+        {name: ("view", angle) for name, angle in geometry.items()}
+        | {
+            "q": (("patch", "view"), q),
+            "q_error": (("patch", "view"), np.full(q.shape, error)),
+            "true_refractive_index": ("patch", index),
+        },
+        attrs={"name": "plates"},
     )

@@ -14,14 +14,13 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / "models")]
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from patches import patch_capture
-from plates import LINKS, PLATE
-from test_hierarchical import plates
+from plates import LINKS, PLATE, plates
 
 import polar_bayes as pb
 from polar_bayes.inference.groups import find_groups

@@ -11,7 +11,7 @@ from arviz_stats.base import array_stats
 from numpyro import distributions as dist
 from numpyro import handlers
 from patches import patch_capture
-from plates import LINKS, PLATE
+from plates import LINKS, PLATE, plates
 from scipy import stats
 from textbook import plate_q
 
@@ -26,9 +26,6 @@ from polar_bayes.observation.data import observe
 ALL = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
 
 
-VIEWS = np.linspace(35.0, 75.0, 6)
-
-
 @pytest.fixture(autouse=True)
 def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(anchoring, "MOST_STARTS", 4)
@@ -38,25 +35,6 @@ def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Itera
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
-
-
-def plates(index, error, views=VIEWS, fraction=0.02, seed=0) -> xr.Dataset:
-    """Smooth plates of their own index, with normal errors of q."""
-    rng = np.random.default_rng(seed)
-    index = np.asarray(index, float)
-    q = plate_q(index[:, None], fraction, np.radians(views))
-    q = np.clip(q + error * rng.normal(size=q.shape), -1.0, 1.0)
-    geometry = {"view_zenith": views, "view_azimuth": np.full(views.size, 180.0)}
-    geometry |= {"light_zenith": views, "light_azimuth": np.zeros(views.size)}
-    return xr.Dataset(
-        {name: ("view", angle) for name, angle in geometry.items()}
-        | {
-            "q": (("patch", "view"), q),
-            "q_error": (("patch", "view"), np.full(q.shape, error)),
-            "true_refractive_index": ("patch", index),
-        },
-        attrs={"name": "plates"},
-    )
 
 
 def fit(capture: xr.Dataset, **asked) -> xr.DataTree:
