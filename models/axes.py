@@ -1,13 +1,14 @@
 """Plates for the axes of a capture, so that a model file can read like the paper."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpyro
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
 from polar_bayes.observation.data import Observations
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 
 SPECTRAL = ("absorption", "refractive_index")
 """What has a value of its own at every wavelength."""
@@ -21,6 +22,19 @@ def over_axes(data: Observations, *, without: tuple[str, ...] = ()) -> Iterator[
             if name not in without:
                 stack.enter_context(numpyro.plate(name, length, dim=position - len(data.dims)))
         yield
+
+
+def material_parameters(scene: Scene) -> tuple[str, ...]:
+    """What a scene reads of the material; nothing else is sampled."""
+    return tuple(name for name in MATERIAL_PARAMETERS if name in scene.parameters)
+
+
+def draw_own(
+    name: str, data: Observations, priors: Mapping[str, dist.Distribution]
+) -> Float[Array, "..."]:
+    """Sample a parameter of the material that each patch, or color, has for itself."""
+    with over_axes(data, without=unchanging(name)):
+        return draw(name, priors[name], data)
 
 
 def draw(name: str, prior: dist.Distribution, data: Observations) -> Float[Array, "..."]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpyro
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
-from polar_bayes.models.axes import draw, over_axes, unchanging
+from polar_bayes.models.axes import draw, draw_own, material_parameters, over_axes, unchanging
 from polar_bayes.models.population import check_members, check_pooled, draw_pooled
 from polar_bayes.models.readings import declare_readings
 from polar_bayes.models.spectra import (
@@ -29,7 +29,7 @@ from polar_bayes.models.spectral_process import SpectralProcess
 
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
-from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
+from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import support_bounds
 
 OF_A_PATCH = ("wavelength", "view")
@@ -85,14 +85,13 @@ class GpSpectral:
         check_capture(self.coupled, data, scene)
         check_members(self.pooled, data, scene)
         parameters = {}
-        for name in (name for name in MATERIAL_PARAMETERS if name in scene.parameters):
+        for name in material_parameters(scene):
             if name in self.coupled:
                 parameters[name] = self._spectrum(name, data, priors)
             elif name in self.pooled:
                 parameters[name] = draw_pooled(name, data, priors, without=unchanging(name))
             else:
-                with over_axes(data, without=unchanging(name)):
-                    parameters[name] = draw(name, priors[name], data)
+                parameters[name] = draw_own(name, data, priors)
 
         declare_readings(parameters, data, scene, priors, links)
 

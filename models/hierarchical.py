@@ -9,14 +9,14 @@ import dataclasses
 from collections.abc import Mapping
 
 from numpyro import distributions as dist
-from polar_bayes.models.axes import draw, over_axes, unchanging
+from polar_bayes.models.axes import draw_own, material_parameters, unchanging
 from polar_bayes.models.population import check_members, check_pooled, draw_pooled
 from polar_bayes.models.readings import declare_readings
 
 from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
-from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
+from polar_bayes.physics.scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,11 +59,10 @@ class Hierarchical:
         """
         check_members(self.pooled, data, scene)
         parameters = {}
-        for name in (name for name in MATERIAL_PARAMETERS if name in scene.parameters):
+        for name in material_parameters(scene):
             if name in self.pooled:
                 parameters[name] = draw_pooled(name, data, priors, without=unchanging(name))
             else:
-                with over_axes(data, without=unchanging(name)):
-                    parameters[name] = draw(name, priors[name], data)
+                parameters[name] = draw_own(name, data, priors)
 
         declare_readings(parameters, data, scene, priors, links)

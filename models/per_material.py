@@ -8,12 +8,12 @@ turns them into what the instrument would record (eq. 1), the links say how read
 from collections.abc import Mapping
 
 from numpyro import distributions as dist
-from polar_bayes.models.axes import draw, over_axes, unchanging
+from polar_bayes.models.axes import draw_own, material_parameters
 from polar_bayes.models.readings import declare_readings
 
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
-from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
+from polar_bayes.physics.scene import Scene
 
 
 def per_material(
@@ -30,10 +30,6 @@ def per_material(
         priors: A distribution for every parameter of the scene and the links.
         links: For each recorded variable, how it scatters.
     """
-    # The material: only what the scene reads is sampled.
-    parameters = {}
-    for name in (name for name in MATERIAL_PARAMETERS if name in scene.parameters):
-        with over_axes(data, without=unchanging(name)):
-            parameters[name] = draw(name, priors[name], data)
+    parameters = {name: draw_own(name, data, priors) for name in material_parameters(scene)}
 
     declare_readings(parameters, data, scene, priors, links)

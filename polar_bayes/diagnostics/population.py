@@ -7,7 +7,6 @@ odds for a share, plain (cut at its bounds) for an index.
 
 import dataclasses
 import math
-import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -19,7 +18,7 @@ import xarray as xr
 
 from polar_bayes.diagnostics.alone import estimate_alone
 from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars
-from polar_bayes.inference.result import provenance_of
+from polar_bayes.inference.result import bounds_of, provenance_of
 from polar_bayes.priors import RANGES
 
 INTERVAL = (0.025, 0.975)
@@ -137,12 +136,12 @@ def populations(result: xr.DataTree) -> list[Population]:
     found: dict[str, list[Scalar]] = {}
     for scalar in posterior_scalars(result):
         found.setdefault(scalar.name, []).append(scalar)
-    priors = provenance_of(result).get("priors") or {}
+    provenance = provenance_of(result)
     return [
         each
         for name in found
         if {f"{name}_location", f"{name}_spread"} <= set(found)
-        for each in _of_parameter(name, found, priors)
+        for each in _of_parameter(name, found, provenance)
     ]
 
 
@@ -221,24 +220,8 @@ def shrinkage(result: xr.DataTree) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(MEMBER_COLUMNS), index=index, dtype=float)
 
 
-def bounds_of(name: str, priors: Mapping[str, str]) -> tuple[float, float]:
-    """Where the population of a parameter is cut: the bounds of its location's prior.
-
-    Args:
-        name: The parameter.
-        priors: Priors as text, as the provenance has them.
-
-    Returns:
-        Least and largest value; the physical range where the text names no bound.
-    """
-    low, high = RANGES.get(name, (-math.inf, math.inf))
-    text = priors.get(f"{name}_location", "")
-    said = {key: float(number) for key, number in re.findall(r"\b(low|high)=([-+.\de]+)", text)}
-    return said.get("low", low), said.get("high", high)
-
-
 def _of_parameter(
-    name: str, found: Mapping[str, list[Scalar]], priors: Mapping[str, str]
+    name: str, found: Mapping[str, list[Scalar]], provenance: Mapping[str, Any]
 ) -> Iterator[Population]:
     for location in found[f"{name}_location"]:
         place = location.index
@@ -247,7 +230,8 @@ def _of_parameter(
         spread = next((s for s in found[f"{name}_spread"] if _agrees(s, place)), None)
         if spread is not None and len(members) > 1:
             label = location.label.replace(f"{name}_location", name, 1)
-            yield Population(label, location, spread, members, *bounds_of(name, priors))
+            low, high = bounds_of(provenance, f"{name}_location")
+            yield Population(label, location, spread, members, low, high)
 
 
 def _stands_at(scalar: Scalar, place: Mapping[str, int]) -> bool:

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import inspect
 import json
+import math
 import platform
 import time
 from collections.abc import Callable, Mapping
@@ -33,7 +34,7 @@ from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import describe_prior
+from polar_bayes.priors import describe_prior, support_bounds
 
 PRIOR_DRAWS = 500
 BLOCK = 500
@@ -264,6 +265,11 @@ def _settings_of(model: Callable) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(model), default=repr))
 
 
+def _bounds_of(prior: dist.Distribution) -> list[float | None]:
+    """Where a prior ends; None, which JSON can hold, where it does not."""
+    return [bound if math.isfinite(bound) else None for bound in support_bounds(prior)]
+
+
 def _source_of(request: Request) -> str:
     """The text of a model of the user's own, so that a result says what was fitted."""
     model = request.model
@@ -298,6 +304,7 @@ def _provenance(
         "scene": request.scene_name,
         "scene_parts": repr(request.scene),
         "priors": {name: describe_prior(prior) for name, prior in request.priors.items()},
+        "bounds": {name: _bounds_of(prior) for name, prior in request.priors.items()},
         "declared": request.declared,
         "fixed": request.fixed,
         "links": {name: repr(link) for name, link in request.links.items()},

@@ -5,6 +5,7 @@ to repeat the fit.
 """
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +16,7 @@ from arviz_base import from_dict
 from polar_bayes.inference.program import Draw, Program
 from polar_bayes.observation.data import Observations
 from polar_bayes.physics.notation import notation
+from polar_bayes.priors import RANGES
 
 PROVENANCE = "polar_bayes"
 GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
@@ -86,6 +88,25 @@ def provenance_of(result: xr.DataTree) -> dict:
         The decoded root attribute; empty where there is none.
     """
     return json.loads(result.attrs.get(PROVENANCE, "{}"))
+
+
+def bounds_of(provenance: Mapping[str, Any], name: str) -> tuple[float, float]:
+    """Where the prior of a parameter ends.
+
+    Args:
+        provenance: What a result says about how it was made.
+        name: The parameter.
+
+    Returns:
+        Least and largest value, infinite where the prior has no end; the physical range of the
+        parameter where the result names no such prior.
+    """
+    limits = RANGES.get(name, (-math.inf, math.inf))
+    said = (provenance.get("bounds") or {}).get(name)
+    if said is None:
+        return limits
+    low, high = said
+    return -math.inf if low is None else low, math.inf if high is None else high
 
 
 def posterior_of(program: Program, parameters: Mapping[str, Any]) -> xr.Dataset:

@@ -1,6 +1,6 @@
 """Spectra at wavelengths that were not measured, from a finished fit."""
 
-import re
+import ast
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,16 +11,16 @@ import xarray as xr
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.result import provenance_of
+from polar_bayes.inference.result import bounds_of, provenance_of
 from polar_bayes.models.gp_spectral import GpSpectral
 from polar_bayes.models.spectra import SPECTRA, around, widening_of
 from polar_bayes.models.spectral_process import SpectralProcess
+from polar_bayes.physics.dispersion import AbstractDispersion, Cauchy, Sellmeier
 from polar_bayes.physics.notation import notation
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import RANGES
-from polar_bayes.setups import SETUPS
 
 BATCH = 64
+LAWS = {law.__name__: law for law in (Cauchy, Sellmeier)}
 
 
 def predict_spectrum(
@@ -42,7 +42,7 @@ def predict_spectrum(
             fresh or loaded.
         wavelengths: One number or a list. nm, > 0.
         model: The model of the fit; needed where its kernel is no name.
-        scene: The scene of the fit; needed where it has a law of dispersion and no name.
+        scene: The scene of the fit; needed where its law of dispersion is the user's own.
         seed: The same seed gives the same draws.
 
     Returns:
@@ -56,7 +56,7 @@ def predict_spectrum(
     new = _checked(wavelengths)
     told = provenance_of(result)
     found: dict[str, xr.DataArray] = {}
-    law = _scene_of(told, scene).dispersion if _has_law(told, scene) else None
+    law = _law_of(told, scene)
     if law is not None:
         found["refractive_index"] = _follow(law, result["posterior"].dataset, new)
     processes = [n for n in SPECTRA if f"{n}_amplitude" in result["posterior"].data_vars]
@@ -91,23 +91,25 @@ def _checked(wavelengths: Any) -> np.ndarray:
     return new
 
 
-def _has_law(told: Mapping[str, Any], scene: Scene | None) -> bool:
+def _law_of(told: Mapping[str, Any], scene: Scene | None) -> AbstractDispersion | None:
+    """The law of dispersion of the fit, read from what it says of its scene unless it is given."""
     if scene is not None:
-        return scene.dispersion is not None
+        return scene.dispersion
     parts = str(told.get("scene_parts", ""))
-    return "dispersion=" in parts and "dispersion=None" not in parts
-
-
-def _scene_of(told: Mapping[str, Any], scene: Scene | None) -> Scene:
-    if scene is not None:
-        return scene
-    if told.get("scene") not in SETUPS:
-        raise FitError(
-            "the fit's scene has a law of dispersion and no name",
-            where="predict_spectrum: scene",
-            mend="give the same scene again: predict_spectrum(result, wavelengths, scene=...)",
-        )
-    return SETUPS[told["scene"]].scene
+    try:
+        for node in ast.walk(ast.parse(parts, mode="eval")):
+            law = node.value if isinstance(node, ast.keyword) and node.arg == "dispersion" else None
+            if isinstance(law, ast.Call) and isinstance(law.func, ast.Name):
+                fields = {str(part.arg): ast.literal_eval(part.value) for part in law.keywords}
+                return LAWS[law.func.id](**fields)
+    except (SyntaxError, ValueError, KeyError) as error:  # a part or a law of the user's own
+        if "dispersion=" in parts and "dispersion=None" not in parts:
+            raise FitError(
+                "the law of dispersion of the fit's scene is not one of this package",
+                where="predict_spectrum: scene",
+                mend="give the same scene again: predict_spectrum(result, wavelengths, scene=...)",
+            ) from error
+    return None
 
 
 def _model_of(told: Mapping[str, Any], model: GpSpectral | None) -> GpSpectral:
@@ -142,7 +144,7 @@ def _process_of(settings: Mapping[str, Any]) -> SpectralProcess:
         ) from error
 
 
-def _follow(law: Any, posterior: xr.Dataset, new: np.ndarray) -> xr.DataArray:
+def _follow(law: AbstractDispersion, posterior: xr.Dataset, new: np.ndarray) -> xr.DataArray:
     """A law of dispersion with the coefficients of every draw."""
     draws = xr.DataArray(
         np.zeros((posterior.sizes["chain"], posterior.sizes["draw"])),
@@ -181,7 +183,8 @@ def _condition(
             where="predict_spectrum: model",
             mend="give the model of the fit",
         )
-    bounds = _bounds(name, told)
+    prior = f"{name}_level_location" if f"{name}_level_location" in posterior else f"{name}_level"
+    bounds = bounds_of(told, prior)
     # A wavelength given twice is one wavelength: both get the same draw.
     distinct, again = np.unique(new, return_inverse=True)
     dtype = weights.dtype
@@ -216,15 +219,6 @@ def _condition(
         found = jax.jit(lambda all_draws: jax.lax.map(one, all_draws, batch_size=BATCH))(draws)
     spectra = np.asarray(found, dtype)[..., again]
     return _label(spectra.reshape(*level.shape, new.size), level, new)
-
-
-def _bounds(name: str, told: Mapping[str, Any]) -> tuple[float, float]:
-    """The range of the index in the fit: what the prior of its level allows."""
-    priors = told.get("priors", {})
-    text = priors.get(f"{name}_level_location", priors.get(f"{name}_level", ""))
-    low, high = RANGES[f"{name}_level"]
-    said = {key: float(number) for key, number in re.findall(r"\b(low|high)=([-+.\de]+)", text)}
-    return said.get("low", low), said.get("high", high)
 
 
 def _label(values: np.ndarray, draws: xr.DataArray, new: np.ndarray) -> xr.DataArray:

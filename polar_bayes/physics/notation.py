@@ -47,6 +47,16 @@ NOTATION: dict[str, Quantity] = {
 }
 
 
+POPULATION = {
+    "_location": "median over the population of",
+    "_spread": "spread, on its natural scale, of the population's",
+}
+
+
 def notation(name: str) -> Quantity:
-    """The row of a parameter, or one made of its name."""
+    """The row of a parameter, or of its population, or one made of its name."""
+    for ending, words in POPULATION.items():
+        if name.endswith(ending) and name.removesuffix(ending) in NOTATION:
+            _, meaning, unit = NOTATION[name.removesuffix(ending)]
+            return Quantity("", f"{words} {meaning}", unit if ending == "_location" else "1")
     return NOTATION.get(name, Quantity("", name.replace("_", " ")))

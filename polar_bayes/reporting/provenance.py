@@ -48,7 +48,6 @@ def provenance_groups(provenance: Mapping[str, Any]) -> list[tuple[str, list[Row
     if timings:
         timings["total"] = round(sum(timings.values()), 3)
     versions = {**(provenance.get("versions") or {}), **(provenance.get("machine") or {})}
-    held = [name.removesuffix(HELD) for name in swapped if name.endswith(HELD)]
     groups = {
         "Fit": fact_rows(fit, {"model", "scene"} & set(swapped), MARK),
         "Settings of the model": fact_rows(provenance.get("model_settings") or {}),
@@ -56,7 +55,7 @@ def provenance_groups(provenance: Mapping[str, Any]) -> list[tuple[str, list[Row
         "Capture": fact_rows(provenance.get("capture") or {}),
         "Priors": fact_rows(priors, {n for n in priors if f"{PRIOR}{n}" in swapped}, MARK),
         "Priors that stand in the model itself": fact_rows(provenance.get("declared") or {}),
-        "Held fixed, by the model or around it": fact_rows(dict.fromkeys(held, "not inferred")),
+        "Held fixed, by the model or around it": fact_rows(provenance.get("fixed") or {}),
         "Likelihood links": fact_rows(links, set(links) if "links" in swapped else (), MARK),
         "Seconds, compilation included": fact_rows(timings),
         "Versions": fact_rows(versions),

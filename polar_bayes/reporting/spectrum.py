@@ -1,6 +1,5 @@
 """The optical constants over wavelength: bands where a fit ties colors together, else intervals."""
 
-import ast
 import dataclasses
 from typing import Any
 
@@ -20,10 +19,7 @@ from polar_bayes.diagnostics.parameters import (
     truth_of,
 )
 from polar_bayes.errors import FitError
-from polar_bayes.inference.result import provenance_of
 from polar_bayes.inference.spectrum import predict_spectrum
-from polar_bayes.physics.dispersion import Cauchy, Sellmeier
-from polar_bayes.physics.scene import Scene
 from polar_bayes.reporting.style import (
     BLUE,
     GRAY,
@@ -37,7 +33,6 @@ from polar_bayes.reporting.style import (
     title_of,
     wrapped,
 )
-from polar_bayes.setups import SETUPS
 
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
 MOST_MEMBERS = 12
@@ -193,7 +188,7 @@ def _bands(result: xr.DataTree, between: np.ndarray) -> dict[str, dict[int, np.n
     )
     thin.attrs = dict(result.attrs)
     try:
-        predicted = predict_spectrum(thin, between, scene=_scene_of(result))
+        predicted = predict_spectrum(thin, between)
     except (FitError, KeyError):
         # Nothing ties the colors together, or what does is known only to the user's own model.
         return {}
@@ -204,23 +199,6 @@ def _bands(result: xr.DataTree, between: np.ndarray) -> dict[str, dict[int, np.n
         draws = draws.reshape(draws.shape[0] * draws.shape[1], -1, between.size)
         found[str(name)] = dict(enumerate(np.quantile(draws, LEVELS, axis=0).transpose(1, 0, 2)))
     return found
-
-
-def _scene_of(result: xr.DataTree) -> Scene | None:
-    """A scene with the fit's law of dispersion, read from its text; None where it has none."""
-    told = provenance_of(result)
-    try:
-        scene = ast.parse(str(told.get("scene_parts", "")), mode="eval")
-    except SyntaxError:  # a part that does not describe itself as Python would
-        return None
-    laws = {"Cauchy": Cauchy, "Sellmeier": Sellmeier}
-    for node in ast.walk(scene):
-        law = node.value if isinstance(node, ast.keyword) and node.arg == "dispersion" else None
-        if isinstance(law, ast.Call) and isinstance(law.func, ast.Name) and law.func.id in laws:
-            fields = {str(part.arg): ast.literal_eval(part.value) for part in law.keywords}
-            found = laws[law.func.id](**fields)
-            return dataclasses.replace(SETUPS["paper"].scene, dispersion=found)
-    return None
 
 
 def _spectrum(

@@ -1,7 +1,5 @@
 """Pooling: the populations are those of the paper, and the posterior is that of a twin."""
 
-from collections.abc import Iterator
-
 import emcee
 import jax
 import numpy as np
@@ -16,8 +14,6 @@ from scipy import stats
 from textbook import plate_q
 
 import polar_bayes as pb
-from polar_bayes.inference import anchoring
-from polar_bayes.inference import fit as fitting
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import provenance_of
@@ -25,16 +21,7 @@ from polar_bayes.observation.data import observe
 
 ALL = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
 
-
-@pytest.fixture(autouse=True)
-def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(anchoring, "MOST_STARTS", 4)
-    monkeypatch.setattr(anchoring, "TYPICAL_DRAWS", 50)
-    monkeypatch.setattr(fitting, "PRIOR_DRAWS", 100)
-    monkeypatch.setattr(fitting, "BLOCK", 100)
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+pytestmark = pytest.mark.usefixtures("compile_fast_rather_than_fast_code")
 
 
 def fit(capture: xr.Dataset, **asked) -> xr.DataTree:
@@ -171,7 +158,15 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [
+        "all alike",
+        pytest.param("all known, far apart", marks=pytest.mark.thorough),
+        pytest.param("hardly known", marks=pytest.mark.thorough),
+        "two members",
+    ],
+)
 def test_every_degree_of_pooling_samples_without_divergences(case: str) -> None:
     index, error = CASES[case]
     result = fit(plates(index, error, seed=5), seed=1)
@@ -183,6 +178,7 @@ def test_every_degree_of_pooling_samples_without_divergences(case: str) -> None:
     assert float(n.max()) <= 2.0
 
 
+@pytest.mark.thorough
 def test_many_members_keep_a_fixed_metric_and_converge() -> None:
     index = np.random.default_rng(0).normal(1.5, 0.03, 40)
     result = fit(plates(index, 0.03, seed=6), seed=1)
@@ -199,6 +195,7 @@ def test_laplace_knows_how_far_it_can_be_trusted() -> None:
     assert np.isfinite(result["posterior"]["refractive_index"]).all()
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_draws() -> None:
     capture = plates([1.45, 1.5, 1.55], 0.02)
     short = pb.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
@@ -206,6 +203,7 @@ def test_the_same_seed_gives_the_same_draws() -> None:
     xr.testing.assert_equal(one, two)
 
 
+@pytest.mark.thorough
 def test_single_precision_finds_the_same_population() -> None:
     capture = plates(np.linspace(1.45, 1.55, 6), 0.02, seed=3)
     double, single = (fit(capture, precision=p, seed=1) for p in ("double", "single"))

@@ -203,6 +203,7 @@ def test_provenance_marks_what_was_swapped() -> None:
                 "links": {"dop": "BetaLink()"},
                 "declared": {"tilt": "Normal"},
                 "model_settings": {"pooled": ["roughness"], "process": {"kernel": "matern52"}},
+                "fixed": {"refractive_index": 1.45},
                 "swapped": ["model", "prior of roughness", "refractive_index held fixed"],
             }
         )
@@ -210,9 +211,8 @@ def test_provenance_marks_what_was_swapped() -> None:
     marked = {row.name for rows in groups.values() for row in rows if row.words == "swapped"}
     assert marked == {"model", "roughness"}
     assert groups["Priors that stand in the model itself"][0].cells == ("Normal",)
-    assert [row.name for row in groups["Held fixed, by the model or around it"]] == [
-        "refractive_index"
-    ]
+    (held,) = groups["Held fixed, by the model or around it"]
+    assert (held.name, held.cells) == ("refractive_index", ("1.45",))
     assert [row.cells[0] for row in groups["Settings of the model"]] == [
         "roughness",
         "kernel matern52",

@@ -74,7 +74,7 @@ def test_a_process_is_drawn_from_its_prediction(monkeypatch) -> None:
     result = make_result(**{**SMALL, "draws": 600}, materials=tuple("abcdefghijklmn"))
     asked = {}
 
-    def predict(tree, wavelengths, *, scene=None):
+    def predict(tree, wavelengths):
         asked["draws"] = tree["posterior"].sizes["draw"] * tree["posterior"].sizes["chain"]
         posterior = tree["posterior"]["absorption"]
         return xr.Dataset(
@@ -100,7 +100,7 @@ def test_a_process_is_drawn_from_its_prediction(monkeypatch) -> None:
 
 
 def test_a_fit_that_cannot_be_predicted_has_intervals(monkeypatch) -> None:
-    def predict(tree, wavelengths, *, scene=None):
+    def predict(tree, wavelengths):
         raise FitError("the fit's kernel has no name", where="x", mend="y")
 
     monkeypatch.setattr(module, "predict_spectrum", predict)

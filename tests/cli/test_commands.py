@@ -1,64 +1,11 @@
 """The commands as a user types them: output, files, exit status, and one line for a mistake."""
 
-import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-import xarray as xr
-from plates import plate_capture
 
 import polar_bayes as pb
 from polar_bayes.cli import main
-
-PLATES = {
-    "glass": (
-        ["--s", "glass_fresnel/s1.txt", "--p", "glass_fresnel/p1.txt"],
-        ["--s-incident", "1910", "--p-incident", "1630"],
-        1.509,
-    ),
-    "plexiglas": (
-        ["--table", "plexiglas_fresnel/plexiglas_A.csv"],
-        ["--angle", "angle_deg", "--s", "I_s_uA", "--p", "I_p_uA"],
-        1.489,
-    ),
-}
-
-
-@pytest.mark.parametrize("plate", PLATES)
-def test_a_measured_plate_from_table_to_interval(
-    plate: str, measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """One and the same setting for both plates, as the commands' defaults have it."""
-    files, columns, index = PLATES[plate]
-    files = [str(measured / word) if "/" in word else word for word in files]
-    capture, fit = tmp_path / "capture.nc", tmp_path / "fit.nc"
-    assert main(["import", "goniometer", *files, *columns, "--out", str(capture)]) == 0
-    assert "views" in capsys.readouterr().out
-    status = main(["fit", str(capture), "--method", "nuts", "--json", "--out", str(fit)])
-    said = json.loads(capsys.readouterr().out)
-    assert status == 0, said["problems"]
-    assert said["converged"]
-    found = said["parameters"]["refractive_index"]
-    assert found["q2.5"] < index < found["q97.5"]
-    assert found["q97.5"] - found["q2.5"] < 0.2
-    # Nothing but the surface reflects from a polished plate with an opaque back.
-    assert said["parameters"]["subsurface_fraction"]["q97.5"] < 0.05
-    result = pb.load_result(fit)
-    assert "without_discrepancy" in result.children
-    assert main(["report", str(fit), "--out", str(tmp_path / "report")]) == 0
-    page = (tmp_path / "report" / "index.html").read_text()
-    assert "overconfident" in page
-
-
-def test_every_preset_converges(tmp_path: Path) -> None:
-    for preset in pb.PRESETS:
-        result = pb.fit(pb.simulate(preset, seed=0), seed=0)
-        verdict = pb.verdict(result)
-        assert verdict.converged, (preset, verdict.problems)
-        rows = pb.json_summary(result)["parameters"]
-        assert max(row["r_hat"] for row in rows.values()) <= 1.01
-        assert min(row["ess_bulk"] for row in rows.values()) >= 400.0
 
 
 def test_simulate_writes_what_fit_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -67,14 +14,6 @@ def test_simulate_writes_what_fit_reads(tmp_path: Path, capsys: pytest.CaptureFi
     assert capsys.readouterr().out.startswith(str(file))
     capture = pb.load_capture(file)
     assert dict(capture.sizes) == {"view": 40, "wavelength": 3}
-
-
-@pytest.fixture(scope="module")
-def plate(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    file = tmp_path_factory.mktemp("plate") / "plate.nc"
-    capture = plate_capture(np.linspace(20.0, 75.0, 20), 0.01, seed=2)
-    pb.save_capture(capture.assign_attrs(setup="goniometer"), file)
-    return file
 
 
 def test_the_table_has_a_row_per_parameter(
@@ -100,40 +39,6 @@ def test_a_fit_whose_diagnostics_fail_is_written_and_exits_with_2(
     assert main(["fit", str(plate), "--out", str(out)]) == 2
     assert "problem: " in capsys.readouterr().err
     assert out.exists()
-
-
-def test_effects_prints_the_ledger_and_writes_it(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "ledger.nc"
-    assert main(["effects", str(plate), "--keep", "BeamOverlap", "--out", str(out)]) == 0
-    head, *rows, space, sentence = capsys.readouterr().out.splitlines()
-    assert head.split()[:2] == ["effect", "data"]
-    assert not space
-    assert f"of {len(rows)} effects are kept" in sentence
-    kept = next(row for row in rows if row.startswith("BeamOverlap"))
-    assert "kept: by your choice; alone no parameter changes" in kept
-    with xr.open_dataset(out) as ledger:
-        assert ledger.sizes["effect"] == len(rows)
-
-
-def test_effects_as_json_are_what_a_fit_of_the_chosen_scene_keeps(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["effects", str(plate), "--tolerance", "0.2", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["tolerance"] == 0.2
-    assert not said["effects"]["BeamOverlap"]["kept"]
-    out = tmp_path / "fit.nc"
-    words = ["fit", str(plate), "--choose-effects", "--tolerance", "0.2", "--method", "point"]
-    assert main([*words, "--out", str(out)]) in (0, 2)
-    assert "effects are kept" in capsys.readouterr().err
-    result = pb.load_result(out)
-    kept = result["effects"]["kept"]
-    assert {
-        name: bool(row) for name, row in zip(kept["effect"].values, kept.values, strict=True)
-    } == {name: row["kept"] for name, row in said["effects"].items()}
-    assert "beam_overlap_zenith" not in result["posterior"]
 
 
 def test_combine_puts_captures_side_by_side(

@@ -1,0 +1,20 @@
+"""Every material that can be simulated can be fitted with the defaults."""
+
+import pytest
+
+import polar_bayes as pb
+
+QUICK = ("leaf", "glass")
+
+
+@pytest.mark.parametrize(
+    "preset",
+    [p if p in QUICK else pytest.param(p, marks=pytest.mark.thorough) for p in pb.PRESETS],
+)
+def test_every_preset_converges(preset: str) -> None:
+    result = pb.fit(pb.simulate(preset, seed=0), seed=0)
+    verdict = pb.verdict(result)
+    assert verdict.converged, verdict.problems
+    rows = pb.json_summary(result)["parameters"]
+    assert max(row["r_hat"] for row in rows.values()) <= 1.01
+    assert min(row["ess_bulk"] for row in rows.values()) >= 400.0
