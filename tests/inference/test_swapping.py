@@ -44,8 +44,7 @@ def test_by_keyword(capture: xr.Dataset) -> None:
 def test_by_an_edited_file(capture: xr.Dataset, tmp_path: Path) -> None:
     text = (MODELS / "per_material.py").read_text()
     edited = text.replace(
-        "parameters[name] = draw(name, priors[name], data)",
-        "parameters[name] = draw(name, OWN.get(name) or priors[name], data)",
+        "draw_own(name, data, priors)", "draw_own(name, data, OWN if name in OWN else priors)"
     ).replace(
         "def per_material(", 'OWN = {"subsurface_fraction": dist.Beta(1.0, 30.0)}\n\n\ndef mine('
     )
@@ -111,7 +110,7 @@ MOVED = handlers.reparam(POOLED, config={"subsurface_fraction_base": LocScaleRep
 def test_by_reparam(plates: xr.Dataset) -> None:
     result = fit(plates, model=MOVED, method="laplace")
     assert provenance_of(result)["model"] == "reparam(Hierarchical)"
-    assert "subsurface_fraction_base_decentered" in result["unconstrained_posterior"]
+    assert "subsurface_fraction_base_decentered" in result["posterior"]
 
 
 @pytest.mark.thorough
