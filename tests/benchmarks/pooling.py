@@ -1,14 +1,15 @@
 """What pooling buys, what it costs, and how its cost grows.
 
-    python tests/benchmarks/pooling.py replicates   hierarchical against separate fits
+    python tests/benchmarks/pooling.py alike        hierarchical against separate fits
+    python tests/benchmarks/pooling.py different    the same, where members truly differ
     python tests/benchmarks/pooling.py patches      30 patches of 40 views, NUTS
     python tests/benchmarks/pooling.py gradient     one gradient, 10 to 1000 patches
 
-`replicates` simulates weak readings of smooth plates; the members differ little in one half of
-the runs, and much in the other. `patches` prints seconds after compilation (a second run of the
+The first two simulate weak readings of smooth plates. `patches` prints seconds after compilation (a second run of the
 same program) and the diagnostics.
 """
 
+import functools
 import sys
 import tempfile
 import time
@@ -31,43 +32,43 @@ from polar_bayes.inference.transport import Anchored, Anchors, Transport
 from polar_bayes.observation.data import observe
 
 REPLICATES, MEMBERS, ERROR = 20, 8, 0.05
-SPREADS = {"alike (sd .02)": 0.02, "different (sd .12)": 0.12}
+SPREADS = {"alike": 0.02, "different": 0.12}
 
 
-def replicates() -> None:
+def replicates(label: str) -> None:
     """RMSE, width and coverage of the index, over all members of all replicates."""
+    spread = SPREADS[label]
     print(f"{REPLICATES} replicates of {MEMBERS} plates, 6 views, error {ERROR} in q")
-    for label, spread in SPREADS.items():
-        rows: dict[str, list[tuple[float, float, float]]] = {}
-        converged = {"hierarchical": 0, "per_material": 0}
-        for seed in range(REPLICATES):
-            rng = np.random.default_rng(1000 + seed)
-            truth = np.clip(rng.normal(1.5, spread, MEMBERS), 1.25, 1.95)
-            capture = plates(truth, ERROR, seed=seed)
-            for model in converged:
-                result = pb.fit(capture, model=model, scene=PLATE, links=LINKS, seed=seed)
-                converged[model] += pb.verdict(result).converged
-                draws = result["posterior"]["refractive_index"].stack(all=("chain", "draw"))
-                low, high = draws.quantile([0.025, 0.975], "all").to_numpy()
-                errors = draws.mean("all").to_numpy() - truth
-                rows.setdefault(model, []).append(
-                    (
-                        float(np.mean(errors**2)),
-                        float(np.mean(high - low)),
-                        float(np.mean((low <= truth) & (truth <= high))),
-                    )
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    converged = {"hierarchical": 0, "per_material": 0}
+    for seed in range(REPLICATES):
+        rng = np.random.default_rng(1000 + seed)
+        truth = np.clip(rng.normal(1.5, spread, MEMBERS), 1.25, 1.95)
+        capture = plates(truth, ERROR, seed=seed)
+        for model in converged:
+            result = pb.fit(capture, model=model, scene=PLATE, links=LINKS, seed=seed)
+            converged[model] += pb.verdict(result).converged
+            draws = result["posterior"]["refractive_index"].stack(all=("chain", "draw"))
+            low, high = draws.quantile([0.025, 0.975], "all").to_numpy()
+            errors = draws.mean("all").to_numpy() - truth
+            rows.setdefault(model, []).append(
+                (
+                    float(np.mean(errors**2)),
+                    float(np.mean(high - low)),
+                    float(np.mean((low <= truth) & (truth <= high))),
                 )
-        print(f"\n{label}")
-        for model, found in rows.items():
-            mean = np.mean(found, axis=0)
-            error = np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
-            rmse = np.sqrt(mean[0])
-            print(
-                f"  {model:<13} RMSE {rmse:.4f} +- {error[0] / (2 * rmse):.4f}   width "
-                f"{mean[1]:.4f} +- {error[1]:.4f}   coverage {mean[2]:.3f} +- {error[2]:.3f}   "
-                f"converged {converged[model]} of {REPLICATES}",
-                flush=True,
             )
+    print(f"\n{label} (sd {spread})")
+    for model, found in rows.items():
+        mean = np.mean(found, axis=0)
+        error = np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
+        rmse = np.sqrt(mean[0])
+        print(
+            f"  {model:<13} RMSE {rmse:.4f} +- {error[0] / (2 * rmse):.4f}   width "
+            f"{mean[1]:.4f} +- {error[1]:.4f}   coverage {mean[2]:.3f} +- {error[2]:.3f}   "
+            f"converged {converged[model]} of {REPLICATES}",
+            flush=True,
+        )
 
 
 def patches() -> None:
@@ -130,4 +131,5 @@ if __name__ == "__main__":
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-        {"replicates": replicates, "patches": patches, "gradient": gradient}[sys.argv[1]]()
+        tasks = {label: functools.partial(replicates, label) for label in SPREADS}
+        (tasks | {"patches": patches, "gradient": gradient})[sys.argv[1]]()
