@@ -48,8 +48,8 @@ NOTATION: dict[str, Quantity] = {
 
 
 POPULATION = {
-    "_location": "median over the population of",
-    "_spread": "spread, on its natural scale, of the population's",
+    "_location": "population median of",
+    "_spread": "population spread of",
 }
 
 
