@@ -5,8 +5,8 @@
     python tests/benchmarks/pooling.py patches      30 patches of 40 views, NUTS
     python tests/benchmarks/pooling.py gradient     one gradient, 10 to 1000 patches
 
-The first two simulate weak readings of smooth plates. `patches` prints seconds after compilation (a second run of the
-same program) and the diagnostics.
+The first two simulate weak readings of smooth plates. `patches` prints seconds after compilation (a
+second run of the same program) and the diagnostics.
 """
 
 import functools
