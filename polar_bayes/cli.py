@@ -16,7 +16,13 @@ from typing import Any
 import click
 import platformdirs
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskProgressColumn,
+    TimeRemainingColumn,
+)
 
 import polar_bayes as pb
 
@@ -205,6 +211,26 @@ def fit(
     return _status(result)
 
 
+@commands.command(name="map")
+@click.argument("capture", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Zarr store to write.")
+@click.option("--model", default="per_material", show_default=True)
+@click.option("--scene", help="Named scene; by default the one that the capture names.")
+@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
+@click.option("--draws", type=int, default=256, show_default=True, help="Weighted, in each pixel.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@click.option("--precision", default="double", show_default=True, help="double or single.")
+@click.option("--scheduler", help="Address of a dask.distributed scheduler; default: threads.")
+@click.option("--resume", is_flag=True, help="Go on with a map that was broken off.")
+def map_(capture: Path, out: Path, draws: int, **settings: Any) -> None:
+    """Fit every pixel of an image."""
+    with _pixels_bar() as progress:
+        method = pb.PixelLaplace(draws=draws)
+        maps = pb.map_file(capture, out, method=method, progress=progress, **settings)
+    counts = ", ".join(f"{count} {what}" for what, count in pb.count_pixels(maps).items() if count)
+    click.echo(f"{out}: {counts}")
+
+
 @commands.command()
 @click.argument("capture", type=click.Path(path_type=Path))
 @click.option("--scene", help="Named set-up; by default the one that the capture names.")
@@ -286,6 +312,21 @@ def _progress() -> Iterator[Callable[[str, float], None]]:
             bars.update(tasks[stage], completed=fraction)
 
         yield progress
+
+
+@contextmanager
+def _pixels_bar() -> Iterator[Callable[[int, int], None]]:
+    """Pixels done, pixels a second and the time that is left, where there is a terminal."""
+    console = Console(stderr=True)
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TaskProgressColumn("pixels", show_speed=True),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+        task = bars.add_task("pixels", total=None)
+        yield lambda done, every: bars.update(task, completed=done, total=every)
 
 
 def _check_writable(path: Path) -> None:

@@ -71,7 +71,11 @@ class Program:
 
     def potential(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """Minus the log posterior density of the unconstrained vector, up to a constant."""
-        return potential_energy(self.model, (data,), {}, self.unravel(z))
+        return self.potential_at(self.unravel(z), data)
+
+    def potential_at(self, sites: dict[str, Array], data: Observations) -> Float[Array, ""]:
+        """The same of the latent sites by name, each unconstrained."""
+        return potential_energy(self.model, (data,), {}, sites)
 
     def constrain(self, z: Float[Array, " size"]) -> dict[str, Array]:
         """The latent sites in their supports."""

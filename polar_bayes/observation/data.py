@@ -50,12 +50,16 @@ class Observations(eqx.Module):
         return tuple(length for _, length in self.dims)
 
 
-def observe(capture: xr.Dataset, *, largest_view_zenith: float = 90.0) -> Observations:
+def observe(
+    capture: xr.Dataset, *, largest_view_zenith: float = 90.0, intensity_unit: float | None = None
+) -> Observations:
     """Turn a validated capture into the arrays of a model.
 
     Args:
         capture: A Dataset as `polar_bayes.capture.schema.validate` returns it.
         largest_view_zenith: Views beyond it are set aside (`valid=False`). Unit degree.
+        intensity_unit: What an intensity of 1 is, for a part of a larger capture that states no
+            saturation level; by default the largest reading.
 
     Returns:
         The arrays, in double precision; intensity is in units of the capture's largest
@@ -64,7 +68,7 @@ def observe(capture: xr.Dataset, *, largest_view_zenith: float = 90.0) -> Observ
     names = [name for name in READINGS if name in capture]
     order = _axis_order(capture[names[0]])
     measured = np.asarray(_values(capture, "valid", order, default=True), bool)
-    largest, full_scale = _intensity_range(capture, order, measured)
+    largest, full_scale = _intensity_range(capture, order, measured, intensity_unit)
     valid = measured & (_values(capture, "view_zenith", order) <= largest_view_zenith)
     saturated = np.asarray(_values(capture, "saturated", order, default=False), bool)
     if np.isfinite(full_scale):  # a reading at the stop has stopped, flagged or not
@@ -125,7 +129,7 @@ def _values(
 
 
 def _intensity_range(
-    capture: xr.Dataset, order: tuple[str, ...], measured: np.ndarray
+    capture: xr.Dataset, order: tuple[str, ...], measured: np.ndarray, unit: float | None
 ) -> tuple[float, float]:
     """The unit of intensity (largest reading or saturation level) and the full scale."""
     if "intensity" not in capture:
@@ -133,6 +137,8 @@ def _intensity_range(
     level = capture["intensity"].attrs.get("saturation_level")
     if level is not None:
         return float(level), float(level)
+    if unit is not None:
+        return unit, np.inf
     # Over the whole capture, angles set aside included: leaving out the views beyond a limit
     # changes no other's noise. Missing entries hold anything, so they do not count.
     largest = float(np.max(_values(capture, "intensity", order), where=measured, initial=0.0))

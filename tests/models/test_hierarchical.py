@@ -166,10 +166,10 @@ CASES = {
 @pytest.mark.parametrize(
     "case",
     [
-        "all alike",
+        pytest.param("all alike", marks=pytest.mark.thorough),
         pytest.param("all known, far apart", marks=pytest.mark.thorough),
         pytest.param("hardly known", marks=pytest.mark.thorough),
-        pytest.param("two members", marks=pytest.mark.thorough),
+        "two members",
     ],
 )
 def test_every_degree_of_pooling_samples_without_divergences(case: str) -> None:

@@ -1,0 +1,1 @@
+"""Many small posteriors at once: every pixel of an image is a fit of its own."""

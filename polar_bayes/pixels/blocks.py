@@ -1,0 +1,209 @@
+"""One block of an image: readings in, maps out, in any process."""
+
+import dataclasses
+import functools
+import threading
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from polar_bayes.capture.schema import validate
+from polar_bayes.inference.program import Program, compile_program
+from polar_bayes.inference.request import Request
+from polar_bayes.inference.search import from_prior
+from polar_bayes.observation.data import READINGS, Observations, observe
+from polar_bayes.physics.notation import notation
+from polar_bayes.pixels.engine import Engine
+from polar_bayes.pixels.fitting import LEVELS, Approach, Marginals, PixelLaplace, Status, fit_stack
+from polar_bayes.pixels.stack import IMAGE, stack
+
+Layout = dict[str, tuple[tuple[str, ...], tuple[int, ...]]]
+"""By parameter: names and lengths of the axes that it has in one pixel."""
+
+DIAGNOSTICS = {
+    "pareto_k": "Pareto k of the importance weights",
+    "effective_draws": "independent draws that the weighted ones are worth",
+    "condition": "condition number of the curvature at the mode",
+    "steps": "steps to the mode",
+    "approach": "how the numbers were found",
+    "status": "what became of the pixel",
+}
+
+NUMBER = "pixel_number"
+"""Variable of a block: where its pixels stand in the whole image, row by row."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plan:
+    """What is done to every block of one image; it can be sent to another process.
+
+    Args:
+        request: The fit of one pixel, checked; its capture is that pixel.
+        settings: What is done for each pixel.
+        intensity_unit: What an intensity of 1 is, or None where the capture states its saturation
+            level.
+        own_directions: Angles, and `normal_confidence`, that each pixel has for itself.
+        key: Of all that the programs depend on: plans that share it share them, in each process.
+    """
+
+    request: Request
+    settings: PixelLaplace
+    intensity_unit: float | None
+    own_directions: frozenset[str]
+    key: str
+
+    def observe(self, capture: xr.Dataset) -> Any:
+        """A block, or one pixel, as arrays."""
+        return observe(
+            capture,
+            largest_view_zenith=self.request.largest_view_zenith,
+            intensity_unit=self.intensity_unit,
+        )
+
+    @property
+    def engine(self) -> Engine:
+        """The compiled programs, made at first use in each process."""
+        with LOCK:
+            return _engine_of(self)
+
+    @property
+    def layout(self) -> Layout:
+        """Own axes of every parameter that a map shows."""
+        return _layout_of(self.engine, self.pixel(self.request.precision))
+
+    def pixel(self, precision: str) -> Observations:
+        """The pixel that stands for all, as arrays."""
+        data = self.observe(self.request.capture)
+        if precision == "double":
+            return data
+        return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, data)
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, ...]]:
+        """Lengths of the own axes of every parameter."""
+        return {name: own for name, (_, own) in self.layout.items()}
+
+    def __eq__(self, other: object) -> bool:
+        """The same programs, not the same readings."""
+        return isinstance(other, Plan) and self.key == other.key
+
+    def __hash__(self) -> int:
+        """Of the key."""
+        return hash(self.key)
+
+
+LOCK = threading.Lock()
+
+
+def fit_block(block: xr.Dataset, plan: Plan) -> xr.Dataset:
+    """Fit every pixel of a block.
+
+    Args:
+        block: A capture with dims y and x, and `pixel_number`.
+        plan: What is done.
+
+    Returns:
+        The maps of the block.
+
+    Raises:
+        CaptureError: A value of the block is not what the contract of captures allows.
+    """
+    engine = plan.engine
+    numbers = block[NUMBER].transpose(*IMAGE).to_numpy()
+    with jax.enable_x64(True):
+        readings = validate(set_aside(block.drop_vars(NUMBER)))
+        pixels = stack(plan.observe(readings), plan.own_directions)
+    found = fit_stack(engine, plan.settings, pixels, plan.sizes, numbers.ravel(), plan.request.seed)
+    return maps_of(found, block, plan.layout)
+
+
+def set_aside(capture: xr.Dataset) -> xr.Dataset:
+    """A capture whose missing readings are marked as such.
+
+    Args:
+        capture: Readings that are not numbers count as missing.
+
+    Returns:
+        The capture with `valid`.
+
+    Raises:
+        Nothing.
+    """
+    valid = capture.get("valid", xr.DataArray(True)).astype(bool)
+    for name in READINGS:
+        if name in capture:
+            valid = valid & capture[name].notnull()
+    return capture.assign(valid=valid)
+
+
+def maps_of(found: Marginals, block: xr.Dataset, layout: Layout) -> xr.Dataset:
+    """The marginals of a block as labeled maps.
+
+    Args:
+        found: Of its pixels, row by row.
+        block: The readings.
+        layout: Own axes of every parameter.
+
+    Returns:
+        For each parameter `<name>` (the posterior mean), `<name>_sd` and `<name>_quantile`; and
+        what is known of each pixel's fit. Maps are in single precision.
+
+    Raises:
+        Nothing.
+    """
+    shape = tuple(block.sizes[dim] for dim in IMAGE)
+    variables: dict[str, Any] = {}
+    for name, (own, sizes) in layout.items():
+        symbol, meaning, unit = notation(name)
+        for ending, words, values, first in (
+            ("", "mean of", found.mean[name], ()),
+            ("_sd", "standard deviation of", found.sd[name], ()),
+            ("_quantile", "quantiles of", found.quantiles[name], ("quantile",)),
+        ):
+            whole = values.reshape(*values.shape[: len(first)], *shape, *sizes)
+            said = {"units": unit, "long_name": f"{words} {meaning}", "symbol": symbol}
+            variables[f"{name}{ending}"] = ((*first, *IMAGE, *own), np.float32(whole), said)
+    for name, meaning in DIAGNOSTICS.items():
+        said = {"units": "1", "long_name": meaning}
+        variables[name] = (IMAGE, getattr(found, name).reshape(shape), said)
+    for name, names in (("approach", Approach), ("status", Status)):
+        flags: dict[str, Any] = {
+            "long_name": DIAGNOSTICS[name],
+            "flag_values": [int(each) for each in names],
+            "flag_meanings": " ".join(each.name.lower() for each in names),
+        }
+        variables[name] = (IMAGE, getattr(found, name).reshape(shape), flags)
+    coords = {dim: block.coords[dim] for dim in (*IMAGE, "wavelength") if dim in block.coords}
+    return xr.Dataset(variables, coords={**coords, "quantile": list(LEVELS)})
+
+
+@functools.lru_cache(maxsize=4)
+def _engine_of(plan: Plan) -> Engine:
+    request = plan.request
+    program, rough = (_program_of(plan, precision) for precision in (request.precision, "single"))
+    with jax.enable_x64(request.precision == "double"):
+        key = jax.random.key(request.seed)
+        pixel = plan.pixel(request.precision)
+        candidates = from_prior(program, key, plan.settings.candidates, pixel)
+    return Engine(program, rough, np.asarray(candidates), request.precision)
+
+
+def _program_of(plan: Plan, precision: str) -> Program:
+    with jax.enable_x64(precision == "double"):
+        model = dataclasses.replace(plan.request, precision=precision).bind(plan.request.scene)
+        return compile_program(model, plan.pixel(precision))
+
+
+def _layout_of(engine: Engine, pixel: Observations) -> Layout:
+    program = engine.program
+    with jax.enable_x64(engine.precision == "double"):
+        shapes = jax.eval_shape(program.parameters, np.zeros(program.size, engine.dtype), pixel)
+    return {name: (_own_axes(name, program), x.shape) for name, x in shapes.items()}
+
+
+def _own_axes(name: str, program: Program) -> tuple[str, ...]:
+    """Those of its plates, then those of its own event."""
+    return (*program.dims[name], *(f"{name}_{i}" for i, _ in enumerate(program.events[name])))

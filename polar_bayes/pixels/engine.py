@@ -1,0 +1,281 @@
+"""The compiled programs of a map, and how pixels pass through them.
+
+A batch has a fixed number of pixels, so that every batch of every image runs the same programs.
+Pixels that have settled leave between passes; who shares a batch with whom changes nothing.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from arviz_stats.base import array_stats
+from jaxtyping import Array
+
+from polar_bayes.inference.program import Program, Values
+from polar_bayes.observation.data import Observations
+from polar_bayes.pixels.climbing import Climber, Peak, crown, stand, step
+from polar_bayes.pixels.derivatives import AnyArray, expand, score
+from polar_bayes.pixels.sampling import PixelNuts, chains
+from polar_bayes.pixels.stack import Stack, together
+
+BATCH = 128
+"""Pixels that one call of a program takes, side by side: what they need stays in a cache."""
+
+FEW = 16
+"""The same where each pixel has chains of its own."""
+
+DRAWN = 4
+"""Pixels of a batch that stand side by side where each has hundreds of draws."""
+
+ROUGH, FINE, EXACT = (5, 4), (2, 2), (1, 4, 4, 8, 16)
+"""Steps between two looks at who has settled: by scoring in single precision, by scoring, and
+with exact curvature. The first exact one only looks; few need more."""
+
+NEAR, NEARER, THERE = 3e-2, 1e-4, 1e-4
+"""Decrements, in posterior sds: of single precision, of scoring, of the last exact step."""
+
+
+class Settled(NamedTuple):
+    """Where a row of pixels arrived.
+
+    Args:
+        peak: The modes.
+        steps: How many steps each took.
+        converged: True where the decrement met its goal and the curvature is positive definite.
+    """
+
+    peak: Peak
+    steps: np.ndarray
+    converged: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Engine:
+    """The model of one pixel, ready to be climbed by many.
+
+    Args:
+        program: In the precision of the answer.
+        rough: The same model in single precision, in which climbs begin.
+        candidates: Unconstrained vectors among which each pixel finds its start.
+        precision: "double" or "single".
+    """
+
+    program: Program
+    rough: Program
+    candidates: np.ndarray
+    precision: str
+
+    def climb(self, pixels: Stack, rank: int = 0) -> Settled:
+        """From a candidate to the mode of every pixel.
+
+        Args:
+            pixels: Each with enough valid views.
+            rank: Which candidate: 0 is the best of them for a pixel, 1 the next.
+
+        Returns:
+            Where they arrived.
+
+        Raises:
+            Nothing.
+        """
+        near = pixels.in_precision(np.float32)
+        with jax.enable_x64(False):
+            z = self._map(functools.partial(self._start, np.int32(rank)), near)
+            rough = self._pass(self._rough_steps, near, stand(z))
+        with jax.enable_x64(self.precision == "double"):
+            exact = pixels.in_precision(self.dtype)
+            z = np.asarray(np.where(_whole(rough.z), rough.z, z), self.dtype)
+            scored = self._pass(self._steps, exact, stand(z))
+            look, *rest = self._exact_steps
+            climbers = jax.tree.map(np.array, self._map(look, exact, stand(np.asarray(scored.z))))
+            peak = self._crown(climbers)
+            left = np.flatnonzero(~(peak.decrement < THERE))
+            if left.size:
+                state = jax.tree.map(lambda x: x[left], climbers)
+                late = self._pass(rest, exact.subset(left), state)
+                mended = self._crown(late)
+                for whole, part in zip((*peak, climbers.steps), (*mended, late.steps), strict=True):
+                    whole[left] = part
+            steps = rough.steps + scored.steps + climbers.steps
+        definite = np.isfinite(np.asarray(peak.widths)).all(axis=(1, 2))
+        converged = np.asarray(peak.decrement < THERE) & definite
+        return Settled(peak, np.asarray(steps), converged)
+
+    def draw(
+        self, pixels: Stack, peak: Peak, points: np.ndarray, *, weighted: bool
+    ) -> tuple[Values, np.ndarray]:
+        """Draws of every pixel's normal approximation, and how the posterior weighs them.
+
+        Args:
+            pixels: The readings.
+            peak: Their modes and widths.
+            points: Standard normal points, (draw, size), the same for all pixels.
+            weighted: True for the ratios too.
+
+        Returns:
+            Draws of the parameters by name, each (pixel, draw, ...); and log of posterior over
+            approximation, (pixel, draw), up to a constant per pixel, or zeros.
+
+        Raises:
+            Nothing.
+        """
+        near = pixels.in_precision(np.float32)
+        with jax.enable_x64(False):
+            z, half, given = (np.float32(x) for x in (peak.z, peak.widths, points))
+            return self._map(functools.partial(self._draws(weighted), given), near, z, half)
+
+    def sample(
+        self, pixels: Stack, peak: Peak, settings: PixelNuts, keys: Array
+    ) -> tuple[Values, np.ndarray]:
+        """Chains in every pixel.
+
+        Args:
+            pixels: The readings.
+            peak: Their modes and widths, which are the metric.
+            settings: Lengths of the chains.
+            keys: One for each pixel.
+
+        Returns:
+            Draws of the parameters by name, each (pixel, draw, ...), and split R-hat of the worst
+            coordinate, (pixel,).
+
+        Raises:
+            Nothing.
+        """
+        with jax.enable_x64(self.precision == "double"):
+            chains = functools.partial(self._map, self._chains(settings), batch=FEW)
+            z, draws = chains(pixels.in_precision(self.dtype), peak.z, peak.widths, keys)
+        r_hat = [max(array_stats.rhat(x) for x in np.moveaxis(one, -1, 0)) for one in z]
+        return draws, np.array(r_hat)
+
+    @property
+    def dtype(self) -> Any:
+        """Floating type of the answer."""
+        return np.float64 if self.precision == "double" else np.float32
+
+    def _pass(self, steps: list[Callable], pixels: Stack, climbers: Climber) -> Climber:
+        """Passes of steps; those who have settled leave."""
+        climbers = jax.tree.map(np.array, climbers)
+        for several in steps:
+            moving = np.flatnonzero(~climbers.settled)
+            if not moving.size:
+                break
+            state = jax.tree.map(lambda x, m=moving: x[m], climbers)
+            found = self._map(several, pixels.subset(moving), state)
+            for whole, part in zip(jax.tree.leaves(climbers), jax.tree.leaves(found), strict=True):
+                whole[moving] = part
+        return climbers
+
+    def _map(self, compiled: Callable, pixels: Stack, *states: Any, batch: int = BATCH) -> Any:
+        """Run a program on all pixels, a batch at a time; the last batch is filled up."""
+        shared, parts = jax.tree.map(jnp.asarray, pixels.shared), []
+        for index in batches(len(pixels), batch):
+            state = jax.tree.map(lambda x, i=index: x[i], states)
+            found = compiled(pixels.take(index), shared, *state)
+            parts.append(jax.tree.map(np.asarray, found))
+        return jax.tree.map(lambda *x: np.concatenate(x)[: len(pixels)], *parts)
+
+    # --- the programs, each compiled at its first use ------------------------------------------
+
+    @functools.cached_property
+    def _start(self) -> Callable:
+        candidates = self.candidates.astype(np.float32)
+
+        def start(rank: Array, data: Observations) -> Array:
+            values = jax.vmap(lambda z: self.rough.potential(z, data))(candidates)
+            order = jnp.argsort(jnp.where(jnp.isnan(values), jnp.inf, values))
+            return jnp.asarray(candidates)[order[rank]]
+
+        return _batched(start, given=1)
+
+    @functools.cached_property
+    def _rough_steps(self) -> list[Callable]:
+        return _stepping(self.rough, score, NEAR, ROUGH)
+
+    @functools.cached_property
+    def _steps(self) -> list[Callable]:
+        return _stepping(self.program, score, NEARER, FINE)
+
+    @functools.cached_property
+    def _exact_steps(self) -> list[Callable]:
+        return _stepping(self.program, expand, 0.1 * THERE, EXACT)
+
+    @functools.cached_property
+    def _all_crowned(self) -> Callable:
+        return jax.jit(jax.vmap(crown))
+
+    def _crown(self, climbers: Climber) -> Peak:
+        """The last step of all, in batches that are filled up."""
+        parts = []
+        for index in batches(len(climbers.z), BATCH):
+            z, slopes = jax.tree.map(lambda x, i=index: x[i], (climbers.z, climbers.slopes))
+            parts.append(jax.tree.map(np.asarray, self._all_crowned(z, slopes)))
+        return jax.tree.map(lambda *x: np.concatenate(x)[: len(climbers.z)], *parts)
+
+    @functools.cache  # noqa: B019 - an engine lives as long as its map
+    def _draws(self, weighted: bool) -> Callable:
+        def draws(points: Array, data: Observations, z: Array, half: Array) -> tuple[Values, Array]:
+            places = z + points @ half
+            parameters = jax.vmap(lambda z: self.rough.parameters(z, data))(places)
+            if not weighted:
+                return parameters, jnp.zeros(len(points))
+            values = jax.vmap(lambda z: self.rough.potential(z, data))(places)
+            return parameters, 0.5 * jnp.sum(points**2, axis=-1) - values
+
+        return _batched(draws, given=1, side_by_side=DRAWN)
+
+    @functools.cache  # noqa: B019 - an engine lives as long as its map
+    def _chains(self, settings: PixelNuts) -> Callable:
+        def pixel(data: Observations, z: Array, half: Array, key: Array) -> tuple[Array, Values]:
+            kept = chains(self.program, settings, data, z, half, key)
+            flat = kept.reshape(-1, self.program.size)
+            return kept, jax.vmap(lambda z: self.program.parameters(z, data))(flat)
+
+        return _batched(pixel, side_by_side=1)
+
+
+def batches(count: int, size: int) -> Iterator[np.ndarray]:
+    """Indices of batches of one size; the last is filled up with the last pixel."""
+    for begin in range(0, count, size):
+        yield np.minimum(np.arange(begin, begin + size), count - 1)
+
+
+def _stepping(
+    program: Program, curvature: Callable, goal: float, passes: tuple[int, ...]
+) -> list[Callable]:
+    """A program of one pass, for any number of steps."""
+
+    def several(count: Array, data: Observations, climber: Climber) -> Climber:
+        return jax.lax.fori_loop(
+            0, count, lambda _, at: step(program, curvature, goal, at, data), climber
+        )
+
+    compiled = _batched(several, given=1)
+    return [functools.partial(compiled, np.int32(count)) for count in passes]
+
+
+def _batched(function: Callable, *, given: int = 0, side_by_side: int = BATCH) -> Callable:
+    """A function of one pixel, mapped over a batch, compiled.
+
+    Its first arguments, as many as `given`, are the same for all pixels.
+    """
+
+    @jax.jit
+    def run(*arguments: Any) -> Any:
+        common, (own, shared, *states) = arguments[:given], arguments[given:]
+
+        def of_pixel(pixel: tuple) -> Any:
+            mine, state = pixel
+            return function(*common, together(mine, shared), *state)
+
+        return jax.lax.map(of_pixel, (own, states), batch_size=side_by_side)
+
+    return run
+
+
+def _whole(z: AnyArray) -> AnyArray:
+    return np.isfinite(np.asarray(z)).all(axis=-1, keepdims=True)

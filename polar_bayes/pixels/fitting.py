@@ -1,0 +1,285 @@
+"""A row of pixels: mode, width, how far they can be trusted, and what is done where they cannot."""
+
+import dataclasses
+import enum
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.program import Values
+from polar_bayes.pixels.engine import Engine, Settled
+from polar_bayes.pixels.importance import (
+    LARGEST_TRUSTED,
+    effective_draws,
+    normal_points,
+    smooth,
+    summarize,
+)
+from polar_bayes.pixels.sampling import PixelNuts
+from polar_bayes.pixels.stack import Stack
+
+LEVELS = (0.025, 0.1, 0.25, 0.5, 0.75, 0.9, 0.975)
+FEWEST_VIEWS = 2
+RESTARTS = (1, 3, 7)
+"""Ranks of the candidates from which doubtful pixels start again."""
+
+PIECE = 4096
+"""Pixels that are fitted at a time: their draws take a hundred megabytes."""
+
+SAME_MODE = 1e-3
+"""Difference of two potentials that is no difference."""
+
+
+class Status(enum.IntEnum):
+    """What became of a pixel."""
+
+    GOOD = 0
+    MASKED = 1
+    TOO_FEW_VIEWS = 2
+    NOT_CONVERGED = 3
+    NOT_TRUSTED = 4
+
+
+class Approach(enum.IntEnum):
+    """How a pixel's numbers were found."""
+
+    NONE = 0
+    LAPLACE = 1
+    IMPORTANCE = 2
+    NUTS = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class PixelLaplace:
+    """The normal approximation of every pixel, checked and corrected.
+
+    Args:
+        draws: Of the approximation in each pixel, from which means and quantiles are taken; a
+            power of two, >= 64.
+        weighted: True weighs them by the posterior, which corrects the approximation and says how
+            far it can be trusted (Pareto k); False takes them as they are, and says nothing.
+        candidates: Prior draws among which each pixel finds its start, >= 8.
+        sampler: What pixels with Pareto k above 0.7 are handed to; None marks them only.
+
+    Raises:
+        FitError: A setting is outside its range.
+    """
+
+    draws: int = 256
+    weighted: bool = True
+    candidates: int = 32
+    sampler: PixelNuts | None = dataclasses.field(default_factory=PixelNuts)
+
+    def __post_init__(self) -> None:
+        if self.draws < 64 or self.draws & (self.draws - 1):
+            raise FitError(
+                f"draws is {self.draws}", where="PixelLaplace", mend="give 64, 128, 256 or so"
+            )
+        if self.candidates < 8:
+            raise FitError(
+                f"candidates is {self.candidates}", where="PixelLaplace", mend="give 8 or more"
+            )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Marginals:
+    """What a row of pixels has: NaN where a pixel has no answer.
+
+    Args:
+        mean: By parameter, (pixel, ...).
+        sd: By parameter, (pixel, ...).
+        quantiles: By parameter, (level, pixel, ...), at `LEVELS`.
+        pareto_k: (pixel,).
+        effective_draws: What the weighted draws are worth, (pixel,).
+        condition: Condition number of the curvature at the mode, (pixel,).
+        steps: Steps to the mode, (pixel,).
+        approach: Of `Approach`, (pixel,).
+        status: Of `Status`, (pixel,).
+    """
+
+    mean: dict[str, np.ndarray]
+    sd: dict[str, np.ndarray]
+    quantiles: dict[str, np.ndarray]
+    pareto_k: np.ndarray
+    effective_draws: np.ndarray
+    condition: np.ndarray
+    steps: np.ndarray
+    approach: np.ndarray
+    status: np.ndarray
+
+
+def fit_stack(
+    engine: Engine,
+    settings: PixelLaplace,
+    pixels: Stack,
+    sizes: Mapping[str, tuple[int, ...]],
+    numbers: np.ndarray,
+    seed: int,
+) -> Marginals:
+    """Fit every pixel of a row.
+
+    Args:
+        engine: The model of one pixel.
+        settings: What is done for each.
+        pixels: The readings.
+        sizes: Own axes of every parameter.
+        numbers: Of the pixels in the whole image, which random numbers follow, (pixel,).
+        seed: Of the random numbers.
+
+    Returns:
+        The marginals, in the order of the pixels.
+
+    Raises:
+        Nothing: what fails is in `status`.
+    """
+    row = _Row(len(pixels), sizes)
+    row.status[pixels.views < FEWEST_VIEWS] = Status.TOO_FEW_VIEWS
+    row.status[pixels.views == 0] = Status.MASKED
+    enough = np.flatnonzero(pixels.views >= FEWEST_VIEWS)
+    points = normal_points(settings.draws, engine.program.size, seed)
+    keys = _keys(seed, numbers)
+    for begin in range(0, enough.size, PIECE):
+        _fit_piece(engine, settings, pixels, enough[begin : begin + PIECE], points, keys, row)
+    return row.marginals()
+
+
+def no_marginals(count: int, sizes: Mapping[str, tuple[int, ...]]) -> Marginals:
+    """Those of pixels that nothing is known of."""
+    return _Row(count, sizes).marginals()
+
+
+def _fit_piece(
+    engine: Engine,
+    settings: PixelLaplace,
+    pixels: Stack,
+    at: np.ndarray,
+    points: np.ndarray,
+    keys: np.ndarray,
+    row: "_Row",
+) -> None:
+    """Fit some pixels of a row, few enough for their draws to fit into memory."""
+    usable = pixels.subset(at)
+    found = _search(engine, settings, usable, points)
+    row.approximate(at, found, settings)
+    hard = np.flatnonzero(found.settled.converged & ~found.is_trusted)
+    if settings.sampler is not None and hard.size:
+        peak = jax.tree.map(lambda x: x[hard], found.settled.peak)
+        draws, r_hat = engine.sample(usable.subset(hard), peak, settings.sampler, keys[at[hard]])
+        row.sample(at[hard], draws, r_hat <= settings.sampler.largest_r_hat)
+
+
+class _Found(NamedTuple):
+    """Normal approximations of a row of pixels, and their weighted draws."""
+
+    settled: Settled
+    parameters: Values
+    weights: np.ndarray
+    pareto_k: np.ndarray
+
+    @property
+    def is_trusted(self) -> np.ndarray:
+        return self.settled.converged & (self.pareto_k <= LARGEST_TRUSTED)
+
+
+def _search(engine: Engine, settings: PixelLaplace, pixels: Stack, points: np.ndarray) -> _Found:
+    """Fit from the best candidate; pixels in doubt start again, and keep the lower mode."""
+    found = _approximate(engine, settings, pixels, points, rank=0)
+    for rank in RESTARTS:
+        doubtful = np.flatnonzero(~found.is_trusted)
+        if not doubtful.size:
+            break
+        again = _approximate(engine, settings, pixels.subset(doubtful), points, rank=rank)
+        old, new = found.settled, again.settled
+        lower = new.peak.value < old.peak.value[doubtful] - SAME_MODE
+        better = new.converged & (~old.converged[doubtful] | lower)
+        for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
+            whole[doubtful[better]] = part[better]
+    return found
+
+
+def _approximate(
+    engine: Engine, settings: PixelLaplace, pixels: Stack, points: np.ndarray, *, rank: int
+) -> _Found:
+    settled = engine.climb(pixels, rank)
+    parameters, ratios = engine.draw(pixels, settled.peak, points, weighted=settings.weighted)
+    if settings.weighted:
+        weights, pareto_k = smooth(ratios)
+    else:
+        weights = np.full((len(pixels), len(points)), 1.0 / len(points))
+        pareto_k = np.zeros(len(pixels))
+    return jax.tree.map(np.array, _Found(settled, parameters, weights, pareto_k))
+
+
+def _keys(seed: int, numbers: np.ndarray) -> np.ndarray:
+    """Random keys that follow the pixels, whoever fits them."""
+    base = jax.random.key(seed)
+    keys = jax.vmap(lambda number: jax.random.fold_in(base, number))(numbers.astype(np.uint32))
+    return np.asarray(jax.random.key_data(keys))
+
+
+class _Row:
+    """Arrays of a row of pixels, filled as answers come."""
+
+    def __init__(self, count: int, sizes: Mapping[str, tuple[int, ...]]) -> None:
+        self._mean = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
+        self._sd = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
+        self._quantiles = {
+            name: np.full((len(LEVELS), count, *own), np.nan) for name, own in sizes.items()
+        }
+        self.pareto_k, self.effective_draws, self.condition = np.full((3, count), np.nan)
+        self.steps = np.zeros(count, np.int32)
+        self.approach = np.full(count, Approach.NONE, np.int8)
+        self.status = np.full(count, Status.NOT_CONVERGED, np.int8)
+
+    def approximate(self, at: np.ndarray, found: _Found, settings: PixelLaplace) -> None:
+        converged, trusted = found.settled.converged, found.is_trusted
+        self.steps[at] = found.settled.steps
+        self.condition[at] = np.where(converged, found.settled.peak.condition, np.nan)
+        approach = np.full(at.size, Approach.LAPLACE)
+        if settings.weighted:
+            self.pareto_k[at] = np.where(converged, found.pareto_k, np.nan)
+            self.effective_draws[at] = np.where(trusted, effective_draws(found.weights), np.nan)
+            approach = np.where(trusted, Approach.IMPORTANCE, Approach.LAPLACE)
+        self.approach[at] = np.where(converged, approach, Approach.NONE)
+        self.status[at] = np.select(
+            [trusted, converged], [Status.GOOD, Status.NOT_TRUSTED], Status.NOT_CONVERGED
+        )
+        # Weights that cannot be trusted do not correct anything.
+        even = 1.0 / found.weights.shape[-1]
+        weights = np.where(trusted[:, None], found.weights, even)[converged]
+        self._describe(at[converged], _rows(found.parameters, converged), weights)
+
+    def sample(self, at: np.ndarray, draws: Values, mixed: np.ndarray) -> None:
+        count = np.asarray(next(iter(draws.values()))).shape[1]
+        even = np.full((int(mixed.sum()), count), 1.0 / count)
+        self._describe(at[mixed], _rows(draws, mixed), even)
+        self.approach[at[mixed]] = Approach.NUTS
+        self.status[at[mixed]] = Status.GOOD
+
+    def marginals(self) -> Marginals:
+        return Marginals(
+            self._mean,
+            self._sd,
+            self._quantiles,
+            self.pareto_k,
+            self.effective_draws,
+            self.condition,
+            self.steps,
+            self.approach,
+            self.status,
+        )
+
+    def _describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
+        for name, mean in self._mean.items():
+            draws = np.asarray(parameters[name], float)
+            for own in np.ndindex(mean.shape[1:]):
+                found = summarize(draws[(..., *own)], weights, LEVELS)
+                mean[(at, *own)], self._sd[name][(at, *own)] = found[:2]
+                self._quantiles[name][(slice(None), at, *own)] = found[2]
+
+
+def _rows(parameters: Values, which: np.ndarray) -> Values:
+    return {name: np.asarray(draws)[which] for name, draws in parameters.items()}

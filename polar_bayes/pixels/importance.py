@@ -1,0 +1,167 @@
+"""What a normal approximation is worth: its draws, weighed by the true posterior.
+
+The weights say how far the approximation can be trusted (Pareto k) and, where it can, correct
+it. All pixels share one set of standard normal points, so a map of the corrections is smooth
+where the posteriors are.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+from jaxtyping import Float
+from scipy.stats import qmc
+
+LARGEST_TRUSTED = 0.7
+"""Pareto k above which weighted draws say little, however many there are."""
+
+
+class Smoothed(NamedTuple):
+    """Weights of the draws of every pixel.
+
+    Args:
+        weights: They sum to one. (pixel, draw).
+        pareto_k: Shape of the tail of the raw weights. (pixel,).
+    """
+
+    weights: Float[np.ndarray, "pixel draw"]
+    pareto_k: Float[np.ndarray, " pixel"]
+
+
+def normal_points(count: int, size: int, seed: int) -> Float[np.ndarray, "count size"]:
+    """Evenly spread standard normal points.
+
+    Args:
+        count: How many; a power of two is spread best.
+        size: Number of coordinates.
+        seed: Of the scrambling.
+
+    Returns:
+        The points, with mean zero: each stands beside its mirror image.
+
+    Raises:
+        Nothing.
+
+    Source:
+        Owen (1998), J. Complexity 14(4), 466-489: scrambled Sobol' points.
+    """
+    half = qmc.Sobol(size, rng=np.random.default_rng(seed)).random(-(-count // 2))
+    points = scipy.special.ndtri(np.clip(half, 1e-12, 1.0 - 1e-12))
+    return np.stack([points, -points], axis=1).reshape(-1, size)[:count]
+
+
+def smooth(log_ratios: Float[np.ndarray, "pixel draw"]) -> Smoothed:
+    r"""Pareto-smoothed importance weights of many pixels at once.
+
+    Args:
+        log_ratios: log of posterior over approximation at each draw, up to a constant per pixel;
+            minus infinity where the posterior is zero.
+
+    Returns:
+        Weights and Pareto k. k is 0 where all ratios of the tail agree to rounding: the
+        approximation is exact there. It is infinite where the tail is none: most ratios are one, or
+        fewer are finite than it should hold. Weights are NaN where no ratio is finite.
+
+    Raises:
+        Nothing.
+
+    Source:
+        Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72).
+    """
+    count = log_ratios.shape[-1]
+    tail = int(3.0 * count**0.5) if count > 225 else count // 5
+    known = np.isfinite(log_ratios)
+    usable = known.any(axis=-1)
+    largest = np.max(log_ratios, axis=-1, where=known, initial=-np.inf, keepdims=True)
+    ratios = np.where(known, log_ratios - np.where(np.isfinite(largest), largest, 0.0), -np.inf)
+    order = np.argsort(ratios, axis=-1, kind="stable")
+    ranked = np.exp(np.take_along_axis(ratios, order, axis=-1).astype(float))
+    cutoff = ranked[:, -tail - 1, None]
+    excess = ranked[:, -tail:] - cutoff
+    flat = excess[:, -1] <= count * np.finfo(log_ratios.dtype).eps
+    shape, scale = _fit_tail(np.where(flat[:, None], np.linspace(0.5, 1.0, tail), excess))
+    shape = np.where(ranked[:, -tail] > 0.0, shape, np.nan)  # too few draws are possible at all
+    steps = (np.arange(tail) + 0.5) / tail
+    with np.errstate(all="ignore"):
+        smoothed = cutoff + _quantiles(steps, shape[:, None], scale[:, None])
+    smooth_enough = (~flat & np.isfinite(shape))[:, None]
+    ranked[:, -tail:] = np.where(smooth_enough, np.minimum(smoothed, 1.0), ranked[:, -tail:])
+    weights = np.empty_like(ranked)
+    np.put_along_axis(weights, order, ranked, axis=-1)
+    weights /= np.where(usable, weights.sum(axis=-1), np.nan)[:, None]
+    pareto_k = np.where(flat, 0.0, np.where(np.isfinite(shape), shape, np.inf))
+    return Smoothed(weights, np.where(usable, pareto_k, np.inf))
+
+
+def _fit_tail(excess: Float[np.ndarray, "pixel tail"]) -> tuple[np.ndarray, np.ndarray]:
+    """Shape and scale of generalized Pareto distributions, ascending excesses in every row.
+
+    Source:
+        Zhang & Stephens (2009), Technometrics 51(3), 316-325, with the prior of Vehtari et al.
+    """
+    count = excess.shape[-1]
+    grid = 30 + int(count**0.5)
+    quartile = excess[:, int(count / 4.0 + 0.5) - 1, None]
+    with np.errstate(all="ignore"):
+        b = 1.0 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))
+        b = b / (3.0 * quartile) + 1.0 / excess[:, -1:]
+        k = np.mean(np.log1p(-b[:, :, None] * excess[:, None, :]), axis=-1)
+        fit = count * (np.log(-b / k) - k - 1.0)
+        weights = scipy.special.softmax(fit, axis=-1)
+        weights = np.where(weights >= 10.0 * np.finfo(float).eps, weights, 0.0)
+        b = np.sum(b * weights, axis=-1) / np.sum(weights, axis=-1)
+        k = np.mean(np.log1p(-b[:, None] * excess), axis=-1)
+        scale = -k / b
+        shape = (count * k + 10.0 * 0.5) / (count + 10.0)
+    lumped = quartile[:, 0] <= excess[:, 0]  # nothing like a tail
+    return np.where(lumped, np.nan, shape), scale
+
+
+def _quantiles(steps: np.ndarray, shape: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Of a generalized Pareto distribution."""
+    spread = np.where(shape == 0.0, -np.log1p(-steps), np.expm1(-shape * np.log1p(-steps)) / shape)
+    return scale * spread
+
+
+def summarize(
+    draws: Float[np.ndarray, "pixel draw"],
+    weights: Float[np.ndarray, "pixel draw"],
+    levels: tuple[float, ...],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean, standard deviation and quantiles of weighted draws.
+
+    Args:
+        draws: Of one parameter.
+        weights: They sum to one in each pixel.
+        levels: Between 0 and 1.
+
+    Returns:
+        Mean and standard deviation, (pixel,), and quantiles, (level, pixel), interpolated between
+        the middles of the weights.
+
+    Raises:
+        Nothing.
+    """
+    mean = np.sum(weights * draws, axis=-1)
+    sd = np.sqrt(np.sum(weights * (draws - mean[:, None]) ** 2, axis=-1))
+    order = np.argsort(draws, axis=-1, kind="stable")
+    ranked = np.take_along_axis(draws, order, axis=-1)
+    share = np.take_along_axis(weights, order, axis=-1)
+    below = np.cumsum(share, axis=-1) - 0.5 * share
+    return mean, sd, np.stack([_interpolate(level, below, ranked) for level in levels])
+
+
+def _interpolate(level: float, below: np.ndarray, ranked: np.ndarray) -> np.ndarray:
+    """One quantile of every row."""
+    last = ranked.shape[-1] - 1
+    right = np.clip(np.sum(below < level, axis=-1), 1, last)[:, None]
+    x0, x1 = (np.take_along_axis(ranked, at, axis=-1)[:, 0] for at in (right - 1, right))
+    p0, p1 = (np.take_along_axis(below, at, axis=-1)[:, 0] for at in (right - 1, right))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = np.clip((level - p0) / (p1 - p0), 0.0, 1.0)
+    return x0 + np.where(p1 > p0, between, 0.0) * (x1 - x0)
+
+
+def effective_draws(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarray, " pixel"]:
+    """How many draws of the posterior itself the weighted ones are worth (Kish)."""
+    return 1.0 / np.sum(weights**2, axis=-1)

@@ -1,0 +1,256 @@
+"""What a map says of every pixel: NumPyro's approximation, honest intervals, clear refusals."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+from numpyro import handlers
+from numpyro.infer.autoguide import AutoLaplaceApproximation
+from plate_images import ASKED, NAMES, mapped, planned, plate_image, stacked
+from polar_bayes.models.per_material import per_material
+from scipy import optimize, stats
+
+import polar_bayes as pb
+from polar_bayes.inference.program import Program
+from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.physics.facets import FacetQuadrature
+from polar_bayes.pixels.blocks import Plan
+from polar_bayes.pixels.fitting import Approach, PixelLaplace, Status
+from polar_bayes.pixels.maps import fit_pixels
+from polar_bayes.pixels.sampling import PixelNuts
+from polar_bayes.pixels.stack import Stack
+
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
+INTERVALS = {"50%": (0.25, 0.75), "80%": (0.1, 0.9), "95%": (0.025, 0.975)}
+
+
+@pytest.fixture(scope="module")
+def image() -> xr.Dataset:
+    return plate_image(30, 30, seed=5).assign_coords(x=np.arange(100.0, 130.0))
+
+
+@pytest.fixture(scope="module")
+def plan(image: xr.Dataset, compiled_in_haste: None) -> Plan:
+    return planned(image)
+
+
+@pytest.fixture(scope="module")
+def maps(image: xr.Dataset, plan: Plan) -> xr.Dataset:
+    return mapped(image, plan)
+
+
+# --- the approximation is NumPyro's ---------------------------------------------------------------
+
+
+class Twin:
+    """The mode of one pixel by SciPy's trust region, with derivatives that run backwards."""
+
+    def __init__(self, program: Program) -> None:
+        bend = jax.jit(
+            lambda z, data: (
+                program.potential(z, data),
+                jax.grad(program.potential)(z, data),
+                jax.hessian(program.potential)(z, data),
+            )
+        )
+        self._around = lambda z, data: [np.asarray(x) for x in bend(jnp.asarray(z), data)]
+
+    def mode(self, start: np.ndarray, data) -> np.ndarray:
+        z = optimize.minimize(
+            lambda z: tuple(self._around(z, data)[:2]),
+            start,
+            jac=True,
+            hess=lambda z: self._around(z, data)[2],
+            method="trust-exact",
+        ).x
+        _, slope, bend = self._around(z, data)
+        return z - np.linalg.solve(bend, slope)
+
+    def covariance(self, z: np.ndarray, data) -> np.ndarray:
+        return np.linalg.inv(self._around(z, data)[2])
+
+
+def _guide_covariance(program: Program, z: jax.Array, data) -> jax.Array:
+    """Of the guide, in the order of the program's own vector."""
+    guide = AutoLaplaceApproximation(program.model)
+    with handlers.seed(rng_seed=0):
+        guide(data)
+    place = guide._unpack_latent(jnp.arange(program.size))
+    order = jnp.stack([place[name] for name in program.unravel(z)])
+    location = jnp.zeros_like(z).at[order].set(z)
+    half = guide.get_transform({"auto_loc": location}).scale_tril
+    return (half @ half.T)[jnp.ix_(order, order)]
+
+
+def assert_modes_agree(plan: Plan, pixels: Stack, covariance: Callable | None = None) -> None:
+    found = plan.engine.climb(pixels)
+    assert found.converged.all()
+    twin = Twin(plan.engine.program)
+    for number, (z, half) in enumerate(zip(found.peak.z, found.peak.widths, strict=True)):
+        data = pixels.pixel(number)
+        # From a start two posterior widths away the climb back is SciPy's own.
+        mode = twin.mode(z + np.full(z.size, 2.0 / z.size**0.5) @ half, data)
+        theirs = (covariance or twin.covariance)(mode, data)
+        sd = np.sqrt(np.diagonal(theirs))
+        assert np.abs((z - mode) / sd).max() < 1e-4, number
+        assert np.abs((half.T @ half - theirs) / np.outer(sd, sd)).max() < 1e-4, number
+
+
+def test_forty_pixels_have_the_mode_and_the_covariance_of_numpyros_guide(plan: Plan) -> None:
+    rng = np.random.default_rng(1)
+    image = plate_image(5, 8, noise=np.exp(rng.uniform(np.log(3e-3), np.log(0.1), (5, 8))))
+    program = plan.engine.program
+    guide = jax.jit(lambda z, data: _guide_covariance(program, z, data))
+    assert_modes_agree(plan, stacked(image, plan), lambda z, data: np.asarray(guide(z, data)))
+
+
+@pytest.mark.thorough
+def test_rough_pixels_have_the_mode_and_the_curvature_there() -> None:
+    surface = pb.RoughSurface(pb.Beckmann(), pb.PointSource(), FacetQuadrature(along=2, across=2))
+    scene = dataclasses.replace(pb.SETUPS["paper"].scene, surface=surface)
+    shape = (3, 4)
+    rng = np.random.default_rng(2)
+    truth = {
+        "roughness": rng.uniform(0.08, 0.35, shape),
+        "subsurface_fraction": rng.uniform(0.2, 0.7, shape),
+        "absorption": rng.uniform(0.1, 0.8, shape),
+        "refractive_index": rng.uniform(1.35, 1.6, shape),
+    }
+    base = pb.simulate("leaf", seed=1, scene=scene, protocol=pb.Protocol(views=12, wavelengths=()))
+    angles = ["view_zenith", "view_azimuth", "light_zenith", "light_azimuth"]
+    geometry = pb.Geometry.from_degrees(**{name: base[name].to_numpy() for name in angles})
+    predict = jax.jit(lambda truth: scene.predict(truth, geometry)["dop"])
+    dop = np.asarray(predict({name: jnp.asarray(x) for name, x in truth.items()}))
+    dop = np.clip(dop + 0.01 * rng.normal(size=dop.shape), 0.0, 1.0)
+    image = base[angles].assign(dop=(("y", "x", "view"), dop))
+    model = handlers.condition(per_material, data={"normal_scale": 0.01})
+    plan = planned(image, model=model, scene=scene, links=pb.NormalLink())
+    assert_modes_agree(plan, stacked(image, plan))
+
+
+@pytest.mark.thorough
+def test_a_map_without_weights_is_the_laplace_fit_of_its_pixel() -> None:
+    image = plate_image(1, 2, seed=4)
+    plan = planned(image, PixelLaplace(draws=4096, weighted=False))
+    maps = mapped(image, plan).isel(y=0, x=1)
+    pixel = image.isel(y=0, x=1, drop=True)
+    fit = pb.fit(pixel, method=pb.Laplace(draws=40_000, chains=1), seed=1, **ASKED)
+    assert maps["approach"] == Approach.LAPLACE
+    assert maps["status"] == Status.GOOD
+    for name in NAMES:
+        draws = fit["posterior"][name].to_numpy().ravel()
+        # Four standard errors of 40,000 draws; the map's points are spread more evenly.
+        assert abs(float(maps[name]) - draws.mean()) < 4.0 * draws.std() / 200.0
+        assert float(maps[f"{name}_sd"]) == pytest.approx(draws.std(), rel=0.02)
+        for level, value in zip(maps["quantile"].values, maps[f"{name}_quantile"], strict=True):
+            below = np.mean(draws < float(value))
+            # Of the share below: 40,000 draws, and 4096 points taken for as many draws.
+            error = np.sqrt(level * (1.0 - level) * (1.0 / 40_000 + 1.0 / 4096))
+            assert abs(below - level) < 4.0 * error, (name, level)
+
+
+# --- what the intervals are worth -----------------------------------------------------------------
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say(image: xr.Dataset, maps: xr.Dataset) -> None:
+    # 900 plates drawn from the priors, readings from the model's own noise: a true map fails
+    # once in 1000 (six comparisons).
+    good = maps["status"] == Status.GOOD
+    assert float(good.mean()) > 0.99  # a pixel without an answer counts as a miss
+    for name in NAMES:
+        truth, quantiles = image[f"true_{name}"], maps[f"{name}_quantile"]
+        for label, (low, high) in INTERVALS.items():
+            inside = (quantiles.sel(quantile=low) <= truth) & (
+                truth <= quantiles.sel(quantile=high)
+            )
+            hits = int((inside & good).sum())
+            fewest, most = stats.binom.ppf([0.5e-3 / 6, 1.0 - 0.5e-3 / 6], 900, high - low)
+            assert fewest <= hits <= most, (name, label, hits)
+
+
+@pytest.mark.thorough
+def test_single_precision_finds_the_same_maps(image: xr.Dataset, maps: xr.Dataset) -> None:
+    corner = image.isel(y=slice(10), x=slice(10))
+    single = mapped(corner, planned(corner, PixelLaplace(sampler=None), precision="single"))
+    double = maps.isel(y=slice(10), x=slice(10))
+    weighted = (double["approach"] == Approach.IMPORTANCE).values
+    weighted &= (single["approach"] == Approach.IMPORTANCE).values
+    assert weighted.mean() > 0.75  # the others are for the sampler, which is not asked here
+    for name in NAMES:
+        sd = double[f"{name}_sd"].values
+        # A reading is predicted to some 30 units of the last digit, 4e-6: 2e-4 of its noise. Six
+        # of them move the mode, the mean and the sd by at most 6**0.5 times that; the weights
+        # carry as much again, and the maps are kept to 1e-7 of values of order 1: together 2e-3.
+        for ending in ("", "_sd", "_quantile"):
+            apart = np.abs(double[f"{name}{ending}"].values - single[f"{name}{ending}"].values) / sd
+            assert apart[..., weighted].max() < 2e-3, (name, ending)
+
+
+# --- what a map is and what is refused ------------------------------------------------------------
+
+
+def test_a_map_says_what_it_holds_and_how_it_was_made(plan: Plan, maps: xr.Dataset) -> None:
+    for name in NAMES:
+        assert maps[name].dims == maps[f"{name}_sd"].dims == ("y", "x")
+        assert maps[f"{name}_quantile"].dims == ("quantile", "y", "x")
+        assert maps[name].attrs["units"] == "1"
+        assert maps[name].dtype == np.float32
+        assert (np.diff(maps[f"{name}_quantile"].values, axis=0) >= 0.0).all()
+    assert maps["status"].attrs["flag_meanings"].split()[Status.GOOD] == "good"
+    assert maps["approach"].attrs["flag_meanings"].split()[Approach.NUTS] == "nuts"
+    said = json.loads(maps.attrs[PROVENANCE])
+    assert said["seed"] == 0
+    assert PixelLaplace(**{**said["settings"], "sampler": PixelNuts()}) == plan.settings
+    assert said["fixed"] == {"stokes_error_factor": 1.0}
+    assert (maps["x"].values == np.arange(100.0, 130.0)).all()
+
+
+def masked(image: xr.Dataset) -> xr.Dataset:
+    valid = np.zeros(image["q"].shape, bool)
+    valid[..., 0] = True
+    return image.assign(valid=(("y", "x", "view"), valid))
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "says"),
+    [
+        (lambda c: c.isel(y=0, x=0), {}, r"plates: it has no axis y or x; give an image"),
+        (lambda c: c.isel(y=0), {}, r"plates: it has no axis y; give an image"),
+        (lambda c: c, {"method": pb.Nuts()}, r"fit_pixels: method: Nuts\(.*give settings such as"),
+        (lambda c: c, {"method": "laplace"}, r"'laplace' is no way to fit pixels; give settings"),
+        (masked, {}, r"plates: no pixel has 2 valid views; check `valid`"),
+        (lambda c: c.assign(q=c["q"] * np.nan), {}, r"plates: no pixel has 2 valid views"),
+        (lambda c: c, {"precision": "half"}, r"precision is 'half'; give 'double' or 'single'"),
+        (lambda c: c, {"seed": -1}, r"seed is -1; give an integer"),
+        (lambda c: c, {"scene": "moon"}, r"no such scene; give one of"),
+    ],
+)
+def test_what_cannot_be_mapped_is_refused_with_the_mend(change, settings: dict, says: str) -> None:
+    image = plate_image(2, 2)
+    with pytest.raises(pb.PolarBayesError, match=says) as caught:
+        fit_pixels(change(image), **{**ASKED, **settings})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("build", "says"),
+    [
+        (lambda: PixelLaplace(draws=100), r"PixelLaplace: draws is 100; give 64, 128, 256 or so"),
+        (lambda: PixelLaplace(draws=32), r"PixelLaplace: draws is 32; give 64, 128, 256 or so"),
+        (lambda: PixelLaplace(candidates=2), r"PixelLaplace: candidates is 2; give 8 or more"),
+        (lambda: PixelNuts(chains=1), r"PixelNuts: chains is 1; give 2 or more"),
+        (lambda: PixelNuts(warmup=5), r"PixelNuts: warmup is 5; give 10 or more"),
+        (lambda: PixelNuts(draws=10), r"PixelNuts: draws is 10; give 50 or more"),
+        (lambda: PixelNuts(target_acceptance=1.5), r"PixelNuts: target_acceptance is 1.5; give"),
+        (lambda: PixelNuts(largest_r_hat=0.9), r"PixelNuts: largest_r_hat is 0.9; give"),
+    ],
+)
+def test_settings_outside_their_range_are_refused(build, says: str) -> None:
+    with pytest.raises(pb.FitError, match=says):
+        build()

@@ -1,0 +1,88 @@
+"""Chains in a pixel: the posterior that a grid finds, and draws that follow the pixel's number."""
+
+import jax
+import numpy as np
+import pytest
+from arviz_stats.base import array_stats
+from plate_images import NAMES, VIEWS, planned, plate_image, stacked
+from scipy import stats
+from textbook import plate_q
+
+from polar_bayes.pixels.engine import Engine, Settled
+from polar_bayes.pixels.fitting import _keys
+from polar_bayes.pixels.sampling import PixelNuts
+from polar_bayes.pixels.stack import Stack
+
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
+CHAINS = PixelNuts(chains=2, warmup=150, draws=1000)
+WEAK = plate_image(1, 3, noise=0.15, views=VIEWS[[1, 4]], seed=7)
+
+
+@pytest.fixture(scope="module")
+def made(compiled_in_haste: None) -> tuple[Engine, Stack, Settled]:
+    plan = planned(WEAK)
+    pixels = stacked(WEAK, plan)
+    settled = plan.engine.climb(pixels)
+    assert settled.converged.all()
+    return plan.engine, pixels, settled
+
+
+@pytest.fixture(scope="module")
+def sampled(made) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    engine, pixels, settled = made
+    return engine.sample(pixels, settled.peak, CHAINS, _keys(0, np.array([40, 50, 60])))
+
+
+def on_a_grid(q: np.ndarray, error: float) -> dict[str, tuple[float, float, float]]:
+    """Mean, sd and skewness of each parameter, by adding up 800 x 800 cells."""
+    cells = (np.arange(800) + 0.5) / 800
+    index, fraction = np.meshgrid(1.2 + 0.8 * cells, cells, indexing="ij")
+    log = stats.norm(1.45, 0.15).logpdf(index) + stats.beta(2.0, 2.0).logpdf(fraction)
+    for reading, zenith in zip(q, np.radians(WEAK["view_zenith"].values), strict=True):
+        log += stats.norm(reading, error).logpdf(plate_q(index, fraction, zenith))
+    weights = np.exp(log - log.max())
+    weights /= weights.sum()
+    found = {}
+    for name, x in zip(NAMES, (index, fraction), strict=True):
+        mean = np.sum(weights * x)
+        sd = np.sqrt(np.sum(weights * (x - mean) ** 2))
+        found[name] = (mean, sd, np.sum(weights * ((x - mean) / sd) ** 3))
+    return found
+
+
+def test_a_skewed_pixel_has_the_posterior_of_a_grid(sampled) -> None:
+    draws, r_hat = sampled
+    assert (r_hat < 1.02).all()
+    skewest = 0.0
+    for pixel, q in enumerate(WEAK["q"].values[0]):
+        for name, (mean, sd, skewness) in on_a_grid(q, 0.15).items():
+            chains = draws[name][pixel].reshape(CHAINS.chains, CHAINS.draws)
+            # Four Monte Carlo errors: 6e-5 a comparison, 8e-4 over these twelve.
+            assert abs(chains.mean() - mean) < 4.0 * array_stats.mcse(chains, method="mean")
+            assert abs(chains.std() - sd) < 4.0 * array_stats.mcse(chains, method="sd")
+            skewest = max(skewest, abs(skewness))
+    assert skewest > 0.5  # or a normal distribution would have done
+
+
+def test_draws_follow_the_number_of_a_pixel_not_its_place(made, sampled) -> None:
+    engine, pixels, settled = made
+    order = np.array([2, 0])
+    peak = jax.tree.map(lambda x: x[order], settled.peak)
+    keys = _keys(0, np.array([60, 40]))
+    draws, r_hat = engine.sample(pixels.subset(order), peak, CHAINS, keys)
+    for name, all_draws in sampled[0].items():
+        assert draws[name].tobytes() == all_draws[order].tobytes(), name
+    assert r_hat.tobytes() == sampled[1][order].tobytes()
+
+
+def test_keys_differ_by_number_and_by_seed() -> None:
+    numbers = np.array([0, 1, 2**31, 10**8])
+    one = _keys(0, numbers)
+    assert len({tuple(key) for key in (*one, *_keys(1, numbers))}) == 8
+    assert (_keys(0, numbers[::-1]) == one[::-1]).all()
+
+
+def test_the_two_chains_of_a_pixel_are_not_the_same(sampled) -> None:
+    chains = sampled[0][NAMES[0]].reshape(3, CHAINS.chains, CHAINS.draws)
+    assert (chains[:, 0] != chains[:, 1]).any(axis=-1).all()

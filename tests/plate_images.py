@@ -1,0 +1,88 @@
+"""Images of smooth plates whose truth is drawn from the priors: textbook optics, NumPy only."""
+
+import numpy as np
+import xarray as xr
+from numpyro import handlers
+from plates import PLATE
+from polar_bayes.models.per_material import per_material
+from scipy import stats
+from textbook import plate_q
+
+import polar_bayes as pb
+from polar_bayes.capture.schema import validate
+from polar_bayes.pixels.blocks import Plan, fit_block, set_aside
+from polar_bayes.pixels.fitting import PixelLaplace
+from polar_bayes.pixels.maps import blank, cut, number_pixels, plan_map
+from polar_bayes.pixels.stack import Stack, stack
+
+NOISE = 0.02
+# Away from Brewster's angle q stays so far from -1 that ordinary noise is never clipped.
+VIEWS = np.array([30.0, 36.0, 42.0, 68.0, 74.0, 80.0])
+NAMES = ("refractive_index", "subsurface_fraction")
+
+# A plate read by q with normal noise as large as each pixel says: two parameters.
+ASKED = {
+    "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
+    "scene": PLATE,
+    "links": {"q": pb.StokesLink(stated_errors=True)},
+}
+
+
+def plate_image(
+    rows: int,
+    columns: int,
+    *,
+    noise: float | np.ndarray = NOISE,
+    views: np.ndarray = VIEWS,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Every pixel is a plate of its own; `noise` is one number or (rows, columns)."""
+    rng = np.random.default_rng(seed)
+    low, high = (1.2 - 1.45) / 0.15, (2.0 - 1.45) / 0.15
+    shape = (rows, columns)
+    index = stats.truncnorm(low, high, 1.45, 0.15).rvs(shape, random_state=rng)
+    fraction = stats.beta(2.0, 2.0).rvs(shape, random_state=rng)
+    q = plate_q(index[..., None], fraction[..., None], np.radians(views))
+    error = np.broadcast_to(np.broadcast_to(noise, shape)[..., None], q.shape)
+    geometry = {"view_zenith": views, "view_azimuth": np.full(views.size, 180.0)}
+    geometry |= {"light_zenith": views, "light_azimuth": np.zeros(views.size)}
+    return xr.Dataset(
+        {name: ("view", angle) for name, angle in geometry.items()}
+        | {
+            "q": (("y", "x", "view"), np.clip(q + error * rng.normal(size=q.shape), -1.0, 1.0)),
+            "q_error": (("y", "x", "view"), error.copy()),
+            "true_refractive_index": (("y", "x"), index),
+            "true_subsurface_fraction": (("y", "x"), fraction),
+        },
+        attrs={"name": "plates"},
+    )
+
+
+def planned(
+    capture: xr.Dataset,
+    method: PixelLaplace | None = None,
+    *,
+    seed: int = 0,
+    precision: str = "double",
+    **asked,
+) -> Plan:
+    """The plan of a map; with one plan, the same programs serve many tests."""
+    given = {**ASKED, **asked}
+    return plan_map(
+        capture, given["model"], method, given["scene"], None, given["links"], None, seed, precision
+    )
+
+
+def stacked(capture: xr.Dataset, plan: Plan) -> Stack:
+    """The pixels of an image in a row."""
+    return stack(plan.observe(validate(set_aside(capture))))
+
+
+def mapped(capture: xr.Dataset, plan: Plan, block: int = 4096) -> xr.Dataset:
+    """Maps made block by block."""
+    numbered = number_pixels(capture)
+    maps = blank(numbered, plan).copy(deep=True)
+    for place in cut(numbered, block):
+        for name, values in fit_block(numbered.isel(place), plan).items():
+            maps[name][place] = values
+    return maps
