@@ -70,6 +70,7 @@ _HOMES = {
     "pixels.store": ("map_file",),
     "priors": ("PRIORS",),
     "reporting.html": ("report",),
+    "reporting.maps": ("plot_maps",),
     "setups": ("SETUPS", "Setup"),
     "simulation.presets": ("PRESETS", "Material"),
     "simulation.protocol": ("Protocol",),

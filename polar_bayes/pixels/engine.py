@@ -35,8 +35,11 @@ ROUGH, FINE, EXACT = (5, 4), (2, 2), (1, 4, 4, 8, 16)
 """Steps between two looks at who has settled: by scoring in single precision, by scoring, and
 with exact curvature. The first exact one only looks; few need more."""
 
-NEAR, NEARER, THERE = 3e-2, 1e-4, 1e-4
-"""Decrements, in posterior sds: of single precision, of scoring, of the last exact step."""
+NEAR, NEARER = 3e-2, 1e-4
+"""Decrements, in posterior sds, at which scoring stops: in single precision, in double."""
+
+THERE = {"double": 1e-4, "single": 1e-2}
+"""The decrement at which a pixel has converged; single precision cannot tell it better."""
 
 
 class Settled(NamedTuple):
@@ -93,7 +96,7 @@ class Engine:
             look, *rest = self._exact_steps
             climbers = jax.tree.map(np.array, self._map(look, exact, stand(np.asarray(scored.z))))
             peak = self._crown(climbers)
-            left = np.flatnonzero(~(peak.decrement < THERE))
+            left = np.flatnonzero(~(peak.decrement < THERE[self.precision]))
             if left.size:
                 state = jax.tree.map(lambda x: x[left], climbers)
                 late = self._pass(rest, exact.subset(left), state)
@@ -102,7 +105,7 @@ class Engine:
                     whole[left] = part
             steps = rough.steps + scored.steps + climbers.steps
         definite = np.isfinite(np.asarray(peak.widths)).all(axis=(1, 2))
-        converged = np.asarray(peak.decrement < THERE) & definite
+        converged = np.asarray(peak.decrement < THERE[self.precision]) & definite
         return Settled(peak, np.asarray(steps), converged)
 
     def draw(
@@ -198,11 +201,11 @@ class Engine:
 
     @functools.cached_property
     def _steps(self) -> list[Callable]:
-        return _stepping(self.program, score, NEARER, FINE)
+        return _stepping(self.program, score, max(NEARER, 0.1 * THERE[self.precision]), FINE)
 
     @functools.cached_property
     def _exact_steps(self) -> list[Callable]:
-        return _stepping(self.program, expand, 0.1 * THERE, EXACT)
+        return _stepping(self.program, expand, 0.1 * THERE[self.precision], EXACT)
 
     @functools.cached_property
     def _all_crowned(self) -> Callable:

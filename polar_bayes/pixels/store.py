@@ -46,7 +46,8 @@ def map_file(
     """Fit every pixel of an image in a file, and write the maps to another.
 
     Blocks are read, fitted and written one by one, so memory does not grow with the image. What is
-    written is the same to the last bit whoever fits it, in whatever order, at once or resumed.
+    written does not depend on the order of the blocks or on how often the work was broken off, as
+    long as the compiler makes the same programs in every process (see the limits in docs/maps.md).
 
     Args:
         capture: A capture with dims y and x, netCDF (read whole) or Zarr (read block by block).
