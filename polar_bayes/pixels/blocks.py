@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import threading
 from typing import Any
 
 import jax
@@ -19,6 +18,7 @@ from polar_bayes.physics.notation import notation
 from polar_bayes.pixels.engine import Engine
 from polar_bayes.pixels.fitting import LEVELS, Approach, Marginals, PixelLaplace, Status, fit_stack
 from polar_bayes.pixels.stack import IMAGE, stack
+from polar_bayes.pixels.tracing import TRACING
 
 Layout = dict[str, tuple[tuple[str, ...], tuple[int, ...]]]
 """By parameter: names and lengths of the axes that it has in one pixel."""
@@ -66,13 +66,14 @@ class Plan:
     @property
     def engine(self) -> Engine:
         """The compiled programs, made at first use in each process."""
-        with LOCK:
+        with TRACING:
             return _engine_of(self)
 
     @property
     def layout(self) -> Layout:
         """Own axes of every parameter that a map shows."""
-        return _layout_of(self.engine, self.pixel(self.request.precision))
+        with TRACING:
+            return _layout_of(self)
 
     def pixel(self, precision: str) -> Observations:
         """The pixel that stands for all, as arrays."""
@@ -93,9 +94,6 @@ class Plan:
     def __hash__(self) -> int:
         """Of the key."""
         return hash(self.key)
-
-
-LOCK = threading.Lock()
 
 
 def fit_block(block: xr.Dataset, plan: Plan) -> xr.Dataset:
@@ -188,7 +186,7 @@ def _engine_of(plan: Plan) -> Engine:
         key = jax.random.key(request.seed)
         pixel = plan.pixel(request.precision)
         candidates = from_prior(program, key, plan.settings.candidates, pixel)
-    return Engine(program, rough, np.asarray(candidates), request.precision)
+    return Engine(program, rough, np.asarray(candidates), request.precision).ready()
 
 
 def _program_of(plan: Plan, precision: str) -> Program:
@@ -197,7 +195,9 @@ def _program_of(plan: Plan, precision: str) -> Program:
         return compile_program(model, plan.pixel(precision))
 
 
-def _layout_of(engine: Engine, pixel: Observations) -> Layout:
+@functools.lru_cache(maxsize=4)
+def _layout_of(plan: Plan) -> Layout:
+    engine, pixel = plan.engine, plan.pixel(plan.request.precision)
     program = engine.program
     with jax.enable_x64(engine.precision == "double"):
         shapes = jax.eval_shape(program.parameters, np.zeros(program.size, engine.dtype), pixel)

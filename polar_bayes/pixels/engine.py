@@ -21,6 +21,7 @@ from polar_bayes.pixels.climbing import Climber, Peak, crown, stand, step
 from polar_bayes.pixels.derivatives import AnyArray, expand, score
 from polar_bayes.pixels.sampling import PixelNuts, chains
 from polar_bayes.pixels.stack import Stack, together
+from polar_bayes.pixels.tracing import TRACING, TracedOnce
 
 BATCH = 128
 """Pixels that one call of a program takes, side by side: what they need stays in a cache."""
@@ -71,6 +72,11 @@ class Engine:
     rough: Program
     candidates: np.ndarray
     precision: str
+
+    def ready(self) -> "Engine":
+        """The engine with its programs made, though not yet traced."""
+        _ = self._start, self._rough_steps, self._steps, self._exact_steps, self._all_crowned
+        return self
 
     def climb(self, pixels: Stack, rank: int = 0) -> Settled:
         """From a candidate to the mode of every pixel.
@@ -129,7 +135,9 @@ class Engine:
         near = pixels.in_precision(np.float32)
         with jax.enable_x64(False):
             z, half, given = (np.float32(x) for x in (peak.z, peak.widths, points))
-            return self._map(functools.partial(self._draws(weighted), given), near, z, half)
+            with TRACING:  # no two threads make the same program
+                draws = self._draws(weighted)
+            return self._map(functools.partial(draws, given), near, z, half)
 
     def sample(
         self, pixels: Stack, peak: Peak, settings: PixelNuts, keys: Array
@@ -150,8 +158,10 @@ class Engine:
             Nothing.
         """
         with jax.enable_x64(self.precision == "double"):
-            chains = functools.partial(self._map, self._chains(settings), batch=FEW)
-            z, draws = chains(pixels.in_precision(self.dtype), peak.z, peak.widths, keys)
+            with TRACING:
+                several = self._chains(settings)
+            given = (pixels.in_precision(self.dtype), peak.z, peak.widths, keys)
+            z, draws = self._map(several, *given, batch=FEW)
         r_hat = [max(array_stats.rhat(x) for x in np.moveaxis(one, -1, 0)) for one in z]
         return draws, np.array(r_hat)
 
@@ -277,7 +287,7 @@ def _batched(function: Callable, *, given: int = 0, side_by_side: int = BATCH) -
 
         return jax.lax.map(of_pixel, (own, states), batch_size=side_by_side)
 
-    return run
+    return TracedOnce(run)
 
 
 def _whole(z: AnyArray) -> AnyArray:

@@ -4,7 +4,7 @@ import pytest
 
 import polar_bayes as pb
 
-QUICK = ("leaf", "glass")
+QUICK = ("leaf",)
 
 
 @pytest.mark.parametrize(

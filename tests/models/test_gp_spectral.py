@@ -54,7 +54,8 @@ def held_out(material: Mapping[float, float], held: float, seed: int) -> tuple[f
     return float(low), float(high)
 
 
-@pytest.mark.parametrize("held", [550.0, pytest.param(633.0, marks=pytest.mark.thorough)])
+@pytest.mark.thorough  # tests/benchmarks/spectrum.py does the same with NUTS
+@pytest.mark.parametrize("held", [550.0, 633.0])
 def test_real_materials_lie_in_the_bands_of_a_color_that_was_not_measured(held: float) -> None:
     """Five materials. If bands were exact, two misses of five have chance .023.
 
@@ -249,11 +250,14 @@ THREE = spectral_plate({450.0: 1.525, 550.0: 1.5185, 650.0: 1.5145}, error=0.01,
 @pytest.mark.parametrize(
     ("kernel", "length"),
     [
-        ("Matern52", True),
-        (lambda length: kernels.RationalQuadratic(scale=length, alpha=1.0), True),
-        (kernels.ExpSquared(scale=200.0), False),
+        pytest.param("Matern52", True, id="name", marks=pytest.mark.thorough),
+        pytest.param(
+            lambda length: kernels.RationalQuadratic(scale=length, alpha=1.0), True, id="function"
+        ),
+        pytest.param(
+            kernels.ExpSquared(scale=200.0), False, id="object", marks=pytest.mark.thorough
+        ),
     ],
-    ids=["name", "function", "object"],
 )
 def test_other_kernels_are_fitted_and_predict(kernel: Any, length: bool) -> None:
     model = pb.GpSpectral(("refractive_index",), pb.SpectralProcess(kernel))

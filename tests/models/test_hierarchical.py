@@ -163,15 +163,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param("all alike", marks=pytest.mark.thorough),
-        pytest.param("all known, far apart", marks=pytest.mark.thorough),
-        pytest.param("hardly known", marks=pytest.mark.thorough),
-        "two members",
-    ],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("case", CASES)
 def test_every_degree_of_pooling_samples_without_divergences(case: str) -> None:
     index, error = CASES[case]
     result = fit(plates(index, error, seed=5), seed=1)
