@@ -101,7 +101,7 @@ def _run(request: Request, progress: Progress) -> xr.DataTree:
     clock = _Clock()
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     if request.precision == "single":
-        data = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, data)
+        data = data.in_single_precision()
     key_main, key_plain, key_posterior, key_prior = jax.random.split(
         jax.random.key(request.seed), 4
     )

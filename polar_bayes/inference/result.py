@@ -66,7 +66,7 @@ def assemble(
     log_prior = xr.Dataset(
         {name: (("chain", "draw"), x) for name, x in groups.pop("log_prior").items()}
     )
-    tree = from_dict(groups, coords=coords, dims=_dims(program))
+    tree = from_dict(groups, coords=coords, dims=dims_of(program))
     tree["log_prior"] = xr.DataTree(log_prior)
     tree["observed_data"] = xr.DataTree(_observed(program, capture, data, coords))
     tree["constant_data"] = xr.DataTree(_constants(capture, data, coords))
@@ -119,11 +119,11 @@ def posterior_of(program: Program, parameters: Mapping[str, Any]) -> xr.Dataset:
     Returns:
         A dataset like the group `posterior`.
     """
-    tree = from_dict({"posterior": _shaped(program, parameters)}, dims=_dims(program))
+    tree = from_dict({"posterior": _shaped(program, parameters)}, dims=dims_of(program))
     return tree["posterior"].to_dataset()
 
 
-def _dims(program: Program) -> dict[str, list[str]]:
+def dims_of(program: Program) -> dict[str, list[str]]:
     """Axes of every site: those of its plates, then those of its own event."""
     return {
         name: [*program.dims[name], *(f"{name}_{i}" for i, _ in enumerate(program.events[name]))]

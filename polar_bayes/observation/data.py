@@ -5,6 +5,7 @@ harmless numbers beside `valid=False`, so that every shape is static and nothing
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
@@ -48,6 +49,10 @@ class Observations(eqx.Module):
     def shape(self) -> tuple[int, ...]:
         """Length of every axis, outermost first."""
         return tuple(length for _, length in self.dims)
+
+    def in_single_precision(self) -> "Observations":
+        """The same readings as 32-bit numbers; masks stay masks."""
+        return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, self)
 
 
 def observe(

@@ -5,13 +5,13 @@ import functools
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request
+from polar_bayes.inference.result import dims_of
 from polar_bayes.inference.search import from_prior
 from polar_bayes.observation.data import READINGS, Observations, observe
 from polar_bayes.physics.notation import notation
@@ -78,9 +78,7 @@ class Plan:
     def pixel(self, precision: str) -> Observations:
         """The pixel that stands for all, as arrays."""
         data = self.observe(self.request.capture)
-        if precision == "double":
-            return data
-        return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, data)
+        return data if precision == "double" else data.in_single_precision()
 
     @property
     def sizes(self) -> dict[str, tuple[int, ...]]:
@@ -201,9 +199,5 @@ def _layout_of(plan: Plan) -> Layout:
     program = engine.program
     with jax.enable_x64(engine.precision == "double"):
         shapes = jax.eval_shape(program.parameters, np.zeros(program.size, engine.dtype), pixel)
-    return {name: (_own_axes(name, program), x.shape) for name, x in shapes.items()}
-
-
-def _own_axes(name: str, program: Program) -> tuple[str, ...]:
-    """Those of its plates, then those of its own event."""
-    return (*program.dims[name], *(f"{name}_{i}" for i, _ in enumerate(program.events[name])))
+    dims = dims_of(program)
+    return {name: (tuple(dims[name]), x.shape) for name, x in shapes.items()}

@@ -72,10 +72,10 @@ def fit_pixels(
     plan = plan_map(
         capture, model, method, scene, priors, links, largest_view_zenith, seed, precision
     )
-    numbered = number_pixels(capture)
     if capture.chunks:
+        numbered = number_pixels(capture)
         return xr.map_blocks(fit_block, numbered, args=[plan], template=blank(capture, plan))
-    return _at_once(numbered, plan, progress)
+    return _at_once(capture, plan, progress)
 
 
 def count_pixels(maps: xr.Dataset) -> dict[str, int]:
@@ -175,6 +175,12 @@ def number_pixels(capture: xr.Dataset) -> xr.Dataset:
     return capture.assign({NUMBER: along[0] * columns + along[1]})
 
 
+def numbered_block(capture: xr.Dataset, place: Mapping[str, slice]) -> xr.Dataset:
+    """A block of an image whose pixels know where they stand in the whole."""
+    y, x = (xr.Variable((d,), np.arange(place[d].start, place[d].stop)) for d in IMAGE)
+    return capture.isel(place).assign({NUMBER: y * capture.sizes["x"] + x})
+
+
 def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
     """Maps of the image before any pixel is fitted: names, axes, types and attributes.
 
@@ -219,15 +225,15 @@ def cut(capture: xr.Dataset, pixels: int = BLOCK) -> Iterator[dict[str, slice]]:
 
 
 def _at_once(
-    numbered: xr.Dataset, plan: Plan, progress: Callable[[int, int], None] | None
+    capture: xr.Dataset, plan: Plan, progress: Callable[[int, int], None] | None
 ) -> xr.Dataset:
     """Blocks on threads, put together in memory."""
-    maps = blank(numbered, plan).copy(deep=True)
-    every, done = numbered.sizes["y"] * numbered.sizes["x"], 0
+    maps = blank(capture, plan).copy(deep=True)
+    every, done = capture.sizes["y"] * capture.sizes["x"], 0
     with workers(None) as (pool, count):
-        tasks = ((place,) for place in cut(numbered))
+        tasks = ((place,) for place in cut(capture))
         blocks = as_completed(
-            pool, count, lambda place: fit_block(numbered.isel(place), plan), tasks
+            pool, count, lambda place: fit_block(numbered_block(capture, place), plan), tasks
         )
         for (place,), block in blocks:
             for name, values in block.items():

@@ -20,7 +20,7 @@ from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.observation.data import READINGS
 from polar_bayes.pixels.blocks import Plan, fit_block
 from polar_bayes.pixels.executors import as_completed, workers
-from polar_bayes.pixels.maps import blank, cut, fit_pixels, number_pixels, plan_map, said_of
+from polar_bayes.pixels.maps import blank, cut, fit_pixels, numbered_block, plan_map, said_of
 
 BLOCK = 65536
 """Pixels of a block, and of a chunk on the disk: few files, little memory."""
@@ -64,11 +64,12 @@ def map_file(
     Raises:
         CaptureError: The capture cannot be read, or is not what a fit needs.
         FitError: Something asked for cannot be used, the store is there already (or, to resume,
-            is not, or was begun otherwise), or it cannot be written.
+            is finished or was begun otherwise), or it cannot be written.
     """
     source, store = as_path(capture, "capture"), as_path(out, "out")
     image = open_image(source)
-    plan = plan_map(image, *(DEFAULTS | asked).values())
+    _check_whole(source)
+    plan = plan_map(image, **(DEFAULTS | asked))
     ledger = _Ledger(store, image, plan)
     if ledger.begin(resume=resume):
         _write_blank(image, plan, store)
@@ -98,7 +99,7 @@ def open_image(path: Path) -> xr.Dataset:
         The capture; of a Zarr store it is validated block by block, later.
 
     Raises:
-        CaptureError: It cannot be read, or readings are missing from the store.
+        CaptureError: It cannot be read.
     """
     if path.suffix != ".zarr":
         return load_capture(path)
@@ -107,21 +108,27 @@ def open_image(path: Path) -> xr.Dataset:
         raise CaptureError("there is no such store", where=where, mend="check the path")
     try:
         image = xr.open_zarr(path, chunks=None, decode_times=False, consolidated=False)
-        arrays = {name: zarr.open_array(path / name, mode="r") for name in image.data_vars}
     except Exception as error:  # the libraries below raise nearly every type for a broken store
         raise CaptureError(
             "it cannot be read as Zarr", where=where, mend="write it again with to_zarr"
         ) from error
-    for name in set(READINGS) & set(arrays):
-        missing = arrays[name].nchunks - arrays[name].nchunks_initialized
-        if missing:
-            raise CaptureError(
-                f"{missing} of {arrays[name].nchunks} chunks are missing",
-                where=f"{where}: {name}",
-                mend="copy the store again, or write it again with to_zarr",
-            )
     image.attrs.setdefault("name", path.stem)
     return image
+
+
+def _check_whole(path: Path) -> None:
+    """Refuse a store with holes, which would read as missing readings; once for the whole map."""
+    for name in READINGS:
+        if path.suffix != ".zarr" or not (path / name).is_dir():
+            continue
+        array = zarr.open_array(path / name, mode="r")
+        missing = array.nchunks - array.nchunks_initialized
+        if missing:
+            raise CaptureError(
+                f"{missing} of {array.nchunks} chunks are missing",
+                where=f"{path}: {name}",
+                mend="copy the store again, or write it again with to_zarr",
+            )
 
 
 def fit_file_block(source: Path, place: Place, plan: Plan) -> xr.Dataset:
@@ -138,7 +145,7 @@ def fit_file_block(source: Path, place: Place, plan: Plan) -> xr.Dataset:
     Raises:
         CaptureError: The block cannot be read or is not what the contract of captures allows.
     """
-    return fit_block(number_pixels(open_image(source)).isel(place), plan)
+    return fit_block(numbered_block(open_image(source), place), plan)
 
 
 class _Ledger:
@@ -157,20 +164,20 @@ class _Ledger:
         self._done: set[str] = set()
 
     def begin(self, *, resume: bool) -> bool:
-        """True where nothing is there yet."""
+        """True where nothing is there yet; then a file says that something was begun."""
         where = str(self._store)
         if not resume:
             if self._store.exists() or self._file.exists():
                 raise FitError(
                     "it is there already", where=where, mend="give another --out, or --resume"
                 )
-            return True
+            return self._start()
         if self._store.exists() and not self._file.exists():
             raise FitError("nothing is left to resume", where=where, mend="give another --out")
         lines = self._file.read_text().split("\n") if self._file.exists() else [""]
         if len(lines) < 2:  # broken off before the store was whole
             shutil.rmtree(self._store, ignore_errors=True)
-            return True
+            return self._start()
         if lines[0] != self._head:
             raise FitError(
                 "it was begun with another capture or other settings",
@@ -179,6 +186,12 @@ class _Ledger:
             )
         self._done = set(lines[1:-1])
         return False
+
+    def _start(self) -> bool:
+        """Before the store: whoever is stopped between the two can go on."""
+        with _written(self._store):
+            self._file.touch()
+        return True
 
     def open(self) -> None:
         """The store is there: from now on there is something to resume."""
@@ -195,7 +208,7 @@ class _Ledger:
         self._file.unlink()
 
     def _append(self, line: str) -> None:
-        with self._file.open("a") as file:
+        with _written(self._store), self._file.open("a") as file:
             file.write(f"{line}\n")
             file.flush()
             os.fsync(file.fileno())

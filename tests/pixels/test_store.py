@@ -67,6 +67,23 @@ def test_the_maps_are_those_that_are_made_in_memory(capture: Path, tmp_path: Pat
     xr.testing.assert_equal(found, pb.fit_pixels(image, method=METHOD, **ASKED))
 
 
+def test_whoever_is_stopped_before_the_store_is_whole_can_go_on(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        (tmp_path / "map.zarr").mkdir()
+        raise BrokenOff
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "_write_blank", stop)
+        with pytest.raises(BrokenOff):
+            mapped(capture, tmp_path / "map.zarr")
+    found = mapped(capture, tmp_path / "map.zarr", resume=True)
+    assert sum(pb.count_pixels(found).values()) == 180
+    with pytest.raises(TypeError, match="unexpected keyword argument 'sceen'"):
+        mapped(capture, tmp_path / "other.zarr", sceen="paper")
+
+
 def test_what_cannot_be_gone_on_with_is_refused(capture: Path, tmp_path: Path) -> None:
     out = tmp_path / "map.zarr"
     break_off(capture, out)
