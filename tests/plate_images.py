@@ -58,6 +58,25 @@ def plate_image(
     )
 
 
+def on_a_grid(
+    q: np.ndarray, error: float, views: np.ndarray
+) -> dict[str, tuple[float, float, float]]:
+    """Mean, sd and skewness of each parameter, by adding up 800 x 800 cells."""
+    cells = (np.arange(800) + 0.5) / 800
+    index, fraction = np.meshgrid(1.2 + 0.8 * cells, cells, indexing="ij")
+    log = stats.norm(1.45, 0.15).logpdf(index) + stats.beta(2.0, 2.0).logpdf(fraction)
+    for reading, zenith in zip(q, np.radians(views), strict=True):
+        log += stats.norm(reading, error).logpdf(plate_q(index, fraction, zenith))
+    weights = np.exp(log - log.max())
+    weights /= weights.sum()
+    found = {}
+    for name, x in zip(NAMES, (index, fraction), strict=True):
+        mean = np.sum(weights * x)
+        sd = np.sqrt(np.sum(weights * (x - mean) ** 2))
+        found[name] = (mean, sd, np.sum(weights * ((x - mean) / sd) ** 3))
+    return found
+
+
 def planned(
     capture: xr.Dataset,
     method: PixelLaplace | None = None,

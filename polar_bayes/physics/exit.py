@@ -66,12 +66,11 @@ class RoughExit(AbstractExit):
     def light(
         self, facets: Microsurface, ellipse: SlopeEllipse, stack: Stack, geometry: Geometry
     ) -> Light:
-        # Without a barrier XLA's CPU compiler fuses the facets into each of their many readers and
-        # computes them anew for each: a gradient then takes up to five times as long.
         sample = facets.sample(ellipse, geometry, seen)
+        # A barrier keeps facets from being found anew for each of their readers; see `facets`.
         sample = Facets(*jax.lax.optimization_barrier(tuple(sample)))
         passing = stack.per_facet().transmission(sample.cos_incidence, sample.sin_squared)
-        area = jnp.sum(sample.weight, axis=-1)
+        area = jnp.sum(sample.weight, axis=-2)
         light = gather(sample, sample.weight, passing)
         light = light._replace(intensity=light.intensity / area)
         return Light(*jax.lax.optimization_barrier(tuple(light)))

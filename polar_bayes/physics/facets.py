@@ -15,6 +15,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple, override
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -95,7 +96,7 @@ class Window(NamedTuple):
     """Border of the facets that matter, in slope coordinates.
 
     Args:
-        limit: Largest slope across the plane of the viewer. Shape (..., view).
+        limit: Largest slope across the plane of the viewer. Shape (..., view), or () for all alike.
         edges: Function from that slope to the smallest and largest slope in the plane.
     """
 
@@ -104,7 +105,7 @@ class Window(NamedTuple):
 
 
 class Facets(NamedTuple):
-    """Sampled facets on a new last axis: shape (..., view, facet).
+    """Sampled facets on an axis before the views: shape (..., facet, view).
 
     Args:
         weight: Share of the facet in the seen area, times cos(theta_v) / G1(v).
@@ -148,7 +149,7 @@ def seen(sin_view: Array, cos_view: Array) -> Window:
         upper = cos_view / jnp.maximum(-sin_view, cos_view / STEEPEST)
         return lower, upper
 
-    return Window(jnp.full_like(cos_view, STEEPEST), edges)
+    return Window(jnp.asarray(STEEPEST, cos_view.dtype), edges)
 
 
 def above_horizon(sin_view: Array, cos_view: Array) -> Window:
@@ -227,19 +228,23 @@ def sample_facets(
         border: Window of a view, from its sine and cosine.
 
     Returns:
-        Facets of shape (..., view, along * across); twice as many for a sheared ellipse.
+        Facets of shape (..., along * across, view); twice as many for a sheared ellipse.
 
     Raises:
         Nothing.
     """
     dtype = jnp.result_type(float, ellipse.across, cos_view)
+    # Axes (..., across, along, view): what one of the two does not touch is found once for all of
+    # it, and the views, the longest axis, are the innermost loop.
     sides = 1 if ellipse.shear is None else 2
-    rows = [np.tile(np.repeat(row, quadrature.along), sides) for row in quadrature.rule_across()]
-    rows += [np.tile(row, sides * quadrature.across) for row in quadrature.rule_along()]
-    share_across, weight_across, share_along, weight_along = (
-        jnp.asarray(row, dtype) for row in rows
+    share_across, weight_across = (
+        jnp.asarray(np.tile(row, sides)[:, None, None], dtype) for row in quadrature.rule_across()
     )
-    sin_view, cos_view, ellipse = sin_view[..., None], cos_view[..., None], ellipse.per_facet()
+    share_along, weight_along = (
+        jnp.asarray(row[:, None], dtype) for row in quadrature.rule_along()
+    )
+    sin_view, cos_view = sin_view[..., None, None, :], cos_view[..., None, None, :]
+    ellipse = ellipse.per_facet().per_facet()
 
     window = border(sin_view, cos_view)
     y, density_y = distribution.across(window.limit, ellipse.across, share_across)
@@ -248,7 +253,7 @@ def sample_facets(
         x, density_x = distribution.along(lower, upper, y, ellipse.across, share_along)
     else:
         # Both sides of the plane, in slopes that are stretched and sheared to an isotropic pair.
-        side = jnp.asarray(np.repeat([1.0, -1.0], len(rows[0]) // 2), dtype)
+        side = jnp.asarray(np.repeat([1.0, -1.0], quadrature.across)[:, None, None], dtype)
         density_y, y = 0.5 * density_y, side * y
         stretch = ellipse.across / ellipse.along
         shift = ellipse.shear / ellipse.across * y
@@ -256,13 +261,16 @@ def sample_facets(
             (lower - shift) * stretch, (upper - shift) * stretch, y, ellipse.across, share_along
         )
         x = x / stretch + shift
+    # Without a barrier XLA's CPU compiler fuses the slopes into each of their many readers and
+    # finds them anew for each: derivatives then take several times as long.
+    x, y, density_x, density_y = jax.lax.optimization_barrier((x, y, density_x, density_y))
 
     shown = jnp.maximum(cos_view + sin_view * x, 0.0)
     cos_tilt = 1.0 / jnp.sqrt(1.0 + x**2 + y**2)
     cos_incidence = jnp.maximum(cos_tilt * shown, 1e-6)
     in_plane = cos_tilt * (sin_view - x * cos_view)
     out_of_plane = cos_tilt * y
-    return Facets(
+    facets = Facets(
         weight=weight_across * density_y * weight_along * density_x * shown,
         cos_incidence=cos_incidence,
         sin_squared=in_plane**2 + out_of_plane**2,
@@ -271,6 +279,10 @@ def sample_facets(
         cos_light=2.0 * cos_incidence * cos_tilt - cos_view,
         light_in_plane=2.0 * cos_incidence * cos_tilt * x - sin_view,
         light_out_of_plane=2.0 * cos_incidence * cos_tilt * y,
+    )
+    shape = jnp.broadcast_shapes(*(jnp.shape(field) for field in (x, y, cos_view, share_along)))
+    return jax.tree.map(
+        lambda field: jnp.broadcast_to(field, shape).reshape(*shape[:-3], -1, shape[-1]), facets
     )
 
 

@@ -85,7 +85,7 @@ class Geometry(NamedTuple):
             self.wavelength,
         )
 
-    def per_facet(self) -> "Geometry":
+    def per_ray(self) -> "Geometry":
         """The same with a trailing axis, for many facets or rays of one view."""
         return jax.tree.map(lambda array: array[..., None], self)
 

@@ -104,7 +104,7 @@ class AbstractIllumination(Part):
         """Light that passes into the body, ray by ray; see `rays` and `entering`."""
         rays, irradiance = self.rays(geometry)
         cos_light = cos_degrees(rays.light_zenith)
-        passing = stack.per_facet().transmission(cos_light, sin_degrees(rays.light_zenith) ** 2)
+        passing = stack.per_ray().transmission(cos_light, sin_degrees(rays.light_zenith) ** 2)
         per_ray = {name: value[..., None] for name, value in parameters.items()}
         light = let_in(passing, cos_light, self.incident(per_ray, rays))
         return rays, light._replace(intensity=irradiance * light.intensity)
@@ -170,7 +170,7 @@ class PointSource(AbstractIllumination):
 
     @override
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
-        rays = geometry.per_facet()
+        rays = geometry.per_ray()
         return rays, jnp.ones_like(rays.light_zenith)
 
     @override
@@ -225,7 +225,7 @@ class AbstractExtendedSource(AbstractIllumination):
         cos_light = jnp.clip(sample.cos_light, 1e-6, 1.0)
         to_viewer = sin_view / cos_view
         seen = facets.shadowing.both(
-            facets.visible(ellipse, to_viewer, jnp.zeros_like(to_viewer))[..., None],
+            facets.visible(ellipse, to_viewer, jnp.zeros_like(to_viewer))[..., None, :],
             facets.visible(
                 ellipse.per_facet(),
                 sample.light_in_plane / cos_light,
@@ -257,7 +257,7 @@ class UniformSky(AbstractExtendedSource):
         # up once and twice around to nothing, which is all that scattering knows of azimuth.
         cosine, weight = squared_rule(SKY_NODES)
         solid_angle = 0.5 * np.pi * weight
-        rays = geometry.per_facet()
+        rays = geometry.per_ray()
         zenith, azimuth = np.degrees(np.arccos(cosine)), 90.0 * np.arange(4.0)
         around = like(np.tile(azimuth, SKY_NODES), rays.view_azimuth)
         return (
@@ -307,7 +307,7 @@ class Disc(AbstractExtendedSource):
         cos_light = cos_light + jnp.asarray(sine_cosine, cos_view.dtype) * sin_view
         cos_light = jnp.clip(cos_light, 1e-4, 1.0)
         sin_squared = (1.0 - cos_light) * (1.0 + cos_light)
-        through = stack.per_facet().transmission(cos_light, sin_squared)
+        through = stack.per_ray().transmission(cos_light, sin_squared)
         passing = jnp.sum(cos_light * through.mean * like(solid_angle, cos_view), axis=-1)
         # Around the light's own plane the disc is nearly symmetric: what polarization is left
         # after averaging belongs to its middle.
@@ -315,7 +315,7 @@ class Disc(AbstractExtendedSource):
 
     @override
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
-        rays = geometry.per_facet()
+        rays = geometry.per_ray()
         sin_view, cos_view = sin_degrees(rays.view_zenith), cos_degrees(rays.view_zenith)
         cosine, along, solid_angle = (like(x, cos_view) for x in self._directions())
         across = jnp.sqrt(jnp.maximum((1.0 - cosine) * (1.0 + cosine) - along**2, 0.0))

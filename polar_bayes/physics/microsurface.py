@@ -89,7 +89,7 @@ class Microsurface:
             border: Window of a view, from its sine and cosine.
 
         Returns:
-            Facets of shape (..., view, facet).
+            Facets of shape (..., facet, view).
 
         Raises:
             Nothing.
@@ -110,7 +110,7 @@ def gather(
     """Light of all facets together.
 
     Args:
-        sample: The facets. Shape (..., view, facet).
+        sample: The facets. Shape (..., facet, view).
         weight: How much each counts. Same shape.
         power: What each reflects or lets pass. Same shape.
         least: Smallest sum that counts, where there may be no facet; None where there always is.
@@ -121,11 +121,11 @@ def gather(
     Raises:
         Nothing.
     """
-    total = jnp.sum(weight * power.mean, axis=-1)
+    total = jnp.sum(weight * power.mean, axis=-2)
     if least is not None:
         total = jnp.maximum(total, least)
     polarized = weight * power.contrast
-    q = jnp.sum(polarized * sample.along_s, axis=-1) / total
+    q = jnp.sum(polarized * sample.along_s, axis=-2) / total
     if sample.across_s is None:
         return Light(total, q, jnp.zeros_like(q))
-    return Light(total, q, -jnp.sum(polarized * sample.across_s, axis=-1) / total)
+    return Light(total, q, -jnp.sum(polarized * sample.across_s, axis=-2) / total)

@@ -30,11 +30,11 @@ class SlopeEllipse(NamedTuple):
     shear: Array | None
 
     def per_facet(self) -> "SlopeEllipse":
-        """The same with a trailing axis, for many facets of one view."""
+        """The same with an axis before the views, for many facets of each."""
         return SlopeEllipse(
-            self.across[..., None],
-            self.along[..., None],
-            None if self.shear is None else self.shear[..., None],
+            self.across[..., None, :],
+            self.along[..., None, :],
+            None if self.shear is None else self.shear[..., None, :],
         )
 
 

@@ -49,7 +49,11 @@ class Stack(NamedTuple):
     layers: tuple[Layer, ...] = ()
 
     def per_facet(self) -> "Stack":
-        """The same with a trailing axis, for many facets of one view."""
+        """The same with an axis before the views, for many facets of each."""
+        return jax.tree.map(lambda array: array[..., None, :] if array.ndim else array, self)
+
+    def per_ray(self) -> "Stack":
+        """The same with a trailing axis, for many rays or quadrature nodes of each view."""
         return jax.tree.map(lambda array: array[..., None] if array.ndim else array, self)
 
     def reflection(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
@@ -99,7 +103,7 @@ class Stack(NamedTuple):
         if not self.layers:
             return 1.0 - fresnel.hemispherical_reflection(self.refractive_index)
         cosine, weight = self._hemisphere()
-        through = self.per_facet().transmission(cosine, (1.0 - cosine) * (1.0 + cosine))
+        through = self.per_ray().transmission(cosine, (1.0 - cosine) * (1.0 + cosine))
         return jnp.sum(weight * through.mean, axis=-1)
 
     def escape(self) -> Array:
@@ -118,7 +122,7 @@ class Stack(NamedTuple):
         if not self.layers:
             return fresnel.escape(self.refractive_index)
         cosine, weight = self._hemisphere()
-        left = self.per_facet()._not_returned(cosine**2, (1.0 - cosine) * (1.0 + cosine))
+        left = self.per_ray()._not_returned(cosine**2, (1.0 - cosine) * (1.0 + cosine))
         # Sums, since matrix products of accelerators drop digits in single precision.
         lost = jnp.sum(weight * left, axis=-1)
         if any(layer.absorbance is not None for layer in self.layers):
@@ -130,7 +134,7 @@ class Stack(NamedTuple):
         lowest = [layer for layer in self.layers if layer.wavenumber is None][-1]
         end = jnp.minimum(self.refractive_index, lowest.refractive_index) ** 2
         beyond = (end - 1.0)[..., None] * like(TRAPPED_SHARE, self.refractive_index)
-        absorbed = self.per_facet()._not_returned(-beyond, 1.0 + beyond, reaches_air=False)
+        absorbed = self.per_ray()._not_returned(-beyond, 1.0 + beyond, reaches_air=False)
         return (end - 1.0) * jnp.sum(
             like(TRAPPED_WEIGHT, self.refractive_index) * absorbed, axis=-1
         )

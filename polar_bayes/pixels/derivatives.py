@@ -70,24 +70,25 @@ def score(program: Program, z: Float[Array, " size"], data: Observations) -> Slo
     """
     coordinates = tuple(z)
     pixel = _Pixel(program, data)
-    arguments, likelihoods = pixel.arguments(coordinates)
-    slopes = _slopes(lambda *c: pixel.arguments(c)[0], coordinates)
+    arguments, likelihoods = pixel.arguments(coordinates), pixel.likelihoods(coordinates)
+    slopes = _slopes(lambda *c: pixel.arguments(c), coordinates)
     value, gradient, curvature = _expand(pixel.prior, coordinates)
     for at, (own, likelihood) in enumerate(zip(arguments, likelihoods, strict=True)):
-        jacobian = [slopes[k][at] for k in range(program.size)]
         active = pixel.active(at, coordinates)
         value = value - jnp.sum(likelihood(own))
         first = jax.grad(lambda a, f=likelihood: jnp.sum(f(a)))
         downhill = first(own)
+        bend = {a: jax.jvp(first, (own,), (_unit(own, a),))[1] for a in active}
+        jacobian = [slopes[k][at] for k in range(program.size)]
+        # The barrier keeps the compiler from finding all this anew for each of the sums below.
+        downhill, bend, jacobian = jax.lax.optimization_barrier((downhill, bend, jacobian))
         gradient = gradient - jnp.stack(
             [sum(jnp.sum(j[a] * downhill[a]) for a in active) for j in jacobian]
         )
         for a in active:
-            unit = [jnp.ones_like(x) if b == a else jnp.zeros_like(x) for b, x in enumerate(own)]
-            bend = jax.jvp(first, (own,), (unit,))[1]
             for b in active:
                 curvature = curvature - _outer(
-                    [j[a] * bend[b] for j in jacobian], [j[b] for j in jacobian]
+                    [j[a] * bend[a][b] for j in jacobian], [j[b] for j in jacobian]
                 )
     return Slopes(value, gradient, curvature)
 
@@ -110,17 +111,40 @@ def expand(program: Program, z: Float[Array, " size"], data: Observations) -> Sl
 
 
 class _Pixel:
-    """A program and its data as functions of coordinates, one number each."""
+    """A program and its data as functions of coordinates, one number each.
+
+    Each is traced once, however often it is differentiated: the model is walked by NumPyro, and
+    that is slow.
+    """
 
     def __init__(self, program: Program, data: Observations) -> None:
         self._program = program
         self._data = data
         self._layout = jax.eval_shape(program.unravel, jnp.zeros(program.size))
+        self.potential = jax.jit(self._potential, inline=True)
+        self.prior = jax.jit(self._prior, inline=True)
+        self.arguments = jax.jit(self._arguments, inline=True)
 
-    def potential(self, *coordinates: Array) -> Array:
+    def likelihoods(self, coordinates: Coordinates) -> list[Callable]:
+        """For each observed site, the log density as a function of `arguments`."""
+        return [
+            functools.partial(self._likelihood, *jax.tree.flatten(distribution), value)
+            for distribution, value in self._observed(coordinates)
+        ]
+
+    def active(self, at: int, coordinates: Coordinates) -> list[int]:
+        """Which arguments of an observed site any coordinate moves at all."""
+
+        def argument(which: int, *coordinates: Array) -> Array:
+            return self.arguments(coordinates)[at][which]
+
+        count = len(self.arguments(coordinates)[at])
+        return [a for a in range(count) if _moves(functools.partial(argument, a), coordinates)]
+
+    def _potential(self, *coordinates: Array) -> Array:
         return self._program.potential_at(self._sites(coordinates), self._data)
 
-    def prior(self, *coordinates: Array) -> Array:
+    def _prior(self, *coordinates: Array) -> Array:
         """The part of the potential that no reading has a share in."""
         unconstrained = self._sites(coordinates)
         log_probs, _ = self._told(unconstrained)
@@ -131,40 +155,24 @@ class _Pixel:
         prior = sum(x for name, x in log_probs.items() if name not in self._program.observed)
         return -prior - stretch
 
-    def arguments(self, coordinates: Coordinates) -> tuple[list[list[Array]], list[Callable]]:
-        """For each observed site, the arguments of its distribution, and its log density of them.
+    def _arguments(self, coordinates: Coordinates) -> list[list[Array]]:
+        """For each observed site, the arguments of its distribution, a value for each reading."""
+        found = []
+        for distribution, value in self._observed(coordinates):
+            leaves = [x for x in jax.tree.leaves(distribution) if _is_number(x)]
+            found.append([jnp.broadcast_to(x, jnp.shape(value)) for x in leaves])
+        return found
 
-        Every argument has one value for each reading.
-        """
+    def _likelihood(
+        self, leaves: list, tree: jax.tree_util.PyTreeDef, value: Array, own: list[Array]
+    ) -> Array:
+        given = iter(own)
+        whole = [next(given) if _is_number(x) else x for x in leaves]
+        return jax.tree.unflatten(tree, whole).log_prob(value)
+
+    def _observed(self, coordinates: Coordinates) -> list[tuple[dist.Distribution, Array]]:
         _, trace = self._told(self._sites(coordinates))
-        arguments, likelihoods = [], []
-        for name in self._program.observed:
-            distribution, value = trace[name]["fn"], trace[name]["value"]
-            leaves, tree = jax.tree.flatten(distribution)
-            moving = [jnp.issubdtype(jnp.result_type(x), jnp.floating) for x in leaves]
-            shape = jnp.shape(value)
-
-            def likelihood(
-                own: list[Array], leaves=leaves, tree=tree, moving=moving, value=value
-            ) -> Array:
-                given = iter(own)
-                whole = [next(given) if m else x for x, m in zip(leaves, moving, strict=True)]
-                return jax.tree.unflatten(tree, whole).log_prob(value)
-
-            arguments.append(
-                [jnp.broadcast_to(x, shape) for x, m in zip(leaves, moving, strict=True) if m]
-            )
-            likelihoods.append(likelihood)
-        return arguments, likelihoods
-
-    def active(self, at: int, coordinates: Coordinates) -> list[int]:
-        """Which arguments of an observed site any coordinate moves at all."""
-
-        def argument(which: int, *coordinates: Array) -> Array:
-            return self.arguments(coordinates)[0][at][which]
-
-        count = len(self.arguments(coordinates)[0][at])
-        return [a for a in range(count) if _moves(functools.partial(argument, a), coordinates)]
+        return [(trace[name]["fn"], trace[name]["value"]) for name in self._program.observed]
 
     def _sites(self, coordinates: Coordinates) -> dict[str, Array]:
         found, start = {}, 0
@@ -181,6 +189,10 @@ class _Pixel:
             for name, value in unconstrained.items()
         }
         return compute_log_probs(self._program.model, (self._data,), {}, latent)
+
+
+def _is_number(x: Array) -> bool:
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
 def _along(function: Callable, k: int) -> Callable:
@@ -217,6 +229,11 @@ def _expand(function: Callable, coordinates: Coordinates) -> tuple[Array, Array,
         rows[i] += [_along(first[i], j)(*coordinates) for j in range(i, size)]
     gradient = jnp.stack([slope(*coordinates) for slope in first])
     return function(*coordinates), gradient, jnp.stack([jnp.stack(row) for row in rows])
+
+
+def _unit(arguments: list[Array], which: int) -> list[Array]:
+    """A step of one argument alone."""
+    return [jnp.full_like(x, float(at == which)) for at, x in enumerate(arguments)]
 
 
 def _outer(left: list[Array], right: list[Array]) -> Array:

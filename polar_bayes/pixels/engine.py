@@ -17,27 +17,32 @@ from jaxtyping import Array
 
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.observation.data import Observations
+from polar_bayes.pixels.adapting import Proposal
 from polar_bayes.pixels.climbing import Climber, Peak, crown, stand, step
 from polar_bayes.pixels.derivatives import AnyArray, expand, score
+from polar_bayes.pixels.importance import Points
 from polar_bayes.pixels.sampling import PixelNuts, chains
 from polar_bayes.pixels.stack import Stack, together
 from polar_bayes.pixels.tracing import TRACING, TracedOnce
 
 BATCH = 128
-"""Pixels that one call of a program takes, side by side: what they need stays in a cache."""
+"""Pixels that one call of a program takes."""
+
+CLIMBING = 16
+"""Pixels of a batch that climb side by side: what they need stays in a core's own cache."""
 
 FEW = 16
 """The same where each pixel has chains of its own."""
 
-DRAWN = 4
+DRAWN = 8
 """Pixels of a batch that stand side by side where each has hundreds of draws."""
 
-ROUGH, FINE, EXACT = (5, 4), (2, 2), (1, 4, 4, 8, 16)
-"""Steps between two looks at who has settled: by scoring in single precision, by scoring, and
-with exact curvature. The first exact one only looks; few need more."""
+ROUGH, EXACT = (5, 4), (1, 1, 1, 2, 4, 8, 16)
+"""Steps between two looks at who has arrived: by scoring in single precision, and with exact
+curvature. The first exact one only looks, and for most pixels that is all."""
 
-NEAR, NEARER = 3e-2, 1e-4
-"""Decrements, in posterior sds, at which scoring stops: in single precision, in double."""
+NEAR = 1e-4
+"""The decrement, in posterior sds, at which scoring stops."""
 
 THERE = {"double": 1e-4, "single": 1e-2}
 """The decrement at which a pixel has converged; single precision cannot tell it better."""
@@ -75,7 +80,7 @@ class Engine:
 
     def ready(self) -> "Engine":
         """The engine with its programs made, though not yet traced."""
-        _ = self._start, self._rough_steps, self._steps, self._exact_steps, self._all_crowned
+        _ = self._start, self._rough_steps, self._exact_steps, self._all_crowned
         return self
 
     def climb(self, pixels: Stack, rank: int = 0) -> Settled:
@@ -98,46 +103,47 @@ class Engine:
         with jax.enable_x64(self.precision == "double"):
             exact = pixels.in_precision(self.dtype)
             z = np.asarray(np.where(_whole(rough.z), rough.z, z), self.dtype)
-            scored = self._pass(self._steps, exact, stand(z))
-            look, *rest = self._exact_steps
-            climbers = jax.tree.map(np.array, self._map(look, exact, stand(np.asarray(scored.z))))
-            peak = self._crown(climbers)
-            left = np.flatnonzero(~(peak.decrement < THERE[self.precision]))
-            if left.size:
-                state = jax.tree.map(lambda x: x[left], climbers)
-                late = self._pass(rest, exact.subset(left), state)
-                mended = self._crown(late)
-                for whole, part in zip((*peak, climbers.steps), (*mended, late.steps), strict=True):
+            look, *further = self._exact_steps
+            climbers = jax.tree.map(np.array, self._map(look, exact, stand(z)))
+            peak = jax.tree.map(np.array, self._crown(climbers))
+            for several in further:
+                left = np.flatnonzero(~(peak.decrement < THERE[self.precision]))
+                if not left.size:
+                    break
+                state = jax.tree.map(lambda x, at=left: x[at], climbers)
+                moved = self._map(several, exact.subset(left), state)
+                parts = jax.tree.leaves((moved, self._crown(moved)))
+                for whole, part in zip(jax.tree.leaves((climbers, peak)), parts, strict=True):
                     whole[left] = part
-            steps = rough.steps + scored.steps + climbers.steps
-        definite = np.isfinite(np.asarray(peak.widths)).all(axis=(1, 2))
-        converged = np.asarray(peak.decrement < THERE[self.precision]) & definite
-        return Settled(peak, np.asarray(steps), converged)
+            steps = rough.steps + climbers.steps
+        definite = np.isfinite(peak.widths).all(axis=(1, 2))
+        return Settled(peak, steps, (peak.decrement < THERE[self.precision]) & definite)
 
     def draw(
-        self, pixels: Stack, peak: Peak, points: np.ndarray, *, weighted: bool
+        self, pixels: Stack, proposal: Proposal, points: Points, *, weighted: bool
     ) -> tuple[Values, np.ndarray]:
-        """Draws of every pixel's normal approximation, and how the posterior weighs them.
+        """Draws of every pixel's proposal, and how the posterior weighs them.
 
         Args:
             pixels: The readings.
-            peak: Their modes and widths.
-            points: Standard normal points, (draw, size), the same for all pixels.
+            proposal: Centers and scales.
+            points: Draws of the standard distribution.
             weighted: True for the ratios too.
 
         Returns:
             Draws of the parameters by name, each (pixel, draw, ...); and log of posterior over
-            approximation, (pixel, draw), up to a constant per pixel, or zeros.
+            proposal, (pixel, draw), up to a constant per pixel, or zeros.
 
         Raises:
             Nothing.
         """
         near = pixels.in_precision(np.float32)
         with jax.enable_x64(False):
-            z, half, given = (np.float32(x) for x in (peak.z, peak.widths, points))
+            center, half = (np.float32(x) for x in proposal)
+            given = [np.float32(x) for x in points]
             with TRACING:  # no two threads make the same program
                 draws = self._draws(weighted)
-            return self._map(functools.partial(draws, given), near, z, half)
+            return self._map(functools.partial(draws, *given), near, center, half)
 
     def sample(
         self, pixels: Stack, peak: Peak, settings: PixelNuts, keys: Array
@@ -210,10 +216,6 @@ class Engine:
         return _stepping(self.rough, score, NEAR, ROUGH)
 
     @functools.cached_property
-    def _steps(self) -> list[Callable]:
-        return _stepping(self.program, score, max(NEARER, 0.1 * THERE[self.precision]), FINE)
-
-    @functools.cached_property
     def _exact_steps(self) -> list[Callable]:
         return _stepping(self.program, expand, 0.1 * THERE[self.precision], EXACT)
 
@@ -231,15 +233,17 @@ class Engine:
 
     @functools.cache  # noqa: B019 - an engine lives as long as its map
     def _draws(self, weighted: bool) -> Callable:
-        def draws(points: Array, data: Observations, z: Array, half: Array) -> tuple[Values, Array]:
-            places = z + points @ half
+        def draws(
+            points: Array, log_density: Array, data: Observations, center: Array, half: Array
+        ) -> tuple[Values, Array]:
+            places = center + points @ half
             parameters = jax.vmap(lambda z: self.rough.parameters(z, data))(places)
             if not weighted:
                 return parameters, jnp.zeros(len(points))
             values = jax.vmap(lambda z: self.rough.potential(z, data))(places)
-            return parameters, 0.5 * jnp.sum(points**2, axis=-1) - values
+            return parameters, -values - log_density
 
-        return _batched(draws, given=1, side_by_side=DRAWN)
+        return _batched(draws, given=2, side_by_side=DRAWN)
 
     @functools.cache  # noqa: B019 - an engine lives as long as its map
     def _chains(self, settings: PixelNuts) -> Callable:
@@ -271,7 +275,7 @@ def _stepping(
     return [functools.partial(compiled, np.int32(count)) for count in passes]
 
 
-def _batched(function: Callable, *, given: int = 0, side_by_side: int = BATCH) -> Callable:
+def _batched(function: Callable, *, given: int = 0, side_by_side: int = CLIMBING) -> Callable:
     """A function of one pixel, mapped over a batch, compiled.
 
     Its first arguments, as many as `given`, are the same for all pixels.

@@ -10,9 +10,12 @@ import numpy as np
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Values
+from polar_bayes.pixels.adapting import FEWEST_EFFECTIVE, TIMES, Proposal, heavy_points, learn
+from polar_bayes.pixels.climbing import Peak
 from polar_bayes.pixels.engine import Engine, Settled
 from polar_bayes.pixels.importance import (
     LARGEST_TRUSTED,
+    Points,
     effective_draws,
     normal_points,
     smooth,
@@ -28,6 +31,9 @@ RESTARTS = (1, 3, 7)
 
 PIECE = 4096
 """Pixels that are fitted at a time: their draws take a hundred megabytes."""
+
+HARD = 1024
+"""The same of pixels that have several times as many."""
 
 SAME_MODE = 1e-3
 """Difference of two potentials that is no difference."""
@@ -49,7 +55,8 @@ class Approach(enum.IntEnum):
     NONE = 0
     LAPLACE = 1
     IMPORTANCE = 2
-    NUTS = 3
+    ADAPTED = 3
+    NUTS = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +69,9 @@ class PixelLaplace:
         weighted: True weighs them by the posterior, which corrects the approximation and says how
             far it can be trusted (Pareto k); False takes them as they are, and says nothing.
         candidates: Prior draws among which each pixel finds its start, >= 8.
-        sampler: What pixels with Pareto k above 0.7 are handed to; None marks them only.
+        rounds: In which the proposal of a pixel with Pareto k above 0.7 is fitted to its own
+            weighted draws, until k is below; >= 0, and 0 without weights.
+        sampler: What pixels whose k is still above are handed to; None marks them only.
 
     Raises:
         FitError: A setting is outside its range.
@@ -71,6 +80,7 @@ class PixelLaplace:
     draws: int = 256
     weighted: bool = True
     candidates: int = 32
+    rounds: int = 3
     sampler: PixelNuts | None = dataclasses.field(default_factory=PixelNuts)
 
     def __post_init__(self) -> None:
@@ -82,6 +92,8 @@ class PixelLaplace:
             raise FitError(
                 f"candidates is {self.candidates}", where="PixelLaplace", mend="give 8 or more"
             )
+        if self.rounds < 0:
+            raise FitError(f"rounds is {self.rounds}", where="PixelLaplace", mend="give 0 or more")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -139,36 +151,18 @@ def fit_stack(
     row.status[pixels.views < FEWEST_VIEWS] = Status.TOO_FEW_VIEWS
     row.status[pixels.views == 0] = Status.MASKED
     enough = np.flatnonzero(pixels.views >= FEWEST_VIEWS)
-    points = normal_points(settings.draws, engine.program.size, seed)
-    keys = _keys(seed, numbers)
+    size = engine.program.size
+    points = normal_points(settings.draws, size, seed)
+    further = heavy_points(TIMES * settings.draws, size, seed)
+    work = _Work(engine, settings, points, further.split(TIMES), further, _keys(seed, numbers))
     for begin in range(0, enough.size, PIECE):
-        _fit_piece(engine, settings, pixels, enough[begin : begin + PIECE], points, keys, row)
+        work.fit(pixels, enough[begin : begin + PIECE], row)
     return row.marginals()
 
 
 def no_marginals(count: int, sizes: Mapping[str, tuple[int, ...]]) -> Marginals:
     """Those of pixels that nothing is known of."""
     return _Row(count, sizes).marginals()
-
-
-def _fit_piece(
-    engine: Engine,
-    settings: PixelLaplace,
-    pixels: Stack,
-    at: np.ndarray,
-    points: np.ndarray,
-    keys: np.ndarray,
-    row: "_Row",
-) -> None:
-    """Fit some pixels of a row, few enough for their draws to fit into memory."""
-    usable = pixels.subset(at)
-    found = _search(engine, settings, usable, points)
-    row.approximate(at, found, settings)
-    hard = np.flatnonzero(found.settled.converged & ~found.is_trusted)
-    if settings.sampler is not None and hard.size:
-        peak = jax.tree.map(lambda x: x[hard], found.settled.peak)
-        draws, r_hat = engine.sample(usable.subset(hard), peak, settings.sampler, keys[at[hard]])
-        row.sample(at[hard], draws, r_hat <= settings.sampler.largest_r_hat)
 
 
 class _Found(NamedTuple):
@@ -180,37 +174,96 @@ class _Found(NamedTuple):
     pareto_k: np.ndarray
 
     @property
+    def proposal(self) -> Proposal:
+        return _normal_at(self.settled.peak)
+
+    @property
     def is_trusted(self) -> np.ndarray:
         return self.settled.converged & (self.pareto_k <= LARGEST_TRUSTED)
 
 
-def _search(engine: Engine, settings: PixelLaplace, pixels: Stack, points: np.ndarray) -> _Found:
-    """Fit from the best candidate; pixels in doubt start again, and keep the lower mode."""
-    found = _approximate(engine, settings, pixels, points, rank=0)
-    for rank in RESTARTS:
-        doubtful = np.flatnonzero(~found.is_trusted)
-        if not doubtful.size:
-            break
-        again = _approximate(engine, settings, pixels.subset(doubtful), points, rank=rank)
-        old, new = found.settled, again.settled
-        lower = new.peak.value < old.peak.value[doubtful] - SAME_MODE
-        better = new.converged & (~old.converged[doubtful] | lower)
-        for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
-            whole[doubtful[better]] = part[better]
-    return found
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Work:
+    """What is done to every piece of a row, from the cheapest answer to the dearest.
 
+    Args:
+        engine: The model of one pixel.
+        settings: What is asked for.
+        points: Of the normal approximations.
+        looks: Of the proposals that are fitted to weighted draws, in parts like `points`.
+        further: The same in one.
+        keys: A random key for each pixel of the row.
+    """
 
-def _approximate(
-    engine: Engine, settings: PixelLaplace, pixels: Stack, points: np.ndarray, *, rank: int
-) -> _Found:
-    settled = engine.climb(pixels, rank)
-    parameters, ratios = engine.draw(pixels, settled.peak, points, weighted=settings.weighted)
-    if settings.weighted:
-        weights, pareto_k = smooth(ratios)
-    else:
-        weights = np.full((len(pixels), len(points)), 1.0 / len(points))
-        pareto_k = np.zeros(len(pixels))
-    return jax.tree.map(np.array, _Found(settled, parameters, weights, pareto_k))
+    engine: Engine
+    settings: PixelLaplace
+    points: Points
+    looks: list[Points]
+    further: Points
+    keys: np.ndarray
+
+    def fit(self, pixels: Stack, at: np.ndarray, row: "_Row") -> None:
+        """Fit some pixels of a row, few enough for their draws to fit into memory."""
+        usable = pixels.subset(at)
+        found = self._search(usable)
+        row.approximate(at, found, self.settings)
+        hard = np.flatnonzero(found.settled.converged & ~found.is_trusted)
+        for begin in range(0, hard.size, HARD):
+            some = hard[begin : begin + HARD]
+            left = some[self._adapt(usable.subset(some), _rows(found, some), at[some], row)]
+            if self.settings.sampler is not None and left.size:
+                peak = _rows(found.settled.peak, left)
+                self._sample(self.settings.sampler, usable.subset(left), peak, at[left], row)
+
+    def _search(self, pixels: Stack) -> _Found:
+        """Fit from the best candidate; pixels in doubt start again, and keep the lower mode."""
+        found = self._approximate(pixels, rank=0)
+        for rank in RESTARTS:
+            doubtful = np.flatnonzero(~found.is_trusted)
+            if not doubtful.size:
+                break
+            again = self._approximate(pixels.subset(doubtful), rank=rank)
+            old, new = found.settled, again.settled
+            lower = new.peak.value < old.peak.value[doubtful] - SAME_MODE
+            better = new.converged & (~old.converged[doubtful] | lower)
+            for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
+                whole[doubtful[better]] = part[better]
+        return found
+
+    def _approximate(self, pixels: Stack, *, rank: int) -> _Found:
+        settled = self.engine.climb(pixels, rank)
+        proposal, weighted = _normal_at(settled.peak), self.settings.weighted
+        parameters, ratios = self.engine.draw(pixels, proposal, self.points, weighted=weighted)
+        if weighted:
+            weights, pareto_k = smooth(ratios)
+        else:
+            weights = np.full((len(pixels), self.settings.draws), 1.0 / self.settings.draws)
+            pareto_k = np.zeros(len(pixels))
+        return jax.tree.map(np.array, _Found(settled, parameters, weights, pareto_k))
+
+    def _adapt(self, pixels: Stack, normal: _Found, at: np.ndarray, row: "_Row") -> np.ndarray:
+        """Fit proposals to their own weighted draws; which pixels are left without an answer."""
+        left = np.arange(len(pixels))
+        places, weights = normal.proposal.places(self.points), normal.weights
+        for _ in range(self.settings.rounds):
+            if not left.size:
+                break
+            proposal, some = learn(places, weights), pixels.subset(left)
+            looks = [self.engine.draw(some, proposal, x, weighted=True) for x in self.looks]
+            parameters, ratios = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *looks)
+            weights, pareto_k = smooth(ratios)
+            enough = pareto_k <= LARGEST_TRUSTED
+            enough &= effective_draws(weights) >= FEWEST_EFFECTIVE
+            row.adapt(at[left[enough]], _rows(parameters, enough), weights[enough])
+            left, weights = left[~enough], weights[~enough]
+            places = proposal.places(self.further)[~enough]
+        return left
+
+    def _sample(
+        self, sampler: PixelNuts, pixels: Stack, peak: Peak, at: np.ndarray, row: "_Row"
+    ) -> None:
+        draws, r_hat = self.engine.sample(pixels, peak, sampler, self.keys[at])
+        row.sample(at, draws, r_hat <= sampler.largest_r_hat)
 
 
 def _keys(seed: int, numbers: np.ndarray) -> np.ndarray:
@@ -252,6 +305,12 @@ class _Row:
         weights = np.where(trusted[:, None], found.weights, even)[converged]
         self._describe(at[converged], _rows(found.parameters, converged), weights)
 
+    def adapt(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
+        self._describe(at, parameters, weights)
+        self.effective_draws[at] = effective_draws(weights)
+        self.approach[at] = Approach.ADAPTED
+        self.status[at] = Status.GOOD
+
     def sample(self, at: np.ndarray, draws: Values, mixed: np.ndarray) -> None:
         count = np.asarray(next(iter(draws.values()))).shape[1]
         even = np.full((int(mixed.sum()), count), 1.0 / count)
@@ -281,5 +340,11 @@ class _Row:
                 self._quantiles[name][(slice(None), at, *own)] = found[2]
 
 
-def _rows(parameters: Values, which: np.ndarray) -> Values:
-    return {name: np.asarray(draws)[which] for name, draws in parameters.items()}
+def _normal_at(peak: Peak) -> Proposal:
+    """The normal approximation at a mode."""
+    return Proposal(np.asarray(peak.z), np.asarray(peak.widths))
+
+
+def _rows[T](values: T, which: np.ndarray) -> T:
+    """Some pixels of arrays that all begin with the axis of pixels."""
+    return jax.tree.map(lambda array: np.asarray(array)[which], values)

@@ -16,6 +16,23 @@ LARGEST_TRUSTED = 0.7
 """Pareto k above which weighted draws say little, however many there are."""
 
 
+class Points(NamedTuple):
+    """Draws of a standard distribution, the same for all pixels.
+
+    Args:
+        places: (draw, size).
+        log_density: Up to a constant, (draw,).
+    """
+
+    places: Float[np.ndarray, "draw size"]
+    log_density: Float[np.ndarray, " draw"]
+
+    def split(self, count: int) -> list["Points"]:
+        """The same in parts of one size."""
+        parts = (np.split(array, count) for array in self)
+        return [Points(*part) for part in zip(*parts, strict=True)]
+
+
 class Smoothed(NamedTuple):
     """Weights of the draws of every pixel.
 
@@ -28,7 +45,7 @@ class Smoothed(NamedTuple):
     pareto_k: Float[np.ndarray, " pixel"]
 
 
-def normal_points(count: int, size: int, seed: int) -> Float[np.ndarray, "count size"]:
+def normal_points(count: int, size: int, seed: int) -> Points:
     """Evenly spread standard normal points.
 
     Args:
@@ -47,7 +64,8 @@ def normal_points(count: int, size: int, seed: int) -> Float[np.ndarray, "count 
     """
     half = qmc.Sobol(size, rng=np.random.default_rng(seed)).random(-(-count // 2))
     points = scipy.special.ndtri(np.clip(half, 1e-12, 1.0 - 1e-12))
-    return np.stack([points, -points], axis=1).reshape(-1, size)[:count]
+    places = np.stack([points, -points], axis=1).reshape(-1, size)[:count]
+    return Points(places, -0.5 * np.sum(places**2, axis=-1))
 
 
 def smooth(log_ratios: Float[np.ndarray, "pixel draw"]) -> Smoothed:

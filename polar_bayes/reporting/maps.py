@@ -12,6 +12,7 @@ from polar_bayes.reporting.style import (
     BLUE,
     GRAY,
     GREEK,
+    GREEN,
     ORANGE,
     SKY,
     VERMILLION,
@@ -25,7 +26,7 @@ MOST_PIXELS = 800
 
 LARGEST_K = 1.0
 NO_ANSWER = lighten(GRAY, 0.75)
-APPROACHES = (lighten(GRAY, 0.75), SKY, BLUE, ORANGE)
+APPROACHES = (lighten(GRAY, 0.75), SKY, BLUE, GREEN, ORANGE)
 STATUSES = (BLUE, lighten(GRAY, 0.75), SKY, VERMILLION, ORANGE)
 
 

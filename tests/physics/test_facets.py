@@ -59,7 +59,7 @@ def test_no_facet_turns_its_back(zenith: float, side: float) -> None:
         cos_degrees(view),
         seen,
     )
-    assert facets.weight.shape == (1, 30)
+    assert facets.weight.shape == (30, 1)
     assert np.all(facets.weight > 0.0)
     np.testing.assert_allclose(facets.cos_incidence**2 + facets.sin_squared, 1.0, rtol=1e-13)
 

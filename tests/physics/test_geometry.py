@@ -166,8 +166,8 @@ def test_the_wavelength_travels_with_the_directions() -> None:
     assert geometry.wavelength.shape == (2, 1)
     assert geometry.wavelength.dtype == jnp.float32
     assert geometry.dtype == jnp.float32
-    assert geometry.per_facet().wavelength.shape == (2, 1, 1)
-    assert geometry.per_facet().view_zenith.shape == (2, 1)
+    assert geometry.per_ray().wavelength.shape == (2, 1, 1)
+    assert geometry.per_ray().view_zenith.shape == (2, 1)
     np.testing.assert_array_equal(geometry.reversed().wavelength, colors)
 
 

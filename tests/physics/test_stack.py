@@ -255,7 +255,7 @@ def test_absorption_in_a_coat_never_brings_light_back() -> None:
 def test_shapes_broadcast_over_facets() -> None:
     stack = Stack(
         jnp.array([1.5, 1.6]), (Layer(jnp.array([1.3, 1.4]), jnp.asarray(0.1)),)
-    ).per_facet()
+    ).per_ray()
     cosine = jnp.full((2, 5), 0.5)
     assert stack.reflection(cosine, 1.0 - cosine**2).mean.shape == (2, 5)
     assert stack.transmission(cosine, 1.0 - cosine**2).contrast.shape == (2, 5)

@@ -161,7 +161,7 @@ def test_one_draw_with_all_the_weight_is_the_answer() -> None:
 
 @pytest.mark.parametrize(("center", "spread"), [(0.0, 0.5), (0.4, 0.7), (-0.3, 0.9)])
 def test_weighted_draws_of_a_wide_normal_are_a_narrow_one(center: float, spread: float) -> None:
-    draws = normal_points(4096, 1, seed=10).T
+    draws = normal_points(4096, 1, seed=10).places.T
     log_ratios = stats.norm(center, spread).logpdf(draws) - stats.norm().logpdf(draws)
     found = smooth(log_ratios)
     assert found.pareto_k[0] < 0.1  # its ratios are bounded
@@ -183,7 +183,7 @@ def test_weighted_draws_of_a_wide_normal_are_a_narrow_one(center: float, spread:
 @pytest.mark.parametrize("count", [64, 256, 1024])
 @pytest.mark.parametrize("size", [1, 2, 4, 7])
 def test_points_are_standard_normal(count: int, size: int) -> None:
-    points = normal_points(count, size, seed=11)
+    points = normal_points(count, size, seed=11).places
     assert points.shape == (count, size)
     assert np.isfinite(points).all()
     assert np.abs(points.mean(axis=0)).max() < 1e-14
@@ -196,6 +196,6 @@ def test_points_are_standard_normal(count: int, size: int) -> None:
 
 
 def test_the_same_seed_gives_the_same_points() -> None:
-    one, two, other = (normal_points(128, 3, seed) for seed in (1, 1, 2))
+    one, two, other = (normal_points(128, 3, seed).places for seed in (1, 1, 2))
     assert one.tobytes() == two.tobytes()
     assert not np.isclose(one, other).all(axis=0).any()

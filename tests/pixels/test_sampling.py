@@ -4,9 +4,7 @@ import jax
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
-from plate_images import NAMES, VIEWS, planned, plate_image, stacked
-from scipy import stats
-from textbook import plate_q
+from plate_images import NAMES, VIEWS, on_a_grid, planned, plate_image, stacked
 
 from polar_bayes.pixels.engine import Engine, Settled
 from polar_bayes.pixels.fitting import _keys
@@ -34,29 +32,12 @@ def sampled(made) -> tuple[dict[str, np.ndarray], np.ndarray]:
     return engine.sample(pixels, settled.peak, CHAINS, _keys(0, np.array([40, 50, 60])))
 
 
-def on_a_grid(q: np.ndarray, error: float) -> dict[str, tuple[float, float, float]]:
-    """Mean, sd and skewness of each parameter, by adding up 800 x 800 cells."""
-    cells = (np.arange(800) + 0.5) / 800
-    index, fraction = np.meshgrid(1.2 + 0.8 * cells, cells, indexing="ij")
-    log = stats.norm(1.45, 0.15).logpdf(index) + stats.beta(2.0, 2.0).logpdf(fraction)
-    for reading, zenith in zip(q, np.radians(WEAK["view_zenith"].values), strict=True):
-        log += stats.norm(reading, error).logpdf(plate_q(index, fraction, zenith))
-    weights = np.exp(log - log.max())
-    weights /= weights.sum()
-    found = {}
-    for name, x in zip(NAMES, (index, fraction), strict=True):
-        mean = np.sum(weights * x)
-        sd = np.sqrt(np.sum(weights * (x - mean) ** 2))
-        found[name] = (mean, sd, np.sum(weights * ((x - mean) / sd) ** 3))
-    return found
-
-
 def test_a_skewed_pixel_has_the_posterior_of_a_grid(sampled) -> None:
     draws, r_hat = sampled
     assert (r_hat < 1.02).all()
     skewest = 0.0
     for pixel, q in enumerate(WEAK["q"].values[0]):
-        for name, (mean, sd, skewness) in on_a_grid(q, 0.15).items():
+        for name, (mean, sd, skewness) in on_a_grid(q, 0.15, WEAK["view_zenith"].values).items():
             chains = draws[name][pixel].reshape(CHAINS.chains, CHAINS.draws)
             # Four Monte Carlo errors: 6e-5 a comparison, 8e-4 over these twelve.
             assert abs(chains.mean() - mean) < 4.0 * array_stats.mcse(chains, method="mean")
