@@ -261,9 +261,20 @@ def effects(
 @commands.command()
 @click.argument("fit", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write.")
-def report(fit: Path, out: Path) -> None:
-    """Write the standardized report of a fit."""
-    click.echo(f"report: {pb.report(pb.load_result(fit), out)}")
+@click.option("--truth", type=click.Path(path_type=Path), help="Of a map: its simulated capture.")
+@click.option(
+    "--uncorrected", type=click.Path(path_type=Path),
+    help="With --truth: the same map without weights, to stand beside.",
+)  # fmt: skip
+def report(fit: Path, out: Path, truth: Path | None, uncorrected: Path | None) -> None:
+    """Write the standardized report of a fit, or of a map (a folder that ends in .zarr)."""
+    is_map = fit.suffix == ".zarr"
+    beside = {
+        "truth": None if truth is None else pb.open_capture(truth),
+        "uncorrected": None if uncorrected is None else pb.open_map(uncorrected),
+    }
+    page = pb.report(pb.open_map(fit) if is_map else pb.load_result(fit), out, **beside)
+    click.echo(f"report: {page}")
 
 
 def _in_setup(capture: Any, setup: str | None) -> Any:

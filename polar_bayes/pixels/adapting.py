@@ -30,11 +30,15 @@ class Proposal(NamedTuple):
 
     Args:
         center: Unconstrained vectors, (pixel, size).
-        half: Of the scale, upper triangular; NaN where there is none. (pixel, size, size).
+        half: Root of the squared scale; NaN where there is none. (pixel, size, size).
     """
 
     center: Float[np.ndarray, "pixel size"]
     half: Float[np.ndarray, "pixel size size"]
+
+    def turned(self, turns: Float[np.ndarray, "pixel size size"]) -> "Proposal":
+        """The same distribution, whose points are turned first, in each pixel by another way."""
+        return Proposal(self.center, turns @ self.half)
 
     def places(self, points: Points) -> Float[np.ndarray, "pixel draw size"]:
         """Unconstrained vectors of all draws."""

@@ -20,6 +20,7 @@ from polar_bayes.pixels.importance import (
     normal_points,
     smooth,
     summarize,
+    turns,
 )
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.stack import Stack
@@ -154,7 +155,9 @@ def fit_stack(
     size = engine.program.size
     points = normal_points(settings.draws, size, seed)
     further = heavy_points(TIMES * settings.draws, size, seed)
-    work = _Work(engine, settings, points, further.split(TIMES), further, _keys(seed, numbers))
+    keys = _keys(seed, numbers)
+    parts = further.split(TIMES)
+    work = _Work(engine, settings, points, parts, further, keys, turns(keys, size))
     for begin in range(0, enough.size, PIECE):
         work.fit(pixels, enough[begin : begin + PIECE], row)
     return row.marginals()
@@ -193,6 +196,7 @@ class _Work:
         looks: Of the proposals that are fitted to weighted draws, in parts like `points`.
         further: The same in one.
         keys: A random key for each pixel of the row.
+        turns: How each pixel of the row turns the points.
     """
 
     engine: Engine
@@ -201,11 +205,12 @@ class _Work:
     looks: list[Points]
     further: Points
     keys: np.ndarray
+    turns: np.ndarray
 
     def fit(self, pixels: Stack, at: np.ndarray, row: "_Row") -> None:
         """Fit some pixels of a row, few enough for their draws to fit into memory."""
         usable = pixels.subset(at)
-        found = self._search(usable)
+        found = self._search(usable, self.turns[at])
         row.approximate(at, found, self.settings)
         hard = np.flatnonzero(found.settled.converged & ~found.is_trusted)
         for begin in range(0, hard.size, HARD):
@@ -215,14 +220,14 @@ class _Work:
                 peak = _rows(found.settled.peak, left)
                 self._sample(self.settings.sampler, usable.subset(left), peak, at[left], row)
 
-    def _search(self, pixels: Stack) -> _Found:
+    def _search(self, pixels: Stack, turns: np.ndarray) -> _Found:
         """Fit from the best candidate; pixels in doubt start again, and keep the lower mode."""
-        found = self._approximate(pixels, rank=0)
+        found = self._approximate(pixels, turns, rank=0)
         for rank in RESTARTS:
             doubtful = np.flatnonzero(~found.is_trusted)
             if not doubtful.size:
                 break
-            again = self._approximate(pixels.subset(doubtful), rank=rank)
+            again = self._approximate(pixels.subset(doubtful), turns[doubtful], rank=rank)
             old, new = found.settled, again.settled
             lower = new.peak.value < old.peak.value[doubtful] - SAME_MODE
             better = new.converged & (~old.converged[doubtful] | lower)
@@ -230,9 +235,9 @@ class _Work:
                 whole[doubtful[better]] = part[better]
         return found
 
-    def _approximate(self, pixels: Stack, *, rank: int) -> _Found:
+    def _approximate(self, pixels: Stack, turns: np.ndarray, *, rank: int) -> _Found:
         settled = self.engine.climb(pixels, rank)
-        proposal, weighted = _normal_at(settled.peak), self.settings.weighted
+        proposal, weighted = _normal_at(settled.peak).turned(turns), self.settings.weighted
         parameters, ratios = self.engine.draw(pixels, proposal, self.points, weighted=weighted)
         if weighted:
             weights, pareto_k = smooth(ratios)
@@ -243,12 +248,12 @@ class _Work:
 
     def _adapt(self, pixels: Stack, normal: _Found, at: np.ndarray, row: "_Row") -> np.ndarray:
         """Fit proposals to their own weighted draws; which pixels are left without an answer."""
-        left = np.arange(len(pixels))
-        places, weights = normal.proposal.places(self.points), normal.weights
+        left, turns = np.arange(len(pixels)), self.turns[at]
+        places, weights = normal.proposal.turned(turns).places(self.points), normal.weights
         for _ in range(self.settings.rounds):
             if not left.size:
                 break
-            proposal, some = learn(places, weights), pixels.subset(left)
+            proposal, some = learn(places, weights).turned(turns[left]), pixels.subset(left)
             looks = [self.engine.draw(some, proposal, x, weighted=True) for x in self.looks]
             parameters, ratios = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *looks)
             weights, pareto_k = smooth(ratios)

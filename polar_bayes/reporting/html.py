@@ -1,19 +1,13 @@
 """The standard report: one page that stands alone, with the result beside it."""
 
-import base64
-import dataclasses
-import io
+import functools
 import math
 import os
-import re
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import xarray as xr
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from polar_bayes.budget.ledger import ledger_sentence
@@ -28,67 +22,60 @@ from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import save_result
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import figures, sentences, tables
+from polar_bayes.reporting.map_page import render_map
+from polar_bayes.reporting.page import Picture, fill, picture, write_page
 from polar_bayes.reporting.population import shrinkage_plot
 from polar_bayes.reporting.provenance import provenance_groups, swapped_sentence
 from polar_bayes.reporting.readings import variables
 from polar_bayes.reporting.spectrum import spectra, spectrum
-from polar_bayes.reporting.style import QUANTITIES, STYLE
+from polar_bayes.reporting.style import QUANTITIES
 
-PAGE = "index.html"
 RESULT = "result.nc"
 MOST_POPULATIONS = 6
 
 
-@dataclasses.dataclass(frozen=True)
-class Picture:
-    """A figure on the page.
-
-    Args:
-        source: The image itself, as a data URI.
-        alternative: What it shows, for readers who cannot see it.
-        caption: How to read it.
-        wide: True for many panels; small screens scroll it in its own box.
-    """
-
-    source: str
-    alternative: str
-    caption: str
-    wide: bool
-
-
-def report(result: xr.DataTree, directory: str | os.PathLike[str]) -> Path:
-    """Write the standard report of a fit: `index.html` and, beside it, `result.nc`.
+def report(
+    result: xr.DataTree | xr.Dataset,
+    directory: str | os.PathLike[str],
+    *,
+    truth: xr.Dataset | None = None,
+    uncorrected: xr.Dataset | None = None,
+) -> Path:
+    """Write the standard report of a fit or of a map: one page, `index.html`.
 
     The page needs no network, no script and no other file. Everything on it is computed from the
-    result, so a report of a file read back is the same report.
+    result, so a report of a file read back is the same report. Beside the page of a fit lies
+    `result.nc`; a map, which may be large, stays where it is.
 
     Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+        result: A tree that `polar_bayes.fit` returned, or maps of `polar_bayes.fit_pixels`; or
+            one of them read back from a file.
         directory: The folder; made if it is not there. An older report in it is replaced.
+        truth: Of maps: the simulated capture, whose `true_<parameter>` the intervals are checked
+            against.
+        uncorrected: Of maps, with `truth`: those of the same image by
+            `PixelLaplace(weighted=False)`, whose coverage is put beside.
 
     Returns:
         The path of the page.
 
     Raises:
-        CaptureError: The directory is no path.
-        FitError: The tree holds no posterior, or the folder cannot be written.
+        CaptureError: The directory is no path, or `truth` does not fit the maps.
+        FitError: It holds no posterior and no maps, an argument does not apply, or the folder
+            cannot be written.
     """
     folder = as_path(directory, "report")
+    if isinstance(result, xr.Dataset):
+        return write_page(folder, render_map(result, truth, uncorrected))
+    for name, given in (("truth", truth), ("uncorrected", uncorrected)):
+        if given is not None:
+            raise FitError(
+                "it goes with maps only",
+                where=f"report: {name}",
+                mend="leave it out: a fit carries the truth of its capture",
+            )
     page = render(result)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".report-") as unfinished:
-            (Path(unfinished) / PAGE).write_text(page, encoding="utf-8")
-            save_result(result, Path(unfinished) / RESULT)
-            for name in (RESULT, PAGE):
-                (Path(unfinished) / name).replace(folder / name)
-    except OSError as error:
-        raise FitError(
-            (error.strerror or str(error)).lower(),
-            where=str(folder),
-            mend="give a folder that can be written",
-        ) from error
-    return folder / PAGE
+    return write_page(folder, page, {RESULT: functools.partial(save_result, result)})
 
 
 def render(result: xr.DataTree) -> str:
@@ -142,15 +129,7 @@ def render(result: xr.DataTree) -> str:
         "model_source": str(provenance.get("model_source") or ""),
         "pictures": _pictures(result, checks, method),
     }
-    environment = Environment(
-        loader=PackageLoader("polar_bayes.reporting"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["plain_letters"] = lambda text: re.sub(r"[^a-z0-9]", "", text.lower())
-    return environment.get_template("report.html.j2").render(content)
+    return fill("report.html.j2", content)
 
 
 def _without(
@@ -190,7 +169,7 @@ def _population(result: xr.DataTree, posterior: xr.Dataset) -> dict[str, Any] | 
         "members": tables.member_table(result, members, found),
         "left_out": max(len(drawn) - MOST_POPULATIONS, 0),
         "pictures": [
-            _picture(
+            picture(
                 shrinkage_plot(result, label, summary, members),
                 f"Shrinkage of {label}: each member alone and pooled",
                 caption if at == 0 else "The same.",
@@ -212,7 +191,7 @@ def _spectrum_pictures(result: xr.DataTree) -> list[Picture]:
         "ties the colors together, so it says nothing in between. Orange: true values, where known."
     )
     return [
-        _picture(
+        picture(
             spectrum(result, name, found),
             f"{name.replace('_', ' ').capitalize()} against wavelength",
             tied if found[name][0].between.size else free,
@@ -281,7 +260,7 @@ def _reading_pictures(result: xr.DataTree, has_draws: bool) -> list[Picture]:
     for name in variables(result):
         quantity = QUANTITIES[name]
         pictures.append(
-            _picture(
+            picture(
                 figures.readings(result, name),
                 f"Readings of {quantity} and the fitted curve against view zenith",
                 f"Readings of {quantity} with the fitted curve{bands if has_draws else '.'}",
@@ -289,7 +268,7 @@ def _reading_pictures(result: xr.DataTree, has_draws: bool) -> list[Picture]:
         )
         if name != "intensity":
             pictures.append(
-                _picture(
+                picture(
                     figures.residuals(result, name),
                     f"Readings of {quantity} minus the fitted curve against view zenith",
                     "The same after subtracting the fitted curve. A wave that many neighbors "
@@ -302,18 +281,4 @@ def _reading_pictures(result: xr.DataTree, has_draws: bool) -> list[Picture]:
 def _optional(
     applies: bool, draw: Callable[[], Figure], alternative: str, caption: str
 ) -> list[Picture]:
-    return [_picture(draw(), alternative, caption)] if applies else []
-
-
-def _picture(figure: Figure, alternative: str, caption: str) -> Picture:
-    buffer = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
-        # No date and a fixed salt: the same result gives the same page, byte for byte.
-        figure.savefig(buffer, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
-    encoded = base64.b64encode(buffer.getvalue()).decode("ascii")
-    return Picture(
-        source=f"data:image/svg+xml;base64,{encoded}",
-        alternative=alternative,
-        caption=caption,
-        wide=figure.get_figwidth() > 7.0,
-    )
+    return [picture(draw(), alternative, caption)] if applies else []

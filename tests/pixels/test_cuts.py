@@ -63,14 +63,13 @@ def test_a_pixel_alone_gets_the_same_bits(image: xr.Dataset, plan: Plan, whole: 
         assert_same_bits(alone, whole.isel(place))
 
 
-def test_a_mirrored_image_gives_mirrored_maps(
+def test_a_mirrored_image_has_mirrored_modes(
     image: xr.Dataset, plan: Plan, whole: xr.Dataset
 ) -> None:
-    there = whole["approach"].values != Approach.NUTS
     mirrored = mapped(image.isel(x=slice(None, None, -1)), plan).isel(x=slice(None, None, -1))
-    # Chains follow the number of a pixel, which has changed; everything else is as before.
-    for name, values in mirrored.items():
-        assert np.array_equal(values.values[..., there], whole[name].values[..., there]), name
+    # Draws follow the number of a pixel, which has changed; where it climbs to does not.
+    for name in ("steps", "condition"):
+        assert mirrored[name].values.tobytes() == whole[name].values.tobytes(), name
 
 
 def test_chunks_on_threads_give_the_same_bits(image: xr.Dataset, whole: xr.Dataset) -> None:

@@ -1,5 +1,6 @@
 """Weights of draws: those of ArviZ, at the edges too; what weighted draws say, in closed form."""
 
+import jax
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
@@ -7,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from polar_bayes.pixels.importance import effective_draws, normal_points, smooth, summarize
+from polar_bayes.pixels.importance import effective_draws, normal_points, smooth, summarize, turns
 
 
 def theirs(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -199,3 +200,30 @@ def test_the_same_seed_gives_the_same_points() -> None:
     one, two, other = (normal_points(128, 3, seed).places for seed in (1, 1, 2))
     assert one.tobytes() == two.tobytes()
     assert not np.isclose(one, other).all(axis=0).any()
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_turns_keep_lengths_and_favor_no_direction(size: int) -> None:
+    keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(12), 4000)))
+    found = turns(keys, size)
+    unit = np.broadcast_to(np.eye(size), found.shape)
+    np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), unit, atol=1e-12)
+    # Entries of a random direction have mean 0 and mean square 1 / size: 5 standard errors.
+    assert np.abs(found.mean(axis=0)).max() < 5.0 / np.sqrt(4000.0 * size)
+    assert np.abs((found**2).mean(axis=0) - 1.0 / size).max() < 5.0 * 0.5 / np.sqrt(4000.0)
+    assert turns(keys[7:8], size)[0].tobytes() == found[7].tobytes()
+
+
+def test_what_few_points_get_wrong_of_a_quantile_averages_out_over_pixels() -> None:
+    """Without turns a half interval holds some percent less, or more, in all pixels alike."""
+    size, pixels = 4, 2000
+    points = normal_points(256, size, seed=13).places
+    keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(14), pixels)))
+    lengthwise = np.ones(size) / size**0.5
+    draws = points @ (turns(keys, size) @ lengthwise)[:, :, None]
+    even = np.full((pixels, 256), 1.0 / 256)
+    _, _, (low, high) = summarize(draws[..., 0], even, (0.25, 0.75))
+    held = stats.norm.cdf(high) - stats.norm.cdf(low)
+    error = held.std() / pixels**0.5
+    assert abs(held.mean() - 0.5) < 4.0 * error + 1e-3  # interpolation between draws
+    assert error < 1e-3

@@ -1,0 +1,166 @@
+"""How often do the intervals of a map hold the truth?"""
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pandas as pd
+import scipy.stats
+import xarray as xr
+
+from polar_bayes.diagnostics.parameters import Scalar, scalars
+from polar_bayes.errors import CaptureError, FitError
+from polar_bayes.pixels.fitting import Status
+from polar_bayes.pixels.maps import cut
+from polar_bayes.pixels.opening import at_hand
+from polar_bayes.pixels.stack import IMAGE
+
+INTERVALS = {50: (0.25, 0.75), 80: (0.1, 0.9), 95: (0.025, 0.975)}
+"""Percent, and the levels of both ends."""
+
+CASES = ("unknown", "masked", "unanswered", "answered")
+COLUMNS = (
+    *CASES,
+    *(f"held_{each}{end}" for each in INTERVALS for end in ("", "_low", "_high", "_of_read")),
+)
+BLOCK = 65536
+"""Pixels that are looked at together: a chunk of a store."""
+
+
+def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
+    """How often the intervals of a map hold the truth.
+
+    A pixel has an answer where its status is good. Of those whose truth is known, the share is
+    counted whose central 50, 80 and 95% interval holds it, ends included, in the precision of the
+    maps. What has no answer cannot be right or wrong: `held_50_of_read` counts it as a miss, so
+    that no map looks better for the pixels on which it gave up.
+
+    Truths that were drawn from the priors should be held by a share of pixels as large as the
+    intervals say. Of truths that were chosen, only their mean over the priors should.
+
+    Args:
+        maps: Of `polar_bayes.fit_pixels`, or opened from a store.
+        truth: The simulated capture: `true_<parameter>`, one number or over axes of the map.
+
+    Returns:
+        A row for each parameter whose truth is known (and wavelength, where it has several), with
+        pixels whose truth is `unknown` (NaN), that are `masked` (never read), `unanswered` (read,
+        without an answer) and `answered`: counts that add up to the image. For each interval, as
+        for 50%: `held_50`, share of those answered; `held_50_low` and `held_50_high`, its 95%
+        interval (Wilson's, as if pixels were independent); `held_50_of_read`, share of those
+        answered and unanswered. NaN where there are none.
+
+    Raises:
+        CaptureError: It knows no parameter of the map, or is of another image.
+        FitError: It holds no maps, or they are in chunks and too large for memory.
+
+    Source:
+        Wilson (1927), JASA 22(158), 209-212: the interval of a share.
+    """
+    found = map_scalars(maps)
+    names = {scalar.name for scalar in found}
+    known = {name: true for name in names if (true := _truth_of(maps, truth, name)) is not None}
+    if not known:
+        raise CaptureError(
+            "it knows the truth of no parameter of the map",
+            where=_name_of(truth),
+            mend=f"give a simulated capture, with one of {', '.join(sorted(names))} as `true_...`",
+        )
+    maps = at_hand(maps)
+    counts: dict[str, np.ndarray] = {}
+    for place in cut(maps, BLOCK):
+        for name, true in known.items():
+            here = true.isel({dim: part for dim, part in place.items() if dim in true.dims})
+            bounds = maps[f"{name}_quantile"].isel(place)
+            added = _count(maps["status"].isel(place).load(), bounds.load(), here.load())
+            counts[name] = counts.get(name, 0) + added
+    shown = [scalar for scalar in found if scalar.name in known]
+    places = [tuple(scalar.index.values()) for scalar in shown]
+    rows = [
+        _row([int(case[place]) for case in counts[scalar.name]])
+        for scalar, place in zip(shown, places, strict=True)
+    ]
+    labels = pd.Index([scalar.label for scalar in shown], dtype=object)
+    return pd.DataFrame(rows, columns=list(COLUMNS), index=labels)
+
+
+def map_scalars(maps: xr.Dataset) -> list[Scalar]:
+    """The numbers that a map has in each pixel, labeled and in the order of a fit of one.
+
+    Args:
+        maps: Of `polar_bayes.fit_pixels`, or opened from a store.
+
+    Returns:
+        Scalars without draws: values stand in the maps.
+
+    Raises:
+        FitError: It holds no maps.
+    """
+    names = [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
+    if not names or "status" not in maps:
+        raise FitError("it holds no maps", where="maps", mend="give what fit_pixels returns")
+    # An empty corner has the axes and labels of a posterior, and nothing is read.
+    corner = maps[names].isel({dim: slice(1) for dim in IMAGE}).drop_vars(IMAGE, errors="ignore")
+    return scalars(xr.zeros_like(corner).rename(dict(zip(IMAGE, ("chain", "draw"), strict=True))))
+
+
+def _truth_of(maps: xr.Dataset, truth: xr.Dataset, name: str) -> xr.DataArray | None:
+    """The truth of a parameter, where it is known over its own axes or fewer."""
+    true, mean = truth.get(f"true_{name}"), maps[name]
+    if true is None or not set(true.dims) <= set(mean.dims):
+        return None
+    try:
+        xr.align(true, mean, join="exact")
+    except ValueError as error:
+        sizes = " and ".join(
+            " x ".join(f"{dim} {each.sizes[dim]}" for dim in true.dims) for each in (true, mean)
+        )
+        raise CaptureError(
+            f"true_{name} and the map stand on different axes ({sizes})",
+            where=_name_of(truth),
+            mend="give the capture of which the map was made",
+        ) from error
+    return true
+
+
+def _name_of(truth: xr.Dataset) -> str:
+    return str(truth.attrs.get("name", "truth"))
+
+
+def _count(status: xr.DataArray, bounds: xr.DataArray, true: xr.DataArray) -> np.ndarray:
+    """Pixels of a block by case, then those held by each interval: (case, own axes)."""
+    own = [dim for dim in bounds.dims if dim not in ("quantile", *IMAGE)]
+    true = true.astype(bounds.dtype)
+    is_known, is_masked = true.notnull(), status == Status.MASKED
+    has_answer = is_known & (status == Status.GOOD) & bounds.notnull().all("quantile")
+    cases = [
+        ~is_known,
+        is_known & is_masked,
+        is_known & ~is_masked & ~has_answer,
+        has_answer,
+        *(has_answer & inside for inside in _inside(bounds, true)),
+    ]
+    whole = bounds.isel(quantile=0, drop=True)
+    return np.stack(
+        [case.broadcast_like(whole).sum(IMAGE).transpose(*own).to_numpy() for case in cases]
+    )
+
+
+def _inside(bounds: xr.DataArray, true: xr.DataArray) -> Iterator[xr.DataArray]:
+    for low, high in INTERVALS.values():
+        least, most = (bounds.sel(quantile=level, drop=True) for level in (low, high))
+        yield (least <= true) & (true <= most)
+
+
+def _row(counts: Sequence[int]) -> list[float]:
+    *cases, answered = counts[: len(CASES)]
+    read = answered + cases[CASES.index("unanswered")]
+    row: list[float] = [*cases, answered]
+    for held in counts[len(CASES) :]:
+        low, high = math.nan, math.nan
+        if answered:
+            sure = scipy.stats.binomtest(held, answered).proportion_ci(0.95, method="wilson")
+            low, high = float(sure.low), float(sure.high)
+        row += [held / answered if answered else math.nan, low, high]
+        row += [held / read if read else math.nan]
+    return row

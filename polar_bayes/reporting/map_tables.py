@@ -1,0 +1,298 @@
+"""What a map says in numbers and sentences: its pixels, its parameters, its coverage."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from polar_bayes.diagnostics.coverage import BLOCK, INTERVALS
+from polar_bayes.diagnostics.parameters import Scalar
+from polar_bayes.physics.notation import notation
+from polar_bayes.pixels.fitting import FEWEST_VIEWS, Status
+from polar_bayes.pixels.importance import LARGEST_TRUSTED
+from polar_bayes.pixels.maps import cut
+from polar_bayes.reporting.style import GREEK, place_of, plain
+from polar_bayes.reporting.tables import INSTRUMENT, MAIN, Row, Table
+from polar_bayes.reporting.text import DASH, numbers, percent, spoken
+
+FEW = 0.95
+"""Below this share of answers among the pixels that were read, the page warns."""
+
+SLIGHT = 0.01
+"""Coverage that is off by less is not worth a warning, however many pixels tell it."""
+
+MOST_NAMED = 6
+
+STATUSES = {
+    "good": "an answer that the checks let pass",
+    "masked": "no valid reading",
+    "too few views": f"fewer than {FEWEST_VIEWS} valid views",
+    "not converged": "no mode was reached; NaN",
+    "not trusted": "numbers of the bare normal approximation, which no check confirms",
+}
+APPROACHES = {
+    "none": "no numbers",
+    "laplace": "the normal approximation as it is",
+    "importance": "the normal approximation corrected by weights",
+    "adapted": "a proposal fitted to its own draws and corrected by weights",
+    "nuts": "sampling (NUTS)",
+}
+
+
+def count_cases(maps: xr.Dataset) -> pd.DataFrame:
+    """Pixels of a map by status (rows) and approach (columns), both in words.
+
+    Args:
+        maps: Of `polar_bayes.fit_pixels`, or opened from a store.
+
+    Returns:
+        Counts; block by block, so that a large map stays where it is.
+    """
+    rows, columns = (_meanings(maps[name]) for name in ("status", "approach"))
+    size = max(*rows, *columns) + 1
+    counts = np.zeros(size * size, int)
+    for place in cut(maps, BLOCK):
+        status, approach = (
+            maps[name].isel(place).to_numpy().ravel().astype(int) for name in ("status", "approach")
+        )
+        counts += np.bincount(status * size + approach, minlength=size * size)
+    table = pd.DataFrame(counts.reshape(size, size)).loc[list(rows), list(columns)]
+    return table.set_axis(list(rows.values()), axis=0).set_axis(list(columns.values()), axis=1)
+
+
+def _meanings(flags: xr.DataArray) -> dict[int, str]:
+    """Words of each flag: those that the map itself knows, whatever became of the code since."""
+    words = [word.replace("_", " ") for word in str(flags.attrs["flag_meanings"]).split()]
+    values = np.asarray(flags.attrs.get("flag_values", range(len(words))))
+    return dict(zip(map(int, values), words, strict=True))
+
+
+def headline(cases: pd.DataFrame) -> tuple[str, bool]:
+    """How many pixels have an answer, and whether that is enough."""
+    good, read = answers(cases)
+    if read == 0:
+        return "No pixel was read: these maps are empty.", False
+    if good == 0:
+        return "No pixel has an answer: do not use these maps.", False
+    if good == read:
+        return "Every pixel that was read has an answer.", True
+    said = f"{good:,} of {read:,} pixels that were read have an answer ({share(good, read)})."
+    return said, good >= FEW * read
+
+
+def answers(cases: pd.DataFrame) -> tuple[int, int]:
+    """Pixels that have an answer, and pixels that were read."""
+    by_status = cases.sum(axis=1)
+    read = int(by_status.sum() - by_status.get("masked", 0))
+    return int(by_status.get("good", 0)), read
+
+
+def share(count: int, whole: int) -> str:
+    """A share that says 0 and 100% only where it is meant."""
+    if whole == 0:
+        return DASH
+    said = percent(count / whole)
+    if count < whole and said == "100%":
+        return "above 99.5%" if count / whole < 0.9995 else "above 99.9%"
+    return "below 0.1%" if count > 0 and said == "0.0%" else said
+
+
+def verdict(cases: pd.DataFrame) -> list[str]:
+    """What became of the pixels, in sentences."""
+    count = {str(word): int(number) for word, number in cases.sum(axis=1).items()}
+    every = sum(count.values())
+    said = []
+    if count.get("good"):
+        by = {str(way): int(number) for way, number in cases.loc["good"].items() if number}
+        ways = [
+            f"{'all' if len(by) == 1 else format(number, ',')} by {APPROACHES.get(way, way)}"
+            for way, number in by.items()
+        ]
+        said.append(
+            f"Of {every:,} pixels {count['good']:,} are good ({share(count['good'], every)}): "
+            f"{spoken(ways)}."
+        )
+    phrases = {
+        "masked": "{} masked: no reading there is valid.",
+        "too few views": f"{{}} read in fewer than {FEWEST_VIEWS} views and not fitted.",
+        "not converged": "{} not converged: from no start was a mode reached, and the maps are "
+        "NaN there.",
+        "not trusted": f"{{}} not trusted: Pareto k is above {LARGEST_TRUSTED:g}, and nothing else "
+        "confirmed the approximation. The maps show its numbers there; do not quote them.",
+    }
+    for word, phrase in phrases.items():
+        if number := count.get(word):
+            are = "pixels are" if number > 1 else "pixel is"
+            said.append(phrase.format(f"{number:,} {are}"))
+    return said
+
+
+def status_table(cases: pd.DataFrame) -> Table:
+    """Pixels by status."""
+    caption = "What became of each pixel. Only good ones count in the other tables."
+    return _cases_table("status", cases.sum(axis=1), STATUSES, caption)
+
+
+def approach_table(cases: pd.DataFrame) -> Table:
+    """Pixels by approach, and how many of them are good."""
+    caption = "How the numbers of each pixel were found, from the cheapest way to the dearest."
+    good = cases.loc["good"] if "good" in cases.index else 0 * cases.sum()
+    return _cases_table("approach", cases.sum(), APPROACHES, caption, good)
+
+
+def _cases_table(
+    head: str,
+    counts: pd.Series,
+    meanings: Mapping[str, str],
+    caption: str,
+    good: pd.Series | None = None,
+) -> Table:
+    every = int(counts.sum())
+    rows = []
+    for word, count in counts.items():
+        cells = [f"{int(count):,}", share(int(count), every)]
+        cells += [] if good is None else [f"{int(good[word]):,}"]
+        rows.append(Row(str(word), meanings.get(str(word), str(word)), tuple(cells)))
+    heads = (head, "pixels", "share", *([] if good is None else ["good"]))
+    return Table(caption, heads, tuple(rows))
+
+
+def parameter_table(maps: xr.Dataset, found: Sequence[Scalar]) -> Table:
+    """Every parameter over the good pixels: what it is, how it varies, how well it is known."""
+    rows = []
+    for scalar in found:
+        mean = _over_good(maps, scalar, "")
+        sd, width = _over_good(maps, scalar, "_sd"), _over_good(maps, scalar, "_quantile")
+        middles = [float(np.median(each)) if each.size else math.nan for each in (mean, sd, width)]
+        ends = np.quantile(mean, [0.05, 0.95]).tolist() if mean.size else [math.nan] * 2
+        scale = middles[1]
+        cells = [
+            *numbers([middles[0], *ends], scale),
+            *numbers([middles[1]], scale),
+            *numbers([middles[2]], scale),
+        ]
+        rows.append(_row(scalar, named(scalar), cells))
+    heads = ("parameter", "median", "5% below", "5% above", "typical sd", "95% width")
+    caption = (
+        "Over the good pixels: median of the posterior means, the values that 5% of them lie "
+        "below and above, and medians of the standard deviations and of the widths of the 95% "
+        "intervals. Means differ from pixel to pixel because the material does and because each "
+        "is uncertain: where the spread is not much larger than the sd, it says little about the "
+        "material."
+    )
+    return Table(caption, heads, tuple(rows))
+
+
+def _over_good(maps: xr.Dataset, scalar: Scalar, ending: str) -> np.ndarray:
+    """Values of one map over the good pixels, or widths of its 95% intervals: (pixel,)."""
+    values = maps[f"{scalar.name}{ending}"].isel(scalar.index)
+    ends = INTERVALS[95]
+    found = []
+    for place in cut(maps, BLOCK):
+        here = values.isel(place).load()
+        if "quantile" in here.dims:
+            low, high = (here.sel(quantile=level, drop=True) for level in ends)
+            here = high - low
+        good = maps["status"].isel(place) == Status.GOOD
+        found.append(here.to_numpy()[(good & here.notnull()).transpose(*here.dims).to_numpy()])
+    return np.concatenate(found)
+
+
+def coverage_table(
+    found: Sequence[Scalar], coverage: pd.DataFrame, uncorrected: pd.DataFrame | None
+) -> Table:
+    """How often the intervals hold the truth, beside those of a map that was not corrected."""
+    heads = ["parameter", "interval"]
+    ways = ["holds the truth"] if uncorrected is None else ["corrected", "uncorrected"]
+    heads += [head for way in ways for head in (way, "within", "of all read")]
+    rows = []
+    for scalar in found:
+        if scalar.label not in coverage.index:
+            continue
+        for claimed in INTERVALS:
+            cells = [f"{claimed}%"]
+            for table in (coverage, uncorrected):
+                if table is not None:
+                    cells += _held(table, scalar.label, claimed)
+            words = named(scalar) if claimed == min(INTERVALS) else scalar.label
+            rows.append(_row(scalar, words, cells))
+    caption = (
+        "Share of the pixels with an answer whose central interval holds the true value, and the "
+        "95% interval within which so many pixels tell that share. Of all read: the same where a "
+        "pixel that was read and has no answer counts as a miss. Right intervals hold the truth as "
+        "often as they say if the truths are drawn from the priors; of truths that were chosen, "
+        "some are held more often and some less. Marked: too few, beyond chance and by more than "
+        f"{100 * SLIGHT:g} in 100 pixels."
+    )
+    return Table(caption, tuple(heads), tuple(rows))
+
+
+def _held(table: pd.DataFrame, label: str, claimed: int) -> list[str]:
+    if label not in table.index:
+        return [DASH] * 3
+    row = table.loc[label]
+    held, low, high, of_read = (
+        row[f"held_{claimed}{end}"] for end in ("", "_low", "_high", "_of_read")
+    )
+    said = _precise(held)
+    known = f"{100 * low:.1f}{DASH}{_precise(high)}" if math.isfinite(low) else DASH
+    return [f"{said} (too few)" if _off(row, claimed) < 0 else said, known, _precise(of_read)]
+
+
+def _precise(value: float) -> str:
+    return f"{value:.1%}" if math.isfinite(value) else DASH
+
+
+def _off(row: pd.Series, claimed: int) -> int:
+    """-1 where intervals hold the truth too seldom, 1 where too often, 0 where rightly."""
+    by = row[f"held_{claimed}"] - claimed / 100
+    if by < -SLIGHT and row[f"held_{claimed}_high"] < claimed / 100:
+        return -1
+    return int(by > SLIGHT and row[f"held_{claimed}_low"] > claimed / 100)
+
+
+def covered(found: Sequence[Scalar], coverage: pd.DataFrame) -> list[str]:
+    """Whether the 95% intervals hold the truth as often as they say, in sentences."""
+    groups: dict[int, list[str]] = {}
+    for scalar in found:
+        if scalar.label in coverage.index and coverage.loc[scalar.label, "answered"]:
+            row = coverage.loc[scalar.label]
+            said = f"{named(scalar)} ({row['held_95']:.1%})"
+            groups.setdefault(_off(row, 95), []).append(said)
+    phrases = {
+        0: "The 95% intervals hold the truth about as often as they say: {}.",
+        1: "The 95% intervals hold the truth more often than they say: {}.",
+        -1: "The 95% intervals hold the truth less often than they say: {}.",
+    }
+    return [phrases[off].format(_few(groups[off])) for off in phrases if off in groups]
+
+
+def counted(coverage: pd.DataFrame) -> list[str]:
+    """Which pixels the coverage counts, and which it leaves out."""
+    said = []
+    for counts, rows in coverage.groupby(["unknown", "masked", "unanswered", "answered"]):
+        *others, answered = (int(count) for count in counts)
+        reasons = ("of unknown truth", "masked", "read without an answer")
+        aside = [f"{n:,} {why}" for n, why in zip(others, reasons, strict=True) if n]
+        whose = "" if len(rows) == len(coverage) else f"{_few(list(rows.index))}: "
+        left = f" Left out: {spoken(aside)}." if aside else " None is left out."
+        said.append(f"{whose}{answered:,} pixels with an answer are counted.{left}")
+    return said
+
+
+def named(scalar: Scalar) -> str:
+    """A parameter in words, with its unit and place."""
+    symbol, meaning, unit = notation(scalar.name)
+    words = f"{meaning} {GREEK.get(symbol, symbol)}".strip() + (f" [{unit}]" if unit != "1" else "")
+    return plain(", ".join([words, *(place_of(d, x) for d, x in scalar.labels.items())]))
+
+
+def _row(scalar: Scalar, words: str, cells: Sequence[str]) -> Row:
+    return Row(scalar.label, words, tuple(cells), MAIN if scalar.is_material else INSTRUMENT)
+
+
+def _few(names: Sequence[str]) -> str:
+    more = len(names) - MOST_NAMED
+    return spoken([*names[:MOST_NAMED], *([f"{more} more"] if more > 0 else [])])

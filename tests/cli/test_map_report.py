@@ -1,0 +1,52 @@
+"""`polar-bayes report` of a map: told by the end of its name."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from synthetic_maps import make_maps
+
+from polar_bayes.cli import main
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    mean = {"roughness": np.full((4, 5), 0.5)}
+    make_maps(mean).to_zarr(tmp_path / "map.zarr", consolidated=False)
+    make_maps(mean, weighted=False).to_zarr(tmp_path / "bare.zarr", consolidated=False)
+    truth = xr.Dataset({"true_roughness": 0.5}, attrs={"name": "leaf"})
+    truth.to_zarr(tmp_path / "leaf.zarr", consolidated=False)
+    return tmp_path
+
+
+def test_a_map_has_a_page(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["report", str(files / "map.zarr"), "--out", str(files / "report")]
+    assert main(words) == 0
+    page = files / "report" / "index.html"
+    assert capsys.readouterr().out == f"report: {page}\n"
+    assert "Map report: map" in page.read_text()
+    words += ["--truth", str(files / "leaf.zarr"), "--uncorrected", str(files / "bare.zarr")]
+    assert main(words) == 0
+    assert "Map report: leaf" in page.read_text()
+    assert "uncorrected" in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["nowhere.zarr"], "nowhere.zarr: there is no such store"),
+        (["map.zarr", "--uncorrected", "bare.zarr"], "give truth=capture as well"),
+        (["map.zarr", "--truth", "nowhere.nc"], "nowhere.nc: there is no such file"),
+        (["map.zarr", "--truth", "leaf.zarr", "--uncorrected", "map.zarr"], "corrected as well"),
+    ],
+)
+def test_a_mistake_gets_one_line(
+    files: Path, options: list[str], says: str, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    monkeypatch.chdir(files)
+    assert main(["report", *options, "--out", "report"]) == 1
+    told = capsys.readouterr()
+    assert says in told.err
+    assert told.err.count("\n") == 1
+    assert not (files / "report").exists()

@@ -1,0 +1,48 @@
+"""Maps made by hand: every quantile, status and approach as a test wants it."""
+
+import json
+
+import numpy as np
+import xarray as xr
+
+from polar_bayes.pixels.fitting import LEVELS, Approach, Status
+
+LEVELS_HERE = np.array(LEVELS)
+
+
+def flags(names: type[Status] | type[Approach], values: np.ndarray) -> tuple:
+    words = " ".join(each.name.lower() for each in names)
+    said = {"flag_values": [int(each) for each in names], "flag_meanings": words}
+    return ("y", "x"), values.astype(np.int8), said
+
+
+def make_maps(
+    means: dict[str, np.ndarray],
+    *,
+    width: float = 1.0,
+    status: np.ndarray | None = None,
+    approach: np.ndarray | None = None,
+    wavelengths: tuple[float, ...] = (),
+    weighted: bool = True,
+    **provenance: object,
+) -> xr.Dataset:
+    """Uniform posteriors of that width about the means, (y, x) or (y, x, wavelength)."""
+    shape = next(iter(means.values())).shape[:2]
+    status = np.full(shape, Status.GOOD) if status is None else status
+    told = np.where(np.isin(status, (Status.GOOD, Status.NOT_TRUSTED)), Approach.IMPORTANCE, 0)
+    found: dict = {}
+    for name, mean in means.items():
+        axes = ("y", "x", "wavelength")[: mean.ndim]
+        nothing = np.isin(status, (Status.MASKED, Status.TOO_FEW_VIEWS, Status.NOT_CONVERGED))
+        mean = np.where(nothing.reshape(*shape, *[1] * (mean.ndim - 2)), np.nan, mean)
+        steps = (LEVELS_HERE - 0.5).reshape(-1, *[1] * mean.ndim)
+        found[name] = (axes, np.float32(mean))
+        found[f"{name}_sd"] = (axes, np.float32(0 * mean + width / np.sqrt(12.0)))
+        found[f"{name}_quantile"] = (("quantile", *axes), np.float32(mean + width * steps))
+    found["pareto_k"] = (("y", "x"), np.where(status == Status.NOT_TRUSTED, 0.9, 0.2))
+    found["status"] = flags(Status, status)
+    found["approach"] = flags(Approach, told if approach is None else approach)
+    about = {"method": "pixels", "settings": {"weighted": weighted}, "seed": 3, **provenance}
+    coords: dict = {"quantile": LEVELS_HERE}
+    coords |= {"wavelength": list(wavelengths)} if wavelengths else {}
+    return xr.Dataset(found, coords=coords, attrs={"polar_bayes": json.dumps(about)})
