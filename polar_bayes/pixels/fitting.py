@@ -156,8 +156,7 @@ def fit_stack(
     points = normal_points(settings.draws, size, seed)
     further = heavy_points(TIMES * settings.draws, size, seed)
     keys = _keys(seed, numbers)
-    parts = further.split(TIMES)
-    work = _Work(engine, settings, points, parts, further, keys, turns(keys, size))
+    work = _Work(engine, settings, points, further, keys, turns(keys, size))
     for begin in range(0, enough.size, PIECE):
         work.fit(pixels, enough[begin : begin + PIECE], row)
     return row.marginals()
@@ -193,8 +192,7 @@ class _Work:
         engine: The model of one pixel.
         settings: What is asked for.
         points: Of the normal approximations.
-        looks: Of the proposals that are fitted to weighted draws, in parts like `points`.
-        further: The same in one.
+        further: Of the proposals that are fitted to weighted draws.
         keys: A random key for each pixel of the row.
         turns: How each pixel of the row turns the points.
     """
@@ -202,7 +200,6 @@ class _Work:
     engine: Engine
     settings: PixelLaplace
     points: Points
-    looks: list[Points]
     further: Points
     keys: np.ndarray
     turns: np.ndarray
@@ -254,7 +251,10 @@ class _Work:
             if not left.size:
                 break
             proposal, some = learn(places, weights).turned(turns[left]), pixels.subset(left)
-            looks = [self.engine.draw(some, proposal, x, weighted=True) for x in self.looks]
+            looks = [
+                self.engine.draw(some, proposal, part, weighted=True)
+                for part in self.further.split(TIMES)  # as large as `points`: one program
+            ]
             parameters, ratios = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *looks)
             weights, pareto_k = smooth(ratios)
             enough = pareto_k <= LARGEST_TRUSTED
