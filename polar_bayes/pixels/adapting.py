@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.special
 from jaxtyping import Float
-from scipy.stats import qmc
 
-from polar_bayes.pixels.importance import Points
+from polar_bayes.pixels.importance import Points, even, mirrored
 
 DEGREES_OF_FREEDOM = 6.0
 """Of the tails: few enough to outlast a posterior's, many enough to waste few draws on them."""
@@ -59,11 +58,10 @@ def heavy_points(count: int, size: int, seed: int) -> Points:
     Raises:
         Nothing.
     """
-    even = qmc.Sobol(size + 1, rng=np.random.default_rng(seed)).random(-(-count // 2))
-    even = np.clip(even, 1e-12, 1.0 - 1e-12)
-    chi_squared = 2.0 * scipy.special.gammaincinv(0.5 * DEGREES_OF_FREEDOM, even[:, :1])
-    half = scipy.special.ndtri(even[:, 1:]) / np.sqrt(chi_squared / DEGREES_OF_FREEDOM)
-    places = np.stack([half, -half], axis=1).reshape(-1, size)[:count]
+    share = even(-(-count // 2), size + 1, seed)
+    chi_squared = 2.0 * scipy.special.gammaincinv(0.5 * DEGREES_OF_FREEDOM, share[:, :1])
+    half = scipy.special.ndtri(share[:, 1:]) / np.sqrt(chi_squared / DEGREES_OF_FREEDOM)
+    places = mirrored(half)[:count]
     squares = np.sum(places**2, axis=-1) / DEGREES_OF_FREEDOM
     return Points(places, -0.5 * (DEGREES_OF_FREEDOM + size) * np.log1p(squares))
 

@@ -71,7 +71,7 @@ class PixelLaplace:
             far it can be trusted (Pareto k); False takes them as they are, and says nothing.
         candidates: Prior draws among which each pixel finds its start, >= 8.
         rounds: In which the proposal of a pixel with Pareto k above 0.7 is fitted to its own
-            weighted draws, until k is below; >= 0, and 0 without weights.
+            weighted draws, until k is below; >= 0. Without weights nothing is in doubt.
         sampler: What pixels whose k is still above are handed to; None marks them only.
 
     Raises:

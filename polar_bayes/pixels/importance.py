@@ -34,6 +34,17 @@ class Points(NamedTuple):
         return [Points(*part) for part in zip(*parts, strict=True)]
 
 
+def even(count: int, size: int, seed: int) -> Float[np.ndarray, "count size"]:
+    """Scrambled Sobol' points, clear of both ends of (0, 1)."""
+    points = qmc.Sobol(size, rng=np.random.default_rng(seed)).random(count)
+    return np.clip(points, 1e-12, 1.0 - 1e-12)
+
+
+def mirrored(points: Float[np.ndarray, "half size"]) -> Float[np.ndarray, "count size"]:
+    """Each point beside its mirror image."""
+    return np.stack([points, -points], axis=1).reshape(-1, points.shape[1])
+
+
 def turns(keys: np.ndarray, size: int) -> Float[np.ndarray, "pixel size size"]:
     """A random rotation or reflection for each pixel, all equally likely.
 
@@ -89,13 +100,12 @@ def normal_points(count: int, size: int, seed: int) -> Points:
     Source:
         Owen (1998), J. Complexity 14(4), 466-489: scrambled Sobol' points.
     """
-    half = qmc.Sobol(size, rng=np.random.default_rng(seed)).random(-(-count // 2))
-    points = scipy.special.ndtri(np.clip(half, 1e-12, 1.0 - 1e-12))
+    points = scipy.special.ndtri(even(-(-count // 2), size, seed))
     distance = np.linalg.norm(points, axis=-1)
     rank = np.argsort(np.argsort(distance))
     share = (rank + 0.5) / len(points)
     points *= (np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * size, share)) / distance)[:, None]
-    places = np.stack([points, -points], axis=1).reshape(-1, size)[:count]
+    places = mirrored(points)[:count]
     return Points(places, -0.5 * np.sum(places**2, axis=-1))
 
 
