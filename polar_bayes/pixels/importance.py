@@ -62,9 +62,11 @@ def turns(keys: np.ndarray, size: int) -> Float[np.ndarray, "pixel size size"]:
         Mezzadri (2007), Notices of the AMS 54(5), 592-604.
     """
     draw = jax.vmap(
-        lambda key: jax.random.normal(jax.random.wrap_key_data(key), (size, size), np.float32)
+        lambda key: jax.random.bits(jax.random.wrap_key_data(key), (size, size), np.uint32)
     )
-    q, r = np.linalg.qr(np.asarray(draw(keys), float))
+    # Whole numbers are the same however a program was compiled, and for however many pixels.
+    share = (np.asarray(draw(keys)) + 0.5) / 2.0**32
+    q, r = np.linalg.qr(scipy.special.ndtri(share))
     return q * np.sign(np.einsum("pii->pi", r))[:, None, :]
 
 

@@ -4,13 +4,14 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterator, Mapping
 
+import jax
 import numpy as np
 import xarray as xr
 from dask.base import tokenize
 from numpyro import distributions as dist
 
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.request import resolve
+from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.data import ANGLES
 from polar_bayes.observation.links import AbstractLink
@@ -152,14 +153,27 @@ def plan_map(
         if name in capture and set(IMAGE) & set(capture[name].dims)
     )
     unit = _intensity_unit(capture)
-    layout = [
-        (name, v.dims, v.shape, str(v.dtype)) for name, v in request.capture.variables.items()
+    return Plan(request, settings, unit, own, _key(request, settings, own, unit is None))
+
+
+def _key(request: Request, settings: PixelLaplace, own: frozenset[str], has_own_unit: bool) -> str:
+    """Of all that the compiled programs depend on."""
+    variables = request.capture.variables
+    parts = [
+        request.model,
+        request.scene,
+        # Not the priors themselves: distributions keep what they have computed.
+        *(
+            (name, jax.tree.leaves(prior), str(jax.tree.structure(prior)))
+            for name, prior in request.priors.items()
+        ),
+        request.links,
+        settings,
+        (request.seed, request.precision, sorted(own), has_own_unit),
+        [(name, v.dims, v.shape, str(v.dtype)) for name, v in variables.items()],
     ]
-    key = tokenize(
-        (request.model, request.scene, request.priors, request.links),
-        (settings, seed, precision, sorted(own), unit is None, layout),
-    )
-    return Plan(request, settings, unit, own, key)
+    # One by one: a token depends on which objects of what it is made of are the same one.
+    return tokenize([tokenize(part) for part in parts])
 
 
 def number_pixels(capture: xr.Dataset) -> xr.Dataset:

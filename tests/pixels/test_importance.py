@@ -214,6 +214,15 @@ def test_turns_keep_lengths_and_favor_no_direction(size: int) -> None:
     assert turns(keys[7:8], size)[0].tobytes() == found[7].tobytes()
 
 
+@pytest.mark.usefixtures("compiled_in_haste")
+def test_turns_do_not_depend_on_how_many_there_are_or_how_they_were_compiled() -> None:
+    keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(15), 13)))
+    in_haste = turns(keys, 3)
+    jax.config.update("jax_disable_most_optimizations", False)
+    for count in (1, 2, 11):
+        assert turns(keys[:count], 3).tobytes() == in_haste[:count].tobytes()
+
+
 def test_what_few_points_get_wrong_of_a_quantile_averages_out_over_pixels() -> None:
     """Without turns a half interval holds some percent less, or more, in all pixels alike."""
     size, pixels = 4, 2000
