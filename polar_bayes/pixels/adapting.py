@@ -17,7 +17,7 @@ from polar_bayes.pixels.importance import Points, even, mirrored
 DEGREES_OF_FREEDOM = 6.0
 """Of the tails: few enough to outlast a posterior's, many enough to waste few draws on them."""
 
-TIMES = 4
+TIMES = 2
 """How many times the draws of the first look a round takes."""
 
 FEWEST_EFFECTIVE = 100

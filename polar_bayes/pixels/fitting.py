@@ -219,21 +219,25 @@ class _Work:
 
     def _search(self, pixels: Stack, turns: np.ndarray) -> _Found:
         """Fit from the best candidate; pixels in doubt start again, and keep the lower mode."""
-        found = self._approximate(pixels, turns, rank=0)
+        found = self._weigh(pixels, self.engine.climb(pixels), turns)
         for rank in RESTARTS:
             doubtful = np.flatnonzero(~found.is_trusted)
             if not doubtful.size:
                 break
-            again = self._approximate(pixels.subset(doubtful), turns[doubtful], rank=rank)
-            old, new = found.settled, again.settled
-            lower = new.peak.value < old.peak.value[doubtful] - SAME_MODE
-            better = new.converged & (~old.converged[doubtful] | lower)
+            some, old = pixels.subset(doubtful), _rows(found.settled, doubtful)
+            new = self.engine.climb(some, rank)
+            lower = new.peak.value < old.peak.value - SAME_MODE
+            better = np.flatnonzero(new.converged & (~old.converged | lower))
+            if not better.size:
+                continue
+            at = doubtful[better]
+            again = self._weigh(some.subset(better), _rows(new, better), turns[at])
             for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
-                whole[doubtful[better]] = part[better]
+                whole[at] = part
         return found
 
-    def _approximate(self, pixels: Stack, turns: np.ndarray, *, rank: int) -> _Found:
-        settled = self.engine.climb(pixels, rank)
+    def _weigh(self, pixels: Stack, settled: Settled, turns: np.ndarray) -> _Found:
+        """Draws of the normal approximations, and their weights where they are asked for."""
         proposal, weighted = _normal_at(settled.peak).turned(turns), self.settings.weighted
         parameters, ratios = self.engine.draw(pixels, proposal, self.points, weighted=weighted)
         if weighted:

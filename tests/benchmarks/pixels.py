@@ -13,6 +13,7 @@ compilation, on as many pixels as it can do in some seconds.
     ours       `Engine.climb`: mode and covariance, one thread as the others
     threads    the same, a thread for each core
     single     the same in single precision, one thread
+    both       single precision, a thread for each core
     weighed    `fit_pixels`: all of it, drawn from, weighed and summarized, on all cores
 
 The second table is the roofline: what one look at a pixel costs in operations and bytes, as the
@@ -218,6 +219,7 @@ def main(count: int) -> None:
         ours, settled = rate(many, lambda: engine.climb(pixels))
         threads, _ = rate(many, threaded(engine, pixels))
         single, near = rate(many, lambda: plans["single"].engine.climb(pixels))
+        both, _ = rate(many, threaded(plans["single"].engine, pixels))
         scipy_rate, _ = rate(60, lambda: by_scipy(engine, pixels, 60))
         guide_rate, _ = rate(200, by_guide(engine, pixels, 200))
         newton_rate, newton = rate(1024, by_newton(engine, pixels, 1024))
@@ -231,6 +233,7 @@ def main(count: int) -> None:
         "ours": ours,
         "threads": threads,
         "single": single,
+        "both": both,
         "weighed": whole,
     }.items():
         ratios = (speed / peer for peer in (scipy_rate, newton_rate, guide_rate))
