@@ -31,7 +31,7 @@ BATCH = 128
 CLIMBING = 16
 """Pixels of a batch that climb side by side: what they need stays in a core's own cache."""
 
-FEW = 16
+FEW = 4
 """The same where each pixel has chains of its own."""
 
 DRAWN = 8

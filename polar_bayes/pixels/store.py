@@ -23,7 +23,10 @@ from polar_bayes.pixels.executors import as_completed, workers
 from polar_bayes.pixels.maps import blank, cut, fit_pixels, numbered_block, plan_map, said_of
 
 BLOCK = 65536
-"""Pixels of a block, and of a chunk on the disk: few files, little memory."""
+"""Most pixels of a block, and of a chunk on the disk: few files, little memory."""
+
+PARTS, LEAST = 4, 1024
+"""Blocks of a smaller image, so that every core has work; but none has fewer pixels."""
 
 Place = dict[str, slice]
 
@@ -74,7 +77,7 @@ def map_file(
     if ledger.begin(resume=resume):
         _write_blank(image, plan, store)
         ledger.open()
-    places = [place for place in cut(image, BLOCK) if not ledger.has(place)]
+    places = [place for place in cut(image, _block(image)) if not ledger.has(place)]
     every = image.sizes["y"] * image.sizes["x"]
     done = every - sum(_size(place) for place in places)
     with workers(scheduler) as (executor, count):
@@ -222,9 +225,14 @@ def _size(place: Place) -> int:
     return math.prod(part.stop - part.start for part in place.values())
 
 
+def _block(image: xr.Dataset) -> int:
+    """Most pixels of a block; it follows from the image alone, so that work can be resumed."""
+    return min(BLOCK, max(LEAST, image.sizes["y"] * image.sizes["x"] // PARTS))
+
+
 def _write_blank(image: xr.Dataset, plan: Plan, store: Path) -> None:
     """The store with names, axes and attributes, and no values."""
-    first = next(cut(image, BLOCK))
+    first = next(cut(image, _block(image)))
     chunks = {dim: part.stop - part.start for dim, part in first.items()}
     maps = blank(image, plan).chunk(chunks)
     with _written(store):
