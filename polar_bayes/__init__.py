@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 _HOMES = {
     "budget.effects": ("ChosenScene", "choose_effects"),
     "budget.ledger": ("ledger_sentence", "ledger_summary", "ledger_table"),
+    "calibration.calibrate": ("calibrate",),
+    "calibration.verdict": ("calibration_table", "calibration_verdict", "is_calibrated"),
     "capture.combine": ("combine",),
     "capture.files": ("load_capture", "save_capture"),
     "capture.goniometer": ("from_goniometer",),
@@ -19,6 +21,8 @@ _HOMES = {
     "diagnostics.coverage": ("map_coverage",),
     "diagnostics.population": ("population_summary",),
     "errors": ("CaptureError", "FitError", "PolarBayesError", "SceneError"),
+    "identifiability.identify": ("identify",),
+    "identifiability.words": ("identifiability_sentences", "identifiability_table"),
     "inference.files": ("load_result", "save_result"),
     "inference.fit": ("fit",),
     "inference.laplace": ("Laplace",),

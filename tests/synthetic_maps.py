@@ -5,7 +5,8 @@ import json
 import numpy as np
 import xarray as xr
 
-from polar_bayes.pixels.fitting import LEVELS, Approach, Status
+from polar_bayes.pixels.fitting import Approach, Status
+from polar_bayes.pixels.marginals import LEVELS
 
 LEVELS_HERE = np.array(LEVELS)
 

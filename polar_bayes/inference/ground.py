@@ -141,7 +141,7 @@ def find_ground(
     """
     groups = find_groups(program, data)
     if groups is None or not can_be_alone(model, groups, data):
-        potential = _compile(program, data)
+        potential = compiled_potential(program, data)
         starts = np.asarray(from_prior(program, key, STARTS, data))
         modes = find_modes(potential, starts, progress)
         return WholeGround(program, data, potential, modes, _describe(modes))
@@ -156,7 +156,19 @@ def find_ground(
     return PatchGround(found, said)
 
 
-def _compile(program: Program, data: Observations) -> ValueAndGradient:
+def compiled_potential(program: Program, data: Observations) -> ValueAndGradient:
+    """Minus the log density with its gradient, compiled, for searches in NumPy.
+
+    Args:
+        program: The model.
+        data: The capture.
+
+    Returns:
+        A function of an unconstrained vector.
+
+    Raises:
+        Nothing.
+    """
     compiled = jax.jit(jax.value_and_grad(program.potential))
 
     def potential(z: np.ndarray) -> tuple[float, np.ndarray]:

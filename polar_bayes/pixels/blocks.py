@@ -9,14 +9,14 @@ import numpy as np
 import xarray as xr
 
 from polar_bayes.capture.schema import validate
-from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import dims_of
-from polar_bayes.inference.search import from_prior
 from polar_bayes.observation.data import READINGS, Observations, observe
 from polar_bayes.physics.notation import notation
 from polar_bayes.pixels.engine import Engine
-from polar_bayes.pixels.fitting import LEVELS, Approach, Marginals, PixelLaplace, Status, fit_stack
+from polar_bayes.pixels.fitting import Approach, Outcome, PixelLaplace, Status, fit_stack
+from polar_bayes.pixels.making import Recipe, make_engine
+from polar_bayes.pixels.marginals import LEVELS, Marginals
 from polar_bayes.pixels.stack import IMAGE, stack
 from polar_bayes.pixels.tracing import TRACING
 
@@ -66,8 +66,9 @@ class Plan:
     @property
     def engine(self) -> Engine:
         """The compiled programs, made at first use in each process."""
+        observe = functools.partial(self.pixel, "double")
         with TRACING:
-            return _engine_of(self)
+            return make_engine(Recipe(self.request, observe, self.settings.candidates, self.key))
 
     @property
     def layout(self) -> Layout:
@@ -77,7 +78,8 @@ class Plan:
 
     def pixel(self, precision: str) -> Observations:
         """The pixel that stands for all, as arrays."""
-        data = self.observe(self.request.capture)
+        with jax.enable_x64(True):
+            data = self.observe(self.request.capture)
         return data if precision == "double" else data.in_single_precision()
 
     @property
@@ -112,8 +114,9 @@ def fit_block(block: xr.Dataset, plan: Plan) -> xr.Dataset:
     with jax.enable_x64(True):
         readings = validate(set_aside(block.drop_vars(NUMBER)))
         pixels = stack(plan.observe(readings), plan.own_directions)
-    found = fit_stack(engine, plan.settings, pixels, plan.sizes, numbers.ravel(), plan.request.seed)
-    return maps_of(found, block, plan.layout)
+    found, seed = Marginals(len(pixels), plan.sizes), plan.request.seed
+    outcome = fit_stack(engine, plan.settings, pixels, numbers.ravel(), seed, found.describe)
+    return maps_of(found, outcome, block, plan.layout)
 
 
 def set_aside(capture: xr.Dataset) -> xr.Dataset:
@@ -135,11 +138,12 @@ def set_aside(capture: xr.Dataset) -> xr.Dataset:
     return capture.assign(valid=valid)
 
 
-def maps_of(found: Marginals, block: xr.Dataset, layout: Layout) -> xr.Dataset:
+def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, layout: Layout) -> xr.Dataset:
     """The marginals of a block as labeled maps.
 
     Args:
         found: Of its pixels, row by row.
+        outcome: What became of them.
         block: The readings.
         layout: Own axes of every parameter.
 
@@ -164,33 +168,16 @@ def maps_of(found: Marginals, block: xr.Dataset, layout: Layout) -> xr.Dataset:
             variables[f"{name}{ending}"] = ((*first, *IMAGE, *own), np.float32(whole), said)
     for name, meaning in DIAGNOSTICS.items():
         said = {"units": "1", "long_name": meaning}
-        variables[name] = (IMAGE, getattr(found, name).reshape(shape), said)
+        variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), said)
     for name, names in (("approach", Approach), ("status", Status)):
         flags: dict[str, Any] = {
             "long_name": DIAGNOSTICS[name],
             "flag_values": [int(each) for each in names],
             "flag_meanings": " ".join(each.name.lower() for each in names),
         }
-        variables[name] = (IMAGE, getattr(found, name).reshape(shape), flags)
+        variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), flags)
     coords = {dim: block.coords[dim] for dim in (*IMAGE, "wavelength") if dim in block.coords}
     return xr.Dataset(variables, coords={**coords, "quantile": list(LEVELS)})
-
-
-@functools.lru_cache(maxsize=4)
-def _engine_of(plan: Plan) -> Engine:
-    request = plan.request
-    program, rough = (_program_of(plan, precision) for precision in (request.precision, "single"))
-    with jax.enable_x64(request.precision == "double"):
-        key = jax.random.key(request.seed)
-        pixel = plan.pixel(request.precision)
-        candidates = from_prior(program, key, plan.settings.candidates, pixel)
-    return Engine(program, rough, np.asarray(candidates), request.precision).ready()
-
-
-def _program_of(plan: Plan, precision: str) -> Program:
-    with jax.enable_x64(precision == "double"):
-        model = dataclasses.replace(plan.request, precision=precision).bind(plan.request.scene)
-        return compile_program(model, plan.pixel(precision))
 
 
 @functools.lru_cache(maxsize=4)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from arviz_stats.base import array_stats
 from jaxtyping import Array
+from numpyro.diagnostics import effective_sample_size
 
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.observation.data import Observations
@@ -147,7 +148,7 @@ class Engine:
 
     def sample(
         self, pixels: Stack, peak: Peak, settings: PixelNuts, keys: Array
-    ) -> tuple[Values, np.ndarray]:
+    ) -> tuple[Values, np.ndarray, np.ndarray]:
         """Chains in every pixel.
 
         Args:
@@ -157,8 +158,8 @@ class Engine:
             keys: One for each pixel.
 
         Returns:
-            Draws of the parameters by name, each (pixel, draw, ...), and split R-hat of the worst
-            coordinate, (pixel,).
+            Draws of the parameters by name, each (pixel, draw, ...); and of the worst coordinate,
+            split R-hat and effective draws, each (pixel,).
 
         Raises:
             Nothing.
@@ -169,7 +170,8 @@ class Engine:
             given = (pixels.in_precision(self.dtype), peak.z, peak.widths, keys)
             z, draws = self._map(several, *given, batch=FEW)
         r_hat = [max(array_stats.rhat(x) for x in np.moveaxis(one, -1, 0)) for one in z]
-        return draws, np.array(r_hat)
+        effective = effective_sample_size(np.moveaxis(np.asarray(z, float), 0, 2))
+        return draws, np.array(r_hat), np.min(effective, axis=-1)
 
     @property
     def dtype(self) -> Any:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import enum
-from collections.abc import Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -19,13 +19,11 @@ from polar_bayes.pixels.importance import (
     effective_draws,
     normal_points,
     smooth,
-    summarize,
     turns,
 )
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.stack import Stack
 
-LEVELS = (0.025, 0.1, 0.25, 0.5, 0.75, 0.9, 0.975)
 FEWEST_VIEWS = 2
 RESTARTS = (1, 3, 7)
 """Ranks of the candidates from which doubtful pixels start again."""
@@ -97,14 +95,14 @@ class PixelLaplace:
             raise FitError(f"rounds is {self.rounds}", where="PixelLaplace", mend="give 0 or more")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Marginals:
-    """What a row of pixels has: NaN where a pixel has no answer.
+Describe = Callable[[np.ndarray, Values, np.ndarray], None]
+"""Told which pixels have an answer, their draws by name, and the weights of these (pixel, draw)."""
+
+
+class Outcome(NamedTuple):
+    """What became of a row of pixels: NaN where there is nothing to say.
 
     Args:
-        mean: By parameter, (pixel, ...).
-        sd: By parameter, (pixel, ...).
-        quantiles: By parameter, (level, pixel, ...), at `LEVELS`.
         pareto_k: (pixel,).
         effective_draws: What the weighted draws are worth, (pixel,).
         condition: Condition number of the curvature at the mode, (pixel,).
@@ -113,9 +111,6 @@ class Marginals:
         status: Of `Status`, (pixel,).
     """
 
-    mean: dict[str, np.ndarray]
-    sd: dict[str, np.ndarray]
-    quantiles: dict[str, np.ndarray]
     pareto_k: np.ndarray
     effective_draws: np.ndarray
     condition: np.ndarray
@@ -124,47 +119,89 @@ class Marginals:
     status: np.ndarray
 
 
+def no_outcome(count: int) -> Outcome:
+    """That of pixels that nothing is known of."""
+    return Outcome(
+        pareto_k=np.full(count, np.nan),
+        effective_draws=np.full(count, np.nan),
+        condition=np.full(count, np.nan),
+        steps=np.zeros(count, np.int32),
+        approach=np.full(count, Approach.NONE, np.int8),
+        status=np.full(count, Status.NOT_CONVERGED, np.int8),
+    )
+
+
 def fit_stack(
     engine: Engine,
-    settings: PixelLaplace,
+    settings: PixelLaplace | PixelNuts,
     pixels: Stack,
-    sizes: Mapping[str, tuple[int, ...]],
     numbers: np.ndarray,
     seed: int,
-) -> Marginals:
+    describe: Describe,
+) -> Outcome:
     """Fit every pixel of a row.
 
     Args:
         engine: The model of one pixel.
-        settings: What is done for each.
+        settings: What is done for each; with those of NUTS every pixel is sampled.
         pixels: The readings.
-        sizes: Own axes of every parameter.
         numbers: Of the pixels in the whole image, which random numbers follow, (pixel,).
         seed: Of the random numbers.
+        describe: Called with the draws of all that have an answer.
 
     Returns:
-        The marginals, in the order of the pixels.
+        What became of each, in the order of the pixels.
 
     Raises:
         Nothing: what fails is in `status`.
     """
-    row = _Row(len(pixels), sizes)
+    row = _Row(len(pixels), describe)
     row.status[pixels.views < FEWEST_VIEWS] = Status.TOO_FEW_VIEWS
     row.status[pixels.views == 0] = Status.MASKED
     enough = np.flatnonzero(pixels.views >= FEWEST_VIEWS)
-    size = engine.program.size
+    size, keys = engine.program.size, _keys(seed, numbers)
+    if isinstance(settings, PixelNuts):
+        _sample_all(engine, settings, pixels, keys, enough, row)
+        return row.outcome
     points = normal_points(settings.draws, size, seed)
     further = heavy_points(TIMES * settings.draws, size, seed)
-    keys = _keys(seed, numbers)
     work = _Work(engine, settings, points, further, keys, turns(keys, size))
     for begin in range(0, enough.size, PIECE):
         work.fit(pixels, enough[begin : begin + PIECE], row)
-    return row.marginals()
+    return row.outcome
 
 
-def no_marginals(count: int, sizes: Mapping[str, tuple[int, ...]]) -> Marginals:
-    """Those of pixels that nothing is known of."""
-    return _Row(count, sizes).marginals()
+def _sample_all(
+    engine: Engine,
+    settings: PixelNuts,
+    pixels: Stack,
+    keys: np.ndarray,
+    at: np.ndarray,
+    row: "_Row",
+) -> None:
+    """Chains from the mode of every pixel that has one."""
+    settled = _climb(engine, pixels.subset(at))
+    row.settle(at, settled)
+    arrived = np.flatnonzero(settled.converged)
+    for begin in range(0, arrived.size, HARD):
+        some = arrived[begin : begin + HARD]
+        peak = _rows(settled.peak, some)
+        chains = engine.sample(pixels.subset(at[some]), peak, settings, keys[at[some]])
+        row.sample(at[some], *chains, settings)
+
+
+def _climb(engine: Engine, pixels: Stack) -> Settled:
+    """The modes of pixels; those that did not converge start again."""
+    settled = jax.tree.map(np.array, engine.climb(pixels))
+    for rank in RESTARTS:
+        lost = np.flatnonzero(~settled.converged)
+        if not lost.size:
+            break
+        again = engine.climb(pixels.subset(lost), rank)
+        better = again.converged
+        for whole, part in zip(jax.tree.leaves(settled), jax.tree.leaves(again), strict=True):
+            whole[lost[better]] = part[better]
+    return settled
 
 
 class _Found(NamedTuple):
@@ -271,8 +308,7 @@ class _Work:
     def _sample(
         self, sampler: PixelNuts, pixels: Stack, peak: Peak, at: np.ndarray, row: "_Row"
     ) -> None:
-        draws, r_hat = self.engine.sample(pixels, peak, sampler, self.keys[at])
-        row.sample(at, draws, r_hat <= sampler.largest_r_hat)
+        row.sample(at, *self.engine.sample(pixels, peak, sampler, self.keys[at]), sampler)
 
 
 def _keys(seed: int, numbers: np.ndarray) -> np.ndarray:
@@ -283,70 +319,65 @@ def _keys(seed: int, numbers: np.ndarray) -> np.ndarray:
 
 
 class _Row:
-    """Arrays of a row of pixels, filled as answers come."""
+    """What is known of a row of pixels, filled in as answers come."""
 
-    def __init__(self, count: int, sizes: Mapping[str, tuple[int, ...]]) -> None:
-        self._mean = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
-        self._sd = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
-        self._quantiles = {
-            name: np.full((len(LEVELS), count, *own), np.nan) for name, own in sizes.items()
-        }
-        self.pareto_k, self.effective_draws, self.condition = np.full((3, count), np.nan)
-        self.steps = np.zeros(count, np.int32)
-        self.approach = np.full(count, Approach.NONE, np.int8)
-        self.status = np.full(count, Status.NOT_CONVERGED, np.int8)
+    def __init__(self, count: int, describe: Describe) -> None:
+        self.outcome = no_outcome(count)
+        self._describe = describe
+
+    @property
+    def status(self) -> np.ndarray:
+        return self.outcome.status
+
+    def settle(self, at: np.ndarray, settled: Settled) -> None:
+        """Modes were found, and nothing is known yet of what surrounds them."""
+        self.outcome.steps[at] = settled.steps
+        self.outcome.condition[at] = np.where(settled.converged, settled.peak.condition, np.nan)
+        self.status[at] = np.where(settled.converged, Status.NOT_TRUSTED, Status.NOT_CONVERGED)
 
     def approximate(self, at: np.ndarray, found: _Found, settings: PixelLaplace) -> None:
-        converged, trusted = found.settled.converged, found.is_trusted
-        self.steps[at] = found.settled.steps
-        self.condition[at] = np.where(converged, found.settled.peak.condition, np.nan)
+        outcome, converged, trusted = self.outcome, found.settled.converged, found.is_trusted
+        self.settle(at, found.settled)
         approach = np.full(at.size, Approach.LAPLACE)
         if settings.weighted:
-            self.pareto_k[at] = np.where(converged, found.pareto_k, np.nan)
-            self.effective_draws[at] = np.where(trusted, effective_draws(found.weights), np.nan)
+            outcome.pareto_k[at] = np.where(converged, found.pareto_k, np.nan)
+            outcome.effective_draws[at] = np.where(trusted, effective_draws(found.weights), np.nan)
             approach = np.where(trusted, Approach.IMPORTANCE, Approach.LAPLACE)
-        self.approach[at] = np.where(converged, approach, Approach.NONE)
-        self.status[at] = np.select(
-            [trusted, converged], [Status.GOOD, Status.NOT_TRUSTED], Status.NOT_CONVERGED
-        )
+        outcome.approach[at] = np.where(converged, approach, Approach.NONE)
+        self.status[at[trusted]] = Status.GOOD
         # Weights that cannot be trusted do not correct anything.
         even = 1.0 / found.weights.shape[-1]
         weights = np.where(trusted[:, None], found.weights, even)[converged]
         self._describe(at[converged], _rows(found.parameters, converged), weights)
 
     def adapt(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        self._describe(at, parameters, weights)
-        self.effective_draws[at] = effective_draws(weights)
-        self.approach[at] = Approach.ADAPTED
-        self.status[at] = Status.GOOD
+        self._answer(at, parameters, weights, effective_draws(weights), Approach.ADAPTED)
 
-    def sample(self, at: np.ndarray, draws: Values, mixed: np.ndarray) -> None:
+    def sample(
+        self,
+        at: np.ndarray,
+        draws: Values,
+        r_hat: np.ndarray,
+        effective: np.ndarray,
+        settings: PixelNuts,
+    ) -> None:
+        mixed = r_hat <= settings.largest_r_hat
         count = np.asarray(next(iter(draws.values()))).shape[1]
         even = np.full((int(mixed.sum()), count), 1.0 / count)
-        self._describe(at[mixed], _rows(draws, mixed), even)
-        self.approach[at[mixed]] = Approach.NUTS
-        self.status[at[mixed]] = Status.GOOD
+        self._answer(at[mixed], _rows(draws, mixed), even, effective[mixed], Approach.NUTS)
 
-    def marginals(self) -> Marginals:
-        return Marginals(
-            self._mean,
-            self._sd,
-            self._quantiles,
-            self.pareto_k,
-            self.effective_draws,
-            self.condition,
-            self.steps,
-            self.approach,
-            self.status,
-        )
-
-    def _describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        for name, mean in self._mean.items():
-            draws = np.asarray(parameters[name], float)
-            for own in np.ndindex(mean.shape[1:]):
-                found = summarize(draws[(..., *own)], weights, LEVELS)
-                mean[(at, *own)], self._sd[name][(at, *own)] = found[:2]
-                self._quantiles[name][(slice(None), at, *own)] = found[2]
+    def _answer(
+        self,
+        at: np.ndarray,
+        draws: Values,
+        weights: np.ndarray,
+        effective: np.ndarray,
+        approach: Approach,
+    ) -> None:
+        self._describe(at, draws, weights)
+        self.outcome.effective_draws[at] = effective
+        self.outcome.approach[at] = approach
+        self.status[at] = Status.GOOD
 
 
 def _normal_at(peak: Peak) -> Proposal:

@@ -4,21 +4,21 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterator, Mapping
 
-import jax
 import numpy as np
 import xarray as xr
-from dask.base import tokenize
 from numpyro import distributions as dist
 
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.request import Request, resolve
+from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.data import ANGLES
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.pixels.blocks import NUMBER, Plan, fit_block, maps_of, set_aside
 from polar_bayes.pixels.executors import as_completed, workers
-from polar_bayes.pixels.fitting import FEWEST_VIEWS, PixelLaplace, Status, no_marginals
+from polar_bayes.pixels.fitting import FEWEST_VIEWS, PixelLaplace, Status, no_outcome
+from polar_bayes.pixels.making import key_of
+from polar_bayes.pixels.marginals import Marginals
 from polar_bayes.pixels.stack import IMAGE
 from polar_bayes.priors import describe_prior
 
@@ -153,27 +153,7 @@ def plan_map(
         if name in capture and set(IMAGE) & set(capture[name].dims)
     )
     unit = _intensity_unit(capture)
-    return Plan(request, settings, unit, own, _key(request, settings, own, unit is None))
-
-
-def _key(request: Request, settings: PixelLaplace, own: frozenset[str], has_own_unit: bool) -> str:
-    """Of all that the compiled programs depend on."""
-    variables = request.capture.variables
-    parts = [
-        request.model,
-        request.scene,
-        # Not the priors themselves: distributions keep what they have computed.
-        *(
-            (name, jax.tree.leaves(prior), str(jax.tree.structure(prior)))
-            for name, prior in request.priors.items()
-        ),
-        request.links,
-        settings,
-        (request.seed, request.precision, sorted(own), has_own_unit),
-        [(name, v.dims, v.shape, str(v.dtype)) for name, v in variables.items()],
-    ]
-    # One by one: a token depends on which objects of what it is made of are the same one.
-    return tokenize([tokenize(part) for part in parts])
+    return Plan(request, settings, unit, own, key_of(request, settings, sorted(own), unit is None))
 
 
 def number_pixels(capture: xr.Dataset) -> xr.Dataset:
@@ -209,7 +189,7 @@ def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
         Nothing.
     """
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
-    tiny = maps_of(no_marginals(1, plan.sizes), corner, plan.layout)
+    tiny = maps_of(Marginals(1, plan.sizes), no_outcome(1), corner, plan.layout)
     one = tiny.isel({dim: 0 for dim in IMAGE}, drop=True)
     whole = one.expand_dims({dim: capture.sizes[dim] for dim in IMAGE})
     whole = whole.assign_coords({dim: capture[dim] for dim in IMAGE if dim in capture.coords})

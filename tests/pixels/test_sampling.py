@@ -27,14 +27,15 @@ def made(compiled_in_haste: None) -> tuple[Engine, Stack, Settled]:
 
 
 @pytest.fixture(scope="module")
-def sampled(made) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def sampled(made) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     engine, pixels, settled = made
     return engine.sample(pixels, settled.peak, CHAINS, _keys(0, np.array([40, 50, 60])))
 
 
 def test_a_skewed_pixel_has_the_posterior_of_a_grid(sampled) -> None:
-    draws, r_hat = sampled
+    draws, r_hat, effective = sampled
     assert (r_hat < 1.02).all()
+    assert (effective > 200.0).all()
     skewest = 0.0
     for pixel, q in enumerate(WEAK["q"].values[0]):
         for name, (mean, sd, skewness) in on_a_grid(q, 0.15, WEAK["view_zenith"].values).items():
@@ -51,10 +52,11 @@ def test_draws_follow_the_number_of_a_pixel_not_its_place(made, sampled) -> None
     order = np.array([2, 0])
     peak = jax.tree.map(lambda x: x[order], settled.peak)
     keys = _keys(0, np.array([60, 40]))
-    draws, r_hat = engine.sample(pixels.subset(order), peak, CHAINS, keys)
+    draws, r_hat, effective = engine.sample(pixels.subset(order), peak, CHAINS, keys)
     for name, all_draws in sampled[0].items():
         assert draws[name].tobytes() == all_draws[order].tobytes(), name
     assert r_hat.tobytes() == sampled[1][order].tobytes()
+    assert effective == pytest.approx(sampled[2][order])
 
 
 def test_keys_differ_by_number_and_by_seed() -> None:

@@ -9,7 +9,7 @@ from plate_images import ASKED, plate_image
 
 import polar_bayes as pb
 from polar_bayes.pixels import store as module
-from polar_bayes.pixels.blocks import _engine_of
+from polar_bayes.pixels.making import make_engine
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 METHOD = pb.PixelLaplace(draws=64, sampler=None)
@@ -65,9 +65,9 @@ def test_a_map_that_was_broken_off_goes_on_to_the_same_bits(capture: Path, tmp_p
 def test_the_maps_are_those_that_are_made_in_memory(capture: Path, tmp_path: Path) -> None:
     found = mapped(capture, tmp_path / "map.zarr").load()
     image = xr.open_zarr(capture, consolidated=False).load()
-    made = _engine_of.cache_info().misses
+    made = make_engine.cache_info().misses
     xr.testing.assert_equal(found, pb.fit_pixels(image, method=METHOD, **ASKED))
-    assert _engine_of.cache_info().misses == made  # nothing is compiled a second time
+    assert make_engine.cache_info().misses == made  # nothing is compiled a second time
 
 
 def test_whoever_is_stopped_before_the_store_is_whole_can_go_on(

@@ -1,0 +1,95 @@
+"""Captures drawn from a model itself: parameters from the prior, readings from the links."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from polar_bayes.inference.program import Program, Values
+from polar_bayes.observation.data import Observations
+from polar_bayes.pixels.stack import Stack
+
+
+class Simulations(NamedTuple):
+    """Truths and what was recorded of them.
+
+    Args:
+        truth: Parameters by name, each (simulation, ...).
+        captures: The readings, in a row.
+    """
+
+    truth: Values
+    captures: Stack
+
+
+def draw_captures(program: Program, data: Observations, count: int, key: Array) -> Simulations:
+    """Draw captures of one layout.
+
+    Directions, stated errors and masks are those of `data`. Where intensity is recorded, each
+    capture's own brightness sets its noise, and readings at full scale are saturated.
+
+    Args:
+        program: The model that tells the story.
+        data: A capture of the layout.
+        count: How many.
+        key: Random key; a simulation's own depends on its number, not on `count`.
+
+    Returns:
+        The simulations.
+
+    Raises:
+        Nothing.
+    """
+
+    def simulate(number: Array) -> tuple[Values, tuple]:
+        key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
+        z = program.from_prior(key_truth, data)
+        told = program.describe(key_noise, z, data)
+        seen = _recorded(data, told.predictive)
+        if "intensity" in program.observed:  # the noise of the other readings may follow it
+            again = program.describe(key_noise, z, seen).predictive
+            seen = _recorded(data, {**again, "intensity": told.predictive["intensity"]})
+        return told.parameters, (seen.readings, seen.brightness, seen.saturated)
+
+    run = jax.jit(lambda numbers: jax.lax.map(simulate, numbers))
+    truth, parts = jax.tree.map(np.asarray, run(jnp.arange(count, dtype=jnp.uint32)))
+    return Simulations(truth, _in_a_row(data, parts))
+
+
+def _recorded(data: Observations, readings: Mapping[str, Any]) -> Observations:
+    """A capture with other readings; harmless numbers stay where a view is not valid."""
+    kept = {n: jnp.where(data.valid, x, data.readings[n]) for n, x in readings.items()}
+    whole = dataclasses.replace(data, readings={**data.readings, **kept})
+    if "intensity" not in kept:
+        return whole
+    return dataclasses.replace(
+        whole,
+        brightness=jnp.clip(kept["intensity"], 0.0, 1.0),
+        saturated=data.valid & (kept["intensity"] >= data.full_scale),
+    )
+
+
+def _in_a_row(data: Observations, parts: tuple) -> Stack:
+    """What was drawn is each capture's own, all else is shared."""
+
+    def drawn(capture: Observations) -> tuple:
+        return capture.readings, capture.brightness, capture.saturated, capture.valid
+
+    count = len(parts[1])
+    parts = jax.tree.map(lambda x: np.broadcast_to(x, (count, *data.shape)), parts)
+    valid = np.broadcast_to(np.asarray(data.valid), (count, *data.shape))
+    plain = jax.tree.map(np.asarray, data)
+    whole = eqx.tree_at(drawn, plain, (*parts, valid))
+    is_own = eqx.tree_at(
+        drawn,
+        jax.tree.map(lambda _: False, plain),
+        jax.tree.map(lambda _: True, drawn(plain)),
+    )
+    own, shared = eqx.partition(whole, is_own)
+    views = valid.reshape(count, -1, data.shape[-1]).any(axis=1).sum(axis=-1)
+    return Stack(own, shared, views)

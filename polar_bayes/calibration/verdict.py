@@ -1,0 +1,135 @@
+"""What a calibration says, as a table and in words."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import scipy.stats
+import xarray as xr
+
+from polar_bayes.calibration.uniformity import uniformity
+from polar_bayes.diagnostics.coverage import INTERVALS
+from polar_bayes.diagnostics.parameters import Scalar, scalars
+from polar_bayes.errors import FitError
+from polar_bayes.pixels.fitting import Status
+
+FALSE_ALARMS = 0.05
+"""How often a right model, method and prior fail the joint test of all parameters."""
+
+
+def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
+    """One row for each parameter of a calibration.
+
+    Args:
+        calibration: What `polar_bayes.calibrate` returns.
+
+    Returns:
+        Columns `answered` and `failed` (fits); `p_value` of uniform ranks; `rank_mean` (a half
+        where the posterior is neither too high nor too low) and `rank_spread` (one where it is
+        neither too narrow, above, nor too wide); for 50, 80 and 95%, as `held_50`, the share of all
+        fits whose interval holds the truth, failed ones counted as misses, with its 95% interval
+        `_low` and `_high` (Wilson's); `width_95`, mean width of the 95% interval; `crps`, mean
+        ranked score.
+
+    Raises:
+        FitError: It is no calibration.
+    """
+    found = _scalars(calibration, "prior_sbc")
+    truths = {each.label: each.draws[0] for each in _scalars(calibration, "truth")}
+    marginals = calibration["marginals"].to_dataset()
+    rows = {each.label: _row(each, truths[each.label], marginals) for each in found}
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def is_calibrated(table: pd.DataFrame) -> bool:
+    """Whether ranks pass the joint test, at a rate of false alarms of at most 5%.
+
+    Args:
+        table: Of `calibration_table`.
+
+    Returns:
+        False where the smallest p-value is below 5% over the number of parameters (Bonferroni).
+
+    Raises:
+        Nothing.
+    """
+    return bool(table["p_value"].min() >= FALSE_ALARMS / len(table))
+
+
+def calibration_verdict(calibration: xr.DataTree) -> list[str]:
+    """What a calibration says, in sentences.
+
+    Args:
+        calibration: What `polar_bayes.calibrate` returns.
+
+    Returns:
+        First whether the ranks pass, then each parameter that does not and how it strays, then the
+        fits that failed.
+
+    Raises:
+        FitError: It is no calibration.
+    """
+    table = calibration_table(calibration)
+    limit = FALSE_ALARMS / len(table)
+    passed = is_calibrated(table)
+    count = int(table["answered"].max() + table["failed"].min())
+    said = [
+        f"{'Calibrated' if passed else 'Not calibrated'}: the ranks of {len(table)} parameters in "
+        f"{count} simulations {'pass' if passed else 'fail'} a joint test that a right method "
+        f"fails {FALSE_ALARMS:.0%} of the time."
+    ]
+    for label, row in table.iterrows():
+        if row["p_value"] < limit:
+            said.append(f"{label}: {_how(row)} (p = {row['p_value']:.2g}).")
+    statuses = calibration["fits"]["status"].to_numpy()
+    for status in Status:
+        lost = int(np.sum(statuses == status))
+        if status != Status.GOOD and lost:
+            said.append(f"{lost} of {statuses.size} fits: {status.name.lower().replace('_', ' ')}.")
+    return said
+
+
+def _how(row: pd.Series) -> str:
+    """In which way the ranks stray, in units of what chance would do."""
+    count = row["answered"]
+    shift = (row["rank_mean"] - 0.5) * math.sqrt(12.0 * count)
+    stretch = (row["rank_spread"] - 1.0) * math.sqrt(5.0 * count)  # sd of the spread: 1/sqrt(5 n)
+    ways = []
+    if abs(shift) > 2.5:
+        ways.append("the posterior is too low" if shift > 0.0 else "the posterior is too high")
+    if abs(stretch) > 2.5:
+        ways.append("intervals are too narrow" if stretch > 0.0 else "intervals are too wide")
+    return " and ".join(ways) or "the ranks have another shape than the uniform"
+
+
+def _scalars(calibration: xr.DataTree, group: str) -> list[Scalar]:
+    if not isinstance(calibration, xr.DataTree) or group not in calibration.children:
+        raise FitError(
+            f"it has no group {group}",
+            where="calibration",
+            mend="give what polar_bayes.calibrate returns",
+        )
+    dataset = calibration[group].to_dataset()
+    return scalars(dataset.rename(simulation="draw").expand_dims("chain"))
+
+
+def _row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> dict[str, float]:
+    pit = scalar.draws[0]
+    answered = pit[np.isfinite(pit)]
+    where = dict(scalar.index)
+    told = uniformity(answered) if answered.size > 1 else (math.nan,) * 3
+    row = {
+        "answered": answered.size,
+        "failed": pit.size - answered.size,
+        **dict(zip(("p_value", "rank_mean", "rank_spread"), told, strict=True)),
+    }
+    bounds = marginals[f"{scalar.name}_quantile"].isel(where)
+    for percent, (low, high) in INTERVALS.items():
+        least, most = (bounds.sel(quantile=level).to_numpy() for level in (low, high))
+        held = int(np.sum((least <= truth) & (truth <= most)))
+        sure = scipy.stats.binomtest(held, pit.size).proportion_ci(0.95, method="wilson")
+        row[f"held_{percent}"] = held / pit.size
+        row[f"held_{percent}_low"], row[f"held_{percent}_high"] = sure.low, sure.high
+    row["width_95"] = float(np.nanmean(most - least))
+    row["crps"] = float(np.nanmean(marginals[f"{scalar.name}_crps"].isel(where)))
+    return row

@@ -1,0 +1,143 @@
+"""Commands that fit, and show what was found."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+import polar_bayes as pb
+from polar_bayes.cli.places import check_writable, in_setup, make_folder
+from polar_bayes.cli.printing import counting_bar, print_table, progress_bars, status
+
+
+@click.command()
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("polar-bayes-demo"),
+    show_default=True, help="Folder to write.",
+)  # fmt: skip
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+def demo(out: Path, seed: int) -> int:
+    """Capture, fit, diagnostics and report of an embedded example."""
+    make_folder(out)
+    capture = pb.simulate("plastic", seed=seed)
+    pb.save_capture(capture, out / "capture.nc")
+    with progress_bars() as progress:
+        result = pb.fit(capture, seed=seed, progress=progress)
+        pb.save_result(result, out / "fit.nc")
+        progress("writing the report", 0.0)
+        page = pb.report(result, out / "report")
+        progress("writing the report", 1.0)
+    print_table(result)
+    click.echo(f"report: {page}")
+    return status(result)
+
+
+@click.command()
+@click.argument("capture", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Result to write.")
+@click.option("--model", default="per_material", show_default=True)
+@click.option("--method", default="nuts", show_default=True, help="nuts, laplace or point.")
+@click.option("--scene", help="Named scene; by default the one that the capture names.")
+@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
+@click.option("--choose-effects", "choose", is_flag=True, help="Fit what `effects` would keep.")
+@click.option("--tolerance", type=float, help="Of --choose-effects; 0.1 posterior sd by default.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
+def fit(
+    capture: Path,
+    out: Path,
+    as_json: bool,
+    choose: bool,
+    tolerance: float | None,
+    scene: Any,
+    **settings: Any,
+) -> int:
+    """Fit a capture; prints a row per parameter and writes everything to --out."""
+    if tolerance is not None and not choose:
+        raise click.UsageError("--tolerance needs --choose-effects")
+    data = pb.load_capture(capture)
+    check_writable(out)
+    with progress_bars() as progress:
+        if choose:
+            data = in_setup(data, scene)
+            options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
+            options |= {} if tolerance is None else {"tolerance": tolerance}
+            scene = pb.choose_effects(data, progress=progress, **options)
+            click.echo(pb.ledger_sentence(scene.ledger), err=True)
+        result = pb.fit(data, scene=scene, progress=progress, **settings)
+    pb.save_result(result, out)
+    if as_json:
+        click.echo(json.dumps(pb.json_summary(result), indent=2, allow_nan=False))
+    else:
+        print_table(result)
+    return status(result)
+
+
+@click.command(name="map")
+@click.argument("capture", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Zarr store to write.")
+@click.option("--model", default="per_material", show_default=True)
+@click.option("--scene", help="Named scene; by default the one that the capture names.")
+@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
+@click.option("--draws", type=int, default=256, show_default=True, help="Weighted, in each pixel.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@click.option("--precision", default="double", show_default=True, help="double or single.")
+@click.option("--scheduler", help="Address of a dask.distributed scheduler; default: threads.")
+@click.option("--resume", is_flag=True, help="Go on with a map that was broken off.")
+def map_(capture: Path, out: Path, draws: int, **settings: Any) -> None:
+    """Fit every pixel of an image."""
+    with counting_bar("pixels") as progress:
+        method = pb.PixelLaplace(draws=draws)
+        maps = pb.map_file(capture, out, method=method, progress=progress, **settings)
+    counts = ", ".join(f"{count} {what}" for what, count in pb.count_pixels(maps).items() if count)
+    click.echo(f"{out}: {counts}")
+
+
+@click.command()
+@click.argument("capture", type=click.Path(path_type=Path))
+@click.option("--scene", help="Named set-up; by default the one that the capture names.")
+@click.option("--tolerance", type=float, default=0.1, show_default=True, help="Posterior sd.")
+@click.option("--keep", multiple=True, help="Effect that stays; give it once per effect.")
+@click.option("--drop", multiple=True, help="Effect that goes; give it once per effect.")
+@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@click.option("--json", "as_json", is_flag=True, help="Print the ledger as JSON.")
+@click.option("--out", type=click.Path(path_type=Path), help="Ledger to write.")
+def effects(
+    capture: Path, scene: str | None, as_json: bool, out: Path | None, **settings: Any
+) -> None:
+    """What each effect changes and costs; which of them this capture can see."""
+    data = in_setup(pb.load_capture(capture), scene)
+    if out is not None:
+        check_writable(out)
+    with progress_bars() as progress:
+        ledger = pb.choose_effects(data, progress=progress, **settings).ledger
+    if out is not None:
+        pb.save_result(ledger, out)
+    if as_json:
+        click.echo(json.dumps(pb.ledger_summary(ledger), indent=2, allow_nan=False))
+    else:
+        click.echo(f"{pb.ledger_table(ledger)}\n\n{pb.ledger_sentence(ledger)}")
+
+
+@click.command()
+@click.argument("fit", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write.")
+@click.option("--truth", type=click.Path(path_type=Path), help="Of a map: its simulated capture.")
+@click.option(
+    "--uncorrected", type=click.Path(path_type=Path),
+    help="With --truth: the same map without weights, to stand beside.",
+)  # fmt: skip
+def report(fit: Path, out: Path, truth: Path | None, uncorrected: Path | None) -> None:
+    """Write the standardized report of a fit, or of a map (a folder that ends in .zarr)."""
+    is_map = fit.suffix == ".zarr"
+    beside = {
+        "truth": None if truth is None else pb.open_capture(truth),
+        "uncorrected": None if uncorrected is None else pb.open_map(uncorrected),
+    }
+    page = pb.report(pb.open_map(fit) if is_map else pb.load_result(fit), out, **beside)
+    click.echo(f"report: {page}")
+
+
+COMMANDS = (demo, fit, map_, effects, report)

@@ -1,0 +1,82 @@
+"""What commands print: tables, counts, progress."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskProgressColumn,
+    TimeRemainingColumn,
+)
+
+import polar_bayes as pb
+
+NOT_CONVERGED = 2
+"""Exit status of a fit whose diagnostics fail."""
+
+
+def status(result: Any) -> int:
+    """Exit status of a fit; its problems and cautions go to the error stream."""
+    verdict = pb.verdict(result)
+    for problem in verdict.problems:
+        click.echo(f"problem: {problem}", err=True)
+    for caution in verdict.cautions:
+        click.echo(f"caution: {caution}", err=True)
+    return 0 if verdict.converged else NOT_CONVERGED
+
+
+def print_table(result: Any) -> None:
+    """A row per parameter."""
+    rows = pb.json_summary(result)["parameters"]
+    columns = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
+    titles = ("mean", "sd", "2.5%", "97.5%", "R-hat", "ESS")
+    width = max(map(len, rows))
+    click.echo(" " * width + "".join(f"{title:>10}" for title in titles))
+    for name, row in rows.items():
+        cells = [row[column] for column in columns]
+        texts = ["-" if cell is None else f"{cell:.4g}" for cell in cells[:4]]
+        texts += ["-" if cells[4] is None else f"{cells[4]:.3f}"]
+        texts += ["-" if cells[5] is None else f"{cells[5]:.0f}"]
+        click.echo(f"{name:<{width}}" + "".join(f"{text:>10}" for text in texts))
+
+
+def print_counts(capture: Any, out: Path) -> None:
+    """What a capture holds, in one line."""
+    counts = ", ".join(f"{number} {what}" for what, number in pb.count(capture).items())
+    click.echo(f"{out}: {counts}")
+
+
+@contextmanager
+def progress_bars() -> Iterator[Callable[[str, float], None]]:
+    """One bar per stage on the error stream; silent where that is not a terminal."""
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bars:
+        tasks: dict[str, Any] = {}
+
+        def progress(stage: str, fraction: float) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=1.0)
+            bars.update(tasks[stage], completed=fraction)
+
+        yield progress
+
+
+@contextmanager
+def counting_bar(what: str) -> Iterator[Callable[[int, int], None]]:
+    """How many are done, how many a second, the time that is left; where there is a terminal."""
+    console = Console(stderr=True)
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TaskProgressColumn(what, show_speed=True),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+        task = bars.add_task(what, total=None)
+        yield lambda done, every: bars.update(task, completed=done, total=every)

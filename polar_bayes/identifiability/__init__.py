@@ -1,0 +1,1 @@
+"""What can a capture tell, before or after it is made?"""

@@ -1,0 +1,100 @@
+"""From a checked request to the programs that fit many captures of one layout."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from dask.base import tokenize
+
+from polar_bayes.inference.program import Program, compile_program
+from polar_bayes.inference.request import Request
+from polar_bayes.inference.search import from_prior
+from polar_bayes.observation.data import Observations
+from polar_bayes.pixels.engine import Engine
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Recipe:
+    """What programs are made from. Recipes of one key make the same, and share them.
+
+    Args:
+        request: What is asked of each capture.
+        observe: One that stands for all, in double precision.
+        candidates: Prior draws among which each capture finds its start.
+        key: Of all that the programs depend on; see `key_of`.
+    """
+
+    request: Request
+    observe: Callable[[], Observations]
+    candidates: int
+    key: str
+
+    def __eq__(self, other: object) -> bool:
+        """The same programs."""
+        return isinstance(other, Recipe) and self.key == other.key
+
+    def __hash__(self) -> int:
+        """Of the key."""
+        return hash(self.key)
+
+
+def key_of(request: Request, *further: Any) -> str:
+    """A text that is the same for requests whose programs are the same.
+
+    Args:
+        request: Its readings do not count, their layout does.
+        further: What else the programs depend on.
+
+    Returns:
+        The text; good for one process and those that it sends it to.
+
+    Raises:
+        Nothing.
+    """
+    variables = request.capture.variables
+    parts = [
+        request.model,
+        request.scene,
+        # Not the priors themselves: distributions keep what they have computed.
+        *(
+            (name, jax.tree.leaves(prior), str(jax.tree.structure(prior)))
+            for name, prior in request.priors.items()
+        ),
+        request.links,
+        (request.seed, request.precision),
+        [(name, v.dims, v.shape, str(v.dtype)) for name, v in variables.items()],
+        *further,
+    ]
+    # One by one: a token depends on which objects of what it is made of are the same one.
+    return tokenize([tokenize(part) for part in parts])
+
+
+@functools.lru_cache(maxsize=4)
+def make_engine(recipe: Recipe) -> Engine:
+    """The programs of a recipe; they are traced at their first use.
+
+    Args:
+        recipe: What they are made from.
+
+    Returns:
+        The engine; the last few are kept.
+
+    Raises:
+        Nothing.
+    """
+    request, data = recipe.request, recipe.observe()
+    given = {"double": data, "single": data.in_single_precision()}
+
+    def program(precision: str) -> Program:
+        with jax.enable_x64(precision == "double"):
+            model = dataclasses.replace(request, precision=precision).bind(request.scene)
+            return compile_program(model, given[precision])
+
+    exact, rough = program(request.precision), program("single")
+    with jax.enable_x64(request.precision == "double"):
+        key = jax.random.key(request.seed)
+        starts = from_prior(exact, key, recipe.candidates, given[request.precision])
+    return Engine(exact, rough, np.asarray(starts), request.precision).ready()

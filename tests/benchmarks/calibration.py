@@ -1,0 +1,90 @@
+"""Fits per second of simulation-based calibration, beside a loop of NumPyro's `MCMC.run`.
+
+    python tests/benchmarks/calibration.py           1000 fits of ours by each method
+    python tests/benchmarks/calibration.py 200       fewer
+
+The per-material model of one color: 40 views of the degree of polarization and of intensity by the
+paper's scene with four facets on the way out; four parameters of the material, three of the noise.
+All fit the same simulations. Ours is timed twice, with compilation and without; the loop runs one
+compiled chain of 500 warm-up and 500 kept draws for each, with NumPyro's defaults.
+ESS is the least of all parameters of a fit: of all fits, the 5% quantile and the median.
+"""
+
+import dataclasses
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+from numpyro.diagnostics import effective_sample_size
+from numpyro.infer import MCMC, NUTS
+
+import polar_bayes as pb
+from polar_bayes.calibration.simulations import draw_captures
+from polar_bayes.inference.program import compile_program
+from polar_bayes.inference.request import resolve
+from polar_bayes.observation.data import observe
+
+LOOPED = 12
+FACETS = pb.FacetQuadrature(along=2, across=2)
+SCENE = dataclasses.replace(
+    pb.SETUPS["paper"].scene, surface=pb.RoughSurface(pb.Beckmann(), pb.PointSource(), FACETS)
+)
+
+
+def layout() -> xr.Dataset:
+    return pb.simulate("leaf", seed=1, protocol=pb.Protocol(views=40, wavelengths=()))
+
+
+def by_loop(capture: xr.Dataset, count: int) -> Iterator[tuple[float, float]]:
+    """Seconds and least ESS of each fit by a chain of NumPyro's own, compiled once."""
+    with jax.enable_x64(True):
+        request = resolve(capture, "per_material", "laplace", SCENE, None, None, None, 0, "double")
+        data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
+        model = request.bind(SCENE)
+        program = compile_program(model, data)
+        drawn = draw_captures(program, data, count, jax.random.key(1))
+        chain = MCMC(NUTS(model), num_warmup=500, num_samples=500, progress_bar=False)
+        for number in range(-1, count):  # the first compiles
+            start = time.perf_counter()
+            chain.run(jax.random.key(number + 1), drawn.captures.pixel(max(number, 0)))
+            draws = chain.get_samples(group_by_chain=True)
+            names = [name for name in draws if name in program.supports]
+            effective = min(float(np.min(effective_sample_size(draws[name]))) for name in names)
+            if number >= 0:
+                yield time.perf_counter() - start, effective
+
+
+def main(count: int) -> None:
+    capture = layout()
+    print(f"{platform.machine()}, {os.cpu_count()} cores; {count} fits of 7 parameters")
+    print("method       cold s   warm s   fits/s   of loop   ESS 5%  median   failed  least p")
+    seconds, effective = np.array(list(by_loop(capture, LOOPED))).T
+    loop = 1.0 / seconds.mean()
+
+    def line(name: str, cold: float, warm: float, rate: float, told: Any, end: str) -> None:
+        print(
+            f"{name:<11} {cold:7.1f} {warm:8.1f} {rate:8.2f} {rate / loop:9.1f} "
+            f"{np.nanquantile(told, 0.05):8.0f} {np.nanmedian(told):7.0f} {end}",
+            flush=True,
+        )
+
+    line("MCMC.run", np.nan, seconds.sum(), loop, effective, f"   ({LOOPED} fits)")
+    for method in ("laplace", "importance", "nuts"):
+        took = []
+        for _ in range(2):
+            start = time.perf_counter()
+            found = pb.calibrate(capture, simulations=count, method=method, scene=SCENE)
+            took.append(time.perf_counter() - start)
+        table, fits = pb.calibration_table(found), found["fits"].to_dataset()
+        end = f"{int(np.sum(fits['status'] != 0)):8d} {table['p_value'].min():8.3f}"
+        line(method, *took, count / took[1], fits["effective_draws"].to_numpy(), end)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 1000)

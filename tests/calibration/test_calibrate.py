@@ -1,0 +1,111 @@
+"""Calibration of plates, whose fits take no time: right methods pass, broken ones are caught."""
+
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+import xarray as xr
+from numpyro import handlers
+from plates import LINKS, PLATE, plate_capture
+from polar_bayes.models.per_material import per_material
+
+import polar_bayes as pb
+
+ASKED = {
+    "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
+    "scene": PLATE,
+    "links": LINKS,
+}
+COUNT = 600
+
+
+@pytest.fixture(scope="module")
+def capture() -> xr.Dataset:
+    return plate_capture(np.array([30.0, 36.0, 42.0, 68.0, 74.0, 80.0]), 0.03, seed=0)
+
+
+@pytest.fixture(scope="module")
+def corrected(capture: xr.Dataset) -> xr.DataTree:
+    return pb.calibrate(capture, simulations=COUNT, **ASKED)
+
+
+@pytest.mark.parametrize("method", ["importance", "nuts"])
+def test_what_is_right_passes(method: str, capture: xr.Dataset, corrected: xr.DataTree) -> None:
+    """At a rate of false alarms of 5%, with a fixed seed; intervals within 3.3 standard errors."""
+    calibration = corrected
+    if method == "nuts":
+        calibration = pb.calibrate(capture, simulations=COUNT, method="nuts", **ASKED)
+    table = pb.calibration_table(calibration)
+    assert pb.is_calibrated(table)
+    assert pb.calibration_verdict(calibration)[0].startswith("Calibrated: ")
+    for percent in (50, 80, 95):
+        share = percent / 100.0
+        error = np.sqrt(share * (1.0 - share) / COUNT)
+        assert np.abs(table[f"held_{percent}"] - share).max() < 3.3 * error
+    assert (table["failed"] <= 3).all()  # chains that did not mix say so, and count as misses
+
+
+@pytest.mark.parametrize(
+    ("truth", "parameter"),
+    [
+        ({"priors": {"refractive_index": dist.Uniform(1.2, 2.0)}}, "refractive_index"),
+        (
+            {"model": handlers.condition(per_material, data={"stokes_error_factor": 2.0})},
+            "subsurface_fraction",
+        ),
+        (
+            {"links": {"q": pb.StokesLink(stated_errors=True, degrees_of_freedom=2.1)}},
+            "subsurface_fraction",
+        ),
+    ],
+    ids=["prior", "noise", "link"],
+)
+def test_what_is_broken_on_purpose_is_caught(capture, truth, parameter) -> None:
+    calibration = pb.calibrate(capture, simulations=COUNT, truth=truth, **ASKED)
+    table = pb.calibration_table(calibration)
+    assert not pb.is_calibrated(table)
+    assert table.loc[parameter, "p_value"] < 0.025
+    verdict = pb.calibration_verdict(calibration)
+    assert verdict[0].startswith("Not calibrated: ")
+    assert any(line.startswith(f"{parameter}: ") for line in verdict[1:])
+
+
+def test_the_tree_holds_every_fit(corrected: xr.DataTree) -> None:
+    assert set(corrected.children) == {"prior_sbc", "truth", "marginals", "fits"}
+    assert dict(corrected["prior_sbc"].sizes) == {"simulation": COUNT}
+    fits = corrected["fits"].to_dataset()
+    assert set(fits.data_vars) >= {"status", "approach", "pareto_k", "effective_draws", "steps"}
+    pit = corrected["prior_sbc"]["refractive_index"]
+    assert float(pit.min()) > 0.0
+    assert float(pit.max()) < 1.0
+
+
+def test_a_simulation_does_not_depend_on_how_many_there_are(capture, corrected) -> None:
+    few = pb.calibrate(capture, simulations=150, **ASKED)
+    some = corrected["truth"].to_dataset().isel(simulation=slice(150))
+    xr.testing.assert_identical(few["truth"].to_dataset(), some)
+    xr.testing.assert_identical(
+        few["marginals"].to_dataset(),
+        corrected["marginals"].to_dataset().isel(simulation=slice(150)),
+    )
+
+
+def test_fits_that_fail_are_counted(capture: xr.Dataset) -> None:
+    method = pb.PixelNuts(chains=2, warmup=10, draws=50, largest_r_hat=1.01)
+    calibration = pb.calibrate(capture, simulations=40, method=method, **ASKED)
+    table = pb.calibration_table(calibration)
+    failed = int(table["failed"].iloc[0])
+    assert 0 < failed < 40
+    assert (table["answered"] + table["failed"] == 40).all()
+    assert (table["held_95"] <= 1.0 - failed / 40).all()
+    assert f"{failed} of 40 fits: not trusted." in pb.calibration_verdict(calibration)
+
+
+def test_mistakes_are_told(capture: xr.Dataset) -> None:
+    with pytest.raises(pb.FitError, match="simulations is 5; give 20 or more"):
+        pb.calibrate(capture, simulations=5, **ASKED)
+    with pytest.raises(pb.FitError, match="no such method; give one of laplace, importance, nuts"):
+        pb.calibrate(capture, method="hmc", **ASKED)
+    with pytest.raises(pb.FitError, match="seed cannot differ"):
+        pb.calibrate(capture, truth={"seed": 1}, **ASKED)
+    with pytest.raises(pb.FitError, match="it has no group prior_sbc"):
+        pb.calibration_table(xr.DataTree())

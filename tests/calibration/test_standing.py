@@ -1,0 +1,62 @@
+"""Ranks and scores against what is known of them."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from polar_bayes.calibration.standing import Standing, ranked_score, share_below
+
+
+def even(fits: int, draws: int) -> np.ndarray:
+    return np.full((fits, draws), 1.0 / draws)
+
+
+def test_the_truth_among_draws_of_its_own_distribution_is_uniform() -> None:
+    random = np.random.default_rng(0)
+    values = random.normal(size=(4000, 20))
+    pit = share_below(values[:, 1:], even(4000, 19), values[:, 0], random.random(4000))
+    assert stats.kstest(pit, "uniform").pvalue > 1e-3
+    few = share_below(values[:, 1:3], even(4000, 2), values[:, 0], random.random(4000))
+    assert stats.kstest(few, "uniform").pvalue > 1e-3
+
+
+def test_ties_are_shared_evenly() -> None:
+    random = np.random.default_rng(1)
+    values = random.integers(0, 3, size=(4000, 20)).astype(float)
+    pit = share_below(values[:, 1:], even(4000, 19), values[:, 0], random.random(4000))
+    assert stats.kstest(pit, "uniform").pvalue > 1e-3
+
+
+def test_weights_count_as_repeated_draws() -> None:
+    draws, weights = np.array([[0.0, 1.0, 2.0]]), np.array([[0.5, 0.25, 0.25]])
+    repeated = np.array([[0.0, 0.0, 1.0, 2.0]])
+    truth, chance = np.array([1.5]), np.array([0.0])
+    told = share_below(draws, weights, truth, chance) * 4 / 3
+    assert told == pytest.approx(share_below(repeated, even(1, 4), truth, chance) * 5 / 4)
+    assert ranked_score(draws, weights, truth) == pytest.approx(
+        ranked_score(repeated, even(1, 4), truth)
+    )
+
+
+def test_the_score_of_a_normal_distribution_is_that_of_its_formula() -> None:
+    """Gneiting & Raftery (2007), below eq. 21."""
+    draws = stats.norm.ppf((np.arange(20_000) + 0.5) / 20_000)
+    for truth in (-2.0, 0.0, 0.7):
+        expected = truth * (2.0 * stats.norm.cdf(truth) - 1.0) + 2.0 * stats.norm.pdf(truth)
+        expected -= 1.0 / np.sqrt(np.pi)
+        found = ranked_score(draws[None], even(1, 20_000), np.array([truth]))
+        assert found == pytest.approx(expected, abs=1e-4)  # of the draws' ends
+
+
+def test_each_fit_has_the_same_chance_whoever_takes_it_down() -> None:
+    random = np.random.default_rng(3)
+    truth = {"roughness": random.random((6, 2))}
+    draws = {"roughness": random.random((6, 30, 2))}
+    whole, parts = Standing(truth, 5), Standing(truth, 5)
+    whole.describe(np.arange(6), draws, even(6, 30))
+    for some in (np.array([4, 1]), np.array([0, 5, 3])):
+        parts.describe(some, {"roughness": draws["roughness"][some]}, even(len(some), 30))
+    assert np.isnan(parts.pit["roughness"][2]).all()
+    told = [0, 1, 3, 4, 5]
+    np.testing.assert_array_equal(whole.pit["roughness"][told], parts.pit["roughness"][told])
+    np.testing.assert_array_equal(whole.crps["roughness"][told], parts.crps["roughness"][told])

@@ -1,0 +1,41 @@
+"""Calibration and identifiability as a user types them."""
+
+import json
+from pathlib import Path
+
+import pytest
+import xarray as xr
+
+from polar_bayes.cli import main
+
+
+def test_calibrate_prints_a_table_and_writes_every_fit(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "sbc.nc"
+    words = ["calibrate", str(plate), "--simulations", "60", "--method", "laplace"]
+    status = main([*words, "--out", str(out)])
+    header, *rows = capsys.readouterr().out.splitlines()
+    assert header.split()[:3] == ["answered", "failed", "p_value"]
+    assert rows[1].split()[0] == "refractive_index"
+    verdict = next(row for row in rows if "alibrated: " in row)
+    assert status == (0 if verdict.startswith("Calibrated") else 2)
+    with xr.open_datatree(out) as tree:
+        assert tree["prior_sbc"].sizes["simulation"] == 60
+
+
+def test_identify_says_what_is_told(plate: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["identify", str(plate), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert 0.0 < told["parameters"]["refractive_index"]["prior_share"] < 0.5
+    assert told["said"]
+
+
+def test_a_mistake_is_one_line(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = str(tmp_path / "sbc.nc")
+    assert main(["calibrate", str(plate), "--out", out, "--simulations", "3"]) == 1
+    assert capsys.readouterr().err.splitlines() == ["calibrate: simulations is 3; give 20 or more"]
+    assert main(["calibrate", str(plate), "--out", out, "--method", "magic"]) == 1
+    assert "method='magic': no such method" in capsys.readouterr().err

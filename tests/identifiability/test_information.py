@@ -1,0 +1,84 @@
+"""Fisher information against the mean outer product of scores, over many simulated readings."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpyro import distributions as dist
+
+import polar_bayes as pb
+from polar_bayes.identifiability.information import information
+from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
+
+READINGS = 200_000
+
+
+def sensor(stop: float):
+    def make(location, scale):
+        return SensorStudentT(5.0, location, scale, jnp.zeros((), bool), jnp.asarray(stop))
+
+    return make
+
+
+CASES = {
+    "normal": (dist.Normal, (0.3, 0.02)),
+    "student": (lambda loc, scale: dist.StudentT(5.0, loc, scale), (0.3, 0.02)),
+    "beta": (MeanConcentrationBeta, (0.3, 80.0)),
+    "beta near the edge": (MeanConcentrationBeta, (0.01, 40.0)),
+    "logit": (
+        lambda loc, scale: dist.TransformedDistribution(
+            dist.Normal(loc, scale), dist.transforms.SigmoidTransform()
+        ),
+        (-1.0, 0.2),
+    ),
+    "sensor": (sensor(np.inf), (0.3, 0.02)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_is_the_mean_square_of_scores(case: str) -> None:
+    make, at = CASES[case]
+    given = jnp.asarray(at)
+    readings = make(*given).sample(jax.random.key(0), (READINGS,))
+    scores = jax.vmap(jax.grad(lambda at, x: make(*at).log_prob(x)), (None, 0))(given, readings)
+    products = np.asarray(scores[:, :, None] * scores[:, None, :])
+    error = products.std(axis=0) / READINGS**0.5
+    told = information(make(*given))
+    assert [float(x) for x in told.parameters] == pytest.approx(at)
+    # Heavy tails of the squares included: five standard errors, and what 400 nodes leave.
+    slack = 5.0 * error + 2e-3 * np.abs(np.diagonal(told.information)).max()
+    assert (np.abs(products.mean(axis=0) - told.information) < slack).all()
+
+
+@pytest.mark.parametrize("location", [0.95, 1.0, 1.05])
+def test_a_saturated_reading_tells_less(location: float) -> None:
+    """Readings are stopped at 1: simulated as the sensor does, the flag set where it stopped."""
+    given = jnp.asarray([location, 0.05])
+    free = dist.StudentT(5.0, *given).sample(jax.random.key(1), (READINGS,))
+
+    def log_prob(at, x):
+        stopped = SensorStudentT(5.0, at[0], at[1], x >= 1.0, jnp.asarray(1.0))
+        return stopped.log_prob(jnp.clip(x, 0.0, 1.0))
+
+    scores = jax.vmap(jax.grad(log_prob), (None, 0))(given, free)
+    products = np.asarray(scores[:, :, None] * scores[:, None, :])
+    error = products.std(axis=0) / READINGS**0.5
+    told = information(sensor(1.0)(*given)).information
+    whole = information(sensor(np.inf)(*given)).information
+    slack = 5.0 * error + 2e-3 * float(whole[0, 0])
+    assert (np.abs(products.mean(axis=0) - told) < slack).all()
+    assert told[0, 0] < whole[0, 0]
+
+
+def test_views_masks_and_plates_keep_their_place() -> None:
+    mean = jnp.linspace(0.1, 0.9, 6).reshape(2, 3)
+    plain = MeanConcentrationBeta(mean, jnp.asarray(50.0))
+    masked = plain.mask(jnp.ones((2, 3), bool)).expand((4, 2, 3))
+    told = information(masked)
+    assert told.information.shape == (4, 2, 3, 2, 2)
+    np.testing.assert_array_equal(told.information[1], information(plain).information)
+
+
+def test_what_is_not_known_is_told() -> None:
+    with pytest.raises(pb.FitError, match="Fisher information of Cauchy is not known"):
+        information(dist.Cauchy(0.0, 1.0))
