@@ -68,9 +68,11 @@ def main(count: int) -> None:
     loop = 1.0 / seconds.mean()
 
     def line(name: str, cold: float, warm: float, rate: float, told: Any, end: str) -> None:
+        least = "       -       -"
+        if np.isfinite(told).any():
+            least = f"{np.nanquantile(told, 0.05):8.0f} {np.nanmedian(told):7.0f}"
         print(
-            f"{name:<11} {cold:7.1f} {warm:8.1f} {rate:8.2f} {rate / loop:9.1f} "
-            f"{np.nanquantile(told, 0.05):8.0f} {np.nanmedian(told):7.0f} {end}",
+            f"{name:<11} {cold:7.1f} {warm:8.1f} {rate:8.2f} {rate / loop:9.1f} {least} {end}",
             flush=True,
         )
 
