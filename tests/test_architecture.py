@@ -1,6 +1,7 @@
 """The picture of the house is a test: every import points up the list, and packages stay home."""
 
 import ast
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -171,3 +172,9 @@ def test_a_file_can_be_read_in_one_sitting(module: str) -> None:
 def test_nothing_prints(module: str) -> None:
     for node in ast.walk(ast.parse(MODULES[module].read_text())):
         assert not (isinstance(node, ast.Name) and node.id == "print"), f"{module} prints"
+
+
+def test_what_is_installed_is_what_is_here() -> None:
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    packages = {module for module, path in MODULES.items() if path.name == "__init__.py"}
+    assert set(listed) == packages

@@ -21,17 +21,20 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.pixels.engine import Engine
 from polar_bayes.pixels.executors import as_completed, workers
-from polar_bayes.pixels.fitting import Outcome, PixelLaplace, fit_stack
+from polar_bayes.pixels.fitting import PixelLaplace, fit_stack
 from polar_bayes.pixels.making import Recipe, key_of, make_engine
 from polar_bayes.pixels.marginals import Marginals
+from polar_bayes.pixels.outcome import Outcome
 from polar_bayes.pixels.sampling import PixelNuts
+from polar_bayes.pixels.tempering import PixelTempering
 from polar_bayes.pixels.tracing import TRACING
 from polar_bayes.priors import describe_prior
 
-Method = PixelLaplace | PixelNuts
+Method = PixelLaplace | PixelNuts | PixelTempering
 METHODS: dict[str, Method] = {
     "laplace": PixelLaplace(weighted=False),
     "importance": PixelLaplace(draws=512),
+    "tempered": PixelTempering(),
     "nuts": PixelNuts(),
 }
 CANDIDATES = 32

@@ -13,8 +13,8 @@ from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import PROVENANCE, dims_of
 from polar_bayes.observation.data import Observations
 from polar_bayes.physics.notation import notation
-from polar_bayes.pixels.fitting import Approach, Outcome, Status
 from polar_bayes.pixels.marginals import LEVELS, Marginals
+from polar_bayes.pixels.outcome import Approach, Outcome, Status
 
 
 def assemble(

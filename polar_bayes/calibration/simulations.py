@@ -1,7 +1,8 @@
 """Captures drawn from a model itself: parameters from the prior, readings from the links."""
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -46,7 +47,16 @@ def draw_captures(program: Program, data: Observations, count: int, key: Array) 
         Nothing.
     """
 
-    def simulate(number: Array) -> tuple[Values, tuple]:
+    numbers = jnp.arange(count, dtype=jnp.uint32)
+    truth, parts = jax.tree.map(np.asarray, _drawing(program)(numbers, key, data))
+    return Simulations(truth, _in_a_row(data, parts))
+
+
+@functools.lru_cache(maxsize=4)
+def _drawing(program: Program) -> Callable[[Array, Array, Observations], tuple[Values, tuple]]:
+    """The story of many captures, compiled once for a program."""
+
+    def simulate(number: Array, key: Array, data: Observations) -> tuple[Values, tuple]:
         key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
         z = program.from_prior(key_truth, data)
         told = program.describe(key_noise, z, data)
@@ -56,9 +66,9 @@ def draw_captures(program: Program, data: Observations, count: int, key: Array) 
             seen = _recorded(data, {**again, "intensity": told.predictive["intensity"]})
         return told.parameters, (seen.readings, seen.brightness, seen.saturated)
 
-    run = jax.jit(lambda numbers: jax.lax.map(simulate, numbers))
-    truth, parts = jax.tree.map(np.asarray, run(jnp.arange(count, dtype=jnp.uint32)))
-    return Simulations(truth, _in_a_row(data, parts))
+    return jax.jit(
+        lambda numbers, key, data: jax.lax.map(lambda at: simulate(at, key, data), numbers)
+    )
 
 
 def _recorded(data: Observations, readings: Mapping[str, Any]) -> Observations:

@@ -46,20 +46,69 @@ def calibrate(capture: Path, out: Path, as_json: bool, **settings: Any) -> int:
 @click.option("--model", default="per_material", show_default=True)
 @click.option("--scene", help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
+@click.option(
+    "--profile",
+    "profiled",
+    multiple=True,
+    metavar="PARAMETER",
+    help="Follow the likelihood while this parameter moves; give it once per parameter.",
+)
+@click.option(
+    "--next-views",
+    "count",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Name the N views that would add most.",
+)
+@click.option(
+    "--criterion",
+    default="D",
+    show_default=True,
+    help="What they should narrow: D (all parameters together), A (each), or one parameter.",
+)
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
-def identify(capture: Path, as_json: bool, **settings: Any) -> None:
-    """Which parameters a capture determines, and which trade off."""
+@click.option("--json", "as_json", is_flag=True, help="Print the tables as JSON.")
+def identify(
+    capture: Path,
+    profiled: tuple[str, ...],
+    count: int | None,
+    criterion: str,
+    as_json: bool,
+    **settings: Any,
+) -> None:
+    """Which parameters a capture determines, which trade off, and where to look next."""
     data = pb.load_capture(capture)
+    tables, said = {}, {}
     with progress_bars() as progress:
         found = pb.identify(data, progress=progress, **settings)
-    table, said = pb.identifiability_table(found), pb.identifiability_sentences(found)
+        tables["parameters"] = pb.identifiability_table(found)
+        said["said"] = pb.identifiability_sentences(found)
+        for name in profiled:
+            curve = pb.profile(data, name, progress=progress, **settings)
+            tables[f"profile of {name}"] = pb.profile_table(curve)
+            said[f"profile of {name}"] = pb.profile_sentences(curve)
+        if count is not None:
+            views = pb.next_views(
+                data, count=count, criterion=_criterion(criterion), progress=progress, **settings
+            )
+            tables["next views"] = pb.next_views_table(views)
+            said["next views"] = pb.next_views_sentences(views)
     if as_json:
-        rows = json.loads(table.to_json(orient="index"))
-        click.echo(json.dumps({"parameters": rows, "said": said}, indent=2, allow_nan=False))
-    else:
+        told = {name: json.loads(table.to_json(orient="index")) for name, table in tables.items()}
+        sentences = {"said": said.pop("said"), **{f"{name}: said": x for name, x in said.items()}}
+        click.echo(json.dumps({**told, **sentences}, indent=2, allow_nan=False))
+        return
+    for (name, table), sentences in zip(tables.items(), said.values(), strict=True):
+        if name != "parameters":
+            click.echo(f"\n{name}")
         click.echo(table.to_string(float_format=lambda x: f"{x:.3g}", index_names=False))
-        click.echo("\n".join(["", *said]))
+        click.echo("\n".join(["", *sentences]))
+
+
+def _criterion(name: str) -> Any:
+    """The criterion of that letter, or the one of that parameter alone."""
+    letters = {"D": pb.DOptimal, "A": pb.AOptimal}
+    return letters[name]() if name in letters else pb.SingleParameter(name)
 
 
 COMMANDS = (calibrate, identify)

@@ -129,15 +129,35 @@ def effects(
     "--uncorrected", type=click.Path(path_type=Path),
     help="With --truth: the same map without weights, to stand beside.",
 )  # fmt: skip
-def report(fit: Path, out: Path, truth: Path | None, uncorrected: Path | None) -> None:
-    """Write the standardized report of a fit, or of a map (a folder that ends in .zarr)."""
-    is_map = fit.suffix == ".zarr"
-    beside = {
+@click.option(
+    "--beside", type=click.Path(path_type=Path), multiple=True,
+    help="Of a calibration: another of the same layout; give it once for each.",
+)  # fmt: skip
+def report(
+    fit: Path, out: Path, truth: Path | None, uncorrected: Path | None, beside: tuple[Path, ...]
+) -> None:
+    """Write the standardized report of a fit, a calibration, or a map (a folder in .zarr)."""
+    others = {
         "truth": None if truth is None else pb.open_capture(truth),
         "uncorrected": None if uncorrected is None else pb.open_map(uncorrected),
+        "beside": _by_name(beside) or None,
     }
-    page = pb.report(pb.open_map(fit) if is_map else pb.load_result(fit), out, **beside)
+    page = pb.report(_opened(fit), out, **others)
     click.echo(f"report: {page}")
+
+
+def _by_name(paths: tuple[Path, ...]) -> dict[str, Any]:
+    """Calibrations by the names of their files."""
+    if len({path.stem for path in paths}) < len(paths):
+        raise click.UsageError("two files of --beside have the same name")
+    return {path.stem: pb.load_calibration(path) for path in paths}
+
+
+def _opened(path: Path) -> Any:
+    """A map, a calibration or a fit."""
+    if path.suffix == ".zarr":
+        return pb.open_map(path)
+    return pb.load_calibration(path) if pb.holds_calibration(path) else pb.load_result(path)
 
 
 COMMANDS = (demo, fit, map_, effects, report)

@@ -10,9 +10,9 @@ import xarray as xr
 
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.pixels.fitting import Status
 from polar_bayes.pixels.maps import cut
 from polar_bayes.pixels.opening import at_hand
+from polar_bayes.pixels.outcome import Status
 from polar_bayes.pixels.stack import IMAGE
 
 INTERVALS = {50: (0.25, 0.75), 80: (0.1, 0.9), 95: (0.025, 0.975)}

@@ -11,19 +11,28 @@ import scipy.linalg
 import xarray as xr
 from numpyro import distributions as dist
 
-from polar_bayes.diagnostics.parameters import Scalar, scalars
-from polar_bayes.identifiability.fisher import expected_information, prior_precision
-from polar_bayes.inference.ground import STARTS, compiled_potential
-from polar_bayes.inference.program import Program, compile_program
-from polar_bayes.inference.request import Request, resolve
-from polar_bayes.inference.result import PROVENANCE, posterior_of
-from polar_bayes.inference.search import Progress, find_modes, from_prior
-from polar_bayes.observation.data import Observations, observe
+from polar_bayes.identifiability.fisher import (
+    look,
+    prior_precision,
+    sound_precision,
+    sum_information,
+)
+from polar_bayes.identifiability.paper import sd_with, sum_as_paper
+from polar_bayes.identifiability.peak import (
+    Labels,
+    Question,
+    find_peaks,
+    flat_parameters,
+    label_parameters,
+    pose,
+)
+from polar_bayes.inference.request import Request
+from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.inference.search import Progress
+from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.notation import notation
 from polar_bayes.physics.scene import Scene
-
-PRIOR_DRAWS = 500
 
 
 class Expected(NamedTuple):
@@ -32,12 +41,16 @@ class Expected(NamedTuple):
     Args:
         data: Fisher information of the capture.
         prior: Curvature of the prior.
+        paper: The paper's information of its degrees of polarization.
+        exact: The exact one of the same readings, noise known.
         slopes: Derivatives of the parameters, flattened, by the coordinates.
         values: The parameters there.
     """
 
     data: np.ndarray
     prior: np.ndarray
+    paper: np.ndarray
+    exact: np.ndarray
     slopes: np.ndarray
     values: np.ndarray
 
@@ -72,106 +85,97 @@ def identify(
         By `parameter`: `value` at the mode, `prior_sd`, `expected_sd` of the posterior,
         `prior_share` of the information (1: the data say nothing; 0: the prior does not matter),
         `sensitivity` (by how many standard deviations of the noise one prior sd moves all readings
-        together, all else held); `correlation` of two parameters. By `direction`, weakest first:
-        `information` that the data add to what the prior has in that combination of the model's
-        coordinates, and `weight` of each parameter in it, in prior sds.
+        together, all else held); `paper_information` (the paper's sum of kappa S^2 over degrees of
+        polarization with Beta noise, all else held), `exact_information` (what the same readings
+        tell), both per squared unit of the parameter, and `paper_sd`, the posterior sd that the
+        paper's sum promises: these three NaN where no noise is Beta. `correlation` of two
+        parameters. By `direction`, weakest first: `information` that the data add to what the
+        prior has in that combination of the model's coordinates, and `weight` of each parameter in
+        it, in prior sds, and `movement`: by how many sds of the noise that
+        parameter's part alone moves the readings. (All parts together move them by the root of
+        `information`.)
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.
         FitError: Something cannot be used, or no mode was found.
 
     Source:
-        Lehmann & Casella (1998), Theory of Point Estimation, section 2.6.
+        Lehmann & Casella (1998), Theory of Point Estimation, section 2.6; the paper's sum:
+        `polar_bayes.identifiability.paper`.
     """
-    request = resolve(
-        capture, model, "laplace", scene, priors, links, largest_view_zenith, seed, "double"
-    )
     with jax.enable_x64(True):
-        data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
-        program = compile_program(request.bind(request.scene), data)
-        key_starts, key_prior = jax.random.split(jax.random.key(seed))
-        starts = np.asarray(from_prior(program, key_starts, STARTS, data))
-        modes = find_modes(compiled_potential(program, data), starts, progress or _silent)
-        expected = _expect(program, modes.z[0], data)
-        drawn = np.asarray(from_prior(program, key_prior, PRIOR_DRAWS, data))
-        prior = jax.jit(jax.vmap(lambda z: program.parameters(z, data)))(drawn)
-    draws = {name: np.asarray(x)[None] for name, x in prior.items()}
-    return _assemble(request, scalars(posterior_of(program, draws)), expected, sorted(prior))
+        question = pose(capture, model, scene, priors, links, largest_view_zenith, seed)
+        expected = _expect(question, find_peaks(question, progress).z[0])
+        labels = label_parameters(question)
+    return _assemble(question.request, labels, expected)
 
 
-def _silent(stage: str, fraction: float) -> None:
-    """No progress to show."""
-
-
-def _expect(program: Program, z: np.ndarray, data: Observations) -> Expected:
-    def parameters(z: jax.Array) -> jax.Array:
-        told = program.parameters(z, data)
-        return jnp.concatenate([jnp.ravel(told[name]) for name in sorted(told)])
+def _expect(question: Question, z: np.ndarray) -> Expected:
+    program = question.program
 
     @jax.jit
     def found(z: jax.Array, data: Observations) -> tuple:
+        seen = look(program, z, data)
         return (
-            expected_information(program, z, data),
+            sum_information(seen),
             prior_precision(program, z, data),
-            jax.jacfwd(parameters)(z),
-            parameters(z),
+            *sum_as_paper(seen, program.size),
+            jax.jacfwd(lambda z: flat_parameters(program, z, data))(z),
+            flat_parameters(program, z, data),
         )
 
-    return Expected(*(np.asarray(x) for x in found(jnp.asarray(z), data)))
+    expected = Expected(*(np.asarray(x) for x in found(jnp.asarray(z), question.data)))
+    return expected._replace(prior=sound_precision(expected.prior, question.prior))
 
 
-def _assemble(
-    request: Request, found: list[Scalar], expected: Expected, order: list[str]
-) -> xr.Dataset:
-    rows = _rows_of(found, order)
-    slopes, values = expected.slopes[rows], expected.values[rows]
-    labels = [scalar.label for scalar in found]
-    prior_sd = np.array([scalar.draws.std() for scalar in found])
+def _assemble(request: Request, labels: Labels, expected: Expected) -> xr.Dataset:
+    slopes, values = expected.slopes[labels.rows], expected.values[labels.rows]
+    prior_sd = labels.prior_sd
     whole = np.linalg.inv(expected.data + expected.prior)
-    alone = np.linalg.inv(expected.prior)
     covariance = slopes @ whole @ slopes.T
-    before = np.einsum("pi,ij,pj->p", slopes, alone, slopes)
+    before = sd_with(np.zeros_like(expected.prior), expected.prior, slopes)
     sd = np.sqrt(np.diag(covariance))
     strength, directions = scipy.linalg.eigh(expected.data, expected.prior)
+    weight = (slopes @ directions) / before[:, None]
+    largest = np.argmax(np.abs(weight), axis=0)
+    weight = weight * np.sign(weight[largest, np.arange(strength.size)])
     back = np.linalg.pinv(slopes)  # of one parameter, all others held
-    sensitivity = np.sqrt(np.maximum(np.einsum("ip,ij,jp->p", back, expected.data, back), 0.0))
-    weight = (slopes @ directions) / np.sqrt(before)[:, None]
+
+    def alone(information: np.ndarray) -> np.ndarray:
+        return np.maximum(np.einsum("ip,ij,jp->p", back, information, back), 0.0)
+
     dataset = xr.Dataset(
         {
             "value": ("parameter", values),
             "prior_sd": ("parameter", prior_sd),
             "expected_sd": ("parameter", sd),
-            "prior_share": ("parameter", sd**2 / before),
-            "sensitivity": ("parameter", sensitivity * prior_sd),
+            "prior_share": ("parameter", (sd / before) ** 2),
+            "sensitivity": ("parameter", np.sqrt(alone(expected.data)) * prior_sd),
+            "paper_information": ("parameter", alone(expected.paper)),
+            "exact_information": ("parameter", alone(expected.exact)),
+            "paper_sd": ("parameter", sd_with(expected.paper, expected.prior, slopes)),
             "correlation": (("parameter", "other"), covariance / np.outer(sd, sd)),
             "information": ("direction", strength),
             "weight": (("direction", "parameter"), weight.T),
+            "movement": (
+                ("direction", "parameter"),
+                np.abs(weight.T) * np.sqrt(alone(expected.data)) * before,
+            ),
         },
         coords={
-            "parameter": labels,
-            "other": labels,
-            "name": ("parameter", [s.name for s in found]),
+            "parameter": labels.names,
+            "other": labels.names,
+            "name": ("parameter", [scalar.name for scalar in labels.scalars]),
         },
     )
-    for scalar in found:
+    for scalar in labels.scalars:
         dataset.attrs[f"meaning_of_{scalar.name}"] = notation(scalar.name).meaning
-    dataset.attrs[PROVENANCE] = json.dumps(_provenance(request), sort_keys=True)
+    dataset.attrs[PROVENANCE] = json.dumps(provenance(request), sort_keys=True)
     return dataset
 
 
-def _rows_of(found: list[Scalar], order: list[str]) -> list[int]:
-    """Where each scalar stands among the flattened parameters, which stand by name."""
-    counts = {name: sum(scalar.name == name for scalar in found) for name in order}
-    begins = dict(zip(order, np.cumsum([0, *counts.values()]), strict=False))
-    seen: dict[str, int] = {}
-    rows = []
-    for scalar in found:  # the entries of one variable follow each other in row order
-        rows.append(int(begins[scalar.name]) + seen.get(scalar.name, 0))
-        seen[scalar.name] = seen.get(scalar.name, 0) + 1
-    return rows
-
-
-def _provenance(request: Request) -> dict[str, Any]:
+def provenance(request: Request) -> dict[str, Any]:
+    """What a question was about, as far as JSON can hold it."""
     return {
         "model": request.model_name,
         "scene": request.scene_name,

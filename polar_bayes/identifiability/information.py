@@ -53,8 +53,7 @@ def information(distribution: dist.Distribution) -> Told:
         Lehmann & Casella (1998), Theory of Point Estimation, section 2.5.
     """
     shape = distribution.batch_shape
-    while isinstance(distribution, _WRAPPED):
-        distribution = distribution.base_dist
+    distribution = bare(distribution)
     for family, told in _FAMILIES.items():
         if type(distribution) is family:
             found = told(distribution)
@@ -68,6 +67,13 @@ def information(distribution: dist.Distribution) -> Told:
         where="identify",
         mend=f"use a link that gives one of {', '.join(f.__name__ for f in _FAMILIES)}",
     )
+
+
+def bare(distribution: dist.Distribution) -> dist.Distribution:
+    """A distribution without the masks and expansions around it."""
+    while isinstance(distribution, _WRAPPED):
+        distribution = distribution.base_dist
+    return distribution
 
 
 def _matrix(rows: list[list[Array]]) -> Array:

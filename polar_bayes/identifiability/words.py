@@ -13,6 +13,12 @@ UNTOLD, PARTLY = 0.8, 0.3
 COUPLED = 0.9
 """Correlation from which two parameters trade off."""
 
+WEAK = 1.0
+"""Information along a direction, over the prior's, below which the data say less than it did."""
+
+PART = 0.3
+"""Share of the largest movement of the readings from which a parameter is named in a direction."""
+
 
 def identifiability_table(found: xr.Dataset) -> pd.DataFrame:
     """One row for each parameter.
@@ -21,13 +27,14 @@ def identifiability_table(found: xr.Dataset) -> pd.DataFrame:
         found: What `polar_bayes.identify` returns.
 
     Returns:
-        Columns value, prior_sd, expected_sd, prior_share and sensitivity.
+        Columns value, prior_sd, expected_sd, prior_share, sensitivity and
+        paper_sd.
 
     Raises:
         FitError: It is something else.
     """
     _check(found)
-    columns = ["value", "prior_sd", "expected_sd", "prior_share", "sensitivity"]
+    columns = ["value", "prior_sd", "expected_sd", "prior_share", "sensitivity", "paper_sd"]
     return found[columns].drop_vars("name").to_dataframe()
 
 
@@ -38,8 +45,10 @@ def identifiability_sentences(found: xr.Dataset) -> list[str]:
         found: What `polar_bayes.identify` returns.
 
     Returns:
-        Parameters of the material that the data tell little of; then pairs that trade off, the
-        closest first; or one sentence that says that all is well.
+        Parameters of the material that the data tell little of; the weakest direction, where the
+        data say less of it than the prior, it is one of the material and several parameters make
+        it; then pairs that trade off, the closest first; or one sentence that says that all is
+        well.
 
     Raises:
         FitError: It is something else.
@@ -57,6 +66,7 @@ def identifiability_sentences(found: xr.Dataset) -> list[str]:
                 f"(sd {float(row['prior_sd']):.3g} before the data, "
                 f"{float(row['expected_sd']):.3g} expected after)."
             )
+    said += _weakest_direction(found, is_material)
     told = is_material & (found["prior_share"].to_numpy() < UNTOLD)
     correlation, names = found["correlation"].to_numpy(), found["parameter"].to_numpy()
     for i, j in _coupled(correlation, told, told | ~is_material):
@@ -66,6 +76,25 @@ def identifiability_sentences(found: xr.Dataset) -> list[str]:
             f"{correlation[i, j]:.2f}), and the readings hardly change."
         )
     return said or ["Every parameter of the material is determined by the data."]
+
+
+def _weakest_direction(found: xr.Dataset, is_material: np.ndarray) -> list[str]:
+    """The combination that the readings see least of, where its parts alone would be seen."""
+    weakest = found.isel(direction=0)
+    weight, movement = weakest["weight"].to_numpy(), weakest["movement"].to_numpy()
+    parts = np.flatnonzero(movement >= PART * movement.max())
+    strength = float(weakest["information"])
+    is_mixture = parts.size > 1 and movement.max() > 2.0  # one alone is not determined, as said
+    if strength >= WEAK or not is_mixture or not is_material[np.argmax(np.abs(weight))]:
+        return []
+    names = found["parameter"].to_numpy()
+    parts = parts[np.argsort(-np.abs(weight[parts]))]
+    mixed = ", ".join(f"{names[part]} by {weight[part]:+.2g}" for part in parts)
+    return [
+        f"The weakest direction moves {mixed} prior sds together: the readings move by "
+        f"{np.sqrt(max(strength, 0.0)):.2g} sds of their noise, though {names[parts[0]]} alone "
+        f"would move them by {movement[parts[0]]:.2g}."
+    ]
 
 
 def _coupled(correlation: np.ndarray, first: np.ndarray, second: np.ndarray) -> list:

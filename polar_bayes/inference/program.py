@@ -38,7 +38,7 @@ class Draw(NamedTuple):
     predictive: Values
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Program:
     """A model conditioned on data of one layout.
 
@@ -76,6 +76,11 @@ class Program:
     def potential_at(self, sites: dict[str, Array], data: Observations) -> Float[Array, ""]:
         """The same of the latent sites by name, each unconstrained."""
         return potential_energy(self.model, (data,), {}, sites)
+
+    def prior_potential(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
+        """The part of the potential in which no reading has a share."""
+        alone = handlers.block(self.model, hide=list(self.observed))
+        return potential_energy(alone, (data,), {}, self.unravel(z))
 
     def constrain(self, z: Float[Array, " size"]) -> dict[str, Array]:
         """The latent sites in their supports."""

@@ -14,9 +14,10 @@ from polar_bayes.inference.result import dims_of
 from polar_bayes.observation.data import READINGS, Observations, observe
 from polar_bayes.physics.notation import notation
 from polar_bayes.pixels.engine import Engine
-from polar_bayes.pixels.fitting import Approach, Outcome, PixelLaplace, Status, fit_stack
+from polar_bayes.pixels.fitting import PixelLaplace, fit_stack
 from polar_bayes.pixels.making import Recipe, make_engine
 from polar_bayes.pixels.marginals import LEVELS, Marginals
+from polar_bayes.pixels.outcome import Approach, Outcome, Status
 from polar_bayes.pixels.stack import IMAGE, stack
 from polar_bayes.pixels.tracing import TRACING
 

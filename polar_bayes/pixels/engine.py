@@ -6,7 +6,7 @@ Pixels that have settled leave between passes; who shares a batch with whom chan
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -19,21 +19,25 @@ from numpyro.diagnostics import effective_sample_size
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.observation.data import Observations
 from polar_bayes.pixels.adapting import Proposal
+from polar_bayes.pixels.batching import batched, batches
 from polar_bayes.pixels.climbing import Climber, Peak, crown, stand, step
 from polar_bayes.pixels.derivatives import AnyArray, expand, score
 from polar_bayes.pixels.importance import Points
+from polar_bayes.pixels.mixtures import draw_mixture, fit_mixture
 from polar_bayes.pixels.sampling import PixelNuts, chains
-from polar_bayes.pixels.stack import Stack, together
-from polar_bayes.pixels.tracing import TRACING, TracedOnce
+from polar_bayes.pixels.stack import Stack
+from polar_bayes.pixels.tempering import PixelTempering, Tempered, temper
+from polar_bayes.pixels.tracing import TRACING
 
 BATCH = 128
 """Pixels that one call of a program takes."""
 
-CLIMBING = 16
-"""Pixels of a batch that climb side by side: what they need stays in a core's own cache."""
-
 FEW = 4
 """The same where each pixel has chains of its own."""
+
+LOOKED = 64
+"""Draws of one pixel that are looked at side by side: more are shared among cores, which then wait
+for each other."""
 
 DRAWN = 8
 """Pixels of a batch that stand side by side where each has hundreds of draws."""
@@ -41,6 +45,9 @@ DRAWN = 8
 ROUGH, EXACT = (5, 4), (1, 1, 1, 2, 4, 8, 16)
 """Steps between two looks at who has arrived: by scoring in single precision, and with exact
 curvature. The first exact one only looks, and for most pixels that is all."""
+
+CROWD = np.uint32(2**32 - 1)
+"""Number of the random key of the first crowd; those of rounds count up from 0."""
 
 NEAR = 1e-4
 """The decrement, in posterior sds, at which scoring stops."""
@@ -173,6 +180,61 @@ class Engine:
         effective = effective_sample_size(np.moveaxis(np.asarray(z, float), 0, 2))
         return draws, np.array(r_hat), np.min(effective, axis=-1)
 
+    def temper(
+        self, pixels: Stack, settings: PixelTempering, keys: np.ndarray, attempt: int
+    ) -> Tempered:
+        """A crowd for every pixel that began as draws from its prior.
+
+        Args:
+            pixels: The readings.
+            settings: How many walks, and how long.
+            keys: One for each pixel.
+            attempt: Number of the crowd, which random numbers follow.
+
+        Returns:
+            The crowds, with a leading pixel axis.
+
+        Raises:
+            Nothing.
+        """
+        with jax.enable_x64(False):
+            with TRACING:
+                crowded = functools.partial(self._tempered(settings), CROWD - np.uint32(attempt))
+            return self._map(crowded, pixels.in_precision(np.float32), keys, batch=FEW)
+
+    def propose(
+        self,
+        pixels: Stack,
+        settings: PixelTempering,
+        z: np.ndarray,
+        weights: np.ndarray,
+        keys: np.ndarray,
+        number: int,
+    ) -> tuple[Values, np.ndarray, np.ndarray]:
+        """Draws of mixtures that are fitted to weighted draws, and how the posterior weighs them.
+
+        Args:
+            pixels: The readings.
+            settings: How many components.
+            z: Unconstrained vectors of the weighted draws, (pixel, draw, size).
+            weights: They sum to one in each pixel.
+            keys: One for each pixel.
+            number: Of the round, which random numbers follow.
+
+        Returns:
+            As many new draws: parameters by name, each (pixel, draw, ...); unconstrained; and log
+            of posterior over mixture, (pixel, draw), up to a constant per pixel.
+
+        Raises:
+            Nothing.
+        """
+        with jax.enable_x64(False):
+            with TRACING:
+                proposed = self._proposed(settings.components)
+            proposed = functools.partial(proposed, np.uint32(number))
+            states = np.float32(z), np.float32(weights), keys
+            return self._map(proposed, pixels.in_precision(np.float32), *states, batch=FEW)
+
     @property
     def dtype(self) -> Any:
         """Floating type of the answer."""
@@ -193,10 +255,12 @@ class Engine:
 
     def _map(self, compiled: Callable, pixels: Stack, *states: Any, batch: int = BATCH) -> Any:
         """Run a program on all pixels, a batch at a time; the last batch is filled up."""
-        shared, parts = jax.tree.map(jnp.asarray, pixels.shared), []
+        shared = jax.tree.map(jnp.asarray, pixels.shared)
+        parts: list = []
         for index in batches(len(pixels), batch):
             state = jax.tree.map(lambda x, i=index: x[i], states)
-            found = compiled(pixels.take(index), shared, *state)
+            wanted = np.int32(min(batch, len(pixels) - len(parts) * batch))
+            found = compiled(wanted, pixels.take(index), shared, *state)
             parts.append(jax.tree.map(np.asarray, found))
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(pixels)], *parts)
 
@@ -211,7 +275,7 @@ class Engine:
             order = jnp.argsort(jnp.where(jnp.isnan(values), jnp.inf, values))
             return jnp.asarray(candidates)[order[rank]]
 
-        return _batched(start, given=1)
+        return batched(start, given=1)
 
     @functools.cached_property
     def _rough_steps(self) -> list[Callable]:
@@ -245,7 +309,7 @@ class Engine:
             values = jax.vmap(lambda z: self.rough.potential(z, data))(places)
             return parameters, -values - log_density
 
-        return _batched(draws, given=2, side_by_side=DRAWN)
+        return batched(draws, given=2, side_by_side=DRAWN)
 
     @functools.cache  # noqa: B019 - an engine lives as long as its map
     def _chains(self, settings: PixelNuts) -> Callable:
@@ -254,13 +318,32 @@ class Engine:
             flat = kept.reshape(-1, self.program.size)
             return kept, jax.vmap(lambda z: self.program.parameters(z, data))(flat)
 
-        return _batched(pixel, side_by_side=1)
+        return batched(pixel, side_by_side=1)
 
+    @functools.cache  # noqa: B019 - an engine lives as long as its map
+    def _tempered(self, settings: PixelTempering) -> Callable:
+        def pixel(number: Array, data: Observations, key: Array) -> Tempered:
+            return temper(self.rough, settings, data, jax.random.fold_in(key, number))
 
-def batches(count: int, size: int) -> Iterator[np.ndarray]:
-    """Indices of batches of one size; the last is filled up with the last pixel."""
-    for begin in range(0, count, size):
-        yield np.minimum(np.arange(begin, begin + size), count - 1)
+        return batched(pixel, given=1, side_by_side=1)
+
+    @functools.cache  # noqa: B019 - an engine lives as long as its map
+    def _proposed(self, components: int) -> Callable:
+        def pixel(
+            number: Array, data: Observations, z: Array, weights: Array, key: Array
+        ) -> tuple[Values, Array, Array]:
+            key_fit, key_draw = jax.random.split(jax.random.fold_in(key, number))
+            mixture = fit_mixture(z, weights, components, key_fit)
+            places, log_density = draw_mixture(mixture, len(z), key_draw)
+
+            def look(z: Array) -> tuple[Values, Array]:
+                return self.rough.parameters(z, data), self.rough.potential(z, data)
+
+            parameters, values = jax.lax.map(look, places, batch_size=LOOKED)
+            ratios = -values - log_density
+            return parameters, places, jnp.where(jnp.isnan(ratios), -jnp.inf, ratios)
+
+        return batched(pixel, given=1, side_by_side=1)
 
 
 def _stepping(
@@ -269,31 +352,16 @@ def _stepping(
     """A program of one pass, for any number of steps."""
 
     def several(count: Array, data: Observations, climber: Climber) -> Climber:
-        return jax.lax.fori_loop(
-            0, count, lambda _, at: step(program, curvature, goal, at, data), climber
-        )
+        def goes_on(at: tuple[Array, Climber]) -> Array:
+            return (at[0] < count) & ~at[1].settled
 
-    compiled = _batched(several, given=1)
+        def onward(at: tuple[Array, Climber]) -> tuple[Array, Climber]:
+            return at[0] + 1, step(program, curvature, goal, at[1], data)
+
+        return jax.lax.while_loop(goes_on, onward, (jnp.zeros_like(count), climber))[1]
+
+    compiled = batched(several, given=1)
     return [functools.partial(compiled, np.int32(count)) for count in passes]
-
-
-def _batched(function: Callable, *, given: int = 0, side_by_side: int = CLIMBING) -> Callable:
-    """A function of one pixel, mapped over a batch, compiled.
-
-    Its first arguments, as many as `given`, are the same for all pixels.
-    """
-
-    @jax.jit
-    def run(*arguments: Any) -> Any:
-        common, (own, shared, *states) = arguments[:given], arguments[given:]
-
-        def of_pixel(pixel: tuple) -> Any:
-            mine, state = pixel
-            return function(*common, together(mine, shared), *state)
-
-        return jax.lax.map(of_pixel, (own, states), batch_size=side_by_side)
-
-    return TracedOnce(run)
 
 
 def _whole(z: AnyArray) -> AnyArray:

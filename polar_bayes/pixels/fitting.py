@@ -1,15 +1,11 @@
 """A row of pixels: mode, width, how far they can be trusted, and what is done where they cannot."""
 
 import dataclasses
-import enum
-from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.program import Values
 from polar_bayes.pixels.adapting import FEWEST_EFFECTIVE, TIMES, Proposal, heavy_points, learn
 from polar_bayes.pixels.climbing import Peak
 from polar_bayes.pixels.engine import Engine, Settled
@@ -21,8 +17,18 @@ from polar_bayes.pixels.importance import (
     smooth,
     turns,
 )
+from polar_bayes.pixels.outcome import (
+    Approximation,
+    Describe,
+    Outcome,
+    Row,
+    Status,
+    Weighted,
+    rows,
+)
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.stack import Stack
+from polar_bayes.pixels.tempering import PixelTempering
 
 FEWEST_VIEWS = 2
 RESTARTS = (1, 3, 7)
@@ -36,26 +42,6 @@ HARD = 1024
 
 SAME_MODE = 1e-3
 """Difference of two potentials that is no difference."""
-
-
-class Status(enum.IntEnum):
-    """What became of a pixel."""
-
-    GOOD = 0
-    MASKED = 1
-    TOO_FEW_VIEWS = 2
-    NOT_CONVERGED = 3
-    NOT_TRUSTED = 4
-
-
-class Approach(enum.IntEnum):
-    """How a pixel's numbers were found."""
-
-    NONE = 0
-    LAPLACE = 1
-    IMPORTANCE = 2
-    ADAPTED = 3
-    NUTS = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,45 +81,9 @@ class PixelLaplace:
             raise FitError(f"rounds is {self.rounds}", where="PixelLaplace", mend="give 0 or more")
 
 
-Describe = Callable[[np.ndarray, Values, np.ndarray], None]
-"""Told which pixels have an answer, their draws by name, and the weights of these (pixel, draw)."""
-
-
-class Outcome(NamedTuple):
-    """What became of a row of pixels: NaN where there is nothing to say.
-
-    Args:
-        pareto_k: (pixel,).
-        effective_draws: What the weighted draws are worth, (pixel,).
-        condition: Condition number of the curvature at the mode, (pixel,).
-        steps: Steps to the mode, (pixel,).
-        approach: Of `Approach`, (pixel,).
-        status: Of `Status`, (pixel,).
-    """
-
-    pareto_k: np.ndarray
-    effective_draws: np.ndarray
-    condition: np.ndarray
-    steps: np.ndarray
-    approach: np.ndarray
-    status: np.ndarray
-
-
-def no_outcome(count: int) -> Outcome:
-    """That of pixels that nothing is known of."""
-    return Outcome(
-        pareto_k=np.full(count, np.nan),
-        effective_draws=np.full(count, np.nan),
-        condition=np.full(count, np.nan),
-        steps=np.zeros(count, np.int32),
-        approach=np.full(count, Approach.NONE, np.int8),
-        status=np.full(count, Status.NOT_CONVERGED, np.int8),
-    )
-
-
 def fit_stack(
     engine: Engine,
-    settings: PixelLaplace | PixelNuts,
+    settings: PixelLaplace | PixelNuts | PixelTempering,
     pixels: Stack,
     numbers: np.ndarray,
     seed: int,
@@ -143,7 +93,7 @@ def fit_stack(
 
     Args:
         engine: The model of one pixel.
-        settings: What is done for each; with those of NUTS every pixel is sampled.
+        settings: What is done for each.
         pixels: The readings.
         numbers: Of the pixels in the whole image, which random numbers follow, (pixel,).
         seed: Of the random numbers.
@@ -155,13 +105,17 @@ def fit_stack(
     Raises:
         Nothing: what fails is in `status`.
     """
-    row = _Row(len(pixels), describe)
+    row = Row(len(pixels), describe)
     row.status[pixels.views < FEWEST_VIEWS] = Status.TOO_FEW_VIEWS
     row.status[pixels.views == 0] = Status.MASKED
     enough = np.flatnonzero(pixels.views >= FEWEST_VIEWS)
     size, keys = engine.program.size, _keys(seed, numbers)
     if isinstance(settings, PixelNuts):
         _sample_all(engine, settings, pixels, keys, enough, row)
+        return row.outcome
+    if isinstance(settings, PixelTempering):
+        for begin in range(0, enough.size, HARD):
+            _temper_all(engine, settings, pixels, keys, enough[begin : begin + HARD], row)
         return row.outcome
     points = normal_points(settings.draws, size, seed)
     further = heavy_points(TIMES * settings.draws, size, seed)
@@ -177,7 +131,7 @@ def _sample_all(
     pixels: Stack,
     keys: np.ndarray,
     at: np.ndarray,
-    row: "_Row",
+    row: Row,
 ) -> None:
     """Chains from the mode of every pixel that has one."""
     settled = _climb(engine, pixels.subset(at))
@@ -185,9 +139,59 @@ def _sample_all(
     arrived = np.flatnonzero(settled.converged)
     for begin in range(0, arrived.size, HARD):
         some = arrived[begin : begin + HARD]
-        peak = _rows(settled.peak, some)
+        peak = rows(settled.peak, some)
         chains = engine.sample(pixels.subset(at[some]), peak, settings, keys[at[some]])
-        row.sample(at[some], *chains, settings)
+        row.sample(at[some], *chains, settings.largest_r_hat)
+
+
+def _temper_all(
+    engine: Engine,
+    settings: PixelTempering,
+    pixels: Stack,
+    keys: np.ndarray,
+    at: np.ndarray,
+    row: Row,
+) -> None:
+    """A crowd from the prior of every pixel; mixtures fitted to it until draws are worth enough."""
+    row.status[at] = Status.NOT_CONVERGED
+    for crowd in range(settings.crowds):
+        at = _temper(engine, settings, pixels, keys, at, row, crowd)
+        if not at.size:
+            return
+
+
+def _temper(
+    engine: Engine,
+    settings: PixelTempering,
+    pixels: Stack,
+    keys: np.ndarray,
+    at: np.ndarray,
+    row: Row,
+    attempt: int,
+) -> np.ndarray:
+    """One crowd for each of some pixels; which of them are left without an answer."""
+    crowd = engine.temper(pixels.subset(at), settings, keys[at], attempt)
+    row.outcome.steps[at] += crowd.stages
+    arrived = (crowd.temperature >= 1.0) & np.isfinite(crowd.z).all(axis=(1, 2))
+    lost, left = at[~arrived], np.flatnonzero(arrived)
+    z = np.tile(crowd.z[left], (1, settings.draws // settings.crowd, 1))
+    weights = np.full(z.shape[:2], 1.0 / settings.draws)
+    for number in range(settings.rounds):
+        if not left.size:
+            break
+        some, round_key = pixels.subset(at[left]), attempt * settings.rounds + number
+        told = engine.propose(some, settings, z, weights, keys[at[left]], round_key)
+        parameters, z, ratios = told
+        found = Weighted(parameters, *smooth(ratios))
+        possible = np.isfinite(found.weights).all(axis=-1)
+        worth = (found.effective >= settings.effective_draws) & (found.pareto_k <= LARGEST_TRUSTED)
+        is_last = number == settings.rounds - 1
+        answer = np.flatnonzero(worth | (is_last & possible))
+        row.temper(at[left[answer]], rows(found, answer), is_worth=worth[answer])
+        lost = np.concatenate([lost, at[left[~possible]]])
+        on = ~worth & possible
+        left, z, weights = left[on], z[on], found.weights[on]
+    return np.sort(np.concatenate([lost, at[left]]))
 
 
 def _climb(engine: Engine, pixels: Stack) -> Settled:
@@ -202,23 +206,6 @@ def _climb(engine: Engine, pixels: Stack) -> Settled:
         for whole, part in zip(jax.tree.leaves(settled), jax.tree.leaves(again), strict=True):
             whole[lost[better]] = part[better]
     return settled
-
-
-class _Found(NamedTuple):
-    """Normal approximations of a row of pixels, and their weighted draws."""
-
-    settled: Settled
-    parameters: Values
-    weights: np.ndarray
-    pareto_k: np.ndarray
-
-    @property
-    def proposal(self) -> Proposal:
-        return _normal_at(self.settled.peak)
-
-    @property
-    def is_trusted(self) -> np.ndarray:
-        return self.settled.converged & (self.pareto_k <= LARGEST_TRUSTED)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -241,39 +228,39 @@ class _Work:
     keys: np.ndarray
     turns: np.ndarray
 
-    def fit(self, pixels: Stack, at: np.ndarray, row: "_Row") -> None:
+    def fit(self, pixels: Stack, at: np.ndarray, row: Row) -> None:
         """Fit some pixels of a row, few enough for their draws to fit into memory."""
         usable = pixels.subset(at)
         found = self._search(usable, self.turns[at])
-        row.approximate(at, found, self.settings)
+        row.approximate(at, found, weighted=self.settings.weighted)
         hard = np.flatnonzero(found.settled.converged & ~found.is_trusted)
         for begin in range(0, hard.size, HARD):
             some = hard[begin : begin + HARD]
-            left = some[self._adapt(usable.subset(some), _rows(found, some), at[some], row)]
+            left = some[self._adapt(usable.subset(some), rows(found, some), at[some], row)]
             if self.settings.sampler is not None and left.size:
-                peak = _rows(found.settled.peak, left)
+                peak = rows(found.settled.peak, left)
                 self._sample(self.settings.sampler, usable.subset(left), peak, at[left], row)
 
-    def _search(self, pixels: Stack, turns: np.ndarray) -> _Found:
+    def _search(self, pixels: Stack, turns: np.ndarray) -> Approximation:
         """Fit from the best candidate; pixels in doubt start again, and keep the lower mode."""
         found = self._weigh(pixels, self.engine.climb(pixels), turns)
         for rank in RESTARTS:
             doubtful = np.flatnonzero(~found.is_trusted)
             if not doubtful.size:
                 break
-            some, old = pixels.subset(doubtful), _rows(found.settled, doubtful)
+            some, old = pixels.subset(doubtful), rows(found.settled, doubtful)
             new = self.engine.climb(some, rank)
             lower = new.peak.value < old.peak.value - SAME_MODE
             better = np.flatnonzero(new.converged & (~old.converged | lower))
             if not better.size:
                 continue
             at = doubtful[better]
-            again = self._weigh(some.subset(better), _rows(new, better), turns[at])
+            again = self._weigh(some.subset(better), rows(new, better), turns[at])
             for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
                 whole[at] = part
         return found
 
-    def _weigh(self, pixels: Stack, settled: Settled, turns: np.ndarray) -> _Found:
+    def _weigh(self, pixels: Stack, settled: Settled, turns: np.ndarray) -> Approximation:
         """Draws of the normal approximations, and their weights where they are asked for."""
         proposal, weighted = _normal_at(settled.peak).turned(turns), self.settings.weighted
         parameters, ratios = self.engine.draw(pixels, proposal, self.points, weighted=weighted)
@@ -282,12 +269,15 @@ class _Work:
         else:
             weights = np.full((len(pixels), self.settings.draws), 1.0 / self.settings.draws)
             pareto_k = np.zeros(len(pixels))
-        return jax.tree.map(np.array, _Found(settled, parameters, weights, pareto_k))
+        return jax.tree.map(np.array, Approximation(settled, parameters, weights, pareto_k))
 
-    def _adapt(self, pixels: Stack, normal: _Found, at: np.ndarray, row: "_Row") -> np.ndarray:
+    def _adapt(self, pixels: Stack, normal: Approximation, at: np.ndarray, row: Row) -> np.ndarray:
         """Fit proposals to their own weighted draws; which pixels are left without an answer."""
         left, turns = np.arange(len(pixels)), self.turns[at]
-        places, weights = normal.proposal.turned(turns).places(self.points), normal.weights
+        places, weights = (
+            _normal_at(normal.settled.peak).turned(turns).places(self.points),
+            normal.weights,
+        )
         for _ in range(self.settings.rounds):
             if not left.size:
                 break
@@ -300,15 +290,16 @@ class _Work:
             weights, pareto_k = smooth(ratios)
             enough = pareto_k <= LARGEST_TRUSTED
             enough &= effective_draws(weights) >= FEWEST_EFFECTIVE
-            row.adapt(at[left[enough]], _rows(parameters, enough), weights[enough])
+            row.adapt(at[left[enough]], rows(parameters, enough), weights[enough])
             left, weights = left[~enough], weights[~enough]
             places = proposal.places(self.further)[~enough]
         return left
 
     def _sample(
-        self, sampler: PixelNuts, pixels: Stack, peak: Peak, at: np.ndarray, row: "_Row"
+        self, sampler: PixelNuts, pixels: Stack, peak: Peak, at: np.ndarray, row: Row
     ) -> None:
-        row.sample(at, *self.engine.sample(pixels, peak, sampler, self.keys[at]), sampler)
+        chains = self.engine.sample(pixels, peak, sampler, self.keys[at])
+        row.sample(at, *chains, sampler.largest_r_hat)
 
 
 def _keys(seed: int, numbers: np.ndarray) -> np.ndarray:
@@ -318,73 +309,6 @@ def _keys(seed: int, numbers: np.ndarray) -> np.ndarray:
     return np.asarray(jax.random.key_data(keys))
 
 
-class _Row:
-    """What is known of a row of pixels, filled in as answers come."""
-
-    def __init__(self, count: int, describe: Describe) -> None:
-        self.outcome = no_outcome(count)
-        self._describe = describe
-
-    @property
-    def status(self) -> np.ndarray:
-        return self.outcome.status
-
-    def settle(self, at: np.ndarray, settled: Settled) -> None:
-        """Modes were found, and nothing is known yet of what surrounds them."""
-        self.outcome.steps[at] = settled.steps
-        self.outcome.condition[at] = np.where(settled.converged, settled.peak.condition, np.nan)
-        self.status[at] = np.where(settled.converged, Status.NOT_TRUSTED, Status.NOT_CONVERGED)
-
-    def approximate(self, at: np.ndarray, found: _Found, settings: PixelLaplace) -> None:
-        outcome, converged, trusted = self.outcome, found.settled.converged, found.is_trusted
-        self.settle(at, found.settled)
-        approach = np.full(at.size, Approach.LAPLACE)
-        if settings.weighted:
-            outcome.pareto_k[at] = np.where(converged, found.pareto_k, np.nan)
-            outcome.effective_draws[at] = np.where(trusted, effective_draws(found.weights), np.nan)
-            approach = np.where(trusted, Approach.IMPORTANCE, Approach.LAPLACE)
-        outcome.approach[at] = np.where(converged, approach, Approach.NONE)
-        self.status[at[trusted]] = Status.GOOD
-        # Weights that cannot be trusted do not correct anything.
-        even = 1.0 / found.weights.shape[-1]
-        weights = np.where(trusted[:, None], found.weights, even)[converged]
-        self._describe(at[converged], _rows(found.parameters, converged), weights)
-
-    def adapt(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        self._answer(at, parameters, weights, effective_draws(weights), Approach.ADAPTED)
-
-    def sample(
-        self,
-        at: np.ndarray,
-        draws: Values,
-        r_hat: np.ndarray,
-        effective: np.ndarray,
-        settings: PixelNuts,
-    ) -> None:
-        mixed = r_hat <= settings.largest_r_hat
-        count = np.asarray(next(iter(draws.values()))).shape[1]
-        even = np.full((int(mixed.sum()), count), 1.0 / count)
-        self._answer(at[mixed], _rows(draws, mixed), even, effective[mixed], Approach.NUTS)
-
-    def _answer(
-        self,
-        at: np.ndarray,
-        draws: Values,
-        weights: np.ndarray,
-        effective: np.ndarray,
-        approach: Approach,
-    ) -> None:
-        self._describe(at, draws, weights)
-        self.outcome.effective_draws[at] = effective
-        self.outcome.approach[at] = approach
-        self.status[at] = Status.GOOD
-
-
 def _normal_at(peak: Peak) -> Proposal:
     """The normal approximation at a mode."""
     return Proposal(np.asarray(peak.z), np.asarray(peak.widths))
-
-
-def _rows[T](values: T, which: np.ndarray) -> T:
-    """Some pixels of arrays that all begin with the axis of pixels."""
-    return jax.tree.map(lambda array: np.asarray(array)[which], values)

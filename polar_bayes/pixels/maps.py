@@ -16,9 +16,10 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.pixels.blocks import NUMBER, Plan, fit_block, maps_of, set_aside
 from polar_bayes.pixels.executors import as_completed, workers
-from polar_bayes.pixels.fitting import FEWEST_VIEWS, PixelLaplace, Status, no_outcome
+from polar_bayes.pixels.fitting import FEWEST_VIEWS, PixelLaplace
 from polar_bayes.pixels.making import key_of
 from polar_bayes.pixels.marginals import Marginals
+from polar_bayes.pixels.outcome import Status, no_outcome
 from polar_bayes.pixels.stack import IMAGE
 from polar_bayes.priors import describe_prior
 

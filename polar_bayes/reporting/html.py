@@ -3,7 +3,7 @@
 import functools
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from polar_bayes.budget.ledger import ledger_sentence
+from polar_bayes.calibration.files import is_calibration
 from polar_bayes.capture.paths import as_path
 from polar_bayes.diagnostics.convergence import judge, summary
 from polar_bayes.diagnostics.discrepancy import WITHOUT, compare_without
@@ -22,6 +23,7 @@ from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import save_result
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import figures, sentences, tables
+from polar_bayes.reporting.calibration_page import render_calibration
 from polar_bayes.reporting.map_page import render_map
 from polar_bayes.reporting.page import Picture, fill, picture, write_page
 from polar_bayes.reporting.population import shrinkage_plot
@@ -31,6 +33,12 @@ from polar_bayes.reporting.spectrum import spectra, spectrum
 from polar_bayes.reporting.style import QUANTITIES
 
 RESULT = "result.nc"
+CALIBRATION = "calibration.nc"
+MENDS = {
+    "truth": "leave it out: a fit carries the truth of its capture",
+    "uncorrected": "leave it out: a fit carries the truth of its capture",
+    "beside": "leave it out, or give what polar_bayes.calibrate returns",
+}
 MOST_POPULATIONS = 6
 
 
@@ -40,21 +48,25 @@ def report(
     *,
     truth: xr.Dataset | None = None,
     uncorrected: xr.Dataset | None = None,
+    beside: Mapping[str, xr.DataTree] | None = None,
 ) -> Path:
-    """Write the standard report of a fit or of a map: one page, `index.html`.
+    """Write the standard report of a fit, a map or a calibration: one page, `index.html`.
 
     The page needs no network, no script and no other file. Everything on it is computed from the
     result, so a report of a file read back is the same report. Beside the page of a fit lies
-    `result.nc`; a map, which may be large, stays where it is.
+    `result.nc`, beside that of a calibration `calibration.nc`; a map, which may be large, stays
+    where it is.
 
     Args:
-        result: A tree that `polar_bayes.fit` returned, or maps of `polar_bayes.fit_pixels`; or
-            one of them read back from a file.
+        result: A tree that `polar_bayes.fit` or `polar_bayes.calibrate` returned, or maps of
+            `polar_bayes.fit_pixels`; or one of them read back from a file.
         directory: The folder; made if it is not there. An older report in it is replaced.
         truth: Of maps: the simulated capture, whose `true_<parameter>` the intervals are checked
             against.
         uncorrected: Of maps, with `truth`: those of the same image by
             `PixelLaplace(weighted=False)`, whose coverage is put beside.
+        beside: Of a calibration: others of the same layout, by a name such as their method
+            ("laplace"), with which it is compared.
 
     Returns:
         The path of the page.
@@ -65,17 +77,21 @@ def report(
             cannot be written.
     """
     folder = as_path(directory, "report")
+    of_calibration = is_calibration(result)
+    _refuse({"truth": truth, "uncorrected": uncorrected}, isinstance(result, xr.Dataset), "maps")
+    _refuse({"beside": beside}, of_calibration, "calibrations")
     if isinstance(result, xr.Dataset):
         return write_page(folder, render_map(result, truth, uncorrected))
-    for name, given in (("truth", truth), ("uncorrected", uncorrected)):
-        if given is not None:
-            raise FitError(
-                "it goes with maps only",
-                where=f"report: {name}",
-                mend="leave it out: a fit carries the truth of its capture",
-            )
-    page = render(result)
-    return write_page(folder, page, {RESULT: functools.partial(save_result, result)})
+    page = render_calibration(result, beside) if of_calibration else render(result)
+    name = CALIBRATION if of_calibration else RESULT
+    return write_page(folder, page, {name: functools.partial(save_result, result)})
+
+
+def _refuse(given: Mapping[str, object], fitting: bool, what: str) -> None:
+    """Arguments that go with another kind of result."""
+    for name, value in given.items():
+        if value is not None and not fitting:
+            raise FitError(f"it goes with {what} only", where=f"report: {name}", mend=MENDS[name])
 
 
 def render(result: xr.DataTree) -> str:

@@ -10,9 +10,10 @@ import xarray as xr
 from polar_bayes.diagnostics.coverage import BLOCK, INTERVALS
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.physics.notation import notation
-from polar_bayes.pixels.fitting import FEWEST_VIEWS, Status
+from polar_bayes.pixels.fitting import FEWEST_VIEWS
 from polar_bayes.pixels.importance import LARGEST_TRUSTED
 from polar_bayes.pixels.maps import cut
+from polar_bayes.pixels.outcome import Status
 from polar_bayes.reporting.style import GREEK, place_of, plain
 from polar_bayes.reporting.tables import INSTRUMENT, MAIN, Row, Table
 from polar_bayes.reporting.text import DASH, numbers, percent, spoken

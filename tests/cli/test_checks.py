@@ -24,11 +24,26 @@ def test_calibrate_prints_a_table_and_writes_every_fit(
         assert tree["prior_sbc"].sizes["simulation"] == 60
 
 
-def test_identify_says_what_is_told(plate: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["identify", str(plate), "--json"]) == 0
+def test_identify_says_what_is_told_and_where_to_look(
+    plate: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["identify", str(plate), "--profile", "subsurface_fraction", "--next-views", "2"]
+    assert main([*words, "--criterion", "refractive_index", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert 0.0 < told["parameters"]["refractive_index"]["prior_share"] < 0.5
     assert told["said"]
+    curve = told["profile of subsurface_fraction"]
+    assert max(row["likelihood"] for row in curve.values() if row["likelihood"]) <= 0.0
+    assert told["profile of subsurface_fraction: said"][0].startswith("subsurface_fraction is ")
+    widths = told["next views"]["refractive_index"]
+    assert widths["after 2"] < widths["after 1"] < widths["now"]
+    assert told["next views: said"][0].startswith("Look next at zenith ")
+    words = ["identify", str(plate), "--next-views", "2", "--criterion", "bend"]
+    assert main(words) == 1
+    assert capsys.readouterr().err.splitlines() == [
+        "SingleParameter('bend'): no parameter of the material has that name; "
+        "give one of subsurface_fraction, refractive_index"
+    ]
 
 
 def test_a_mistake_is_one_line(

@@ -12,7 +12,7 @@ from synthetic_maps import make_maps
 import polar_bayes as pb
 from polar_bayes.diagnostics import coverage
 from polar_bayes.pixels import opening
-from polar_bayes.pixels.fitting import Status
+from polar_bayes.pixels.outcome import Status
 
 HALF = np.full((40, 50), 0.5)
 SPREAD = ((np.arange(2000) + 0.5) / 2000).reshape(40, 50)

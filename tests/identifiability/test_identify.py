@@ -1,14 +1,17 @@
 """What captures determine: against a linear model in closed form, and in words."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture
 from polar_bayes.models.per_material import per_material
+from scipy.special import polygamma
 from textbook import plate_q
 
 import polar_bayes as pb
+from polar_bayes.identifiability.fisher import sound_precision
 
 ASKED = {
     "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
@@ -61,11 +64,114 @@ def test_without_information_the_prior_is_all_there_is() -> None:
     assert any(line.startswith("refractive_index is not determined: ") for line in said)
 
 
-def test_glass_does_not_tell_its_absorption() -> None:
-    """Its body returns hardly any light: what it absorbs is nowhere in the readings."""
-    capture = pb.simulate("glass", seed=0, protocol=pb.Protocol(views=20, wavelengths=()))
-    said = pb.identifiability_sentences(pb.identify(capture))
+POLISHED = pb.Scene(pb.SmoothSurface(), pb.Depolarizer(), pb.DopMixing())
+ANGLES = np.linspace(10.0, 80.0, 12)
+GLASS = {
+    "roughness": 0.03,
+    "subsurface_fraction": 0.05,
+    "absorption": 0.2,
+    "refractive_index": 1.519,
+}
+
+
+@pytest.fixture(scope="module")
+def glass() -> xr.Dataset:
+    """A polished pane with errors of one percent."""
+    angles = (ANGLES, np.full(12, 180.0), ANGLES, np.zeros(12))
+    told = POLISHED.predict(GLASS, pb.Geometry(*map(jnp.asarray, angles)))
+    named = dict(zip(pb.Geometry._fields, angles, strict=False))
+    capture = xr.Dataset({name: ("view", angle) for name, angle in named.items()})
+    noise = 0.01 * np.random.default_rng(0).normal(size=(2, 12))
+    readings = {
+        name: ("view", np.clip(np.asarray(told[name]) + error, -0.999, 0.999))
+        for name, error in zip(("dop", "q"), noise, strict=True)
+    }
+    readings["q_error"] = ("view", np.full(12, 0.01))
+    return capture.assign(readings).assign_attrs(name="glass")
+
+
+@pytest.fixture(scope="module")
+def of_glass(glass: xr.Dataset) -> xr.Dataset:
+    return pb.identify(glass, scene=POLISHED, links={"dop": pb.BetaLink()})
+
+
+def test_glass_does_not_tell_its_absorption(glass: xr.Dataset, of_glass: xr.Dataset) -> None:
+    said = pb.identifiability_sentences(of_glass)
     assert any(line.startswith("absorption is not determined: ") for line in said)
+    asked = ASKED | {"scene": POLISHED, "points": 5}
+    flat = pb.profile_sentences(pb.profile(glass, "absorption", **asked))
+    assert flat[0].startswith("absorption is flat: the data exclude nothing below, down to 0.0")
+
+
+def test_the_papers_sum_is_that_of_slopes_and_concentrations(
+    glass: xr.Dataset, of_glass: xr.Dataset
+) -> None:
+    """By differences, from the schedule as the paper prints it."""
+    value = of_glass["value"]
+    at = {name: float(value.sel(parameter=name)) for name in POLISHED.parameters}
+    geometry = pb.Geometry(ANGLES, np.full(12, 180.0), ANGLES, np.zeros(12))
+
+    def dop(name: str, step: float) -> np.ndarray:
+        return np.asarray(POLISHED.predict({**at, name: at[name] + step}, geometry)["dop"])
+
+    scale = float(value.sel(parameter="concentration_scale"))
+    concentration = 5.0 + scale * np.cos(np.radians(ANGLES))
+    for name in POLISHED.parameters:
+        slope = (dop(name, 1e-5) - dop(name, -1e-5)) / 2e-5
+        mean = dop(name, 0.0)
+        row = of_glass.sel(parameter=name)
+        assert float(row["paper_information"]) == pytest.approx(
+            np.sum(concentration * slope**2), rel=1e-3
+        )
+        each = sum(polygamma(1, part * concentration) for part in (mean, 1.0 - mean))
+        assert float(row["exact_information"]) == pytest.approx(
+            np.sum(concentration**2 * each * slope**2), rel=1e-3
+        )
+        assert row["exact_information"] >= 4.0 * row["paper_information"]
+        assert row["paper_sd"] >= row["expected_sd"] * 0.99
+
+
+def test_without_beta_noise_the_paper_says_nothing(plate: xr.Dataset) -> None:
+    for name in ("paper_information", "exact_information", "paper_sd"):
+        assert np.isnan(plate[name]).all()
+
+
+def test_the_weakest_direction_is_said_where_its_parts_would_be_seen() -> None:
+    """Only the difference of two parameters is read: their sum is the weakest direction."""
+    weight = np.array([[0.7, 0.7], [0.7, -0.7]])
+    found = xr.Dataset(
+        {
+            "prior_share": ("parameter", [0.5, 0.5]),
+            "prior_sd": ("parameter", [0.1, 0.1]),
+            "expected_sd": ("parameter", [0.07, 0.07]),
+            "correlation": (("parameter", "other"), np.eye(2)),
+            "information": ("direction", [1e-4, 900.0]),
+            "weight": (("direction", "parameter"), weight),
+            "movement": (("direction", "parameter"), 30.0 * np.abs(weight)),
+        },
+        coords={
+            "parameter": ["roughness", "absorption"],
+            "name": ("parameter", ["roughness", "absorption"]),
+        },
+    )
+    said = pb.identifiability_sentences(found)
+    assert said[2] == (
+        "The weakest direction moves roughness by +0.7, absorption by +0.7 prior sds together: "
+        "the readings move by 0.01 sds of their noise, though roughness alone would move them "
+        "by 21."
+    )
+    found["information"][0] = 4.0
+    assert not any("weakest" in line for line in pb.identifiability_sentences(found))
+
+
+def test_a_prior_that_bends_the_other_way_stays_a_precision() -> None:
+    draws = np.random.default_rng(0).normal(size=(500, 2)) * [1.0, 3.0]
+    found = sound_precision(np.diag([1.0, -0.1]), draws)
+    np.testing.assert_allclose(np.diag(found), [1.0, 1.0 / 9.0], rtol=0.2)
+    few = sound_precision(np.diag([1.0, -0.1]), draws[:5])
+    assert (np.linalg.eigvalsh(few) > 0.0).all()
+    sound = np.array([[2.0, 1.0], [1.0, 2.0]])
+    np.testing.assert_array_equal(sound_precision(sound, draws), sound)
 
 
 def test_something_else_is_refused() -> None:

@@ -10,8 +10,9 @@ from plate_images import ASKED, NAMES, mapped, planned, plate_image
 
 from polar_bayes.pixels import maps as verb
 from polar_bayes.pixels.blocks import Plan, fit_block
-from polar_bayes.pixels.fitting import Approach, PixelLaplace, Status
+from polar_bayes.pixels.fitting import PixelLaplace
 from polar_bayes.pixels.maps import fit_pixels, number_pixels
+from polar_bayes.pixels.outcome import Approach, Status
 from polar_bayes.pixels.sampling import PixelNuts
 
 # Chains too short to be believed are as good as any to compare bits.

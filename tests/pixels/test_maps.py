@@ -20,8 +20,9 @@ from polar_bayes.inference.program import Program
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.pixels.blocks import Plan
-from polar_bayes.pixels.fitting import Approach, PixelLaplace, Status
+from polar_bayes.pixels.fitting import PixelLaplace
 from polar_bayes.pixels.maps import fit_pixels
+from polar_bayes.pixels.outcome import Approach, Status
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.stack import Stack
 

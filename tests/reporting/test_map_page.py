@@ -11,7 +11,7 @@ from synthetic_maps import make_maps
 from synthetic_results import make_result
 
 import polar_bayes as pb
-from polar_bayes.pixels.fitting import Approach, Status
+from polar_bayes.pixels.outcome import Approach, Status
 from polar_bayes.reporting import map_tables
 from polar_bayes.reporting.map_page import render_map
 

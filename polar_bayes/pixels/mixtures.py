@@ -1,0 +1,136 @@
+"""Mixtures of Student t distributions, fitted to weighted draws: proposals for bent posteriors.
+
+One normal or t distribution wastes most of its draws on a posterior that bends or has two modes; a
+few together follow it. Measured in `tests/benchmarks/calibration.py`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Float
+
+from polar_bayes.pixels.tempering import spread
+
+DEGREES_OF_FREEDOM = 8.0
+"""Of the tails: longer than those of most posteriors, which bounds the weights."""
+
+STEPS = 15
+"""Of expectation and maximization; the mixture need not be the best one, only a good one."""
+
+PRIOR_SCALE = 0.5
+"""Scale of a component that no draws belong to, in units of that of all draws."""
+
+
+class Mixture(NamedTuple):
+    """A mixture in coordinates in which all draws together have mean 0 and covariance 1.
+
+    Args:
+        center: Mean of all draws, (size,).
+        half: Lower root of their covariance, (size, size).
+        log_share: (component,).
+        mean: (component, size).
+        scale: Lower root of the squared scale of each component, (component, size, size).
+    """
+
+    center: Float[Array, " size"]
+    half: Float[Array, "size size"]
+    log_share: Float[Array, " component"]
+    mean: Float[Array, "component size"]
+    scale: Float[Array, "component size size"]
+
+
+def fit_mixture(
+    z: Float[Array, "draw size"], weights: Float[Array, " draw"], components: int, key: Array
+) -> Mixture:
+    """Fit normal components by expectation and maximization.
+
+    Components shrink towards the whole as far as they have few draws.
+
+    Args:
+        z: Draws.
+        weights: They sum to one.
+        components: How many.
+        key: Random key: of the draws at which components begin.
+
+    Returns:
+        The mixture.
+
+    Raises:
+        Nothing.
+
+    Source:
+        Cappe, Douc, Guillin, Marin & Robert (2008), Stat. Comput. 18, 447-459: adaptive importance
+        sampling by mixtures.
+    """
+    size = z.shape[-1]
+    center, half = spread(z, weights)
+    x = (z - center) @ _inverse(half).T
+    worth = weights / jnp.sum(weights**2)  # they sum to what the draws are worth
+    begin = jax.random.choice(key, len(x), (components,), replace=False, p=weights)
+    unit = PRIOR_SCALE * jnp.eye(size, dtype=z.dtype)
+
+    def improve(_: int, parts: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        log_share, mean, scale = parts
+        squares, log_volume = _whitened(x, mean, scale)
+        share = jax.nn.softmax(log_share - 0.5 * squares - log_volume, axis=-1) * worth[:, None]
+        held = jnp.sum(share, axis=0) + 1e-3
+        mean = (share.T @ x) / held[:, None]
+        apart = x[:, None] - mean
+        found = jnp.einsum("dk,dki,dkj->kij", share, apart, apart) / held[:, None, None]
+        own = (held / (held + size + 2.0))[:, None, None]
+        covariance = own * found + (1.0 - own) * unit
+        return jnp.log(held / jnp.sum(held)), mean, jnp.linalg.cholesky(covariance)
+
+    log_share = jnp.full(components, -jnp.log(components), z.dtype)
+    scale = jnp.broadcast_to(jnp.linalg.cholesky(unit), (components, size, size))
+    parts = jax.lax.fori_loop(0, STEPS, improve, (log_share, x[begin], scale))
+    return Mixture(center, half, *parts)
+
+
+def draw_mixture(
+    mixture: Mixture, count: int, key: Array
+) -> tuple[Float[Array, "draw size"], Float[Array, " draw"]]:
+    """Draws of the mixture with tails of Student's t, each component's share evenly.
+
+    Args:
+        mixture: Of `fit_mixture`.
+        count: How many.
+        key: Random key.
+
+    Returns:
+        Unconstrained vectors, and their log density up to a constant.
+
+    Raises:
+        Nothing.
+    """
+    components, size = mixture.mean.shape
+    key_which, key_normal, key_tail = jax.random.split(key, 3)
+    even = (jnp.arange(count) + jax.random.uniform(key_which)) / count
+    which = jnp.searchsorted(jnp.cumsum(jnp.exp(mixture.log_share)), even)
+    which = jnp.clip(which, 0, components - 1)
+    dtype = mixture.mean.dtype
+    freedom = DEGREES_OF_FREEDOM
+    tail = jax.random.gamma(key_tail, 0.5 * freedom, (count, 1), dtype) * 2.0 / freedom
+    noise = jax.random.normal(key_normal, (count, size), dtype) / jnp.sqrt(tail)
+    x = mixture.mean[which] + jnp.einsum("dij,dj->di", mixture.scale[which], noise)
+    squares, log_volume = _whitened(x, mixture.mean, mixture.scale)
+    each = -0.5 * (freedom + size) * jnp.log1p(squares / freedom) - log_volume
+    return mixture.center + x @ mixture.half.T, logsumexp(each + mixture.log_share, axis=-1)
+
+
+def _whitened(x: Array, mean: Array, scale: Array) -> tuple[Array, Array]:
+    """Squared distances of draws from components, (draw, component), and log volumes of these."""
+
+    def squares(mean: Array, scale: Array) -> Array:
+        return jnp.sum(((x - mean) @ _inverse(scale).T) ** 2, axis=-1)
+
+    volume = jnp.sum(jnp.log(jnp.diagonal(scale, axis1=-2, axis2=-1)), axis=-1)
+    return jax.vmap(squares, out_axes=-1)(mean, scale), volume
+
+
+def _inverse(scale: Array) -> Array:
+    """Of a small triangle: with many right-hand sides, a library would share them among cores."""
+    return solve_triangular(scale, jnp.eye(len(scale), dtype=scale.dtype), lower=True)

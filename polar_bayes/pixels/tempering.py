@@ -1,0 +1,244 @@
+r"""From the prior to the posterior of one capture, in small steps of temperature.
+
+$$ p_t(z) \propto p(z) \, p(y|z)^t, \quad 0 = t_0 < t_1 < ... < 1 $$
+
+A crowd that begins as draws from the prior sees every mode before any of them is narrow, and keeps
+what the data leave open. After each step the crowd is thinned to a few by weight, and each of these
+walks on; all places along the walks are the next crowd, so that no evaluation of the model is lost.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Float
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.program import Program
+from polar_bayes.observation.data import Observations
+
+HALVINGS = 20
+"""Of the interval in which the next temperature lies."""
+
+MOST_STAGES = 60
+"""Steps of temperature; what has not arrived by then has failed."""
+
+ACCEPTED = 0.25
+"""Share of the steps of a walk that should be taken; the length of the next ones follows it."""
+
+LIFT = 1e-6
+"""Added to the correlation matrix of a crowd, which single precision rounds."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PixelTempering:
+    """Tempered draws of every pixel, corrected by weights.
+
+    Args:
+        walks: How many of the crowd walk on after each step of temperature, >= 16.
+        length: Places of each walk, its first included, >= 2; all together are the crowd.
+        effective_share: Share of the crowd that its weights must be worth after a step of
+            temperature, between 0.1 and 0.95.
+        draws: Of a mixture in every round; a multiple of the crowd.
+        components: Of the mixtures, >= 1.
+        rounds: In which a mixture is fitted to the weighted draws, at most, >= 1.
+        crowds: What has not come to an answer in these rounds begins again from a new crowd, until
+            there were so many, >= 1.
+        effective_draws: Independent draws that the weighted ones must be worth, >= 1.
+
+    Raises:
+        FitError: A setting is outside its range.
+    """
+
+    walks: int = 64
+    length: int = 8
+    effective_share: float = 0.5
+    draws: int = 1024
+    components: int = 4
+    rounds: int = 6
+    crowds: int = 3
+    effective_draws: float = 200.0
+
+    def __post_init__(self) -> None:
+        least = {
+            "walks": 16,
+            "length": 2,
+            "components": 1,
+            "rounds": 1,
+            "crowds": 1,
+            "effective_draws": 1,
+        }
+        for name, lowest in least.items():
+            if getattr(self, name) < lowest:
+                raise FitError(
+                    f"{name} is {getattr(self, name)}",
+                    where="PixelTempering",
+                    mend=f"give {lowest} or more",
+                )
+        if not 0.1 <= self.effective_share <= 0.95:
+            raise FitError(
+                f"effective_share is {self.effective_share}",
+                where="PixelTempering",
+                mend="give a number from 0.1 to 0.95",
+            )
+        if self.draws < self.crowd or self.draws % self.crowd:
+            raise FitError(
+                f"draws is {self.draws}, and the crowd {self.crowd}",
+                where="PixelTempering",
+                mend="give a multiple of walks * length",
+            )
+        if self.effective_draws >= self.draws:
+            raise FitError(
+                f"effective_draws is {self.effective_draws}, and there are {self.draws} draws",
+                where="PixelTempering",
+                mend="give fewer, or more draws",
+            )
+
+    @property
+    def crowd(self) -> int:
+        """Draws that are tempered."""
+        return self.walks * self.length
+
+
+class Crowd(NamedTuple):
+    """Draws on their way.
+
+    Args:
+        z: Unconstrained vectors, (draw, size).
+        log_prior: Their log prior density, (draw,).
+        log_likelihood: Log posterior minus log prior; minus infinity where there is none. (draw,).
+    """
+
+    z: Float[Array, "draw size"]
+    log_prior: Float[Array, " draw"]
+    log_likelihood: Float[Array, " draw"]
+
+
+class Tempered(NamedTuple):
+    """A crowd that has arrived, or not.
+
+    Args:
+        z: Unconstrained vectors, (draw, size).
+        temperature: 1 where it arrived.
+        stages: Steps of temperature.
+    """
+
+    z: Float[Array | np.ndarray, "draw size"]
+    temperature: Float[Array | np.ndarray, ""]
+    stages: Array | np.ndarray
+
+
+def temper(program: Program, settings: PixelTempering, data: Observations, key: Array) -> Tempered:
+    """Draws that are spread about as the posterior is.
+
+    Args:
+        program: The model of one pixel.
+        settings: Numbers and lengths of the walks.
+        data: The pixel's readings.
+        key: Random key.
+
+    Returns:
+        The crowd. Its draws follow each other in walks: a start for weighted draws, no more.
+
+    Raises:
+        Nothing.
+
+    Source:
+        Dau & Chopin (2022), J. R. Stat. Soc. B 84(1), 114-148: waste-free sequential Monte Carlo;
+        Jasra, Stephens, Doucet & Tsagaris (2011), Scand. J. Stat. 38(1), 1-22: adaptive steps.
+    """
+    walks, count, size = settings.walks, settings.crowd, program.size
+
+    def look(z: Array) -> Crowd:
+        prior = -jax.vmap(lambda z: program.prior_potential(z, data))(z)
+        likelihood = -jax.vmap(lambda z: program.potential(z, data))(z) - prior
+        return Crowd(z, prior, jnp.where(jnp.isnan(likelihood), -jnp.inf, likelihood))
+
+    def goes_on(state: tuple) -> Array:
+        temperature, *_, stages = state
+        return (temperature < 1.0) & (stages < MOST_STAGES)
+
+    def stage(state: tuple) -> tuple:
+        temperature, crowd, stride, key, stages = state
+        key, key_thin, key_walk = jax.random.split(key, 3)
+        rise = _rise(crowd.log_likelihood, 1.0 - temperature, settings.effective_share * count)
+        weights = jax.nn.softmax(jnp.where(rise > 0.0, rise * crowd.log_likelihood, 0.0))
+        temperature = jnp.minimum(temperature + rise, 1.0)
+        even = (jnp.arange(walks) + jax.random.uniform(key_thin)) / walks
+        kept = jnp.clip(jnp.searchsorted(jnp.cumsum(weights), even), 0, count - 1)
+        half = spread(crowd.z, weights)[1]
+
+        def walk(at: Crowd, key: Array) -> tuple[Crowd, tuple[Crowd, Array]]:
+            key_step, key_choice = jax.random.split(key)
+            noise = jax.random.normal(key_step, at.z.shape, at.z.dtype)
+            tried = look(at.z + stride * noise @ half.T)
+            gain = tried.log_prior - at.log_prior
+            gain += temperature * (tried.log_likelihood - at.log_likelihood)
+            taken = jnp.log(jax.random.uniform(key_choice, gain.shape, gain.dtype)) < gain
+            moved = jax.tree.map(lambda new, old: _choose(taken, new, old), tried, at)
+            return moved, (moved, jnp.mean(taken))
+
+        first = jax.tree.map(lambda x: x[kept], crowd)
+        keys = jax.random.split(key_walk, settings.length - 1)
+        _, (rest, accepted) = jax.lax.scan(walk, first, keys)
+        crowd = jax.tree.map(
+            lambda x, y: jnp.concatenate([x[None], y]).reshape(count, *x.shape[1:]), first, rest
+        )
+        longer = jnp.exp(jnp.clip(2.0 * (jnp.mean(accepted) - ACCEPTED), -1.0, 1.0))
+        return temperature, crowd, stride * longer, key, stages + 1
+
+    key_start, key_stages = jax.random.split(key)
+    keys = jax.random.split(key_start, count)
+    z = jax.vmap(lambda key: program.from_prior(key, data))(keys)
+    one = jnp.ones((), z.dtype)
+    state = (0.0 * one, look(z), 2.38 / size**0.5 * one, key_stages, jnp.int32(0))
+    temperature, crowd, *_, stages = jax.lax.while_loop(goes_on, stage, state)
+    return Tempered(crowd.z, temperature, stages)
+
+
+def spread(
+    z: Float[Array, "draw size"], weights: Float[Array, " draw"]
+) -> tuple[Float[Array, " size"], Float[Array, "size size"]]:
+    """Mean of weighted draws, and the lower root of their covariance.
+
+    Args:
+        z: Draws.
+        weights: They sum to one.
+
+    Returns:
+        Both.
+
+    Raises:
+        Nothing.
+    """
+    center = weights @ z
+    apart = z - center
+    sd = jnp.sqrt(weights @ apart**2)
+    sd = jnp.where(sd > 0.0, sd, 1.0)
+    scaled = apart / sd
+    correlation = scaled.T @ (scaled * weights[:, None])
+    return center, sd[:, None] * jnp.linalg.cholesky(correlation + LIFT * jnp.eye(sd.size))
+
+
+def _rise(log_likelihood: Array, most: Array, effective: float) -> Array:
+    """The largest step of temperature after which weights are still worth so many draws."""
+
+    def is_worth(rise: Array) -> Array:
+        log_weights = rise * log_likelihood
+        return 2.0 * logsumexp(log_weights) - logsumexp(2.0 * log_weights) >= jnp.log(effective)
+
+    def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        worth = is_worth(middle)
+        return jnp.where(worth, middle, low), jnp.where(worth, high, middle)
+
+    low, _ = jax.lax.fori_loop(0, HALVINGS, halve, (jnp.zeros_like(most), most))
+    return jnp.where(is_worth(most), most, low)
+
+
+def _choose(taken: Array, new: Array, old: Array) -> Array:
+    return jnp.where(taken.reshape(-1, *(1,) * (new.ndim - 1)), new, old)

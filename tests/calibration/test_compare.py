@@ -1,0 +1,85 @@
+"""Calibrations side by side, and in which way each strays."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from synthetic_calibrations import make_calibration
+from synthetic_results import make_result
+
+import polar_bayes as pb
+
+
+@pytest.fixture(scope="module")
+def compared():
+    calibrations = {
+        "laplace": make_calibration(
+            narrow={"roughness": 0.6}, shifted={"refractive_index": 0.5}, failed=(2, 9)
+        ),
+        "importance": make_calibration(),
+    }
+    return pb.compare_calibrations(calibrations)
+
+
+def test_each_parameter_by_each_method(compared) -> None:
+    assert list(compared.index.names) == ["parameter", "method"]
+    assert len(compared) == 6
+    assert compared["passes"].to_dict() == {
+        (label, method): method == "importance" or label == "subsurface_fraction"
+        for label, method in compared.index
+    }
+    assert compared.loc[("roughness", "laplace"), "ways"] == "intervals are too narrow"
+    assert compared.loc[("refractive_index", "laplace"), "ways"] == "the posterior is too high"
+    assert (compared.xs("laplace", level="method")["failed"] == 2).all()
+
+
+def test_scores_are_compared_fit_by_fit(compared) -> None:
+    """The exact posterior has the best expected score; where both are exact none is better."""
+    for label in ("roughness", "refractive_index"):
+        row = compared.loc[(label, "importance")]
+        assert row["score_change"] < -2.0 * row["score_change_error"]
+    assert compared.loc[("subsurface_fraction", "importance"), "score_change"] == 0.0
+    others = pb.compare_calibrations({"a": make_calibration(), "b": make_calibration(seed=1)})
+    assert others.xs("b", level="method")["score_change"].isna().all()
+
+
+def test_sentences_name_what_fails_and_what_mends_it(compared) -> None:
+    said = pb.comparison_sentences(compared)
+    assert said[0] == "Of 3 parameters 2 fail by laplace, none fails by importance."
+    assert said[1].startswith("roughness: by laplace intervals are too narrow (p = 0.0001, 95%")
+    assert "; by importance the ranks pass (95% intervals hold 9" in said[1]
+    assert len(said) == 3
+
+
+def test_a_shift_alone_is_not_called_a_width() -> None:
+    for shift in (-1.0, -0.4, 0.4, 1.0):
+        tree = make_calibration(shifted={"roughness": shift}, count=4000)
+        way = pb.compare_calibrations({"a": tree})["ways"].iloc[0]
+        assert way == f"the posterior is too {'high' if shift > 0.0 else 'low'}"
+
+
+def test_what_cannot_be_compared_is_refused() -> None:
+    with pytest.raises(pb.FitError, match="nothing to compare"):
+        pb.compare_calibrations({})
+    few = make_calibration(names=("roughness",))
+    with pytest.raises(pb.FitError, match="b: it has other parameters than a; calibrate the same"):
+        pb.compare_calibrations({"a": make_calibration(), "b": few})
+
+
+def test_calibrations_come_back_from_files(tmp_path: Path) -> None:
+    tree, fit = make_calibration(failed=(1,)), make_result(views=4, draws=20, wavelengths=())
+    pb.save_result(tree, tmp_path / "sbc.nc")
+    pb.save_result(fit, tmp_path / "fit.nc")
+    (tmp_path / "text.nc").write_text("nothing")
+    read = pb.load_calibration(tmp_path / "sbc.nc")
+    xr.testing.assert_identical(read["prior_sbc"].to_dataset(), tree["prior_sbc"].to_dataset())
+    assert np.isnan(read["prior_sbc"]["roughness"].to_numpy()[1])
+    held = {name: pb.holds_calibration(tmp_path / f"{name}.nc") for name in ("sbc", "fit", "text")}
+    assert held == {"sbc": True, "fit": False, "text": False}
+    assert not pb.holds_calibration(tmp_path / "nowhere.nc")
+    for name in ("fit", "text"):
+        with pytest.raises(pb.FitError, match="it holds no calibration; give the file that"):
+            pb.load_calibration(tmp_path / f"{name}.nc")
+    with pytest.raises(pb.CaptureError, match="there is no such file"):
+        pb.load_calibration(tmp_path / "nowhere.nc")

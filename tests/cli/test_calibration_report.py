@@ -1,0 +1,46 @@
+"""`polar-bayes report` of a calibration: told by what the file holds."""
+
+from pathlib import Path
+
+import pytest
+from synthetic_calibrations import make_calibration
+
+import polar_bayes as pb
+from polar_bayes.cli import main
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    pb.save_result(make_calibration(count=60), tmp_path / "sbc.nc")
+    narrow = make_calibration(count=60, narrow={"roughness": 0.4}, method="laplace")
+    pb.save_result(narrow, tmp_path / "laplace.nc")
+    return tmp_path
+
+
+def test_a_calibration_has_a_page(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["report", str(files / "sbc.nc"), "--out", str(files / "report")]
+    assert main(words) == 0
+    page = files / "report" / "index.html"
+    assert capsys.readouterr().out == f"report: {page}\n"
+    assert "Calibration report: leaf" in page.read_text()
+    assert main([*words, "--beside", str(files / "laplace.nc")]) == 0
+    assert "by laplace intervals are too narrow" in page.read_text()
+
+
+def test_a_mistake_gets_one_line(
+    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    monkeypatch.chdir(files)
+    (files / "other").mkdir()
+    pb.save_result(make_calibration(count=60), files / "other" / "laplace.nc")
+    twice = ["--beside", "laplace.nc", "--beside", "other/laplace.nc"]
+    for options, says in (
+        (["nowhere.nc"], "nowhere.nc: there is no such file"),
+        (["sbc.nc", "--beside", "nowhere.nc"], "nowhere.nc: there is no such file"),
+        (["sbc.nc", *twice], "two files of --beside have the same name"),
+    ):
+        assert main(["report", *options, "--out", "report"]) == 1
+        told = capsys.readouterr()
+        assert says in told.err
+        assert told.err.count("\n") == 1
+    assert not (files / "report").exists()

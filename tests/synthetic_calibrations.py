@@ -1,0 +1,87 @@
+"""Calibrations made by hand: normal posteriors that are right, or wrong in a known way."""
+
+import json
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from polar_bayes.pixels.marginals import LEVELS
+from polar_bayes.pixels.outcome import Approach, Status
+
+CENTER, PRIOR_SD, NOISE = 0.5, 0.1, 0.05
+NAMES = ("roughness", "subsurface_fraction", "refractive_index")
+
+
+def make_calibration(
+    *,
+    names: tuple[str, ...] = NAMES,
+    narrow: dict[str, float] | None = None,
+    shifted: dict[str, float] | None = None,
+    wavelengths: tuple[float, ...] = (),
+    count: int = 400,
+    failed: tuple[int, ...] = (),
+    seed: int = 0,
+    **provenance: object,
+) -> xr.DataTree:
+    """Truths, readings and their posteriors, all normal.
+
+    `narrow` multiplies the posterior sd of a parameter, `shifted` moves its mean by so many; all
+    others are exact. Two calibrations of one seed are of the same simulations.
+    """
+    random = np.random.default_rng(seed)
+    level = np.array(LEVELS)
+    axes: dict = {"simulation": np.arange(count)}
+    axes |= {"wavelength": list(wavelengths)} if wavelengths else {}
+    groups: dict = {"prior_sbc": {}, "truth": {}, "marginals": {}}
+    for name in names:
+        dims = ("simulation", "wavelength") if wavelengths else ("simulation",)
+        shape = tuple(len(axes[dim]) for dim in dims)
+        truth = CENTER + PRIOR_SD * random.standard_normal(shape)
+        reading = truth + NOISE * random.standard_normal(shape)
+        weight = PRIOR_SD**2 / (PRIOR_SD**2 + NOISE**2)
+        sd = np.full(shape, np.sqrt(weight) * NOISE * (narrow or {}).get(name, 1.0))
+        mean = weight * reading + (1.0 - weight) * CENTER + (shifted or {}).get(name, 0.0) * sd
+        mean[list(failed)] = sd[list(failed)] = np.nan
+        z = (truth - mean) / sd
+        score = sd * (z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z))
+        attributes = {"symbol": "", "units": "1"}
+        quantile = mean + sd * stats.norm.ppf(level).reshape(-1, *[1] * mean.ndim)
+        groups["prior_sbc"][name] = (dims, stats.norm.cdf(z), attributes)
+        groups["truth"][name] = (dims, truth, attributes)
+        groups["marginals"] |= {
+            name: (dims, mean, attributes),
+            f"{name}_sd": (dims, sd, attributes),
+            f"{name}_quantile": (("quantile", *dims), quantile, attributes),
+            f"{name}_crps": (dims, score - sd / np.sqrt(np.pi), attributes),
+        }
+    tree = xr.DataTree.from_dict(
+        {
+            "prior_sbc": xr.Dataset(groups["prior_sbc"], axes),
+            "truth": xr.Dataset(groups["truth"], axes),
+            "marginals": xr.Dataset(groups["marginals"], {**axes, "quantile": level}),
+            "fits": xr.Dataset(_fits(count, failed), {"simulation": axes["simulation"]}),
+        }
+    )
+    about = {"calibration": count, "model": "per_material", "method": "importance"}
+    about |= {"scene": "paper", "seed": seed, "capture": "leaf", "truth": {}}
+    about |= {"priors": {"roughness": "Beta(2, 3)"}, "links": {"dop": "BetaLink()"}}
+    tree.attrs["polar_bayes"] = json.dumps({**about, **provenance})
+    return tree
+
+
+def _fits(count: int, failed: tuple[int, ...]) -> dict:
+    status, approach = np.full(count, Status.GOOD), np.full(count, Approach.IMPORTANCE)
+    approach[::4] = Approach.NUTS
+    status[list(failed)], approach[list(failed)] = Status.NOT_CONVERGED, Approach.NONE
+    k = np.where(np.arange(count) % 10 == 0, 0.9, 0.2)
+    draws = np.linspace(100.0, 500.0, count)
+    k[list(failed)] = draws[list(failed)] = np.nan
+    words = {"status": Status, "approach": Approach}
+    flags = {name: " ".join(each.name.lower() for each in kinds) for name, kinds in words.items()}
+    return {
+        "status": ("simulation", status, {"flag_meanings": flags["status"]}),
+        "approach": ("simulation", approach, {"flag_meanings": flags["approach"]}),
+        "pareto_k": ("simulation", k),
+        "effective_draws": ("simulation", draws),
+    }
