@@ -41,7 +41,7 @@ HOMES = {
     "jinja2": ("polar_bayes.reporting",),
     "click": ("polar_bayes.cli",),
     "netCDF4": ("polar_bayes.capture",),
-    "optimistix": ("polar_bayes.inference",),
+    "optimistix": ("polar_bayes.inference", "polar_bayes.identifiability"),
     "tinygp": ("polar_bayes.models",),
     "arviz_base": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.reporting"),
     "arviz_stats": (

@@ -46,7 +46,6 @@ def draw_captures(program: Program, data: Observations, count: int, key: Array) 
     Raises:
         Nothing.
     """
-
     numbers = jnp.arange(count, dtype=jnp.uint32)
     truth, parts = jax.tree.map(np.asarray, _drawing(program)(numbers, key, data))
     return Simulations(truth, _in_a_row(data, parts))

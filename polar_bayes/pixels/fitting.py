@@ -175,7 +175,7 @@ def _temper(
     arrived = (crowd.temperature >= 1.0) & np.isfinite(crowd.z).all(axis=(1, 2))
     lost, left = at[~arrived], np.flatnonzero(arrived)
     z = np.tile(crowd.z[left], (1, settings.draws // settings.crowd, 1))
-    weights = np.full(z.shape[:2], 1.0 / settings.draws)
+    weights, was_worth = np.full(z.shape[:2], 1.0 / settings.draws), np.zeros(left.size, bool)
     for number in range(settings.rounds):
         if not left.size:
             break
@@ -184,13 +184,15 @@ def _temper(
         parameters, z, ratios = told
         found = Weighted(parameters, *smooth(ratios))
         possible = np.isfinite(found.weights).all(axis=-1)
-        worth = (found.effective >= settings.effective_draws) & (found.pareto_k <= LARGEST_TRUSTED)
-        is_last = number == settings.rounds - 1
-        answer = np.flatnonzero(worth | (is_last & possible))
-        row.temper(at[left[answer]], rows(found, answer), is_worth=worth[answer])
+        is_worth = found.effective >= settings.effective_draws
+        is_worth &= found.pareto_k <= LARGEST_TRUSTED
+        # A mixture too narrow looks good once: the next one, fitted to its draws, tells.
+        settled, is_last = is_worth & was_worth, number == settings.rounds - 1
+        answer = np.flatnonzero(settled | (is_last & possible))
+        row.temper(at[left[answer]], rows(found, answer), is_worth=settled[answer])
         lost = np.concatenate([lost, at[left[~possible]]])
-        on = ~worth & possible
-        left, z, weights = left[on], z[on], found.weights[on]
+        on = ~settled & possible
+        left, z, weights, was_worth = left[on], z[on], found.weights[on], is_worth[on]
     return np.sort(np.concatenate([lost, at[left]]))
 
 

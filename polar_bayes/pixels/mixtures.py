@@ -20,6 +20,9 @@ DEGREES_OF_FREEDOM = 8.0
 STEPS = 15
 """Of expectation and maximization; the mixture need not be the best one, only a good one."""
 
+WIDE_SHARE, WIDE_SCALE = 0.15, 2.0
+"""Of one more component around all draws: it shows a tail that they have too little of."""
+
 PRIOR_SCALE = 0.5
 """Scale of a component that no draws belong to, in units of that of all draws."""
 
@@ -86,8 +89,16 @@ def fit_mixture(
 
     log_share = jnp.full(components, -jnp.log(components), z.dtype)
     scale = jnp.broadcast_to(jnp.linalg.cholesky(unit), (components, size, size))
-    parts = jax.lax.fori_loop(0, STEPS, improve, (log_share, x[begin], scale))
-    return Mixture(center, half, *parts)
+    log_share, mean, scale = jax.lax.fori_loop(0, STEPS, improve, (log_share, x[begin], scale))
+    wide = WIDE_SCALE * jnp.eye(size, dtype=z.dtype)
+    shares = log_share + jnp.log1p(-WIDE_SHARE), jnp.log(jnp.full(1, WIDE_SHARE, z.dtype))
+    return Mixture(
+        center,
+        half,
+        jnp.concatenate(shares),
+        jnp.concatenate([mean, jnp.zeros((1, size), z.dtype)]),
+        jnp.concatenate([scale, wide[None]]),
+    )
 
 
 def draw_mixture(

@@ -23,6 +23,7 @@ from paper_study import (
     score,
     scores,
     share_of,
+    told,
 )
 
 import polar_bayes as pb
@@ -34,7 +35,7 @@ from polar_bayes.inference.search import from_prior
 from polar_bayes.observation.data import observe
 from polar_bayes.pixels.stack import together
 
-USUAL = ("laplace", "importance", "nuts")
+USUAL = ("laplace", "importance", "tempered", "nuts")
 NORMAL_95 = 1.959964
 
 
@@ -56,7 +57,7 @@ class LeastSquares:
     """The deterministic fit, of all captures in one compiled program."""
 
     def __init__(self, capture: xr.Dataset, truth: Mapping[str, Any] | None, study: Study) -> None:
-        told, fitted = (
+        teller, fitted = (
             resolve(
                 capture,
                 model,
@@ -73,10 +74,10 @@ class LeastSquares:
         with jax.enable_x64(True):
             data = observe(fitted.capture)
             self.program = compile_program(fitted.bind(SCENE), data)
-            teller = compile_program(told.bind(SCENE), data)
+            story = compile_program(teller.bind(SCENE), data)
             key = jax.random.key(study.seed)
             # The captures that `calibrate` draws for this seed.
-            self.drawn = draw_captures(teller, data, study.simulations, jax.random.fold_in(key, 1))
+            self.drawn = draw_captures(story, data, study.simulations, jax.random.fold_in(key, 1))
             starts = from_prior(self.program, key, pb.Point().starts, data)
         self._run = jax.jit(lambda own, shared: _each(self.program, own, shared, starts))
 
@@ -130,7 +131,8 @@ def methods(study: Study) -> None:
     begun = time.perf_counter()
     found = squares()
     seconds = {"least squares": time.perf_counter() - begun}
-    lost = {"least squares": int(np.sum(~found.converged))}
+    count = study.simulations
+    lost = {"least squares": f"{np.sum(~found.converged)} of {count} without an answer"}
     by = {
         name: {"least squares": scores_of(found, squares.drawn.truth[name], name)} for name in NAMES
     }
@@ -140,7 +142,7 @@ def methods(study: Study) -> None:
             tree = study.calibrate(capture, method=method, truth=truth)
             seconds[method] = time.perf_counter() - begun
         check_same(squares.drawn, tree)
-        lost[method] = int(np.sum(tree["fits"]["status"].to_numpy() != 0))
+        lost[method] = told([tree])
         for name in NAMES:
             by[name][method] = scores(tree, name)
     header("parameter", "method", "MAE", "95% holds", "mean width", "MAE against NUTS")
@@ -149,6 +151,6 @@ def methods(study: Study) -> None:
             against = "" if method == "nuts" else change_of(own.error, rows["nuts"].error).percent()
             row(name, method, mean_of(own.error), share_of(own.held), mean_of(own.width), against)
     print()
-    header("method", "seconds a fit", "without an answer")
+    header("method", "seconds a fit", "fits")
     for method, each in seconds.items():
-        row(method, f"{each / study.simulations:.3f}", f"{lost[method]} of {study.simulations}")
+        row(method, f"{each / count:.3f}", lost[method])

@@ -54,7 +54,7 @@ class Study:
     """
 
     simulations: int
-    method: str = "importance"
+    method: str = "tempered"
     seed: int = 0
 
     def calibrate(self, capture: xr.Dataset, **asked: Any) -> xr.DataTree:
@@ -147,6 +147,18 @@ def scores(tree: xr.DataTree, name: str) -> Scores:
     marginals = tree["marginals"].to_dataset()
     low, high = (marginals[f"{name}_quantile"].sel(quantile=q) for q in (0.025, 0.975))
     return score(marginals[name], low, high, tree["truth"][name])
+
+
+def told(trees: list[xr.DataTree]) -> str:
+    """How many fits have no answer, and how many have one that is doubted."""
+    missing, doubted, every = 0, 0, 0
+    for tree in trees:
+        status = tree["fits"]["status"].to_numpy()
+        unknown = np.isnan(tree["marginals"][INDEX].to_numpy())
+        missing += int(unknown.sum())
+        doubted += int(np.sum(~unknown & (status != 0)))
+        every += status.size
+    return f"{missing} of {every} without an answer, {doubted} doubted by their status"
 
 
 def joined(parts: list[Scores]) -> Scores:

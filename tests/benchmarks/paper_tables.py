@@ -26,6 +26,7 @@ from paper_study import (
     row,
     scores,
     share_of,
+    told,
 )
 
 import polar_bayes as pb
@@ -43,11 +44,11 @@ def table1(study: Study) -> None:
     """Error, coverage and width of every parameter in every class."""
     capture = layout()
     guess, _ = prior_moments()
-    lost = 0
+    trees = []
     header("class", "parameter", "MAE", "MAE of the prior's mean", "95% holds", "mean width")
     for name in CLASSES:
         tree = study.calibrate(capture, truth={"model": Population((name,))})
-        lost += int(np.sum(tree["fits"]["status"].to_numpy() != 0))
+        trees.append(tree)
         for parameter in NAMES:
             found = scores(tree, parameter)
             blind = np.abs(guess[parameter] - tree["truth"][parameter].to_numpy())
@@ -59,9 +60,7 @@ def table1(study: Study) -> None:
                 share_of(found.held),
                 mean_of(found.width),
             )
-    print(
-        f"\n{lost} of {study.simulations * len(CLASSES)} fits without an answer, which are misses"
-    )
+    print(f"\nfits: {told(trees)}")
 
 
 def prior_moments() -> tuple[dict[str, float], dict[str, float]]:
@@ -107,8 +106,8 @@ class Information:
             )
             self.data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
             self.program = compile_program(request.bind(SCENE), self.data)
-        self._told = jax.jit(
-            lambda z: jax.lax.map(lambda each: _told(self.program, each, self.data), z)
+        self._run = jax.jit(
+            lambda z: jax.lax.map(lambda each: _at(self.program, each, self.data), z)
         )
 
     def eigenvalues(self, truth: xr.Dataset) -> Eigenvalues:
@@ -116,7 +115,7 @@ class Information:
         program = self.program
         with jax.enable_x64(True):
             z = unconstrain(program, {name: truth[name].to_numpy() for name in program.supports})
-            paper, whole, slope = (np.asarray(x) for x in self._told(jnp.asarray(z)))
+            paper, whole, slope = (np.asarray(x) for x in self._run(jnp.asarray(z)))
             places = program.unravel(jnp.arange(program.size))
         material = np.array([int(places[name]) for name in NAMES])
         nuisance = np.setdiff1d(np.arange(program.size), material)
@@ -139,7 +138,7 @@ def _smallest(matrix: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return np.linalg.eigvalsh(scaled)[:, 0]
 
 
-def _told(program: Program, z: Array, data: Observations) -> tuple[Array, Array, Array]:
+def _at(program: Program, z: Array, data: Observations) -> tuple[Array, Array, Array]:
     """The paper's and the whole information about the coordinates, and what these move."""
     seen = program.describe(jax.random.key(0), z, data).center["intensity"]
     # Full scale is that of the sensor, not that of the views at hand.
@@ -216,8 +215,9 @@ def _differences(pairs: list) -> tuple:
 
 def geometric(values: np.ndarray) -> Figure:
     """Geometric mean, with its standard error."""
-    told = mean_of(np.log(np.maximum(values, 1e-300)))
-    return Figure(math.exp(told.value), math.exp(told.value) * told.error)
+    logarithm = mean_of(np.log(np.maximum(values, 1e-300)))
+    middle = math.exp(logarithm.value)
+    return Figure(middle, middle * logarithm.error)
 
 
 def ratio(new: np.ndarray, old: np.ndarray) -> Figure:

@@ -28,12 +28,12 @@ def corrected(capture: xr.Dataset) -> xr.DataTree:
     return pb.calibrate(capture, simulations=COUNT, **ASKED)
 
 
-@pytest.mark.parametrize("method", ["importance", "nuts"])
+@pytest.mark.parametrize("method", ["importance", "tempered", "nuts"])
 def test_what_is_right_passes(method: str, capture: xr.Dataset, corrected: xr.DataTree) -> None:
     """At a rate of false alarms of 5%, with a fixed seed; intervals within 3.3 standard errors."""
     calibration = corrected
-    if method == "nuts":
-        calibration = pb.calibrate(capture, simulations=COUNT, method="nuts", **ASKED)
+    if method != "importance":
+        calibration = pb.calibrate(capture, simulations=COUNT, method=method, **ASKED)
     table = pb.calibration_table(calibration)
     assert pb.is_calibrated(table)
     assert pb.calibration_verdict(calibration)[0].startswith("Calibrated: ")
@@ -103,7 +103,9 @@ def test_fits_that_fail_are_counted(capture: xr.Dataset) -> None:
 def test_mistakes_are_told(capture: xr.Dataset) -> None:
     with pytest.raises(pb.FitError, match="simulations is 5; give 20 or more"):
         pb.calibrate(capture, simulations=5, **ASKED)
-    with pytest.raises(pb.FitError, match="no such method; give one of laplace, importance, nuts"):
+    with pytest.raises(
+        pb.FitError, match="no such method; give one of laplace, importance, tempered, nuts"
+    ):
         pb.calibrate(capture, method="hmc", **ASKED)
     with pytest.raises(pb.FitError, match="seed cannot differ"):
         pb.calibrate(capture, truth={"seed": 1}, **ASKED)

@@ -1,0 +1,143 @@
+"""Crowds from the prior, and mixtures fitted to them: two modes, a skewed pixel, densities."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import pytest
+import scipy.stats
+from numpyro import distributions as dist
+from plate_images import VIEWS, on_a_grid, planned, plate_image, stacked
+from plates import plate_capture
+
+import polar_bayes as pb
+from polar_bayes.inference.program import Program, compile_program
+from polar_bayes.observation.data import Observations, observe
+from polar_bayes.pixels.fitting import fit_stack
+from polar_bayes.pixels.importance import effective_draws, smooth
+from polar_bayes.pixels.mixtures import DEGREES_OF_FREEDOM, draw_mixture, fit_mixture
+from polar_bayes.pixels.outcome import Approach, Status
+from polar_bayes.pixels.tempering import PixelTempering, spread, temper
+
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
+SETTINGS = PixelTempering()
+WEAK = plate_image(1, 3, noise=0.15, views=VIEWS[[1, 4]], seed=7)
+FAR, WIDTH = 2.0, 0.05
+
+
+def two_sided(data: Observations) -> None:
+    """Readings that know how far x is from 0, and not on which side; y is free."""
+    x = numpyro.sample("x", dist.Normal(0.0, 3.0))
+    numpyro.sample("y", dist.Normal(0.0, 1.0))
+    with numpyro.plate("view", data.shape[-1]):
+        numpyro.sample("q", dist.Normal(jnp.abs(x) - FAR, WIDTH), obs=jnp.zeros(data.shape[-1]))
+
+
+@pytest.fixture(scope="module")
+def two_modes() -> tuple[Program, Observations]:
+    data = observe(plate_capture(np.array([40.0]), 0.03, seed=0)).in_single_precision()
+    return compile_program(two_sided, data), data
+
+
+@pytest.fixture(scope="module")
+def crowd(two_modes: tuple[Program, Observations]) -> np.ndarray:
+    program, data = two_modes
+    with jax.enable_x64(False):
+        found = jax.jit(lambda data, key: temper(program, SETTINGS, data, key))(
+            data, jax.random.key(0)
+        )
+    assert float(found.temperature) == 1.0
+    assert int(found.stages) > 2
+    return np.asarray(found.z)
+
+
+def test_a_crowd_is_in_both_modes_and_wide_where_nothing_is_known(crowd: np.ndarray) -> None:
+    x, y = crowd.T
+    assert np.abs(np.abs(x) - FAR).max() < 6.0 * WIDTH
+    # 64 walks thinned at each of some stages: the share of a side scatters by about 0.15.
+    assert 0.1 < np.mean(x > 0.0) < 0.9
+    assert 0.6 < y.std() < 1.4
+
+
+def test_weighted_draws_of_its_mixture_are_the_posterior(two_modes, crowd: np.ndarray) -> None:
+    program, data = two_modes
+    count = 4096
+    with jax.enable_x64(False):
+        even = jnp.full(len(crowd), 1.0 / len(crowd))
+        mixture = fit_mixture(jnp.asarray(crowd), even, 4, jax.random.key(1))
+        z, log_density = draw_mixture(mixture, count, jax.random.key(2))
+        values = jax.vmap(lambda z: program.potential(z, data))(z)
+    weights, pareto_k = smooth(np.asarray(-values - log_density)[None])
+    assert pareto_k[0] < 0.7
+    x, y = np.asarray(z, float).T
+    worth = effective_draws(weights)[0]
+    assert worth >= SETTINGS.effective_draws
+    # Four Monte Carlo errors each: three comparisons fail by chance twice in ten thousand.
+    assert abs(weights[0] @ (x > 0.0) - 0.5) < 4.0 * 0.5 / np.sqrt(worth)
+    assert abs(weights[0] @ y) < 4.0 / np.sqrt(worth)
+    assert abs(weights[0] @ y**2 - 1.0) < 4.0 * np.sqrt(2.0 / worth)
+
+
+def test_the_density_of_a_mixture_is_that_of_its_parts() -> None:
+    random = np.random.default_rng(0)
+    z = random.normal(size=(400, 2)) @ np.array([[1.0, 0.4], [0.0, 0.2]]) + np.array([3.0, -5.0])
+    mixture = fit_mixture(jnp.asarray(z), jnp.full(400, 1.0 / 400), 3, jax.random.key(0))
+    drawn, log_density = draw_mixture(mixture, 256, jax.random.key(1))
+    center, half = np.asarray(mixture.center), np.asarray(mixture.half)
+    expected = np.zeros(256)
+    for log_share, mean, scale in zip(*(np.asarray(x) for x in mixture[2:]), strict=True):
+        root = half @ scale
+        part = scipy.stats.multivariate_t(center + half @ mean, root @ root.T, DEGREES_OF_FREEDOM)
+        expected += np.exp(log_share) * part.pdf(np.asarray(drawn))
+    difference = np.asarray(log_density) - np.log(expected)
+    assert np.exp(np.asarray(mixture.log_share)).sum() == pytest.approx(1.0)
+    assert np.ptp(difference) < 1e-9  # up to a constant
+
+
+def test_spread_is_mean_and_covariance_of_weighted_draws() -> None:
+    random = np.random.default_rng(1)
+    z, weights = random.normal(size=(50, 3)) * [1.0, 1e-3, 1e3], random.dirichlet(np.ones(50))
+    center, half = (np.asarray(x) for x in spread(jnp.asarray(z), jnp.asarray(weights)))
+    assert center == pytest.approx(np.average(z, axis=0, weights=weights))
+    covariance = np.cov(z.T, aweights=weights, ddof=0)
+    scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    assert np.abs(half @ half.T - covariance).max() < 2e-6 * scale.max()
+    assert np.abs((half @ half.T - covariance) / scale).max() < 2e-6  # what the lift adds
+
+
+def test_a_skewed_pixel_has_the_posterior_of_a_grid() -> None:
+    plan = planned(WEAK)
+    found = {}
+
+    def describe(at: np.ndarray, parameters: dict, weights: np.ndarray) -> None:
+        for row, pixel in enumerate(at):
+            draws = {name: x[row] for name, x in parameters.items()}
+            found[int(pixel)] = draws, weights[row]
+
+    outcome = fit_stack(plan.engine, SETTINGS, stacked(WEAK, plan), np.arange(3), 0, describe)
+    assert (outcome.status == Status.GOOD).all()
+    assert (outcome.approach == Approach.TEMPERED).all()
+    assert (outcome.effective_draws >= SETTINGS.effective_draws).all()
+    for pixel, q in enumerate(WEAK["q"].values[0]):
+        draws, weights = found[pixel]
+        for name, (mean, sd, _) in on_a_grid(q, 0.15, WEAK["view_zenith"].values).items():
+            # The error of a ratio of weighted sums; four of them: 4e-4 over these six.
+            told = weights @ draws[name]
+            error = np.sqrt(np.sum(weights**2 * (draws[name] - told) ** 2))
+            assert abs(told - mean) < 4.0 * error
+            assert error < 0.1 * sd
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"walks": 4}, "walks is 4; give 16 or more"),
+        ({"effective_share": 0.99}, "effective_share is 0.99; give a number from 0.1 to 0.95"),
+        ({"draws": 1000}, "draws is 1000, and the crowd 512; give a multiple of walks"),
+        ({"effective_draws": 2000.0}, "effective_draws is 2000.0, and there are 1024 draws"),
+    ],
+)
+def test_mistakes_are_told(settings: dict, said: str) -> None:
+    with pytest.raises(pb.FitError, match=said):
+        pb.PixelTempering(**settings)
