@@ -15,7 +15,6 @@ from paper_study import (
     Population,
     Scores,
     Study,
-    change_of,
     header,
     layout,
     mean_of,
@@ -145,11 +144,10 @@ def methods(study: Study) -> None:
         lost[method] = told([tree])
         for name in NAMES:
             by[name][method] = scores(tree, name)
-    header("parameter", "method", "MAE", "95% holds", "mean width", "MAE against NUTS")
+    header("parameter", "method", "MAE", "95% holds", "mean width")
     for name, rows in by.items():
         for method, own in rows.items():
-            against = "" if method == "nuts" else change_of(own.error, rows["nuts"].error).percent()
-            row(name, method, mean_of(own.error), share_of(own.held), mean_of(own.width), against)
+            row(name, method, mean_of(own.error), share_of(own.held), mean_of(own.width))
     print()
     header("method", "seconds a fit", "fits")
     for method, each in seconds.items():

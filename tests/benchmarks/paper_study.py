@@ -134,7 +134,7 @@ class Scores(NamedTuple):
     width: np.ndarray
 
 
-def score(estimate: Array, low: Array, high: Array, truth: Array) -> Scores:
+def score(estimate: Any, low: Any, high: Any, truth: Any) -> Scores:
     """Scores of estimates and intervals; an interval without end is no answer."""
     estimate, low, high, truth = (np.asarray(x, float) for x in (estimate, low, high, truth))
     width = np.where(np.isfinite(high - low), high - low, np.nan)
