@@ -73,8 +73,8 @@ def calibrate(
         simulations: How many, at least 20.
         model: As for `polar_bayes.fit`; scene, priors, links and largest_view_zenith too.
         method: "laplace" (the normal approximation at the mode), "importance" (its draws weighed by
-            the posterior, corrected as in maps), "tempered" (draws led from the prior to the posterior,
-            which sees every mode), "nuts" (chains in every fit), or settings.
+            the posterior, corrected as in maps), "tempered" (draws led from the prior to the
+            posterior, which sees every mode), "nuts" (chains in every fit), or settings.
         scene: A name, a `Scene` or None.
         priors: Overrides.
         links: One link, a mapping or None.

@@ -8,8 +8,8 @@ The per-material model of one color: 40 views of the degree of polarization and 
 paper's scene with four facets on the way out; four parameters of the material, three of the noise.
 All fit the same simulations. Ours is timed twice, with compilation and without; the loop runs one
 compiled chain of 500 warm-up and 500 kept draws for each, with NumPyro's defaults.
-ESS is the least of all parameters of a fit, or what its weighted draws are worth: of all fits, the 5%
-quantile and the median. The last column is the least p-value of uniform ranks.
+ESS is the least of all parameters of a fit, or what its weighted draws are worth: of all fits, the
+5% quantile and the median. The last column is the least p-value of uniform ranks.
 """
 
 import dataclasses
