@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 from numpyro import handlers
-from numpyro.infer.util import potential_energy
 
 from polar_bayes.identifiability.information import bare, information
 from polar_bayes.inference.program import Program
@@ -174,8 +173,7 @@ def prior_precision(
     Raises:
         Nothing.
     """
-    alone = handlers.block(program.model, hide=list(program.observed))
-    return jax.hessian(lambda z: potential_energy(alone, (data,), {}, program.unravel(z)))(z)
+    return jax.hessian(lambda z: program.prior_potential(z, data))(z)
 
 
 def sound_precision(
