@@ -14,6 +14,7 @@ _HOMES = {
     "calibration.calibrate": ("calibrate",),
     "calibration.compare": ("compare_calibrations", "comparison_sentences"),
     "calibration.files": ("holds_calibration", "load_calibration"),
+    "calibration.prediction": ("calibration_readings",),
     "calibration.retest": ("proxy_coverage", "proxy_scores", "retest"),
     "calibration.verdict": ("calibration_table", "calibration_verdict", "is_calibrated"),
     "capture.combine": ("combine",),

@@ -21,13 +21,15 @@ def make_calibration(
     wavelengths: tuple[float, ...] = (),
     count: int = 400,
     failed: tuple[int, ...] = (),
+    readings: dict[str, float] | None = None,
     seed: int = 0,
     **provenance: object,
 ) -> xr.DataTree:
     """Truths, readings and their posteriors, all normal.
 
     `narrow` multiplies the posterior sd of a parameter, `shifted` moves its mean by so many; all
-    others are exact. Two calibrations of one seed are of the same simulations.
+    others are exact. `readings` adds ranks of readings, and says by what the spread of their
+    predictions is wrong. Two calibrations of one seed are of the same simulations.
     """
     random = np.random.default_rng(seed)
     level = np.array(LEVELS)
@@ -55,19 +57,37 @@ def make_calibration(
             f"{name}_quantile": (("quantile", *dims), quantile, attributes),
             f"{name}_crps": (dims, score - sd / np.sqrt(np.pi), attributes),
         }
-    tree = xr.DataTree.from_dict(
-        {
-            "prior_sbc": xr.Dataset(groups["prior_sbc"], axes),
-            "truth": xr.Dataset(groups["truth"], axes),
-            "marginals": xr.Dataset(groups["marginals"], {**axes, "quantile": level}),
-            "fits": xr.Dataset(_fits(count, failed), {"simulation": axes["simulation"]}),
-        }
-    )
+    simulation = {"simulation": axes["simulation"]}
+    datasets = {
+        "prior_sbc": xr.Dataset(groups["prior_sbc"], axes),
+        "truth": xr.Dataset(groups["truth"], axes),
+        "marginals": xr.Dataset(groups["marginals"], {**axes, "quantile": level}),
+        "fits": xr.Dataset(_fits(count, failed), simulation),
+    }
+    if readings is not None:
+        told = _readings(readings, count, failed, random)
+        datasets |= {group: xr.Dataset(values, simulation) for group, values in told.items()}
+    tree = xr.DataTree.from_dict(datasets)
     about = {"calibration": count, "model": "per_material", "method": "importance"}
     about |= {"scene": "paper", "seed": seed, "capture": "leaf", "truth": {}}
     about |= {"priors": {"roughness": "Beta(2, 3)"}, "links": {"dop": "BetaLink()"}}
     tree.attrs["polar_bayes"] = json.dumps({**about, **provenance})
     return tree
+
+
+def _readings(
+    spread: dict[str, float], count: int, failed: tuple[int, ...], random: np.random.Generator
+) -> dict:
+    found: dict = {"predictive_pit": {}, "loo_pit": {}, "readings": {}}
+    for name in ("dop", "intensity"):
+        for group in ("predictive_pit", "loo_pit"):
+            pit = stats.norm.cdf(random.standard_normal(count) / spread.get(name, 1.0))
+            pit[list(failed)] = np.nan
+            found[group][name] = ("simulation", pit)
+        k = np.where(np.arange(count) % 10 == 0, 0.9, 0.2)
+        found["readings"][f"{name}_pareto_k"] = ("simulation", k)
+        found["readings"][f"{name}_view"] = ("simulation", np.arange(count) % 7)
+    return found
 
 
 def _fits(count: int, failed: tuple[int, ...]) -> dict:

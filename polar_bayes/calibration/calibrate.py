@@ -1,49 +1,39 @@
 """The public verb: draw from the prior, simulate, fit again, and see where the truth stands."""
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from dask.base import tokenize
 from numpyro import distributions as dist
 
+from polar_bayes.calibration.block import CANDIDATES, Block, Method, Plan, cut, fit_block, join
+from polar_bayes.calibration.one_by_one import has_further_axes
+from polar_bayes.calibration.question import question_of
 from polar_bayes.calibration.result import assemble
-from polar_bayes.calibration.simulations import Simulations, draw_captures
-from polar_bayes.calibration.standing import Standing
+from polar_bayes.calibration.store import Store
+from polar_bayes.capture.paths import as_path
 from polar_bayes.errors import FitError
-from polar_bayes.inference.program import Program, Values, compile_program
+from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.request import Request, resolve
-from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.pixels.engine import Engine
 from polar_bayes.pixels.executors import as_completed, workers
-from polar_bayes.pixels.fitting import PixelLaplace, fit_stack
-from polar_bayes.pixels.making import Recipe, key_of, make_engine
-from polar_bayes.pixels.marginals import Marginals
-from polar_bayes.pixels.outcome import Outcome
+from polar_bayes.pixels.fitting import PixelLaplace
+from polar_bayes.pixels.making import key_of
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.tempering import PixelTempering
-from polar_bayes.pixels.tracing import TRACING
 from polar_bayes.priors import describe_prior
 
-Method = PixelLaplace | PixelNuts | PixelTempering
 METHODS: dict[str, Method] = {
     "laplace": PixelLaplace(weighted=False),
     "importance": PixelLaplace(draws=512),
     "tempered": PixelTempering(),
     "nuts": PixelNuts(),
 }
-CANDIDATES = 32
-BLOCK = 128
-"""Simulations that one thread fits at a time."""
-
-RANKED = 128
-"""About so many draws of a chain are ranked: far enough apart to be nearly independent."""
-
 FEWEST = 20
 
 
@@ -59,6 +49,10 @@ def calibrate(
     largest_view_zenith: float | None = None,
     truth: Mapping[str, Any] | None = None,
     seed: int = 0,
+    readings: bool = True,
+    store: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> xr.DataTree:
     """Simulation-based calibration: do the intervals of this fit hold?
@@ -74,7 +68,9 @@ def calibrate(
         model: As for `polar_bayes.fit`; scene, priors, links and largest_view_zenith too.
         method: "laplace" (the normal approximation at the mode), "importance" (its draws weighed by
             the posterior, corrected as in maps), "tempered" (draws led from the prior to the
-            posterior, which sees every mode), "nuts" (chains in every fit), or settings.
+            posterior, which sees every mode), "nuts" (chains in every fit; those of
+            `polar_bayes.fit` where the capture has patches, materials or wavelengths), or settings,
+            those of `polar_bayes.fit` (`Nuts`, `Laplace`) among them.
         scene: A name, a `Scene` or None.
         priors: Overrides.
         links: One link, a mapping or None.
@@ -82,23 +78,39 @@ def calibrate(
         truth: Arguments (model, scene, priors, links) by which captures are simulated where they
             differ from those that are fitted: a check that is broken on purpose.
         seed: Of everything that is drawn.
+        readings: True ranks readings among what the fits predict, too: in every simulation one of
+            each recorded variable that is read afresh, and one that is left out of the fit.
+        store: A folder in which finished blocks of fits are kept, so that a calibration that was
+            broken off can go on; by default they are kept in memory alone. It stays.
+        resume: Go on with what is in the store: the same question, and as many simulations or
+            more, or fewer. The result is that of a calibration that was not broken off.
+        scheduler: Address of a `dask.distributed` scheduler whose workers fit the blocks; by
+            default threads of this process.
         progress: Called with the fits that are done, and all.
 
     Returns:
         A tree with the groups `prior_sbc` (probability integral transforms, which
         `arviz_plots.plot_ecdf_pit(tree, sample_dims=["simulation"])` shows), `truth`, `marginals`
         (mean, sd, quantiles and ranked score of every fit) and `fits` (status, approach, pareto_k,
-        effective_draws, condition, steps). A fit that failed is NaN, and counted in `status`.
+        effective_draws, condition, steps). A fit that failed is NaN, and counted in `status`. Where
+        readings are ranked, `predictive_pit` (of fresh readings), `loo_pit` (of those left out)
+        and `readings` (which ones, and Pareto k) lie beside them; where they cannot be, the
+        attribute `polar_bayes` says why.
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.
-        FitError: Something asked for cannot be used.
+        FitError: Something asked for cannot be used, the store is there already (or, to resume,
+            was begun with another question), or it cannot be written.
     """
+    if resume and store is None:
+        raise FitError(
+            "there is no store to go on with", where="calibrate: resume", mend="give store="
+        )
     if simulations < FEWEST:
         raise FitError(
             f"simulations is {simulations}", where="calibrate", mend=f"give {FEWEST} or more"
         )
-    settings = _settings(method)
+    settings = _settings(method, capture)
     asked = {"model": model, "scene": scene, "priors": priors, "links": links}
     strange = set(truth or {}) - set(asked)
     if strange:
@@ -112,24 +124,32 @@ def calibrate(
         for differing in ({}, truth or {})
     )
     clock = time.perf_counter()
-    with jax.enable_x64(True):
-        data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
-        engine = _engine_of(request, settings, data)
-        teller = compile_program(told.bind(told.scene), data) if truth else engine.program
-        key = jax.random.fold_in(jax.random.key(seed), 1)
-        drawn = draw_captures(teller, data, simulations, key)
-    shared = _in_common(engine.program, data, drawn)
-    marginals = Marginals(simulations, {name: x.shape[1:] for name, x in shared.items()})
-    standing = Standing(shared, seed)
-    outcomes = _fit_all(engine, settings, drawn, seed, (marginals, standing), progress or _silent)
+    plan = _planned(request, told if truth else None, settings, readings)
+    kept = None if store is None else Store(as_path(store, "store"), question_of(plan))
+    found = kept.begin(resume=resume) if kept is not None else []
+    if not plan.shared:
+        raise FitError(
+            "it has no parameter in common with what is fitted",
+            where="calibrate: truth",
+            mend="give models whose parameters have the same names and shapes",
+        )
+    missing = _missing(found, simulations)
+    show = progress or _silent
+    found += _fit_all(plan, missing, simulations, kept, scheduler, show)
     about = _provenance(request, settings, method, truth, simulations)
     about["seconds"] = round(time.perf_counter() - clock, 3)
-    return assemble(engine.program, request, data, shared, marginals, standing, outcomes, about)
+    if missing.size < simulations:
+        about["fits found in the store"] = simulations - missing.size
+    if readings:
+        about["readings_told"] = plan.untold or "ranked"
+    return assemble(plan.program, request, plan.data, join(found, simulations), about)
 
 
-def _settings(method: str | Method) -> Method:
+def _settings(method: str | Method, capture: xr.Dataset) -> Method:
     if isinstance(method, Method):
         return method
+    if method == "nuts" and has_further_axes(capture):
+        return Nuts()
     if method not in METHODS:
         raise FitError(
             "no such method",
@@ -146,65 +166,43 @@ def _resolved(
     return resolve(capture, model, "laplace", scene, priors, links, limit, seed, "double")
 
 
-def _engine_of(request: Request, settings: Method, data: Observations) -> Engine:
-    """The programs, which the next calibration of the same model finds compiled."""
+def _planned(request: Request, told: Request | None, settings: Method, readings: bool) -> Plan:
     candidates = settings.candidates if isinstance(settings, PixelLaplace) else CANDIDATES
-    key = key_of(request, candidates, request.largest_view_zenith)
-    with TRACING:
-        return make_engine(Recipe(request, lambda: data, candidates, key))
+    limit = request.largest_view_zenith
+    recipe_key = key_of(request, candidates, limit)
+    told_key = "" if told is None else key_of(told)
+    key = tokenize(recipe_key, told_key, repr(settings), readings, tokenize(request.capture))
+    return Plan(request, told, settings, readings, recipe_key, key)
 
 
-def _in_common(program: Program, data: Observations, drawn: Simulations) -> Values:
-    """Truths of the parameters that are fitted."""
-    with jax.enable_x64(True):
-        fitted = jax.eval_shape(program.parameters, jnp.zeros(program.size), data)
-    shared = {
-        name: np.asarray(truth)
-        for name, truth in drawn.truth.items()
-        if name in fitted and truth.shape[1:] == fitted[name].shape
-    }
-    if not shared:
-        raise FitError(
-            "it has no parameter in common with what is fitted",
-            where="calibrate: truth",
-            mend="give models whose parameters have the same names and shapes",
-        )
-    return shared
+def _missing(found: list[Block], simulations: int) -> np.ndarray:
+    """Numbers of the simulations that are still to be fitted."""
+    there = [block.numbers for block in found]
+    return np.setdiff1d(np.arange(simulations), np.concatenate([*there, []])).astype(int)
 
 
 def _fit_all(
-    engine: Engine,
-    settings: Method,
-    drawn: Simulations,
-    seed: int,
-    takers: tuple[Marginals, Standing],
+    plan: Plan,
+    missing: np.ndarray,
+    every: int,
+    kept: Store | None,
+    scheduler: str | None,
     progress: Callable[[int, int], None],
-) -> Outcome:
-    """Blocks of fits on threads; who fits what changes nothing."""
-    count = len(drawn.captures)
-    apart = 1
-    if isinstance(settings, PixelNuts):
-        apart = max(1, settings.chains * settings.draws // RANKED)
-
-    def fit(begin: int) -> Outcome:
-        index = np.arange(begin, min(begin + BLOCK, count))
-
-        def describe(at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-            few = {name: np.asarray(x)[:, ::apart] for name, x in parameters.items()}
-            share = weights[:, ::apart] / weights[:, ::apart].sum(axis=-1, keepdims=True)
-            for taker in takers:
-                taker.describe(index[at], few, share)
-
-        return fit_stack(engine, settings, drawn.captures.subset(index), index, seed, describe)
-
-    found: dict[int, Outcome] = {}
-    with workers(None) as (pool, threads):
-        tasks = ((begin,) for begin in range(0, count, BLOCK))
-        for (begin,), outcome in as_completed(pool, threads, fit, tasks):
-            found[begin] = outcome
-            progress(sum(len(each.status) for each in found.values()), count)
-    ordered = (found[begin] for begin in sorted(found))
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *ordered)
+) -> list[Block]:
+    """Blocks of fits on threads or workers; who fits what changes nothing."""
+    found: list[Block] = []
+    if not missing.size:
+        return found
+    done = every - missing.size
+    with workers(scheduler) as (executor, count):
+        tasks = ((plan, numbers) for numbers in cut(missing, plan.block))
+        for _, block in as_completed(executor, count, fit_block, tasks):
+            if kept is not None:
+                kept.add(block)
+            found.append(block)
+            done += len(block.numbers)
+            progress(done, every)
+    return found
 
 
 def _silent(done: int, every: int) -> None:

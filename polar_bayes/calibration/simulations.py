@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.observation.data import Observations
-from polar_bayes.pixels.stack import Stack
+from polar_bayes.pixels.stack import Stack, together
 
 
 class Simulations(NamedTuple):
@@ -46,9 +46,74 @@ def draw_captures(program: Program, data: Observations, count: int, key: Array) 
     Raises:
         Nothing.
     """
-    numbers = jnp.arange(count, dtype=jnp.uint32)
-    truth, parts = jax.tree.map(np.asarray, _drawing(program)(numbers, key, data))
+    return draw_numbered(program, data, np.arange(count), key)
+
+
+def draw_numbered(
+    program: Program, data: Observations, numbers: np.ndarray, key: Array
+) -> Simulations:
+    """Draw the captures of some numbers.
+
+    Args:
+        program: The model that tells the story.
+        data: A capture of the layout.
+        numbers: Of the simulations.
+        key: Random key; as many numbers as the last time run the same program, to the same bits.
+
+    Returns:
+        The simulations, in the order of their numbers.
+
+    Raises:
+        Nothing.
+    """
+    told = _drawing(program)(jnp.asarray(numbers, np.uint32), key, data)
+    truth, parts = jax.tree.map(np.asarray, told)
     return Simulations(truth, _in_a_row(data, parts))
+
+
+def draw_fresh(
+    program: Program, data: Observations, drawn: Simulations, numbers: np.ndarray, key: Array
+) -> Values:
+    """Read the same truths once more.
+
+    Args:
+        program: The model that told the story.
+        data: The capture of the layout.
+        drawn: What was recorded; its brightness sets the noise of the other readings.
+        numbers: Of the simulations.
+        key: The random key that they were drawn with.
+
+    Returns:
+        Fresh readings by name, each (simulation, ..., view).
+
+    Raises:
+        Nothing.
+    """
+    captures = drawn.captures
+    found = _reading_again(program)(
+        np.asarray(numbers, np.uint32), key, data, captures.own, captures.shared
+    )
+    return jax.tree.map(np.asarray, found)
+
+
+@functools.lru_cache(maxsize=4)
+def _reading_again(program: Program) -> Callable[..., Values]:
+    """Fresh readings of many truths, compiled once for a program."""
+
+    def read(
+        number: Array, key: Array, data: Observations, own: Observations, shared: Observations
+    ) -> Values:
+        key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
+        z = program.from_prior(key_truth, data)
+        told = program.describe(jax.random.fold_in(key_noise, 1), z, together(own, shared))
+        return told.predictive
+
+    def read_all(
+        numbers: Array, key: Array, data: Observations, own: Observations, shared: Observations
+    ) -> Values:
+        return jax.lax.map(lambda at: read(at[0], key, data, at[1], shared), (numbers, own))
+
+    return jax.jit(read_all)
 
 
 @functools.lru_cache(maxsize=4)

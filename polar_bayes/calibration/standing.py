@@ -11,6 +11,7 @@ class Standing:
 
     Args:
         truth: By parameter, (simulation, ...).
+        numbers: Of the simulations, which the randomization follows.
         seed: Of the randomization.
 
     Attributes:
@@ -23,10 +24,13 @@ class Standing:
         (2007), JASA 102, 359-378, eq. 21.
     """
 
-    def __init__(self, truth: Values, seed: int) -> None:
-        self._truth = {name: np.asarray(x, float) for name, x in truth.items()}
-        random = np.random.default_rng(seed)
-        self._chance = {name: random.random(x.shape) for name, x in self._truth.items()}
+    def __init__(self, truth: Values, numbers: np.ndarray, seed: int) -> None:
+        self._truth = {name: np.asarray(truth[name], float) for name in sorted(truth)}
+        random = [np.random.default_rng([seed, number]) for number in numbers]
+        self._chance = {
+            name: np.array([each.random(x.shape[1:]) for each in random])
+            for name, x in self._truth.items()
+        }
         self.pit = {name: np.full(x.shape, np.nan) for name, x in self._truth.items()}
         self.crps = {name: np.full(x.shape, np.nan) for name, x in self._truth.items()}
 

@@ -8,6 +8,7 @@ import scipy.special
 import scipy.stats
 import xarray as xr
 
+from polar_bayes.calibration.prediction import readings_verdict
 from polar_bayes.calibration.uniformity import uniformity
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.diagnostics.parameters import Scalar, scalars
@@ -66,7 +67,7 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
 
     Returns:
         First whether the ranks pass, then each parameter that does not and how it strays, then the
-        fits that failed.
+        fits that failed, then what the readings say, which are judged by themselves.
 
     Raises:
         FitError: It is no calibration.
@@ -89,7 +90,7 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
         lost = int(np.sum(statuses == status))
         if status != Status.GOOD and lost:
             said.append(f"{lost} of {statuses.size} fits: {status.name.lower().replace('_', ' ')}.")
-    return said
+    return said + readings_verdict(calibration)
 
 
 def how_ranks_stray(row: pd.Series) -> str:

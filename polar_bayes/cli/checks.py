@@ -25,21 +25,39 @@ from polar_bayes.cli.printing import NOT_CONVERGED, counting_bar, progress_bars
 @click.option("--scene", help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
-def calibrate(capture: Path, out: Path, as_json: bool, **settings: Any) -> int:
+@click.option("--no-readings", is_flag=True, help="Rank parameters only.")
+@click.option("--scheduler", help="Address of a dask.distributed scheduler; default: threads.")
+@click.option(
+    "--resume", is_flag=True,
+    help="Go on with a calibration that was broken off, or with more simulations.",
+)  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print the tables as JSON.")
+def calibrate(
+    capture: Path, out: Path, no_readings: bool, resume: bool, as_json: bool, **settings: Any
+) -> int:
     """Simulate captures of this layout, fit each, and see whether the intervals hold."""
     data = pb.load_capture(capture)
     check_writable(out)
+    store = out.with_name(f"{out.name}.fits")
+    if resume and out.exists() and not store.exists():
+        raise pb.FitError("nothing is left to resume", where=str(out), mend="give another --out")
+    settings |= {"readings": not no_readings, "store": store, "resume": resume}
     with counting_bar("fits") as progress:
         calibration = pb.calibrate(data, progress=progress, **settings)
     pb.save_result(calibration, out)
     table, said = pb.calibration_table(calibration), pb.calibration_verdict(calibration)
+    is_ranked = "predictive_pit" in calibration.children
+    readings = pb.calibration_readings(calibration) if is_ranked else None
     if as_json:
-        rows = json.loads(table.to_json(orient="index"))
-        click.echo(json.dumps({"parameters": rows, "verdict": said}, indent=2, allow_nan=False))
+        tables = {"parameters": table} | ({} if readings is None else {"readings": readings})
+        rows = {name: json.loads(each.to_json(orient="index")) for name, each in tables.items()}
+        click.echo(json.dumps({**rows, "verdict": said}, indent=2, allow_nan=False))
     else:
         shown = table[["answered", "failed", "p_value", "held_50", "held_80", "held_95", "crps"]]
         click.echo(shown.to_string(float_format=lambda x: f"{x:.3g}"))
+        if readings is not None:
+            shown = readings.drop(columns=["reading", "test"])
+            click.echo(f"\n{shown.to_string(float_format=lambda x: f'{x:.3g}', na_rep='')}")
         click.echo("\n".join(["", *said]))
     return 0 if pb.is_calibrated(table) else NOT_CONVERGED
 

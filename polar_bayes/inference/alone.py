@@ -1,5 +1,6 @@
 """One patch of a capture by itself: its peaks, and the shape of its density around a point."""
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -10,15 +11,28 @@ import numpy as np
 from polar_bayes.errors import FitError
 from polar_bayes.inference.groups import Groups, find_groups, group_of
 from polar_bayes.inference.modes import Modes, ValueAndGradient, climb, distinct, quiet_line_search
-from polar_bayes.inference.program import Model, compile_program
+from polar_bayes.inference.program import Model, Program, compile_program
 from polar_bayes.observation.data import Observations
 
 Starts = tuple[np.ndarray, np.ndarray]
 """Coordinates of a patch, (start, local), and common ones, (start, common)."""
 
 
-def can_be_alone(model: Model, groups: Groups, data: Observations) -> bool:
-    """Whether the model can be told for one patch: not where a prior names every patch.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lone:
+    """The model of one patch, compiled once for all patches of all captures.
+
+    Args:
+        program: The model on a capture of one patch.
+        groups: Which of its coordinates are the patch's own.
+    """
+
+    program: Program
+    groups: Groups
+
+
+def find_lone(model: Model, groups: Groups, data: Observations) -> Lone | None:
+    """The model told for one patch, where it can be: not where a prior names every patch.
 
     Args:
         model: The model of the data alone.
@@ -26,37 +40,36 @@ def can_be_alone(model: Model, groups: Groups, data: Observations) -> bool:
         data: The whole capture.
 
     Returns:
-        False where the shapes of one patch do not fit the model.
+        None where the shapes of one patch do not fit the model.
+
+    Raises:
+        Nothing.
     """
     first = group_of(data, 0)
     try:
         program = compile_program(model, first)
     except (TypeError, ValueError):  # arrays of the wrong length for one patch
-        return False
+        return None
     alone = find_groups(program, first)
     if alone is None:
-        return False
+        return None
     same_local = alone.local.shape == (1, groups.local.shape[1])
-    return same_local and alone.common.size == groups.common.size
+    same = same_local and alone.common.size == groups.common.size
+    return Lone(program, alone) if same else None
 
 
 class Alone:
-    """The model on one patch, compiled once for all.
+    """The patches of one capture, each by itself.
 
     Args:
-        model: The model of the data alone.
+        lone: The model of one patch.
         data: The whole capture.
         threads: Patches that are climbed at once.
     """
 
-    def __init__(self, model: Model, data: Observations, threads: int = 2) -> None:
-        first = group_of(data, 0)
-        self._program = compile_program(model, first)
-        groups = find_groups(self._program, first)
-        assert groups is not None, "see `can_be_alone`"
-        self._groups: Groups = groups
+    def __init__(self, lone: Lone, data: Observations, threads: int = 2) -> None:
+        self._program, self._groups = lone.program, lone.groups
         self._parts = [group_of(data, number) for number in range(data.dims[0][1])]
-        self._compiled = jax.jit(jax.value_and_grad(self._program.potential))
         self._dtype = data.brightness.dtype
         self._threads = threads
 
@@ -69,7 +82,8 @@ class Alone:
         """Minus the log density of one patch and what is common, with its gradient."""
 
         def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
-            value, gradient = self._compiled(jnp.asarray(z, self._dtype), self._parts[patch])
+            at = jnp.asarray(z, self._dtype)
+            value, gradient = self._program.value_and_gradient(at, self._parts[patch])
             return float(value), np.asarray(gradient, float)
 
         return potential

@@ -16,10 +16,9 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array
 
-from polar_bayes.inference.alone import Alone, Starts
+from polar_bayes.inference.alone import Alone, Lone, Starts
 from polar_bayes.inference.groups import Groups
 from polar_bayes.inference.modes import Modes, ValueAndGradient
-from polar_bayes.inference.program import Model, Program
 from polar_bayes.inference.search import Progress, from_prior
 from polar_bayes.inference.transport import Anchored, Anchors, Transport
 from polar_bayes.observation.data import Observations
@@ -81,31 +80,28 @@ class Anchoring:
         """
         random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         groups, dtype = self.transport.groups, self.given.anchors.common.dtype
-        there = jax.jit(lambda w: self.transport.to_program(w, self.given)[0])
-        back = jax.jit(lambda z: self.transport.from_program(z, self.given))
         starts = []
         for _ in range(chains):
             w = random.normal(size=self.transport.size)
-            z = np.array(there(jnp.asarray(w, dtype)))
+            z = np.array(self.transport.there(jnp.asarray(w, dtype), self.given))
             for place, modes in zip(groups.local, self.peaks.of_patch, strict=True):
                 which = random.choice(len(modes.weight), p=modes.weight)
                 if which:
                     z[place] = modes.z[which]
-            start = np.asarray(back(jnp.asarray(z, dtype)), float)
+            start = np.asarray(self.transport.back(jnp.asarray(z, dtype), self.given), float)
             usable = np.isfinite(start).all() and np.isfinite(self.potential(start)[0])
             starts.append(start if usable else np.zeros_like(start))
         return np.stack(starts)
 
 
 def anchor(
-    model: Model, program: Program, groups: Groups, data: Observations, key: Array, tell: Progress
+    lone: Lone, transport: Transport, data: Observations, key: Array, tell: Progress
 ) -> Anchoring:
     """Find the anchors.
 
     Args:
-        model: The model of the data alone.
-        program: The same on the whole capture.
-        groups: Its patches.
+        lone: The model of one patch.
+        transport: The map of the whole capture.
         data: The whole capture.
         key: Random key.
         tell: Called with the name of a stage and the fraction of it that is done.
@@ -116,17 +112,14 @@ def anchor(
     Raises:
         FitError: A patch has no peak.
     """
-    alone = Alone(model, data)
-    transport = Transport(program, groups)
+    alone, groups, size = Alone(lone, data), transport.groups, transport.size
     surveyor = _Surveyor(alone, transport, data)
     peaks = _find_peaks(alone, transport, surveyor, data, key, tell)
-    compiled = jax.jit(jax.value_and_grad(transport.potential))
-    there = jax.jit(lambda w, given: transport.to_program(w, given)[0])
     dtype = data.brightness.dtype
 
     def potential_at(given: Anchored) -> ValueAndGradient:
         def potential(w: np.ndarray) -> tuple[float, np.ndarray]:
-            value, gradient = compiled(jnp.asarray(w, dtype), given)
+            value, gradient = transport.value_and_gradient(jnp.asarray(w, dtype), given)
             return float(value), np.asarray(gradient, float)
 
         return potential
@@ -136,8 +129,8 @@ def anchor(
     for number in range(MOST_ROUNDS):
         given = surveyor.anchors(common, local, factor, peaks)
         potential = potential_at(given)
-        w = _descend(potential, program.size)
-        z = np.asarray(there(jnp.asarray(w, dtype), given), float)
+        w = _descend(potential, size)
+        z = np.asarray(transport.there(jnp.asarray(w, dtype), given), float)
         common, local = z[groups.common], z[groups.local]
         factor = _spread_of_common(potential, w, factor, dtype)
         tell("joining the patches", (number + 1) / MOST_ROUNDS)
@@ -145,7 +138,7 @@ def anchor(
             break
     given = surveyor.anchors(common, local, factor, peaks)
     potential = potential_at(given)
-    decrement = float(np.linalg.norm(potential(np.zeros(program.size))[1]))
+    decrement = float(np.linalg.norm(potential(np.zeros(size))[1]))
     return Anchoring(transport, given, potential, peaks, decrement)
 
 
@@ -154,13 +147,13 @@ class _Surveyor:
 
     def __init__(self, alone: Alone, transport: Transport, data: Observations) -> None:
         self._alone, self._data = alone, data
-        self._compiled = jax.jit(transport.population)
+        self._of_population = transport.of_population
         self._dtype = data.brightness.dtype
 
     def population(self, common: np.ndarray, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Slope and curvature of minus the log prior of the patches, each (group, local)."""
-        arrays = (jnp.asarray(x, self._dtype) for x in (common, local))
-        slope, curvature = self._compiled(*arrays, self._data)
+        g, z = (jnp.asarray(x, self._dtype) for x in (common, local))
+        slope, curvature = self._of_population(g, z, self._data)
         return np.asarray(slope, float), np.asarray(curvature, float)
 
     def anchors(

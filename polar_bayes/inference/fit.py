@@ -1,7 +1,6 @@
 """The one public verb of inference: a capture in, an ArviZ DataTree out."""
 
 import dataclasses
-import functools
 import inspect
 import json
 import math
@@ -23,10 +22,11 @@ from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
-from polar_bayes.inference import laplace, nuts, point
-from polar_bayes.inference.ground import STARTS, find_ground
-from polar_bayes.inference.modes import SETTLED
-from polar_bayes.inference.program import Draw, Program, compile_program
+from polar_bayes.inference import point
+from polar_bayes.inference.draws import parameters_of
+from polar_bayes.inference.ground import STARTS
+from polar_bayes.inference.prepared import Prepared, prepare
+from polar_bayes.inference.program import Draw, Program
 from polar_bayes.inference.request import MODELS, Method, Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.inference.search import Progress, from_prior
@@ -38,6 +38,7 @@ from polar_bayes.priors import describe_prior, support_bounds
 
 PRIOR_DRAWS = 500
 BLOCK = 500
+KEYS = 1 << 15
 THREADS = 2
 
 
@@ -105,7 +106,8 @@ def _run(request: Request, progress: Progress) -> xr.DataTree:
     key_main, key_plain, key_posterior, key_prior = jax.random.split(
         jax.random.key(request.seed), 4
     )
-    fitted = _fit_scene(request, request.scene, data, key_main, progress, clock)
+    prepared = prepare(request, request.scene, data)
+    fitted = _fit_scene(request, prepared, data, key_main, progress, clock)
     describe = _per_draw(fitted.program)
     posterior = describe(key_posterior, fitted.z, data)
     prior_z = np.asarray(from_prior(fitted.program, key_prior, PRIOR_DRAWS, data))
@@ -127,7 +129,7 @@ def _run(request: Request, progress: Progress) -> xr.DataTree:
 
 def _fit_scene(
     request: Request,
-    scene: Scene,
+    prepared: Prepared,
     data: Observations,
     key: Array,
     progress: Progress,
@@ -135,32 +137,20 @@ def _fit_scene(
 ) -> _Fitted:
     """Search for modes from prior draws, then do what the method asks."""
     key_starts, key_draws = jax.random.split(key)
-    model = request.bind(scene)
-    program = compile_program(model, data)
+    program = prepared.program
     if isinstance(request.method, point.Point):
         starts = np.asarray(from_prior(program, key_starts, STARTS, data))
-        fitted = _fit_point(program, data, starts, request.method)
+        fitted = _fit_point(prepared, data, starts, request.method)
         clock.lap("least squares")
         return fitted
-    ground = find_ground(model, program, data, key_starts, progress)
+    ground = prepared.grounds.find(data, key_starts, progress)
     clock.lap("modes")
-    problems: list[str] = []
-    extra: dict[str, Any] = {"modes": ground.said}
-    if isinstance(request.method, laplace.Laplace):
-        if ground.decrement > SETTLED:
-            problems.append(
-                f"the mode is not settled (Newton decrement {ground.decrement:.2g} posterior "
-                "standard deviations): use method='nuts'"
-            )
-        z, stats = ground.laplace(key_draws, request.method)
-    else:
-        key_first, key_chains = jax.random.split(key_draws)
-        target = ground.target(key_first, request.method.chains)
-        z, stats, extra["goals_reached"] = nuts.sample(
-            target, key_chains, request.method, lambda done: progress("sampling", done)
-        )
+    drawn = ground.draw(key_draws, request.method, progress)
     clock.lap("draws")
-    return _Fitted(program, z, stats, problems, extra)
+    extra: dict[str, Any] = {"modes": ground.said}
+    if drawn.goals_reached is not None:
+        extra["goals_reached"] = drawn.goals_reached
+    return _Fitted(program, drawn.z, drawn.stats, drawn.problems, extra)
 
 
 class _Clock:
@@ -182,25 +172,24 @@ def _silent(stage: str, fraction: float) -> None:
 
 def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], Draw]:
     """Describe every draw, a block at a time inside one compiled loop of fixed length."""
-    compiled = jax.jit(
-        lambda keys, z, data: jax.lax.map(
-            lambda kz: program.describe(kz[0], kz[1], data), (keys, z)
-        )
-    )
 
     def describe(key: Array, z: np.ndarray, data: Observations) -> Draw:
-        flat = jnp.asarray(z.reshape(-1, program.size), data.brightness.dtype)
-        keys = jax.random.split(key, len(flat))
+        dtype = data.brightness.dtype
+        flat = z.reshape(-1, program.size).astype(dtype)
+        # A key depends on its place alone, so a round number of them serves draws of any number.
+        every = jax.random.split(key, KEYS * -(-len(flat) // KEYS))
+        keys = np.asarray(jax.random.key_data(every))
         # Posterior and prior have different lengths; blocks of one length compile once, and run on
         # threads as the chains do.
         blocks = []
         for start in range(0, len(flat), BLOCK):
-            index = jnp.clip(jnp.arange(start, start + BLOCK), max=len(flat) - 1)
+            index = np.minimum(np.arange(start, start + BLOCK), len(flat) - 1)
             blocks.append((keys[index], flat[index]))
 
-        def run(block: tuple[Array, Array]) -> Draw:
-            with jax.enable_x64(flat.dtype == jnp.float64):  # a thread does not inherit it
-                return jax.tree.map(np.asarray, compiled(*block, data))
+        def run(block: tuple[np.ndarray, np.ndarray]) -> Draw:
+            with jax.enable_x64(dtype == jnp.float64):  # a thread does not inherit it
+                of_block, drawn = (jnp.asarray(part) for part in block)
+                return jax.tree.map(np.asarray, program.described(of_block, drawn, data))
 
         done = [run(blocks[0])]  # compiled before the threads start
         with ThreadPoolExecutor(THREADS) as pool:
@@ -211,17 +200,11 @@ def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], D
     return describe
 
 
-def _parameters(program: Program, z: np.ndarray, data: Observations) -> dict[str, np.ndarray]:
-    of_draw = functools.partial(program.parameters, data=data)
-    found = jax.jit(jax.vmap(jax.vmap(of_draw)))(jnp.asarray(z))
-    return {name: np.asarray(value) for name, value in found.items()}
-
-
 def _fit_point(
-    program: Program, data: Observations, starts: np.ndarray, method: point.Point
+    prepared: Prepared, data: Observations, starts: np.ndarray, method: point.Point
 ) -> _Fitted:
-    solve = jax.jit(lambda starts, data: point.estimate(program, data, starts))
-    found = point.to_numpy(solve(jnp.asarray(starts[: method.starts]), data))
+    program = prepared.program
+    found = point.to_numpy(prepared.least_squares(jnp.asarray(starts[: method.starts]), data))
     errors = point.standard_errors(program, found)
     problems = [] if found.converged else ["least squares did not meet its tolerance"]
     stats = {"loss": np.asarray(found.loss)[None, None]}
@@ -248,11 +231,12 @@ def _fit_beside(
     for number, (name, scene) in enumerate(scenes.items()):
         progress("comparing", number / len(scenes))
         try:
-            fitted = _fit_scene(request, scene, data, key, _silent, _Clock())
+            prepared = prepare(request, scene, data)
+            fitted = _fit_scene(request, prepared, data, key, _silent, _Clock())
         except FitError as error:  # a failed comparison must not cost the user the fit, but is told
             comparisons_failed[name] = str(error)
             continue
-        draws = _parameters(fitted.program, fitted.z, data)
+        draws = parameters_of(fitted.program, fitted.z, data)
         beside[name] = posterior_of(fitted.program, draws)
     progress("comparing", 1.0)
     return beside, comparisons_failed

@@ -2,12 +2,14 @@
 
 A capture of one material is climbed as a whole. A capture of many patches is climbed patch by
 patch, and sampled in coordinates in which the patches look alike. Both offer the same.
+
+What is compiled belongs to the grounds of a layout, and serves every capture of it.
 """
 
 import abc
 import dataclasses
-from collections.abc import Callable
-from typing import Any, override
+import functools
+from typing import Any, NamedTuple, override
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +17,12 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference import anchoring, laplace, nuts
-from polar_bayes.inference.alone import can_be_alone
+from polar_bayes.inference.alone import Lone, find_lone
 from polar_bayes.inference.groups import find_groups
-from polar_bayes.inference.modes import Modes, ValueAndGradient
+from polar_bayes.inference.modes import SETTLED, Modes, ValueAndGradient
 from polar_bayes.inference.program import Model, Program
 from polar_bayes.inference.search import Progress, find_modes, from_prior
+from polar_bayes.inference.transport import Transport
 from polar_bayes.observation.data import Observations
 
 STARTS = 16
@@ -32,6 +35,22 @@ Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 """Unconstrained draws (chain, draw, size), and statistics, each (chain, draw)."""
 
 
+class Drawn(NamedTuple):
+    """What became of one posterior.
+
+    Args:
+        z: Unconstrained draws of the model, (chain, draw, size).
+        stats: Statistics, each (chain, draw).
+        problems: What makes them unusable.
+        goals_reached: Whether chains mixed before `most_draws`; None where there are no chains.
+    """
+
+    z: np.ndarray
+    stats: dict[str, np.ndarray]
+    problems: list[str]
+    goals_reached: bool | None
+
+
 class AbstractGround(abc.ABC):
     """Where draws start."""
 
@@ -42,6 +61,32 @@ class AbstractGround(abc.ABC):
     def decrement(self) -> float:
         """How far, in posterior standard deviations, the true peak may still be."""
         return float(self.said["newton_decrement"])
+
+    def draw(self, key: Array, method: nuts.Nuts | laplace.Laplace, progress: Progress) -> Drawn:
+        """Do what the method asks.
+
+        Args:
+            key: Random key.
+            method: Settings.
+            progress: Called with the name of a stage and the fraction of it that is done.
+
+        Returns:
+            The draws.
+        """
+        if isinstance(method, laplace.Laplace):
+            problems = []
+            if self.decrement > SETTLED:
+                problems.append(
+                    f"the mode is not settled (Newton decrement {self.decrement:.2g} posterior "
+                    "standard deviations): use method='nuts'"
+                )
+            return Drawn(*self.laplace(key, method), problems, None)
+        key_first, key_chains = jax.random.split(key)
+        target = self.target(key_first, method.chains)
+        z, stats, mixed = nuts.sample(
+            target, key_chains, method, lambda done: progress("sampling", done)
+        )
+        return Drawn(z, stats, [], mixed)
 
     @abc.abstractmethod
     def target(self, key: Array, chains: int) -> nuts.Target:
@@ -56,7 +101,7 @@ class AbstractGround(abc.ABC):
 class WholeGround(AbstractGround):
     """One material: all coordinates together, a dense metric."""
 
-    program: Program
+    grounds: "WholeGrounds"
     data: Observations
     potential: ValueAndGradient
     modes: Modes
@@ -65,7 +110,7 @@ class WholeGround(AbstractGround):
     @override
     def target(self, key: Array, chains: int) -> nuts.Target:
         return nuts.Target(
-            density=self.program.potential,
+            samplers=self.grounds.samplers,
             given=self.data,
             potential=self.potential,
             starts=nuts.draw_starts(self.potential, self.modes, key, chains),
@@ -75,13 +120,15 @@ class WholeGround(AbstractGround):
 
     @override
     def laplace(self, key: Array, settings: laplace.Laplace) -> Draws:
-        return laplace.sample(self.program, self.data, self.potential, self.modes, key, settings)
+        program, guide = self.grounds.program, self.grounds.guide
+        return laplace.sample(program, guide, self.data, self.potential, self.modes, key, settings)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PatchGround(AbstractGround):
     """Many patches: the coordinates of `transport`, in which the metric is about the identity."""
 
+    samplers: nuts.Samplers
     found: anchoring.Anchoring
     said: dict[str, Any]
 
@@ -90,7 +137,7 @@ class PatchGround(AbstractGround):
         size, dtype = self.found.transport.size, self.found.given.anchors.common.dtype
         few = size <= LARGEST_DENSE
         return nuts.Target(
-            density=self.found.transport.potential,
+            samplers=self.samplers,
             given=self.found.given,
             potential=self.found.potential,
             starts=self.found.draw_starts(key, chains),
@@ -109,51 +156,90 @@ class PatchGround(AbstractGround):
         return self._place(noise), {"lp": lp, "log_weight": lp - approximation}
 
     def _place(self, w: np.ndarray) -> np.ndarray:
-        return np.asarray(self._to_program(jnp.asarray(w), self.found.given))
-
-    @property
-    def _to_program(self) -> Callable[[Array, Any], Array]:
-        one = self.found.transport.to_program
-        return jax.jit(
-            lambda w, given: jax.lax.map(
-                lambda chain: jax.lax.map(lambda x: one(x, given)[0], chain), w
-            )
-        )
+        return np.asarray(self.found.transport.chains_there(jnp.asarray(w), self.found.given))
 
 
-def find_ground(
-    model: Model, program: Program, data: Observations, key: Array, progress: Progress
-) -> AbstractGround:
-    """Search for the peaks, in the way that the layout of the capture calls for.
+class AbstractGrounds(abc.ABC):
+    """The grounds of all captures of one layout."""
+
+    @abc.abstractmethod
+    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractGround:
+        """Search for the peaks of one capture.
+
+        Args:
+            data: The capture.
+            key: Random key.
+            progress: Called with the name of a stage and the fraction of it that is done.
+
+        Returns:
+            The ground.
+
+        Raises:
+            FitError: No start reached a peak.
+        """
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WholeGrounds(AbstractGrounds):
+    """Of captures that are climbed as a whole."""
+
+    program: Program
+    samplers: nuts.Samplers
+
+    @functools.cached_property
+    def guide(self) -> laplace.Guide:
+        """The normal approximation."""
+        return laplace.compiled_guide(self.program)
+
+    @override
+    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractGround:
+        potential = compiled_potential(self.program, data)
+        starts = np.asarray(from_prior(self.program, key, STARTS, data))
+        modes = find_modes(potential, starts, progress)
+        return WholeGround(self, data, potential, modes, _describe(modes))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PatchGrounds(AbstractGrounds):
+    """Of captures whose patches are climbed one by one."""
+
+    lone: Lone
+    transport: Transport
+    samplers: nuts.Samplers
+
+    @override
+    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractGround:
+        found = anchoring.anchor(self.lone, self.transport, data, key, progress)
+        peaks = found.peaks
+        said = {
+            "starts": peaks.starts * self.transport.groups.count,
+            "failures": peaks.failures,
+            "patches_with_several": sum(len(modes.weight) > 1 for modes in peaks.of_patch),
+            "newton_decrement": found.decrement,
+        }
+        return PatchGround(self.samplers, found, said)
+
+
+def make_grounds(model: Model, program: Program, data: Observations) -> AbstractGrounds:
+    """What searches for peaks, in the way that the layout of the capture calls for.
 
     Args:
         model: The model of the data alone.
         program: The same on these data.
-        data: The capture.
-        key: Random key.
-        progress: Called with the name of a stage and the fraction of it that is done.
+        data: Any capture of the layout.
 
     Returns:
-        The ground.
+        The grounds; they are compiled as they are used.
 
     Raises:
-        FitError: No start reached a peak.
+        Nothing.
     """
     groups = find_groups(program, data)
-    if groups is None or not can_be_alone(model, groups, data):
-        potential = compiled_potential(program, data)
-        starts = np.asarray(from_prior(program, key, STARTS, data))
-        modes = find_modes(potential, starts, progress)
-        return WholeGround(program, data, potential, modes, _describe(modes))
-    found = anchoring.anchor(model, program, groups, data, key, progress)
-    peaks = found.peaks
-    said = {
-        "starts": peaks.starts * groups.count,
-        "failures": peaks.failures,
-        "patches_with_several": sum(len(modes.weight) > 1 for modes in peaks.of_patch),
-        "newton_decrement": found.decrement,
-    }
-    return PatchGround(found, said)
+    lone = None if groups is None else find_lone(model, groups, data)
+    if groups is None or lone is None:
+        return WholeGrounds(program, nuts.Samplers(program.potential))
+    transport = Transport(program, groups)
+    return PatchGrounds(lone, transport, nuts.Samplers(transport.potential))
 
 
 def compiled_potential(program: Program, data: Observations) -> ValueAndGradient:
@@ -169,10 +255,9 @@ def compiled_potential(program: Program, data: Observations) -> ValueAndGradient
     Raises:
         Nothing.
     """
-    compiled = jax.jit(jax.value_and_grad(program.potential))
 
     def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = compiled(jnp.asarray(z, data.brightness.dtype), data)
+        value, gradient = program.value_and_gradient(jnp.asarray(z, data.brightness.dtype), data)
         return float(value), np.asarray(gradient, float)
 
     return potential

@@ -7,6 +7,7 @@ definite it silently returns zero width, and a fit that failed would look perfec
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from numpyro.infer.autoguide import AutoLaplaceApproximation
 from polar_bayes.errors import FitError
 from polar_bayes.inference.modes import Modes, ValueAndGradient
 from polar_bayes.inference.program import Program
+from polar_bayes.inference.tracing import TracedOnce
 from polar_bayes.observation.data import Observations
 
 
@@ -45,8 +47,13 @@ class Laplace:
             )
 
 
+Guide = Callable[[Array, Array, Observations], tuple[Array, Array, Array]]
+"""Of a mode, its precision and the data: location and Cholesky factor of the guide, and order."""
+
+
 def sample(
     program: Program,
+    guide: Guide,
     data: Observations,
     potential: ValueAndGradient,
     modes: Modes,
@@ -57,6 +64,7 @@ def sample(
 
     Args:
         program: The model.
+        guide: Its guide, compiled.
         data: The capture.
         potential: Minus the log density and its gradient, already compiled.
         modes: The peaks.
@@ -67,7 +75,7 @@ def sample(
         Unconstrained draws (chain, draw, size), NaN where the guide has no width; and their
         statistics: the log density `lp` and the `log_weight` of posterior over approximation.
     """
-    location, factor, order = jax.jit(functools.partial(_guide, program))(
+    location, factor, order = guide(
         jnp.asarray(modes.z[0]), jnp.linalg.inv(jnp.asarray(modes.covariance[0])), data
     )
     # The guide's own sign of failure is a width of exactly zero.
@@ -79,6 +87,21 @@ def sample(
     approximation = -0.5 * np.asarray(jnp.sum(noise**2, axis=-1))
     lp = lp.reshape(z.shape[:2])
     return z, {"lp": lp, "log_weight": lp - approximation}
+
+
+def compiled_guide(program: Program) -> Guide:
+    """NumPyro's guide around a mode, compiled for captures of the program's layout.
+
+    Args:
+        program: The model.
+
+    Returns:
+        See `Guide`.
+
+    Raises:
+        Nothing.
+    """
+    return TracedOnce(jax.jit(functools.partial(_guide, program)))
 
 
 def _guide(

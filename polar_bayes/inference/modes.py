@@ -12,6 +12,7 @@ takes five times as long to compile as all the climbs take to run.
 import contextlib
 import dataclasses
 import enum
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -81,15 +82,42 @@ class Modes:
     failures: int
 
 
+class _Quiet:
+    """Filters of warnings belong to the process: the first fit sets them, the last one resets."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._fits = 0
+        self._filters = contextlib.ExitStack()
+
+    def begin(self) -> None:
+        with self._lock:
+            self._fits += 1
+            if self._fits == 1:
+                self._filters.enter_context(warnings.catch_warnings())
+                warnings.filterwarnings("ignore", "The line search algorithm did not converge")
+
+    def end(self) -> None:
+        with self._lock:
+            self._fits -= 1
+            if not self._fits:
+                self._filters.close()
+
+
+_QUIET = _Quiet()
+
+
 @contextlib.contextmanager
 def quiet_line_search() -> Iterator[None]:
     """Climbs judge their own ends, so SciPy's warning of a poor step says nothing more.
 
-    To be opened around all climbs, outside of any threads: filters belong to the process.
+    Fits on several threads may open it side by side.
     """
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "The line search algorithm did not converge")
+    _QUIET.begin()
+    try:
         yield
+    finally:
+        _QUIET.end()
 
 
 def climb(potential: ValueAndGradient, start: np.ndarray) -> Climb:

@@ -15,17 +15,22 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from arviz_stats.base import array_stats
 from jaxtyping import Array, Float
 from numpyro import infer
 
 from polar_bayes.errors import FitError
+from polar_bayes.inference.kept import Kept
+from polar_bayes.inference.mixing import measure
 from polar_bayes.inference.modes import Modes, ValueAndGradient
+from polar_bayes.inference.tracing import TRACING
 
 Progress = Callable[[float], None]
 
 LARGEST_R_HAT = 1.008
 """A little below the 1.01 at which a fit is refused."""
+
+MOST_KEPT = 4
+"""Samplers of one density, by their lengths and goals, that stay compiled."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,16 +104,16 @@ class Target(NamedTuple):
     """What is sampled.
 
     Args:
-        density: Minus the log density of a vector, given data (any tree of arrays).
+        samplers: Of minus the log density of a vector, given data (any tree of arrays).
         given: Those data.
-        potential: The same with its gradient, already compiled, for those data.
+        potential: The density with its gradient, already compiled, for those data.
         starts: Where each chain starts, (chain, size).
         metric: Covariance, (size, size), to begin with; or variances, (size,), to stay with.
         place: From vectors (chain, draw, size) to the model's unconstrained coordinates.
         acceptance: What to aim at where the settings leave it open.
     """
 
-    density: Callable[[Array, Any], Array]
+    samplers: "Samplers"
     given: Any
     potential: ValueAndGradient
     starts: np.ndarray
@@ -141,11 +146,14 @@ def sample(
         whether the goals for mixing were reached before `most_draws`.
     """
     warmup, acceptance = _warmup(settings, target)
-    kernel = _Kernel(target, settings, warmup, acceptance)
+    fixed = _Fixed(
+        warmup, acceptance, settings.max_tree_depth, settings.block, target.knows_its_metric
+    )
+    sampler = target.samplers.of(fixed)
     keys = jax.random.split(key, settings.chains)
-    states = [kernel.begin(key, start) for key, start in zip(keys, target.starts, strict=True)]
+    states = [sampler.begin(target, key, at) for key, at in zip(keys, target.starts, strict=True)]
     # Compiled before the threads start: all then share one executable.
-    advance = jax.jit(kernel.advance).lower(states[0], target.given).compile()
+    advance = sampler.advance(states[0], target.given)
 
     rounds: list[Step] = []
     mixed = False
@@ -193,14 +201,7 @@ def _warmup(settings: Nuts, target: Target) -> tuple[int, float]:
 def _mixed(rounds: list[Step], settings: Nuts) -> bool:
     """Whether every coordinate has reached the goals; both are invariant to monotone maps."""
     z = np.concatenate([steps.z for steps in rounds], axis=1)
-    bulk, tail, r_hat = (
-        np.array([measure(coordinate) for coordinate in np.moveaxis(z, -1, 0)])
-        for measure in (
-            lambda x: array_stats.ess(x, method="bulk"),
-            lambda x: array_stats.ess(x, method="tail", prob=(0.05, 0.95)),
-            array_stats.rhat,
-        )
-    )
+    bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))
     enough = min(bulk.min(), tail.min()) >= settings.effective_draws
     return bool(enough and r_hat.max() <= LARGEST_R_HAT)
 
@@ -227,37 +228,70 @@ def draw_starts(
     return np.stack(starts)
 
 
-class _Kernel:
+class _Fixed(NamedTuple):
+    """What a compiled sampler cannot change."""
+
+    warmup: int
+    acceptance: float
+    max_tree_depth: int
+    block: int
+    knows_its_metric: bool
+
+
+class Samplers:
+    """The samplers of one density, each compiled once.
+
+    Args:
+        density: Minus the log density of a vector, given data (any tree of arrays).
+    """
+
+    def __init__(self, density: Callable[[Array, Any], Array]) -> None:
+        self._density = density
+        self._made: Kept[_Sampler] = Kept(MOST_KEPT)
+
+    def of(self, fixed: _Fixed) -> "_Sampler":
+        """The sampler of such lengths and goals."""
+        return self._made.of(fixed, lambda: _Sampler(self._density, fixed))
+
+
+class _Sampler:
     """NumPyro's NUTS as two functions of arrays: begin a chain, advance it by a block."""
 
-    def __init__(self, target: Target, settings: Nuts, warmup: int, acceptance: float) -> None:
-        self.target, self.settings = target, settings
-        self.warmup, self.acceptance = warmup, acceptance
-        self.init, self.next = infer.hmc.hmc(
-            potential_fn_gen=lambda given: lambda z: target.density(z, given), algo="NUTS"
+    def __init__(self, density: Callable[[Array, Any], Array], fixed: _Fixed) -> None:
+        self.fixed = fixed
+        self._compiled: Callable | None = None
+        self._init, self._next = infer.hmc.hmc(
+            potential_fn_gen=lambda given: lambda z: density(z, given), algo="NUTS"
         )
 
-    def begin(self, key: Array, start: np.ndarray) -> infer.hmc.HMCState:
-        value, gradient = self.target.potential(start)
+    def begin(self, target: Target, key: Array, start: np.ndarray) -> infer.hmc.HMCState:
+        value, gradient = target.potential(start)
         # Value and gradient are given, so that beginning a chain compiles no model.
         given = infer.util.ParamInfo(jnp.asarray(start), jnp.asarray(value), jnp.asarray(gradient))
-        return self.init(
+        return self._init(
             given,
-            self.warmup,
+            self.fixed.warmup,
             step_size=0.5,
-            inverse_mass_matrix=jnp.asarray(self.target.metric),
-            dense_mass=not self.target.knows_its_metric,
-            adapt_mass_matrix=not self.target.knows_its_metric,
-            target_accept_prob=self.acceptance,
+            inverse_mass_matrix=jnp.asarray(target.metric),
+            dense_mass=not self.fixed.knows_its_metric,
+            adapt_mass_matrix=not self.fixed.knows_its_metric,
+            target_accept_prob=self.fixed.acceptance,
             trajectory_length=None,
-            max_tree_depth=self.settings.max_tree_depth,
-            model_args=(self.target.given,),
+            max_tree_depth=self.fixed.max_tree_depth,
+            model_args=(target.given,),
             rng_key=key,
         )
 
-    def advance(self, state: infer.hmc.HMCState, given: Any) -> tuple[infer.hmc.HMCState, Step]:
+    def advance(self, state: infer.hmc.HMCState, given: Any) -> Callable:
+        """From a state and the data to the state after a block and its steps, compiled."""
+        with TRACING:
+            if self._compiled is None:
+                self._compiled = jax.jit(self._advance).lower(state, given).compile()
+            return self._compiled
+
+    def _advance(self, state: infer.hmc.HMCState, given: Any) -> tuple[infer.hmc.HMCState, Step]:
         def step(state: infer.hmc.HMCState, _: None) -> tuple[infer.hmc.HMCState, Step]:
-            state = self.next(state, model_args=(given,))
+            state = self._next(state, model_args=(given,))
             return state, Step(
                 z=state.z,
                 diverging=state.diverging,
@@ -267,4 +301,4 @@ class _Kernel:
                 lp=-state.potential_energy,
             )
 
-        return jax.lax.scan(step, state, None, length=self.settings.block)
+        return jax.lax.scan(step, state, None, length=self.fixed.block)

@@ -124,7 +124,7 @@ def standard_errors(program: Program, estimate: Estimate) -> dict[str, list[floa
     free = np.isinf(np.diagonal(estimate.covariance))
     covariance = np.where(np.isinf(estimate.covariance), 0.0, estimate.covariance)
     errors = {}
-    for name, slope in jax.jit(jax.jacfwd(program.constrain))(jnp.asarray(estimate.z)).items():
+    for name, slope in program.slopes(jnp.asarray(estimate.z)).items():
         rows = np.asarray(slope).reshape(-1, program.size)
         sd = np.sqrt(np.einsum("ki,ij,kj->k", rows, covariance, rows))
         undetermined = (rows[:, free] != 0.0).any(axis=1)

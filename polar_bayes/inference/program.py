@@ -6,6 +6,7 @@ shapes do not compiles nothing.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.util import potential_energy
 
+from polar_bayes.inference.tracing import TracedByShape, TracedOnce
 from polar_bayes.observation.data import Observations
 
 Model = Callable[[Observations], None]
@@ -144,6 +146,39 @@ class Program:
             name: jnp.where(data.valid, trace[name]["value"] - noise_free(trace, name), 0.0)
             for name in self.observed
         }
+
+    @functools.cached_property
+    def value_and_gradient(self) -> Callable[[Array, Observations], tuple[Array, Array]]:
+        """The potential with its gradient, compiled."""
+        return TracedOnce(jax.jit(jax.value_and_grad(self.potential)))
+
+    @functools.cached_property
+    def drawn_from_prior(self) -> Callable[[Array, Observations], Array]:
+        """Vectors drawn from the prior, one for each key, compiled for any number of keys."""
+        return TracedByShape(
+            jax.jit(lambda keys, data: jax.lax.map(lambda k: self.from_prior(k, data), keys))
+        )
+
+    @functools.cached_property
+    def described(self) -> Callable[[Array, Array, Observations], Draw]:
+        """Many draws described, compiled; keys as the numbers that they hold, (draw, ...)."""
+
+        def describe(keys: Array, z: Array, data: Observations) -> Draw:
+            wrapped = jax.random.wrap_key_data(keys)
+            return jax.lax.map(lambda kz: self.describe(kz[0], kz[1], data), (wrapped, z))
+
+        return TracedByShape(jax.jit(describe))
+
+    @functools.cached_property
+    def parameters_of_chains(self) -> Callable[[Array, Observations], dict[str, Array]]:
+        """The parameters of chains of draws, (chain, draw, size), compiled."""
+        over_draws = jax.vmap(self.parameters, in_axes=(0, None))
+        return TracedByShape(jax.jit(jax.vmap(over_draws, in_axes=(0, None))))
+
+    @functools.cached_property
+    def slopes(self) -> Callable[[Array], dict[str, Array]]:
+        """Derivatives of the latent sites in the vector, compiled."""
+        return TracedOnce(jax.jit(jax.jacfwd(self.constrain)))
 
 
 def compile_program(model: Model, data: Observations) -> Program:

@@ -131,14 +131,14 @@ def dims_of(program: Program) -> dict[str, list[str]]:
     }
 
 
+def shape_of(program: Program, name: str) -> tuple[int, ...]:
+    """Lengths of the axes of a site, without those of length 1 that plates leave behind."""
+    return (*(program.plates[dim] for dim in program.dims[name]), *program.events[name])
+
+
 def _shaped(program: Program, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Drop the axes of length 1 that plates leave behind."""
     return {
-        name: np.asarray(value).reshape(
-            *np.shape(value)[:2],
-            *(program.plates[dim] for dim in program.dims[name]),
-            *program.events[name],
-        )
+        name: np.asarray(value).reshape(*np.shape(value)[:2], *shape_of(program, name))
         for name, value in values.items()
     }
 

@@ -26,8 +26,7 @@ def from_prior(program: Program, key: Array, draws: int, data: Observations) -> 
     Returns:
         Shape (draws, size).
     """
-    draw = jax.jit(lambda keys, data: jax.lax.map(lambda k: program.from_prior(k, data), keys))
-    return draw(jax.random.split(key, draws), data)
+    return program.drawn_from_prior(jax.random.split(key, draws), data)
 
 
 def find_modes(potential: ValueAndGradient, starts: np.ndarray, progress: Progress) -> Modes:

@@ -19,6 +19,8 @@ Source:
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -29,6 +31,7 @@ from numpyro import handlers
 
 from polar_bayes.inference.groups import Groups
 from polar_bayes.inference.program import Program
+from polar_bayes.inference.tracing import TracedByShape, TracedOnce
 from polar_bayes.observation.data import Observations
 
 
@@ -118,6 +121,37 @@ class Transport:
             return jax.grad(lambda x: self._prior(self._join(common, x), data))(local)
 
         return jax.jvp(slope, (local,), (jnp.ones_like(local),))
+
+    @functools.cached_property
+    def value_and_gradient(self) -> Callable[[Array, Anchored], tuple[Array, Array]]:
+        """The potential with its gradient, compiled."""
+        return TracedOnce(jax.jit(jax.value_and_grad(self.potential)))
+
+    @functools.cached_property
+    def there(self) -> Callable[[Array, Anchored], Array]:
+        """`to_program` without the volume, compiled."""
+        return TracedOnce(jax.jit(lambda w, given: self.to_program(w, given)[0]))
+
+    @functools.cached_property
+    def back(self) -> Callable[[Array, Anchored], Array]:
+        """`from_program`, compiled."""
+        return TracedOnce(jax.jit(self.from_program))
+
+    @functools.cached_property
+    def chains_there(self) -> Callable[[Array, Anchored], Array]:
+        """The same as `there` for chains of draws, (chain, draw, size), one after the other."""
+
+        def place(w: Array, given: Anchored) -> Array:
+            return jax.lax.map(
+                lambda chain: jax.lax.map(lambda x: self.to_program(x, given)[0], chain), w
+            )
+
+        return TracedByShape(jax.jit(place))
+
+    @functools.cached_property
+    def of_population(self) -> Callable[[Array, Array, Observations], tuple[Array, Array]]:
+        """`population`, compiled."""
+        return TracedOnce(jax.jit(self.population))
 
     def _prior(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """Minus the log prior density of all groups' coordinates."""

@@ -7,8 +7,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from dask.base import tokenize
 
+from polar_bayes.inference.kept import key_of_story
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.search import from_prior
@@ -54,22 +54,18 @@ def key_of(request: Request, *further: Any) -> str:
     Raises:
         Nothing.
     """
-    variables = request.capture.variables
-    parts = [
+    layout = [
+        (name, v.dims, v.shape, str(v.dtype)) for name, v in request.capture.variables.items()
+    ]
+    return key_of_story(
         request.model,
         request.scene,
-        # Not the priors themselves: distributions keep what they have computed.
-        *(
-            (name, jax.tree.leaves(prior), str(jax.tree.structure(prior)))
-            for name, prior in request.priors.items()
-        ),
+        request.priors,
         request.links,
         (request.seed, request.precision),
-        [(name, v.dims, v.shape, str(v.dtype)) for name, v in variables.items()],
+        layout,
         *further,
-    ]
-    # One by one: a token depends on which objects of what it is made of are the same one.
-    return tokenize([tokenize(part) for part in parts])
+    )
 
 
 @functools.lru_cache(maxsize=4)

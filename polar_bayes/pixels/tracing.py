@@ -1,32 +1,5 @@
-"""One thread at a time tells a model: NumPyro keeps one stack of handlers for the whole process.
+"""One thread at a time tells a model: see `polar_bayes.inference.tracing`."""
 
-Two threads that trace at once would find each other's handlers on it: a crash at best, another
-model's values at worst. Compiled programs run side by side.
-"""
+from polar_bayes.inference.tracing import TRACING, TracedOnce
 
-import threading
-from collections.abc import Callable
-from typing import Any
-
-TRACING = threading.RLock()
-
-
-class TracedOnce:
-    """A compiled function whose first call, which traces it, is alone in the process.
-
-    Args:
-        function: Compiled by `jax.jit`; always called with arrays of the same shapes and types.
-    """
-
-    def __init__(self, function: Callable) -> None:
-        self._function = function
-        self._is_traced = False
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Run it; the first time, trace and compile it before."""
-        if self._is_traced:
-            return self._function(*arguments)
-        with TRACING:
-            found = self._function(*arguments)
-            self._is_traced = True
-        return found
+__all__ = ["TRACING", "TracedOnce"]

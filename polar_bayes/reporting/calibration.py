@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from polar_bayes.errors import FitError
 from polar_bayes.reporting.calibration_panels import (
     Part,
+    Ranked,
     coverage_rows,
     ecdf_panel,
     estimate_panel,
@@ -93,7 +94,7 @@ def plot_calibration(
 
 @styled
 def ecdf_differences(
-    parts: Sequence[Part], beside: Mapping[str, Mapping[str, Part]], method: str
+    parts: Sequence[Ranked], beside: Mapping[str, Mapping[str, Ranked]], method: str
 ) -> Figure:
     """Share of the ranks below each rank, minus the uniform share.
 
@@ -213,7 +214,7 @@ def colors_of(beside: Mapping[str, object]) -> dict[str, str]:
     return {name: own[at % len(own)] for at, name in enumerate(beside)}
 
 
-def _title(part: Part) -> str:
+def _title(part: Ranked) -> str:
     chance = or_dash(part.row["p_value"], "{:.2g}")
     return f"{wrapped(part.title, 30)}\np = {chance}"
 

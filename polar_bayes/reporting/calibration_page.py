@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from polar_bayes.calibration.compare import compare_calibrations, comparison_sentences
 from polar_bayes.calibration.files import is_calibration
+from polar_bayes.calibration.prediction import holds_readings
 from polar_bayes.calibration.verdict import (
     calibration_table,
     calibration_verdict,
@@ -18,7 +19,12 @@ from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.reporting import calibration as figures
 from polar_bayes.reporting import calibration_tables as tables
-from polar_bayes.reporting.calibration_panels import MOST_SHOWN, Part, parts_of
+from polar_bayes.reporting.calibration_panels import MOST_SHOWN, Part, Ranked, parts_of
+from polar_bayes.reporting.calibration_readings import (
+    ReadingRanks,
+    ranks_of_readings,
+    reading_rows,
+)
 from polar_bayes.reporting.page import Picture, fill, picture
 from polar_bayes.reporting.text import spoken
 
@@ -64,6 +70,7 @@ def render_calibration(
     compared = compare_calibrations({method: calibration, **rivals}) if rivals else None
     words = {label: how_ranks_stray(part.row) for label, part in parts.items() if not part.passes}
     others = {name: parts_of(each) for name, each in rivals.items()}
+    read = ranks_of_readings(calibration) if holds_readings(calibration) else []
     content: dict[str, Any] = {
         "name": _name(provenance),
         "provenance": {key: value for key, value in provenance.items() if value is not None},
@@ -80,10 +87,12 @@ def render_calibration(
             "table": tables.comparison_rows(compared, parts),
             "sentences": comparison_sentences(compared),
         },
+        "readings": reading_rows(read) if read else None,
         "statuses": tables.fit_tables(calibration, parts),
         "facts_of_fits": tables.fit_facts(calibration),
         "groups": tables.calibration_groups(provenance),
-        "pictures": _pictures(list(parts.values()), others, method),
+        "pictures": _pictures(list(parts.values()), others, method)
+        | {"readings": list(_readings(read, method))},
     }
     return fill("calibration.html.j2", content)
 
@@ -177,9 +186,22 @@ def _pictures(
     }
 
 
-def _paged(
-    parts: Sequence[Part],
-    draw: Callable[[Sequence[Part]], Figure],
+def _readings(read: Sequence[ReadingRanks], method: str) -> Iterator[Picture]:
+    return _paged(
+        read,
+        lambda some: figures.ecdf_differences(some, {}, method),
+        "Distribution of the ranks of readings minus the uniform one",
+        "Where model, links and posterior are right, a reading stands uniformly among what is "
+        "predicted of it, and the curve stays in the gray band: curves of all readings together "
+        "leave it in at most one of twenty right calibrations. Black dots mark where it leaves "
+        "the band. A hump above zero on the left and a dip below it on the right: readings lie "
+        "too often at both ends, predictions are too narrow; dip first, then hump: too wide.",
+    )
+
+
+def _paged[T: Ranked](
+    parts: Sequence[T],
+    draw: Callable[[Sequence[T]], Figure],
     alternative: str,
     caption: str,
 ) -> Iterator[Picture]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pandas as pd
@@ -34,6 +34,34 @@ LOGARITHMIC = 50.0
 
 BARE = ("title", "xlabel", "ylabel", "suspicious_points", "p_value_text")
 ONLY_BARS = ("title", "point_estimate", "point_estimate_text", "credible_interval", "remove_axis")
+
+
+class Ranked(Protocol):
+    """Whatever has ranks that should be uniform: a parameter, or a reading."""
+
+    @property
+    def label(self) -> str:
+        """Its name."""
+
+    @property
+    def title(self) -> str:
+        """In words."""
+
+    @property
+    def answered(self) -> np.ndarray:
+        """Ranks of the fits that have an answer."""
+
+    @property
+    def row(self) -> pd.Series:
+        """With its p-value."""
+
+    @property
+    def passes(self) -> bool:
+        """Whether its ranks pass the joint test."""
+
+    @property
+    def level(self) -> float:
+        """Of that test for one of them."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,14 +137,14 @@ def parts_of(calibration: xr.DataTree, table: pd.DataFrame | None = None) -> dic
 
 
 def ecdf_panel(
-    axes: Axes, part: Part, beside: Mapping[str, tuple[Part, str]] | None = None
+    axes: Axes, part: Ranked, beside: Mapping[str, tuple[Ranked, str]] | None = None
 ) -> None:
     """Share of the ranks below each rank, minus the uniform share, in its band.
 
     Args:
         axes: Where.
-        part: The parameter.
-        beside: The same parameter by other methods, each with its color.
+        part: The parameter, or the reading.
+        beside: The same by other methods, each with its color.
     """
     if part.answered.size < 2:
         _too_few(axes)
@@ -222,7 +250,7 @@ def coverage_rows(
     axes.set_xticks(ticks, [f"{tick:.0%}" for tick in ticks])
 
 
-def _ecdf(axes: Axes, part: Part, color: str) -> None:
+def _ecdf(axes: Axes, part: Ranked, color: str) -> None:
     tree = xr.DataTree.from_dict({"prior_sbc": _ranks(part)})
     plot_ecdf_pit(
         tree,
@@ -236,7 +264,7 @@ def _ecdf(axes: Axes, part: Part, color: str) -> None:
     )
 
 
-def _mark_outside(axes: Axes, part: Part, band: EcdfBand) -> None:
+def _mark_outside(axes: Axes, part: Ranked, band: EcdfBand) -> None:
     """Dots where the curve leaves the band, which is too narrow to see at its ends."""
     below = np.searchsorted(np.sort(part.answered), band.at[1:-1], side="left")
     away = below / part.answered.size - band.at[1:-1]
@@ -245,11 +273,11 @@ def _mark_outside(axes: Axes, part: Part, band: EcdfBand) -> None:
         axes.plot(band.at[1:-1][outside], away[outside], "o", color=BLACK, ms=2.6, zorder=4)
 
 
-def _ranks(part: Part) -> xr.Dataset:
+def _ranks(part: Ranked) -> xr.Dataset:
     return xr.Dataset({"rank": ("simulation", part.answered)})
 
 
-def _collection(axes: Axes, part: Part) -> PlotCollection:
+def _collection(axes: Axes, part: Ranked) -> PlotCollection:
     """ArviZ draws into axes of ours, so that no figure belongs to pyplot."""
     boxed = {key: np.array(None, dtype=object) for key in ("figure", "rank")}
     boxed["figure"][()], boxed["rank"][()] = axes.figure, axes

@@ -104,7 +104,7 @@ def calibration_rows(
     rows = []
     for label, part in parts.items():
         row = table.loc[label]
-        cells = [_chance(row["p_value"], part.passes), words.get(label, "uniform")]
+        cells = [chance(row["p_value"], part.passes), words.get(label, "uniform")]
         cells.append(f"{int(row['failed']):,} of {part.pit.size:,}")
         rows.append(Row(label, part.title, tuple([*cells, *_numbers(row)])))
     heads = ("parameter", "p", "the ranks", "failed", *NUMBERS)
@@ -133,7 +133,7 @@ def comparison_rows(compared: pd.DataFrame, parts: Mapping[str, Part]) -> Table:
     """
     rows = []
     for (label, method), row in compared.iterrows():
-        cells = [one_line(str(method)), _chance(row["p_value"], bool(row["passes"])), row["ways"]]
+        cells = [one_line(str(method)), chance(row["p_value"], bool(row["passes"])), row["ways"]]
         cells += [f"{int(row['failed']):,}", _change(row), *_numbers(row)]
         rows.append(Row(label, parts[label].title, tuple(cells)))
     first = one_line(str(compared.index.get_level_values("method")[0]))
@@ -229,6 +229,12 @@ def calibration_groups(provenance: Mapping[str, Any]) -> list[tuple[str, list[Ro
     return [(title, rows) for title, rows in groups.items() if rows]
 
 
+def chance(p_value: float, passes: bool) -> str:
+    """A p-value, marked where it fails."""
+    said = or_dash(p_value, "{:.2g}")
+    return said if passes or not math.isfinite(p_value) else f"{said} {FAILS}"
+
+
 def _flag_table(
     flags: xr.DataArray,
     known: type[enum.IntEnum],
@@ -249,11 +255,6 @@ def _flag_table(
             cells = (f"{count:,}", share(count, values.size), f"{int(answered[which].sum()):,}")
             rows.append(Row(word, meanings.get(word, ""), cells))
     return Table(caption, (str(flags.name), "fits", "share", "with ranks"), tuple(rows))
-
-
-def _chance(p_value: float, passes: bool) -> str:
-    said = or_dash(p_value, "{:.2g}")
-    return said if passes or not math.isfinite(p_value) else f"{said} {FAILS}"
 
 
 def _numbers(row: pd.Series) -> list[str]:

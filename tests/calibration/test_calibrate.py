@@ -70,13 +70,39 @@ def test_what_is_broken_on_purpose_is_caught(capture, truth, parameter) -> None:
 
 
 def test_the_tree_holds_every_fit(corrected: xr.DataTree) -> None:
-    assert set(corrected.children) == {"prior_sbc", "truth", "marginals", "fits"}
+    ranked = {"predictive_pit", "loo_pit", "readings"}
+    assert set(corrected.children) == {"prior_sbc", "truth", "marginals", "fits"} | ranked
     assert dict(corrected["prior_sbc"].sizes) == {"simulation": COUNT}
     fits = corrected["fits"].to_dataset()
     assert set(fits.data_vars) >= {"status", "approach", "pareto_k", "effective_draws", "steps"}
     pit = corrected["prior_sbc"]["refractive_index"]
     assert float(pit.min()) > 0.0
     assert float(pit.max()) < 1.0
+
+
+def test_readings_of_a_right_model_pass(corrected: xr.DataTree) -> None:
+    table = pb.calibration_readings(corrected)
+    assert list(table.index) == ["q, fresh", "q, left out"]
+    assert pb.is_calibrated(table)
+    assert "Readings (q; fresh ones and ones left out) pass" in pb.calibration_verdict(corrected)[1]
+    views = corrected["readings"]["q_view"].to_numpy()
+    assert np.bincount(views, minlength=6).min() > 60  # all six, equally likely
+
+
+def test_readings_see_a_wrong_noise(capture: xr.Dataset) -> None:
+    truth = {"model": handlers.condition(per_material, data={"stokes_error_factor": 2.0})}
+    table = pb.calibration_readings(pb.calibrate(capture, simulations=200, truth=truth, **ASKED))
+    assert (table["p_value"] < 1e-3).all()
+    assert (table["rank_spread"] > 1.1).all()
+
+
+def test_what_is_off_leaves_no_trace(capture: xr.Dataset, corrected: xr.DataTree) -> None:
+    bare = pb.calibrate(capture, simulations=64, readings=False, **ASKED)
+    assert set(bare.children) == {"prior_sbc", "truth", "marginals", "fits"}
+    assert not any("eadings" in line for line in pb.calibration_verdict(bare))
+    for name in bare.children:
+        some = corrected[name].to_dataset().isel(simulation=slice(64))
+        xr.testing.assert_identical(bare[name].to_dataset(), some)
 
 
 def test_a_simulation_does_not_depend_on_how_many_there_are(capture, corrected) -> None:

@@ -52,7 +52,7 @@ def test_each_fit_has_the_same_chance_whoever_takes_it_down() -> None:
     random = np.random.default_rng(3)
     truth = {"roughness": random.random((6, 2))}
     draws = {"roughness": random.random((6, 30, 2))}
-    whole, parts = Standing(truth, 5), Standing(truth, 5)
+    whole, parts = (Standing(truth, np.arange(6), 5) for _ in range(2))
     whole.describe(np.arange(6), draws, even(6, 30))
     for some in (np.array([4, 1]), np.array([0, 5, 3])):
         parts.describe(some, {"roughness": draws["roughness"][some]}, even(len(some), 30))
@@ -60,3 +60,14 @@ def test_each_fit_has_the_same_chance_whoever_takes_it_down() -> None:
     told = [0, 1, 3, 4, 5]
     np.testing.assert_array_equal(whole.pit["roughness"][told], parts.pit["roughness"][told])
     np.testing.assert_array_equal(whole.crps["roughness"][told], parts.crps["roughness"][told])
+
+
+def test_the_chance_of_a_fit_follows_its_number() -> None:
+    truth = {"roughness": np.arange(6.0), "absorption": np.zeros((6, 2))}
+    draws = {"roughness": np.zeros((6, 30)), "absorption": np.zeros((6, 30, 2))}
+    whole = Standing(truth, np.arange(6), 5)
+    whole.describe(np.arange(6), draws, even(6, 30))
+    last = Standing({name: x[4:] for name, x in truth.items()}, np.array([4, 5]), 5)
+    last.describe(np.arange(2), {name: x[4:] for name, x in draws.items()}, even(2, 30))
+    for name in truth:
+        np.testing.assert_array_equal(last.pit[name], whole.pit[name][4:])

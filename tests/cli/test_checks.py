@@ -1,6 +1,7 @@
 """Calibration and identifiability as a user types them."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -20,8 +21,27 @@ def test_calibrate_prints_a_table_and_writes_every_fit(
     assert rows[1].split()[0] == "refractive_index"
     verdict = next(row for row in rows if "alibrated: " in row)
     assert status == (0 if verdict.startswith("Calibrated") else 2)
+    assert any(row.startswith("q, left out") for row in rows)
     with xr.open_datatree(out) as tree:
         assert tree["prior_sbc"].sizes["simulation"] == 60
+    store = f"{tmp_path / 'sbc.nc.fits'}"
+    assert main([*words, "--out", str(out)]) == 1
+    assert capsys.readouterr().err.splitlines() == [
+        f"{store}: it is there already; give another --out, or --resume"
+    ]
+    assert main([*words, "--out", str(out), "--resume", "--seed", "1"]) == 1
+    assert capsys.readouterr().err.splitlines() == [
+        f"{store}: it was begun with another seed; "
+        "repeat the command as it was, or give another --out"
+    ]
+    more = [*words[:3], "70", *words[4:], "--out", str(out), "--resume", "--json"]
+    assert main(more) in (0, 2)
+    told = json.loads(capsys.readouterr().out)
+    assert told["parameters"]["refractive_index"]["answered"] <= 70
+    assert "q, fresh" in told["readings"]
+    shutil.rmtree(store)
+    assert main([*words, "--out", str(out), "--resume"]) == 1
+    assert "nothing is left to resume; give another --out" in capsys.readouterr().err
 
 
 def test_identify_says_what_is_told_and_where_to_look(

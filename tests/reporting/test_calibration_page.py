@@ -66,6 +66,21 @@ def test_every_number_of_the_table_is_the_tree_s(page: Page, good: xr.DataTree) 
         assert f"{row['crps']:.3g}" in page.text
 
 
+def test_readings_have_a_section_of_their_own(good: xr.DataTree) -> None:
+    assert "What became of the fits" in Page(render_calibration(good)).text
+    assert 'id="readings"' not in render_calibration(good)
+    tree = make_calibration(failed=FAILED, readings={"dop": 0.7})
+    page = Page(render_calibration(tree))
+    assert page.open == []
+    assert "Calibrated." in page.text
+    assert "fail a joint test of their own that a right model fails 5% of the time" in page.text
+    assert "degree of polarization, left out" in page.text
+    assert "predictions are too narrow" in page.text
+    assert "0.0001 (fails)" in page.text
+    assert "3 of 400" in page.text
+    assert any("Distribution of the ranks of readings" in x for x in page.values("alt"))
+
+
 def test_failed_fits_are_counted_everywhere(page: Page) -> None:
     for said in (
         "3 of 400 fits: not converged.",

@@ -1,0 +1,305 @@
+"""Some simulations of a calibration: numbers in, ranks and marginals out, in any process."""
+
+import dataclasses
+import functools
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from polar_bayes.calibration import one_by_one
+from polar_bayes.calibration.readings import Arrays, Readings, why_untold
+from polar_bayes.calibration.simulations import draw_fresh, draw_numbered
+from polar_bayes.calibration.standing import Standing
+from polar_bayes.inference.prepared import Prepared, prepare
+from polar_bayes.inference.program import Program, Values, compile_program
+from polar_bayes.inference.request import Request
+from polar_bayes.observation.data import Observations, observe
+from polar_bayes.pixels.engine import Engine
+from polar_bayes.pixels.fitting import PixelLaplace, fit_stack
+from polar_bayes.pixels.making import Recipe, make_engine
+from polar_bayes.pixels.marginals import Marginals
+from polar_bayes.pixels.outcome import Describe, Outcome
+from polar_bayes.pixels.sampling import PixelNuts
+from polar_bayes.pixels.stack import Stack
+from polar_bayes.pixels.tempering import PixelTempering
+from polar_bayes.pixels.tracing import TRACING
+
+Method = PixelLaplace | PixelNuts | PixelTempering | one_by_one.OneByOne
+BLOCK = 64
+"""Simulations of a block: what one thread or worker fits at a time, and what a crash can lose."""
+
+CANDIDATES = 32
+RANKED = 128
+"""About so many draws of a chain are ranked: far enough apart to be nearly independent."""
+
+
+class Block(NamedTuple):
+    """Some simulations and their fits, NaN where a fit has no answer; axis 0 is the simulation.
+
+    Args:
+        numbers: Of the simulations.
+        truth: By parameter, what was simulated.
+        pit: By parameter, where the truth stands.
+        crps: By parameter, ranked scores.
+        mean: By parameter.
+        sd: By parameter.
+        quantiles: By parameter, (simulation, level, ...).
+        fresh: By reading, where a fresh one stands in the prediction.
+        left_out: By reading, where one of the fitted ones stands in what the others predict.
+        left_out_k: By reading, Pareto k of leaving it out.
+        place: By reading, the number of its entry, in row-major order of its axes.
+        outcome: What became of each fit.
+    """
+
+    numbers: np.ndarray
+    truth: Arrays
+    pit: Arrays
+    crps: Arrays
+    mean: Arrays
+    sd: Arrays
+    quantiles: Arrays
+    fresh: Arrays
+    left_out: Arrays
+    left_out_k: Arrays
+    place: Arrays
+    outcome: Outcome
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plan:
+    """What is done to every block of one calibration; it can be sent to another process.
+
+    Args:
+        request: What is fitted, checked.
+        told: What captures are simulated by, where it differs.
+        settings: How each is fitted.
+        readings: Whether readings are ranked too.
+        recipe_key: Of all that the programs of the fits depend on.
+        key: Of all that the blocks depend on.
+    """
+
+    request: Request
+    told: Request | None
+    settings: Method
+    readings: bool
+    recipe_key: str
+    key: str
+
+    @property
+    def data(self) -> Observations:
+        """The capture whose layout all simulations have."""
+        return _data_of(self)
+
+    @property
+    def engine(self) -> Engine:
+        """The compiled programs, which the next calibration of the same model finds."""
+        candidates = CANDIDATES
+        if isinstance(self.settings, PixelLaplace):
+            candidates = self.settings.candidates
+        recipe = Recipe(self.request, lambda: self.data, candidates, self.recipe_key)
+        with TRACING:
+            return make_engine(recipe)
+
+    @property
+    def prepared(self) -> Prepared:
+        """The same for fits one by one, which `polar_bayes.fit` finds."""
+        return _prepared_of(self)
+
+    @property
+    def program(self) -> Program:
+        """The model that is fitted."""
+        if isinstance(self.settings, one_by_one.OneByOne):
+            return self.prepared.program
+        return self.engine.program
+
+    @property
+    def rough(self) -> Program:
+        """The same in single precision."""
+        if isinstance(self.settings, one_by_one.OneByOne):
+            return _rough_of(self)
+        return self.engine.rough
+
+    @property
+    def block(self) -> int:
+        """Simulations of a block."""
+        return one_by_one.BLOCK if isinstance(self.settings, one_by_one.OneByOne) else BLOCK
+
+    @property
+    def teller(self) -> Program:
+        """The model by which captures are simulated."""
+        return _teller_of(self)
+
+    @property
+    def shared(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the parameters that are both simulated and fitted, by name."""
+        return _shared_by(self)
+
+    @property
+    def untold(self) -> str:
+        """Why readings cannot be ranked; empty where they can, or nobody asks."""
+        return _untold_of(self) if self.readings else ""
+
+    def __eq__(self, other: object) -> bool:
+        """The same blocks."""
+        return isinstance(other, Plan) and self.key == other.key
+
+    def __hash__(self) -> int:
+        """Of the key."""
+        return hash(self.key)
+
+
+def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
+    """Simulate some captures and fit each; this is what a worker is sent.
+
+    What becomes of a simulation depends on its number alone, not on those beside it.
+
+    Args:
+        plan: What is done.
+        numbers: Of the simulations, at most `plan.block`.
+
+    Returns:
+        The block.
+
+    Raises:
+        Nothing: fits that fail are in its outcome.
+    """
+    seed, shared = plan.request.seed, plan.shared
+    filled = np.resize(numbers, plan.block)  # so that all blocks run the same program
+    wanted = np.arange(len(numbers))
+    with jax.enable_x64(True), TRACING:
+        key = jax.random.fold_in(jax.random.key(seed), 1)
+        drawn = draw_numbered(plan.teller, plan.data, filled, key)
+        is_ranked = plan.readings and not plan.untold
+        fresh = draw_fresh(plan.teller, plan.data, drawn, filled, key) if is_ranked else {}
+    truth = {name: np.asarray(drawn.truth[name])[wanted] for name in shared}
+    captures = drawn.captures.subset(wanted)
+    marginals, standing = Marginals(len(numbers), shared), Standing(truth, numbers, seed)
+    ranked = None
+    if is_ranked:
+        again = {name: np.asarray(values)[wanted] for name, values in fresh.items()}
+        ranked = Readings(plan.rough, captures, again, numbers, seed)
+    apart = _apart(plan.settings)
+
+    def describe(at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
+        few = {name: np.asarray(x)[:, ::apart] for name, x in parameters.items()}
+        share = weights[:, ::apart] / weights[:, ::apart].sum(axis=-1, keepdims=True)
+        for taker in (marginals, standing, ranked):
+            if taker is not None:
+                taker.describe(at, few, share)
+
+    outcome = _fit(plan, captures, numbers, describe)
+    return Block(
+        numbers=np.asarray(numbers),
+        truth=truth,
+        pit=standing.pit,
+        crps=standing.crps,
+        mean=marginals.mean,
+        sd=marginals.sd,
+        quantiles={name: np.moveaxis(x, 0, 1) for name, x in marginals.quantiles.items()},
+        fresh=ranked.fresh if ranked else {},
+        left_out=ranked.left_out if ranked else {},
+        left_out_k=ranked.left_out_k if ranked else {},
+        place=ranked.place if ranked else {},
+        outcome=outcome,
+    )
+
+
+def join(blocks: Iterable[Block], count: int) -> Block:
+    """The first simulations of a calibration as one block, in order.
+
+    Args:
+        blocks: That hold them, in any order; some may hold the same.
+        count: How many.
+
+    Returns:
+        The block.
+
+    Raises:
+        Nothing.
+    """
+    whole = jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
+    numbers, first = np.unique(whole.numbers, return_index=True)
+    return jax.tree.map(lambda x: x[first[numbers < count]], whole)
+
+
+def cut(numbers: np.ndarray, size: int) -> list[np.ndarray]:
+    """Numbers of simulations in ascending order, a part for each block.
+
+    Args:
+        numbers: Those that are to be fitted.
+        size: Most simulations of a block.
+
+    Returns:
+        The parts: what is cut does not depend on how many there are in all.
+
+    Raises:
+        Nothing.
+    """
+    ends = np.flatnonzero(np.diff(numbers // size)) + 1
+    return [part for part in np.split(numbers, ends) if part.size]
+
+
+def _fit(plan: Plan, captures: Stack, numbers: np.ndarray, describe: Describe) -> Outcome:
+    """Fits of captures by what the settings say."""
+    settings, seed = plan.settings, plan.request.seed
+    if isinstance(settings, one_by_one.OneByOne):
+        return one_by_one.fit_each(plan.prepared, settings, captures, numbers, seed, describe)
+    return fit_stack(plan.engine, settings, captures, numbers, seed, describe)
+
+
+def _apart(settings: Method) -> int:
+    if isinstance(settings, PixelNuts):
+        return max(1, settings.chains * settings.draws // RANKED)
+    return 1
+
+
+@functools.lru_cache(maxsize=4)
+def _data_of(plan: Plan) -> Observations:
+    limit = plan.request.largest_view_zenith
+    with jax.enable_x64(True):
+        return observe(plan.request.capture, largest_view_zenith=limit)
+
+
+@functools.lru_cache(maxsize=4)
+def _prepared_of(plan: Plan) -> Prepared:
+    with jax.enable_x64(True):
+        return prepare(plan.request, plan.request.scene, plan.data)
+
+
+@functools.lru_cache(maxsize=4)
+def _rough_of(plan: Plan) -> Program:
+    single = dataclasses.replace(plan.request, precision="single")
+    with jax.enable_x64(False), TRACING:
+        return compile_program(single.bind(single.scene), plan.data.in_single_precision())
+
+
+@functools.lru_cache(maxsize=4)
+def _teller_of(plan: Plan) -> Program:
+    told = plan.told
+    if told is None:
+        return plan.program
+    with jax.enable_x64(True), TRACING:
+        return compile_program(told.bind(told.scene), plan.data)
+
+
+@functools.lru_cache(maxsize=4)
+def _shared_by(plan: Plan) -> dict[str, tuple[int, ...]]:
+    fitted, told = (_shapes(program, plan.data) for program in (plan.program, plan.teller))
+    return {name: shape for name, shape in told.items() if fitted.get(name) == shape}
+
+
+@functools.lru_cache(maxsize=4)
+def _untold_of(plan: Plan) -> str:
+    given = _shapes(plan.program, plan.data)
+    with jax.enable_x64(True), TRACING:
+        return why_untold(plan.program, plan.teller, plan.data, given)
+
+
+def _shapes(program: Program, data: Observations) -> dict[str, tuple[int, ...]]:
+    """Of the parameters of a model, in the order of their names."""
+    with jax.enable_x64(True), TRACING:
+        found = jax.eval_shape(program.parameters, jnp.zeros(program.size), data)
+    return {name: found[name].shape for name in sorted(found)}

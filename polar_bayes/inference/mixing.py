@@ -1,0 +1,45 @@
+"""How well chains have mixed, number by number."""
+
+from typing import NamedTuple
+
+import numpy as np
+from arviz_stats.base import array_stats
+from jaxtyping import Float
+
+TAILS = (0.05, 0.95)
+
+
+class Mixing(NamedTuple):
+    """Of every coordinate.
+
+    Args:
+        bulk: Effective sample size of the center.
+        tail: Of the ends of the 90% interval.
+        r_hat: Rank-normalized, split.
+    """
+
+    bulk: Float[np.ndarray, " coordinate"]
+    tail: Float[np.ndarray, " coordinate"]
+    r_hat: Float[np.ndarray, " coordinate"]
+
+
+def measure(draws: Float[np.ndarray, "coordinate chain draw"]) -> Mixing:
+    """Effective sample sizes and R-hat, which monotone maps of a coordinate do not change.
+
+    Args:
+        draws: Of some chains of one length.
+
+    Returns:
+        The measures.
+
+    Raises:
+        Nothing.
+
+    Source:
+        Vehtari et al. (2021), Bayesian Analysis 16(2).
+    """
+    return Mixing(
+        bulk=np.array([array_stats.ess(x, method="bulk") for x in draws]),
+        tail=np.array([array_stats.ess(x, method="tail", prob=TAILS) for x in draws]),
+        r_hat=np.array([array_stats.rhat(x) for x in draws]),
+    )

@@ -1,0 +1,124 @@
+"""Simulation-based calibration of whole models by what `polar_bayes.fit` runs, on small layouts.
+
+    python tests/benchmarks/calibration_models.py hierarchical [simulations]
+    python tests/benchmarks/calibration_models.py spectral [simulations]
+    python tests/benchmarks/calibration_models.py links [simulations]
+
+The paper's scene with four facets on the way out, the default priors. `hierarchical`: 4 patches of
+16 views of the degree of polarization and of intensity, indices from one population. `spectral`:
+one material in 4 colors, index and absorption Gaussian processes over wavelength. Both by
+`pb.Nuts()`. `links`: one material, 16 views, each way in which readings may scatter, by "tempered"
+and by "nuts". Prints the joint verdict, the table, what became of the fits, and seconds.
+"""
+
+import dataclasses
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from patches import patch_capture
+
+import polar_bayes as pb
+from polar_bayes.pixels.outcome import Status
+
+VIEWS, COLORS, ERROR = 16, (450.0, 550.0, 650.0, 750.0), 0.02
+FACETS = pb.FacetQuadrature(along=2, across=2)
+SCENE = dataclasses.replace(
+    pb.SETUPS["paper"].scene, surface=pb.RoughSurface(pb.Beckmann(), pb.PointSource(), FACETS)
+)
+DOP = {
+    "Beta": pb.BetaLink(),
+    "logit-normal": pb.LogitNormalLink(),
+    "normal": pb.NormalLink(),
+}
+STOKES = {
+    "Stokes, normal": pb.StokesLink(),
+    "Stokes, Student-t": pb.StokesLink(degrees_of_freedom=5.0),
+    "Stokes, stated errors": pb.StokesLink(stated_errors=True),
+    "Stokes, normal of one scale": pb.NormalLink(),
+}
+
+
+def one_material(wavelengths: tuple[float, ...] = ()) -> xr.Dataset:
+    protocol = pb.Protocol(views=VIEWS, wavelengths=wavelengths)
+    return pb.simulate("leaf", seed=1, protocol=protocol)
+
+
+def stokes() -> xr.Dataset:
+    """The same views, read as q and u beside intensity."""
+    capture = one_material()
+    level = xr.zeros_like(capture["dop"])
+    return capture.drop_vars("dop").assign(
+        {name: level + value for name, value in {"q": 0.1, "u": 0.0}.items()}
+        | {f"{name}_error": level + ERROR for name in ("q", "u")}
+    )
+
+
+def asked(what: str) -> Iterator[tuple[str, xr.Dataset, dict[str, Any]]]:
+    """Titles, layouts and the arguments of `pb.calibrate`."""
+    if what == "hierarchical":
+        capture = patch_capture(np.full(4, 1.45), views=VIEWS)
+        yield "4 patches, 16 views", capture, {"model": "hierarchical", "method": pb.Nuts()}
+    elif what == "spectral":
+        capture = one_material(COLORS)
+        yield "4 colors, 16 views", capture, {"model": "gp_spectral", "method": pb.Nuts()}
+    else:
+        intensity = pb.SETUPS["paper"].links["intensity"]
+        for links, capture in ((DOP, one_material()), (STOKES, stokes())):
+            read = [name for name in ("dop", "q", "u") if name in capture]
+            for title, link in links.items():
+                chosen = {name: link for name in read} | {"intensity": intensity}
+                for method in ("tempered", "nuts"):
+                    yield f"{title}, {method}", capture, {"links": chosen, "method": method}
+
+
+def said(found: xr.DataTree) -> str:
+    """Table and verdict of one calibration."""
+    table = pb.calibration_table(found)
+    shown = pd.DataFrame({"p": table["p_value"].map("{:.3f}".format)})
+    for percent in (50, 80, 95):
+        name = f"held_{percent}"
+        shown[f"{percent}% hold (range)"] = [
+            f"{row[name]:.3f} ({row[f'{name}_low']:.3f}-{row[f'{name}_high']:.3f})"
+            for _, row in table.iterrows()
+        ]
+    shown["rank mean"] = table["rank_mean"].map("{:.3f}".format)
+    shown["spread"] = table["rank_spread"].map("{:.3f}".format)
+    shown["answered"] = table["answered"]
+    fits = found["fits"].to_dataset()
+    statuses = fits["status"].to_numpy()
+    counts = {each.name.lower(): int(np.sum(statuses == each)) for each in Status}
+    worth = fits["effective_draws"].to_numpy()
+    worth = worth[np.isfinite(worth)]
+    lines = [
+        *pb.calibration_verdict(found),
+        shown.to_string(),
+        f"fits: {', '.join(f'{count} {name}' for name, count in counts.items() if count)}",
+    ]
+    if worth.size:
+        lines.append(f"least ESS of a fit: 5% {np.quantile(worth, 0.05):.0f}, median "
+                     f"{np.median(worth):.0f}")  # fmt: skip
+    return "\n".join(lines)
+
+
+def main(what: str, count: int) -> None:
+    print(f"{platform.machine()}, {os.cpu_count()} cores; {count} simulations each", flush=True)
+    for title, capture, arguments in asked(what):
+        start = time.perf_counter()
+        found = pb.calibrate(capture, simulations=count, scene=SCENE, seed=1, **arguments)
+        seconds = time.perf_counter() - start
+        print(f"\n{title}: {seconds:.0f} s, {count / seconds:.3f} fits/s with compilation")
+        print(said(found), flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 60)

@@ -1,0 +1,187 @@
+"""Calibration by the fits of `polar_bayes.fit`, of models with more axes than a pixel has."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+import numpyro
+import pytest
+import xarray as xr
+from numpyro import distributions as dist
+from plates import LINKS, PLATE, plate_capture, plates
+
+import polar_bayes as pb
+from polar_bayes.calibration import one_by_one
+from polar_bayes.calibration.calibrate import METHODS, _settings
+from polar_bayes.errors import FitError
+from polar_bayes.inference import anchoring
+from polar_bayes.inference.draws import PIECE, parameters_of
+from polar_bayes.inference.prepared import prepare
+from polar_bayes.inference.request import resolve
+from polar_bayes.observation.data import observe
+from polar_bayes.pixels.outcome import Approach, Status
+
+COUNT, PATCHES, VIEWS, NOISE = 80, 3, 4, 0.5
+SHORT = pb.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
+
+
+def population(data, scene, priors, links) -> None:
+    """Normal means of normal patches: its posterior is normal, so `Laplace` is exact."""
+    del scene, priors, links
+    location = numpyro.sample("location", dist.Normal(0.0, 2.0))
+    with numpyro.plate("patch", data.shape[0], dim=-2):
+        level = numpyro.sample("level", dist.Normal(location, 1.0))
+        with numpyro.plate("view", data.shape[1], dim=-1):
+            numpyro.sample("q", dist.Normal(level, NOISE), obs=data.readings["q"])
+
+
+def too_sure(data, scene, priors, links) -> None:
+    """The same with half the noise."""
+    del scene, priors, links
+    location = numpyro.sample("location", dist.Normal(0.0, 2.0))
+    with numpyro.plate("patch", data.shape[0], dim=-2):
+        level = numpyro.sample("level", dist.Normal(location, 1.0))
+        with numpyro.plate("view", data.shape[1], dim=-1):
+            numpyro.sample("q", dist.Normal(level, NOISE / 2.0), obs=data.readings["q"])
+
+
+ASKED: dict[str, Any] = {"scene": PLATE, "links": LINKS, "readings": False}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_start_finds_the_one_peak() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(anchoring, "FEWEST_STARTS", 1)
+        patch.setattr(anchoring, "MOST_STARTS", 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def capture() -> xr.Dataset:
+    return plates(np.full(PATCHES, 1.5), 0.03, views=np.linspace(35.0, 75.0, VIEWS))
+
+
+@pytest.fixture(scope="module")
+def exact(capture: xr.Dataset) -> xr.DataTree:
+    laplace = pb.Laplace(draws=200, chains=1)
+    return pb.calibrate(capture, simulations=COUNT, model=population, method=laplace, **ASKED)
+
+
+def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
+    table = pb.calibration_table(exact)
+    assert sorted(table.index) == ["level[0]", "level[1]", "level[2]", "location"]
+    assert pb.is_calibrated(table)
+    assert (table["answered"] == COUNT).all()
+    for percent in (50, 80, 95):
+        share = percent / 100.0
+        error = np.sqrt(share * (1.0 - share) / COUNT)
+        assert np.abs(table[f"held_{percent}"] - share).max() < 3.3 * error
+    assert exact["truth"]["level"].dims == ("simulation", "patch")
+    assert (exact["fits"]["status"] == Status.GOOD).all()
+    assert (exact["fits"]["approach"] == Approach.LAPLACE).all()
+
+
+def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
+    laplace, told = pb.Laplace(draws=200, chains=1), {"model": population}
+    asked = {"model": too_sure, "method": laplace, "truth": told, **ASKED}
+    table = pb.calibration_table(pb.calibrate(capture, simulations=40, **asked))
+    assert not pb.is_calibrated(table)
+    assert (table["rank_spread"].drop("location") > 1.0).all()
+
+
+def test_a_fit_does_not_depend_on_how_many_there_are(
+    capture: xr.Dataset, exact: xr.DataTree
+) -> None:
+    laplace = pb.Laplace(draws=200, chains=1)
+    few = pb.calibrate(capture, simulations=22, model=population, method=laplace, **ASKED)
+    for group in ("truth", "prior_sbc", "marginals"):
+        some = exact[group].to_dataset().isel(simulation=slice(22))
+        xr.testing.assert_identical(few[group].to_dataset(), some)
+
+
+def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Dataset) -> None:
+    found = pb.calibrate(capture, simulations=20, model=population, method=SHORT, **ASKED)
+    fits = found["fits"].to_dataset()
+    assert (fits["status"] == Status.NOT_TRUSTED).all()  # 100 draws are not worth 400
+    assert (fits["approach"] == Approach.NUTS).all()
+    assert (fits["effective_draws"] < 400.0).all()
+    assert np.isfinite(found["prior_sbc"]["level"]).all()
+    assert "20 of 20 fits: not trusted." in pb.calibration_verdict(found)
+
+
+def test_fits_without_draws_are_counted(
+    capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever a fit raises for want of a peak: it is not left out, and has no rank."""
+    inner = one_by_one.Prepared.grounds.func
+    refused = []
+
+    class Refusing:
+        def __init__(self, grounds) -> None:
+            self._grounds = grounds
+
+        def find(self, data, key, progress):
+            if float(data.readings["q"].mean()) > 0.0:
+                refused.append(None)
+                raise FitError("no start reached a peak", where="fit", mend="look at it")
+            return self._grounds.find(data, key, progress)
+
+    monkeypatch.setattr(
+        one_by_one.Prepared, "grounds", property(lambda self: Refusing(inner(self)))
+    )
+    laplace = pb.Laplace(draws=50, chains=1)
+    found = pb.calibrate(capture, simulations=24, model=population, method=laplace, **ASKED)
+    lost = found["fits"]["status"].to_numpy() == Status.NOT_CONVERGED
+    assert 0 < lost.sum() == len(refused) < 24
+    assert np.array_equal(np.isnan(found["prior_sbc"]["location"].to_numpy()), lost)
+    table = pb.calibration_table(found)
+    assert (table["failed"] == lost.sum()).all()
+
+
+def test_nuts_by_name_is_that_of_a_pixel_where_there_is_but_one(capture: xr.Dataset) -> None:
+    one = plate_capture(np.linspace(30.0, 75.0, 6), 0.02, seed=1)
+    colors = one.expand_dims(wavelength=[450.0, 650.0])
+    assert _settings("nuts", one) == METHODS["nuts"]
+    assert _settings("nuts", capture) == pb.Nuts()
+    assert _settings("nuts", colors) == pb.Nuts()
+    assert _settings(SHORT, one) == SHORT
+
+
+def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
+    """The same posterior: mean and spread against the closed form."""
+    request = resolve(capture, population, SHORT, PLATE, None, LINKS, None, 0, "double")
+    data = observe(request.capture)
+    prepared = prepare(request, PLATE, data)
+    settings = pb.Laplace(draws=4000, chains=1)
+    told = one_by_one._fit(prepared.grounds, prepared.program, settings, data, jax.random.key(1))
+    assert told is not None
+    _, parameters = told
+    q = np.asarray(data.readings["q"])
+    # Patch means are normal around the location with the variance of a patch and of its mean.
+    spread = 1.0 + NOISE**2 / VIEWS
+    precision = 0.25 + PATCHES / spread
+    mean, sd = q.mean(axis=1).sum() / spread / precision, precision**-0.5
+    draws = parameters["location"]
+    assert abs(draws.mean() - mean) < 4.0 * sd / np.sqrt(draws.size)
+    assert draws.std() == pytest.approx(sd, rel=4.0 / np.sqrt(2.0 * draws.size))
+
+
+def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None:
+    request = resolve(capture, population, SHORT, PLATE, None, LINKS, None, 0, "double")
+    data = observe(request.capture)
+    program = prepare(request, PLATE, data).program
+    z = np.random.default_rng(1).normal(size=(2, PIECE + 3, program.size))
+    found = parameters_of(program, z, data)
+    assert found["level"].shape[:2] == z.shape[:2]
+    last = program.parameters(z[1, -1], data)["level"]
+    np.testing.assert_array_equal(found["level"][1, -1], last)
+
+
+def test_draws_are_thinned_by_what_they_are_worth() -> None:
+    draws = {"x": np.arange(200.0).reshape(2, 100), "y": np.zeros((2, 100, 3))}
+    draws["x"][0, 40] = np.nan
+    few = one_by_one._thin(draws, effective=21.0)  # every tenth: 200 / 21, rounded up
+    assert few["x"].tolist() == [x for x in range(0, 200, 10) if x != 40]
+    assert few["y"].shape == (19, 3)
+    assert len(one_by_one._thin(draws, effective=500.0)["x"]) == 199

@@ -1,0 +1,127 @@
+"""Ranks of readings against exact ones, and what cannot be ranked."""
+
+import jax
+import numpy as np
+import numpyro
+import pytest
+import xarray as xr
+from numpyro import distributions as dist
+from plates import plate_capture
+from scipy import stats
+from synthetic_calibrations import make_calibration
+
+import polar_bayes as pb
+from polar_bayes.calibration.readings import DRAWS, Readings, _choose, _resample, why_untold
+from polar_bayes.calibration.simulations import draw_captures, draw_fresh
+from polar_bayes.inference.program import compile_program
+from polar_bayes.observation.data import observe
+
+NOISE, FITS = 0.1, 300
+
+
+def shifted(data):
+    """One unknown level that every view reads with the same noise."""
+    level = numpyro.sample("level", dist.Normal(0.0, 0.3))
+    with numpyro.plate("view", data.shape[-1]):
+        likelihood = dist.Normal(level, NOISE).mask(data.valid)
+        numpyro.sample("q", likelihood, obs=data.readings["q"])
+
+
+@pytest.fixture(scope="module")
+def read():
+    """Exact draws of the posterior of every fit, and what stands where among them."""
+    capture = plate_capture(np.linspace(30.0, 70.0, 5), 0.03, seed=0)
+    valid = xr.DataArray([True, True, False, True, True], dims="view")
+    data = observe(capture.assign(valid=valid))
+    with jax.enable_x64(False):
+        rough = compile_program(shifted, data.in_single_precision())
+    program, numbers = compile_program(shifted, data), np.arange(FITS)
+    drawn = draw_captures(program, data, FITS, jax.random.key(3))
+    again = draw_fresh(program, data, drawn, numbers, jax.random.key(3))
+    readings = Readings(rough, drawn.captures, again, numbers, seed=4)
+    q = np.asarray(drawn.captures.own.readings["q"])[:, valid.to_numpy()]
+    variance = 1.0 / (1.0 / 0.3**2 + q.shape[1] / NOISE**2)
+    mean = variance * q.sum(axis=1) / NOISE**2
+    random = np.random.default_rng(5)
+    draws = mean[:, None] + np.sqrt(variance) * random.standard_normal((FITS, 1000))
+    readings.describe(numbers, {"level": draws}, np.full(draws.shape, 1e-3))
+    return readings, drawn, again, mean, variance
+
+
+def test_they_stand_where_the_exact_prediction_has_them(read) -> None:
+    """Within what 128 draws can tell: 0.044 at the middle of each, less at its ends."""
+    readings, drawn, again, mean, variance = read
+    place = readings.place["q"]
+    rows = np.arange(FITS)
+    fresh = again["q"][rows, place]
+    exact = stats.norm.cdf(fresh, mean, np.sqrt(variance + NOISE**2))
+    left = np.asarray(drawn.captures.own.readings["q"])[rows, place]
+    precision = 1.0 / variance - 1.0 / NOISE**2
+    without = (mean / variance - left / NOISE**2) / precision
+    exact_left = stats.norm.cdf(left, without, np.sqrt(1.0 / precision + NOISE**2))
+    for found, expected in ((readings.fresh["q"], exact), (readings.left_out["q"], exact_left)):
+        away = found - expected
+        assert np.sqrt(np.mean(away**2)) < 0.05
+        assert abs(away.mean()) < 3.9 * away.std() / np.sqrt(FITS)
+        assert stats.kstest(found, "uniform").pvalue > 1e-3
+    assert np.mean(readings.left_out_k["q"] > 0.7) < 0.1
+
+
+def test_masked_entries_are_never_chosen(read) -> None:
+    assert set(read[0].place["q"]) == {0, 1, 3, 4}
+    valid = np.array([[False, True, True], [False, False, False]])
+    for chance in (0.0, 0.49, 0.5, 0.999999):
+        found = _choose(valid, np.full(2, chance))
+        assert found.tolist() == [1 if chance < 0.5 else 2, -1]
+
+
+def test_heavy_draws_are_repeated() -> None:
+    weights = np.array([[0.5, 0.25, 0.25, 0.0], [0.25, 0.25, 0.25, 0.25]])
+    found = _resample(weights, np.array([0.5, 0.5]))
+    counts = [np.bincount(row, minlength=4).tolist() for row in found]
+    assert counts[0] == [DRAWS // 2, DRAWS // 4, DRAWS // 4, 0]
+    assert np.ptp(counts[1]) <= 1
+
+
+def test_a_model_whose_draws_do_not_say_all_is_told() -> None:
+    """Of a pooled parameter the draws hold the value, not the coordinate that makes it."""
+
+    def pooled(data):
+        place = numpyro.sample("place", dist.Normal(0.0, 1.0), infer={"auxiliary": True})
+        level = numpyro.deterministic("level", 0.3 * place)
+        with numpyro.plate("view", data.shape[-1]):
+            numpyro.sample("q", dist.Normal(level, NOISE), obs=data.readings["q"])
+
+    data = observe(plate_capture(np.linspace(30.0, 70.0, 5), 0.03, seed=0))
+    given = {"level": ()}
+    program = compile_program(pooled, data)
+    assert "draws do not hold place" in why_untold(program, program, data, given)
+    plain = compile_program(shifted, data)
+    assert why_untold(plain, plain, data, given) == ""
+
+
+def test_readings_are_judged_by_themselves() -> None:
+    good, bad = make_calibration(readings={}), make_calibration(readings={"dop": 0.7})
+    for tree in (good, bad):
+        table = pb.calibration_readings(tree)
+        assert list(table.index) == [
+            "dop, fresh", "dop, left out", "intensity, fresh", "intensity, left out"
+        ]  # fmt: skip
+        assert pb.calibration_verdict(tree)[0].startswith("Calibrated: the ranks of 3 parameters")
+        assert pb.is_calibrated(pb.calibration_table(tree))
+    said = pb.calibration_verdict(good)
+    assert "Readings (dop, intensity; fresh ones and ones left out) pass a joint test" in said[1]
+    said = pb.calibration_verdict(bad)
+    assert " fail a joint test of their own that a right model fails 5%" in said[1]
+    assert "dop, fresh: predictions are too narrow (p = 0.0001)." in said
+    assert not any(line.startswith("intensity") and "too narrow" in line for line in said)
+    assert any(line.startswith("dop, left out: in 40 of 400 fits the weights") for line in said)
+
+
+def test_what_was_not_ranked_is_told() -> None:
+    tree = make_calibration(readings=None)
+    with pytest.raises(pb.FitError, match="no ranks of readings; give what polar_bayes"):
+        pb.calibration_readings(tree)
+    assert not any("eadings" in line for line in pb.calibration_verdict(tree))
+    why = make_calibration(readings=None, **{"readings_told": "draws do not hold place"})
+    assert pb.calibration_verdict(why)[-1] == "Readings were not ranked: draws do not hold place."

@@ -1,0 +1,263 @@
+"""What one fit compiled serves the next, where nothing but readings changed; and only there."""
+
+import dataclasses
+import importlib
+import os
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+import numpyro
+import pytest
+import xarray as xr
+from numpyro import distributions as dist
+from numpyro import handlers
+from plates import LINKS, PLATE, plate_capture, plates
+from polar_bayes.models.per_material import per_material
+from spectral_plates import spectral_plate
+
+import polar_bayes as pb
+from polar_bayes.budget.effects import ChosenScene
+from polar_bayes.inference import anchoring, ground
+from polar_bayes.inference import fit as fitting
+from polar_bayes.inference.kept import Kept, key_of_story, last_edit
+from polar_bayes.inference.modes import quiet_line_search
+from polar_bayes.inference.prepared import prepare
+from polar_bayes.inference.request import resolve
+from polar_bayes.observation.data import observe
+
+# The goals let chains of other readings stop at another length.
+NUTS = pb.Nuts(chains=2, warmup=50, draws=50, most_draws=100, block=25, effective_draws=20.0)
+LAPLACE = pb.Laplace(draws=50, chains=2)
+COLORS = np.array([450.0, 650.0])
+
+
+def one(seed: int) -> xr.Dataset:
+    return plate_capture(np.linspace(30.0, 75.0, 6), 0.02, seed)
+
+
+def several(seed: int) -> xr.Dataset:
+    return plates([1.45, 1.55], 0.03, seed=seed)
+
+
+def colors(seed: int) -> xr.Dataset:
+    views = np.linspace(30.0, 75.0, 6)
+    return spectral_plate((COLORS, np.array([1.52, 1.5])), error=0.01, seed=seed, views=views)
+
+
+@pytest.fixture(autouse=True)
+def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(ground, "STARTS", 2)
+    monkeypatch.setattr(anchoring, "MOST_STARTS", 4)
+    monkeypatch.setattr(anchoring, "TYPICAL_DRAWS", 20)
+    monkeypatch.setattr(fitting, "PRIOR_DRAWS", 20)
+    monkeypatch.setattr(fitting, "BLOCK", 50)
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture
+def compiled() -> Iterator[list[str]]:
+    """What JAX compiles or reads from its cache, as it happens."""
+    found: list[str] = []
+
+    def listen(event: str, seconds: float, **about: object) -> None:
+        del seconds
+        if event == "/jax/core/compile/backend_compile_duration":
+            found.append(str(about.get("fun_name")))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield found
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
+SPECTRAL = pb.GpSpectral(coupled=("refractive_index",))
+
+
+@pytest.mark.parametrize(
+    ("model", "method", "capture"),
+    [
+        ("per_material", NUTS, one),
+        ("per_material", LAPLACE, one),
+        ("per_material", pb.Point(starts=2), one),
+        ("hierarchical", NUTS, several),
+        ("hierarchical", LAPLACE, several),
+        (SPECTRAL, NUTS, colors),
+    ],
+    ids=["nuts", "laplace", "point", "hierarchical nuts", "hierarchical laplace", "spectral nuts"],
+)
+def test_other_readings_compile_nothing(
+    model: object, method: object, capture: Callable[[int], xr.Dataset], compiled: list[str]
+) -> None:
+    def fit(seed: int) -> xr.DataTree:
+        asked = {"model": model, "method": method, "scene": PLATE, "links": LINKS}
+        return pb.fit(capture(seed), seed=seed, **asked)
+
+    first = fit(1)
+    assert compiled
+    compiled.clear()
+    second = fit(2)
+    assert compiled == []
+    first_index, second_index = (tree["posterior"]["refractive_index"] for tree in (first, second))
+    assert not np.isclose(float(first_index.mean()), float(second_index.mean()), rtol=1e-6)
+
+
+def test_what_was_compiled_for_others_gives_the_same_draws() -> None:
+    """A fit is the same to the bit, whether or not another one compiled it."""
+    asked = {"method": NUTS, "scene": PLATE, "links": LINKS, "seed": 3}
+    before = pb.fit(one(1), **asked)
+    pb.fit(one(2), **asked)
+    again = pb.fit(one(1), **asked)
+    xr.testing.assert_equal(before["posterior"].to_dataset(), again["posterior"].to_dataset())
+    name = "posterior_predictive"
+    xr.testing.assert_equal(before[name].to_dataset(), again[name].to_dataset())
+
+
+def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
+    """`fit` splits a round number of keys; the first of them must be those of any number."""
+    key = jax.random.key(5)
+    many, few = (
+        jax.random.key_data(jax.random.split(key, count)) for count in (fitting.KEYS, 1234)
+    )
+    assert np.array_equal(many[:1234], few)
+
+
+# --- what is shared, and what is not --------------------------------------------------------------
+
+
+def prepared(capture: xr.Dataset, *, precision: str = "double", **asked: object) -> object:
+    model, scene, priors, links = (
+        asked.get(name, usual)
+        for name, usual in (
+            ("model", "per_material"),
+            ("scene", PLATE),
+            ("priors", None),
+            ("links", LINKS),
+        )
+    )
+    request = resolve(capture, model, NUTS, scene, priors, links, None, 0, precision)
+    with jax.enable_x64(precision == "double"):
+        data = observe(request.capture)
+        if precision == "single":
+            data = data.in_single_precision()
+        return prepare(request, request.scene, data)
+
+
+def held(value: float) -> handlers.condition:
+    return handlers.condition(per_material, data={"stokes_error_factor": value})
+
+
+def shifted(by: float) -> Callable:
+    def model(data, scene, priors, links) -> None:
+        del scene, priors, links
+        mean = numpyro.sample("mean", dist.Normal(by, 1.0))
+        with numpyro.plate("view", data.shape[-1]):
+            numpyro.sample("q", dist.Normal(mean, 0.5), obs=data.readings["q"])
+
+    return model
+
+
+SAME: dict[str, tuple[dict, dict]] = {
+    "defaults": ({}, {}),
+    "a value held": ({"model": held(1.0)}, {"model": held(1.0)}),
+    "a model that encloses a value": ({"model": shifted(1.0)}, {"model": shifted(1.0)}),
+    "a prior": (
+        {"priors": {"refractive_index": dist.Uniform(1.3, 1.8)}},
+        {"priors": {"refractive_index": dist.Uniform(1.3, 1.8)}},
+    ),
+}
+OTHER: dict[str, tuple[dict, dict]] = {
+    "a value held": ({"model": held(1.0)}, {"model": held(1.5)}),
+    "a model that encloses a value": ({"model": shifted(1.0)}, {"model": shifted(2.0)}),
+    "a prior": ({}, {"priors": {"refractive_index": dist.Uniform(1.3, 1.8)}}),
+    "a bound of a prior": (
+        {"priors": {"refractive_index": dist.Uniform(1.3, 1.8)}},
+        {"priors": {"refractive_index": dist.Uniform(1.3, 1.9)}},
+    ),
+    "a link": ({}, {"links": {"q": pb.StokesLink(stated_errors=True, degrees_of_freedom=4.0)}}),
+    "a scene": ({}, {"scene": pb.Scene(surface=pb.SmoothSurface())}),
+    "the precision": ({}, {"precision": "single"}),
+}
+
+
+@pytest.mark.parametrize("what", SAME)
+def test_the_same_question_shares_what_is_compiled(what: str) -> None:
+    first, second = SAME[what]
+    assert prepared(one(1), **first) is prepared(one(2), **second)
+
+
+@pytest.mark.parametrize("what", OTHER)
+def test_another_question_shares_nothing(what: str) -> None:
+    first, second = OTHER[what]
+    assert prepared(one(1), **first) is not prepared(one(1), **second)
+
+
+def test_another_layout_shares_nothing() -> None:
+    longer = plate_capture(np.linspace(30.0, 75.0, 7), 0.02, 1)
+    assert prepared(one(1)) is not prepared(longer)
+
+
+def test_how_a_scene_was_chosen_does_not_count() -> None:
+    parts = {field.name: getattr(PLATE, field.name) for field in dataclasses.fields(PLATE)}
+    chosen = [ChosenScene(**parts) for _ in range(2)]
+    for number, scene in enumerate(chosen):
+        object.__setattr__(scene, "ledger", xr.Dataset({"cost": number}))
+    keys = [key_of_story(per_material, scene, {}, LINKS) for scene in chosen]
+    assert keys[0] == keys[1]
+
+
+def test_a_model_that_is_edited_and_loaded_again_is_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has the same name as before, which is all that a pickle of it says."""
+    file = tmp_path / "model_of_mine.py"
+    file.write_text("def model(data, scene, priors, links): return 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    mine = importlib.import_module("model_of_mine")
+    before = key_of_story(mine.model, PLATE, {}, {})
+    assert key_of_story(mine.model, PLATE, {}, {}) == before
+    os.utime(file, ns=(last_edit() + 1,) * 2)
+    assert key_of_story(mine.model, PLATE, {}, {}) != before
+    del sys.modules["model_of_mine"]
+
+
+def test_the_last_few_are_kept() -> None:
+    made: list[str] = []
+    kept: Kept[str] = Kept(2)
+
+    def ask(key: str) -> str:
+        return kept.of(key, lambda: (made.append(key), key)[1])
+
+    for key in ("a", "b", "a", "c", "a", "b"):
+        assert ask(key) == key
+    assert made == ["a", "b", "c", "b"]  # c took the place of b, which was asked for before a
+
+
+def test_fits_side_by_side_leave_warnings_as_they_were() -> None:
+    """The first ends before the second does: neither may undo what the other needs."""
+    first_ended, second_began = threading.Event(), threading.Event()
+    before = list(warnings.filters)
+    heard: list[str] = []
+
+    def second() -> None:
+        with quiet_line_search():
+            second_began.set()
+            first_ended.wait(10.0)
+            try:
+                warnings.warn("The line search algorithm did not converge", stacklevel=1)
+            except UserWarning as warning:
+                heard.append(str(warning))
+
+    thread = threading.Thread(target=second)
+    with quiet_line_search():
+        thread.start()
+        assert second_began.wait(10.0)
+    first_ended.set()
+    thread.join()
+    assert heard == []
+    assert list(warnings.filters) == before
