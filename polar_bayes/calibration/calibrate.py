@@ -32,7 +32,7 @@ METHODS: dict[str, Method] = {
     "laplace": PixelLaplace(weighted=False),
     "importance": PixelLaplace(draws=512),
     "tempered": PixelTempering(),
-    "nuts": PixelNuts(),
+    "nuts": PixelNuts(start=PixelTempering()),
 }
 FEWEST = 20
 
@@ -42,7 +42,7 @@ def calibrate(
     *,
     simulations: int = 1000,
     model: str | Callable = "per_material",
-    method: str | Method = "importance",
+    method: str | Method = "tempered",
     scene: str | Scene | None = None,
     priors: Mapping[str, dist.Distribution] | None = None,
     links: AbstractLink | Mapping[str, AbstractLink] | None = None,

@@ -24,7 +24,7 @@ from polar_bayes.pixels.climbing import Climber, Peak, crown, stand, step
 from polar_bayes.pixels.derivatives import AnyArray, expand, score
 from polar_bayes.pixels.importance import Points
 from polar_bayes.pixels.mixtures import draw_mixture, fit_mixture
-from polar_bayes.pixels.sampling import PixelNuts, chains
+from polar_bayes.pixels.sampling import PixelNuts, around_mode, chains
 from polar_bayes.pixels.stack import Stack
 from polar_bayes.pixels.tempering import PixelTempering, Tempered, temper
 from polar_bayes.pixels.tracing import TRACING
@@ -154,13 +154,15 @@ class Engine:
             return self._map(functools.partial(draws, *given), near, center, half)
 
     def sample(
-        self, pixels: Stack, peak: Peak, settings: PixelNuts, keys: Array
+        self, pixels: Stack, z: AnyArray, half: AnyArray, settings: PixelNuts, keys: np.ndarray
     ) -> tuple[Values, np.ndarray, np.ndarray]:
         """Chains in every pixel.
 
         Args:
             pixels: The readings.
-            peak: Their modes and widths, which are the metric.
+            z: Their modes, (pixel, size); or where chains begin, (pixel, chain, size), where the
+                settings have a start of their own.
+            half: Widths, which are the metric, (pixel, size, size).
             settings: Lengths of the chains.
             keys: One for each pixel.
 
@@ -174,10 +176,10 @@ class Engine:
         with jax.enable_x64(self.precision == "double"):
             with TRACING:
                 several = self._chains(settings)
-            given = (pixels.in_precision(self.dtype), peak.z, peak.widths, keys)
-            z, draws = self._map(several, *given, batch=FEW)
-        r_hat = [max(array_stats.rhat(x) for x in np.moveaxis(one, -1, 0)) for one in z]
-        effective = effective_sample_size(np.moveaxis(np.asarray(z, float), 0, 2))
+            states = np.asarray(z, self.dtype), np.asarray(half, self.dtype), keys
+            kept, draws = self._map(several, pixels.in_precision(self.dtype), *states, batch=FEW)
+        r_hat = [max(array_stats.rhat(x) for x in np.moveaxis(one, -1, 0)) for one in kept]
+        effective = effective_sample_size(np.moveaxis(np.asarray(kept, float), 0, 2))
         return draws, np.array(r_hat), np.min(effective, axis=-1)
 
     def temper(
@@ -314,6 +316,8 @@ class Engine:
     @functools.cache  # noqa: B019 - an engine lives as long as its map
     def _chains(self, settings: PixelNuts) -> Callable:
         def pixel(data: Observations, z: Array, half: Array, key: Array) -> tuple[Array, Values]:
+            if settings.start is None:
+                z = around_mode(self.program, settings, data, z, half, key)
             kept = chains(self.program, settings, data, z, half, key)
             flat = kept.reshape(-1, self.program.size)
             return kept, jax.vmap(lambda z: self.program.parameters(z, data))(flat)

@@ -1,6 +1,7 @@
 """A row of pixels: mode, width, how far they can be trusted, and what is done where they cannot."""
 
 import dataclasses
+from collections.abc import Iterator
 
 import jax
 import numpy as np
@@ -28,7 +29,7 @@ from polar_bayes.pixels.outcome import (
 )
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.stack import Stack
-from polar_bayes.pixels.tempering import PixelTempering
+from polar_bayes.pixels.tempering import LIFT, PixelTempering
 
 FEWEST_VIEWS = 2
 RESTARTS = (1, 3, 7)
@@ -56,7 +57,8 @@ class PixelLaplace:
         candidates: Prior draws among which each pixel finds its start, >= 8.
         rounds: In which the proposal of a pixel with Pareto k above 0.7 is fitted to its own
             weighted draws, until k is below; >= 0. Without weights nothing is in doubt.
-        sampler: What pixels whose k is still above are handed to; None marks them only.
+        sampler: What pixels whose k is still above are handed to, `PixelNuts` or `PixelTempering`;
+            None marks them only.
 
     Raises:
         FitError: A setting is outside its range.
@@ -66,7 +68,7 @@ class PixelLaplace:
     weighted: bool = True
     candidates: int = 32
     rounds: int = 3
-    sampler: PixelNuts | None = dataclasses.field(default_factory=PixelNuts)
+    sampler: PixelNuts | PixelTempering | None = dataclasses.field(default_factory=PixelNuts)
 
     def __post_init__(self) -> None:
         if self.draws < 64 or self.draws & (self.draws - 1):
@@ -133,15 +135,46 @@ def _sample_all(
     at: np.ndarray,
     row: Row,
 ) -> None:
-    """Chains from the mode of every pixel that has one."""
+    """Chains in every pixel: around its mode, where it has one, or from tempered draws."""
+    if settings.start is not None:
+        for begin in range(0, at.size, HARD):
+            some = at[begin : begin + HARD]
+            _sample_tempered(engine, settings, settings.start, pixels, keys, some, row)
+        return
     settled = _climb(engine, pixels.subset(at))
     row.settle(at, settled)
     arrived = np.flatnonzero(settled.converged)
     for begin in range(0, arrived.size, HARD):
         some = arrived[begin : begin + HARD]
-        peak = rows(settled.peak, some)
-        chains = engine.sample(pixels.subset(at[some]), peak, settings, keys[at[some]])
-        row.sample(at[some], *chains, settings.largest_r_hat)
+        peak, here = rows(settled.peak, some), at[some]
+        chains = engine.sample(pixels.subset(here), peak.z, peak.widths, settings, keys[here])
+        row.sample(here, *chains, settings.largest_r_hat)
+
+
+def _sample_tempered(
+    engine: Engine,
+    settings: PixelNuts,
+    start: PixelTempering,
+    pixels: Stack,
+    keys: np.ndarray,
+    at: np.ndarray,
+    row: Row,
+) -> None:
+    """Chains that begin at tempered draws: in each mode as many as it weighs."""
+    begins: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    for some, found in _tempered(engine, start, pixels, keys, at, row):
+        for number, z, weights in zip(some, found.z, found.weights, strict=True):
+            chosen = np.random.default_rng(keys[number]).choice(
+                len(z), settings.chains, p=weights / weights.sum()
+            )
+            covariance = np.cov(z.T, aweights=weights) + LIFT * np.diag(np.var(z, axis=0))
+            begins[number] = z[chosen], np.linalg.cholesky(covariance).T
+    here = np.array(sorted(begins), int)
+    if not here.size:
+        return
+    z, half = (np.stack(parts) for parts in zip(*(begins[one] for one in here), strict=True))
+    chains = engine.sample(pixels.subset(here), z, half, settings, keys[here])
+    row.sample(here, *chains, settings.largest_r_hat)
 
 
 def _temper_all(
@@ -152,15 +185,34 @@ def _temper_all(
     at: np.ndarray,
     row: Row,
 ) -> None:
-    """A crowd from the prior of every pixel; mixtures fitted to it until draws are worth enough."""
+    """Weighted draws of every pixel."""
+    for begin in range(0, at.size, HARD):
+        for _ in _tempered(engine, settings, pixels, keys, at[begin : begin + HARD], row):
+            pass  # the row has been told
+
+
+def _tempered(
+    engine: Engine,
+    settings: PixelTempering,
+    pixels: Stack,
+    keys: np.ndarray,
+    at: np.ndarray,
+    row: Row,
+) -> Iterator[tuple[np.ndarray, Weighted]]:
+    """Weighted draws as answers come; what has none begins again from a new crowd."""
     row.status[at] = Status.NOT_CONVERGED
-    for crowd in range(settings.crowds):
-        at = _temper(engine, settings, pixels, keys, at, row, crowd)
+    for attempt in range(settings.crowds):
+        lost = at
+        for some, found, is_worth in _rounds(engine, settings, pixels, keys, at, row, attempt):
+            row.temper(some, found, is_worth=is_worth)
+            lost = np.setdiff1d(lost, some)
+            yield some, found
+        at = lost
         if not at.size:
             return
 
 
-def _temper(
+def _rounds(
     engine: Engine,
     settings: PixelTempering,
     pixels: Stack,
@@ -168,32 +220,30 @@ def _temper(
     at: np.ndarray,
     row: Row,
     attempt: int,
-) -> np.ndarray:
-    """One crowd for each of some pixels; which of them are left without an answer."""
+) -> Iterator[tuple[np.ndarray, Weighted, np.ndarray]]:
+    """A crowd from the prior of each; mixtures fitted to it until their draws are worth enough."""
     crowd = engine.temper(pixels.subset(at), settings, keys[at], attempt)
     row.outcome.steps[at] += crowd.stages
-    arrived = (crowd.temperature >= 1.0) & np.isfinite(crowd.z).all(axis=(1, 2))
-    lost, left = at[~arrived], np.flatnonzero(arrived)
+    left = np.flatnonzero((crowd.temperature >= 1.0) & np.isfinite(crowd.z).all(axis=(1, 2)))
     z = np.tile(crowd.z[left], (1, settings.draws // settings.crowd, 1))
     weights, was_worth = np.full(z.shape[:2], 1.0 / settings.draws), np.zeros(left.size, bool)
     for number in range(settings.rounds):
         if not left.size:
-            break
+            return
         some, round_key = pixels.subset(at[left]), attempt * settings.rounds + number
         told = engine.propose(some, settings, z, weights, keys[at[left]], round_key)
         parameters, z, ratios = told
-        found = Weighted(parameters, *smooth(ratios))
+        found = Weighted(z, parameters, *smooth(ratios))
         possible = np.isfinite(found.weights).all(axis=-1)
         is_worth = found.effective >= settings.effective_draws
         is_worth &= found.pareto_k <= LARGEST_TRUSTED
         # A mixture too narrow looks good once: the next one, fitted to its draws, tells.
         settled, is_last = is_worth & was_worth, number == settings.rounds - 1
         answer = np.flatnonzero(settled | (is_last & possible))
-        row.temper(at[left[answer]], rows(found, answer), is_worth=settled[answer])
-        lost = np.concatenate([lost, at[left[~possible]]])
+        if answer.size:
+            yield at[left[answer]], rows(found, answer), settled[answer]
         on = ~settled & possible
         left, z, weights, was_worth = left[on], z[on], found.weights[on], is_worth[on]
-    return np.sort(np.concatenate([lost, at[left]]))
 
 
 def _climb(engine: Engine, pixels: Stack) -> Settled:
@@ -241,7 +291,7 @@ class _Work:
             left = some[self._adapt(usable.subset(some), rows(found, some), at[some], row)]
             if self.settings.sampler is not None and left.size:
                 peak = rows(found.settled.peak, left)
-                self._sample(self.settings.sampler, usable.subset(left), peak, at[left], row)
+                self._hand_over(self.settings.sampler, pixels, peak, at[left], row)
 
     def _search(self, pixels: Stack, turns: np.ndarray) -> Approximation:
         """Fit from the best candidate; pixels in doubt start again, and keep the lower mode."""
@@ -297,11 +347,23 @@ class _Work:
             places = proposal.places(self.further)[~enough]
         return left
 
-    def _sample(
-        self, sampler: PixelNuts, pixels: Stack, peak: Peak, at: np.ndarray, row: Row
+    def _hand_over(
+        self,
+        sampler: PixelNuts | PixelTempering,
+        pixels: Stack,
+        peak: Peak,
+        at: np.ndarray,
+        row: Row,
     ) -> None:
-        chains = self.engine.sample(pixels, peak, sampler, self.keys[at])
-        row.sample(at, *chains, sampler.largest_r_hat)
+        """Draws of pixels of the row that no proposal suits."""
+        if isinstance(sampler, PixelTempering):
+            _temper_all(self.engine, sampler, pixels, self.keys, at, row)
+        elif sampler.start is not None:
+            _sample_tempered(self.engine, sampler, sampler.start, pixels, self.keys, at, row)
+        else:
+            some = pixels.subset(at)
+            chains = self.engine.sample(some, peak.z, peak.widths, sampler, self.keys[at])
+            row.sample(at, *chains, sampler.largest_r_hat)
 
 
 def _keys(seed: int, numbers: np.ndarray) -> np.ndarray:

@@ -94,11 +94,13 @@ class Weighted(NamedTuple):
     """Weighted draws of a row of pixels.
 
     Args:
-        parameters: Draws by name, each (pixel, draw, ...).
+        z: Unconstrained vectors, (pixel, draw, size).
+        parameters: The same by name, each (pixel, draw, ...).
         weights: (pixel, draw).
         pareto_k: (pixel,).
     """
 
+    z: np.ndarray
     parameters: Values
     weights: np.ndarray
     pareto_k: np.ndarray
@@ -161,8 +163,9 @@ class Row:
         effective: np.ndarray,
         largest_r_hat: float,
     ) -> None:
-        """Chains, where they have mixed."""
+        """Chains, where they have mixed; elsewhere what was known before is not to be trusted."""
         mixed = r_hat <= largest_r_hat
+        self.status[at[~mixed]] = Status.NOT_TRUSTED
         count = np.asarray(next(iter(draws.values()))).shape[1]
         even = np.full((int(mixed.sum()), count), 1.0 / count)
         self._answer(at[mixed], rows(draws, mixed), even, effective[mixed], Approach.NUTS)

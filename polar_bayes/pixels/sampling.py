@@ -11,13 +11,14 @@ from numpyro import infer
 from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
+from polar_bayes.pixels.tempering import PixelTempering
 
 MOST_DOUBLINGS = 8
 
 
 @dataclasses.dataclass(frozen=True)
 class PixelNuts:
-    """NUTS in each of many pixels, with the metric of the normal approximation.
+    """NUTS in each of many pixels, with a metric that is known before.
 
     Args:
         chains: Of each pixel, >= 2.
@@ -25,6 +26,9 @@ class PixelNuts:
         draws: Kept draws of each chain, >= 50.
         target_acceptance: Between 0.5 and 1.
         largest_r_hat: Above it a pixel counts as not converged; between 1 and 100.
+        start: None: chains begin around the mode, with the metric of the normal approximation; they
+            see one mode and no other. Or they begin at tempered draws, with the metric of these,
+            which see all; where chains do not mix, the tempered draws stay.
 
     Raises:
         FitError: A setting is outside its range.
@@ -35,6 +39,7 @@ class PixelNuts:
     draws: int = 400
     target_acceptance: float = 0.9
     largest_r_hat: float = 1.05
+    start: PixelTempering | None = None
 
     def __post_init__(self) -> None:
         for name, least in (("chains", 2), ("warmup", 10), ("draws", 50)):
@@ -57,18 +62,18 @@ def chains(
     program: Program,
     settings: PixelNuts,
     data: Observations,
-    z: Float[Array, " size"],
+    starts: Float[Array, "chain size"],
     half: Float[Array, "size size"],
     key: Array,
 ) -> Float[Array, "chain draw size"]:
-    """Chains in one pixel, each from a draw of the normal approximation.
+    """Chains in one pixel.
 
     Args:
         program: The model of one pixel.
         settings: Lengths and goals.
         data: The pixel's readings.
-        z: The mode.
-        half: Widths there; `z + half.T @ e` are draws.
+        starts: Where each chain begins.
+        half: `half.T @ half` is the metric.
         key: Random key.
 
     Returns:
@@ -80,16 +85,14 @@ def chains(
     Source:
         Hoffman & Gelman (2014), JMLR 15, 1593-1623.
     """
-    start, advance = infer.hmc.hmc(
+    begin, advance = infer.hmc.hmc(
         potential_fn_gen=lambda data: lambda z: program.potential(z, data), algo="NUTS"
     )
 
-    def chain(key: Array) -> Array:
-        key_start, key_chain = jax.random.split(key)
-        first = z + jax.random.normal(key_start, z.shape, z.dtype) @ half
-        first = jnp.where(jnp.isfinite(program.potential(first, data)), first, z)
+    def chain(given: tuple[Array, Array]) -> Array:
+        first, key = given
         value, gradient = jax.value_and_grad(program.potential)(first, data)
-        state = start(
+        state = begin(
             infer.util.ParamInfo(first, value, gradient),
             settings.warmup,
             step_size=0.5,
@@ -100,7 +103,7 @@ def chains(
             trajectory_length=None,
             max_tree_depth=MOST_DOUBLINGS,
             model_args=(data,),
-            rng_key=key_chain,
+            rng_key=jax.random.split(key)[1],
         )
 
         def move(state: Any, _: None) -> tuple[Any, Array]:
@@ -109,4 +112,38 @@ def chains(
 
         return jax.lax.scan(move, state, None, length=settings.warmup + settings.draws)[1]
 
-    return jax.lax.map(chain, jax.random.split(key, settings.chains))[:, settings.warmup :]
+    keys = jax.random.split(key, settings.chains)
+    return jax.lax.map(chain, (starts, keys))[:, settings.warmup :]
+
+
+def around_mode(
+    program: Program,
+    settings: PixelNuts,
+    data: Observations,
+    mode: Float[Array, " size"],
+    half: Float[Array, "size size"],
+    key: Array,
+) -> Float[Array, "chain size"]:
+    """Draws of the normal approximation, for chains to begin at.
+
+    Args:
+        program: The model of one pixel.
+        settings: How many chains.
+        data: The pixel's readings.
+        mode: Its highest density.
+        half: Widths there; `mode + half.T @ e` are draws.
+        key: Random key.
+
+    Returns:
+        Unconstrained vectors; the mode itself where a draw has no density.
+
+    Raises:
+        Nothing.
+    """
+
+    def draw(key: Array) -> Array:
+        noise = jax.random.normal(jax.random.split(key)[0], mode.shape, mode.dtype)
+        found = mode + noise @ half
+        return jnp.where(jnp.isfinite(program.potential(found, data)), found, mode)
+
+    return jax.vmap(draw)(jax.random.split(key, settings.chains))

@@ -53,10 +53,10 @@ class PixelTempering:
         FitError: A setting is outside its range.
     """
 
-    walks: int = 64
+    walks: int = 128
     length: int = 8
     effective_share: float = 0.5
-    draws: int = 1024
+    draws: int = 2048
     components: int = 4
     rounds: int = 6
     crowds: int = 3

@@ -6,6 +6,7 @@ import pytest
 from arviz_stats.base import array_stats
 from plate_images import NAMES, VIEWS, on_a_grid, planned, plate_image, stacked
 
+from polar_bayes.pixels.climbing import Peak
 from polar_bayes.pixels.engine import Engine, Settled
 from polar_bayes.pixels.fitting import _keys
 from polar_bayes.pixels.sampling import PixelNuts
@@ -15,6 +16,12 @@ pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
 CHAINS = PixelNuts(chains=2, warmup=150, draws=1000)
 WEAK = plate_image(1, 3, noise=0.15, views=VIEWS[[1, 4]], seed=7)
+
+
+def _sampled(
+    engine: Engine, pixels: Stack, peak: Peak, numbers: np.ndarray
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    return engine.sample(pixels, peak.z, peak.widths, CHAINS, _keys(0, numbers))
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +36,7 @@ def made(compiled_in_haste: None) -> tuple[Engine, Stack, Settled]:
 @pytest.fixture(scope="module")
 def sampled(made) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     engine, pixels, settled = made
-    return engine.sample(pixels, settled.peak, CHAINS, _keys(0, np.array([40, 50, 60])))
+    return _sampled(engine, pixels, settled.peak, np.array([40, 50, 60]))
 
 
 def test_a_skewed_pixel_has_the_posterior_of_a_grid(sampled) -> None:
@@ -51,8 +58,7 @@ def test_draws_follow_the_number_of_a_pixel_not_its_place(made, sampled) -> None
     engine, pixels, settled = made
     order = np.array([2, 0])
     peak = jax.tree.map(lambda x: x[order], settled.peak)
-    keys = _keys(0, np.array([60, 40]))
-    draws, r_hat, effective = engine.sample(pixels.subset(order), peak, CHAINS, keys)
+    draws, r_hat, effective = _sampled(engine, pixels.subset(order), peak, np.array([60, 40]))
     for name, all_draws in sampled[0].items():
         assert draws[name].tobytes() == all_draws[order].tobytes(), name
     assert r_hat.tobytes() == sampled[1][order].tobytes()

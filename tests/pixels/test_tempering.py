@@ -13,10 +13,13 @@ from plates import plate_capture
 import polar_bayes as pb
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.observation.data import Observations, observe
+from polar_bayes.pixels.engine import Engine
 from polar_bayes.pixels.fitting import fit_stack
 from polar_bayes.pixels.importance import effective_draws, smooth
 from polar_bayes.pixels.mixtures import DEGREES_OF_FREEDOM, draw_mixture, fit_mixture
 from polar_bayes.pixels.outcome import Approach, Status
+from polar_bayes.pixels.sampling import PixelNuts
+from polar_bayes.pixels.stack import Stack
 from polar_bayes.pixels.tempering import PixelTempering, spread, temper
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
@@ -55,7 +58,7 @@ def crowd(two_modes: tuple[Program, Observations]) -> np.ndarray:
 def test_a_crowd_is_in_both_modes_and_wide_where_nothing_is_known(crowd: np.ndarray) -> None:
     x, y = crowd.T
     assert np.abs(np.abs(x) - FAR).max() < 6.0 * WIDTH
-    # 64 walks thinned at each of some stages: the share of a side scatters by about 0.15.
+    # 128 walks thinned at each of some stages: the share of a side scatters by about 0.15.
     assert 0.1 < np.mean(x > 0.0) < 0.9
     assert 0.6 < y.std() < 1.4
 
@@ -106,25 +109,56 @@ def test_spread_is_mean_and_covariance_of_weighted_draws() -> None:
     assert np.abs((half @ half.T - covariance) / scale).max() < 2e-6  # what the lift adds
 
 
-def test_a_skewed_pixel_has_the_posterior_of_a_grid() -> None:
-    plan = planned(WEAK)
-    found = {}
+Found = dict[int, tuple[dict[str, np.ndarray], np.ndarray]]
+"""Of each pixel its draws by name, and their weights."""
+
+
+def fitted(engine: Engine, settings: PixelTempering | PixelNuts, pixels: Stack):
+    found: Found = {}
 
     def describe(at: np.ndarray, parameters: dict, weights: np.ndarray) -> None:
         for row, pixel in enumerate(at):
             draws = {name: x[row] for name, x in parameters.items()}
             found[int(pixel)] = draws, weights[row]
 
-    outcome = fit_stack(plan.engine, SETTINGS, stacked(WEAK, plan), np.arange(3), 0, describe)
+    numbers = np.arange(len(pixels))
+    return fit_stack(engine, settings, pixels, numbers, 0, describe), found
+
+
+def test_chains_begin_in_every_mode_and_tempered_draws_stay_where_they_do_not_mix() -> None:
+    plan = planned(WEAK)
+    pixels = stacked(WEAK, plan).subset(np.zeros(16, int))
+    with jax.enable_x64(False):
+        program = compile_program(two_sided, pixels.in_precision(np.float32).pixel())
+    engine = Engine(program, program, np.zeros((8, 2)), "single")
+    chains = PixelNuts(warmup=50, draws=100, start=SETTINGS)
+    outcome, found = fitted(engine, chains, pixels)
+    sampled = outcome.approach == Approach.NUTS
+    assert (outcome.status == np.where(sampled, Status.GOOD, Status.NOT_TRUSTED)).all()
+    assert (outcome.approach[~sampled] == Approach.TEMPERED).all()
+    # Two chains begin on one side each other time; 16 times alike happens once in 30000.
+    assert 0 < sampled.sum() < 16
+    sides = np.array([np.mean(found[pixel][0]["x"] > 0.0) for pixel in range(16)])
+    assert set(sides[sampled]) == {0.0, 1.0}
+    assert (np.abs(sides[~sampled] - 0.5) < 0.3).all()
+
+
+@pytest.mark.parametrize("chains", [False, True])
+def test_a_skewed_pixel_has_the_posterior_of_a_grid(chains: bool) -> None:
+    plan = planned(WEAK)
+    settings = PixelNuts(draws=1000, start=SETTINGS) if chains else SETTINGS
+    outcome, found = fitted(plan.engine, settings, stacked(WEAK, plan))
     assert (outcome.status == Status.GOOD).all()
-    assert (outcome.approach == Approach.TEMPERED).all()
+    assert (outcome.approach == (Approach.NUTS if chains else Approach.TEMPERED)).all()
     assert (outcome.effective_draws >= SETTINGS.effective_draws).all()
     for pixel, q in enumerate(WEAK["q"].values[0]):
         draws, weights = found[pixel]
         for name, (mean, sd, _) in on_a_grid(q, 0.15, WEAK["view_zenith"].values).items():
-            # The error of a ratio of weighted sums; four of them: 4e-4 over these six.
+            # The error of a ratio of weighted sums, or of as many draws as chains are worth; four
+            # of them: 8e-4 over these twelve.
             told = weights @ draws[name]
             error = np.sqrt(np.sum(weights**2 * (draws[name] - told) ** 2))
+            error = sd / np.sqrt(outcome.effective_draws[pixel]) if chains else error
             assert abs(told - mean) < 4.0 * error
             assert error < 0.1 * sd
 
@@ -134,8 +168,8 @@ def test_a_skewed_pixel_has_the_posterior_of_a_grid() -> None:
     [
         ({"walks": 4}, "walks is 4; give 16 or more"),
         ({"effective_share": 0.99}, "effective_share is 0.99; give a number from 0.1 to 0.95"),
-        ({"draws": 1000}, "draws is 1000, and the crowd 512; give a multiple of walks"),
-        ({"effective_draws": 2000.0}, "effective_draws is 2000.0, and there are 1024 draws"),
+        ({"draws": 1000}, "draws is 1000, and the crowd 1024; give a multiple of walks"),
+        ({"effective_draws": 3000.0}, "effective_draws is 3000.0, and there are 2048 draws"),
     ],
 )
 def test_mistakes_are_told(settings: dict, said: str) -> None:
