@@ -16,6 +16,7 @@ from polar_bayes.calibration.standing import Standing
 from polar_bayes.inference.prepared import Prepared, prepare
 from polar_bayes.inference.program import Program, Values, compile_program
 from polar_bayes.inference.request import Request
+from polar_bayes.inference.tracing import TRACING
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.pixels.engine import Engine
 from polar_bayes.pixels.fitting import PixelLaplace, fit_stack
@@ -25,7 +26,6 @@ from polar_bayes.pixels.outcome import Describe, Outcome
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.stack import Stack
 from polar_bayes.pixels.tempering import PixelTempering
-from polar_bayes.pixels.tracing import TRACING
 
 Method = PixelLaplace | PixelNuts | PixelTempering | one_by_one.OneByOne
 BLOCK = 64

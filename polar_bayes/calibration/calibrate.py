@@ -42,7 +42,7 @@ def calibrate(
     *,
     simulations: int = 1000,
     model: str | Callable = "per_material",
-    method: str | Method = "tempered",
+    method: str | Method | None = None,
     scene: str | Scene | None = None,
     priors: Mapping[str, dist.Distribution] | None = None,
     links: AbstractLink | Mapping[str, AbstractLink] | None = None,
@@ -66,11 +66,12 @@ def calibrate(
             errors and masks.
         simulations: How many, at least 20.
         model: As for `polar_bayes.fit`; scene, priors, links and largest_view_zenith too.
-        method: "laplace" (the normal approximation at the mode), "importance" (its draws weighed by
-            the posterior, corrected as in maps), "tempered" (draws led from the prior to the
-            posterior, which sees every mode), "nuts" (chains in every fit; those of
-            `polar_bayes.fit` where the capture has patches, materials or wavelengths), or settings,
-            those of `polar_bayes.fit` (`Nuts`, `Laplace`) among them.
+        method: "tempered" (draws led from the prior to the posterior, which sees every mode: the
+            default for one material in one color), "nuts" (chains that begin at such draws), or
+            what begins at one mode: "importance" (the normal approximation, its draws weighed by
+            the posterior, corrected as in maps), "laplace" (the same unweighed). Where the capture
+            has patches, materials or wavelengths the default is "nuts", and these chains are those
+            of `polar_bayes.fit`. Or settings, those of `polar_bayes.fit` (`Nuts`, `Laplace`) too.
         scene: A name, a `Scene` or None.
         priors: Overrides.
         links: One link, a mapping or None.
@@ -136,7 +137,7 @@ def calibrate(
     missing = _missing(found, simulations)
     show = progress or _silent
     found += _fit_all(plan, missing, simulations, kept, scheduler, show)
-    about = _provenance(request, settings, method, truth, simulations)
+    about = _provenance(request, settings, truth, simulations)
     about["seconds"] = round(time.perf_counter() - clock, 3)
     if missing.size < simulations:
         about["fits found in the store"] = simulations - missing.size
@@ -145,11 +146,13 @@ def calibrate(
     return assemble(plan.program, request, plan.data, join(found, simulations), about)
 
 
-def _settings(method: str | Method, capture: xr.Dataset) -> Method:
+def _settings(method: str | Method | None, capture: xr.Dataset) -> Method:
     if isinstance(method, Method):
         return method
-    if method == "nuts" and has_further_axes(capture):
+    if has_further_axes(capture) and method in (None, "nuts"):
         return Nuts()
+    if method is None:
+        return METHODS["tempered"]
     if method not in METHODS:
         raise FitError(
             "no such method",
@@ -157,6 +160,11 @@ def _settings(method: str | Method, capture: xr.Dataset) -> Method:
             mend=f"give one of {', '.join(METHODS)}, or settings such as PixelNuts(draws=1000)",
         )
     return METHODS[method]
+
+
+def _named(settings: Method) -> str:
+    names = (name for name, each in METHODS.items() if each == settings)
+    return next(names, type(settings).__name__)
 
 
 def _resolved(
@@ -212,14 +220,13 @@ def _silent(done: int, every: int) -> None:
 def _provenance(
     request: Request,
     settings: Method,
-    method: str | Method,
     truth: Mapping[str, Any] | None,
     simulations: int,
 ) -> dict[str, Any]:
     return {
         "calibration": simulations,
         "model": request.model_name,
-        "method": method if isinstance(method, str) else type(method).__name__,
+        "method": _named(settings),
         "settings": repr(settings),
         "scene": request.scene_name,
         "scene_parts": repr(request.scene),

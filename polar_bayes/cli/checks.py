@@ -16,10 +16,7 @@ from polar_bayes.cli.printing import NOT_CONVERGED, counting_bar, progress_bars
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="File to write.")
 @click.option("--model", default="per_material", show_default=True)
 @click.option(
-    "--method",
-    default="importance",
-    show_default=True,
-    help="laplace, importance, tempered or nuts.",
+    "--method", help="laplace, importance, tempered or nuts; by default what suits the capture."
 )
 @click.option("--simulations", type=int, default=1000, show_default=True)
 @click.option("--scene", help="Named scene; by default the one that the capture names.")

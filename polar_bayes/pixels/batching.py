@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from polar_bayes.inference.tracing import TracedOnce
 from polar_bayes.pixels.stack import together
-from polar_bayes.pixels.tracing import TracedOnce
 
 CLIMBING = 16
 """Pixels of a batch that climb side by side: what they need stays in a core's own cache."""

@@ -11,6 +11,7 @@ import xarray as xr
 from polar_bayes.capture.schema import validate
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import dims_of
+from polar_bayes.inference.tracing import TRACING
 from polar_bayes.observation.data import READINGS, Observations, observe
 from polar_bayes.physics.notation import notation
 from polar_bayes.pixels.engine import Engine
@@ -19,7 +20,6 @@ from polar_bayes.pixels.making import Recipe, make_engine
 from polar_bayes.pixels.marginals import LEVELS, Marginals
 from polar_bayes.pixels.outcome import Approach, Outcome, Status
 from polar_bayes.pixels.stack import IMAGE, stack
-from polar_bayes.pixels.tracing import TRACING
 
 Layout = dict[str, tuple[tuple[str, ...], tuple[int, ...]]]
 """By parameter: names and lengths of the axes that it has in one pixel."""

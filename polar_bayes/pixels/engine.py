@@ -17,6 +17,7 @@ from jaxtyping import Array
 from numpyro.diagnostics import effective_sample_size
 
 from polar_bayes.inference.program import Program, Values
+from polar_bayes.inference.tracing import TRACING
 from polar_bayes.observation.data import Observations
 from polar_bayes.pixels.adapting import Proposal
 from polar_bayes.pixels.batching import batched, batches
@@ -27,7 +28,6 @@ from polar_bayes.pixels.mixtures import draw_mixture, fit_mixture
 from polar_bayes.pixels.sampling import PixelNuts, around_mode, chains
 from polar_bayes.pixels.stack import Stack
 from polar_bayes.pixels.tempering import PixelTempering, Tempered, temper
-from polar_bayes.pixels.tracing import TRACING
 
 BATCH = 128
 """Pixels that one call of a program takes."""

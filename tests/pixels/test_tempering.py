@@ -131,7 +131,7 @@ def test_chains_begin_in_every_mode_and_tempered_draws_stay_where_they_do_not_mi
     with jax.enable_x64(False):
         program = compile_program(two_sided, pixels.in_precision(np.float32).pixel())
     engine = Engine(program, program, np.zeros((8, 2)), "single")
-    chains = PixelNuts(warmup=50, draws=100, start=SETTINGS)
+    chains = PixelNuts(start=SETTINGS)
     outcome, found = fitted(engine, chains, pixels)
     sampled = outcome.approach == Approach.NUTS
     assert (outcome.status == np.where(sampled, Status.GOOD, Status.NOT_TRUSTED)).all()
