@@ -1,15 +1,17 @@
-"""Fits per second of simulation-based calibration, beside a loop of NumPyro's `MCMC.run`.
+"""Fits per second of simulation-based calibration, beside a loop of `MCMC.run` and simuk.
 
+    pip install '.[peers]'
     python tests/benchmarks/calibration.py           1000 fits of ours by each method
     python tests/benchmarks/calibration.py 200       fewer
     python tests/benchmarks/calibration.py 200 nuts  by one method
 
 The per-material model of one color: 40 views of the degree of polarization and of intensity by the
 paper's scene with four facets on the way out; four parameters of the material, three of the noise.
-All fit the same simulations. Ours is timed twice, with compilation and without; the loop runs one
-compiled chain of 500 warm-up and 500 kept draws for each, with NumPyro's defaults.
+Ours is timed twice, with compilation and without. The loop fits the same simulations, each by one
+compiled chain of 500 warm-up and 500 kept draws with NumPyro's defaults; simuk simulates and fits
+by such chains itself, and compiles each. A few fits stand for many there.
 ESS is the least of all parameters of a fit, or what its weighted draws are worth: of all fits, the
-5% quantile and the median. The last column is the least p-value of uniform ranks.
+5% quantile and the median. The last column is the least p-value of uniform ranks, of seven.
 """
 
 import dataclasses
@@ -22,9 +24,12 @@ from typing import Any
 
 import jax
 import numpy as np
+import simuk
 import xarray as xr
+from numpyro import handlers
 from numpyro.diagnostics import effective_sample_size
 from numpyro.infer import MCMC, NUTS
+from one_material import SCENE, layout
 
 import polar_bayes as pb
 from polar_bayes.calibration.simulations import draw_captures
@@ -32,15 +37,8 @@ from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 
-LOOPED = 12
-FACETS = pb.FacetQuadrature(along=2, across=2)
-SCENE = dataclasses.replace(
-    pb.SETUPS["paper"].scene, surface=pb.RoughSurface(pb.Beckmann(), pb.PointSource(), FACETS)
-)
-
-
-def layout() -> xr.Dataset:
-    return pb.simulate("leaf", seed=1, protocol=pb.Protocol(views=40, wavelengths=()))
+LOOPED, SIMUK = 8, 2
+LENGTHS = {"num_warmup": 500, "num_samples": 500}
 
 
 def by_loop(capture: xr.Dataset, count: int) -> Iterator[tuple[float, float]]:
@@ -51,7 +49,7 @@ def by_loop(capture: xr.Dataset, count: int) -> Iterator[tuple[float, float]]:
         model = request.bind(SCENE)
         program = compile_program(model, data)
         drawn = draw_captures(program, data, count, jax.random.key(1))
-        chain = MCMC(NUTS(model), num_warmup=500, num_samples=500, progress_bar=False)
+        chain = MCMC(NUTS(model), progress_bar=False, **LENGTHS)
         for number in range(-1, count):  # the first compiles
             start = time.perf_counter()
             chain.run(jax.random.key(number + 1), drawn.captures.pixel(max(number, 0)))
@@ -60,6 +58,30 @@ def by_loop(capture: xr.Dataset, count: int) -> Iterator[tuple[float, float]]:
             effective = min(float(np.min(effective_sample_size(draws[name]))) for name in names)
             if number >= 0:
                 yield time.perf_counter() - start, effective
+
+
+def by_simuk(capture: xr.Dataset, count: int) -> float:
+    """Seconds of some fits by simuk."""
+    with jax.enable_x64(True):
+        request = resolve(capture, "per_material", "laplace", SCENE, None, None, None, 0, "double")
+        data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
+        model = request.bind(SCENE)
+
+        def story(dop: Any = None, intensity: Any = None) -> None:
+            if dop is None:
+                handlers.uncondition(model)(data)
+            else:
+                model(dataclasses.replace(data, readings={"dop": dop, "intensity": intensity}))
+
+        start = time.perf_counter()
+        simuk.SBC(
+            NUTS(story),
+            num_simulations=count,
+            sample_kwargs=dict(LENGTHS),
+            data_dir={name: data.readings[name] for name in ("dop", "intensity")},
+            progress_bar=False,
+        ).run_simulations()
+        return time.perf_counter() - start
 
 
 def main(count: int, methods: Sequence[str]) -> None:
@@ -79,6 +101,8 @@ def main(count: int, methods: Sequence[str]) -> None:
         )
 
     line("MCMC.run", np.nan, seconds.sum(), loop, effective, f"   ({LOOPED} fits)")
+    took_simuk = by_simuk(capture, SIMUK)
+    line("simuk", took_simuk, np.nan, SIMUK / took_simuk, np.nan, f"   ({SIMUK} fits)")
     for method in methods:
         took = []
         for _ in range(2):
@@ -86,12 +110,12 @@ def main(count: int, methods: Sequence[str]) -> None:
             found = pb.calibrate(capture, simulations=count, method=method, scene=SCENE)
             took.append(time.perf_counter() - start)
         table, fits = pb.calibration_table(found), found["fits"].to_dataset()
-        end = f"{int(np.sum(fits['status'] != 0)):8d} {table['p_value'].min():8.3f}"
+        end = f"{int(np.sum(fits['status'] != 0)):8d} {table['p_value'].min():8.4f}"
         line(method, *took, count / took[1], fits["effective_draws"].to_numpy(), end)
 
 
 if __name__ == "__main__":
     main(
         int(sys.argv[1]) if len(sys.argv) > 1 else 1000,
-        sys.argv[2:] or ("laplace", "importance", "tempered"),
+        sys.argv[2:] or ("tempered", "nuts", "importance", "laplace"),
     )

@@ -11,7 +11,6 @@ one material in 4 colors, index and absorption Gaussian processes over wavelengt
 and by "nuts". Prints the joint verdict, the table, what became of the fits, and seconds.
 """
 
-import dataclasses
 import os
 import platform
 import sys
@@ -25,16 +24,13 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 import pandas as pd
 import xarray as xr
+from one_material import SCENE
 from patches import patch_capture
 
 import polar_bayes as pb
 from polar_bayes.pixels.outcome import Status
 
 VIEWS, COLORS, ERROR = 16, (450.0, 550.0, 650.0, 750.0), 0.02
-FACETS = pb.FacetQuadrature(along=2, across=2)
-SCENE = dataclasses.replace(
-    pb.SETUPS["paper"].scene, surface=pb.RoughSurface(pb.Beckmann(), pb.PointSource(), FACETS)
-)
 DOP = {
     "Beta": pb.BetaLink(),
     "logit-normal": pb.LogitNormalLink(),

@@ -5,7 +5,7 @@
     python tests/benchmarks/power.py 400 right index    some of the models
     python tests/benchmarks/power.py 400 --keep FOLDER  fits are kept there, and gone on with
 
-The layout is that of tests/benchmarks/calibration.py: 40 views of the degree of polarization and
+The layout is that of tests/benchmarks/one_material.py: 40 views of the degree of polarization and
 of intensity, seven parameters, fitted by tempered draws. Captures are simulated by one model and
 fitted by another; the first row fits what it simulates, and its shares are false alarms.
 
@@ -29,8 +29,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from calibration import SCENE, layout
 from numpyro import distributions as dist
+from one_material import SCENE, layout
 
 import polar_bayes as pb
 
