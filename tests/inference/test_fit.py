@@ -303,14 +303,14 @@ def test_a_comparison_that_fails_is_told_and_costs_nothing(
 ) -> None:
     from polar_bayes.inference import fit as fitting
 
-    whole = fitting._fit_scene
+    whole = fitting.prepare
 
-    def fails_without_instrument(request, scene, *rest):
+    def fails_without_instrument(request, scene, data):
         if scene.instrument is None:
             raise pb.FitError("no peak", where="fit", mend="nothing")
-        return whole(request, scene, *rest)
+        return whole(request, scene, data)
 
-    monkeypatch.setattr(fitting, "_fit_scene", fails_without_instrument)
+    monkeypatch.setattr(fitting, "prepare", fails_without_instrument)
     result = pb.fit(capture, scene="goniometer", method="laplace", seed=1)
     assert "without_discrepancy" in result.children
     assert "without_instrument" not in result.children
