@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from one_material import SCENE
 
 import polar_bayes as pb
 from polar_bayes.calibration.simulations import draw_captures
@@ -41,10 +42,6 @@ from polar_bayes.pixels.fitting import PixelLaplace, fit_stack
 from polar_bayes.pixels.making import Recipe, key_of, make_engine
 from polar_bayes.pixels.stack import Stack
 
-FACETS = pb.FacetQuadrature(along=2, across=2)
-SCENE = dataclasses.replace(
-    pb.SETUPS["paper"].scene, surface=pb.RoughSurface(pb.Beckmann(), pb.PointSource(), FACETS)
-)
 NAMES = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
 MEASURED = (15.0, 30.0, 45.0, 60.0)
 ZENITHS = np.arange(5.0, 86.0, 5.0)

@@ -16,6 +16,7 @@ import scipy.stats
 import xarray as xr
 from jaxtyping import Array
 from numpyro import distributions as dist
+from one_material import SCENE
 from polar_bayes.models.axes import draw_own, material_parameters
 from polar_bayes.models.readings import declare_readings
 
@@ -37,10 +38,6 @@ SPREADS = {
     "concentration_scale": 0.1,
     "intensity_scale": 0.1,
 }
-FACETS = pb.FacetQuadrature(along=2, across=2)
-SCENE = dataclasses.replace(
-    pb.SETUPS["paper"].scene, surface=pb.RoughSurface(pb.Beckmann(), pb.PointSource(), FACETS)
-)
 
 
 @dataclasses.dataclass(frozen=True)
