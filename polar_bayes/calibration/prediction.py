@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pandas as pd
@@ -89,16 +89,35 @@ def readings_verdict(calibration: xr.DataTree) -> list[str]:
         f"{'pass' if passed else 'fail'} a joint test of their own that a right model fails "
         f"{FALSE_ALARMS:.0%} of the time."
     ]
-    for label, row in table.iterrows():
-        if not row["p_value"] >= limit:
-            chance = f" (p = {row['p_value']:.2g})" if row["answered"] > 1 else ""
-            said.append(f"{label}: {how_predictions_stray(row)}{chance}.")
+    said += which_stray(table, limit, how_predictions_stray)
     for label, row in table.iterrows():
         if row["untrusted"] > 0:
             said.append(
                 f"{label}: in {int(row['untrusted'])} of {int(row['answered'])} fits the weights "
                 f"without it say little (Pareto k above {LARGEST_TRUSTED:g})."
             )
+    return said
+
+
+def which_stray(table: pd.DataFrame, limit: float, how: Callable[[pd.Series], str]) -> list[str]:
+    """A sentence for each row whose ranks stray.
+
+    Args:
+        table: With the columns `p_value` and `answered`.
+        limit: A p-value below it, or none at all, strays.
+        how: The words for a row.
+
+    Returns:
+        The sentences, in the order of the rows.
+
+    Raises:
+        Nothing.
+    """
+    said = []
+    for label, row in table.iterrows():
+        if not row["p_value"] >= limit:
+            chance = f" (p = {row['p_value']:.2g})" if row["answered"] > 1 else ""
+            said.append(f"{label}: {how(row)}{chance}.")
     return said
 
 

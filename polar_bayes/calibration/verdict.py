@@ -8,7 +8,7 @@ import scipy.special
 import scipy.stats
 import xarray as xr
 
-from polar_bayes.calibration.prediction import readings_verdict
+from polar_bayes.calibration.prediction import readings_verdict, which_stray
 from polar_bayes.calibration.uniformity import uniformity
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.diagnostics.parameters import Scalar, scalars
@@ -81,10 +81,7 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
         f"{count} simulations {'pass' if passed else 'fail'} a joint test that a right method "
         f"fails {FALSE_ALARMS:.0%} of the time."
     ]
-    for label, row in table.iterrows():
-        if not row["p_value"] >= limit:
-            chance = f" (p = {row['p_value']:.2g})" if row["answered"] > 1 else ""
-            said.append(f"{label}: {how_ranks_stray(row)}{chance}.")
+    said += which_stray(table, limit, how_ranks_stray)
     statuses = calibration["fits"]["status"].to_numpy()
     for status in Status:
         lost = int(np.sum(statuses == status))
