@@ -126,14 +126,14 @@ def calibrate(
     )
     clock = time.perf_counter()
     plan = _planned(request, told if truth else None, settings, readings)
-    kept = None if store is None else Store(as_path(store, "store"), question_of(plan))
-    found = kept.begin(resume=resume) if kept is not None else []
     if not plan.shared:
         raise FitError(
             "it has no parameter in common with what is fitted",
             where="calibrate: truth",
             mend="give models whose parameters have the same names and shapes",
         )
+    kept = None if store is None else Store(as_path(store, "store"), question_of(plan))
+    found = kept.begin(resume=resume) if kept is not None else []
     missing = _missing(found, simulations)
     show = progress or _silent
     found += _fit_all(plan, missing, simulations, kept, scheduler, show)
