@@ -32,7 +32,7 @@ BLOCK = 4
 
 
 def has_further_axes(capture: xr.Dataset) -> bool:
-    """Whether a capture has another axis than its views: patches, materials, wavelengths.
+    """Whether a capture has several patches, materials or wavelengths.
 
     Args:
         capture: As a caller gives it.
@@ -45,8 +45,8 @@ def has_further_axes(capture: xr.Dataset) -> bool:
     """
     if not isinstance(capture, xr.Dataset):
         return False  # which is refused elsewhere, in words
-    read = [capture[name].dims for name in READINGS if name in capture]
-    return any(dim != "view" for dims in read for dim in dims)
+    read = [capture[name].sizes for name in READINGS if name in capture]
+    return any(dim != "view" and length > 1 for sizes in read for dim, length in sizes.items())
 
 
 def fit_each(
