@@ -9,6 +9,7 @@ import pandas as pd
 import xarray as xr
 from arviz_plots import PlotCollection, plot_dist, plot_ecdf_pit
 from matplotlib.axes import Axes
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from polar_bayes.calibration.bands import EcdfBand, ecdf_band, histogram_band
 from polar_bayes.calibration.verdict import FALSE_ALARMS, calibration_scalars, calibration_table
@@ -215,6 +216,9 @@ def estimate_panel(axes: Axes, part: Part) -> None:
     axes.plot(limits, limits, color=GRAY, lw=0.9, ls="--", zorder=1)
     if limits[0] > 0.0 and limits[1] / limits[0] > LOGARITHMIC:
         axes.set(xscale="log", yscale="log")
+        for axis in (axes.xaxis, axes.yaxis):  # the style reads no formulas
+            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.set_minor_formatter(NullFormatter())
     else:
         axes.locator_params(nbins=4)
     axes.set(xlim=limits, ylim=limits)
