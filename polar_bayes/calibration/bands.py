@@ -7,7 +7,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-from polar_bayes.calibration.uniformity import MOST_POINTS, NULLS, _null, _two_sided
+from polar_bayes.calibration.uniformity import MOST_POINTS, NULLS, null_statistics, two_sided
 
 
 class EcdfBand(NamedTuple):
@@ -40,11 +40,11 @@ def ecdf_band(count: int, level: float) -> EcdfBand:
     Source:
         Saeilynoja, Buerkner & Vehtari (2022), Stat. Comput. 32, 32.
     """
-    table = _two_sided(count, min(count, MOST_POINTS))
+    table = two_sided(count, min(count, MOST_POINTS))
     # A p-value is (1 + null samples at least as surprising) / (1 + NULLS): below the level are
     # those that surprise more than the null sample of this rank.
     rank = max(math.ceil(round(level * (1 + NULLS), 6)) - 2, 0)
-    inside = table >= _null(count)[rank]
+    inside = table >= null_statistics(count)[rank]
     at = np.arange(1, table.shape[1] + 1) / (table.shape[1] + 1)
     lowest = inside.argmax(axis=0) / count
     highest = 1.0 - inside[::-1].argmax(axis=0) / count

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from polar_bayes.calibration.joint import limit_of
 from polar_bayes.calibration.verdict import (
-    FALSE_ALARMS,
     calibration_scalars,
     calibration_table,
     how_ranks_stray,
@@ -52,7 +52,7 @@ def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFram
                 where=f"compare_calibrations: {name}",
                 mend="calibrate the same model on the same layout",
             )
-    limit = FALSE_ALARMS / len(expected)
+    limit = limit_of(expected)
     rows = {}
     for scalar in calibration_scalars(calibrations[first], "truth"):
         for name, calibration in calibrations.items():

@@ -2,19 +2,17 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
+from polar_bayes.calibration.joint import FALSE_ALARMS, is_calibrated, which_stray
 from polar_bayes.calibration.uniformity import uniformity
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.pixels.importance import LARGEST_TRUSTED
-
-FALSE_ALARMS = 0.05
-"""How often a right model, link and method fail the joint test of all readings."""
 
 TESTS = {"predictive_pit": "fresh", "loo_pit": "left out"}
 """What the groups of a calibration rank, in a word."""
@@ -81,43 +79,20 @@ def readings_verdict(calibration: xr.DataTree) -> list[str]:
         why = json.loads(calibration.attrs.get(PROVENANCE, "{}")).get("readings_told", "")
         return [f"Readings were not ranked: {why}."] if why else []
     table = calibration_readings(calibration)
-    limit = FALSE_ALARMS / len(table)
-    passed = bool((table["p_value"] >= limit).all())
+    passed = is_calibrated(table)
     names = list(dict.fromkeys(table["reading"]))
     said = [
         f"Readings ({', '.join(names)}; fresh ones and ones left out) "
         f"{'pass' if passed else 'fail'} a joint test of their own that a right model fails "
         f"{FALSE_ALARMS:.0%} of the time."
     ]
-    said += which_stray(table, limit, how_predictions_stray)
+    said += which_stray(table, how_predictions_stray)
     for label, row in table.iterrows():
         if row["untrusted"] > 0:
             said.append(
                 f"{label}: in {int(row['untrusted'])} of {int(row['answered'])} fits the weights "
                 f"without it say little (Pareto k above {LARGEST_TRUSTED:g})."
             )
-    return said
-
-
-def which_stray(table: pd.DataFrame, limit: float, how: Callable[[pd.Series], str]) -> list[str]:
-    """A sentence for each row whose ranks stray.
-
-    Args:
-        table: With the columns `p_value` and `answered`.
-        limit: A p-value below it, or none at all, strays.
-        how: The words for a row.
-
-    Returns:
-        The sentences, in the order of the rows.
-
-    Raises:
-        Nothing.
-    """
-    said = []
-    for label, row in table.iterrows():
-        if not row["p_value"] >= limit:
-            chance = f" (p = {row['p_value']:.2g})" if row["answered"] > 1 else ""
-            said.append(f"{label}: {how(row)}{chance}.")
     return said
 
 

@@ -9,12 +9,10 @@ import pandas as pd
 import scipy.stats
 import xarray as xr
 
+from polar_bayes.calibration.joint import FALSE_ALARMS
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.diagnostics.parameters import Scalar, posterior_scalars, truth_of
 from polar_bayes.errors import FitError
-
-FALSE_ALARMS = 0.05
-"""How often repeats that scatter as intervals say are called wrong, all parameters together."""
 
 MOST_DRAWS = 4000
 SEED = 31

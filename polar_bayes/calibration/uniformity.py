@@ -51,7 +51,7 @@ def uniformity(sample: Float[np.ndarray, " size"]) -> Uniformity:
         Saeilynoja, Buerkner & Vehtari (2022), Stat. Comput. 32, 32.
     """
     observed = _surprise(sample[None])[0]
-    null = _null(len(sample))
+    null = null_statistics(len(sample))
     p_value = (1 + np.searchsorted(null, observed, side="right")) / (1 + NULLS)
     return Uniformity(float(p_value), float(sample.mean()), float(sample.std() * 12.0**0.5))
 
@@ -64,11 +64,11 @@ def _surprise(samples: Float[np.ndarray, "sample size"]) -> Float[np.ndarray, " 
     held = np.zeros((len(samples), points), int)
     np.add.at(held, (np.arange(len(samples))[:, None], cell), 1)
     below = np.cumsum(held, axis=-1)[:, :-1]
-    return _two_sided(count, points)[below, np.arange(points - 1)].min(axis=-1)
+    return two_sided(count, points)[below, np.arange(points - 1)].min(axis=-1)
 
 
 @functools.lru_cache(maxsize=4)
-def _two_sided(count: int, points: int) -> Float[np.ndarray, "outcome point"]:
+def two_sided(count: int, points: int) -> Float[np.ndarray, "outcome point"]:
     """Two-sided p-values of every count below every point."""
     share = np.arange(1, points) / points
     outcome = np.arange(count + 1)[:, None]
@@ -78,7 +78,7 @@ def _two_sided(count: int, points: int) -> Float[np.ndarray, "outcome point"]:
 
 
 @functools.lru_cache(maxsize=4)
-def _null(count: int) -> Float[np.ndarray, " null"]:
+def null_statistics(count: int) -> Float[np.ndarray, " null"]:
     """Statistics of uniform samples, in ascending order."""
     random = np.random.default_rng(SEED)
     found = [

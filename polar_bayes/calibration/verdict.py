@@ -8,15 +8,13 @@ import scipy.special
 import scipy.stats
 import xarray as xr
 
-from polar_bayes.calibration.prediction import readings_verdict, which_stray
+from polar_bayes.calibration.joint import FALSE_ALARMS, is_calibrated, which_stray
+from polar_bayes.calibration.prediction import readings_verdict
 from polar_bayes.calibration.uniformity import uniformity
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.pixels.outcome import Status
-
-FALSE_ALARMS = 0.05
-"""How often a right model, method and prior fail the joint test of all parameters."""
 
 
 def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
@@ -43,22 +41,6 @@ def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def is_calibrated(table: pd.DataFrame) -> bool:
-    """Whether ranks pass the joint test, at a rate of false alarms of at most 5%.
-
-    Args:
-        table: Of `calibration_table`.
-
-    Returns:
-        False where the smallest p-value is below 5% over the number of parameters (Bonferroni), or
-        a parameter has none, with fewer than two answers.
-
-    Raises:
-        Nothing.
-    """
-    return bool((table["p_value"] >= FALSE_ALARMS / len(table)).all())
-
-
 def calibration_verdict(calibration: xr.DataTree) -> list[str]:
     """What a calibration says, in sentences.
 
@@ -73,7 +55,6 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
         FitError: It is no calibration.
     """
     table = calibration_table(calibration)
-    limit = FALSE_ALARMS / len(table)
     passed = is_calibrated(table)
     count = int(table["answered"].max() + table["failed"].min())
     said = [
@@ -81,7 +62,7 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
         f"{count} simulations {'pass' if passed else 'fail'} a joint test that a right method "
         f"fails {FALSE_ALARMS:.0%} of the time."
     ]
-    said += which_stray(table, limit, how_ranks_stray)
+    said += which_stray(table, how_ranks_stray)
     statuses = calibration["fits"]["status"].to_numpy()
     for status in Status:
         lost = int(np.sum(statuses == status))

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from polar_bayes.calibration.compare import compare_calibrations, comparison_sentences
 from polar_bayes.calibration.files import is_calibration
-from polar_bayes.calibration.prediction import holds_readings
+from polar_bayes.calibration.prediction import calibration_readings, holds_readings
 from polar_bayes.calibration.verdict import (
     calibration_table,
     calibration_verdict,
@@ -65,12 +65,14 @@ def render_calibration(
     _check_rivals(rivals, method)
     table = calibration_table(calibration)
     parts = parts_of(calibration, table)
-    headline, is_good = tables.verdict_head(table)
     said = tables.verdict_words(calibration_verdict(calibration))
     compared = compare_calibrations({method: calibration, **rivals}) if rivals else None
     words = {label: how_ranks_stray(part.row) for label, part in parts.items() if not part.passes}
     others = {name: parts_of(each) for name, each in rivals.items()}
-    read = ranks_of_readings(calibration) if holds_readings(calibration) else []
+    has_readings = holds_readings(calibration)
+    read = ranks_of_readings(calibration) if has_readings else []
+    judged = calibration_readings(calibration) if has_readings else None
+    headline, is_good = tables.verdict_head(table, judged)
     content: dict[str, Any] = {
         "name": _name(provenance),
         "provenance": {key: value for key, value in provenance.items() if value is not None},

@@ -12,7 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from polar_bayes.calibration.bands import EcdfBand, ecdf_band, histogram_band
-from polar_bayes.calibration.verdict import FALSE_ALARMS, calibration_scalars, calibration_table
+from polar_bayes.calibration.joint import limit_of
+from polar_bayes.calibration.verdict import calibration_scalars, calibration_table
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.reporting.style import (
     BLACK,
@@ -115,7 +116,7 @@ def parts_of(calibration: xr.DataTree, table: pd.DataFrame | None = None) -> dic
     table = calibration_table(calibration) if table is None else table
     truths = {each.label: each.draws[0] for each in calibration_scalars(calibration, "truth")}
     ranks, marginals = (calibration[name].to_dataset() for name in ("prior_sbc", "marginals"))
-    level = FALSE_ALARMS / len(table)
+    level = limit_of(table)
     found = {}
     for scalar in calibration_scalars(calibration, "prior_sbc"):
         place = dict(scalar.index)

@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from polar_bayes.calibration.joint import limit_of
 from polar_bayes.calibration.prediction import (
-    FALSE_ALARMS,
     calibration_readings,
     how_predictions_stray,
     reading_ranks,
@@ -60,7 +60,7 @@ def ranks_of_readings(calibration: xr.DataTree) -> list[ReadingRanks]:
         The readings.
     """
     table, ranks = calibration_readings(calibration), reading_ranks(calibration)
-    level = FALSE_ALARMS / len(table)
+    level = limit_of(table)
     return [
         ReadingRanks(
             label=label,

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from polar_bayes.calibration.verdict import is_calibrated
+from polar_bayes.calibration.joint import is_calibrated
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.errors import one_line
 from polar_bayes.pixels.importance import LARGEST_TRUSTED
@@ -33,18 +33,21 @@ STATUSES = {
 }
 
 
-def verdict_head(table: pd.DataFrame) -> tuple[str, bool]:
+def verdict_head(table: pd.DataFrame, readings: pd.DataFrame | None) -> tuple[str, bool]:
     """The verdict in a few words, and whether all is well.
 
     Args:
         table: Of `calibration_table`.
+        readings: Of `calibration_readings`; None where they were not ranked.
 
     Returns:
-        The headline, and False where the ranks fail or too many fits have no answer.
+        The headline, and False where ranks fail or too many fits have no answer.
     """
     passed = is_calibrated(table)
     answered = float((table["answered"] / (table["answered"] + table["failed"])).min())
     said = "Calibrated" if passed else "Not calibrated"
+    if passed and readings is not None and not is_calibrated(readings):
+        said, passed = "Parameters are calibrated, predicted readings are not", False
     if answered < FEW:
         return (
             f"{said}{', but' if passed else ', and'} {1.0 - answered:.0%} of the fits failed.",

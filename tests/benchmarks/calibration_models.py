@@ -1,16 +1,19 @@
 """Simulation-based calibration of whole models by what `polar_bayes.fit` runs, on small layouts.
 
-    python tests/benchmarks/calibration_models.py hierarchical [simulations]
-    python tests/benchmarks/calibration_models.py spectral [simulations]
-    python tests/benchmarks/calibration_models.py links [simulations]
+    python tests/benchmarks/calibration_models.py hierarchical         200 simulations
+    python tests/benchmarks/calibration_models.py spectral 60          so many
+    python tests/benchmarks/calibration_models.py links --keep FOLDER  kept there, and gone on with
 
-The paper's scene with four facets on the way out, the default priors. `hierarchical`: 4 patches of
-16 views of the degree of polarization and of intensity, indices from one population. `spectral`:
-one material in 4 colors, index and absorption Gaussian processes over wavelength. Both by
-`pb.Nuts()`. `links`: one material, 16 views, each way in which readings may scatter, by "tempered"
-and by "nuts". Prints the joint verdict, the table, what became of the fits, and seconds.
+`hierarchical`: 4 smooth plates, 6 views of q with stated errors, indices and fractions from one
+population. `spectral`: a smooth plate in 4 colors, 6 views of q, index a Gaussian process over
+wavelength. Both by `pb.Nuts()`. `rough-hierarchical` and `rough-spectral`: the same axes by the
+paper's scene, 16 views of the degree of polarization and of intensity; minutes for each fit.
+`links`: one material of the paper's scene, 16 views, each way in which readings may scatter, by
+"tempered" and by "nuts". The paper's scene has four facets on the way out here; priors are the
+default ones. Prints the joint verdict, the table, what became of the fits, and seconds.
 """
 
+import argparse
 import os
 import platform
 import sys
@@ -26,6 +29,8 @@ import pandas as pd
 import xarray as xr
 from one_material import SCENE
 from patches import patch_capture
+from plates import LINKS, PLATE, plates
+from spectral_plates import spectral_plate
 
 import polar_bayes as pb
 from polar_bayes.pixels.outcome import Status
@@ -61,12 +66,21 @@ def stokes() -> xr.Dataset:
 
 def asked(what: str) -> Iterator[tuple[str, xr.Dataset, dict[str, Any]]]:
     """Titles, layouts and the arguments of `pb.calibrate`."""
+    chains: dict[str, Any] = {"method": pb.Nuts(), "scene": SCENE}
+    smooth = chains | {"scene": PLATE, "links": LINKS}
     if what == "hierarchical":
-        capture = patch_capture(np.full(4, 1.45), views=VIEWS)
-        yield "4 patches, 16 views", capture, {"model": "hierarchical", "method": pb.Nuts()}
+        views = np.linspace(35.0, 75.0, 6)
+        capture = plates(np.full(4, 1.5), ERROR, views=views)
+        yield "4 plates, 6 views", capture, smooth | {"model": "hierarchical"}
     elif what == "spectral":
-        capture = one_material(COLORS)
-        yield "4 colors, 16 views", capture, {"model": "gp_spectral", "method": pb.Nuts()}
+        views, index = np.linspace(35.0, 75.0, 6), dict.fromkeys(COLORS, 1.5)
+        capture = spectral_plate(index, error=ERROR, seed=0, views=views)
+        yield "a plate in 4 colors, 6 views", capture, smooth | {"model": "gp_spectral"}
+    elif what == "rough-hierarchical":
+        capture = patch_capture(np.full(4, 1.45), views=VIEWS)
+        yield "4 patches, 16 views", capture, chains | {"model": "hierarchical"}
+    elif what == "rough-spectral":
+        yield "4 colors, 16 views", one_material(COLORS), chains | {"model": "gp_spectral"}
     else:
         intensity = pb.SETUPS["paper"].links["intensity"]
         for links, capture in ((DOP, one_material()), (STOKES, stokes())):
@@ -74,7 +88,8 @@ def asked(what: str) -> Iterator[tuple[str, xr.Dataset, dict[str, Any]]]:
             for title, link in links.items():
                 chosen = {name: link for name in read} | {"intensity": intensity}
                 for method in ("tempered", "nuts"):
-                    yield f"{title}, {method}", capture, {"links": chosen, "method": method}
+                    arguments = {"links": chosen, "method": method, "scene": SCENE}
+                    yield f"{title}, {method}", capture, arguments
 
 
 def said(found: xr.DataTree) -> str:
@@ -106,15 +121,28 @@ def said(found: xr.DataTree) -> str:
     return "\n".join(lines)
 
 
-def main(what: str, count: int) -> None:
+def main(what: str, count: int, keep: Path | None) -> None:
     print(f"{platform.machine()}, {os.cpu_count()} cores; {count} simulations each", flush=True)
+    if keep is not None:
+        keep.mkdir(parents=True, exist_ok=True)
     for title, capture, arguments in asked(what):
+        store = None if keep is None else keep / title.replace(",", "").replace(" ", "-")
         start = time.perf_counter()
-        found = pb.calibrate(capture, simulations=count, scene=SCENE, seed=1, **arguments)
+        found = pb.calibrate(
+            capture, simulations=count, seed=1, store=store, resume=store is not None, **arguments
+        )
         seconds = time.perf_counter() - start
         print(f"\n{title}: {seconds:.0f} s, {count / seconds:.3f} fits/s with compilation")
         print(said(found), flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 60)
+    parser = argparse.ArgumentParser()
+    parser.add_argument(
+        "what",
+        choices=["hierarchical", "spectral", "rough-hierarchical", "rough-spectral", "links"],
+    )
+    parser.add_argument("count", type=int, nargs="?", default=200)
+    parser.add_argument("--keep", type=Path)
+    given = parser.parse_args()
+    main(given.what, given.count, given.keep)
