@@ -24,7 +24,7 @@ from polar_bayes.pixels.batching import batched, batches
 from polar_bayes.pixels.climbing import Climber, Peak, crown, stand, step
 from polar_bayes.pixels.derivatives import AnyArray, expand, score
 from polar_bayes.pixels.importance import Points
-from polar_bayes.pixels.mixtures import draw_mixture, fit_mixture
+from polar_bayes.pixels.mixtures import Proposed, draw_mixture, fit_mixture
 from polar_bayes.pixels.sampling import PixelNuts, around_mode, chains
 from polar_bayes.pixels.stack import Stack
 from polar_bayes.pixels.tempering import PixelTempering, Tempered, temper
@@ -212,27 +212,26 @@ class Engine:
         weights: np.ndarray,
         keys: np.ndarray,
         number: int,
-    ) -> tuple[Values, np.ndarray, np.ndarray]:
-        """Draws of mixtures that are fitted to weighted draws, and how the posterior weighs them.
+    ) -> Proposed:
+        """Draws of mixtures that are fitted to weighted draws.
 
         Args:
             pixels: The readings.
-            settings: How many components.
+            settings: How many components, and draws.
             z: Unconstrained vectors of the weighted draws, (pixel, draw, size).
             weights: They sum to one in each pixel.
             keys: One for each pixel.
             number: Of the round, which random numbers follow.
 
         Returns:
-            As many new draws: parameters by name, each (pixel, draw, ...); unconstrained; and log
-            of posterior over mixture, (pixel, draw), up to a constant per pixel.
+            The mixtures, their draws, and what the posterior is there.
 
         Raises:
             Nothing.
         """
         with jax.enable_x64(False):
             with TRACING:
-                proposed = self._proposed(settings.components)
+                proposed = self._proposed(settings)
             proposed = functools.partial(proposed, np.uint32(number))
             states = np.float32(z), np.float32(weights), keys
             return self._map(proposed, pixels.in_precision(np.float32), *states, batch=FEW)
@@ -332,20 +331,20 @@ class Engine:
         return batched(pixel, given=1, side_by_side=1)
 
     @functools.cache  # noqa: B019 - an engine lives as long as its map
-    def _proposed(self, components: int) -> Callable:
+    def _proposed(self, settings: PixelTempering) -> Callable:
         def pixel(
             number: Array, data: Observations, z: Array, weights: Array, key: Array
-        ) -> tuple[Values, Array, Array]:
+        ) -> Proposed:
             key_fit, key_draw = jax.random.split(jax.random.fold_in(key, number))
-            mixture = fit_mixture(z, weights, components, key_fit)
-            places, log_density = draw_mixture(mixture, len(z), key_draw)
+            mixture = fit_mixture(z, weights, settings.components, key_fit)
+            places = draw_mixture(mixture, settings.draws, key_draw)
 
             def look(z: Array) -> tuple[Values, Array]:
                 return self.rough.parameters(z, data), self.rough.potential(z, data)
 
             parameters, values = jax.lax.map(look, places, batch_size=LOOKED)
-            ratios = -values - log_density
-            return parameters, places, jnp.where(jnp.isnan(ratios), -jnp.inf, ratios)
+            log_posterior = jnp.where(jnp.isnan(values), -jnp.inf, -values)
+            return Proposed(mixture, places, parameters, log_posterior)
 
         return batched(pixel, given=1, side_by_side=1)
 

@@ -27,6 +27,7 @@ from polar_bayes.pixels.outcome import (
     Weighted,
     rows,
 )
+from polar_bayes.pixels.pooling import pool
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.stack import Stack
 from polar_bayes.pixels.tempering import LIFT, PixelTempering
@@ -225,25 +226,27 @@ def _rounds(
     crowd = engine.temper(pixels.subset(at), settings, keys[at], attempt)
     row.outcome.steps[at] += crowd.stages
     left = np.flatnonzero((crowd.temperature >= 1.0) & np.isfinite(crowd.z).all(axis=(1, 2)))
-    z = np.tile(crowd.z[left], (1, settings.draws // settings.crowd, 1))
-    weights, was_worth = np.full(z.shape[:2], 1.0 / settings.draws), np.zeros(left.size, bool)
+    count = 2 * settings.draws
+    z = np.tile(crowd.z[left], (1, count // settings.crowd, 1))
+    weights, before = np.full(z.shape[:2], 1.0 / count), None
     for number in range(settings.rounds):
         if not left.size:
             return
         some, round_key = pixels.subset(at[left]), attempt * settings.rounds + number
-        told = engine.propose(some, settings, z, weights, keys[at[left]], round_key)
-        parameters, z, ratios = told
-        found = Weighted(z, parameters, *smooth(ratios))
+        drawn = engine.propose(some, settings, z, weights, keys[at[left]], round_key)
+        found = pool(drawn if before is None else before, drawn)
         possible = np.isfinite(found.weights).all(axis=-1)
-        is_worth = found.effective >= settings.effective_draws
-        is_worth &= found.pareto_k <= LARGEST_TRUSTED
-        # A mixture too narrow looks good once: the next one, fitted to its draws, tells.
-        settled, is_last = is_worth & was_worth, number == settings.rounds - 1
+        settled = np.zeros(left.size, bool)
+        if before is not None:  # one mixture alone, too narrow, would look well
+            settled = found.worth >= settings.effective_draws
+            settled &= found.pareto_k <= LARGEST_TRUSTED
+        is_last = number == settings.rounds - 1
         answer = np.flatnonzero(settled | (is_last & possible))
         if answer.size:
             yield at[left[answer]], rows(found, answer), settled[answer]
         on = ~settled & possible
-        left, z, weights, was_worth = left[on], z[on], found.weights[on], is_worth[on]
+        left, before = left[on], rows(drawn, on)
+        z, weights = found.z[on], found.weights[on]
 
 
 def _climb(engine: Engine, pixels: Stack) -> Settled:

@@ -17,6 +17,10 @@ LARGEST_TRUSTED = 0.7
 """Pareto k above which weighted draws say little, however many there are."""
 
 
+TAILS = (0.05, 0.95)
+"""Levels of the posterior whose Monte Carlo error counts as that of its tails."""
+
+
 class Points(NamedTuple):
     """Draws of a standard distribution, the same for all pixels.
 
@@ -226,3 +230,39 @@ def _interpolate(level: float, below: np.ndarray, ranked: np.ndarray) -> np.ndar
 def effective_draws(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarray, " pixel"]:
     """How many draws of the posterior itself the weighted ones are worth (Kish)."""
     return 1.0 / np.sum(weights**2, axis=-1)
+
+
+def effective_tails(
+    draws: Float[np.ndarray, "pixel draw size"], weights: Float[np.ndarray, "pixel draw"]
+) -> Float[np.ndarray, " pixel"]:
+    """How many draws of the posterior itself would tell its tails as well as the weighted ones do.
+
+    Args:
+        draws: Unconstrained vectors.
+        weights: They sum to one in each pixel.
+
+    Returns:
+        The least of all coordinates and both tails: p (1 - p) over the variance of the share of the
+        posterior below its own 5% and 95% quantile.
+
+    Raises:
+        Nothing.
+
+    Source:
+        Vehtari, Gelman, Simpson, Carpenter & Buerkner (2021), Bayesian Anal. 16(2), section 4.3
+        (tail effective sample size); Owen (2013), Monte Carlo theory, methods and examples, eq. 9.8
+        (variance of weighted means).
+    """
+    least = np.full(len(draws), np.inf)
+    for coordinate in np.moveaxis(draws, -1, 0):
+        order = np.argsort(coordinate, axis=-1)
+        share = np.take_along_axis(weights, order, axis=-1)
+        below, squares = np.cumsum(share, axis=-1), np.cumsum(share**2, axis=-1)
+        for level in TAILS:
+            at = np.argmax(below >= level, axis=-1)[:, None]
+            p, inside = (np.take_along_axis(x, at, axis=-1)[:, 0] for x in (below, squares))
+            outside = squares[:, -1] - inside
+            variance = inside * (1.0 - p) ** 2 + outside * p**2
+            with np.errstate(invalid="ignore"):  # weights may be no numbers
+                least = np.fmin(least, p * (1.0 - p) / variance)
+    return least

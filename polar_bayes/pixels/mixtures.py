@@ -12,6 +12,8 @@ from jax.scipy.linalg import solve_triangular
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 
+from polar_bayes.inference.program import Values
+from polar_bayes.pixels.derivatives import AnyArray
 from polar_bayes.pixels.tempering import spread
 
 DEGREES_OF_FREEDOM = 8.0
@@ -43,6 +45,23 @@ class Mixture(NamedTuple):
     log_share: Float[Array, " component"]
     mean: Float[Array, "component size"]
     scale: Float[Array, "component size size"]
+
+
+class Proposed(NamedTuple):
+    """Draws of a mixture for every pixel of a row.
+
+    Args:
+        mixture: It, with a leading pixel axis.
+        z: Its draws, (pixel, draw, size).
+        parameters: The same by name, each (pixel, draw, ...).
+        log_posterior: There, (pixel, draw), up to a constant per pixel; minus infinity where there
+            is none.
+    """
+
+    mixture: Mixture
+    z: AnyArray
+    parameters: Values
+    log_posterior: AnyArray
 
 
 def fit_mixture(
@@ -101,9 +120,7 @@ def fit_mixture(
     )
 
 
-def draw_mixture(
-    mixture: Mixture, count: int, key: Array
-) -> tuple[Float[Array, "draw size"], Float[Array, " draw"]]:
+def draw_mixture(mixture: Mixture, count: int, key: Array) -> Float[Array, "draw size"]:
     """Draws of the mixture with tails of Student's t, each component's share evenly.
 
     Args:
@@ -112,7 +129,7 @@ def draw_mixture(
         key: Random key.
 
     Returns:
-        Unconstrained vectors, and their log density up to a constant.
+        Unconstrained vectors.
 
     Raises:
         Nothing.
@@ -127,9 +144,28 @@ def draw_mixture(
     tail = jax.random.gamma(key_tail, 0.5 * freedom, (count, 1), dtype) * 2.0 / freedom
     noise = jax.random.normal(key_normal, (count, size), dtype) / jnp.sqrt(tail)
     x = mixture.mean[which] + jnp.einsum("dij,dj->di", mixture.scale[which], noise)
+    return mixture.center + x @ mixture.half.T
+
+
+def log_density(mixture: Mixture, z: Float[Array, "draw size"]) -> Float[Array, " draw"]:
+    """Log density of a mixture with tails of Student's t.
+
+    Args:
+        mixture: Of `fit_mixture`.
+        z: Unconstrained vectors.
+
+    Returns:
+        The log density, up to a constant that depends on the size alone.
+
+    Raises:
+        Nothing.
+    """
+    freedom, size = DEGREES_OF_FREEDOM, z.shape[-1]
+    x = (z - mixture.center) @ _inverse(mixture.half).T
     squares, log_volume = _whitened(x, mixture.mean, mixture.scale)
     each = -0.5 * (freedom + size) * jnp.log1p(squares / freedom) - log_volume
-    return mixture.center + x @ mixture.half.T, logsumexp(each + mixture.log_share, axis=-1)
+    whole = jnp.sum(jnp.log(jnp.diagonal(mixture.half)))
+    return logsumexp(each + mixture.log_share, axis=-1) - whole
 
 
 def _whitened(x: Array, mean: Array, scale: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from polar_bayes.inference.program import Values
 from polar_bayes.pixels.engine import Settled
-from polar_bayes.pixels.importance import LARGEST_TRUSTED, effective_draws
+from polar_bayes.pixels.importance import LARGEST_TRUSTED, effective_draws, effective_tails
 
 
 class Status(enum.IntEnum):
@@ -106,9 +106,9 @@ class Weighted(NamedTuple):
     pareto_k: np.ndarray
 
     @property
-    def effective(self) -> np.ndarray:
-        """What the draws are worth, (pixel,)."""
-        return effective_draws(self.weights)
+    def worth(self) -> np.ndarray:
+        """Independent draws that they are worth, in the middle and in both tails, (pixel,)."""
+        return np.minimum(effective_draws(self.weights), effective_tails(self.z, self.weights))
 
 
 class Row:
@@ -151,7 +151,7 @@ class Row:
 
     def temper(self, at: np.ndarray, found: Weighted, *, is_worth: np.ndarray) -> None:
         """Weighted draws of mixtures; those that are worth too little are described and told."""
-        self._answer(at, found.parameters, found.weights, found.effective, Approach.TEMPERED)
+        self._answer(at, found.parameters, found.weights, found.worth, Approach.TEMPERED)
         self.outcome.pareto_k[at] = found.pareto_k
         self.status[at[~is_worth]] = Status.NOT_TRUSTED
 

@@ -42,12 +42,14 @@ class PixelTempering:
         length: Places of each walk, its first included, >= 2; all together are the crowd.
         effective_share: Share of the crowd that its weights must be worth after a step of
             temperature, between 0.1 and 0.95.
-        draws: Of a mixture in every round; a multiple of the crowd.
+        draws: Of a mixture in every round; half a multiple of the crowd. An answer has the draws of
+            two rounds.
         components: Of the mixtures, >= 1.
         rounds: In which a mixture is fitted to the weighted draws, at most, >= 1.
         crowds: What has not come to an answer in these rounds begins again from a new crowd, until
             there were so many, >= 1.
-        effective_draws: Independent draws that the weighted ones must be worth, >= 1.
+        effective_draws: Independent draws that the weighted ones must be worth, >= 1; in the middle
+            and in both tails.
 
     Raises:
         FitError: A setting is outside its range.
@@ -84,15 +86,15 @@ class PixelTempering:
                 where="PixelTempering",
                 mend="give a number from 0.1 to 0.95",
             )
-        if self.draws < self.crowd or self.draws % self.crowd:
+        if 2 * self.draws < self.crowd or 2 * self.draws % self.crowd:
             raise FitError(
                 f"draws is {self.draws}, and the crowd {self.crowd}",
                 where="PixelTempering",
-                mend="give a multiple of walks * length",
+                mend="give half a multiple of walks * length",
             )
-        if self.effective_draws >= self.draws:
+        if self.effective_draws >= 2 * self.draws:
             raise FitError(
-                f"effective_draws is {self.effective_draws}, and there are {self.draws} draws",
+                f"effective_draws is {self.effective_draws}, and there are {2 * self.draws} draws",
                 where="PixelTempering",
                 mend="give fewer, or more draws",
             )

@@ -1,16 +1,18 @@
 """Simulation-based calibration of whole models by what `polar_bayes.fit` runs, on small layouts.
 
-    python tests/benchmarks/calibration_models.py hierarchical         200 simulations
-    python tests/benchmarks/calibration_models.py spectral 60          so many
+    python tests/benchmarks/calibration_models.py material 3000        so many simulations
+    python tests/benchmarks/calibration_models.py hierarchical         200 of them
+    python tests/benchmarks/calibration_models.py spectral
     python tests/benchmarks/calibration_models.py links --keep FOLDER  kept there, and gone on with
 
-`hierarchical`: 4 smooth plates, 6 views of q with stated errors, indices and fractions from one
-population. `spectral`: a smooth plate in 4 colors, 6 views of q, index a Gaussian process over
-wavelength. Both by `pb.Nuts()`. `rough-hierarchical` and `rough-spectral`: the same axes by the
-paper's scene, 16 views of the degree of polarization and of intensity; minutes for each fit.
-`links`: one material of the paper's scene, 16 views, each way in which readings may scatter, by
-"tempered" and by "nuts". The paper's scene has four facets on the way out here; priors are the
-default ones. Prints the joint verdict, the table, what became of the fits, and seconds.
+`material`: one material of the paper's scene, 40 views of the degree of polarization and of
+intensity, by tempered draws. `links`: the same, 16 views, each way in which readings may scatter,
+by tempered draws and by chains. `hierarchical`: 4 smooth plates, 6 views of q with stated errors,
+indices and fractions from one population. `spectral`: a smooth plate in 4 colors, 6 views of q,
+index a Gaussian process over wavelength. Both by `pb.Nuts()`. `rough-hierarchical` and
+`rough-spectral`: the same axes by the paper's scene, 16 views; minutes for each fit. The paper's
+scene has four facets on the way out here; priors are the default ones. Prints the joint verdict,
+the table, what became of the fits, and seconds.
 """
 
 import argparse
@@ -27,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 import pandas as pd
 import xarray as xr
-from one_material import SCENE
+from one_material import SCENE, layout
 from patches import patch_capture
 from plates import LINKS, PLATE, plates
 from spectral_plates import spectral_plate
@@ -36,6 +38,9 @@ import polar_bayes as pb
 from polar_bayes.pixels.outcome import Status
 
 VIEWS, COLORS, ERROR = 16, (450.0, 550.0, 650.0, 750.0), 0.02
+FEW = np.linspace(35.0, 75.0, 6)
+ROUGH: dict[str, Any] = {"method": pb.Nuts(), "scene": SCENE}
+SMOOTH: dict[str, Any] = {"method": pb.Nuts(), "scene": PLATE, "links": LINKS}
 DOP = {
     "Beta": pb.BetaLink(),
     "logit-normal": pb.LogitNormalLink(),
@@ -64,32 +69,52 @@ def stokes() -> xr.Dataset:
     )
 
 
-def asked(what: str) -> Iterator[tuple[str, xr.Dataset, dict[str, Any]]]:
-    """Titles, layouts and the arguments of `pb.calibrate`."""
-    chains: dict[str, Any] = {"method": pb.Nuts(), "scene": SCENE}
-    smooth = chains | {"scene": PLATE, "links": LINKS}
-    if what == "hierarchical":
-        views = np.linspace(35.0, 75.0, 6)
-        capture = plates(np.full(4, 1.5), ERROR, views=views)
-        yield "4 plates, 6 views", capture, smooth | {"model": "hierarchical"}
-    elif what == "spectral":
-        views, index = np.linspace(35.0, 75.0, 6), dict.fromkeys(COLORS, 1.5)
-        capture = spectral_plate(index, error=ERROR, seed=0, views=views)
-        yield "a plate in 4 colors, 6 views", capture, smooth | {"model": "gp_spectral"}
-    elif what == "rough-hierarchical":
-        capture = patch_capture(np.full(4, 1.45), views=VIEWS)
-        yield "4 patches, 16 views", capture, chains | {"model": "hierarchical"}
-    elif what == "rough-spectral":
-        yield "4 colors, 16 views", one_material(COLORS), chains | {"model": "gp_spectral"}
-    else:
-        intensity = pb.SETUPS["paper"].links["intensity"]
-        for links, capture in ((DOP, one_material()), (STOKES, stokes())):
-            read = [name for name in ("dop", "q", "u") if name in capture]
-            for title, link in links.items():
-                chosen = {name: link for name in read} | {"intensity": intensity}
-                for method in ("tempered", "nuts"):
-                    arguments = {"links": chosen, "method": method, "scene": SCENE}
-                    yield f"{title}, {method}", capture, arguments
+Asked = Iterator[tuple[str, xr.Dataset, dict[str, Any]]]
+"""Titles, layouts and the arguments of `pb.calibrate`."""
+
+
+def material() -> Asked:
+    yield "one material, 40 views", layout(), {"method": "tempered", "scene": SCENE}
+
+
+def links() -> Asked:
+    intensity = pb.SETUPS["paper"].links["intensity"]
+    for ways, capture in ((DOP, one_material()), (STOKES, stokes())):
+        read = [name for name in ("dop", "q", "u") if name in capture]
+        for title, link in ways.items():
+            chosen = {name: link for name in read} | {"intensity": intensity}
+            for method in ("tempered", "nuts"):
+                arguments = {"links": chosen, "method": method, "scene": SCENE}
+                yield f"{title}, {method}", capture, arguments
+
+
+def hierarchical() -> Asked:
+    capture = plates(np.full(4, 1.5), ERROR, views=FEW)
+    yield "4 plates, 6 views", capture, SMOOTH | {"model": "hierarchical"}
+
+
+def spectral() -> Asked:
+    capture = spectral_plate(dict.fromkeys(COLORS, 1.5), error=ERROR, seed=0, views=FEW)
+    yield "a plate in 4 colors, 6 views", capture, SMOOTH | {"model": "gp_spectral"}
+
+
+def rough_hierarchical() -> Asked:
+    capture = patch_capture(np.full(4, 1.45), views=VIEWS)
+    yield "4 patches, 16 views", capture, ROUGH | {"model": "hierarchical"}
+
+
+def rough_spectral() -> Asked:
+    yield "4 colors, 16 views", one_material(COLORS), ROUGH | {"model": "gp_spectral"}
+
+
+EVERY = {
+    "material": material,
+    "links": links,
+    "hierarchical": hierarchical,
+    "spectral": spectral,
+    "rough-hierarchical": rough_hierarchical,
+    "rough-spectral": rough_spectral,
+}
 
 
 def said(found: xr.DataTree) -> str:
@@ -125,7 +150,7 @@ def main(what: str, count: int, keep: Path | None) -> None:
     print(f"{platform.machine()}, {os.cpu_count()} cores; {count} simulations each", flush=True)
     if keep is not None:
         keep.mkdir(parents=True, exist_ok=True)
-    for title, capture, arguments in asked(what):
+    for title, capture, arguments in EVERY[what]():
         store = None if keep is None else keep / title.replace(",", "").replace(" ", "-")
         start = time.perf_counter()
         found = pb.calibrate(
@@ -138,10 +163,7 @@ def main(what: str, count: int, keep: Path | None) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument(
-        "what",
-        choices=["hierarchical", "spectral", "rough-hierarchical", "rough-spectral", "links"],
-    )
+    parser.add_argument("what", choices=list(EVERY))
     parser.add_argument("count", type=int, nargs="?", default=200)
     parser.add_argument("--keep", type=Path)
     given = parser.parse_args()

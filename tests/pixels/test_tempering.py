@@ -15,9 +15,16 @@ from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.pixels.engine import Engine
 from polar_bayes.pixels.fitting import fit_stack
-from polar_bayes.pixels.importance import effective_draws, smooth
-from polar_bayes.pixels.mixtures import DEGREES_OF_FREEDOM, draw_mixture, fit_mixture
+from polar_bayes.pixels.importance import effective_draws, effective_tails, smooth
+from polar_bayes.pixels.mixtures import (
+    DEGREES_OF_FREEDOM,
+    Proposed,
+    draw_mixture,
+    fit_mixture,
+    log_density,
+)
 from polar_bayes.pixels.outcome import Approach, Status
+from polar_bayes.pixels.pooling import pool
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.stack import Stack
 from polar_bayes.pixels.tempering import PixelTempering, spread, temper
@@ -69,9 +76,10 @@ def test_weighted_draws_of_its_mixture_are_the_posterior(two_modes, crowd: np.nd
     with jax.enable_x64(False):
         even = jnp.full(len(crowd), 1.0 / len(crowd))
         mixture = fit_mixture(jnp.asarray(crowd), even, 4, jax.random.key(1))
-        z, log_density = draw_mixture(mixture, count, jax.random.key(2))
+        z = draw_mixture(mixture, count, jax.random.key(2))
+        told = log_density(mixture, z)
         values = jax.vmap(lambda z: program.potential(z, data))(z)
-    weights, pareto_k = smooth(np.asarray(-values - log_density)[None])
+    weights, pareto_k = smooth(np.asarray(-values - told)[None])
     assert pareto_k[0] < 0.7
     x, y = np.asarray(z, float).T
     worth = effective_draws(weights)[0]
@@ -86,14 +94,14 @@ def test_the_density_of_a_mixture_is_that_of_its_parts() -> None:
     random = np.random.default_rng(0)
     z = random.normal(size=(400, 2)) @ np.array([[1.0, 0.4], [0.0, 0.2]]) + np.array([3.0, -5.0])
     mixture = fit_mixture(jnp.asarray(z), jnp.full(400, 1.0 / 400), 3, jax.random.key(0))
-    drawn, log_density = draw_mixture(mixture, 256, jax.random.key(1))
+    drawn = draw_mixture(mixture, 256, jax.random.key(1))
     center, half = np.asarray(mixture.center), np.asarray(mixture.half)
     expected = np.zeros(256)
     for log_share, mean, scale in zip(*(np.asarray(x) for x in mixture[2:]), strict=True):
         root = half @ scale
         part = scipy.stats.multivariate_t(center + half @ mean, root @ root.T, DEGREES_OF_FREEDOM)
         expected += np.exp(log_share) * part.pdf(np.asarray(drawn))
-    difference = np.asarray(log_density) - np.log(expected)
+    difference = np.asarray(log_density(mixture, drawn)) - np.log(expected)
     assert np.exp(np.asarray(mixture.log_share)).sum() == pytest.approx(1.0)
     assert np.ptp(difference) < 1e-9  # up to a constant
 
@@ -168,10 +176,51 @@ def test_a_skewed_pixel_has_the_posterior_of_a_grid(chains: bool) -> None:
     [
         ({"walks": 4}, "walks is 4; give 16 or more"),
         ({"effective_share": 0.99}, "effective_share is 0.99; give a number from 0.1 to 0.95"),
-        ({"draws": 1000}, "draws is 1000, and the crowd 1024; give a multiple of walks"),
-        ({"effective_draws": 3000.0}, "effective_draws is 3000.0, and there are 2048 draws"),
+        ({"draws": 1000}, "draws is 1000, and the crowd 1024; give half a multiple of walks"),
+        ({"effective_draws": 5000.0}, "effective_draws is 5000.0, and there are 4096 draws"),
     ],
 )
 def test_mistakes_are_told(settings: dict, said: str) -> None:
     with pytest.raises(pb.FitError, match=said):
         pb.PixelTempering(**settings)
+
+
+def test_two_mixtures_are_weighed_as_one() -> None:
+    """A mixture that sees half of the posterior, and one that sees the other: both together see it.
+
+    The posterior is normal in two coordinates; alone, neither mixture knows its mean.
+    """
+    count, random = 4096, np.random.default_rng(5)
+    parts = []
+    for side in (-1.0, 1.0):
+        crowd = random.normal([side, 0.0], [0.5, 1.0], (256, 2)).astype(np.float32)
+        even = jnp.full(256, np.float32(1.0 / 256))
+        with jax.enable_x64(False):
+            mixture = fit_mixture(jnp.asarray(crowd), even, 2, jax.random.key(int(side) + 7))
+            z = draw_mixture(mixture, count, jax.random.key(int(side) + 11))
+        rows = jax.tree.map(lambda x: np.asarray(x)[None], mixture)
+        log_posterior = -0.5 * np.sum(np.asarray(z) ** 2, axis=-1)[None]
+        parts.append(Proposed(rows, np.asarray(z)[None], {"z": np.asarray(z)[None]}, log_posterior))
+    found = pool(*parts)
+    worth = found.worth[0]
+    assert 1000.0 < worth < 2 * count
+    told = found.weights[0] @ found.z[0]
+    spread = found.weights[0] @ found.z[0] ** 2
+    # Four Monte Carlo errors each: four comparisons fail by chance three times in ten thousand.
+    assert np.abs(told).max() < 4.0 / np.sqrt(worth)
+    assert np.abs(spread - 1.0).max() < 4.0 * np.sqrt(2.0 / worth)
+
+
+def test_tails_are_worth_less_where_few_draws_tell_them() -> None:
+    random = np.random.default_rng(3)
+    z = random.normal(size=(2, 4000, 2))
+    even = np.full((2, 4000), 1.0 / 4000)
+    # Even weights: as many draws as there are. The quantile is an order statistic: one draw off.
+    assert effective_tails(z, even) == pytest.approx(4000.0, rel=0.01)
+    heavy = even.copy()
+    at = np.argsort(z[0, :, 1])[-200:]  # the upper tail of one coordinate, told by one in ten
+    heavy[0, at] = 0.0
+    heavy[0, at[::10]] = 10.0 / 4000
+    worth = effective_tails(z, heavy)
+    assert worth[1] == pytest.approx(4000.0, rel=0.01)
+    assert 300.0 < worth[0] < 700.0  # 20 draws for a tail of 5%: 20 / 0.05 = 400
