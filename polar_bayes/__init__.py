@@ -34,11 +34,16 @@ _HOMES = {
     "identifiability.views": ("next_views",),
     "identifiability.words": ("identifiability_sentences", "identifiability_table"),
     "inference.files": ("load_result", "save_result"),
-    "inference.fit": ("fit",),
     "inference.laplace": ("Laplace",),
     "inference.nuts": ("Nuts",),
     "inference.point": ("Point",),
     "inference.spectrum": ("predict_spectrum",),
+    "ladder.auto": ("Auto",),
+    "ladder.fit": ("fit",),
+    "ladder.importance": ("Importance",),
+    "ladder.tempered": ("Tempered",),
+    "ladder.variational": ("FlowGuide", "NormalGuide"),
+    "ladder.words": ("auto_sentences",),
     "models.gp_spectral": ("GpSpectral",),
     "models.spectral_process": ("SpectralProcess",),
     "models.hierarchical": ("Hierarchical",),
@@ -99,7 +104,7 @@ _MODULE_OF = {name: module for module, names in _HOMES.items() for name in names
 __all__ = sorted(_MODULE_OF)
 
 if TYPE_CHECKING:
-    from polar_bayes.inference.fit import fit as fit
+    from polar_bayes.ladder.fit import fit as fit
 
 
 def __getattr__(name: str) -> Any:

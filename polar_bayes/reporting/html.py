@@ -40,6 +40,14 @@ MENDS = {
     "beside": "leave it out, or give what polar_bayes.calibrate returns",
 }
 MOST_POPULATIONS = 6
+METHODS = {
+    "nuts": "NUTS",
+    "laplace": "Laplace approximation",
+    "importance": "Laplace approximation, its draws weighed",
+    "tempered": "tempered draws",
+    "variational": "variational guide",
+    "point": "least squares",
+}
 
 
 def report(
@@ -116,7 +124,7 @@ def render(result: xr.DataTree) -> str:
     name = one_line(str((provenance.get("capture") or {}).get("name", "capture")))
     content: dict[str, Any] = {
         "name": name,
-        "method": {"nuts": "NUTS", "laplace": "Laplace approximation"}.get(method, "least squares"),
+        "method": METHODS[method],
         "provenance": provenance,
         "verdict": judged,
         "headline": sentences.headline(method, judged.converged, judged.cautions),
