@@ -9,8 +9,13 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 _HOMES = {
+    "budget.accuracy": ("accuracy",),
+    "budget.accuracy_files": ("holds_accuracy", "load_accuracy"),
+    "budget.advice": ("accuracy_advice", "accuracy_table"),
+    "budget.dials": ("DrawsDial", "EffectsDial", "FacetsDial", "PrecisionDial"),
     "budget.effects": ("ChosenScene", "choose_effects"),
     "budget.ledger": ("ledger_sentence", "ledger_summary", "ledger_table"),
+    "budget.reference": ("Reference",),
     "calibration.calibrate": ("calibrate",),
     "calibration.compare": ("compare_calibrations", "comparison_sentences"),
     "calibration.files": ("holds_calibration", "load_calibration"),
@@ -40,6 +45,7 @@ _HOMES = {
     "inference.spectrum": ("predict_spectrum",),
     "ladder.auto": ("Auto",),
     "ladder.fit": ("fit",),
+    "ladder.rungs": ("LADDER",),
     "ladder.importance": ("Importance",),
     "ladder.tempered": ("Tempered",),
     "ladder.variational": ("FlowGuide", "NormalGuide"),
@@ -91,6 +97,7 @@ _HOMES = {
     "pixels.store": ("map_file",),
     "pixels.tempering": ("PixelTempering",),
     "priors": ("PRIORS",),
+    "reporting.accuracy": ("plot_accuracy",),
     "reporting.calibration": ("plot_calibration",),
     "reporting.html": ("report",),
     "reporting.maps": ("plot_maps",),

@@ -1,4 +1,4 @@
-"""The contract of methods beside `Point`, `Laplace` and `Nuts`: a capture ready to fit in, draws out."""
+"""The contract of methods beside `Point`, `Laplace` and `Nuts`: a capture in, draws out."""
 
 import abc
 import dataclasses
@@ -39,6 +39,7 @@ class Answer:
     said: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
+@dataclasses.dataclass(frozen=True)
 class AbstractMethod(abc.ABC):
     """How draws of a posterior are made; a small frozen dataclass of settings."""
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.bench import Bench
-from polar_bayes.inference.ground import WholeGround
 from polar_bayes.inference.method import AbstractMethod, Answer
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.request import Method
@@ -17,18 +16,17 @@ from polar_bayes.ladder.expected import count_scalars, draws_needed, expected_er
 from polar_bayes.ladder.importance import Importance
 from polar_bayes.ladder.scaling import with_draws
 from polar_bayes.ladder.tempered import Tempered
+from polar_bayes.ladder.visiting import unvisited_weight
 from polar_bayes.pixels.importance import LARGEST_TRUSTED
 from polar_bayes.pixels.tempering import PixelTempering
 
 LARGEST_R_HAT = 1.01
-HEAVY_MODE = 0.01
-"""Laplace weight of a mode that chains must have visited."""
 
 RESERVE = 4
 """Times as many weighted draws as normal posteriors need: long tails need more."""
 
 MARGIN, MOST_TIMES = 1.5, 16.0
-"""Draws of a second try: more than its first error asks for, but at most so many times as before."""
+"""Draws of a second try: more than the first error asks for, but not above so many times."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +90,9 @@ class Auto(AbstractMethod):
 
     @override
     def draw(self, bench: Bench) -> Answer:
-        deadline, steps, best = time.perf_counter() + self.seconds, [], None
+        deadline = time.perf_counter() + self.seconds
+        steps: list[Step] = []
+        best: tuple[Step, Answer] | None = None
         waiting = list(self.rungs(bench).items())
         again = False
         while waiting:
@@ -124,9 +124,9 @@ class Auto(AbstractMethod):
         begin = time.perf_counter()
         try:
             found = answer(method, bench)
-        except (FitError, _TimeIsUp) as error:
+        except (FitError, _TimeIsUpError) as failure:
             seconds = time.perf_counter() - begin
-            return Step(name, seconds, why=str(error)), None
+            return Step(name, seconds, why=str(failure)), None
         error = expected_error(found, bench.program, bench.data)
         doubts = _doubts(found, bench)
         biased = bool(doubts)
@@ -189,7 +189,7 @@ class Step(NamedTuple):
     effective_draws: float = np.nan
 
 
-class _TimeIsUp(Exception):
+class _TimeIsUpError(Exception):
     """Chains were stopped."""
 
 
@@ -200,7 +200,7 @@ def _within(bench: Bench, deadline: float) -> Bench:
 
     def progress(stage: str, fraction: float) -> None:
         if time.perf_counter() > deadline:
-            raise _TimeIsUp("the time was up before it was done")
+            raise _TimeIsUpError("the time was up before it was done")
         bench.progress(stage, fraction)
 
     limited = dataclasses.replace(bench, progress=progress)
@@ -216,30 +216,9 @@ def _doubts(found: Answer, bench: Bench) -> list[str]:
         doubts.append(f"its Pareto k-hat is {found.k_hat:.2f}")
     if found.r_hat > LARGEST_R_HAT:
         doubts.append(f"its R-hat is {found.r_hat:.3f}")
-    if found.kind == "nuts" and (share := _unvisited(found.z, bench)) > 0.0:
+    if found.kind == "nuts" and (share := unvisited_weight(found.z, bench)) > 0.0:
         doubts.append(f"a mode of weight {share:.2g} was not visited by every chain")
     return doubts
-
-
-def _unvisited(z: np.ndarray, bench: Bench) -> float:
-    """Weight of the heaviest mode to which some chain never came nearest; 0 where there is none.
-
-    R-hat cannot see it when all chains began at the same one.
-    """
-    ground = bench.ground
-    if not isinstance(ground, WholeGround):
-        return 0.0
-    modes = ground.modes
-    heavy = np.flatnonzero(modes.weight >= HEAVY_MODE)
-    if heavy.size < 2:
-        return 0.0
-    halves = np.linalg.cholesky(modes.covariance[heavy])
-    apart = z[None] - modes.z[heavy][:, None, None]
-    steps = np.einsum("mij,mcdj->mcdi", np.linalg.inv(halves), apart)
-    volume = np.log(np.diagonal(halves, axis1=1, axis2=2)).sum(axis=1)
-    nearest = np.argmin(0.5 * np.sum(steps**2, axis=-1) + volume[:, None, None], axis=0)
-    visited = np.array([(nearest == number).any(axis=1).all() for number in range(heavy.size)])
-    return float(np.max(modes.weight[heavy], where=~visited, initial=0.0))
 
 
 def _as_said(step: Step) -> dict[str, Any]:

@@ -22,7 +22,7 @@ def expected_error(answer: Answer, program: Program, data: Observations) -> floa
     2P standard errors times the normal quantile of 0.5% / (2P) (Bonferroni). Bias is not seen here.
 
     Args:
-        answer: Draws of chains, independent ones, or chosen ones with the weighted ones they are from.
+        answer: Draws of chains, independent ones, or weighted ones and those chosen from them.
         program: The model.
         data: The capture.
 

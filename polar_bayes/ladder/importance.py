@@ -30,7 +30,7 @@ class Importance(AbstractMethod):
 
     Draws come from a mixture of Student t distributions with 8 degrees of freedom, one at each
     mode, as heavy as its Laplace evidence. Weighing them by the posterior corrects what the
-    normal approximation gets wrong, as far as the mixture reaches; Pareto k-hat says whether it does.
+    normal approximation gets wrong, as far as the mixture reaches; Pareto k-hat says how far.
 
     Args:
         draws: Of the mixture, at least 256.

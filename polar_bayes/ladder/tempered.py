@@ -1,5 +1,6 @@
 """Draws led from the prior to the posterior, by what calibrations are made with."""
 
+import collections
 import dataclasses
 import functools
 from typing import Any, override
@@ -40,7 +41,7 @@ class Tempered(AbstractMethod):
         FitError: A setting is outside its range.
     """
 
-    settings: PixelTempering = PixelTempering(draws=4096)
+    settings: PixelTempering = dataclasses.field(default_factory=lambda: PixelTempering(draws=4096))
 
     @override
     def draw(self, bench: Bench) -> Answer:
@@ -52,10 +53,12 @@ class Tempered(AbstractMethod):
             )
         row = Row(1, lambda at, parameters, weights: None)
         keys = np.asarray(jax.random.key_data(bench.key_of_draws))[None]
-        engine, found = _Counting.of(bench), None
+        engine = _engine(bench)
+        found: Weighted | None = None
         pixels = _alone(bench.data)
-        for _, found in tempered_draws(engine, self.settings, pixels, keys, np.zeros(1, int), row):
-            pass
+        at = np.zeros(1, int)
+        for _, answer in tempered_draws(engine, self.settings, pixels, keys, at, row):
+            found = answer
         if found is None:
             raise FitError(
                 "the crowd did not arrive at the posterior", where="Tempered", mend="use 'nuts'"
@@ -76,7 +79,9 @@ class Tempered(AbstractMethod):
             )
         walks, length = self.settings.walks, self.settings.length
         steps = int(row.outcome.steps[0]) * walks * (length - 1)
-        densities = engine.crowds * self.settings.crowd + steps + engine.rounds * len(z)
+        densities = (
+            engine.counts["crowds"] * self.settings.crowd + steps + engine.counts["rounds"] * len(z)
+        )
         return Answer(
             kind="tempered",
             z=z[index],
@@ -87,39 +92,43 @@ class Tempered(AbstractMethod):
             effective_draws=worth,
             gradients=0.0,
             densities=float(densities),
-            said={"stages": int(row.outcome.steps[0]), "rounds": engine.rounds},
+            said={"stages": int(row.outcome.steps[0]), "rounds": engine.counts["rounds"]},
         )
 
 
-class _Counting:
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Counting(Engine):
     """The programs of a layout, and how often one fit runs them."""
 
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
-        self.crowds, self.rounds = 0, 0
+    counts: collections.Counter = dataclasses.field(default_factory=collections.Counter)
 
-    @classmethod
-    def of(cls, bench: Bench) -> "_Counting":
-        return cls(_ENGINES.of(id(bench.prepared), functools.partial(_make, bench))[1])
-
+    @override
     def temper(self, *arguments: Any) -> Any:
-        self.crowds += 1
-        return self._engine.temper(*arguments)
+        self.counts["crowds"] += 1
+        return super().temper(*arguments)
 
+    @override
     def propose(self, *arguments: Any) -> Any:
-        self.rounds += 1
-        return self._engine.propose(*arguments)
+        self.counts["rounds"] += 1
+        return super().propose(*arguments)
 
 
-_ENGINES: Kept[tuple[Prepared, Engine]] = Kept(MOST_KEPT)
+_ENGINES: Kept[tuple[Prepared, _Counting]] = Kept(MOST_KEPT)
 """With what they were made for, so that its identity is not given to another."""
 
 
-def _make(bench: Bench) -> tuple[Prepared, Engine]:
+def _engine(bench: Bench) -> _Counting:
+    """The programs of the bench's layout, kept from fit to fit; their counts begin at zero."""
+    _, engine = _ENGINES.of(id(bench.prepared), functools.partial(_make, bench))
+    engine.counts.clear()
+    return engine
+
+
+def _make(bench: Bench) -> tuple[Prepared, _Counting]:
     candidates = np.zeros((1, bench.program.size))  # nothing climbs here
     rough = _rough(bench)
     with TRACING:
-        return bench.prepared, Engine(bench.program, rough, candidates, bench.request.precision)
+        return bench.prepared, _Counting(bench.program, rough, candidates, bench.request.precision)
 
 
 def _rough(bench: Bench) -> Program:

@@ -139,7 +139,7 @@ def _sample_all(
     if settings.start is not None:
         for begin in range(0, at.size, HARD):
             some = at[begin : begin + HARD]
-            _sampletempered_draws(engine, settings, settings.start, pixels, keys, some, row)
+            _sample_tempered(engine, settings, settings.start, pixels, keys, some, row)
         return
     settled = _climb(engine, pixels.subset(at))
     row.settle(at, settled)
