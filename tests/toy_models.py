@@ -45,7 +45,7 @@ def squared(data, scene, priors, links) -> None:
 def long_tailed(data, scene, priors, links) -> None:
     """Readings that say nothing of a parameter with a long tail."""
     del scene, priors, links
-    numpyro.sample("far", dist.StudentT(1.5, 0.0, 1.0))
+    numpyro.sample("far", dist.StudentT(0.5, 0.0, 1.0))
     level = numpyro.sample("level", dist.Normal(0.0, 1.0))
     with numpyro.plate("view", data.shape[-1]):
         numpyro.sample("q", dist.Normal(level, NOISE), obs=data.readings["q"])

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
@@ -13,7 +14,7 @@ from polar_bayes.budget.dials import DIALS, AbstractDial
 from polar_bayes.budget.distances import Distances, distances
 from polar_bayes.budget.fresh import run_fresh
 from polar_bayes.budget.reference import Judge, Reference, run_reference
-from polar_bayes.budget.trial import Measured, Trial, run_trial
+from polar_bayes.budget.trial import Measured, Trial, bench_of, run_trial
 from polar_bayes.errors import FitError
 from polar_bayes.inference.request import Method, Request, resolve
 from polar_bayes.inference.result import PROVENANCE
@@ -23,6 +24,8 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 
 AS_GIVEN = "as given"
+FOLD = 7
+"""Folded into the key of the reference."""
 
 DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
     "mean_error": ("posterior mean minus that of the reference, in its sds", "1"),
@@ -98,7 +101,9 @@ def accuracy(
     show = progress or _silent
     trials = _trials(request, LADDER if rungs is None else rungs, tuple(dials))
     show("reference", 0.0)
-    judge = run_reference(reference or Reference(), request, seed)
+    with jax.enable_x64(True):
+        key = jax.random.fold_in(jax.random.key(seed), FOLD)  # no random number of any trial
+        judge = run_reference(reference or Reference(), bench_of(request, key))
     show("reference", 1.0)
     rows = []
     for number, ((rung, dial), trial) in enumerate(trials.items()):

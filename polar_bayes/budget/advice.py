@@ -157,6 +157,25 @@ def accuracy_advice(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERAN
     return told
 
 
+def advised(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> str | None:
+    """The fastest rung as given that is good for every parameter.
+
+    Args:
+        result: What `polar_bayes.accuracy` returns.
+        tolerance: Largest error of a mean or sd, in posterior sds.
+
+    Returns:
+        Its name; None where there is none.
+
+    Raises:
+        FitError: It holds no accuracy study.
+    """
+    table = accuracy_table(result)
+    seconds = table[time_of(table)]
+    good = (table["dial"] == AS_GIVEN) & (table["error"] <= tolerance) & seconds.notna()
+    return str(seconds[good].idxmin()) if good.any() else None
+
+
 def _advice(table: pd.DataFrame, errors: pd.DataFrame, tolerance: float) -> str:
     seconds = table[time_of(table)]
     known = table["error"].notna() & seconds.notna()

@@ -1,28 +1,25 @@
 """The posterior that others are judged by: long chains, and how far they can be trusted."""
 
+import contextlib
 import dataclasses
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from polar_bayes.budget.distances import Distances, distances
-from polar_bayes.budget.trial import bench_of, labeled
+from polar_bayes.budget.trial import labeled
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT
 from polar_bayes.errors import FitError
 from polar_bayes.inference.bench import Bench
 from polar_bayes.inference.method import Answer
 from polar_bayes.inference.mixing import standard_errors
 from polar_bayes.inference.nuts import Nuts
-from polar_bayes.inference.request import Method, Request
+from polar_bayes.inference.request import Method
 from polar_bayes.ladder.builtin import answer
 from polar_bayes.ladder.scaling import with_draws
 from polar_bayes.ladder.tempered import Tempered
 from polar_bayes.ladder.visiting import unvisited_weight
 from polar_bayes.pixels.tempering import PixelTempering
-
-FOLD = 7
-"""Folded into the key of what is judged, so that both share no random number."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +98,7 @@ class Judge(NamedTuple):
         return float(max(self.mean_error.max(), self.sd_error.max()))
 
 
-def run_reference(settings: Reference, request: Request, seed: int) -> Judge:
+def run_reference(settings: Reference, bench: Bench) -> Judge:
     """Chains that go on until their own error is small enough.
 
     Where they do not agree, or some of them missed a mode, tempered draws take over, where the
@@ -109,8 +106,7 @@ def run_reference(settings: Reference, request: Request, seed: int) -> Judge:
 
     Args:
         settings: How small.
-        request: The capture.
-        seed: Of what is judged.
+        bench: The capture, in the precision of the surrounding scope, with a key of its own.
 
     Returns:
         The reference.
@@ -118,15 +114,10 @@ def run_reference(settings: Reference, request: Request, seed: int) -> Judge:
     Raises:
         FitError: Nothing can be drawn at all.
     """
-    with jax.enable_x64(True):
-        key = jax.random.fold_in(jax.random.key(seed), FOLD)
-        bench = bench_of(dataclasses.replace(request, precision="double"), key)
-        tried = [_climb(settings, "NUTS", settings.chains, bench)]
-        if tried[0].doubts:
-            try:
-                tried.append(_climb(settings, "tempered draws", settings.tempered, bench))
-            except FitError:  # several patches or colors
-                pass
+    tried = [_climb(settings, "NUTS", settings.chains, bench)]
+    if tried[0].doubts:
+        with contextlib.suppress(FitError):  # several patches or colors
+            tried.append(_climb(settings, "tempered draws", settings.tempered, bench))
     return min(tried, key=lambda judge: (len(judge.doubts), judge.error))
 
 

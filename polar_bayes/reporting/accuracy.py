@@ -88,7 +88,7 @@ def plot_accuracy(
     figure = Figure(figsize=(5.2 * len(shown), 4.4), layout="constrained")
     for at, name in enumerate(shown):
         axes = figure.add_subplot(1, len(shown), at + 1)
-        _panel(axes, table, name, float(found.attrs["reference_error"]))
+        front_panel(axes, found, name)
         if at == 0:
             axes.set_ylabel("largest error of a mean or sd [posterior sd]")
     dials = list(dict.fromkeys(table["dial"]))
@@ -109,7 +109,15 @@ def _measured(table: pd.DataFrame) -> list[str]:
     return [name for name in TIME_LABELS if table[name].notna().any()]
 
 
-def _panel(axes: Axes, table: pd.DataFrame, time: str, noise: float) -> None:
+def front_panel(axes: Axes, found: xr.Dataset, time: str) -> None:
+    """One panel of `plot_accuracy`.
+
+    Args:
+        axes: Where to draw.
+        found: An accuracy study.
+        time: "seconds_first" or "seconds_again".
+    """
+    table, noise = accuracy_table(found), float(found.attrs["reference_error"])
     known = table[table["error"].notna() & np.isfinite(table["error"]) & table[time].notna()]
     rungs, dials = (list(dict.fromkeys(table[name])) for name in ("rung", "dial"))
     colors = dict(zip(rungs, _repeat(COLORS, len(rungs)), strict=True))
