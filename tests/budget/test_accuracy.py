@@ -18,6 +18,7 @@ from polar_bayes.budget.dials import AbstractDial
 from polar_bayes.budget.fresh import run_fresh
 from polar_bayes.budget.reference import run_reference
 from polar_bayes.budget.trial import Trial, bench_of
+from polar_bayes.budget.variants import parts_of
 from polar_bayes.inference.bench import Bench
 from polar_bayes.inference.method import AbstractMethod, Answer
 from polar_bayes.inference.request import resolve
@@ -124,7 +125,14 @@ def test_without_processes_of_their_own_first_times_and_memory_are_not_told(stud
 def test_facets_are_turned_where_there_are_any():
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
     turned, method = pb.FacetsDial(0.5).turn(request, pb.Nuts())
-    assert "FacetQuadrature(along=3, across=2)" in repr(turned.scene)
+    before, after = (
+        [part for _, part in parts_of(scene) if isinstance(part, pb.FacetQuadrature)]
+        for scene in (request.scene, turned.scene)
+    )
+    assert len(before) == len(after) > 0
+    for one, other in zip(before, after, strict=True):
+        assert other.along == round(0.5 * one.along)
+        assert other.across == round(0.5 * one.across)
     assert method == pb.Nuts()
     smooth = dataclasses.replace(request, scene=pb.Scene(pb.SmoothSurface()))
     assert pb.FacetsDial(0.5).turn(smooth, pb.Nuts()) is None

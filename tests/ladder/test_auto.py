@@ -8,7 +8,7 @@ from typing import override
 import jax
 import numpy as np
 import pytest
-from toy_models import capture, line, long_tailed, of_line
+from toy_models import capture, funnel, line, of_line
 
 import polar_bayes as pb
 from polar_bayes.inference import fit as fitting
@@ -139,8 +139,8 @@ def test_a_normal_posterior_is_met_by_the_cheapest():
     assert (np.abs(table["sd"] / sd - 1.0) < 0.2).all()
 
 
-def test_a_long_tail_is_left_to_higher_rungs():
-    result = pb.fit(capture(), model=long_tailed, links=LINKS, method=pb.Auto(0.5, 600.0))
+def test_a_funnel_is_left_to_higher_rungs():
+    result = pb.fit(capture(), model=funnel, links=LINKS, method=pb.Auto(0.5, 600.0))
     steps = json.loads(result.attrs["polar_bayes"])["auto"]["steps"]
     assert not steps[0]["taken"]
     assert len(steps) > 1

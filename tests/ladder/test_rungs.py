@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 import pytest
-from toy_models import capture, line, long_tailed, of_line, squared
+from toy_models import capture, funnel, line, of_line, squared
 
 import polar_bayes as pb
 from polar_bayes.budget.trial import bench_of, labeled
@@ -102,8 +102,8 @@ def test_chains_that_missed_a_mode_are_told():
     assert unvisited_weight(both.z, bench(line)) == 0.0
 
 
-def test_weights_that_do_not_reach_a_long_tail_are_a_problem():
-    found = answer(SMALL["importance"], bench(long_tailed))
+def test_weights_that_do_not_reach_all_of_a_posterior_are_a_problem():
+    found = answer(SMALL["importance"], bench(funnel))
     assert found.k_hat > 0.7
     assert any("Pareto k-hat" in problem for problem in found.problems)
 
