@@ -11,13 +11,13 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from matplotlib.transforms import Bbox
 
 from polar_bayes.budget.accuracy import AS_GIVEN
 from polar_bayes.budget.advice import accuracy_of, accuracy_table
 from polar_bayes.errors import FitError
 from polar_bayes.reporting.style import (
-    BLACK,
     BLUE,
     GRAY,
     GREEN,
@@ -31,7 +31,8 @@ from polar_bayes.reporting.style import (
     styled,
 )
 
-COLORS = (VERMILLION, ORANGE, SKY, GREEN, PURPLE, BLUE, BLACK)
+WINE, INDIGO = "#882255", "#332288"  # of Paul Tol's muted scheme, beside those of the house
+COLORS = (VERMILLION, ORANGE, SKY, GREEN, PURPLE, WINE, GRAY, BLUE, INDIGO)
 MARKERS = ("o", "^", "v", "s", "D", "P", "X", "*")
 LETTER, LINE = 5.2, 10.0
 """About the size of a letter of a label, unit point: labels are placed before they are drawn."""
@@ -101,7 +102,9 @@ def plot_accuracy(
                 zip(dials, _repeat(MARKERS, len(dials)), strict=True)
             )
         ]
-        figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
+        figure.legend(
+            handles=handles, loc="outside lower center", ncols=4 * len(shown), frameon=False
+        )
     return figure
 
 
@@ -141,7 +144,10 @@ def front_panel(axes: Axes, found: xr.Dataset, time: str) -> None:
         )
     _limits(axes, known, time, noise)
     axes.set_xlabel(TIME_LABELS[time])
-    _name_points(axes, known[known["dial"] == AS_GIVEN], time, colors)
+    for axis in (axes.xaxis, axes.yaxis):  # the style reads no formulas
+        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.set_minor_formatter(NullFormatter())
+    _name_points(axes, known, time, colors)
     quiet_ticks(axes)
 
 
@@ -161,13 +167,15 @@ def _limits(axes: Axes, known: pd.DataFrame, time: str, noise: float) -> None:
     axes.set_ylim(min(float(error.min()), noise) / 1.6, float(error.max()) * 1.8)
 
 
-def _name_points(axes: Axes, given: pd.DataFrame, time: str, colors: dict[str, str]) -> None:
+def _name_points(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, str]) -> None:
     """The name of each rung beside its point, where no other name or point stands."""
     figure = axes.get_figure()
     scale = 72.0 / (figure.dpi if figure is not None else 100.0)
-    places = axes.transData.transform(given[[time, "error"]].to_numpy(float)) * scale
-    taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in places]
-    for (x, y), name in zip(places, given["rung"], strict=True):
+    places = axes.transData.transform(known[[time, "error"]].to_numpy(float)) * scale
+    taken = [Bbox.from_bounds(x - 3, y - 3, 6, 6) for x, y in places]
+    given = known[known["dial"] == AS_GIVEN]
+    own = places[(known["dial"] == AS_GIVEN).to_numpy()]
+    for (x, y), name in zip(own, given["rung"], strict=True):
         width = LETTER * len(name)
         for right, up in AROUND:
             box = Bbox.from_bounds(
