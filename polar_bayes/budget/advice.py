@@ -63,7 +63,7 @@ def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
     errors = parameter_errors(found)
     worst = [_worst(row) for row in errors.to_numpy()]
     error = np.array([row[at] for row, at in zip(errors.to_numpy(), worst, strict=True)])
-    ends = np.fmax(np.abs(found["low_error"]), np.abs(found["high_error"])).to_numpy()
+    ends = _larger(found, "low_error", "high_error")
     alone = ("r_hat", "k_hat", "effective_draws", "gradients", "densities", *TIMES, "peak_memory")
     table = pd.DataFrame(
         {
@@ -96,7 +96,7 @@ def parameter_errors(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
         FitError: It holds no accuracy study.
     """
     found = accuracy_of(result)
-    values = np.fmax(np.abs(found["mean_error"]), np.abs(found["sd_error"])).to_numpy()
+    values = _larger(found, "mean_error", "sd_error")
     pairs = zip(found["rung"].to_numpy(), found["dial"].to_numpy(), strict=True)
     names = [str(rung) if dial == AS_GIVEN else f"{rung}, {dial}" for rung, dial in pairs]
     labels = [str(label) for label in found["parameter"].to_numpy()]
@@ -232,6 +232,10 @@ def _largest(values: np.ndarray) -> np.ndarray:
     """Of every row; NaN where nothing is known."""
     found = np.max(np.where(np.isnan(values), -np.inf, np.abs(values)), axis=1)
     return np.where(np.isneginf(found), np.nan, found)
+
+
+def _larger(found: xr.Dataset, one: str, other: str) -> np.ndarray:
+    return np.fmax(np.abs(found[one].to_numpy()), np.abs(found[other].to_numpy()))
 
 
 def _spoken(names: list[str]) -> str:

@@ -72,7 +72,7 @@ def fit(
             options |= {} if tolerance is None else {"tolerance": tolerance}
             scene = pb.choose_effects(data, progress=progress, **options)
             click.echo(pb.ledger_sentence(scene.ledger), err=True)
-        wish = {"tolerance": tolerance} if is_auto else {}
+        wish: dict[str, Any] = {"tolerance": tolerance} if is_auto else {}
         result = pb.fit(data, scene=scene, progress=progress, **wish, **settings)
     pb.save_result(result, out)
     for sentence in pb.auto_sentences(result):

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from typing import Any
 
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.request import Method
@@ -26,7 +27,8 @@ def with_draws(method: Method, factor: float) -> Method | None:
     draws = getattr(method, "draws", None)
     if not isinstance(draws, int):
         return None
-    return dataclasses.replace(method, draws=math.ceil(factor * draws))  # type: ignore[type-var]
+    changed: dict[str, Any] = {"draws": math.ceil(factor * draws)}
+    return dataclasses.replace(method, **changed)
 
 
 @with_draws.register
