@@ -161,17 +161,22 @@ DIALS: tuple[AbstractDial, ...] = (
 )
 """What every rung is crossed with, one turn at a time."""
 
+PRIOR = "prior of "
+"""How a request says that a prior is the user's own."""
+
 _CHOSEN: Kept[tuple[Request, Scene]] = Kept(2)
 """Choices take minutes, and every rung asks; each stands beside the request that it is of."""
 
 
 def _chosen(request: Request, tolerance: float) -> tuple[Request, Scene]:
     plain = simplify(request.scene, ())
+    own = [name.removeprefix(PRIOR) for name in request.swapped if name.startswith(PRIOR)]
     scene = choose_effects(
         request.capture,
         scene=plain,
         tolerance=tolerance,
         model=request.model,
+        priors={name: request.priors[name] for name in own},
         links=request.links,
         largest_view_zenith=request.largest_view_zenith,
         seed=request.seed,

@@ -22,8 +22,11 @@ from polar_bayes.pixels.tempering import PixelTempering
 
 LARGEST_R_HAT = 1.01
 
-RESERVE = 4
+RESERVE = 8
 """Times as many weighted draws as normal posteriors need: long tails need more."""
+
+MOST_DRAWS = 2**17
+"""Weighted draws beyond which chains are the better way."""
 
 MARGIN, MOST_TIMES = 1.5, 16.0
 """Draws of a second try: more than the first error asks for, but not above so many times."""
@@ -80,10 +83,11 @@ class Auto(AbstractMethod):
         if any(name != "view" and length > 1 for name, length in bench.data.dims):
             return {"nuts": chains}
         crowd = PixelTempering().crowd
-        drawn = crowd * -(-2 * RESERVE * needed // crowd)
-        tempering = PixelTempering(draws=drawn, effective_draws=float(needed))
+        weighted = min(RESERVE * needed, MOST_DRAWS)
+        drawn = crowd * -(-weighted // crowd)
+        tempering = PixelTempering(draws=drawn, effective_draws=min(needed, 0.5 * drawn))
         return {
-            "importance": Importance(draws=max(2048, 4 * RESERVE * needed)),
+            "importance": Importance(draws=max(2048, 2 * weighted)),
             "tempered": Tempered(tempering),
             "nuts": chains,
         }

@@ -20,7 +20,7 @@ SIDE_BY_SIDE = 64
 CHAINS = 4
 """Groups of the chosen draws, for diagnostics that ask for chains."""
 
-FEWEST, MOST = 50, 2500
+FEWEST, MOST = 50, 10_000
 """Chosen draws of each group."""
 
 
