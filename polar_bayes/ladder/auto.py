@@ -106,7 +106,8 @@ class Auto(AbstractMethod):
                 continue
             step, found = self._try(name, method, _within(bench, deadline if best else np.inf))
             steps.append(step)
-            if found is not None and (best is None or step.error < best[0].error):
+            # Of two in doubt the dearer one is nearer to exact.
+            if found is not None and (best is None or step.error <= best[0].error):
                 best = step, found
             if step.taken:
                 break

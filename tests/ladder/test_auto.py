@@ -117,6 +117,11 @@ def test_where_nothing_is_good_enough_the_nearest_is_returned_and_flagged():
     assert "Nothing was good enough" in pb.auto_sentences(result)[-1]
 
 
+def test_of_two_in_doubt_the_dearer_one_is_returned():
+    _, said = fitted(Made(k_hat=0.9), Made(k_hat=np.nan, r_hat=1.2))
+    assert (said["auto"]["chosen"], said["auto"]["met"]) == ("rung 1", False)
+
+
 def test_after_its_time_nothing_begins():
     _, said = fitted(Made(k_hat=0.9), Made(), seconds=1e-9)
     assert [step["why"] for step in said["auto"]["steps"]][1] == "the time was up"
