@@ -11,11 +11,12 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from matplotlib.transforms import Bbox
 
 from polar_bayes.budget.accuracy import AS_GIVEN
-from polar_bayes.budget.advice import accuracy_of, accuracy_table
+from polar_bayes.budget.advice import RESOLVED, accuracy_of, accuracy_table
 from polar_bayes.errors import FitError
 from polar_bayes.reporting.style import (
     BLUE,
@@ -127,7 +128,7 @@ def front_panel(axes: Axes, found: xr.Dataset, time: str) -> None:
     markers = dict(zip(dials, _repeat(MARKERS, len(dials)), strict=True))
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.axhspan(1e-9, noise, color=lighten(GRAY, 0.85), lw=0, zorder=0)
+    axes.axhspan(1e-9, RESOLVED * noise, color=lighten(GRAY, 0.85), lw=0, zorder=0)
     front = _front(known, time)
     axes.plot(front[time], front["error"], color=GRAY, lw=1.0, drawstyle="steps-post", zorder=1)
     for _, row in known.iterrows():
@@ -193,6 +194,7 @@ def _name_points(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, s
             va="center",
             fontsize=8,
             color=colors[name],
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )
 
 

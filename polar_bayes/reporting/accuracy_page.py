@@ -8,6 +8,7 @@ import xarray as xr
 
 from polar_bayes.budget.accuracy import AS_GIVEN
 from polar_bayes.budget.advice import (
+    RESOLVED,
     accuracy_advice,
     accuracy_of,
     accuracy_table,
@@ -21,8 +22,8 @@ from polar_bayes.reporting.tables import Row, Table, fact_rows
 from polar_bayes.reporting.text import DASH, or_dash
 
 HEADS = (
-    "method", "error", "of", "interval", "Wasserstein", "R-hat", "k-hat", "worth", "gradients",
-    "densities", "first s", "next s", "MiB",
+    "method", "error", "of", "first s", "next s", "MiB", "interval", "Wasserstein", "R-hat",
+    "k-hat", "worth", "gradients", "densities",
 )  # fmt: skip
 CAPTION = (
     "Error: the largest of any mean or standard deviation, in posterior standard deviations, and "
@@ -122,10 +123,12 @@ def study_table(found: xr.Dataset) -> Table:
     for name, row in accuracy_table(found).iterrows():
         error = or_dash(row["error"], "{:.2g}")
         if math.isfinite(row["error"]) and not row["resolved"]:
-            error = f"< {2.0 * noise:.2g}"
+            error = f"< {RESOLVED * noise:.2g}"
         cells = (
             error,
             row["worst"] if math.isfinite(row["error"]) else DASH,
+            *(or_dash(row[key], "{:.2g}") for key in ("seconds_first", "seconds_again")),
+            or_dash(row["peak_memory"], "{:,.0f}"),
             *(or_dash(row[key], "{:.2g}") for key in ("interval", "wasserstein")),
             or_dash(row["r_hat"], "{:.3f}"),
             or_dash(row["k_hat"], "{:.2f}"),
@@ -133,8 +136,6 @@ def study_table(found: xr.Dataset) -> Table:
                 or_dash(row[key], "{:,.0f}")
                 for key in ("effective_draws", "gradients", "densities")
             ),
-            *(or_dash(row[key], "{:.2g}") for key in ("seconds_first", "seconds_again")),
-            or_dash(row["peak_memory"], "{:,.0f}"),
         )
         words = "; ".join(filter(None, ["*" if row["on_front"] else "", row["problems"]]))
         rows.append(Row(str(name), words or str(name), cells))
