@@ -9,8 +9,13 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 _HOMES = {
+    "budget.accuracy": ("accuracy",),
+    "budget.accuracy_files": ("holds_accuracy", "load_accuracy"),
+    "budget.advice": ("accuracy_advice", "accuracy_table"),
+    "budget.dials": ("DrawsDial", "EffectsDial", "FacetsDial", "PrecisionDial"),
     "budget.effects": ("ChosenScene", "choose_effects"),
     "budget.ledger": ("ledger_sentence", "ledger_summary", "ledger_table"),
+    "budget.reference": ("Reference",),
     "calibration.calibrate": ("calibrate",),
     "calibration.compare": ("compare_calibrations", "comparison_sentences"),
     "calibration.files": ("holds_calibration", "load_calibration"),
@@ -35,11 +40,17 @@ _HOMES = {
     "identifiability.views": ("next_views",),
     "identifiability.words": ("identifiability_sentences", "identifiability_table"),
     "inference.files": ("load_result", "save_result"),
-    "inference.fit": ("fit",),
     "inference.laplace": ("Laplace",),
     "inference.nuts": ("Nuts",),
     "inference.point": ("Point",),
     "inference.spectrum": ("predict_spectrum",),
+    "ladder.auto": ("Auto",),
+    "ladder.fit": ("fit",),
+    "ladder.rungs": ("LADDER",),
+    "ladder.importance": ("Importance",),
+    "ladder.tempered": ("Tempered",),
+    "ladder.variational": ("FlowGuide", "NormalGuide"),
+    "ladder.words": ("auto_sentences",),
     "models.gp_spectral": ("GpSpectral",),
     "models.spectral_process": ("SpectralProcess",),
     "models.hierarchical": ("Hierarchical",),
@@ -87,6 +98,7 @@ _HOMES = {
     "pixels.store": ("map_file",),
     "pixels.tempering": ("PixelTempering",),
     "priors": ("PRIORS",),
+    "reporting.accuracy": ("plot_accuracy",),
     "reporting.calibration": ("plot_calibration",),
     "reporting.html": ("report",),
     "reporting.maps": ("plot_maps",),
@@ -100,7 +112,7 @@ _MODULE_OF = {name: module for module, names in _HOMES.items() for name in names
 __all__ = sorted(_MODULE_OF)
 
 if TYPE_CHECKING:
-    from polar_bayes.inference.fit import fit as fit
+    from polar_bayes.ladder.fit import fit as fit
 
 
 def __getattr__(name: str) -> Any:

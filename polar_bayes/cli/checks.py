@@ -123,10 +123,52 @@ def identify(
         click.echo("\n".join(["", *sentences]))
 
 
+@click.command()
+@click.argument("capture", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Study to write.")
+@click.option("--model", default="per_material", show_default=True)
+@click.option("--scene", help="Named scene; by default the one that the capture names.")
+@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
+@click.option("--rung", "rungs", multiple=True, help="Method to try; by default the whole ladder.")
+@click.option("--no-dials", is_flag=True, help="Methods alone, nothing turned beside them.")
+@click.option("--tolerance", type=float, default=0.1, show_default=True, help="Of the advice.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
+def accuracy(
+    capture: Path,
+    out: Path,
+    rungs: tuple[str, ...],
+    no_dials: bool,
+    tolerance: float,
+    as_json: bool,
+    **settings: Any,
+) -> None:
+    """What each method gets wrong for this capture, and what it costs in time."""
+    data = pb.load_capture(capture)
+    check_writable(out)
+    strange = [name for name in rungs if name not in pb.LADDER]
+    if strange:
+        raise click.UsageError(f"no rung {', '.join(strange)}: give {', '.join(pb.LADDER)}")
+    settings["rungs"] = {name: pb.LADDER[name] for name in rungs or pb.LADDER}
+    settings |= {"dials": ()} if no_dials else {}
+    with progress_bars() as progress:
+        study = pb.accuracy(data, progress=progress, **settings)
+    pb.save_result(study, out)
+    table, advice = pb.accuracy_table(study), pb.accuracy_advice(study, tolerance)
+    if as_json:
+        rows = json.loads(table.to_json(orient="index"))
+        click.echo(json.dumps({"rows": rows, "advice": advice}, indent=2, allow_nan=False))
+        return
+    columns = ["error", "worst", "k_hat", "r_hat", "seconds_first", "seconds_again"]
+    shown = table[columns].rename_axis(None)
+    click.echo(shown.to_string(float_format=lambda x: f"{x:.3g}", na_rep="-"))
+    click.echo(f"\n{advice}")
+
+
 def _criterion(name: str) -> Any:
     """The criterion of that letter, or the one of that parameter alone."""
     letters = {"D": pb.DOptimal, "A": pb.AOptimal}
     return letters[name]() if name in letters else pb.SingleParameter(name)
 
 
-COMMANDS = (calibrate, identify)
+COMMANDS = (calibrate, identify, accuracy)

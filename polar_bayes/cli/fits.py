@@ -37,11 +37,15 @@ def demo(out: Path, seed: int) -> int:
 @click.argument("capture", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Result to write.")
 @click.option("--model", default="per_material", show_default=True)
-@click.option("--method", default="nuts", show_default=True, help="nuts, laplace or point.")
+@click.option(
+    "--method", default="nuts", show_default=True,
+    help="point, laplace, importance, tempered, nuts, or auto: the cheapest that is good enough.",
+)  # fmt: skip
+@click.option("--seconds", type=float, help="Of --method auto; 60 by default.")
 @click.option("--scene", help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
 @click.option("--choose-effects", "choose", is_flag=True, help="Fit what `effects` would keep.")
-@click.option("--tolerance", type=float, help="Of --choose-effects; 0.1 posterior sd by default.")
+@click.option("--tolerance", type=float, help="Of --choose-effects and --method auto; 0.1 sd.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
 def fit(
@@ -54,8 +58,11 @@ def fit(
     **settings: Any,
 ) -> int:
     """Fit a capture; prints a row per parameter and writes everything to --out."""
-    if tolerance is not None and not choose:
-        raise click.UsageError("--tolerance needs --choose-effects")
+    is_auto = settings["method"] == "auto"
+    if tolerance is not None and not (choose or is_auto):
+        raise click.UsageError("--tolerance needs --choose-effects or --method auto")
+    if settings["seconds"] is not None and not is_auto:
+        raise click.UsageError("--seconds needs --method auto")
     data = pb.load_capture(capture)
     check_writable(out)
     with progress_bars() as progress:
@@ -65,8 +72,11 @@ def fit(
             options |= {} if tolerance is None else {"tolerance": tolerance}
             scene = pb.choose_effects(data, progress=progress, **options)
             click.echo(pb.ledger_sentence(scene.ledger), err=True)
-        result = pb.fit(data, scene=scene, progress=progress, **settings)
+        wish: dict[str, Any] = {"tolerance": tolerance} if is_auto else {}
+        result = pb.fit(data, scene=scene, progress=progress, **wish, **settings)
     pb.save_result(result, out)
+    for sentence in pb.auto_sentences(result):
+        click.echo(sentence, err=True)
     if as_json:
         click.echo(json.dumps(pb.json_summary(result), indent=2, allow_nan=False))
     else:
@@ -136,7 +146,7 @@ def effects(
 def report(
     fit: Path, out: Path, truth: Path | None, uncorrected: Path | None, beside: tuple[Path, ...]
 ) -> None:
-    """Write the standardized report of a fit, a calibration, or a map (a folder in .zarr)."""
+    """Write the standardized report of a fit, calibration, accuracy study, or map (.zarr)."""
     others = {
         "truth": None if truth is None else pb.open_capture(truth),
         "uncorrected": None if uncorrected is None else pb.open_map(uncorrected),
@@ -154,9 +164,11 @@ def _by_name(paths: tuple[Path, ...]) -> dict[str, Any]:
 
 
 def _opened(path: Path) -> Any:
-    """A map, a calibration or a fit."""
+    """A map, an accuracy study, a calibration or a fit."""
     if path.suffix == ".zarr":
         return pb.open_map(path)
+    if pb.holds_accuracy(path):
+        return pb.load_accuracy(path)
     return pb.load_calibration(path) if pb.holds_calibration(path) else pb.load_result(path)
 
 

@@ -11,6 +11,7 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 SAMPLE_DIMS = ("chain", "draw")
+METHODS = ("nuts", "laplace", "point", "importance", "tempered", "variational")
 OF_POPULATIONS = ("_location", "_spread")
 OF_PROCESSES = ("_level", "_amplitude", "_length")
 
@@ -109,9 +110,9 @@ def stats_of(result: xr.DataTree) -> Mapping[str, xr.DataArray]:
 
 
 def method_of(result: xr.DataTree) -> str:
-    """How the fit was made: "nuts", "laplace" or "point"; told by its statistics if not said."""
+    """How the fit was made, by one of `METHODS`; told by its statistics if not said."""
     method = provenance_of(result).get("method")
-    if method in ("nuts", "laplace", "point"):
+    if method in METHODS:
         return str(method)
     stats = stats_of(result)
     if "loss" in stats or result["posterior"].sizes.get("draw", 0) == 1:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
 from polar_bayes.diagnostics.parameters import Scalar, scalars
-from polar_bayes.inference.ground import STARTS, compiled_potential
+from polar_bayes.inference.ground import STARTS, CompiledPotential
 from polar_bayes.inference.modes import Modes, ValueAndGradient
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request, resolve
@@ -91,7 +91,7 @@ def find_peaks(
     Raises:
         FitError: No start reached a peak.
     """
-    potential = potential or compiled_potential(question.program, question.data)
+    potential = potential or CompiledPotential(question.program, question.data)
     return find_modes(potential, question.prior[:STARTS], progress or silent)
 
 

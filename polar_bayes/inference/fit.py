@@ -23,8 +23,10 @@ from numpyro.primitives import Messenger
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference import point
+from polar_bayes.inference.bench import Bench
 from polar_bayes.inference.draws import parameters_of
 from polar_bayes.inference.ground import STARTS
+from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.prepared import Prepared, prepare
 from polar_bayes.inference.program import Draw, Program
 from polar_bayes.inference.request import MODELS, Method, Request, resolve
@@ -60,7 +62,8 @@ def fit(
     Args:
         capture: A Dataset of the capture schema; validated here.
         model: A name in `MODELS` or a callable `model(data, scene, priors, links)`.
-        method: "nuts", "laplace", "point", or settings such as `Nuts(draws=2000)`.
+        method: "nuts", "laplace", "point", or settings such as `Nuts(draws=2000)`; those of any
+            `polar_bayes.inference.method.AbstractMethod`, too.
         scene: A name in `SETUPS` or a `Scene`; by default the set-up that the capture names in
             its attribute `setup`, else "paper".
         priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
@@ -138,6 +141,11 @@ def _fit_scene(
     """Search for modes from prior draws, then do what the method asks."""
     key_starts, key_draws = jax.random.split(key)
     program = prepared.program
+    if isinstance(request.method, AbstractMethod):
+        answer = request.method.draw(Bench(request, prepared, data, key, progress))
+        clock.lap("draws")
+        said = {"method": answer.kind} | answer.said
+        return _Fitted(program, answer.z, answer.stats, answer.problems, said)
     if isinstance(request.method, point.Point):
         starts = np.asarray(from_prior(program, key_starts, STARTS, data))
         fitted = _fit_point(prepared, data, starts, request.method)
@@ -232,7 +240,8 @@ def _fit_beside(
         progress("comparing", number / len(scenes))
         try:
             prepared = prepare(request, scene, data)
-            fitted = _fit_scene(request, prepared, data, key, _silent, _Clock())
+            simpler = dataclasses.replace(request, scene=scene)
+            fitted = _fit_scene(simpler, prepared, data, key, _silent, _Clock())
         except FitError as error:  # a failed comparison must not cost the user the fit, but is told
             comparisons_failed[name] = str(error)
             continue

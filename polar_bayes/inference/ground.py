@@ -193,10 +193,11 @@ class WholeGrounds(AbstractGrounds):
 
     @override
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractGround:
-        potential = compiled_potential(self.program, data)
+        potential = CompiledPotential(self.program, data)
         starts = np.asarray(from_prior(self.program, key, STARTS, data))
         modes = find_modes(potential, starts, progress)
-        return WholeGround(self, data, potential, modes, _describe(modes))
+        said = _describe(modes) | {"gradients": potential.calls}
+        return WholeGround(self, data, potential, modes, said)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -242,25 +243,24 @@ def make_grounds(model: Model, program: Program, data: Observations) -> Abstract
     return PatchGrounds(lone, transport, nuts.Samplers(transport.potential))
 
 
-def compiled_potential(program: Program, data: Observations) -> ValueAndGradient:
-    """Minus the log density with its gradient, compiled, for searches in NumPy.
+class CompiledPotential:
+    """Minus the log density with its gradient, compiled, for searches in NumPy; counts its calls.
 
     Args:
         program: The model.
         data: The capture.
-
-    Returns:
-        A function of an unconstrained vector.
-
-    Raises:
-        Nothing.
     """
 
-    def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = program.value_and_gradient(jnp.asarray(z, data.brightness.dtype), data)
-        return float(value), np.asarray(gradient, float)
+    def __init__(self, program: Program, data: Observations) -> None:
+        self._program, self._data = program, data
+        self.calls = 0
 
-    return potential
+    def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        """Of an unconstrained vector."""
+        self.calls += 1
+        at = jnp.asarray(z, self._data.brightness.dtype)
+        value, gradient = self._program.value_and_gradient(at, self._data)
+        return float(value), np.asarray(gradient, float)
 
 
 def _describe(modes: Modes) -> dict[str, Any]:

@@ -43,3 +43,28 @@ def measure(draws: Float[np.ndarray, "coordinate chain draw"]) -> Mixing:
         tail=np.array([array_stats.ess(x, method="tail", prob=TAILS) for x in draws]),
         r_hat=np.array([array_stats.rhat(x) for x in draws]),
     )
+
+
+def standard_errors(
+    draws: Float[np.ndarray, "coordinate chain draw"],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Monte Carlo standard errors of mean and standard deviation, in standard deviations.
+
+    Args:
+        draws: Of some chains of one length.
+
+    Returns:
+        Of the means and of the standard deviations, each (coordinate,); NaN for what never moved.
+
+    Raises:
+        Nothing.
+
+    Source:
+        Vehtari et al. (2021), Bayesian Analysis 16(2).
+    """
+    sd = draws.reshape(len(draws), -1).std(axis=-1)
+    with np.errstate(all="ignore"):
+        return (
+            np.array([array_stats.mcse(x, method="mean") for x in draws]) / sd,
+            np.array([array_stats.mcse(x, method="sd") for x in draws]) / sd,
+        )

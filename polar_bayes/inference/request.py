@@ -14,6 +14,7 @@ from numpyro.primitives import Messenger
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.laplace import Laplace
+from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.point import Point
 from polar_bayes.inference.story import read_story
@@ -26,7 +27,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import PriorTable, in_this_precision, resolve_priors
 from polar_bayes.setups import SETUPS, Setup, find_setup
 
-Method = Nuts | Laplace | Point
+Method = Nuts | Laplace | Point | AbstractMethod
 MODELS: dict[str, Callable] = {
     "per_material": per_material,
     "hierarchical": Hierarchical(),

@@ -163,7 +163,7 @@ def _sample_tempered(
 ) -> None:
     """Chains that begin at tempered draws: in each mode as many as it weighs."""
     begins: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    for some, found in _tempered(engine, start, pixels, keys, at, row):
+    for some, found in tempered_draws(engine, start, pixels, keys, at, row):
         for number, z, weights in zip(some, found.z, found.weights, strict=True):
             chosen = np.random.default_rng(keys[number]).choice(
                 len(z), settings.chains, p=weights / weights.sum()
@@ -188,11 +188,11 @@ def _temper_all(
 ) -> None:
     """Weighted draws of every pixel."""
     for begin in range(0, at.size, HARD):
-        for _ in _tempered(engine, settings, pixels, keys, at[begin : begin + HARD], row):
+        for _ in tempered_draws(engine, settings, pixels, keys, at[begin : begin + HARD], row):
             pass  # the row has been told
 
 
-def _tempered(
+def tempered_draws(
     engine: Engine,
     settings: PixelTempering,
     pixels: Stack,
@@ -200,7 +200,22 @@ def _tempered(
     at: np.ndarray,
     row: Row,
 ) -> Iterator[tuple[np.ndarray, Weighted]]:
-    """Weighted draws as answers come; what has none begins again from a new crowd."""
+    """Weighted draws as answers come; what has none begins again from a new crowd.
+
+    Args:
+        engine: The model of one pixel.
+        settings: Numbers and lengths.
+        pixels: The readings.
+        keys: A random key for each pixel.
+        at: Numbers of those that are fitted.
+        row: Told of every answer.
+
+    Returns:
+        Numbers of some pixels, and their draws.
+
+    Raises:
+        Nothing: what fails is in `row.status`.
+    """
     row.status[at] = Status.NOT_CONVERGED
     for attempt in range(settings.crowds):
         lost = at

@@ -10,6 +10,7 @@ from typing import Any
 import xarray as xr
 from matplotlib.figure import Figure
 
+from polar_bayes.budget.accuracy_files import is_accuracy
 from polar_bayes.budget.ledger import ledger_sentence
 from polar_bayes.calibration.files import is_calibration
 from polar_bayes.capture.paths import as_path
@@ -22,7 +23,9 @@ from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import save_result
 from polar_bayes.inference.result import provenance_of
+from polar_bayes.ladder.words import auto_sentences
 from polar_bayes.reporting import figures, sentences, tables
+from polar_bayes.reporting.accuracy_page import accuracy_section, render_accuracy
 from polar_bayes.reporting.calibration_page import render_calibration
 from polar_bayes.reporting.map_page import render_map
 from polar_bayes.reporting.page import Picture, fill, picture, write_page
@@ -34,12 +37,21 @@ from polar_bayes.reporting.style import QUANTITIES
 
 RESULT = "result.nc"
 CALIBRATION = "calibration.nc"
+ACCURACY = "accuracy.nc"
 MENDS = {
     "truth": "leave it out: a fit carries the truth of its capture",
     "uncorrected": "leave it out: a fit carries the truth of its capture",
     "beside": "leave it out, or give what polar_bayes.calibrate returns",
 }
 MOST_POPULATIONS = 6
+METHODS = {
+    "nuts": "NUTS",
+    "laplace": "Laplace approximation",
+    "importance": "Laplace approximation, its draws weighed",
+    "tempered": "tempered draws",
+    "variational": "variational guide",
+    "point": "least squares",
+}
 
 
 def report(
@@ -50,16 +62,17 @@ def report(
     uncorrected: xr.Dataset | None = None,
     beside: Mapping[str, xr.DataTree] | None = None,
 ) -> Path:
-    """Write the standard report of a fit, a map or a calibration: one page, `index.html`.
+    """Write the standard report of a fit, map, calibration or accuracy study: one `index.html`.
 
     The page needs no network, no script and no other file. Everything on it is computed from the
     result, so a report of a file read back is the same report. Beside the page of a fit lies
-    `result.nc`, beside that of a calibration `calibration.nc`; a map, which may be large, stays
-    where it is.
+    `result.nc`, beside that of a calibration `calibration.nc`, of an accuracy study
+    `accuracy.nc`; a map, which may be large, stays where it is. A fit whose tree has a group
+    `accuracy` (`result["accuracy"] = study["accuracy"]`) shows it.
 
     Args:
-        result: A tree that `polar_bayes.fit` or `polar_bayes.calibrate` returned, or maps of
-            `polar_bayes.fit_pixels`; or one of them read back from a file.
+        result: A tree that `polar_bayes.fit`, `polar_bayes.calibrate` or `polar_bayes.accuracy`
+            returned, or maps of `polar_bayes.fit_pixels`; or one of them read back from a file.
         directory: The folder; made if it is not there. An older report in it is replaced.
         truth: Of maps: the simulated capture, whose `true_<parameter>` the intervals are checked
             against.
@@ -82,6 +95,9 @@ def report(
     _refuse({"beside": beside}, of_calibration, "calibrations")
     if isinstance(result, xr.Dataset):
         return write_page(folder, render_map(result, truth, uncorrected))
+    if is_accuracy(result):
+        beside_it = {ACCURACY: functools.partial(save_result, result)}
+        return write_page(folder, render_accuracy(result), beside_it)
     page = render_calibration(result, beside) if of_calibration else render(result)
     name = CALIBRATION if of_calibration else RESULT
     return write_page(folder, page, {name: functools.partial(save_result, result)})
@@ -116,7 +132,7 @@ def render(result: xr.DataTree) -> str:
     name = one_line(str((provenance.get("capture") or {}).get("name", "capture")))
     content: dict[str, Any] = {
         "name": name,
-        "method": {"nuts": "NUTS", "laplace": "Laplace approximation"}.get(method, "least squares"),
+        "method": METHODS[method],
         "provenance": provenance,
         "verdict": judged,
         "headline": sentences.headline(method, judged.converged, judged.cautions),
@@ -141,6 +157,8 @@ def render(result: xr.DataTree) -> str:
         "sampler": tables.sampler_facts(result, method, provenance),
         "checks": tables.check_table(checks) if checks else None,
         "effects": _effects(result),
+        "accuracy": accuracy_section(result) if "accuracy" in result.children else None,
+        "auto": auto_sentences(result),
         "groups": provenance_groups(provenance),
         "model_source": str(provenance.get("model_source") or ""),
         "pictures": _pictures(result, checks, method),

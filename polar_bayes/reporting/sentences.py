@@ -23,6 +23,12 @@ HEADLINES = {
     ("nuts", False): "The fit did not converge: do not use these numbers.",
     ("laplace", True): "The approximation raised no alarm.",
     ("laplace", False): "The approximation failed: do not use these numbers.",
+    ("variational", True): "The guide raised no alarm.",
+    ("variational", False): "The guide failed: do not use these numbers.",
+    ("importance", True): "The weighted draws raised no alarm.",
+    ("importance", False): "The weighted draws failed: do not use these numbers.",
+    ("tempered", True): "The tempered draws raised no alarm.",
+    ("tempered", False): "The tempered draws failed: do not use these numbers.",
     ("point", True): "Least squares met its tolerance.",
     ("point", False): "Least squares failed: do not use these numbers.",
 }

@@ -1,0 +1,73 @@
+"""A trial in a process of its own: nothing is compiled yet, nothing else takes memory.
+
+    python -m polar_bayes.budget.fresh TRIAL MEASURED
+
+runs what one file holds and writes what came of it to the other.
+"""
+
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import cloudpickle
+
+from polar_bayes.budget.trial import Measured, Trial, run_trial
+from polar_bayes.errors import FitError
+
+LAST_WORDS = 300
+"""Characters of what a process that broke down has said."""
+
+
+def run_fresh(trial: Trial) -> Measured:
+    """Run a trial in a new process, with compiled programs of earlier ones out of reach.
+
+    Args:
+        trial: What is run. What it names by import is imported there, the rest is sent along.
+
+    Returns:
+        What came of it; imports are not part of its times.
+
+    Raises:
+        FitError: The method does not suit the capture, found nothing, or its process broke down.
+    """
+    with tempfile.TemporaryDirectory(prefix="polar-bayes-") as folder:
+        given, made = Path(folder) / "trial", Path(folder) / "measured"
+        given.write_bytes(cloudpickle.dumps(trial))
+        words = [sys.executable, "-m", "polar_bayes.budget.fresh", str(given), str(made)]
+        done = subprocess.run(
+            words, env=_environment(), capture_output=True, text=True, check=False
+        )
+        if not made.exists():
+            raise FitError(
+                f"its process ended with {done.returncode}: {done.stderr[-LAST_WORDS:].strip()}",
+                where="accuracy",
+                mend="try the same method with polar_bayes.fit, or a smaller capture",
+            )
+        # Written by the process that this one has just started.
+        found = pickle.loads(made.read_bytes())
+    if isinstance(found, FitError):
+        raise found
+    return found
+
+
+def _environment() -> dict[str, str]:
+    """That of this process, without its store of compiled programs."""
+    kept = {name: value for name, value in os.environ.items() if "COMPILATION_CACHE" not in name}
+    path = os.pathsep.join(part or os.getcwd() for part in sys.path)
+    return kept | {"PYTHONPATH": path, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+
+
+def _work(given: Path, made: Path) -> None:
+    trial = pickle.loads(given.read_bytes())
+    try:
+        found: Measured | FitError = run_trial(trial)
+    except FitError as error:
+        found = error
+    made.write_bytes(cloudpickle.dumps(found))
+
+
+if __name__ == "__main__":
+    _work(*map(Path, sys.argv[1:]))

@@ -1,0 +1,151 @@
+"""The posterior that others are judged by: long chains, and how far they can be trusted."""
+
+import contextlib
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from polar_bayes.budget.distances import Distances, distances
+from polar_bayes.budget.trial import labeled
+from polar_bayes.diagnostics.convergence import LARGEST_R_HAT
+from polar_bayes.errors import FitError
+from polar_bayes.inference.bench import Bench
+from polar_bayes.inference.method import Answer
+from polar_bayes.inference.mixing import standard_errors
+from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.request import Method
+from polar_bayes.ladder.builtin import answer
+from polar_bayes.ladder.scaling import with_draws
+from polar_bayes.ladder.tempered import Tempered
+from polar_bayes.ladder.visiting import unvisited_weight
+from polar_bayes.pixels.tempering import PixelTempering
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """Settings of the reference.
+
+    Args:
+        error: Largest Monte Carlo standard error of a mean or standard deviation, in posterior
+            standard deviations, above 0.
+        longer: How often chains may be made four times as long to get there, >= 0.
+
+    Raises:
+        FitError: A setting is out of range.
+    """
+
+    error: float = 0.02
+    longer: int = 2
+
+    def __post_init__(self) -> None:
+        if not self.error > 0.0 or self.longer < 0:
+            raise FitError(
+                f"error is {self.error} and longer {self.longer}",
+                where="Reference",
+                mend="give an error above 0, such as 0.02, and longer from 0",
+            )
+
+    @property
+    def chains(self) -> Nuts:
+        """The chains with which it begins."""
+        goal = 2.0 / self.error**2
+        draws = int(np.ceil(goal / 4.0))
+        return Nuts(
+            warmup=1000,
+            draws=draws,
+            most_draws=2 * draws,
+            effective_draws=goal,
+            target_acceptance=0.95,
+            max_tree_depth=10,
+        )
+
+    @property
+    def tempered(self) -> Tempered:
+        """What takes over where chains do not find each other's modes."""
+        goal = 2.0 / self.error**2
+        crowd = 8192
+        draws = crowd * -(-int(4.0 * goal) // crowd)
+        return Tempered(PixelTempering(walks=1024, draws=draws, effective_draws=goal))
+
+
+class Judge(NamedTuple):
+    """A reference that was run.
+
+    Args:
+        labels: Of the parameters.
+        draws: (parameter, chain, draw).
+        made_by: Name of the method.
+        mean_error: Monte Carlo standard error of the means, in standard deviations, (parameter,).
+        sd_error: Of the standard deviations, likewise.
+        halves: Distances of the draws of one half of the chains from those of the other.
+        answer: What the method says of itself.
+        doubts: Why it may be wrong; empty where nothing speaks against it.
+    """
+
+    labels: tuple[str, ...]
+    draws: np.ndarray
+    made_by: str
+    mean_error: np.ndarray
+    sd_error: np.ndarray
+    halves: Distances
+    answer: Answer
+    doubts: tuple[str, ...]
+
+    @property
+    def error(self) -> float:
+        """The largest standard error of a mean or a standard deviation."""
+        return float(max(self.mean_error.max(), self.sd_error.max()))
+
+
+def run_reference(settings: Reference, bench: Bench) -> Judge:
+    """Chains that go on until their own error is small enough.
+
+    Where they do not agree, or some of them missed a mode, tempered draws take over, where the
+    capture allows it. Where nothing is good enough, the best of it says so in its doubts.
+
+    Args:
+        settings: How small.
+        bench: The capture, in the precision of the surrounding scope, with a key of its own.
+
+    Returns:
+        The reference.
+
+    Raises:
+        FitError: Nothing can be drawn at all.
+    """
+    tried = [_climb(settings, "NUTS", settings.chains, bench)]
+    if tried[0].doubts:
+        with contextlib.suppress(FitError):  # several patches or colors
+            tried.append(_climb(settings, "tempered draws", settings.tempered, bench))
+    return min(tried, key=lambda judge: (len(judge.doubts), judge.error))
+
+
+def _climb(settings: Reference, name: str, method: Method, bench: Bench) -> Judge:
+    judge = _judge(settings, name, method, bench)
+    for _ in range(settings.longer):
+        longer = with_draws(method, 4.0)
+        if judge.error <= settings.error or longer is None:
+            break
+        method = longer
+        judge = _judge(settings, name, method, bench)
+    return judge
+
+
+def _judge(settings: Reference, name: str, method: Method, bench: Bench) -> Judge:
+    found = answer(method, bench)
+    labels, draws = labeled(bench.program, found.z, bench.data)
+    mean_error, sd_error = standard_errors(draws)
+    half = draws.shape[1] // 2
+    one, other = (part.reshape(len(draws), -1) for part in (draws[:, :half], draws[:, half:]))
+    doubts = list(found.problems)
+    if found.r_hat > LARGEST_R_HAT:
+        doubts.append(f"its R-hat is {found.r_hat:.3f}")
+    if isinstance(method, Nuts) and (weight := unvisited_weight(found.z, bench)) > 0.0:
+        doubts.append(f"a mode of weight {weight:.2g} was not visited by every chain")
+    judge = Judge(
+        labels, draws, name, mean_error, sd_error, distances(one, other), found, tuple(doubts)
+    )
+    if not judge.error <= settings.error:
+        doubts.append(f"its own Monte Carlo error is {judge.error:.2g} posterior sd")
+    return judge._replace(doubts=tuple(doubts))

@@ -1,0 +1,54 @@
+"""One capture, ready to be fitted: what every method finds on its bench."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from polar_bayes.inference.ground import AbstractGround
+from polar_bayes.inference.prepared import Prepared
+from polar_bayes.inference.program import Program
+from polar_bayes.inference.request import Request
+from polar_bayes.inference.search import Progress
+from polar_bayes.observation.data import Observations
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bench:
+    """A capture with the programs that fit it.
+
+    Args:
+        request: What was asked.
+        prepared: What is compiled for captures of this layout.
+        data: The capture.
+        key: Random key of the whole fit.
+        progress: Called with the name of a stage and the fraction of it that is done.
+    """
+
+    request: Request
+    prepared: Prepared
+    data: Observations
+    key: Array
+    progress: Progress
+
+    @property
+    def program(self) -> Program:
+        """The model as functions of one unconstrained vector."""
+        return self.prepared.program
+
+    @property
+    def key_of_draws(self) -> Array:
+        """Random key of what comes after the search for modes."""
+        return jax.random.split(self.key)[1]
+
+    @functools.cached_property
+    def ground(self) -> AbstractGround:
+        """The peaks of the posterior, searched for once however many methods ask."""
+        return self.prepared.grounds.find(self.data, jax.random.split(self.key)[0], self.progress)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Floating type of the fit."""
+        return np.dtype(self.data.brightness.dtype)

@@ -1,0 +1,58 @@
+"""The contract of methods beside `Point`, `Laplace` and `Nuts`: a capture in, draws out."""
+
+import abc
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Answer:
+    """What a method says of one posterior.
+
+    Args:
+        kind: How the draws were made: "nuts", "laplace", "point", "importance" and so on.
+        z: Unconstrained draws of the model, all worth the same, (chain, draw, size).
+        stats: Statistics of the draws, each (chain, draw).
+        problems: What makes them unusable.
+        weighted: The draws and weights that `z` was chosen from, (draw, size) and (draw,); None
+            where there are none.
+        r_hat: Largest of all coordinates; NaN where there are no chains.
+        k_hat: Pareto k-hat of the importance weights; NaN where there are none.
+        effective_draws: How many independent draws these are worth, the least of all coordinates.
+        gradients: Evaluations of the log density with its gradient; NaN where nobody counts.
+        densities: Evaluations of the log density alone, likewise.
+        said: What else belongs into the provenance; JSON must hold it.
+    """
+
+    kind: str
+    z: np.ndarray
+    stats: dict[str, np.ndarray]
+    problems: list[str] = dataclasses.field(default_factory=list)
+    weighted: tuple[np.ndarray, np.ndarray] | None = None
+    r_hat: float = np.nan
+    k_hat: float = np.nan
+    effective_draws: float = np.nan
+    gradients: float = np.nan
+    densities: float = np.nan
+    said: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class AbstractMethod(abc.ABC):
+    """How draws of a posterior are made; a small frozen dataclass of settings."""
+
+    @abc.abstractmethod
+    def draw(self, bench: Any) -> Answer:
+        """Draw from the posterior of one capture.
+
+        Args:
+            bench: The capture, ready to be fitted; a `polar_bayes.inference.bench.Bench`.
+
+        Returns:
+            The draws, and how far they can be trusted.
+
+        Raises:
+            FitError: The method does not suit the capture, or found nothing to draw from.
+        """

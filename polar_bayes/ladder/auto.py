@@ -1,0 +1,236 @@
+"""The cheapest method that is good enough, found by trying: from cheap to exact."""
+
+import dataclasses
+import time
+from typing import Any, NamedTuple, override
+
+import numpy as np
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.bench import Bench
+from polar_bayes.inference.method import AbstractMethod, Answer
+from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.request import Method
+from polar_bayes.ladder.builtin import answer
+from polar_bayes.ladder.expected import count_scalars, draws_needed, expected_error
+from polar_bayes.ladder.importance import Importance
+from polar_bayes.ladder.scaling import with_draws
+from polar_bayes.ladder.tempered import Tempered
+from polar_bayes.ladder.visiting import unvisited_weight
+from polar_bayes.pixels.importance import LARGEST_TRUSTED
+from polar_bayes.pixels.tempering import PixelTempering
+
+LARGEST_R_HAT = 1.01
+
+RESERVE = 8
+"""Times as many weighted draws as normal posteriors need: long tails need more."""
+
+MOST_DRAWS = 2**17
+"""Weighted draws beyond which chains are the better way."""
+
+MARGIN, MOST_TIMES = 1.5, 16.0
+"""Draws of a second try: more than the first error asks for, but not above so many times."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Auto(AbstractMethod):
+    """The cheapest method whose own diagnostics say that it is good enough.
+
+    Methods are tried from cheap to exact: importance, tempered draws (of one material in one
+    color), NUTS. One is taken when Pareto k-hat is at most 0.7, R-hat at most 1.01, nothing
+    diverged, no mode was left out, and the Monte Carlo error of every mean and standard deviation
+    is within the tolerance (but in 1% of the fits). Where only that is missing, the same method
+    is tried once more with more draws.
+
+    Args:
+        tolerance: Largest error of a posterior mean or standard deviation, in posterior standard
+            deviations, above 0 and at most 1.
+        seconds: No method begins later, and chains stop then, > 0. The first one always ends.
+
+    Raises:
+        FitError: A setting is out of range.
+    """
+
+    tolerance: float = 0.1
+    seconds: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.tolerance <= 1.0:
+            raise FitError(
+                f"tolerance is {self.tolerance}",
+                where="Auto",
+                mend="give posterior standard deviations above 0, at most 1, such as 0.1",
+            )
+        if not self.seconds > 0.0:
+            raise FitError(
+                f"seconds is {self.seconds}", where="Auto", mend="give a time above 0, such as 60"
+            )
+
+    def rungs(self, bench: Bench) -> dict[str, Method]:
+        """What is tried for a capture, cheapest first, each with as many draws as it takes.
+
+        Args:
+            bench: The capture.
+
+        Returns:
+            Settings by name.
+
+        Raises:
+            Nothing.
+        """
+        needed = draws_needed(self.tolerance, count_scalars(bench.program, bench.data))
+        chains = Nuts(effective_draws=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
+        if any(name != "view" and length > 1 for name, length in bench.data.dims):
+            return {"nuts": chains}
+        crowd = PixelTempering().crowd
+        weighted = min(RESERVE * needed, MOST_DRAWS)
+        drawn = crowd * -(-weighted // crowd)
+        tempering = PixelTempering(draws=drawn, effective_draws=min(needed, 0.5 * drawn))
+        return {
+            "importance": Importance(draws=max(2048, 2 * weighted)),
+            "tempered": Tempered(tempering),
+            "nuts": chains,
+        }
+
+    @override
+    def draw(self, bench: Bench) -> Answer:
+        deadline = time.perf_counter() + self.seconds
+        steps: list[Step] = []
+        best: tuple[Step, Answer] | None = None
+        waiting = list(self.rungs(bench).items())
+        again = False
+        while waiting:
+            name, method = waiting.pop(0)
+            if steps and time.perf_counter() >= deadline:
+                steps.append(Step(name, 0.0, why="the time was up"))
+                continue
+            step, found = self._try(name, method, _within(bench, deadline if best else np.inf))
+            steps.append(step)
+            # Of two in doubt the dearer one is nearer to exact.
+            if found is not None and (best is None or step.error <= best[0].error):
+                best = step, found
+            if step.taken:
+                break
+            again = not again and np.isfinite(step.error)
+            if again:
+                times = min(MARGIN * (step.error / self.tolerance) ** 2, MOST_TIMES)
+                more = with_draws(method, times)
+                waiting[:0] = [] if more is None else [(name, more)]
+        if best is None:
+            raise FitError(
+                "; ".join(f"{step.name}: {step.why}" for step in steps),
+                where="method='auto'",
+                mend="give more seconds, or check the capture against the prior predictive",
+            )
+        return self._told(*best, steps)
+
+    def _try(self, name: str, method: Method, bench: Bench) -> tuple["Step", Answer | None]:
+        """One rung, judged by its own diagnostics."""
+        begin = time.perf_counter()
+        try:
+            found = answer(method, bench)
+        except (FitError, _TimeIsUpError) as failure:
+            seconds = time.perf_counter() - begin
+            return Step(name, seconds, why=str(failure)), None
+        error = expected_error(found, bench.program, bench.data)
+        doubts = _doubts(found, bench)
+        biased = bool(doubts)
+        if not error <= self.tolerance:
+            doubts.append(f"its Monte Carlo error may be {error:.2g} posterior sd")
+        return Step(
+            name,
+            time.perf_counter() - begin,
+            why="; ".join(doubts),
+            error=np.inf if biased else error,  # a doubt weighs more than any noise
+            monte_carlo=error,
+            taken=not doubts,
+            r_hat=found.r_hat,
+            k_hat=found.k_hat,
+            effective_draws=found.effective_draws,
+        ), found
+
+    def _told(self, step: "Step", found: Answer, steps: list["Step"]) -> Answer:
+        """The answer with what was tried, and a problem where none was good enough."""
+        problems = list(found.problems)
+        if not step.taken:
+            problems.append(
+                f"no method met the tolerance of {self.tolerance:g} posterior sd within "
+                f"{self.seconds:g} s: {step.name} came nearest, and {step.why or 'was not judged'}"
+            )
+        said = {
+            "tolerance": self.tolerance,
+            "seconds": self.seconds,
+            "chosen": step.name,
+            "met": step.taken,
+            "expected_error": _plain(step.monte_carlo),
+            "steps": [_as_said(each) for each in steps],
+        }
+        return dataclasses.replace(found, problems=problems, said=found.said | {"auto": said})
+
+
+class Step(NamedTuple):
+    """One method that was tried.
+
+    Args:
+        name: The method.
+        seconds: That it took, compilation included.
+        why: Why it was not taken; empty where it was.
+        error: By which methods that were not taken are compared, posterior sds.
+        monte_carlo: Largest expected error of a mean or sd, posterior sds.
+        taken: Whether it was good enough.
+        r_hat: Largest of all coordinates.
+        k_hat: Of the weights.
+        effective_draws: Of the worst coordinate.
+    """
+
+    name: str
+    seconds: float
+    why: str = ""
+    error: float = np.inf
+    monte_carlo: float = np.inf
+    taken: bool = False
+    r_hat: float = np.nan
+    k_hat: float = np.nan
+    effective_draws: float = np.nan
+
+
+class _TimeIsUpError(Exception):
+    """Chains were stopped."""
+
+
+def _within(bench: Bench, deadline: float) -> Bench:
+    """The same bench, whose methods are stopped after the deadline where they report progress."""
+    if not np.isfinite(deadline):
+        return bench
+
+    def progress(stage: str, fraction: float) -> None:
+        if time.perf_counter() > deadline:
+            raise _TimeIsUpError("the time was up before it was done")
+        bench.progress(stage, fraction)
+
+    limited = dataclasses.replace(bench, progress=progress)
+    if "ground" in bench.__dict__:  # the peaks are found already
+        limited.__dict__["ground"] = bench.ground
+    return limited
+
+
+def _doubts(found: Answer, bench: Bench) -> list[str]:
+    """Why an answer may be biased."""
+    doubts = list(found.problems)
+    if found.k_hat > LARGEST_TRUSTED and not doubts:
+        doubts.append(f"its Pareto k-hat is {found.k_hat:.2f}")
+    if found.r_hat > LARGEST_R_HAT:
+        doubts.append(f"its R-hat is {found.r_hat:.3f}")
+    if found.kind == "nuts" and (share := unvisited_weight(found.z, bench)) > 0.0:
+        doubts.append(f"a mode of weight {share:.2g} was not visited by every chain")
+    return doubts
+
+
+def _as_said(step: Step) -> dict[str, Any]:
+    numbers = ("seconds", "monte_carlo", "r_hat", "k_hat", "effective_draws")
+    said = {"name": step.name, "taken": step.taken, "why": step.why}
+    return said | {name: _plain(getattr(step, name)) for name in numbers}
+
+
+def _plain(value: float) -> float | None:
+    return round(float(value), 4) if np.isfinite(value) else None

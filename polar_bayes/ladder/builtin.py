@@ -1,0 +1,116 @@
+"""Every method answers in one shape: those of `polar_bayes.inference` do so here."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference import point
+from polar_bayes.inference.bench import Bench
+from polar_bayes.inference.ground import STARTS
+from polar_bayes.inference.laplace import Laplace
+from polar_bayes.inference.method import AbstractMethod, Answer
+from polar_bayes.inference.mixing import measure
+from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.request import Method
+from polar_bayes.inference.search import from_prior
+from polar_bayes.ladder.weighing import CHAINS, generator
+from polar_bayes.pixels.importance import smooth
+
+POINT_DRAWS = 1000
+"""Of the normal distribution that the standard errors of a point fit stand for."""
+
+
+@functools.singledispatch
+def answer(method: Method, bench: Bench) -> Answer:
+    """What a method says of a capture.
+
+    Args:
+        method: Settings of any method.
+        bench: The capture.
+
+    Returns:
+        Draws, and how far they can be trusted.
+
+    Raises:
+        FitError: It is no method, does not suit the capture, or found nothing to draw from.
+    """
+    raise FitError(
+        f"a {type(method).__name__} is not a method",
+        where="method",
+        mend="give settings such as polar_bayes.Nuts()",
+    )
+
+
+@answer.register
+def _(method: AbstractMethod, bench: Bench) -> Answer:
+    return method.draw(bench)
+
+
+@answer.register
+def _(method: Nuts, bench: Bench) -> Answer:
+    drawn = bench.ground.draw(bench.key_of_draws, method, bench.progress)
+    bulk, tail, r_hat = measure(np.moveaxis(drawn.z, -1, 0))
+    steps = drawn.stats["n_steps"]
+    # Warm-up leaves no record: its trajectories are counted as long as the kept ones.
+    warmup = (300 if method.warmup is None else method.warmup) * method.chains * np.mean(steps)
+    climbing = float(bench.ground.said.get("gradients", np.nan))
+    return Answer(
+        kind="nuts",
+        z=drawn.z,
+        stats=drawn.stats,
+        problems=[*drawn.problems, *_divergence(drawn.stats)],
+        r_hat=float(np.max(r_hat)),
+        effective_draws=float(min(np.min(bulk), np.min(tail))),
+        gradients=climbing + float(np.sum(steps) + warmup),
+        densities=0.0,
+        said={"modes": bench.ground.said, "goals_reached": drawn.goals_reached},
+    )
+
+
+@answer.register
+def _(method: Laplace, bench: Bench) -> Answer:
+    drawn = bench.ground.draw(bench.key_of_draws, method, bench.progress)
+    count = drawn.z[..., 0].size
+    k_hat = smooth(drawn.stats["log_weight"].reshape(1, -1)).pareto_k[0]
+    return Answer(
+        kind="laplace",
+        z=drawn.z,
+        stats=drawn.stats,
+        problems=drawn.problems,
+        k_hat=float(k_hat),
+        effective_draws=float(count),
+        gradients=float(bench.ground.said.get("gradients", np.nan)) + count,
+        densities=0.0,
+        said={"modes": bench.ground.said},
+    )
+
+
+@answer.register
+def _(method: point.Point, bench: Bench) -> Answer:
+    """Draws of the normal distribution that the standard errors stand for.
+
+    What the readings do not determine has no standard error, and is drawn without any width.
+    """
+    key_starts = jax.random.split(bench.key)[0]
+    starts = np.asarray(from_prior(bench.program, key_starts, STARTS, bench.data))
+    least_squares = bench.prepared.least_squares
+    found = point.to_numpy(least_squares(jnp.asarray(starts[: method.starts]), bench.data))
+    free = np.isinf(np.diagonal(found.covariance))
+    covariance = np.where(free[:, None] | free, 0.0, found.covariance)
+    random = generator(bench.key_of_draws)
+    drawn = random.multivariate_normal(found.z, covariance, (CHAINS, POINT_DRAWS // CHAINS))
+    return Answer(
+        kind="point",
+        z=drawn,
+        stats={},
+        problems=[] if found.converged else ["least squares did not meet its tolerance"],
+        effective_draws=float(POINT_DRAWS),
+    )
+
+
+def _divergence(stats: dict[str, np.ndarray]) -> list[str]:
+    count = int(np.sum(stats["diverging"]))
+    return [f"{count} of {stats['diverging'].size} draws diverged"] if count else []

@@ -1,0 +1,96 @@
+"""How far means and standard deviations may be off, as the draws themselves tell."""
+
+import jax
+import numpy as np
+import scipy.stats
+
+from polar_bayes.inference.draws import parameters_of
+from polar_bayes.inference.method import Answer
+from polar_bayes.inference.mixing import standard_errors
+from polar_bayes.inference.program import Program
+from polar_bayes.inference.tracing import TRACING
+from polar_bayes.observation.data import Observations
+
+FALSE_ALARMS = 0.01
+"""How often some mean or standard deviation of one fit may stray further than expected."""
+
+
+def expected_error(answer: Answer, program: Program, data: Observations) -> float:
+    r"""The largest error of a mean or a standard deviation that Monte Carlo noise can make.
+
+    In posterior standard deviations, over all parameters, exceeded in 1% of the fits: each of the
+    2P standard errors times the normal quantile of 0.5% / (2P) (Bonferroni). Bias is not seen here.
+
+    Args:
+        answer: Draws of chains, independent ones, or weighted ones and those chosen from them.
+        program: The model.
+        data: The capture.
+
+    Returns:
+        The error; infinite where a draw is not finite, or a parameter never moved.
+
+    Raises:
+        Nothing.
+    """
+    drawn = scalars_of(program, answer.z, data)
+    mean, sd = standard_errors(drawn)
+    if answer.weighted is not None:
+        z, weights = answer.weighted
+        whole = scalars_of(program, z[None], data)[:, 0]
+        weighted = _of_weighted(whole, weights)
+        # What is lost by choosing is at most what as many independent draws would lose.
+        mean, sd = np.hypot(weighted[0], mean), np.hypot(weighted[1], sd)
+    errors = np.concatenate([mean, sd])
+    if not np.isfinite(errors).all():
+        return float("inf")
+    return float(errors.max() * quantile(len(errors)))
+
+
+def quantile(count: int) -> float:
+    """Standard errors within which so many numbers stay together, but in 1% of the fits."""
+    return float(scipy.stats.norm.isf(0.5 * FALSE_ALARMS / count))
+
+
+def draws_needed(tolerance: float, count: int) -> int:
+    """Independent draws after which the expected error is below a tolerance, parameters normal.
+
+    Args:
+        tolerance: Posterior standard deviations.
+        count: Parameters.
+
+    Returns:
+        How many.
+
+    Raises:
+        Nothing.
+    """
+    return int(np.ceil((quantile(2 * count) / tolerance) ** 2))
+
+
+def scalars_of(program: Program, z: np.ndarray, data: Observations) -> np.ndarray:
+    """Every number that a model estimates, (scalar, chain, draw)."""
+    found = parameters_of(program, z.astype(data.brightness.dtype), data)
+    flat = [np.asarray(x, float).reshape(*np.shape(x)[:2], -1) for x in found.values()]
+    return np.moveaxis(np.concatenate(flat, axis=-1), -1, 0)
+
+
+def count_scalars(program: Program, data: Observations) -> int:
+    """How many numbers a model estimates."""
+    z = jax.ShapeDtypeStruct((program.size,), data.brightness.dtype)
+    with TRACING:
+        found = jax.eval_shape(program.parameters, z, data)
+    return sum(int(np.prod(x.shape)) for x in jax.tree.leaves(found))
+
+
+def _of_weighted(draws: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard errors of self-normalized weighted draws, in their standard deviations.
+
+    Source:
+        Owen (2013), Monte Carlo theory, methods and examples, section 9.2: the delta method.
+    """
+    apart = draws - (draws @ weights)[:, None]
+    variance = apart**2 @ weights
+    with np.errstate(all="ignore"):
+        mean = np.sqrt(apart**2 @ weights**2 / variance)
+        sd = np.sqrt((apart**2 - variance[:, None]) ** 2 @ weights**2) / (2.0 * variance)
+    return mean, sd

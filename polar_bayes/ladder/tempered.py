@@ -1,0 +1,146 @@
+"""Draws led from the prior to the posterior, by what calibrations are made with."""
+
+import collections
+import dataclasses
+import functools
+from typing import Any, override
+
+import jax
+import numpy as np
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.bench import Bench
+from polar_bayes.inference.kept import Kept
+from polar_bayes.inference.method import AbstractMethod, Answer
+from polar_bayes.inference.prepared import Prepared
+from polar_bayes.inference.program import Program, compile_program
+from polar_bayes.inference.tracing import TRACING
+from polar_bayes.ladder.weighing import choose, generator
+from polar_bayes.observation.data import Observations
+from polar_bayes.pixels.engine import Engine
+from polar_bayes.pixels.fitting import tempered_draws
+from polar_bayes.pixels.importance import LARGEST_TRUSTED
+from polar_bayes.pixels.outcome import Row, Status, Weighted
+from polar_bayes.pixels.stack import Stack
+from polar_bayes.pixels.tempering import PixelTempering
+
+MOST_KEPT = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Tempered(AbstractMethod):
+    """Tempered draws of one material in one color, corrected by weights.
+
+    A crowd that begins as draws from the prior sees all modes before any of them is narrow, and
+    nothing is differentiated.
+
+    Args:
+        settings: Of the crowd, and of the mixtures that are fitted to it.
+
+    Raises:
+        FitError: A setting is outside its range.
+    """
+
+    settings: PixelTempering = dataclasses.field(default_factory=lambda: PixelTempering(draws=4096))
+
+    @override
+    def draw(self, bench: Bench) -> Answer:
+        if any(name != "view" and length > 1 for name, length in bench.data.dims):
+            raise FitError(
+                "draws are tempered of one material in one color only",
+                where="Tempered",
+                mend="use method='nuts'",
+            )
+        row = Row(1, lambda at, parameters, weights: None)
+        keys = np.asarray(jax.random.key_data(bench.key_of_draws))[None]
+        engine = _engine(bench)
+        found: Weighted | None = None
+        pixels = _alone(bench.data)
+        at = np.zeros(1, int)
+        for _, answer in tempered_draws(engine, self.settings, pixels, keys, at, row):
+            found = answer
+        if found is None:
+            raise FitError(
+                "the crowd did not arrive at the posterior", where="Tempered", mend="use 'nuts'"
+            )
+        return self._answer(bench, found, row, engine)
+
+    def _answer(self, bench: Bench, found: Weighted, row: Row, engine: "_Counting") -> Answer:
+        z, weights = found.z[0].astype(float), found.weights[0].astype(float)
+        weights = weights / weights.sum()
+        worth, k_hat = float(found.effective[0]), float(found.pareto_k[0])
+        index = choose(weights, worth, generator(bench.key_of_draws))
+        problems = []
+        if row.status[0] != Status.GOOD:
+            problems.append(
+                f"the weighted draws are worth {worth:.0f} independent ones (at least "
+                f"{self.settings.effective_draws:.0f}), with a Pareto k-hat of {k_hat:.2f} (at "
+                f"most {LARGEST_TRUSTED}): use method='nuts'"
+            )
+        walks, length = self.settings.walks, self.settings.length
+        steps = int(row.outcome.steps[0]) * walks * (length - 1)
+        densities = (
+            engine.counts["crowds"] * self.settings.crowd + steps + engine.counts["rounds"] * len(z)
+        )
+        return Answer(
+            kind="tempered",
+            z=z[index],
+            stats={"log_weight": np.log(np.maximum(weights, 1e-300))[index]},
+            problems=problems,
+            weighted=(z, weights),
+            k_hat=k_hat,
+            effective_draws=worth,
+            gradients=0.0,
+            densities=float(densities),
+            said={"stages": int(row.outcome.steps[0]), "rounds": engine.counts["rounds"]},
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Counting(Engine):
+    """The programs of a layout, and how often one fit runs them."""
+
+    counts: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+
+    @override
+    def temper(self, *arguments: Any) -> Any:
+        self.counts["crowds"] += 1
+        return super().temper(*arguments)
+
+    @override
+    def propose(self, *arguments: Any) -> Any:
+        self.counts["rounds"] += 1
+        return super().propose(*arguments)
+
+
+_ENGINES: Kept[tuple[Prepared, _Counting]] = Kept(MOST_KEPT)
+"""With what they were made for, so that its identity is not given to another."""
+
+
+def _engine(bench: Bench) -> _Counting:
+    """The programs of the bench's layout, kept from fit to fit; their counts begin at zero."""
+    _, engine = _ENGINES.of(id(bench.prepared), functools.partial(_make, bench))
+    engine.counts.clear()
+    return engine
+
+
+def _make(bench: Bench) -> tuple[Prepared, _Counting]:
+    candidates = np.zeros((1, bench.program.size))  # nothing climbs here
+    rough = _rough(bench)
+    with TRACING:
+        return bench.prepared, _Counting(bench.program, rough, candidates, bench.request.precision)
+
+
+def _rough(bench: Bench) -> Program:
+    """The same model in single precision."""
+    if bench.request.precision == "single":
+        return bench.program
+    single = dataclasses.replace(bench.request, precision="single")
+    with jax.enable_x64(False), TRACING:
+        return compile_program(single.bind(single.scene), bench.data.in_single_precision())
+
+
+def _alone(data: Observations) -> Stack:
+    """One capture as a row of one pixel, which shares nothing with others."""
+    own = jax.tree.map(lambda x: np.asarray(x)[None], data)
+    return Stack(own, jax.tree.map(lambda _: None, data), np.array([int(np.sum(data.valid))]))

@@ -1,0 +1,202 @@
+"""The figure of an accuracy study: error against time.
+
+In a notebook it is the last line of a cell; `figure.savefig("name.pdf")` writes it.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
+from matplotlib.transforms import Bbox
+
+from polar_bayes.budget.accuracy import AS_GIVEN
+from polar_bayes.budget.advice import RESOLVED, accuracy_of, accuracy_table
+from polar_bayes.errors import FitError
+from polar_bayes.reporting.style import (
+    BLUE,
+    GRAY,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    lighten,
+    plain,
+    quiet_ticks,
+    styled,
+)
+
+WINE, INDIGO = "#882255", "#332288"  # of Paul Tol's muted scheme, beside those of the house
+COLORS = (VERMILLION, ORANGE, SKY, GREEN, PURPLE, WINE, GRAY, BLUE, INDIGO)
+MARKERS = ("o", "^", "v", "s", "D", "P", "X", "*")
+LETTER, LINE = 5.2, 10.0
+"""About the size of a letter of a label, unit point: labels are placed before they are drawn."""
+
+AROUND = (
+    (6, 0),
+    (6, 8),
+    (6, -8),
+    (-6, 0),
+    (-6, 8),
+    (-6, -8),
+    (6, 18),
+    (6, -18),
+    (-6, 18),
+    (-6, -18),
+)
+"""Where a label may stand beside its point, unit point; the first free place is taken."""
+
+TIME_LABELS = {
+    "seconds_first": "time of a first fit, compilation included [s]",
+    "seconds_again": "time of the next fit, nothing to compile [s]",
+}
+
+
+@styled
+def plot_accuracy(
+    result: xr.DataTree | xr.Dataset, *, times: Sequence[str] | None = None
+) -> Figure:
+    """Error against time of every rung and dial, with the Pareto front.
+
+    Args:
+        result: What `polar_bayes.accuracy` returns, or one read back from a file.
+        times: Columns of `polar_bayes.accuracy_table`, a panel each: "seconds_first",
+            "seconds_again"; by default both, where they were measured.
+
+    Returns:
+        The figure. A color stands for a rung, a marker for what was turned; rungs as given are
+        filled and named. The line joins points than which none is both faster and better. In the
+        gray area the reference itself does not tell errors from nothing.
+
+    Raises:
+        FitError: It holds no accuracy study, or no such column.
+    """
+    found = accuracy_of(result)
+    table = accuracy_table(found)
+    shown = list(times) if times is not None else _measured(table)
+    strange = [name for name in shown if name not in TIME_LABELS]
+    if strange or not shown:
+        raise FitError(
+            f"there is no time {', '.join(strange)}" if strange else "no time was measured",
+            where="plot_accuracy",
+            mend=f"give some of {', '.join(TIME_LABELS)}",
+        )
+    figure = Figure(figsize=(5.2 * len(shown), 4.4), layout="constrained")
+    for at, name in enumerate(shown):
+        axes = figure.add_subplot(1, len(shown), at + 1)
+        front_panel(axes, found, name)
+        if at == 0:
+            axes.set_ylabel("largest error of a mean or sd [posterior sd]")
+    dials = list(dict.fromkeys(table["dial"]))
+    if len(dials) > 1:
+        handles = [
+            Line2D(
+                [], [], ls="", marker=marker, mfc=GRAY if at == 0 else "none", mec=GRAY, label=dial
+            )
+            for at, (dial, marker) in enumerate(
+                zip(dials, _repeat(MARKERS, len(dials)), strict=True)
+            )
+        ]
+        figure.legend(
+            handles=handles, loc="outside lower center", ncols=4 * len(shown), frameon=False
+        )
+    return figure
+
+
+def _measured(table: pd.DataFrame) -> list[str]:
+    return [name for name in TIME_LABELS if table[name].notna().any()]
+
+
+def front_panel(axes: Axes, found: xr.Dataset, time: str) -> None:
+    """One panel of `plot_accuracy`.
+
+    Args:
+        axes: Where to draw.
+        found: An accuracy study.
+        time: "seconds_first" or "seconds_again".
+    """
+    table, noise = accuracy_table(found), float(found.attrs["reference_error"])
+    known = table[table["error"].notna() & np.isfinite(table["error"]) & table[time].notna()]
+    rungs, dials = (list(dict.fromkeys(table[name])) for name in ("rung", "dial"))
+    colors = dict(zip(rungs, _repeat(COLORS, len(rungs)), strict=True))
+    markers = dict(zip(dials, _repeat(MARKERS, len(dials)), strict=True))
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.axhspan(1e-9, RESOLVED * noise, color=lighten(GRAY, 0.85), lw=0, zorder=0)
+    front = _front(known, time)
+    axes.plot(front[time], front["error"], color=GRAY, lw=1.0, drawstyle="steps-post", zorder=1)
+    for _, row in known.iterrows():
+        given = row["dial"] == AS_GIVEN
+        axes.plot(
+            row[time],
+            row["error"],
+            ls="",
+            marker=markers[row["dial"]],
+            ms=6.5 if given else 4.5,
+            mfc=colors[row["rung"]] if given else "none",
+            mec=colors[row["rung"]],
+            zorder=3 if given else 2,
+        )
+    _limits(axes, known, time, noise)
+    axes.set_xlabel(TIME_LABELS[time])
+    for axis in (axes.xaxis, axes.yaxis):  # the style reads no formulas
+        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.set_minor_formatter(NullFormatter())
+    _name_points(axes, known, time, colors)
+    quiet_ticks(axes)
+
+
+def _front(known: pd.DataFrame, time: str) -> pd.DataFrame:
+    """Rows that are better than all faster ones."""
+    ordered = known.sort_values([time, "error"], kind="stable")
+    before = ordered["error"].cummin().shift(fill_value=np.inf)
+    return ordered[ordered["error"] < before]
+
+
+def _limits(axes: Axes, known: pd.DataFrame, time: str, noise: float) -> None:
+    """Room around all points, and to the right for a name."""
+    if known.empty:
+        return
+    seconds, error = known[time], known["error"].clip(lower=1e-6)
+    axes.set_xlim(float(seconds.min()) / 1.6, float(seconds.max()) * 3.0)
+    axes.set_ylim(min(float(error.min()), noise) / 1.6, float(error.max()) * 1.8)
+
+
+def _name_points(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, str]) -> None:
+    """The name of each rung beside its point, where no other name or point stands."""
+    figure = axes.get_figure()
+    scale = 72.0 / (figure.dpi if figure is not None else 100.0)
+    places = axes.transData.transform(known[[time, "error"]].to_numpy(float)) * scale
+    taken = [Bbox.from_bounds(x - 3, y - 3, 6, 6) for x, y in places]
+    given = known[known["dial"] == AS_GIVEN]
+    own = places[(known["dial"] == AS_GIVEN).to_numpy()]
+    for (x, y), name in zip(own, given["rung"], strict=True):
+        width = LETTER * len(name)
+        for right, up in AROUND:
+            box = Bbox.from_bounds(
+                x + (right if right > 0 else right - width), y + up - 5, width, LINE
+            )
+            if not any(box.overlaps(other) for other in taken):
+                break
+        taken.append(box)
+        axes.annotate(
+            plain(name),
+            tuple(given.loc[given["rung"] == name, [time, "error"]].to_numpy(float)[0]),
+            xytext=(right, up),
+            textcoords="offset points",
+            ha="left" if right > 0 else "right",
+            va="center",
+            fontsize=8,
+            color=colors[name],
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
+        )
+
+
+def _repeat(values: Sequence[str], count: int) -> list[str]:
+    return [values[at % len(values)] for at in range(count)]

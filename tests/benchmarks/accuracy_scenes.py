@@ -1,0 +1,111 @@
+"""Six captures from easy to hard: what methods are measured on, and methods are not tuned on.
+
+The first two are smooth plates, three parameters; the others have a rough surface over a body,
+seven. The last two are hard: the degree of polarization alone says next to nothing of absorption,
+and near Brewster's angle an index below explains it as well as one above.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, override
+
+import numpy as np
+import xarray as xr
+from one_material import SCENE
+
+import polar_bayes as pb
+
+PLATE = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
+SIGNED = {"q": pb.StokesLink(stated_errors=True)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Mirror(pb.Protocol):
+    """Every view in the mirror direction of the light, between two zeniths.
+
+    Args:
+        smallest: Smallest view zenith, unit degree.
+    """
+
+    smallest: float = 20.0
+
+    @override
+    def angles(self) -> dict[str, np.ndarray]:
+        zenith = np.linspace(self.smallest, self.largest_view_zenith, self.views)
+        turned = {"view_zenith": zenith, "light_zenith": zenith}
+        return turned | {
+            "view_azimuth": np.full(self.views, 180.0),
+            "light_azimuth": np.zeros(self.views),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One capture.
+
+    Args:
+        preset: Material.
+        scene: Optics that simulate and that are fitted.
+        protocol: Where to look from.
+        links: How readings scatter; None for those of the paper.
+        keep: Variables that were read; all where empty.
+        truth: Values that replace the preset's.
+    """
+
+    preset: str
+    scene: pb.Scene
+    protocol: pb.Protocol
+    links: Mapping[str, Any] | None = None
+    keep: tuple[str, ...] = ()
+    truth: Mapping[str, float] = MappingProxyType({})
+
+    def capture(self, seed: int) -> xr.Dataset:
+        """Readings of known truth."""
+        drawn = pb.simulate(
+            self.preset,
+            scene=self.scene,
+            links=self.links,
+            protocol=self.protocol,
+            parameters=dict(self.truth),
+            seed=seed,
+        )
+        every = ("dop", "q", "u", "intensity")
+        return drawn.drop_vars(
+            [n for n in every if n in drawn and self.keep and n not in self.keep]
+        )
+
+
+ONE_COLOR: dict[str, Any] = {"wavelengths": ()}
+
+CASES: Mapping[str, Case] = MappingProxyType(
+    {
+        "smooth glass, 40 views": Case(
+            "glass", PLATE, Mirror(views=40, largest_view_zenith=78.0, **ONE_COLOR), SIGNED
+        ),
+        "smooth glass, 6 views": Case(
+            "glass", PLATE, Mirror(views=6, largest_view_zenith=78.0, **ONE_COLOR), SIGNED
+        ),
+        "leaf, 40 views": Case("leaf", SCENE, pb.Protocol(views=40, **ONE_COLOR)),
+        "glossy, fraction near 0": Case(
+            "plastic",
+            SCENE,
+            pb.Protocol(views=24, **ONE_COLOR),
+            truth=MappingProxyType({"subsurface_fraction": 0.01}),
+        ),
+        "few grazing views, DoP alone": Case(
+            "fruit",
+            SCENE,
+            Mirror(views=8, smallest=70.0, largest_view_zenith=86.0, **ONE_COLOR),
+            keep=("dop",),
+        ),
+        "two views at Brewster's angle": Case(
+            "glass",
+            PLATE,
+            Mirror(views=2, smallest=55.0, largest_view_zenith=57.0, **ONE_COLOR),
+            SIGNED,
+            truth=MappingProxyType({"subsurface_fraction": 0.05, "refractive_index": 1.40}),
+        ),
+    }
+)
+"""From easy to hard, by name."""

@@ -1,0 +1,85 @@
+"""The study and the automatic choice from the command line."""
+
+import json
+from pathlib import Path
+
+import pytest
+from synthetic_accuracy import make_accuracy
+
+import polar_bayes as pb
+from polar_bayes.cli import main
+
+
+@pytest.fixture
+def studied(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    """Stands in for the study, and holds what it was asked."""
+    asked: dict[str, object] = {}
+
+    def accuracy(capture, **settings):
+        asked.update(settings)
+        return make_accuracy()
+
+    monkeypatch.setattr(pb, "accuracy", accuracy)
+    return asked
+
+
+def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys, studied):
+    out = tmp_path / "accuracy.nc"
+    assert main(["accuracy", str(plate), "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert told.splitlines()[0].split()[:2] == ["error", "worst"]
+    assert told.splitlines()[-1] == pb.accuracy_advice(make_accuracy())
+    assert set(studied["rungs"]) == set(pb.LADDER)
+    assert "dials" not in studied
+    assert pb.accuracy_table(pb.load_accuracy(out)).equals(pb.accuracy_table(make_accuracy()))
+    report = tmp_path / "report"
+    assert main(["report", str(out), "--out", str(report)]) == 0
+    assert "Error against time" in (report / "index.html").read_text()
+
+
+def test_rungs_and_dials_are_chosen_and_json_is_json(plate, tmp_path, capsys, studied):
+    words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--json", "--no-dials"]
+    assert main([*words, "--rung", "laplace", "--rung", "nuts", "--tolerance", "0.001"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert set(said["rows"]) == set(pb.accuracy_table(make_accuracy()).index)
+    assert said["advice"].startswith("No method is within 0.001 sd")
+    assert list(studied["rungs"]) == ["laplace", "nuts"]
+    assert studied["dials"] == ()
+
+
+def test_a_rung_that_is_not_there_is_refused(plate, tmp_path, capsys):
+    words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--rung", "magic"]
+    assert main(words) == 1
+    assert "no rung magic: give point, laplace" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--tolerance", "0.1"], "--tolerance needs --choose-effects or --method auto"),
+        (["--seconds", "5"], "--seconds needs --method auto"),
+        (["--method", "auto", "--tolerance", "7"], "tolerance is 7.0"),
+    ],
+)
+def test_wishes_that_do_not_fit_the_method_are_refused(plate, tmp_path, capsys, words, said):
+    assert main(["fit", str(plate), "--out", str(tmp_path / "fit.nc"), *words]) == 1
+    assert said in capsys.readouterr().err
+
+
+def test_the_automatic_choice_says_what_it_did(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    asked: dict[str, object] = {}
+    fit = pb.fit
+
+    def quick(capture, **settings):
+        asked.update(settings)
+        del settings["tolerance"], settings["seconds"]
+        return fit(capture, **settings | {"method": "point"})
+
+    monkeypatch.setattr(pb, "fit", quick)
+    monkeypatch.setattr(pb, "auto_sentences", lambda result: ["point (0.1 s) was taken."])
+    words = ["fit", str(plate), "--out", str(tmp_path / "fit.nc"), "--method", "auto"]
+    assert main([*words, "--tolerance", "0.2", "--seconds", "30"]) in (0, 2)
+    assert "point (0.1 s) was taken." in capsys.readouterr().err
+    assert (asked["method"], asked["tolerance"], asked["seconds"]) == ("auto", 0.2, 30.0)

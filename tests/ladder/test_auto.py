@@ -1,0 +1,166 @@
+"""The automatic choice: what it takes, why it climbs, and what it says of it."""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from typing import override
+
+import jax
+import numpy as np
+import pytest
+from toy_models import capture, funnel, line, of_line
+
+import polar_bayes as pb
+from polar_bayes.inference import fit as fitting
+from polar_bayes.inference.bench import Bench
+from polar_bayes.inference.method import AbstractMethod, Answer
+
+LINKS = {"q": pb.StokesLink()}
+
+
+@pytest.fixture(autouse=True)
+def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(fitting, "PRIOR_DRAWS", 20)
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@dataclasses.dataclass(frozen=True)
+class Made(AbstractMethod):
+    """Independent draws of a normal posterior, with diagnostics as one likes."""
+
+    draws: int = 4000
+    k_hat: float = 0.1
+    r_hat: float = np.nan
+    problem: str = ""
+    fails: str = ""
+
+    @override
+    def draw(self, bench: Bench) -> Answer:
+        if self.fails:
+            raise pb.FitError(self.fails, where="Made", mend="nothing")
+        z = np.random.default_rng(0).normal(size=(4, self.draws // 4, bench.program.size))
+        return Answer(
+            "importance",
+            z,
+            {},
+            [self.problem] if self.problem else [],
+            k_hat=self.k_hat,
+            r_hat=self.r_hat,
+            effective_draws=float(self.draws),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Given(pb.Auto):
+    """An automatic choice among given rungs."""
+
+    given: tuple[tuple[str, AbstractMethod], ...] = ()
+
+    @override
+    def rungs(self, bench: Bench):
+        return dict(self.given)
+
+
+def fitted(*rungs, **settings):
+    given = tuple((f"rung {number}", rung) for number, rung in enumerate(rungs))
+    result = pb.fit(capture(), model=line, links=LINKS, method=Given(given=given, **settings))
+    return result, json.loads(result.attrs["polar_bayes"])
+
+
+def test_the_first_rung_that_is_good_enough_is_taken():
+    result, said = fitted(Made(), Made(fails="must not be tried"))
+    assert said["auto"]["chosen"] == "rung 0"
+    assert said["auto"]["met"]
+    assert said["method"] == "importance"
+    assert pb.verdict(result).converged
+    (sentence,) = pb.auto_sentences(result)
+    assert "was taken: its means and standard deviations are expected within" in sentence
+
+
+@pytest.mark.parametrize(
+    ("rung", "why"),
+    [
+        (Made(k_hat=0.9), "its Pareto k-hat is 0.90"),
+        (Made(r_hat=1.2), "its R-hat is 1.200"),
+        (Made(problem="it broke"), "it broke"),
+        (Made(fails="no peak"), "no peak"),
+    ],
+)
+def test_a_rung_that_fails_its_own_diagnostics_is_climbed_over(rung, why):
+    result, said = fitted(rung, Made())
+    assert said["auto"]["chosen"] == "rung 1"
+    assert why in said["auto"]["steps"][0]["why"]
+    assert why in pb.auto_sentences(result)[0]
+    assert pb.verdict(result).converged
+
+
+def test_too_few_draws_are_mended_by_more_of_the_same():
+    _, said = fitted(Made(draws=200), Made(fails="must not be tried"))
+    steps = said["auto"]["steps"]
+    assert [step["name"] for step in steps] == ["rung 0", "rung 0"]
+    assert "Monte Carlo error" in steps[0]["why"]
+    assert steps[1]["effective_draws"] > 4 * steps[0]["effective_draws"]
+    assert steps[1]["taken"]
+
+
+def test_where_nothing_is_good_enough_the_nearest_is_returned_and_flagged():
+    result, said = fitted(Made(draws=400, k_hat=0.9), Made(draws=60), tolerance=0.01)
+    assert not said["auto"]["met"]
+    assert said["auto"]["chosen"] == "rung 1"
+    judged = pb.verdict(result)
+    assert not judged.converged
+    assert any(
+        "no method met the tolerance of 0.01" in problem.lower() for problem in judged.problems
+    )
+    assert "Nothing was good enough" in pb.auto_sentences(result)[-1]
+
+
+def test_of_two_in_doubt_the_dearer_one_is_returned():
+    _, said = fitted(Made(k_hat=0.9), Made(k_hat=np.nan, r_hat=1.2))
+    assert (said["auto"]["chosen"], said["auto"]["met"]) == ("rung 1", False)
+
+
+def test_after_its_time_nothing_begins():
+    _, said = fitted(Made(k_hat=0.9), Made(), seconds=1e-9)
+    assert [step["why"] for step in said["auto"]["steps"]][1] == "the time was up"
+    assert not said["auto"]["met"]
+
+
+def test_where_every_rung_fails_the_fit_is_refused():
+    with pytest.raises(pb.FitError, match=r"rung 0: .*no peak.*rung 1: .*no draws"):
+        fitted(Made(fails="no peak"), Made(fails="no draws"))
+
+
+def test_a_normal_posterior_is_met_by_the_cheapest():
+    result = pb.fit(capture(), model=line, links=LINKS, method="auto", tolerance=0.2, seconds=600)
+    said = json.loads(result.attrs["polar_bayes"])["auto"]
+    assert (said["chosen"], said["met"], said["tolerance"]) == ("importance", True, 0.2)
+    mean, covariance = of_line(capture()["q"].to_numpy())
+    table = pb.summary(result).loc[["level", "slope"]]
+    sd = np.sqrt(np.diagonal(covariance))
+    assert (np.abs(table["mean"] - mean) / sd < 0.2).all()
+    assert (np.abs(table["sd"] / sd - 1.0) < 0.2).all()
+
+
+def test_a_funnel_is_left_to_higher_rungs():
+    result = pb.fit(capture(), model=funnel, links=LINKS, method=pb.Auto(0.5, 600.0))
+    steps = json.loads(result.attrs["polar_bayes"])["auto"]["steps"]
+    assert not steps[0]["taken"]
+    assert len(steps) > 1
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"method": "nuts", "tolerance": 0.1}, "tolerance needs method='auto'"),
+        ({"method": pb.Auto(), "seconds": 3.0}, "seconds needs method='auto'"),
+        ({"method": "auto", "tolerance": 0.0}, "tolerance is 0.0"),
+        ({"method": "auto", "seconds": -1.0}, "seconds is -1.0"),
+        ({"method": "magic"}, "no such method"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(asked, said):
+    with pytest.raises(pb.FitError, match=said):
+        pb.fit(capture(), model=line, links=LINKS, **asked)

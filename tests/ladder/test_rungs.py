@@ -1,0 +1,161 @@
+"""Every rung on posteriors that are known."""
+
+import dataclasses
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+import pytest
+from toy_models import capture, funnel, line, of_line, squared
+
+import polar_bayes as pb
+from polar_bayes.budget.trial import bench_of, labeled
+from polar_bayes.errors import FitError
+from polar_bayes.inference.request import resolve
+from polar_bayes.ladder.builtin import answer
+from polar_bayes.ladder.expected import draws_needed, expected_error, quantile
+from polar_bayes.ladder.scaling import with_draws
+from polar_bayes.ladder.visiting import unvisited_weight
+
+SMALL = {
+    "point": pb.Point(starts=2),
+    "laplace": pb.Laplace(draws=1000),
+    "importance": pb.Importance(),
+    "tempered": pb.Tempered(pb.PixelTempering(draws=4096)),
+    "normal guide": pb.NormalGuide(steps=400, draws=1000),
+    "flow guide": pb.FlowGuide(steps=400, draws=1000),
+    "nuts": pb.Nuts(effective_draws=2000.0),
+}
+WITHOUT_PRIOR = {"point"}
+
+
+@pytest.fixture(autouse=True)
+def compile_fast_rather_than_fast_code() -> Iterator[None]:
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+def bench(model, seed: int = 0):
+    request = resolve(
+        capture(), model, "nuts", "paper", None, {"q": pb.StokesLink()}, 90.0, 0, "double"
+    )
+    return bench_of(request, jax.random.key(seed))
+
+
+def test_the_ladder_holds_every_method_that_is_tested_here():
+    assert set(pb.LADDER) == {*SMALL, "nuts short", "nuts long"}
+    assert {type(method) for method in pb.LADDER.values()} == {type(m) for m in SMALL.values()}
+
+
+@pytest.mark.parametrize("name", [name for name in SMALL if name not in WITHOUT_PRIOR])
+def test_a_normal_posterior_is_found_by_every_rung(name):
+    here = bench(line)
+    found = answer(SMALL[name], here)
+    assert not found.problems
+    labels, draws = labeled(here.program, found.z, here.data)
+    assert labels == ("level", "slope")
+    mean, covariance = of_line(capture()["q"].to_numpy())
+    sd = np.sqrt(np.diagonal(covariance))
+    flat = draws.reshape(2, -1)
+    # Five standard errors; the guides stop a little beside their optimum.
+    worth = min(found.effective_draws, flat.shape[1])
+    slack = 5.0 / np.sqrt(worth) + (0.05 if "guide" in name else 0.0)
+    assert (np.abs(flat.mean(axis=1) - mean) / sd < slack).all()
+    assert (np.abs(flat.std(axis=1) / sd - 1.0) < slack).all()
+    assert name == "flow guide" or not found.k_hat > 0.7  # tails of a flow are short
+    assert not found.r_hat > 1.01
+
+
+def test_a_point_fit_has_the_width_of_its_standard_errors():
+    here = bench(line)
+    found = answer(SMALL["point"], here)
+    _, draws = labeled(here.program, found.z, here.data)
+    q = capture()["q"].to_numpy()
+    x = np.linspace(-1.0, 1.0, len(q))
+    slope, level = np.polyfit(x, q, 1)
+    np.testing.assert_allclose(draws.mean(axis=(1, 2)), [level, slope], atol=0.02)
+
+
+@pytest.mark.parametrize("name", ["importance", "tempered"])
+def test_both_modes_are_weighed_alike(name):
+    here = bench(squared)
+    found = answer(SMALL[name], here)
+    assert not found.problems
+    _, draws = labeled(here.program, found.z, here.data)
+    share = float(np.mean(draws[-1] > 0.0))  # the root is the last in the alphabet
+    assert abs(share - 0.5) < 5.0 * 0.5 / np.sqrt(min(found.effective_draws, draws[0].size))
+
+
+def test_chains_that_missed_a_mode_are_told():
+    here = bench(squared)
+    both = answer(SMALL["importance"], here)
+    assert unvisited_weight(both.z, here) == 0.0
+    at = here.program.unravel(np.arange(here.program.size))["root"]
+    one = both.z.copy()
+    one[..., int(at)] = np.abs(one[..., int(at)])
+    assert unvisited_weight(one, here) == pytest.approx(0.5, abs=0.02)
+    # One chain that saw only one of them is enough.
+    some = both.z.copy()
+    some[0] = one[0]
+    assert unvisited_weight(some, here) > 0.4
+    assert unvisited_weight(both.z, bench(line)) == 0.0
+
+
+def test_weights_that_do_not_reach_all_of_a_posterior_are_a_problem():
+    found = answer(SMALL["importance"], bench(funnel))
+    assert found.k_hat > 0.7
+    assert any("Pareto k-hat" in problem for problem in found.problems)
+
+
+def test_the_expected_error_is_the_one_that_is_seen():
+    """Over 40 seeds the error of a mean stays within what is expected, and is not far below."""
+    mean, covariance = of_line(capture()["q"].to_numpy())
+    sd, seen, expected = np.sqrt(np.diagonal(covariance)), [], []
+    here = bench(line)
+    for seed in range(40):
+        other = dataclasses.replace(here, key=jax.random.key(seed))
+        other.__dict__["ground"] = here.ground
+        found = answer(pb.Importance(draws=1024), other)
+        _, draws = labeled(here.program, found.z, here.data)
+        seen.append(np.max(np.abs(draws.mean(axis=(1, 2)) - mean) / sd))
+        expected.append(expected_error(found, here.program, here.data))
+    # 1% of fits exceed it: of 40, four or more in one of ten thousand runs.
+    assert np.sum(np.array(seen) > expected) < 4
+    assert np.max(seen) > 0.3 * np.mean(expected)
+
+
+def test_as_many_draws_are_needed_as_the_tolerance_says():
+    assert quantile(1) == pytest.approx(2.5758, abs=1e-4)
+    assert draws_needed(0.1, 3) == int(np.ceil((quantile(6) / 0.1) ** 2))
+    assert draws_needed(0.05, 3) == pytest.approx(4 * draws_needed(0.1, 3), abs=4)
+
+
+def test_draws_that_are_no_numbers_have_an_infinite_error():
+    here = bench(line)
+    found = answer(SMALL["laplace"], here)
+    found.z[0, 0, 0] = np.nan
+    assert np.isposinf(expected_error(found, here.program, here.data))
+
+
+def test_draws_are_scaled_and_settings_kept():
+    assert with_draws(pb.Laplace(draws=500), 2.0) == pb.Laplace(draws=1000)
+    chains = with_draws(pb.Nuts(warmup=77), 2.0)
+    assert (chains.draws, chains.most_draws, chains.effective_draws) == (1000, 8000, 900.0)
+    assert chains.warmup == 77
+    tempered = with_draws(pb.Tempered(pb.PixelTempering(draws=2048)), 4.0).settings
+    assert (tempered.draws, tempered.effective_draws) == (8192, 800.0)
+    assert with_draws(pb.Point(), 2.0) is None
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: pb.Importance(draws=10), "draws is 10"),
+        (lambda: pb.NormalGuide(steps=1), "steps is 1"),
+        (lambda: pb.FlowGuide(learning_rate=0.0), "learning_rate 0.0"),
+    ],
+)
+def test_settings_out_of_range_are_refused(make, said):
+    with pytest.raises(FitError, match=said):
+        make()

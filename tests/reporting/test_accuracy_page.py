@@ -1,0 +1,97 @@
+"""The page and the figure of an accuracy study."""
+
+import numpy as np
+import pytest
+from clipping import clipped
+from pages import Page
+from synthetic_accuracy import ROWS, make_accuracy
+from synthetic_results import make_result
+
+import polar_bayes as pb
+from polar_bayes.reporting.accuracy_page import reference_sentence, render_accuracy
+from polar_bayes.reporting.html import render
+
+
+@pytest.fixture(scope="module")
+def page() -> Page:
+    return Page(render_accuracy(make_accuracy()))
+
+
+def test_it_stands_alone_and_its_anchors_lead_somewhere(page):
+    assert page.open == []
+    assert not {"script", "link", "iframe", "object", "embed", "base"} & set(page.tags)
+    ids = page.values("id")
+    assert len(ids) == len(set(ids))
+    assert set(page.values("aria-labelledby")) <= set(ids)
+    assert "<leaf>" in page.text
+
+
+def test_the_advice_comes_first_and_the_reference_with_it(page):
+    assert page.text.index("use nuts for it") < page.text.index("Error against time")
+    assert "10,000 draws of NUTS, worth 5,000 independent ones" in page.text
+    assert "is at most 0.012 posterior sd." in page.text
+
+
+def test_an_error_that_the_reference_cannot_tell_is_marked(page):
+    row = page.text[page.text.index("nuts long") :]
+    assert "< 0.024" in row
+
+
+def test_a_doubtful_reference_is_said_in_red():
+    study = make_accuracy(doubts="its R-hat is 1.3")
+    assert "verdict failed" in render_accuracy(study)
+    assert reference_sentence(study).endswith("Against it speaks: its R-hat is 1.3.")
+
+
+def test_the_report_lies_beside_its_file(tmp_path):
+    page = pb.report(make_accuracy(), tmp_path / "report")
+    again = pb.load_accuracy(page.parent / "accuracy.nc")
+    assert page.read_text() == render_accuracy(again)
+    with pytest.raises(pb.FitError, match="it goes with calibrations only"):
+        pb.report(make_accuracy(), tmp_path / "other", beside={})
+
+
+def test_a_fit_that_holds_a_study_shows_it():
+    result = make_result()
+    result["accuracy"] = make_accuracy()["accuracy"]
+    text = Page(render(result)).text
+    assert "Accuracy against time" in text
+    assert "use nuts for it" in text
+
+
+def test_every_rung_as_given_is_named_and_nothing_is_cut_off():
+    figure = pb.plot_accuracy(make_accuracy())
+    assert len(figure.axes) == 2
+    for axes in figure.axes:
+        named = {text.get_text() for text in axes.texts}
+        assert named == {rung for rung, dial in ROWS if dial == "as given"}
+    assert not clipped(figure)
+
+
+def test_names_that_lie_close_do_not_cover_each_other():
+    rows = {
+        (f"method {at}", "as given"): ([0.1, 0.1, 0.1], 1.0 + 0.02 * at, 1.0) for at in range(4)
+    }
+    figure = pb.plot_accuracy(make_accuracy(rows), times=["seconds_first"])
+    figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for text in figure.axes[0].texts]
+    for at, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:at])
+
+
+def test_the_front_falls_from_left_to_right():
+    (axes,) = pb.plot_accuracy(make_accuracy(), times=["seconds_again"]).axes
+    front = next(line for line in axes.lines if line.get_drawstyle() == "steps-post")
+    seconds, error = front.get_data()
+    assert (np.diff(seconds) > 0).all()
+    assert (np.diff(error) < 0).all()
+    assert error[-1] == pytest.approx(0.02)
+
+
+def test_without_first_times_one_panel_is_drawn():
+    assert len(pb.plot_accuracy(make_accuracy(fresh=False)).axes) == 1
+
+
+def test_a_column_that_is_no_time_is_refused():
+    with pytest.raises(pb.FitError, match="there is no time gradients"):
+        pb.plot_accuracy(make_accuracy(), times=["gradients"])

@@ -1,0 +1,52 @@
+"""Models whose posteriors are known: they compile in a second, and no method may get them wrong."""
+
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import xarray as xr
+from numpyro import distributions as dist
+from plates import plate_capture
+
+NOISE = 0.5
+VIEWS = np.linspace(35.0, 75.0, 6)
+
+
+def capture(seed: int = 0) -> xr.Dataset:
+    """Six readings of q."""
+    return plate_capture(VIEWS, 0.05, seed)
+
+
+def line(data, scene, priors, links) -> None:
+    """Readings on a line over the views: the posterior is normal."""
+    del scene, priors, links
+    level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+    with numpyro.plate("view", data.shape[-1]):
+        x = np.linspace(-1.0, 1.0, data.shape[-1])
+        numpyro.sample("q", dist.Normal(level + slope * x, NOISE), obs=data.readings["q"])
+
+
+def of_line(readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of level and slope."""
+    design = np.stack([np.ones(len(readings)), np.linspace(-1.0, 1.0, len(readings))], axis=1)
+    covariance = np.linalg.inv(np.eye(2) + design.T @ design / NOISE**2)
+    return covariance @ design.T @ readings / NOISE**2, covariance
+
+
+def squared(data, scene, priors, links) -> None:
+    """Readings of a square: the root may have either sign, and half of the posterior has each."""
+    del scene, priors, links
+    root = numpyro.sample("root", dist.Normal(0.0, 1.0))
+    other = numpyro.sample("other", dist.Normal(0.0, 1.0))
+    with numpyro.plate("view", data.shape[-1]):
+        mean = root**2 + 0.0 * other
+        numpyro.sample("q", dist.Normal(mean, 0.05), obs=data.readings["q"])
+
+
+def funnel(data, scene, priors, links) -> None:
+    """Readings that say nothing of a funnel: its peak is far from where most of it lies."""
+    del scene, priors, links
+    width = numpyro.sample("width", dist.Normal(0.0, 3.0))
+    numpyro.sample("inside", dist.Normal(0.0, jnp.exp(0.5 * width)))
+    with numpyro.plate("view", data.shape[-1]):
+        numpyro.sample("q", dist.Normal(0.0, NOISE), obs=data.readings["q"])
