@@ -41,6 +41,13 @@ SCENES: dict[str, Scene] = {
         mixing=StokesMixing(),
         instrument=Instrument((DolpGain(),)),
     ),
+    # The same in a picture, with the noise that is stated of each pixel.
+    "frames": Scene(
+        surface=RoughSurface(Beckmann(), PointSource(), WAY_OUT),
+        subsurface=Lambertian(),
+        mixing=StokesMixing(),
+        instrument=Instrument((DolpGain(),)),
+    ),
     # A goniometer on a polished plate: the whole reflected beam is caught, s and p in turn.
     "goniometer": Scene(
         surface=SmoothSurface(),
