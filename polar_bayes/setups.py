@@ -35,10 +35,10 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             SCENES["camera"],
             {"q": StokesLink(), "u": StokesLink(), "intensity": StudentTLink()},
         ),
-        # A picture whose noise is known in every pixel. Its brightness is left aside: how much
-        # light fell on a place is known of no pixel by itself.
-        "frames": Setup(
-            SCENES["frames"],
+        # How much light fell on a place of a picture is known of no pixel by itself, so brightness
+        # would tell nothing; its noise is known in every pixel.
+        "picture": Setup(
+            SCENES["picture"],
             {"q": StokesLink(stated_errors=True), "u": StokesLink(stated_errors=True)},
         ),
         # A laser beam grows longer than the sample towards grazing, each channel losing its own

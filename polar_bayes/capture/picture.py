@@ -107,7 +107,7 @@ def picture_capture(
     valid = ~np.logical_or.reduce(list(reasons.values()))
     attributes = {
         **attributes,
-        "setup": "frames",
+        "setup": "picture",
         "analyzer_angles": ", ".join(f"{angle:g}" for angle in np.asarray(angles)),
         "bin": squares.bin,
         "window": squares.window,

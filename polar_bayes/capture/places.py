@@ -11,7 +11,6 @@ $$ a = x - \frac{v_x}{1 + v_z} (z + v), \qquad b = v \times a $$
 
 import abc
 import dataclasses
-from collections.abc import Sequence
 from typing import Any, override
 
 import numpy as np
@@ -226,7 +225,7 @@ def as_place(place: Any, where: str) -> AbstractPlace:
     """
     if isinstance(place, AbstractPlace):
         return place
-    if isinstance(place, Sequence | np.ndarray) and len(place) == 3:
+    if isinstance(place, list | tuple | np.ndarray) and len(place) == 3:
         return Direction(*place)
     mend = "give Direction(x, y, z) or Position(x, y, z)"
     raise CaptureError(f"{place!r} is no place", where=where, mend=mend)

@@ -41,13 +41,9 @@ SCENES: dict[str, Scene] = {
         mixing=StokesMixing(),
         instrument=Instrument((DolpGain(),)),
     ),
-    # The same in a picture, with the noise that is stated of each pixel.
-    "frames": Scene(
-        surface=RoughSurface(Beckmann(), PointSource(), WAY_OUT),
-        subsurface=Lambertian(),
-        mixing=StokesMixing(),
-        instrument=Instrument((DolpGain(),)),
-    ),
+    # One picture, read without its brightness: how rough the surface is cannot be told apart from
+    # how much of its light falls towards the camera, so that a smooth one stands for any.
+    "picture": Scene(surface=SmoothSurface(), subsurface=Lambertian(), mixing=StokesMixing()),
     # A goniometer on a polished plate: the whole reflected beam is caught, s and p in turn.
     "goniometer": Scene(
         surface=SmoothSurface(),
@@ -74,6 +70,12 @@ FULL_SCENES: dict[str, Scene] = {
         subsurface=Lambertian(internal_reflection=InternalReflection()),
         mixing=StokesMixing(),
         instrument=Instrument((AngleZero(), DolpGain(), DarkLevel())),
+    ),
+    "picture": Scene(
+        surface=SmoothSurface(),
+        subsurface=Lambertian(internal_reflection=InternalReflection()),
+        mixing=StokesMixing(),
+        instrument=Instrument((DolpGain(),)),
     ),
     "goniometer": Scene(
         surface=SmoothSurface(),
