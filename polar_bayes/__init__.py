@@ -22,7 +22,7 @@ _HOMES = {
     "capture.files": ("load_capture", "save_capture"),
     "capture.goniometer": ("from_goniometer",),
     "capture.mosaic": ("from_mosaic",),
-    "capture.places": ("Direction", "Highlight", "Position"),
+    "capture.places": ("Direction", "Highlight", "Position", "Surroundings"),
     "capture.polarizer": ("from_polarizer",),
     "capture.schema": ("count", "validate"),
     "capture.shapes": ("NormalMap", "Sphere", "Spheres", "fit_sphere"),

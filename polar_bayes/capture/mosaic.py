@@ -25,7 +25,7 @@ from scipy.ndimage import binary_dilation
 from polar_bayes.capture.detector import Detector, os_name, signal_of
 from polar_bayes.capture.frames import Frame, read_frame
 from polar_bayes.capture.picture import picture_capture, setting_of
-from polar_bayes.capture.places import AbstractPlace, Highlight
+from polar_bayes.capture.places import AbstractPlace, Highlight, Surroundings
 from polar_bayes.capture.polarizer import FACING, with_wavelength
 from polar_bayes.capture.shapes import AbstractShape, Sphere
 from polar_bayes.capture.squares import Squares, squares_of
@@ -46,7 +46,7 @@ def from_mosaic(
     frame: Frame,
     *,
     shape: AbstractShape | Sphere | Sequence[Sphere] | Any,
-    light: AbstractPlace | Highlight | Sequence[float],
+    light: AbstractPlace | Highlight | Surroundings | Sequence[float],
     view: AbstractPlace | Sequence[float] = FACING,
     layout: ArrayLike = SONY,
     detector: Detector | None = None,

@@ -15,8 +15,10 @@ from polar_bayes.capture.contract import EXCESS_POLARIZATION
 from polar_bayes.capture.detector import Signal
 from polar_bayes.capture.places import (
     AbstractPlace,
+    Direction,
     Directions,
     Highlight,
+    Surroundings,
     as_place,
     directions,
     mirrored,
@@ -38,12 +40,12 @@ class Setting:
     Args:
         shape: The surface.
         view: Where the camera stands.
-        light: Where the light stands, or the highlight that tells it.
+        light: Where the light stands, or the highlight that tells it; or it is all around.
     """
 
     shape: AbstractShape
     view: AbstractPlace
-    light: AbstractPlace | Highlight
+    light: AbstractPlace | Highlight | Surroundings
 
 
 def setting_of(shape: Any, view: Any, light: Any, frame: tuple[int, ...]) -> Setting:
@@ -66,7 +68,7 @@ def setting_of(shape: Any, view: Any, light: Any, frame: tuple[int, ...]) -> Set
     return Setting(
         surface,
         as_place(view, "view"),
-        light if isinstance(light, Highlight) else as_place(light, "light"),
+        light if isinstance(light, Highlight | Surroundings) else as_place(light, "light"),
     )
 
 
@@ -162,6 +164,8 @@ def _directions(squares: Squares, setting: Setting) -> tuple[Directions, str]:
     points = _points(rows, columns, squares.frame)
     view = setting.view.towards(points)
     light, said = setting.light, repr(setting.light)
+    if isinstance(light, Surroundings):
+        return directions(normals, view, mirrored(normals, view)), said
     if isinstance(light, Highlight):
         light = _light_of(light, setting, squares.frame)
         said = f"{said}: {light!r}"
@@ -176,7 +180,7 @@ def _light_of(highlight: Highlight, setting: Setting, frame: tuple[int, int]) ->
         mend = "give row and column of the highlight, row first, in pixels of the frame"
         raise CaptureError("there is no surface", where=repr(highlight), mend=mend)
     view = setting.view.towards(_points(row, column, frame))[0]
-    return mirrored(normal, view)
+    return Direction(*(float(x) for x in mirrored(normal, view)))
 
 
 def _points(rows: np.ndarray, columns: np.ndarray, frame: tuple[int, int]) -> np.ndarray:

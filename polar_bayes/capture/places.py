@@ -120,6 +120,15 @@ class Highlight:
             check_number(f"Highlight: {name}", getattr(self, name), Interval(0.0, 1e6))
 
 
+@dataclasses.dataclass(frozen=True)
+class Surroundings:
+    """Light from everywhere: each piece of surface mirrors what stands opposite to the camera.
+
+    So for smooth surfaces in a room, where no lamp need be known: the light's direction is the
+    mirror direction of each piece, in its plane of incidence.
+    """
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Directions:
     """What a model must know of each piece of surface; all of one shape.
@@ -153,7 +162,7 @@ def directions(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> Dire
     Args:
         normals: Unit normals, NaN where there is no surface, (..., 3).
         view: Unit vectors to the camera, (..., 3).
-        light: Unit vectors to the light, (..., 3).
+        light: Unit vectors to the light, NaN where there is no surface, (..., 3).
 
     Returns:
         Angles of shape (...).
@@ -163,6 +172,7 @@ def directions(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> Dire
     """
     outside = ~np.isfinite(normals).all(axis=-1)
     n = np.where(outside[..., None], view, normals)
+    light = np.where(np.isfinite(light), light, view)
     cos_view, cos_light = _dot(n, view), _dot(n, light)
     turned_away = ~outside & (cos_view <= 0.0)
     in_shadow = ~outside & ~turned_away & (cos_light <= 0.0)
@@ -197,17 +207,20 @@ def directions(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> Dire
     )
 
 
-def mirrored(normal: np.ndarray, view: np.ndarray) -> Direction:
-    """The direction from which a mirror of that normal sends light to the viewer.
+def mirrored(normals: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """The direction from which a mirror sends light to the viewer.
 
     Args:
-        normal: Unit vector (3,).
-        view: Unit vector (3,).
+        normals: Unit vectors (..., 3).
+        view: Unit vectors (..., 3).
 
     Returns:
-        The direction.
+        Unit vectors (..., 3); NaN where there is no surface.
+
+    Raises:
+        Nothing.
     """
-    return Direction(*(float(x) for x in 2.0 * _dot(normal, view) * normal - view))
+    return 2.0 * _dot(normals, view)[..., None] * normals - view
 
 
 def as_place(place: Any, where: str) -> AbstractPlace:

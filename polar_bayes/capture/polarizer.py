@@ -15,7 +15,7 @@ from polar_bayes.capture.contract import POSITIVE
 from polar_bayes.capture.detector import Detector, check_number, os_name, signal_of
 from polar_bayes.capture.frames import Frame, read_frame
 from polar_bayes.capture.picture import picture_capture, setting_of
-from polar_bayes.capture.places import AbstractPlace, Direction, Highlight
+from polar_bayes.capture.places import AbstractPlace, Direction, Highlight, Surroundings
 from polar_bayes.capture.schema import validate
 from polar_bayes.capture.shapes import AbstractShape, Sphere
 from polar_bayes.capture.squares import squares_of
@@ -32,7 +32,7 @@ def from_polarizer(
     angles: ArrayLike,
     *,
     shape: AbstractShape | Sphere | Sequence[Sphere] | Any,
-    light: AbstractPlace | Highlight | Sequence[float],
+    light: AbstractPlace | Highlight | Surroundings | Sequence[float],
     view: AbstractPlace | Sequence[float] = FACING,
     detector: Detector | None = None,
     bin: int = 1,
@@ -52,7 +52,7 @@ def from_polarizer(
             the camera sees it, degree. Three different ones or more, shape (frame,).
         shape: Where the surface points: a `Sphere`, several, or unit normals of shape
             (row, column, 3), NaN where there is no surface, also in a .npy file.
-        light: Where the light stands: `Direction`, `Position`, or `Highlight`.
+        light: Where the light stands: `Direction`, `Position`, `Highlight`, or `Surroundings`.
         view: Where the camera stands: `Direction`, or `Position(0, 0, f)` for a focal length of f
             pixels.
         detector: How counts become light, and their noise.

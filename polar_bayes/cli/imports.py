@@ -59,6 +59,7 @@ def of_a_picture(command: Callable) -> Callable:
             "--highlight", type=float, nargs=2, metavar="ROW COLUMN",
             help="Where the surface mirrors the light [pixels].",
         ),
+        click.option("--surroundings", is_flag=True, help="Light from everywhere."),
         click.option(
             "--view-position", type=float, nargs=3, metavar="X Y Z",
             help="Place of a near camera [pixels]: 0 0 and its focal length.",
@@ -128,6 +129,7 @@ def _setting(options: dict[str, Any]) -> dict[str, Any]:
             "--light": _made(pb.Direction, take("light")),
             "--light-position": _made(pb.Position, take("light_position")),
             "--highlight": _made(pb.Highlight, take("highlight")),
+            "--surroundings": pb.Surroundings() if take("surroundings") else None,
         }
     )
     view = _made(pb.Position, take("view_position"))

@@ -78,8 +78,7 @@ def test_straight_on_the_frame_is_that_of_the_light(light):
 
 def test_a_mirror_sends_light_from_where_it_says():
     normal, view = unit((0.2, 0.3, 0.9)), Z
-    light = mirrored(normal, view)
-    vector = np.array([light.x, light.y, light.z])
+    vector = mirrored(normal, view)
     np.testing.assert_allclose(np.cross(unit(vector + view), normal), 0.0, atol=1e-12)
     assert np.linalg.norm(vector) == pytest.approx(1.0)
 

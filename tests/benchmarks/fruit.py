@@ -1,0 +1,144 @@
+"""The fruit frame: which light of it comes from surfaces, which from below, and from what lamp.
+
+    python tests/benchmarks/fruit.py fruits_IMX250MZR.png [--map fruit.zarr] [--picture fruit.png]
+
+Regions are told by place alone: around the two highlights, low on each fruit (where it mirrors the
+white table), and on its shoulders (which mirror the dark room). With --map, what the map of the
+same spheres says there.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+import polar_bayes as pb
+from polar_bayes.capture.frames import read_frame
+
+APPLE, ORANGE = pb.Sphere(632.0, 732.0, 552.0), pb.Sphere(536.0, 1804.0, 400.0)
+SPOTS = {"apple": (456.0, 744.0), "orange": (400.0, 1820.0)}
+"""Row and column of the brightest polarized light of each fruit."""
+
+
+def fruit_capture(frame: Path, bin_: int = 16, window: int = 1) -> xr.Dataset:
+    """The frame as a capture of two spheres."""
+    spheres = (APPLE, ORANGE)
+    light = pb.Surroundings()
+    return pb.from_mosaic(frame, shape=spheres, light=light, bin=bin_, window=window, name="fruit")
+
+
+def regions(image: xr.Dataset) -> dict[str, np.ndarray]:
+    """Places (y, x) of each region, from rows and columns of the frame."""
+    rows, columns = np.meshgrid(image["y"], image["x"], indexing="ij")
+    found = {}
+    for name, ball in (("apple", APPLE), ("orange", ORANGE)):
+        x, y = (columns - ball.column) / ball.radius, (ball.row - rows) / ball.radius
+        zenith = np.rad2deg(np.arcsin(np.minimum(np.hypot(x, y), 1.0)))
+        from_top = np.abs(np.rad2deg(np.arctan2(x, y)))
+        row, column = SPOTS[name]
+        spot = np.hypot(rows - row, columns - column) < 0.15 * ball.radius
+        found[f"{name}: highlight"] = spot
+        found[f"{name}: underside"] = (zenith > 40.0) & (zenith < 65.0) & (from_top > 150.0)
+        shoulder = (from_top > 35.0) & (from_top < 75.0)
+        found[f"{name}: shoulders"] = (zenith > 55.0) & (zenith < 72.0) & shoulder
+    return found
+
+
+def mean_stokes(capture: xr.Dataset, where: np.ndarray) -> tuple[float, float, float, int]:
+    """Brightness-weighted q, u, their common error, and the number of readings of a region."""
+    weight = capture["intensity"].where(capture["valid"]).isel(view=0).values
+    weight = np.where(where & np.isfinite(weight), weight, 0.0)
+    q, u = (
+        float(np.nansum(weight * capture[name].isel(view=0).values) / weight.sum())
+        for name in ("q", "u")
+    )
+    error = float(np.nanmean(capture["q_error"].isel(view=0).values[weight > 0.0]))
+    return q, u, error, int((weight > 0.0).sum())
+
+
+def of_the_lamp(frame: Path, row: float, column: float, reach: int) -> tuple[float, float]:
+    """Polarization of what a highlight adds to the light of the skin around it.
+
+    Brightness of glints changes over few pixels, that of the body over many: the Stokes parameters
+    are regressed on brightness beside a smooth surface of second order.
+    """
+    raw, _ = read_frame(frame, "frame")
+    four = raw[0::2, 0::2], raw[0::2, 1::2], raw[1::2, 0::2], raw[1::2, 1::2]  # 90, 45, 135, 0
+    row, column = int(row) // 8, int(column) // 8
+    cut = []
+    for each in four:
+        rows, columns = (n // 4 * 4 for n in each.shape)
+        mean = each[:rows, :columns].reshape(rows // 4, 4, columns // 4, 4).mean((1, 3))
+        cut.append(mean[row - reach : row + reach, column - reach : column + reach].ravel())
+    S0, Q, U = sum(cut) / 2.0, cut[3] - cut[0], cut[1] - cut[2]
+    y, x = (axis.ravel() for axis in np.mgrid[-1 : 1 : 2j * reach, -1 : 1 : 2j * reach])
+    design = np.stack([S0, np.ones_like(x), x, y, x * x, y * y, x * y], axis=-1)
+    q, u = (float(np.linalg.lstsq(design, each)[0][0]) for each in (Q, U))
+    return float(np.hypot(q, u)), float(np.rad2deg(np.arctan2(u, q)) / 2.0)
+
+
+def fresnel_dop(degrees: float, index: float) -> float:
+    """Degree of polarization of unpolarized light after a mirror."""
+    c = np.cos(np.deg2rad(degrees))
+    inside = np.sqrt(1.0 - (1.0 - c**2) / index**2)
+    s, p = (c - index * inside) / (c + index * inside), (index * c - inside) / (index * c + inside)
+    return float((s**2 - p**2) / (s**2 + p**2))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("frame", type=Path)
+    parser.add_argument("--map", type=Path)
+    parser.add_argument("--picture", type=Path)
+    asked = parser.parse_args()
+    capture = fruit_capture(asked.frame)
+    print(f"{'region':<20} {'q':>7} {'u':>7} {'error':>6} readings")
+    for name, where in regions(capture).items():
+        q, u, error, count = mean_stokes(capture, where)
+        print(f"{name:<20} {q:7.3f} {u:7.3f} {error:6.3f} {count}")
+    print(f"median misfit {capture.attrs['median_misfit']:.1f} (1: noise as stated)")
+    for name, spot in SPOTS.items():
+        ball = APPLE if name == "apple" else ORANGE
+        tilt = np.hypot(spot[0] - ball.row, spot[1] - ball.column) / ball.radius
+        incidence = float(np.rad2deg(np.arcsin(tilt)))
+        dop, angle = of_the_lamp(asked.frame, *spot, 8)
+        bound = fresnel_dop(incidence, 1.6)
+        print(
+            f"highlight of the {name}: incidence {incidence:.0f} degrees, DoP {dop:.2f} at "
+            f"{angle:.0f} degrees from horizontal; unpolarized light would have {bound:.2f}"
+        )
+    if asked.map is not None:
+        maps = pb.open_map(asked.map)
+        print(pb.count_pixels(maps))
+        for name, where in regions(maps).items():
+            here = {n: maps[n].values[where] for n in ("subsurface_fraction", "refractive_index")}
+            share = np.nanmedian(here["subsurface_fraction"])
+            known = np.isfinite(here["subsurface_fraction"]).sum()
+            print(f"{name:<20} subsurface_fraction {share:.2f} (median of {known})")
+    if asked.picture is not None:
+        draw(capture, asked.picture)
+
+
+def draw(capture: xr.Dataset, path: Path) -> None:
+    """Brightness, q and u of the spheres."""
+    figure = Figure(figsize=(10.0, 2.8), layout="constrained")
+    for at, (name, colors, ends) in enumerate(
+        (
+            ("intensity", "gray", (0.0, 120.0)),
+            ("q", "RdBu", (-0.2, 0.2)),
+            ("u", "RdBu", (-0.2, 0.2)),
+        )
+    ):
+        axes = figure.add_subplot(1, 3, at + 1)
+        values = capture[name].where(capture["valid"]).isel(view=0)
+        axes.set_facecolor("0.8")
+        drawn = axes.imshow(values, cmap=colors, vmin=ends[0], vmax=ends[1])
+        figure.colorbar(drawn, ax=axes)
+        axes.set(title=name, xticks=[], yticks=[])
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main()
