@@ -109,6 +109,18 @@ def test_a_highlight_tells_the_direction_of_the_light():
     assert "Direction" in told.attrs["light"]
 
 
+def test_surroundings_stand_where_each_place_mirrors_them():
+    capture = from_polarizer(
+        frames(FOUR), FOUR, shape=BALL, light=pb.Surroundings(), detector=QUIET, window=1
+    )
+    assert capture.attrs["masked_in_shadow"] == 0
+    np.testing.assert_allclose(capture["light_zenith"], capture["view_zenith"], atol=1e-6)
+    np.testing.assert_allclose(np.abs(capture["view_azimuth"]), 180.0)
+    lamp = from_polarizer(frames(FOUR), FOUR, shape=BALL, light=LAMP, detector=QUIET, window=1)
+    both = lamp["valid"].values & capture["valid"].values
+    np.testing.assert_array_equal(capture["q"].values[both], lamp["q"].values[both])
+
+
 def test_views_of_a_window_are_the_readings_next_to_each_other():
     known = {"shape": ball_normals(), "light": LAMP, "detector": QUIET}
     one = from_polarizer(frames(FOUR), FOUR, window=1, **known)

@@ -1,13 +1,13 @@
 """The fruit frame: which light of it comes from surfaces, which from below, and from what lamp.
 
-    python tests/benchmarks/fruit.py fruits_IMX250MZR.png [--map fruit.zarr] [--picture fruit.png]
+    python tests/benchmarks/fruit_frame.py FRAME [--map fruit.zarr] [--picture fruit.png]
 
-Regions are told by place alone: around the two highlights, low on each fruit (where it mirrors the
-white table), and on its shoulders (which mirror the dark room). With --map, what the map of the
-same spheres says there.
+Regions are told by place alone (tests/fruit.py). With --map, what a map of the same spheres says
+there.
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,8 @@ from matplotlib.figure import Figure
 import polar_bayes as pb
 from polar_bayes.capture.frames import read_frame
 
-APPLE, ORANGE = pb.Sphere(632.0, 732.0, 552.0), pb.Sphere(536.0, 1804.0, 400.0)
-SPOTS = {"apple": (456.0, 744.0), "orange": (400.0, 1820.0)}
-"""Row and column of the brightest polarized light of each fruit."""
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from fruit import APPLE, ORANGE, SPOTS, mean_stokes, regions
 
 
 def fruit_capture(frame: Path, bin_: int = 16, window: int = 1) -> xr.Dataset:
@@ -27,35 +26,6 @@ def fruit_capture(frame: Path, bin_: int = 16, window: int = 1) -> xr.Dataset:
     spheres = (APPLE, ORANGE)
     light = pb.Surroundings()
     return pb.from_mosaic(frame, shape=spheres, light=light, bin=bin_, window=window, name="fruit")
-
-
-def regions(image: xr.Dataset) -> dict[str, np.ndarray]:
-    """Places (y, x) of each region, from rows and columns of the frame."""
-    rows, columns = np.meshgrid(image["y"], image["x"], indexing="ij")
-    found = {}
-    for name, ball in (("apple", APPLE), ("orange", ORANGE)):
-        x, y = (columns - ball.column) / ball.radius, (ball.row - rows) / ball.radius
-        zenith = np.rad2deg(np.arcsin(np.minimum(np.hypot(x, y), 1.0)))
-        from_top = np.abs(np.rad2deg(np.arctan2(x, y)))
-        row, column = SPOTS[name]
-        spot = np.hypot(rows - row, columns - column) < 0.15 * ball.radius
-        found[f"{name}: highlight"] = spot
-        found[f"{name}: underside"] = (zenith > 40.0) & (zenith < 65.0) & (from_top > 150.0)
-        shoulder = (from_top > 35.0) & (from_top < 75.0)
-        found[f"{name}: shoulders"] = (zenith > 55.0) & (zenith < 72.0) & shoulder
-    return found
-
-
-def mean_stokes(capture: xr.Dataset, where: np.ndarray) -> tuple[float, float, float, int]:
-    """Brightness-weighted q, u, their common error, and the number of readings of a region."""
-    weight = capture["intensity"].where(capture["valid"]).isel(view=0).values
-    weight = np.where(where & np.isfinite(weight), weight, 0.0)
-    q, u = (
-        float(np.nansum(weight * capture[name].isel(view=0).values) / weight.sum())
-        for name in ("q", "u")
-    )
-    error = float(np.nanmean(capture["q_error"].isel(view=0).values[weight > 0.0]))
-    return q, u, error, int((weight > 0.0).sum())
 
 
 def of_the_lamp(frame: Path, row: float, column: float, reach: int) -> tuple[float, float]:
