@@ -79,34 +79,42 @@ def main() -> None:
             f"highlight of the {name}: incidence {incidence:.0f} degrees, DoP {dop:.2f} at "
             f"{angle:.0f} degrees from horizontal; unpolarized light would have {bound:.2f}"
         )
-    if asked.map is not None:
-        maps = pb.open_map(asked.map)
+    maps = None if asked.map is None else pb.open_map(asked.map)
+    if maps is not None:
         print(pb.count_pixels(maps))
         for name, where in regions(maps).items():
-            here = {n: maps[n].values[where] for n in ("subsurface_fraction", "refractive_index")}
-            share = np.nanmedian(here["subsurface_fraction"])
-            known = np.isfinite(here["subsurface_fraction"]).sum()
-            print(f"{name:<20} subsurface_fraction {share:.2f} (median of {known})")
+            share, factor = (
+                maps[each].values[where] for each in ("subsurface_fraction", "stokes_error_factor")
+            )
+            print(
+                f"{name:<20} subsurface_fraction {np.nanmedian(share):.2f}, stokes_error_factor "
+                f"{np.nanmedian(factor):.0f} (medians of {np.isfinite(share).sum()} pixels)"
+            )
     if asked.picture is not None:
-        draw(capture, asked.picture)
+        draw(capture, maps, asked.picture)
 
 
-def draw(capture: xr.Dataset, path: Path) -> None:
-    """Brightness, q and u of the spheres."""
-    figure = Figure(figsize=(10.0, 2.8), layout="constrained")
-    for at, (name, colors, ends) in enumerate(
-        (
-            ("intensity", "gray", (0.0, 120.0)),
-            ("q", "RdBu", (-0.2, 0.2)),
-            ("u", "RdBu", (-0.2, 0.2)),
-        )
-    ):
-        axes = figure.add_subplot(1, 3, at + 1)
-        values = capture[name].where(capture["valid"]).isel(view=0)
-        axes.set_facecolor("0.8")
-        drawn = axes.imshow(values, cmap=colors, vmin=ends[0], vmax=ends[1])
-        figure.colorbar(drawn, ax=axes)
-        axes.set(title=name, xticks=[], yticks=[])
+def draw(capture: xr.Dataset, maps: xr.Dataset | None, path: Path) -> None:
+    """Brightness, q and u of the spheres, and the map."""
+    shown = capture.where(capture["valid"]).isel(view=0)
+    panels = [
+        (shown["intensity"], "brightness [counts]", "gray", (0.0, 120.0)),
+        (shown["q"], "q: surface > 0, body < 0", "RdBu", (-0.2, 0.2)),
+        (shown["u"], "u", "RdBu", (-0.2, 0.2)),
+    ]
+    if maps is not None:
+        fraction = maps["subsurface_fraction"]
+        panels.append((fraction, "subsurface fraction", "viridis", (0.0, 1.0)))
+    bottom = APPLE.row + APPLE.radius
+    figure = Figure(figsize=(3.2 * len(panels), 2.2), layout="constrained")
+    for at, (values, title, colors, ends) in enumerate(panels):
+        axes = figure.add_subplot(1, len(panels), at + 1)
+        axes.set_facecolor("0.85")
+        upper = values.isel(y=values["y"] < bottom)  # below it is no sphere
+        drawn = axes.imshow(upper, cmap=colors, vmin=ends[0], vmax=ends[1])
+        figure.colorbar(drawn, ax=axes, shrink=0.8)
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(title, fontsize=9)
     figure.savefig(path, dpi=110)
 
 
