@@ -105,7 +105,7 @@ def picture_capture(
     stokes = fit_stokes(light, variance + (relative * light) ** 2, angles)
     turned = stokes.turned(places.cos_twice, places.sin_twice)
     dop, dop_error = unbiased_dop(turned)
-    reasons = _reasons(turned, dop, places, saturated)
+    reasons = _reasons(turned, places, saturated)
     valid = ~np.logical_or.reduce(list(reasons.values()))
     attributes = {
         **attributes,
@@ -190,7 +190,7 @@ def _points(rows: np.ndarray, columns: np.ndarray, frame: tuple[int, int]) -> np
 
 
 def _reasons(
-    stokes: StokesImage, dop: np.ndarray, places: Directions, saturated: np.ndarray
+    stokes: StokesImage, places: Directions, saturated: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Why readings say nothing, each under its first reason."""
     with np.errstate(invalid="ignore"):

@@ -22,6 +22,9 @@ from polar_bayes.errors import CaptureError
 ON_NORMAL = 1e-6
 """Sine of the zenith below which a direction is that of the normal itself."""
 
+EDGE_ON = 1e-9
+"""Cosine below which a surface no longer faces something; its zenith stays below 90 degrees."""
+
 COMPONENT = Interval(-1e9, 1e9)
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -174,8 +177,8 @@ def directions(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> Dire
     n = np.where(outside[..., None], view, normals)
     light = np.where(np.isfinite(light), light, view)
     cos_view, cos_light = _dot(n, view), _dot(n, light)
-    turned_away = ~outside & (cos_view <= 0.0)
-    in_shadow = ~outside & ~turned_away & (cos_light <= 0.0)
+    turned_away = ~outside & (cos_view <= EDGE_ON)
+    in_shadow = ~outside & ~turned_away & (cos_light <= EDGE_ON)
     seen = ~(outside | turned_away | in_shadow)
     across_view, across_light = np.cross(n, view), np.cross(n, light)
     sin_view = np.linalg.norm(across_view, axis=-1)

@@ -76,6 +76,19 @@ def test_straight_on_the_frame_is_that_of_the_light(light):
     assert np.isfinite([found.cos_twice, found.sin_twice, found.view_azimuth]).all()
 
 
+def test_what_is_seen_edge_on_is_not_seen():
+    """No zenith reaches 90 degrees, which captures refuse."""
+    found = directions(
+        np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1e-12], [0.0, 0.6, 0.8]]),
+        np.broadcast_to(Z, (3, 3)),
+        np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.8, -0.6]]),
+    )
+    assert found.turned_away.tolist() == [True, True, False]
+    assert found.in_shadow.tolist() == [False, False, True]
+    assert (found.view_zenith < 90.0).all()
+    assert (found.light_zenith < 90.0).all()
+
+
 def test_a_mirror_sends_light_from_where_it_says():
     normal, view = unit((0.2, 0.3, 0.9)), Z
     vector = mirrored(normal, view)
