@@ -35,6 +35,12 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             SCENES["camera"],
             {"q": StokesLink(), "u": StokesLink(), "intensity": StudentTLink()},
         ),
+        # How much light fell on a place of a picture is known of no pixel by itself, so brightness
+        # would tell nothing; its noise is known in every pixel.
+        "picture": Setup(
+            SCENES["picture"],
+            {"q": StokesLink(stated_errors=True), "u": StokesLink(stated_errors=True)},
+        ),
         # A laser beam grows longer than the sample towards grazing, each channel losing its own
         # share: beyond 78 degrees a plate's readings say more about its size than its index.
         "goniometer": Setup(

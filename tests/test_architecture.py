@@ -42,6 +42,8 @@ HOMES = {
     "jinja2": ("polar_bayes.reporting",),
     "click": ("polar_bayes.cli",),
     "netCDF4": ("polar_bayes.capture",),
+    "PIL": ("polar_bayes.capture.frames",),
+    "polanalyser": ("polar_bayes.capture.mosaic",),
     "optimistix": ("polar_bayes.inference", "polar_bayes.identifiability"),
     "tinygp": ("polar_bayes.models",),
     "arviz_base": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.reporting"),

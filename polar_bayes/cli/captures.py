@@ -38,32 +38,6 @@ def simulate(
     print_counts(capture, out)
 
 
-@click.group(name="import")
-def import_() -> None:
-    """Turn raw measurements into a capture."""
-
-
-@import_.command()
-@click.option("--s", "s", required=True, help="Table of s readings, or column name in --table.")
-@click.option("--p", "p", required=True, help="Table of p readings, or column name in --table.")
-@click.option("--table", type=click.Path(path_type=Path), help="One table with both channels.")
-@click.option("--angle", help="Column of --table with the angle of incidence in degrees.")
-@click.option("--s-incident", type=float, help="Reading of the incident beam, s.")
-@click.option("--p-incident", type=float, help="Reading of the incident beam, p.")
-@click.option("--dark-level", type=float, default=0.0, show_default=True, help="Without light.")
-@click.option("--s-error", type=float, help="Absolute error of an s reading.")
-@click.option("--p-error", type=float, help="Absolute error of a p reading.")
-@click.option("--relative-error", type=float, default=0.01, show_default=True)
-@click.option("--wavelength", type=float, help="Nanometers.")
-@click.option("--name", help="Name of the sample.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Capture to write.")
-def goniometer(s: str, p: str, table: Path | None, out: Path, **settings: Any) -> None:
-    """Tables of s and p readings against the angle of incidence, together or apart."""
-    capture = pb.from_goniometer(s, p, table=table, **settings)
-    pb.save_capture(capture, out)
-    print_counts(capture, out)
-
-
 @click.command()
 @click.argument("captures", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("--dim", default="material", show_default=True, help="material or patch.")
@@ -87,4 +61,4 @@ def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Pa
     print_counts(capture, out)
 
 
-COMMANDS = (simulate, import_, combine)
+COMMANDS = (simulate, combine)

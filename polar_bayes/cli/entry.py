@@ -13,6 +13,7 @@ import polar_bayes as pb
 from polar_bayes.cli.captures import COMMANDS as OF_CAPTURES
 from polar_bayes.cli.checks import COMMANDS as OF_CHECKS
 from polar_bayes.cli.fits import COMMANDS as OF_FITS
+from polar_bayes.cli.imports import COMMANDS as OF_IMPORTS
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -56,5 +57,5 @@ def commands() -> None:
     """From polarization captures to calibrated posteriors of layered dielectrics."""
 
 
-for _command in (*OF_CAPTURES, *OF_FITS, *OF_CHECKS):
+for _command in (*OF_CAPTURES, *OF_IMPORTS, *OF_FITS, *OF_CHECKS):
     commands.add_command(_command)

@@ -52,6 +52,18 @@ def print_counts(capture: Any, out: Path) -> None:
     click.echo(f"{out}: {counts}")
 
 
+def print_masked(capture: Any) -> None:
+    """Why readings of a picture are masked, in one line; nothing where none is."""
+    reasons = {
+        str(name).removeprefix("masked_").replace("_", " "): int(number)
+        for name, number in capture.attrs.items()
+        if str(name).startswith("masked_") and number
+    }
+    if reasons:
+        told = ", ".join(f"{number} {reason}" for reason, number in reasons.items())
+        click.echo(f"masked: {told}")
+
+
 @contextmanager
 def progress_bars() -> Iterator[Callable[[str, float], None]]:
     """One bar per stage on the error stream; silent where that is not a terminal."""

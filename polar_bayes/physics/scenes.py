@@ -41,6 +41,9 @@ SCENES: dict[str, Scene] = {
         mixing=StokesMixing(),
         instrument=Instrument((DolpGain(),)),
     ),
+    # One picture, read without its brightness: how rough the surface is cannot be told apart from
+    # how much of its light falls towards the camera, so that a smooth one stands for any.
+    "picture": Scene(surface=SmoothSurface(), subsurface=Lambertian(), mixing=StokesMixing()),
     # A goniometer on a polished plate: the whole reflected beam is caught, s and p in turn.
     "goniometer": Scene(
         surface=SmoothSurface(),
@@ -67,6 +70,12 @@ FULL_SCENES: dict[str, Scene] = {
         subsurface=Lambertian(internal_reflection=InternalReflection()),
         mixing=StokesMixing(),
         instrument=Instrument((AngleZero(), DolpGain(), DarkLevel())),
+    ),
+    "picture": Scene(
+        surface=SmoothSurface(),
+        subsurface=Lambertian(internal_reflection=InternalReflection()),
+        mixing=StokesMixing(),
+        instrument=Instrument((DolpGain(),)),
     ),
     "goniometer": Scene(
         surface=SmoothSurface(),

@@ -18,7 +18,7 @@ from polar_bayes.pixels.engine import Engine
 from polar_bayes.pixels.fitting import PixelLaplace, fit_stack
 from polar_bayes.pixels.making import Recipe, make_engine
 from polar_bayes.pixels.marginals import LEVELS, Marginals
-from polar_bayes.pixels.outcome import Approach, Outcome, Status
+from polar_bayes.pixels.outcome import Approach, Outcome, Status, no_outcome
 from polar_bayes.pixels.stack import IMAGE, stack
 
 Layout = dict[str, tuple[tuple[str, ...], tuple[int, ...]]]
@@ -113,11 +113,21 @@ def fit_block(block: xr.Dataset, plan: Plan) -> xr.Dataset:
     engine = plan.engine
     numbers = block[NUMBER].transpose(*IMAGE).to_numpy()
     with jax.enable_x64(True):
-        readings = validate(set_aside(block.drop_vars(NUMBER)))
-        pixels = stack(plan.observe(readings), plan.own_directions)
+        readings = set_aside(block.drop_vars(NUMBER))
+        if not readings["valid"].any():  # a corner of a picture; as a capture it would be refused
+            return _masked(block, plan)
+        pixels = stack(plan.observe(validate(readings)), plan.own_directions)
     found, seed = Marginals(len(pixels), plan.sizes), plan.request.seed
     outcome = fit_stack(engine, plan.settings, pixels, numbers.ravel(), seed, found.describe)
     return maps_of(found, outcome, block, plan.layout)
+
+
+def _masked(block: xr.Dataset, plan: Plan) -> xr.Dataset:
+    """The maps of a block in which nothing was read."""
+    count = block.sizes["y"] * block.sizes["x"]
+    outcome = no_outcome(count)
+    outcome.status[:] = Status.MASKED
+    return maps_of(Marginals(count, plan.sizes), outcome, block, plan.layout)
 
 
 def set_aside(capture: xr.Dataset) -> xr.Dataset:

@@ -238,7 +238,10 @@ def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:
     [
         ({"model": "per_leaf"}, r"model='per_leaf': no such model; give one of per_material"),
         ({"method": "magic"}, r"method='magic': no such method; give one of nuts, laplace, point"),
-        ({"scene": "moon"}, r"scene='moon': no such scene; give one of paper, camera, goniometer"),
+        (
+            {"scene": "moon"},
+            r"scene='moon': no such scene; give one of paper, camera, picture, goniometer",
+        ),
         ({"scene": 3}, r"a int is not a scene"),
         ({"links": pb.BetaLink()}, r"no polarization that these links describe"),
         ({"links": {"q": pb.BetaLink()}}, r"BetaLink does not describe q; it describes dop"),

@@ -56,6 +56,15 @@ def test_blocks_of_any_size_give_the_same_bits(
     assert_same_bits(mapped(image, plan, block), whole)
 
 
+def test_a_block_in_which_nothing_was_read_is_masked(image: xr.Dataset, plan: Plan) -> None:
+    """A corner of a picture, for example, beside what is shown."""
+    nothing = number_pixels(image.assign(valid=xr.zeros_like(image["q"], bool))).isel(y=[1])
+    maps = fit_block(nothing, plan)
+    assert (maps["status"] == Status.MASKED).all()
+    assert (maps["approach"] == Approach.NONE).all()
+    assert all(np.isnan(maps[name]).all() for name in (*NAMES, "pareto_k"))
+
+
 def test_a_pixel_alone_gets_the_same_bits(image: xr.Dataset, plan: Plan, whole: xr.Dataset) -> None:
     sampled = np.argwhere((whole["approach"] == Approach.NUTS).values)[-1]
     for y, x in ((0, 0), (2, 42), sampled):

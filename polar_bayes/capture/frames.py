@@ -1,0 +1,104 @@
+"""Frames of a camera as arrays of numbers, from files or from memory; nothing is guessed.
+
+PNG and TIFF files go through Pillow, which every plotting library brings along; .npy files hold
+what a script saved. A frame in color is refused: its channels would have to be told apart first.
+"""
+
+import os
+import warnings
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from polar_bayes.capture.paths import existing_file
+from polar_bayes.errors import CaptureError
+
+Frame = str | os.PathLike[str] | np.ndarray
+
+GRAY_MODES = ("L", "I;16", "I;16L", "I;16B", "I", "F")
+LARGEST_COUNT = 1e9
+
+
+def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
+    """One frame of gray values.
+
+    Args:
+        frame: A PNG, TIFF or .npy file, or an array of shape (row, column).
+        where: What it is, for errors, such as "dark".
+
+    Returns:
+        The values as they are, shape (row, column), in counts; and the largest count that its type
+        can hold, where that is the sensor's: 255 for 8 bits. Wider types hold sensors of 10, 12,
+        14 or 16 bits alike, so for them it is None.
+
+    Raises:
+        CaptureError: The file cannot be read, or it holds no single frame of finite gray values.
+    """
+    values = _array(frame, where)
+    if values.dtype.kind not in "uif" or values.ndim != 2 or values.size == 0:
+        raise CaptureError(
+            f"it holds {values.dtype.name} of shape {values.shape}, not one frame of gray values",
+            where=_place(frame, where),
+            mend="give rows and columns of numbers; of a color frame, one channel",
+        )
+    counts = values.astype(np.float64)
+    if not np.isfinite(counts).all() or np.abs(counts).max() > LARGEST_COUNT:
+        row, column = np.argwhere(~(np.abs(counts) <= LARGEST_COUNT))[0]
+        raise CaptureError(
+            f"{counts[row, column]:g} is no reading",
+            where=f"{_place(frame, where)}[row={row}, column={column}]",
+            mend=f"give finite counts up to {LARGEST_COUNT:g}",
+        )
+    return counts, 255.0 if values.dtype == np.uint8 else None
+
+
+def read_array(path: str | os.PathLike[str], where: str) -> np.ndarray:
+    """The array of a .npy file.
+
+    Args:
+        path: The file.
+        where: What it is, for errors.
+
+    Returns:
+        The array.
+
+    Raises:
+        CaptureError: The file is not there, or holds something else.
+    """
+    file = existing_file(path, where)
+    try:
+        values = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        mend = "save one array with numpy.save"
+        raise CaptureError("it cannot be read as .npy", where=str(file), mend=mend) from error
+    if not isinstance(values, np.ndarray):
+        mend = "save one array with numpy.save"
+        raise CaptureError("it holds several arrays", where=str(file), mend=mend)
+    return values
+
+
+def _array(frame: Any, where: str) -> np.ndarray:
+    if not isinstance(frame, str | os.PathLike):
+        return np.asarray(frame)
+    file = existing_file(frame, where)
+    if file.suffix == ".npy":
+        return read_array(file, where)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(file) as image:
+                if image.mode not in GRAY_MODES:
+                    what = f"its pixels are {image.mode}, not gray values"
+                    mend = "save it with 8 or 16 bits of gray, or give one channel as .npy"
+                    raise CaptureError(what, where=str(file), mend=mend)
+                return np.asarray(image)
+    except CaptureError:
+        raise
+    except Exception as error:  # Pillow raises many types for a broken file
+        mend = "give PNG, TIFF or .npy"
+        raise CaptureError("it cannot be read as an image", where=str(file), mend=mend) from error
+
+
+def _place(frame: Any, where: str) -> str:
+    return str(frame) if isinstance(frame, str | os.PathLike) else where

@@ -1,0 +1,202 @@
+r"""Stokes parameters from readings behind a linear polarizer, with their noise.
+
+A polarizer at angle $\chi$ lets pass $I(\chi) = (S_0 + S_1 \cos 2\chi + S_2 \sin 2\chi)/2$. Three
+angles or more tell S by least squares, $S = (A^T A)^{-1} A^T I = P I$, with the covariance
+$P\,\mathrm{diag}(\sigma^2) P^T$. Weights would take the noise from the noisy readings themselves,
+so that dark ones would count too much and bias S; with four angles there is little to gain.
+
+The noise of $q = S_1/S_0$ and $u = S_2/S_0$ follows to first order, their correlation with it. A
+degree of polarization $p = \sqrt{q^2 + u^2}$ is never negative, so noise alone makes it positive.
+The modified asymptotic estimator takes that off:
+
+$$ \hat p = p - b^2 \frac{1 - e^{-p^2/b^2}}{2p}, \qquad
+   b^2 = d_\perp^T C d_\perp, \qquad \sigma_p^2 = d^T C d, \qquad d = (q, u)/p $$
+
+It is never negative and continuous, and without bias where p is well above its noise. Unpolarized
+light still reads 0.99 of its noise (p itself: 1.25), since nothing that is never negative can read
+zero on average: fits should read q and u, which carry their sign.
+
+Source:
+    Plaszczynski, Montier, Levrier and Tristram 2014, A novel estimator of the polarization
+    amplitude from normally distributed Stokes parameters, MNRAS 439, 4048 (arXiv:1312.0437).
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from polar_bayes.errors import CaptureError
+
+FEWEST_ANGLES = 3
+LARGEST_CONDITION = 100.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StokesImage:
+    """Normalized Stokes parameters with their noise, each of shape (row, column).
+
+    Args:
+        intensity: Half of S0: what the polarizer lets pass of unpolarized light. Counts.
+        q: S1/S0, NaN where there is no light.
+        u: S2/S0.
+        intensity_variance: Of the intensity, counts squared.
+        q_variance: Of q.
+        u_variance: Of u.
+        covariance: Of q and u.
+        misfit: Squared distance of the readings from the fit over its variance, for each degree of
+            freedom; about 1 where the noise is as stated. None for three angles, which always fit.
+    """
+
+    intensity: np.ndarray
+    q: np.ndarray
+    u: np.ndarray
+    intensity_variance: np.ndarray
+    q_variance: np.ndarray
+    u_variance: np.ndarray
+    covariance: np.ndarray
+    misfit: np.ndarray | None
+
+    def turned(self, cos: np.ndarray, sin: np.ndarray) -> "StokesImage":
+        """The same light in axes that are turned counterclockwise, as the camera sees it.
+
+        Args:
+            cos: Cosine of twice the angle, (row, column).
+            sin: Sine of the same.
+
+        Returns:
+            Stokes parameters in those axes.
+        """
+        q_variance, u_variance, between = self.q_variance, self.u_variance, self.covariance
+        mixed = 2.0 * cos * sin * between
+        return dataclasses.replace(
+            self,
+            q=self.q * cos + self.u * sin,
+            u=self.u * cos - self.q * sin,
+            q_variance=cos**2 * q_variance + sin**2 * u_variance + mixed,
+            u_variance=sin**2 * q_variance + cos**2 * u_variance - mixed,
+            covariance=(cos**2 - sin**2) * between + cos * sin * (u_variance - q_variance),
+        )
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """Correlation of the errors of q and u, (row, column)."""
+        return self.covariance / np.sqrt(self.q_variance * self.u_variance)
+
+
+def fit_stokes(light: np.ndarray, variance: np.ndarray, angles: Any) -> StokesImage:
+    """Stokes parameters by least squares.
+
+    Args:
+        light: What passed the polarizer at each angle, (angle, row, column), counts.
+        variance: Of each reading; they are independent. Same shape.
+        angles: Of the polarizer's axis from the first axis of the image (to the right),
+            counterclockwise as the camera sees it, degree. Shape (angle,).
+
+    Returns:
+        Stokes parameters in the axes of the image, with their covariance.
+
+    Raises:
+        CaptureError: Fewer than three different angles, or angles too close to tell.
+    """
+    design = _design(check_angles(angles))
+    solve = np.linalg.pinv(design)
+    S = np.einsum("sa,ayx->syx", solve, light)
+    C = np.einsum("sa,ta,ayx->styx", solve, solve, variance)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        q, u = S[1] / S[0], S[2] / S[0]
+        brightness = S[0] ** 2
+        q_variance = (C[1, 1] - 2.0 * q * C[0, 1] + q**2 * C[0, 0]) / brightness
+        u_variance = (C[2, 2] - 2.0 * u * C[0, 2] + u**2 * C[0, 0]) / brightness
+        covariance = (C[1, 2] - q * C[0, 2] - u * C[0, 1] + q * u * C[0, 0]) / brightness
+    return StokesImage(
+        intensity=0.5 * S[0],
+        q=q,
+        u=u,
+        intensity_variance=0.25 * C[0, 0],
+        q_variance=q_variance,
+        u_variance=u_variance,
+        covariance=covariance,
+        misfit=_misfit(light, variance, design, solve),
+    )
+
+
+def unbiased_dop(image: StokesImage) -> tuple[np.ndarray, np.ndarray]:
+    """Degree of polarization with what noise alone adds to it taken off, and its error.
+
+    Args:
+        image: Stokes parameters with their noise.
+
+    Returns:
+        `(dop, dop_error)`, each (row, column); the module tells how. The error is that along the
+        direction of polarization.
+
+    Raises:
+        Nothing.
+    """
+    p = np.hypot(image.q, image.u)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along_q = np.where(p > 0.0, image.q / p, 1.0)
+        along_u = np.where(p > 0.0, image.u / p, 0.0)
+        mixed = 2.0 * along_q * along_u * image.covariance
+        error = along_q**2 * image.q_variance + along_u**2 * image.u_variance + mixed
+        bias = along_u**2 * image.q_variance + along_q**2 * image.u_variance - mixed
+        ratio = p / np.sqrt(bias)
+        # (1 - exp(-r^2))/(2 r) without a quotient of two zeros at r = 0.
+        taken = np.sqrt(bias) * np.where(ratio > 0.0, -np.expm1(-(ratio**2)) / (2.0 * ratio), 0.0)
+    return p - taken, np.sqrt(error)
+
+
+def check_angles(angles: Any) -> np.ndarray:
+    """Angles of a polarizer that tell all three Stokes parameters.
+
+    Args:
+        angles: Degrees.
+
+    Returns:
+        The same as an array, (angle,).
+
+    Raises:
+        CaptureError: They are no list of numbers, fewer than three different ones, or too close.
+    """
+    try:
+        degrees = np.asarray(angles, dtype=np.float64)
+    except (TypeError, ValueError):
+        degrees = np.full(1, np.nan)
+    if degrees.ndim != 1 or not (np.abs(degrees) <= 360.0).all():
+        mend = "give one number from -360 to 360 for each frame"
+        raise CaptureError(f"{angles!r} are no angles", where="angles", mend=mend)
+    different = np.unique(np.round(degrees % 180.0, 6) % 180.0)
+    told = ", ".join(f"{angle:g}" for angle in degrees)
+    if different.size < FEWEST_ANGLES:
+        raise CaptureError(
+            f"the polarizer stood at {different.size} different angles ({told})",
+            where="angles",
+            mend="give three or more; 0 and 180 are the same",
+        )
+    condition = float(np.linalg.cond(_design(degrees)))
+    if condition > LARGEST_CONDITION:
+        raise CaptureError(
+            f"{told} are so close that noise grows {condition:.0f}-fold",
+            where="angles",
+            mend="spread them over 180 degrees, such as 0, 60 and 120",
+        )
+    return degrees
+
+
+def _design(degrees: np.ndarray) -> np.ndarray:
+    """What each angle reads of S0, S1 and S2: (angle, 3)."""
+    twice = np.deg2rad(2.0 * degrees)
+    return 0.5 * np.stack([np.ones_like(twice), np.cos(twice), np.sin(twice)], axis=-1)
+
+
+def _misfit(
+    light: np.ndarray, variance: np.ndarray, design: np.ndarray, solve: np.ndarray
+) -> np.ndarray | None:
+    """Of the part of the readings that no Stokes vector makes."""
+    beyond = np.linalg.svd(design)[0].T[FEWEST_ANGLES:]
+    if not len(beyond):
+        return None
+    rest = np.einsum("ka,ayx->kyx", beyond, light)
+    spread = np.einsum("ka,ka,ayx->kyx", beyond, beyond, variance)
+    return np.mean(rest**2 / spread, axis=0)

@@ -1,0 +1,164 @@
+"""Mosaics of polarizers as captures: filled in, averaged, with the noise that is left."""
+
+import importlib
+import re
+import sys
+
+import numpy as np
+import pictures
+import pytest
+from pictures import FULL, LAMP
+from PIL import Image
+
+import polar_bayes as pb
+from polar_bayes.capture.mosaic import SONY, from_mosaic
+from polar_bayes.capture.polarizer import from_polarizer
+from polar_bayes.errors import CaptureError
+
+QUIET = pb.Detector(saturation_level=FULL, gain=1e-6, read_noise=0.0, relative_error=0.0)
+FOUR = (0.0, 45.0, 90.0, 135.0)
+FLAT = np.broadcast_to(pictures.unit(np.array([0.3, 0.5, 0.8])), (*pictures.SHAPE, 3))
+
+
+def mosaic(frames, layout=SONY):
+    """What a sensor reads of four frames, each pixel behind its own polarizer."""
+    found = np.zeros(frames[0].shape)
+    for row in (0, 1):
+        for column in (0, 1):
+            angle = layout[row][column]
+            found[row::2, column::2] = frames[FOUR.index(angle)][row::2, column::2]
+    return found
+
+
+def sloping(shape=pictures.SHAPE):
+    """Frames whose light grows linearly over the frame, which filling in keeps."""
+    row, column = np.mgrid[: shape[0], : shape[1]]
+    clean = pictures.frames(FOUR, normals=np.broadcast_to(FLAT[0, 0], (*shape, 3)))
+    return clean * (0.5 + 0.4 * row / shape[0] - 0.2 * column / shape[1])
+
+
+@pytest.mark.parametrize(
+    "layout", [SONY, ((0.0, 45.0), (135.0, 90.0)), ((135.0, 0.0), (90.0, 45.0))]
+)
+def test_a_mosaic_tells_what_four_frames_tell(layout):
+    """Any order of the four polarizers: away from the edges linear light comes back whole."""
+    known = {"shape": FLAT, "light": LAMP, "detector": QUIET, "bin": 4, "window": 1}
+    filled = from_mosaic(mosaic(sloping(), layout), layout=layout, **known)
+    whole = from_polarizer(sloping(), FOUR, **known)
+    inside = {"y": slice(1, -1), "x": slice(1, -1)}
+    # The library works in steps of a 65535th of the frame's range.
+    for name in ("q", "u"):
+        np.testing.assert_allclose(filled[name].isel(inside), whole[name].isel(inside), atol=1e-4)
+    assert np.ptp(whole["intensity"].values) > 0.2 * float(whole["intensity"].max())
+    np.testing.assert_allclose(
+        filled["intensity"].isel(inside), whole["intensity"].isel(inside), rtol=1e-4
+    )
+
+
+def test_a_wrong_layout_does_not_pass():
+    known = {"shape": FLAT, "light": LAMP, "detector": QUIET, "bin": 4, "window": 1}
+    right = from_mosaic(mosaic(sloping()), **known)
+    wrong = from_mosaic(mosaic(sloping()), layout=((0.0, 45.0), (135.0, 90.0)), **known)
+    assert np.abs(right["q"] - wrong["q"]).max() > 0.01
+
+
+def test_a_ball_comes_back_in_the_plane_of_the_model():
+    """Curved light is smeared by filling in: within .03 of the scene, and of both signs."""
+    shape, ball = (160, 160), pb.Sphere(80.2, 79.7, 74.0)
+    normals = pictures.ball_normals(shape, ball)
+    frames = pictures.frames(FOUR, normals=normals)
+    capture = from_mosaic(mosaic(frames), shape=ball, light=LAMP, detector=QUIET, bin=4, window=1)
+    valid = capture["valid"].values & (capture["view_zenith"].values < 70.0)
+    valid &= capture["light_zenith"].values < 70.0
+    names = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
+    geometry = pb.Geometry.from_degrees(**{name: capture[name].values for name in names})
+    said = pictures.SCENE.predict(pictures.TRUTH, geometry)
+    assert valid.sum() > 500
+    for name in ("q", "u"):
+        off = capture[name].values[valid] - np.asarray(said[name])[valid]
+        assert np.abs(off).max() < 0.03
+        assert np.sqrt(np.mean(off**2)) < 0.005
+        assert np.asarray(said[name])[valid].min() < -0.02
+        assert np.asarray(said[name])[valid].max() > 0.02
+
+
+@pytest.mark.parametrize("width", [2, 4, 8])
+def test_the_noise_that_is_left_is_the_stated_one(width):
+    """Scores of q over a frame of even light; neighbors share a little noise.
+
+    With 64 x 64 squares at least and correlations below .3 to eight neighbors, the mean square
+    has a standard error below .05; the bound is four of them.
+    """
+    shape = (64 * width, 64 * width)
+    passed = np.array([300.0, 220.0, 100.0, 180.0])  # at each angle
+    frames = np.broadcast_to(passed[:, None, None], (4, *shape))
+    rng = np.random.default_rng(width)
+    clean = mosaic(frames)
+    raw = clean + np.sqrt(9.0 + 0.2 * clean) * rng.normal(size=shape)
+    detector = pb.Detector(saturation_level=FULL, read_noise=3.0, gain=0.2, relative_error=0.0)
+    normals = np.broadcast_to(FLAT[0, 0], (*shape, 3))
+    capture = from_mosaic(
+        raw, shape=normals, light=LAMP, detector=detector, bin=width, window=1
+    ).isel(y=slice(1, -1), x=slice(1, -1))
+    for name in ("q", "u"):
+        score = (capture[name] - capture[name].mean()) / capture[f"{name}_error"]
+        assert float((score**2).mean()) == pytest.approx(1.0, abs=0.2)
+    assert capture.attrs["median_misfit"] < 3.0
+
+
+def test_noise_below_the_dark_level_is_kept():
+    """Cut off at zero, dark pixels would look brighter than they are."""
+    rng = np.random.default_rng(5)
+    frames = np.broadcast_to(np.array([6.0, 5.0, 4.0, 5.0])[:, None, None], (4, 256, 256))
+    raw = mosaic(frames) + 100.0 + 8.0 * rng.normal(size=(256, 256))
+    assert (raw < 100.0).mean() > 0.1
+    detector = pb.Detector(saturation_level=FULL, dark=100.0, read_noise=8.0, relative_error=0.0)
+    normals = np.broadcast_to(FLAT[0, 0], (256, 256, 3))
+    capture = from_mosaic(raw, shape=normals, light=LAMP, detector=detector, bin=64, window=1)
+    np.testing.assert_allclose(capture["intensity"].mean(), 5.0, atol=5.0 * 8.0 / 256.0)
+
+
+def test_a_full_pixel_masks_all_that_is_filled_in_from_it():
+    raw = mosaic(sloping())
+    raw[7, 20] = FULL  # at the lower edge of its square of four rows
+    capture = from_mosaic(raw, shape=FLAT, light=LAMP, detector=QUIET, bin=4, window=1)
+    full = np.argwhere(capture["saturated"].values[..., 0])
+    assert {tuple(place) for place in full.tolist()} == {(1, 4), (1, 5), (2, 4), (2, 5)}
+    assert not capture["valid"].values[capture["saturated"].values].any()
+
+
+def test_a_frame_in_a_file(tmp_path):
+    raw = np.rint(mosaic(sloping()) * 0.5).astype(np.uint8)
+    Image.fromarray(raw).save(tmp_path / "plate.png")
+    known = {"shape": FLAT, "light": LAMP}
+    file = from_mosaic(tmp_path / "plate.png", **known)
+    array = from_mosaic(raw, name="plate", **known)
+    assert file.attrs["name"] == "plate"
+    assert file.attrs["source"] == "plate.png"
+    assert file.attrs["demosaicing"].startswith("polanalyser ")
+    assert file.attrs["saturation_level"] == 255.0
+    assert file.drop_attrs().equals(array.drop_attrs())
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"layout": ((0, 180), (90, 90))}, "the polarizer stood at 2 different angles"),
+        ({"layout": (0, 45, 90, 135)}, "layout: it is (0, 45, 90, 135)"),
+        ({"bin": 3}, "bin: it is 3; give an even number"),
+        ({"frame": np.ones((5, 4))}, "frame: it is (5, 4), not even"),
+    ],
+)
+def test_a_mistake_is_told_with_its_mend(asked, said):
+    given = {"frame": np.ones(pictures.SHAPE), "shape": FLAT, "light": LAMP, "detector": QUIET}
+    given |= asked
+    with pytest.raises(CaptureError, match=re.escape(said)):
+        from_mosaic(given.pop("frame"), **given)
+
+
+def test_without_the_library_the_way_to_it_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "polanalyser", None)
+    with pytest.raises(CaptureError, match=re.escape("pip install 'polar_bayes[camera]'")):
+        from_mosaic(np.ones(pictures.SHAPE), shape=FLAT, light=LAMP, detector=QUIET)
+    monkeypatch.undo()
+    assert importlib.import_module("polanalyser")

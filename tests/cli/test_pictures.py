@@ -1,0 +1,111 @@
+"""The commands that import pictures say what the Python interface says."""
+
+from pathlib import Path
+
+import numpy as np
+import pictures
+import pytest
+from pictures import BALL, LAMP
+
+import polar_bayes as pb
+from polar_bayes.cli import main
+
+ANGLES = (0.0, 60.0, 120.0)
+SPHERE = ["--sphere", str(BALL.row), str(BALL.column), str(BALL.radius)]
+LIGHT = ["--light", str(LAMP.x), str(LAMP.y), str(LAMP.z)]
+FULL = ["--saturation-level", "1000"]
+
+
+@pytest.fixture(scope="module")
+def raw() -> np.ndarray:
+    return np.rint(pictures.frames(ANGLES)).astype(np.uint16)
+
+
+@pytest.fixture
+def files(raw: np.ndarray, tmp_path: Path) -> list[str]:
+    words = []
+    for angle, frame in zip(ANGLES, raw, strict=True):
+        path = tmp_path / f"ball{angle:.0f}.npy"
+        np.save(path, frame)
+        words += ["--frame", str(angle), str(path)]
+    return words
+
+
+def test_frames_behind_a_polarizer(
+    files: list[str], raw: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "ball.nc"
+    noise = ["--gain", "0.2", "--read-noise", "2", "--relative-error", "0", "--dark-level", "1"]
+    words = [*files, *SPHERE, *LIGHT, *FULL, *noise, "--bin", "2", "--window", "1"]
+    words += ["--wavelength", "550", "--name", "ball"]
+    assert main(["import", "polarizer", *words, "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    detector = pb.Detector(
+        saturation_level=1000.0, dark=1.0, gain=0.2, read_noise=2.0, relative_error=0.0
+    )
+    known = {"shape": BALL, "light": LAMP, "detector": detector, "bin": 2, "window": 1}
+    wanted = pb.from_polarizer(raw, ANGLES, wavelength=550.0, name="ball", **known)
+    found = pb.load_capture(out)
+    assert found.drop_attrs().equals(wanted.drop_attrs())
+    assert f"{wanted.attrs['masked_outside']} outside" in said
+    assert "480 views" in said
+
+
+def test_a_mosaic_with_another_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    frame = rng.integers(300, 600, pictures.SHAPE).astype(np.uint16)
+    np.save(tmp_path / "frame.npy", frame)
+    np.save(tmp_path / "normals.npy", pictures.ball_normals())
+    np.savetxt(tmp_path / "rim.csv", rim(), header="row column", comments="")
+    layout = ["--layout", "0", "45", "135", "90"]
+    out = tmp_path / "ball.nc"
+    command = ["import", "mosaic", str(tmp_path / "frame.npy"), *FULL, *layout, "--out", str(out)]
+    asked = {"layout": ((0, 45), (135, 90)), "detector": pb.Detector(saturation_level=1000.0)}
+    for words, known in (
+        (
+            ["--normals", str(tmp_path / "normals.npy"), "--highlight", "15", "25"],
+            {"shape": pictures.ball_normals(), "light": pb.Highlight(15.0, 25.0)},
+        ),
+        (
+            ["--rim", str(tmp_path / "rim.csv"), "--light-position", "5", "6", "90"],
+            {"shape": BALL, "light": pb.Position(5.0, 6.0, 90.0)},
+        ),
+        (
+            [*SPHERE, "--surroundings", "--view-position", "0", "0", "70"],
+            {"shape": BALL, "light": pb.Surroundings(), "view": pb.Position(0.0, 0.0, 70.0)},
+        ),
+    ):
+        assert main([*command, *words]) == 0
+        wanted, found = pb.from_mosaic(frame, **known, **asked), pb.load_capture(out)
+        np.testing.assert_allclose(found["q"], wanted["q"], atol=1e-9)
+        np.testing.assert_allclose(found["light_zenith"], wanted["light_zenith"], atol=1e-6)
+    assert "outside" in capsys.readouterr().out
+
+
+def rim() -> np.ndarray:
+    around = np.linspace(0.0, 6.0, 9)
+    row = BALL.row + BALL.radius * np.sin(around)
+    return np.stack([row, BALL.column + BALL.radius * np.cos(around)], axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([*LIGHT], "give one of --sphere or --rim, --normals"),
+        ([*SPHERE], "give one of --light, --light-position, --highlight, --surroundings"),
+        ([*SPHERE, *LIGHT, "--surroundings"], "give one of --light"),
+        ([*SPHERE, *LIGHT, "--dark", "d.npy", "--dark-level", "3"], "exclude each other"),
+        ([*SPHERE, *LIGHT], "saturation_level: the frames do not say"),
+        ([*SPHERE, *LIGHT, *FULL, "--dark", "none.npy"], "none.npy: there is no such file"),
+        ([*SPHERE, "--highlight", "0", "0", *FULL], "there is no surface"),
+    ],
+)
+def test_a_mistake_takes_one_line_and_writes_nothing(
+    files: list[str], words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    out = tmp_path / "ball.nc"
+    assert main(["import", "polarizer", *files, *words, "--out", str(out)]) == 1
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not out.exists()
