@@ -15,7 +15,7 @@ from polar_bayes.inference.method import AbstractMethod, Answer
 from polar_bayes.inference.modes import Modes
 from polar_bayes.ladder.weighing import choose, generator, log_densities
 from polar_bayes.pixels.importance import LARGEST_TRUSTED, effective_draws, smooth
-from polar_bayes.pixels.mixtures import Mixture, draw_mixture
+from polar_bayes.pixels.mixtures import Mixture, draw_mixture, log_density
 
 MODES = 4
 """Heaviest modes that draws are made at."""
@@ -56,8 +56,8 @@ class Importance(AbstractMethod):
             )
         proposal = _proposal(ground.modes, bench.dtype)
         key_draw, key_choice = jax.random.split(bench.key_of_draws)
-        places, log_density = (np.asarray(x) for x in _drawn(proposal, self.draws, key_draw))
-        ratios = log_densities(bench.program, places, bench.data) - log_density
+        places, proposed = (np.asarray(x) for x in _drawn(proposal, self.draws, key_draw))
+        ratios = log_densities(bench.program, places, bench.data) - proposed
         weights, k_hat = (x[0] for x in smooth(ratios[None]))
         worth = float(effective_draws(weights[None])[0])
         said = {"modes": ground.said}
@@ -78,7 +78,7 @@ class Importance(AbstractMethod):
         return Answer(
             kind="importance",
             z=places[index],
-            stats={"lp": (ratios + log_density)[index]},
+            stats={"lp": (ratios + proposed)[index]},
             problems=problems,
             weighted=(places, weights),
             k_hat=float(k_hat),
@@ -90,7 +90,8 @@ class Importance(AbstractMethod):
 
 @functools.partial(jax.jit, static_argnums=1)
 def _drawn(proposal: Mixture, count: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return draw_mixture(proposal, count, key)
+    places = draw_mixture(proposal, count, key)
+    return places, log_density(proposal, places)
 
 
 def _proposal(modes: Modes, dtype: np.dtype) -> Mixture:

@@ -41,7 +41,7 @@ class Tempered(AbstractMethod):
         FitError: A setting is outside its range.
     """
 
-    settings: PixelTempering = dataclasses.field(default_factory=lambda: PixelTempering(draws=4096))
+    settings: PixelTempering = dataclasses.field(default_factory=PixelTempering)
 
     @override
     def draw(self, bench: Bench) -> Answer:
@@ -68,7 +68,7 @@ class Tempered(AbstractMethod):
     def _answer(self, bench: Bench, found: Weighted, row: Row, engine: "_Counting") -> Answer:
         z, weights = found.z[0].astype(float), found.weights[0].astype(float)
         weights = weights / weights.sum()
-        worth, k_hat = float(found.effective[0]), float(found.pareto_k[0])
+        worth, k_hat = float(found.worth[0]), float(found.pareto_k[0])
         index = choose(weights, worth, generator(bench.key_of_draws))
         problems = []
         if row.status[0] != Status.GOOD:
@@ -79,9 +79,8 @@ class Tempered(AbstractMethod):
             )
         walks, length = self.settings.walks, self.settings.length
         steps = int(row.outcome.steps[0]) * walks * (length - 1)
-        densities = (
-            engine.counts["crowds"] * self.settings.crowd + steps + engine.counts["rounds"] * len(z)
-        )
+        drawn = engine.counts["rounds"] * self.settings.draws
+        densities = engine.counts["crowds"] * self.settings.crowd + steps + drawn
         return Answer(
             kind="tempered",
             z=z[index],
