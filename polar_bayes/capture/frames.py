@@ -16,6 +16,9 @@ from polar_bayes.errors import CaptureError
 
 Frame = str | os.PathLike[str] | np.ndarray
 
+FORMATS = ("PNG", "TIFF")
+"""Of image files, those that keep counts as they are."""
+
 GRAY_MODES = ("L", "I;16", "I;16L", "I;16B", "I", "F")
 LARGEST_COUNT = 1e9
 
@@ -87,14 +90,20 @@ def _array(frame: Any, where: str) -> np.ndarray:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(file) as image:
+            with Image.open(file, formats=FORMATS) as image:
                 if image.mode not in GRAY_MODES:
                     what = f"its pixels are {image.mode}, not gray values"
                     mend = "save it with 8 or 16 bits of gray, or give one channel as .npy"
                     raise CaptureError(what, where=str(file), mend=mend)
+                if (pages := getattr(image, "n_frames", 1)) > 1:
+                    mend = "save each page as a file of its own"
+                    raise CaptureError(f"it holds {pages} frames", where=str(file), mend=mend)
                 return np.asarray(image)
     except CaptureError:
         raise
+    except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+        mend = "cut it to what matters, or give it as .npy"
+        raise CaptureError("it is larger than any camera", where=str(file), mend=mend) from error
     except Exception as error:  # Pillow raises many types for a broken file
         mend = "give PNG, TIFF or .npy"
         raise CaptureError("it cannot be read as an image", where=str(file), mend=mend) from error

@@ -17,8 +17,8 @@ LARGEST_TRUSTED = 0.7
 """Pareto k above which weighted draws say little, however many there are."""
 
 
-TAILS = (0.05, 0.95)
-"""Levels of the posterior whose Monte Carlo error counts as that of its tails."""
+TAIL = 0.05
+"""Share of the posterior at either end whose Monte Carlo error counts as that of the tails."""
 
 
 class Points(NamedTuple):
@@ -243,7 +243,7 @@ def effective_tails(
 
     Returns:
         The least of all coordinates and both tails: p (1 - p) over the variance of the share of the
-        posterior below its own 5% and 95% quantile.
+        posterior beyond its own 5% and 95% quantile.
 
     Raises:
         Nothing.
@@ -256,13 +256,15 @@ def effective_tails(
     least = np.full(len(draws), np.inf)
     for coordinate in np.moveaxis(draws, -1, 0):
         order = np.argsort(coordinate, axis=-1)
-        share = np.take_along_axis(weights, order, axis=-1)
-        below, squares = np.cumsum(share, axis=-1), np.cumsum(share**2, axis=-1)
-        for level in TAILS:
-            at = np.argmax(below >= level, axis=-1)[:, None]
-            p, inside = (np.take_along_axis(x, at, axis=-1)[:, 0] for x in (below, squares))
+        rising = np.take_along_axis(weights, order, axis=-1)
+        for share in (rising, rising[:, ::-1]):
+            within, squares = np.cumsum(share, axis=-1), np.cumsum(share**2, axis=-1)
+            at = np.argmax(within >= TAIL, axis=-1)[:, None]
+            p, inside = (np.take_along_axis(x, at, axis=-1)[:, 0] for x in (within, squares))
             outside = squares[:, -1] - inside
             variance = inside * (1.0 - p) ** 2 + outside * p**2
             with np.errstate(invalid="ignore"):  # weights may be no numbers
-                least = np.fmin(least, p * (1.0 - p) / variance)
+                # One draw that is all there is: p is 1 and the variance 0, and it is worth itself.
+                told = np.where(p < 1.0, p * (1.0 - p) / np.where(p < 1.0, variance, 1.0), 1.0)
+                least = np.fmin(least, told)
     return least

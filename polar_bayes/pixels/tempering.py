@@ -45,7 +45,7 @@ class PixelTempering:
         draws: Of a mixture in every round; half a multiple of the crowd. An answer has the draws of
             two rounds.
         components: Of the mixtures, >= 1.
-        rounds: In which a mixture is fitted to the weighted draws, at most, >= 1.
+        rounds: In which a mixture is fitted to the weighted draws, at most, >= 2.
         crowds: What has not come to an answer in these rounds begins again from a new crowd, until
             there were so many, >= 1.
         effective_draws: Independent draws that the weighted ones must be worth, >= 1; in the middle
@@ -69,7 +69,7 @@ class PixelTempering:
             "walks": 16,
             "length": 2,
             "components": 1,
-            "rounds": 1,
+            "rounds": 2,
             "crowds": 1,
             "effective_draws": 1,
         }

@@ -344,3 +344,18 @@ def test_a_picture_in_color_is_refused(tmp_path):
     (tmp_path / "broken.png").write_bytes(b"no picture")
     with pytest.raises(CaptureError, match="it cannot be read as an image"):
         with_defaults(frames=[tmp_path / "broken.png"] * 4)
+
+
+def test_files_that_hold_something_else_than_one_frame_of_counts_are_refused(tmp_path, monkeypatch):
+    pages = [Image.fromarray(np.full((8, 8), 100 + k, np.uint8)) for k in range(4)]
+    stacked, lossy = tmp_path / "angles.tif", tmp_path / "ball.jpg"
+    pages[0].save(stacked, save_all=True, append_images=pages[1:])
+    pages[0].save(lossy)
+    with pytest.raises(CaptureError, match="it holds 4 frames"):
+        with_defaults(frames=[stacked] * 4)
+    with pytest.raises(CaptureError, match="give PNG, TIFF or .npy"):
+        with_defaults(frames=[lossy] * 4)
+    pages[0].save(tmp_path / "large.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
+    with pytest.raises(CaptureError, match="larger than any camera"):
+        with_defaults(frames=[tmp_path / "large.png"] * 4)

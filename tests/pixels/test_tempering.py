@@ -175,6 +175,7 @@ def test_a_skewed_pixel_has_the_posterior_of_a_grid(chains: bool) -> None:
     ("settings", "said"),
     [
         ({"walks": 4}, "walks is 4; give 16 or more"),
+        ({"rounds": 1}, "rounds is 1; give 2 or more"),
         ({"effective_share": 0.99}, "effective_share is 0.99; give a number from 0.1 to 0.95"),
         ({"draws": 1000}, "draws is 1000, and the crowd 1024; give half a multiple of walks"),
         ({"effective_draws": 5000.0}, "effective_draws is 5000.0, and there are 4096 draws"),
@@ -224,3 +225,15 @@ def test_tails_are_worth_less_where_few_draws_tell_them() -> None:
     worth = effective_tails(z, heavy)
     assert worth[1] == pytest.approx(4000.0, rel=0.01)
     assert 300.0 < worth[0] < 700.0  # 20 draws for a tail of 5%: 20 / 0.05 = 400
+
+
+def test_a_tail_that_one_draw_carries_is_worth_as_little_above_as_below() -> None:
+    z = np.linspace(-1.0, 1.0, 1000)[None, :, None]
+    heavy = np.full((1, 1000), 0.93 / 999)
+    heavy[0, -1] = 0.07  # the highest draw alone is more than the tail
+    above = effective_tails(z, heavy)
+    assert above == pytest.approx(effective_tails(-z, heavy))
+    assert 10.0 < above[0] < 20.0  # p (1 - p) / (p^2 (1 - p)^2) = 1 / (.07 * .93) = 15.4
+    alone = np.zeros((1, 1000))
+    alone[0, 500] = 1.0
+    assert effective_tails(z, alone) == pytest.approx(1.0)
