@@ -125,7 +125,7 @@ def calibrate(
         for differing in ({}, truth or {})
     )
     clock = time.perf_counter()
-    plan = _planned(request, told if truth else None, settings, readings)
+    plan = planned(request, told if truth else None, settings, readings)
     if not plan.shared:
         raise FitError(
             "it has no parameter in common with what is fitted",
@@ -174,7 +174,21 @@ def _resolved(
     return resolve(capture, model, "laplace", scene, priors, links, limit, seed, "double")
 
 
-def _planned(request: Request, told: Request | None, settings: Method, readings: bool) -> Plan:
+def planned(request: Request, told: Request | None, settings: Method, readings: bool) -> Plan:
+    """What is done to every block.
+
+    Args:
+        request: What is fitted, checked.
+        told: What captures are simulated by; None where it is the same.
+        settings: How each is fitted.
+        readings: Whether readings are ranked too.
+
+    Returns:
+        The plan.
+
+    Raises:
+        Nothing.
+    """
     candidates = settings.candidates if isinstance(settings, PixelLaplace) else CANDIDATES
     limit = request.largest_view_zenith
     recipe_key = key_of(request, candidates, limit)
