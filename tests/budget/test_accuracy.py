@@ -12,7 +12,7 @@ import xarray as xr
 from toy_models import capture, line, of_line, squared
 
 import polar_bayes as pb
-from polar_bayes.budget import fresh
+from polar_bayes.budget import dials, fresh
 from polar_bayes.budget.accuracy import AS_GIVEN
 from polar_bayes.budget.dials import AbstractDial
 from polar_bayes.budget.fresh import run_fresh
@@ -59,6 +59,20 @@ class Broken(AbstractMethod):
         raise pb.FitError("it cannot be", where="Broken", mend="nothing")
 
 
+@dataclasses.dataclass(frozen=True)
+class Stuck(AbstractDial):
+    """A dial that cannot be turned."""
+
+    @property
+    @override
+    def name(self) -> str:
+        return "stuck"
+
+    @override
+    def turn(self, request, method):
+        raise pb.FitError("it is rusty", where="Stuck", mend="oil it")
+
+
 @pytest.fixture(scope="module")
 def study() -> xr.DataTree:
     return pb.accuracy(
@@ -66,7 +80,7 @@ def study() -> xr.DataTree:
         model=line,
         links=LINKS,
         rungs={"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()},
-        dials=(pb.DrawsDial(0.1), pb.FacetsDial(2.0), pb.PrecisionDial()),
+        dials=(pb.DrawsDial(0.1), pb.FacetsDial(2.0), pb.PrecisionDial(), Stuck()),
         reference=ROUGHLY,
         fresh=False,
     )
@@ -100,6 +114,28 @@ def test_a_rung_that_fails_is_a_row_that_says_why(study):
     assert "it cannot be" in table.loc["broken", "problems"]
     assert np.isnan(table.loc["broken", "error"])
     assert not table.loc["broken", "on_front"]
+
+
+def test_a_dial_that_fails_is_a_row_that_says_why(study):
+    table = pb.accuracy_table(study)
+    for rung in ("biased", "right", "broken"):
+        assert "it is rusty" in table.loc[f"{rung}, stuck", "problems"]
+        assert np.isnan(table.loc[f"{rung}, stuck", "error"])
+
+
+def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
+    tries = []
+
+    def refuse(*arguments, **keywords):
+        tries.append(arguments)
+        raise pb.FitError("no peak", where="choose_effects", mend="nothing")
+
+    monkeypatch.setattr(dials, "choose_effects", refuse)
+    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    for method in (pb.Laplace(), pb.Nuts()):
+        with pytest.raises(pb.FitError, match="no peak"):
+            pb.EffectsDial().turn(request, method)
+    assert len(tries) == 1
 
 
 def test_dials_turn_what_they_can_and_leave_the_rest_out(study):
@@ -141,11 +177,11 @@ def test_facets_are_turned_where_there_are_any():
 
 
 def test_every_dial_has_a_name_of_its_own():
-    dials: list[AbstractDial] = [
+    every: list[AbstractDial] = [
         pb.DrawsDial(0.25), pb.DrawsDial(4.0), pb.FacetsDial(0.5), pb.FacetsDial(2.0),
         pb.EffectsDial(), pb.PrecisionDial(),
     ]  # fmt: skip
-    names = [dial.name for dial in dials]
+    names = [dial.name for dial in every]
     assert names[:3] == ["draws / 4", "draws x 4", "facets / 2"]
     assert len(set(names)) == len(names)
 
