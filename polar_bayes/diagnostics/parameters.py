@@ -12,6 +12,10 @@ from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 SAMPLE_DIMS = ("chain", "draw")
 METHODS = ("nuts", "laplace", "point", "importance", "tempered", "variational")
+APPROXIMATIONS = ("laplace", "variational")
+"""Methods whose draws are of the approximation, and stand beside `log_weight`: log posterior minus
+log approximation, up to a constant."""
+
 OF_POPULATIONS = ("_location", "_spread")
 OF_PROCESSES = ("_level", "_amplitude", "_length")
 

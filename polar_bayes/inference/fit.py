@@ -42,6 +42,8 @@ PRIOR_DRAWS = 500
 BLOCK = 500
 KEYS = 1 << 15
 THREADS = 2
+OF_DRAWS = ("r_hat", "k_hat", "effective_draws")
+"""What a method says of its own draws, kept with the result; None where it says nothing."""
 
 
 def fit(
@@ -144,7 +146,9 @@ def _fit_scene(
     if isinstance(request.method, AbstractMethod):
         answer = request.method.draw(Bench(request, prepared, data, key, progress))
         clock.lap("draws")
-        said = {"method": answer.kind} | answer.said
+        own = {name: getattr(answer, name) for name in OF_DRAWS}
+        finite = {name: x if math.isfinite(x) else None for name, x in own.items()}
+        said = {"method": answer.kind} | finite | answer.said
         return _Fitted(program, answer.z, answer.stats, answer.problems, said)
     if isinstance(request.method, point.Point):
         starts = np.asarray(from_prior(program, key_starts, STARTS, data))

@@ -156,6 +156,25 @@ def test_cautions_do_not_fail(change: dict, words: str) -> None:
     assert any(words in caution for caution in judged.cautions)
 
 
+@pytest.mark.parametrize(
+    ("method", "words"),
+    [
+        ("laplace", "only the heaviest is described here; use method='nuts'"),
+        ("variational", "only the heaviest is described here; use method='nuts'"),
+        ("nuts", "chains may not have visited them in proportion"),
+        ("importance", "the draws are of both"),
+        ("mine", "another explanation of the readings exists; add views"),
+    ],
+)
+def test_another_mode_is_told_as_the_method_sees_it(method: str, words: str) -> None:
+    tree = make_result(draws=1000)
+    judged = verdict(edit_provenance(tree, method=method, modes={"weights": [0.6, 0.4]}))
+    (caution,) = judged.cautions
+    assert words in caution
+    assert ("only the heaviest" in caution) == (method in ("laplace", "variational"))
+    assert ("use method='nuts'" in caution) == (method in ("laplace", "variational"))
+
+
 def test_deep_trees_are_a_caution_once_they_are_many() -> None:
     tree = make_result()
     deep = np.zeros((4, 250), bool)
@@ -184,6 +203,15 @@ def test_k_hat_has_the_right_sign(width: float, trusted: bool) -> None:
     assert judged.converged
     assert bool(judged.cautions) == (not trusted)
     assert trusted or "Pareto k-hat" in judged.cautions[0]
+
+
+def test_a_guide_is_judged_by_its_weights_as_laplace_is() -> None:
+    z = np.random.default_rng(3).normal(0.0, 0.3, (4, 1000))
+    tree = laplace_tree(stats.norm.logpdf(z) - stats.norm.logpdf(z, scale=0.3))
+    (caution,) = verdict(edit_provenance(tree, method="variational")).cautions
+    assert "Pareto k-hat of the guide's draws is" in caution
+    # Weights of draws that were chosen by weight are another matter.
+    assert not verdict(edit_provenance(tree, method="tempered")).cautions
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,13 @@ def test_the_first_rung_that_is_good_enough_is_taken():
     assert "was taken: its means and standard deviations are expected within" in sentence
 
 
+def test_what_a_method_says_of_its_draws_stays_with_the_result():
+    said = json.loads(
+        pb.fit(capture(), model=line, links=LINKS, method=Made(k_hat=2.0)).attrs["polar_bayes"]
+    )
+    assert (said["k_hat"], said["effective_draws"], said["r_hat"]) == (2.0, 4000.0, None)
+
+
 @pytest.mark.parametrize(
     ("rung", "why"),
     [
