@@ -10,11 +10,14 @@ from polar_bayes.budget.variants import Effect, parts_of, simplify
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.kept import Kept
 from polar_bayes.inference.request import Method, Request
-from polar_bayes.ladder.scaling import with_draws
+from polar_bayes.ladder.scaling import draws_of, with_draws
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.scene import Scene
 
 Turned = tuple[Request, Method]
+
+NEARLY = 0.1
+"""Relative difference between the draws that a dial is called by and those that there are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +47,7 @@ class AbstractDial(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class DrawsDial(AbstractDial):
-    """So many times the draws.
+    """So many times the draws; left out where a method cannot have about as many.
 
     Args:
         factor: Above 0.
@@ -72,7 +75,12 @@ class DrawsDial(AbstractDial):
             turned = with_draws(method, self.factor)
         except FitError:  # as few as the method allows
             return None
-        return None if turned is None or turned == method else (request, turned)
+        before, after = draws_of(method), None if turned is None else draws_of(turned)
+        if turned is None or not before or not after:
+            return None
+        # Some draw whole crowds only: what is called so must be so.
+        is_so = abs(after / before / self.factor - 1.0) < NEARLY
+        return (request, turned) if is_so and turned != method else None
 
 
 @dataclasses.dataclass(frozen=True)

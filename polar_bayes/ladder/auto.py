@@ -14,7 +14,7 @@ from polar_bayes.inference.request import Method
 from polar_bayes.ladder.builtin import answer
 from polar_bayes.ladder.expected import count_scalars, draws_needed, expected_error
 from polar_bayes.ladder.importance import Importance
-from polar_bayes.ladder.scaling import with_draws
+from polar_bayes.ladder.scaling import with_answer_draws, with_draws
 from polar_bayes.ladder.tempered import Tempered
 from polar_bayes.ladder.visiting import unvisited_weight
 from polar_bayes.pixels.importance import LARGEST_TRUSTED
@@ -82,10 +82,10 @@ class Auto(AbstractMethod):
         chains = Nuts(effective_draws=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
         if any(name != "view" and length > 1 for name, length in bench.data.dims):
             return {"nuts": chains}
-        crowd = PixelTempering().crowd
         weighted = min(RESERVE * needed, MOST_DRAWS)
-        drawn = crowd * -(-weighted // crowd)
-        tempering = PixelTempering(draws=drawn, effective_draws=min(needed, 0.5 * drawn))
+        tempering = with_answer_draws(PixelTempering(), weighted)
+        enough = min(needed, 0.5 * tempering.answer_draws)
+        tempering = dataclasses.replace(tempering, effective_draws=enough)
         return {
             "importance": Importance(draws=max(2048, 2 * weighted)),
             "tempered": Tempered(tempering),

@@ -16,7 +16,7 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.ladder.builtin import answer
 from polar_bayes.ladder.expected import draws_needed, expected_error, quantile
 from polar_bayes.ladder.importance import _proposal
-from polar_bayes.ladder.scaling import with_draws
+from polar_bayes.ladder.scaling import draws_of, with_answer_draws, with_draws
 from polar_bayes.ladder.visiting import unvisited_weight
 
 SMALL = {
@@ -161,7 +161,25 @@ def test_draws_are_scaled_and_settings_kept():
     assert chains.warmup == 77
     tempered = with_draws(pb.Tempered(pb.PixelTempering(draws=2048)), 4.0).settings
     assert (tempered.draws, tempered.effective_draws) == (8192, 800.0)
+    assert draws_of(pb.Tempered(tempered)) == tempered.answer_draws == 16384
+    # Half crowds count: a quarter is a quarter.
+    fewer = with_draws(pb.Tempered(pb.PixelTempering(draws=2048)), 0.25).settings
+    assert (fewer.draws, fewer.effective_draws) == (512, 50.0)
+    with pytest.raises(FitError, match="512 draws are fewer than the crowd of 1024"):
+        with_draws(pb.Tempered(pb.PixelTempering(draws=1024)), 0.25)
     assert with_draws(pb.Point(), 2.0) is None
+
+
+def test_tempered_answers_have_as_many_draws_as_are_asked_for():
+    settings = pb.PixelTempering()
+    for count, draws in ((1.0, 1024), (1024, 1024), (1025, 2048), (5000, 5120)):
+        assert with_answer_draws(settings, count).answer_draws == draws
+    auto, here = pb.Auto(tolerance=0.1), bench(line)
+    needed = draws_needed(0.1, 2)
+    rungs = auto.rungs(here)
+    assert 8 * needed <= rungs["tempered"].settings.answer_draws < 8 * needed + settings.crowd
+    assert rungs["tempered"].settings.effective_draws == needed
+    assert rungs["importance"].draws == 16 * needed
 
 
 @pytest.mark.parametrize(
