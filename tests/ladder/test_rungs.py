@@ -17,6 +17,7 @@ from polar_bayes.ladder.builtin import answer
 from polar_bayes.ladder.expected import draws_needed, expected_error, quantile
 from polar_bayes.ladder.importance import _proposal
 from polar_bayes.ladder.scaling import draws_of, with_answer_draws, with_draws
+from polar_bayes.ladder.tempered import _engine
 from polar_bayes.ladder.visiting import unvisited_weight
 
 SMALL = {
@@ -152,6 +153,14 @@ def test_draws_that_are_no_numbers_have_an_infinite_error():
     found = answer(SMALL["laplace"], here)
     found.z[0, 0, 0] = np.nan
     assert np.isposinf(expected_error(found, here.program, here.data))
+
+
+def test_each_tempered_fit_counts_for_itself_with_the_same_programs():
+    here = bench(line)
+    first, second = _engine(here), _engine(here)
+    assert first.programs is second.programs
+    first.counts["rounds"] += 3
+    assert second.counts["rounds"] == 0
 
 
 def test_draws_are_scaled_and_settings_kept():
