@@ -16,6 +16,7 @@ from polar_bayes.diagnostics.convergence import (
     summary,
     verdict,
 )
+from polar_bayes.diagnostics.parameters import method_of
 from polar_bayes.errors import FitError
 
 
@@ -173,6 +174,15 @@ def test_another_mode_is_told_as_the_method_sees_it(method: str, words: str) -> 
     assert words in caution
     assert ("only the heaviest" in caution) == (method in ("laplace", "variational"))
     assert ("use method='nuts'" in caution) == (method in ("laplace", "variational"))
+
+
+def test_the_method_is_called_as_it_was_stated() -> None:
+    tree = make_result(method="laplace")
+    assert method_of(tree) == "laplace"
+    assert method_of(edit_provenance(tree, method="mine")) == "mine"
+    assert json_summary(edit_provenance(tree, method="mine"))["method"] == "mine"
+    assert method_of(edit_provenance(tree, method=None)) == "laplace"
+    assert method_of(edit_provenance(make_result(), method=None)) == "nuts"
 
 
 def test_deep_trees_are_a_caution_once_they_are_many() -> None:
