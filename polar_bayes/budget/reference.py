@@ -130,7 +130,7 @@ def run_reference(settings: Reference, bench: Bench) -> Judge:
 
 
 def nearest(tried: Sequence[Judge]) -> Judge:
-    """The one that least can be said against: noise is known and told, and no reason to take a bias.
+    """The one that least can be said against: noise is told, and no reason to take a bias.
 
     Args:
         tried: At least one.
