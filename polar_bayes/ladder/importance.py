@@ -93,7 +93,7 @@ class Importance(AbstractMethod):
 def _drawn(proposal: Mixture, count: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     places = draw_mixture(proposal, count, key)
     densities = jax.lax.map(
-        lambda z: log_density(proposal, z), places, batch_size=min(SIDE_BY_SIDE, count)
+        lambda z: log_density(proposal, z[None])[0], places, batch_size=min(SIDE_BY_SIDE, count)
     )
     return places, densities
 
