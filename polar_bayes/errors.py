@@ -1,8 +1,12 @@
 """What goes wrong is told in one line: where, what, and the mend."""
 
+import functools
+from collections.abc import Callable
+from typing import override
+
 
 class PolarBayesError(ValueError):
-    """Base of every error that a user can mend.
+    """Base of every error that a user can mend; it may be sent to another process.
 
     Args:
         what: What is wrong, as a clause without a full stop.
@@ -13,6 +17,11 @@ class PolarBayesError(ValueError):
     def __init__(self, what: str, *, where: str, mend: str) -> None:
         self.what, self.where, self.mend = (one_line(text) for text in (what, where, mend))
         super().__init__(f"{self.where}: {self.what}; {self.mend}")
+
+    @override
+    def __reduce__(self) -> tuple[Callable[[], "PolarBayesError"], tuple[()]]:
+        # Exceptions are unpickled from `args`, which know no keywords.
+        return functools.partial(type(self), self.what, where=self.where, mend=self.mend), ()
 
 
 class CaptureError(PolarBayesError):

@@ -15,7 +15,7 @@ from polar_bayes.budget.distances import Distances, distances
 from polar_bayes.budget.fresh import run_fresh
 from polar_bayes.budget.reference import Judge, Reference, run_reference
 from polar_bayes.budget.trial import Measured, Trial, bench_of, run_trial
-from polar_bayes.errors import FitError
+from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.request import Method, Request, resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.inference.search import Progress
@@ -175,13 +175,13 @@ _NUMBERS = (
 
 def _trials(
     request: Request, rungs: Mapping[str, Method], dials: tuple[AbstractDial, ...]
-) -> dict[tuple[str, str], Trial]:
-    """What is run, by rung and dial; all rungs as given come first."""
+) -> dict[tuple[str, str], Trial | PolarBayesError]:
+    """What is run, or why it cannot be, by rung and dial; all rungs as given come first."""
     if not isinstance(rungs, Mapping) or not rungs:
         raise FitError(
             "there is no rung", where="accuracy: rungs", mend="give methods by name, as in LADDER"
         )
-    trials = {}
+    trials: dict[tuple[str, str], Trial | PolarBayesError] = {}
     for name, method in rungs.items():
         if not isinstance(method, Method):
             raise FitError(
@@ -192,7 +192,11 @@ def _trials(
         trials[str(name), AS_GIVEN] = Trial(request, method, request.seed)
     for dial in dials:
         for name, method in rungs.items():
-            turned = dial.turn(request, method)
+            try:
+                turned = dial.turn(request, method)
+            except PolarBayesError as error:  # a dial that fails is a row of every rung
+                trials[str(name), dial.name] = error
+                continue
             if turned is not None:
                 trials[str(name), dial.name] = Trial(*turned, request.seed)
     return trials
@@ -201,16 +205,18 @@ def _trials(
 def _row(
     rung: str,
     dial: str,
-    trial: Trial,
+    trial: Trial | PolarBayesError,
     judge: Judge,
     run: Callable[[Trial], Measured],
     fresh: bool,
 ) -> Row:
     lost = np.full(len(judge.labels), np.nan)
     nothing = Distances(*(lost.copy() for _ in Distances._fields))
+    if isinstance(trial, PolarBayesError):
+        return Row(rung, dial, nothing, None, str(trial), fresh)
     try:
         found = run(trial)
-    except FitError as error:  # a rung that fails is a row, too
+    except PolarBayesError as error:  # a rung that fails is a row, too
         return Row(rung, dial, nothing, None, str(error), fresh)
     shared = [label for label in judge.labels if label in found.labels]
     ours, theirs = (

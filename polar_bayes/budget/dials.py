@@ -7,14 +7,17 @@ from typing import override
 
 from polar_bayes.budget.effects import choose_effects
 from polar_bayes.budget.variants import Effect, parts_of, simplify
-from polar_bayes.errors import FitError
+from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.kept import Kept
 from polar_bayes.inference.request import Method, Request
-from polar_bayes.ladder.scaling import with_draws
+from polar_bayes.ladder.scaling import draws_of, with_draws
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.scene import Scene
 
 Turned = tuple[Request, Method]
+
+NEARLY = 0.1
+"""Relative difference between the draws that a dial is called by and those that there are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,12 +39,15 @@ class AbstractDial(abc.ABC):
 
         Returns:
             Both, turned; None where this dial changes nothing.
+
+        Raises:
+            FitError: It cannot be turned for this capture; other errors of the package likewise.
         """
 
 
 @dataclasses.dataclass(frozen=True)
 class DrawsDial(AbstractDial):
-    """So many times the draws.
+    """So many times the draws; left out where a method cannot have about as many.
 
     Args:
         factor: Above 0.
@@ -69,7 +75,12 @@ class DrawsDial(AbstractDial):
             turned = with_draws(method, self.factor)
         except FitError:  # as few as the method allows
             return None
-        return None if turned is None or turned == method else (request, turned)
+        before, after = draws_of(method), None if turned is None else draws_of(turned)
+        if turned is None or not before or not after:
+            return None
+        # Some draw whole crowds only: what is called so must be so.
+        is_so = abs(after / before / self.factor - 1.0) < NEARLY
+        return (request, turned) if is_so and turned != method else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,6 +159,8 @@ class EffectsDial(AbstractDial):
     def turn(self, request: Request, method: Method) -> Turned | None:
         choose = functools.partial(_chosen, request, self.tolerance)
         _, scene = _CHOSEN.of((id(request), self.tolerance), choose)
+        if isinstance(scene, PolarBayesError):
+            raise scene
         return None if scene == request.scene else (_with_scene(request, scene), method)
 
 
@@ -164,23 +177,27 @@ DIALS: tuple[AbstractDial, ...] = (
 PRIOR = "prior of "
 """How a request says that a prior is the user's own."""
 
-_CHOSEN: Kept[tuple[Request, Scene]] = Kept(2)
-"""Choices take minutes, and every rung asks; each stands beside the request that it is of."""
+_CHOSEN: Kept[tuple[Request, Scene | PolarBayesError]] = Kept(2)
+"""Choices take minutes, and every rung asks; each stands beside the request that it is of. One that
+failed would fail again."""
 
 
-def _chosen(request: Request, tolerance: float) -> tuple[Request, Scene]:
+def _chosen(request: Request, tolerance: float) -> tuple[Request, Scene | PolarBayesError]:
     plain = simplify(request.scene, ())
     own = [name.removeprefix(PRIOR) for name in request.swapped if name.startswith(PRIOR)]
-    scene = choose_effects(
-        request.capture,
-        scene=plain,
-        tolerance=tolerance,
-        model=request.model,
-        priors={name: request.priors[name] for name in own},
-        links=request.links,
-        largest_view_zenith=request.largest_view_zenith,
-        seed=request.seed,
-    )
+    try:
+        scene = choose_effects(
+            request.capture,
+            scene=plain,
+            tolerance=tolerance,
+            model=request.model,
+            priors={name: request.priors[name] for name in own},
+            links=request.links,
+            largest_view_zenith=request.largest_view_zenith,
+            seed=request.seed,
+        )
+    except PolarBayesError as error:
+        return request, error
     return request, simplify(scene, ())
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import cloudpickle
 
 from polar_bayes.budget.trial import Measured, Trial, run_trial
-from polar_bayes.errors import FitError
+from polar_bayes.errors import FitError, PolarBayesError
 
 LAST_WORDS = 300
 """Characters of what a process that broke down has said."""
@@ -31,7 +31,8 @@ def run_fresh(trial: Trial) -> Measured:
         What came of it; imports are not part of its times.
 
     Raises:
-        FitError: The method does not suit the capture, found nothing, or its process broke down.
+        FitError: The method does not suit the capture, found nothing, or its process broke down;
+            other errors of the package as the trial raised them.
     """
     with tempfile.TemporaryDirectory(prefix="polar-bayes-") as folder:
         given, made = Path(folder) / "trial", Path(folder) / "measured"
@@ -48,7 +49,7 @@ def run_fresh(trial: Trial) -> Measured:
             )
         # Written by the process that this one has just started.
         found = pickle.loads(made.read_bytes())
-    if isinstance(found, FitError):
+    if isinstance(found, PolarBayesError):
         raise found
     return found
 
@@ -63,8 +64,8 @@ def _environment() -> dict[str, str]:
 def _work(given: Path, made: Path) -> None:
     trial = pickle.loads(given.read_bytes())
     try:
-        found: Measured | FitError = run_trial(trial)
-    except FitError as error:
+        found: Measured | PolarBayesError = run_trial(trial)
+    except PolarBayesError as error:
         found = error
     made.write_bytes(cloudpickle.dumps(found))
 

@@ -10,7 +10,13 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
-from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars, stats_of
+from polar_bayes.diagnostics.parameters import (
+    APPROXIMATIONS,
+    Scalar,
+    method_of,
+    posterior_scalars,
+    stats_of,
+)
 from polar_bayes.inference.result import provenance_of
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
@@ -23,6 +29,15 @@ LARGEST_SECOND_MODE = 0.01
 MANY_MASKED = 0.25
 MANY_DEEP = 0.01
 LONGEST_LIST = 4
+HEAVIEST = ", and only the heaviest is described here; use method='nuts', or "
+OTHER_MODES = {
+    "laplace": HEAVIEST,
+    "variational": HEAVIEST,
+    "importance": ", and the draws are of both; a mean may lie between them; ",
+    "nuts": ", and chains may not have visited them in proportion; compare chains in the rank "
+    "plot, or ",
+}
+"""What methods make of a further mode; of one's own nothing is known."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +145,7 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
 
 
 def laplace_k_hat(result: xr.DataTree) -> float:
-    """How far Laplace draws are from the posterior, as the Pareto k-hat of their weights.
+    """How far draws of Laplace or a guide are from the posterior, as Pareto k-hat of their weights.
 
     $$ w = p(z | data) / q(z) $$
 
@@ -243,28 +258,31 @@ def _divergences(result: xr.DataTree) -> list[str]:
 
 
 def _approximation(result: xr.DataTree, method: str) -> list[str]:
-    if method != "laplace":
+    if method not in APPROXIMATIONS:
         return []
     stats = stats_of(result)
     k_hat = laplace_k_hat(result)
-    if "log_weight" in stats and not k_hat <= LARGEST_K_HAT:
-        return [
-            f"Pareto k-hat of the Laplace draws is {k_hat:.2f} (at most {LARGEST_K_HAT}): the "
-            "posterior is not close to a normal distribution; use method='nuts' for intervals."
-        ]
-    return []
+    if "log_weight" not in stats or k_hat <= LARGEST_K_HAT:
+        return []
+    whose, what = (
+        ("the Laplace draws", "a normal distribution")
+        if method == "laplace"
+        else ("the guide's draws", "the guide")
+    )
+    return [
+        f"Pareto k-hat of {whose} is {k_hat:.2f} (at most {LARGEST_K_HAT}): the posterior is not "
+        f"close to {what}; use method='nuts' for intervals."
+    ]
 
 
 def _several_modes(provenance: Mapping[str, Any]) -> list[str]:
     weights = (provenance.get("modes") or {}).get("weights", [])
     if len(weights) < 2 or not weights[1] > LARGEST_SECOND_MODE:
         return []
-    which = "only the heaviest is described here; use method='nuts'"
-    if provenance.get("method") == "nuts":
-        which = "chains may not have visited them in proportion; compare chains in the rank plot"
+    method = str(provenance.get("method", "laplace"))
     return [
         f"The posterior has another mode, of weight {weights[1]:.2g}: another explanation of the "
-        f"readings exists, and {which}, or add views that tell them apart."
+        f"readings exists{OTHER_MODES.get(method, '; ')}add views that tell them apart."
     ]
 
 

@@ -11,7 +11,10 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 SAMPLE_DIMS = ("chain", "draw")
-METHODS = ("nuts", "laplace", "point", "importance", "tempered", "variational")
+APPROXIMATIONS = ("laplace", "variational")
+"""Methods whose draws are of the approximation, and stand beside `log_weight`: log posterior minus
+log approximation, up to a constant."""
+
 OF_POPULATIONS = ("_location", "_spread")
 OF_PROCESSES = ("_level", "_amplitude", "_length")
 
@@ -110,10 +113,10 @@ def stats_of(result: xr.DataTree) -> Mapping[str, xr.DataArray]:
 
 
 def method_of(result: xr.DataTree) -> str:
-    """How the fit was made, by one of `METHODS`; told by its statistics if not said."""
+    """How the fit was made: the kind that its method gave, told by its statistics if not said."""
     method = provenance_of(result).get("method")
-    if method in METHODS:
-        return str(method)
+    if isinstance(method, str) and method:
+        return method
     stats = stats_of(result)
     if "loss" in stats or result["posterior"].sizes.get("draw", 0) == 1:
         return "point"

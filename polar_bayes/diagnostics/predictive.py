@@ -16,6 +16,7 @@ from arviz_stats.base import array_stats
 from arviz_stats.ecdf_utils import ecdf_pit
 
 from polar_bayes.diagnostics.parameters import (
+    APPROXIMATIONS,
     SAMPLE_DIMS,
     method_of,
     posterior_scalars,
@@ -113,7 +114,7 @@ def predictive_checks(result: xr.DataTree) -> dict[str, Check]:
         FitError: The tree holds no posterior.
     """
     efficiency = _relative_efficiency(result)
-    correction = _laplace_correction(result)
+    correction = _correction(result)
     checks = {}
     for name in result["observed_data"].data_vars if "observed_data" in result.children else ():
         part = _select(result, str(name))
@@ -276,10 +277,10 @@ def _relative_efficiency(result: xr.DataTree) -> float:
     return float(np.mean(array_stats.ess(draws, method="mean", relative=True)))
 
 
-def _laplace_correction(result: xr.DataTree) -> np.ndarray | None:
-    """Log weights that turn Laplace draws into posterior draws, where they were stored."""
+def _correction(result: xr.DataTree) -> np.ndarray | None:
+    """Log weights that turn draws of an approximation into posterior draws, where stored."""
     stats = stats_of(result)
-    if "log_weight" not in stats or method_of(result) != "laplace":
+    if "log_weight" not in stats or method_of(result) not in APPROXIMATIONS:
         return None
     log_weight = stats["log_weight"].to_numpy().astype(float).ravel()
     return log_weight - log_weight.max() if np.isfinite(log_weight).all() else None

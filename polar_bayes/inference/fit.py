@@ -42,6 +42,8 @@ PRIOR_DRAWS = 500
 BLOCK = 500
 KEYS = 1 << 15
 THREADS = 2
+OF_DRAWS = ("r_hat", "k_hat", "effective_draws")
+"""What a method says of its own draws, kept with the result; None where it says nothing."""
 
 
 def fit(
@@ -99,6 +101,7 @@ class _Fitted(NamedTuple):
     stats: dict[str, np.ndarray]
     problems: list[str]
     extra: dict[str, Any]
+    beside: Method | None = None
 
 
 def _run(request: Request, progress: Progress) -> xr.DataTree:
@@ -117,7 +120,8 @@ def _run(request: Request, progress: Progress) -> xr.DataTree:
     prior = describe(key_prior, prior_z[None], data)
     clock.lap("prediction")
 
-    beside, comparisons_failed = _fit_beside(request, data, key_plain, progress)
+    method = fitted.beside or request.method
+    beside, comparisons_failed = _fit_beside(request, method, data, key_plain, progress)
     if isinstance(request.scene.ledger, xr.Dataset):
         beside["effects"] = request.scene.ledger  # how the scene was chosen stays with the result
     if comparisons_failed:
@@ -144,8 +148,10 @@ def _fit_scene(
     if isinstance(request.method, AbstractMethod):
         answer = request.method.draw(Bench(request, prepared, data, key, progress))
         clock.lap("draws")
-        said = {"method": answer.kind} | answer.said
-        return _Fitted(program, answer.z, answer.stats, answer.problems, said)
+        own = {name: getattr(answer, name) for name in OF_DRAWS}
+        finite = {name: x if math.isfinite(x) else None for name, x in own.items()}
+        said = {"method": answer.kind} | finite | answer.said
+        return _Fitted(program, answer.z, answer.stats, answer.problems, said, answer.beside)
     if isinstance(request.method, point.Point):
         starts = np.asarray(from_prior(program, key_starts, STARTS, data))
         fitted = _fit_point(prepared, data, starts, request.method)
@@ -222,13 +228,11 @@ def _fit_point(
 
 
 def _fit_beside(
-    request: Request, data: Observations, key: Array, progress: Progress
+    request: Request, method: Method, data: Observations, key: Array, progress: Progress
 ) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
     """Posteriors of the same fit without what makes its intervals honest, and which ones failed."""
     terms = () if request.scene.instrument is None else request.scene.instrument.terms
-    if isinstance(request.method, point.Point) or not any(
-        isinstance(term, Discrepancy) for term in terms
-    ):
+    if isinstance(method, point.Point) or not any(isinstance(term, Discrepancy) for term in terms):
         return {}, {}
     scenes = {
         "without_discrepancy": request.scene.without(Discrepancy),
@@ -240,7 +244,7 @@ def _fit_beside(
         progress("comparing", number / len(scenes))
         try:
             prepared = prepare(request, scene, data)
-            simpler = dataclasses.replace(request, scene=scene)
+            simpler = dataclasses.replace(request, scene=scene, method=method)
             fitted = _fit_scene(simpler, prepared, data, key, _silent, _Clock())
         except FitError as error:  # a failed comparison must not cost the user the fit, but is told
             comparisons_failed[name] = str(error)

@@ -12,7 +12,9 @@ class Answer:
     """What a method says of one posterior.
 
     Args:
-        kind: How the draws were made: "nuts", "laplace", "point", "importance" and so on.
+        kind: How the draws were made: "nuts", "laplace", "point", "importance", "tempered",
+            "variational", or a word of one's own. Verdict and report follow it: "nuts" is judged by
+            R-hat, "laplace" and "variational" by the statistic `log_weight`.
         z: Unconstrained draws of the model, all worth the same, (chain, draw, size).
         stats: Statistics of the draws, each (chain, draw).
         problems: What makes them unusable.
@@ -24,6 +26,8 @@ class Answer:
         gradients: Evaluations of the log density with its gradient; NaN where nobody counts.
         densities: Evaluations of the log density alone, likewise.
         said: What else belongs into the provenance; JSON must hold it.
+        beside: Settings that fit the comparisons beside this answer, where a method has chosen
+            another; None where they are its own.
     """
 
     kind: str
@@ -37,6 +41,7 @@ class Answer:
     gradients: float = np.nan
     densities: float = np.nan
     said: dict[str, Any] = dataclasses.field(default_factory=dict)
+    beside: Any = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The cheapest method that is good enough, found by trying: from cheap to exact."""
 
+import contextlib
 import dataclasses
 import time
 from typing import Any, NamedTuple, override
@@ -14,9 +15,10 @@ from polar_bayes.inference.request import Method
 from polar_bayes.ladder.builtin import answer
 from polar_bayes.ladder.expected import count_scalars, draws_needed, expected_error
 from polar_bayes.ladder.importance import Importance
-from polar_bayes.ladder.scaling import with_draws
+from polar_bayes.ladder.scaling import draws_of, with_answer_draws, with_draws
 from polar_bayes.ladder.tempered import Tempered
 from polar_bayes.ladder.visiting import unvisited_weight
+from polar_bayes.ladder.weighing import most_worth
 from polar_bayes.pixels.importance import LARGEST_TRUSTED
 from polar_bayes.pixels.tempering import PixelTempering
 
@@ -45,7 +47,8 @@ class Auto(AbstractMethod):
     Args:
         tolerance: Largest error of a posterior mean or standard deviation, in posterior standard
             deviations, above 0 and at most 1.
-        seconds: No method begins later, and chains stop then, > 0. The first one always ends.
+        seconds: No method begins later, and chains stop then, > 0; those of the fits beside this
+            one, too, which are made by the method that was taken. The first one always ends.
 
     Raises:
         FitError: A setting is out of range.
@@ -69,6 +72,8 @@ class Auto(AbstractMethod):
     def rungs(self, bench: Bench) -> dict[str, Method]:
         """What is tried for a capture, cheapest first, each with as many draws as it takes.
 
+        Weighted draws are left out where even the best weights could not meet the tolerance.
+
         Args:
             bench: The capture.
 
@@ -82,15 +87,16 @@ class Auto(AbstractMethod):
         chains = Nuts(effective_draws=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
         if any(name != "view" and length > 1 for name, length in bench.data.dims):
             return {"nuts": chains}
-        crowd = PixelTempering().crowd
         weighted = min(RESERVE * needed, MOST_DRAWS)
-        drawn = crowd * -(-weighted // crowd)
-        tempering = PixelTempering(draws=drawn, effective_draws=min(needed, 0.5 * drawn))
-        return {
-            "importance": Importance(draws=max(2048, 2 * weighted)),
-            "tempered": Tempered(tempering),
-            "nuts": chains,
+        tempering = with_answer_draws(PixelTempering(), weighted)
+        enough = min(needed, 0.5 * tempering.answer_draws)
+        tempering = dataclasses.replace(tempering, effective_draws=enough)
+        importance = Importance(draws=max(2048, 2 * weighted))
+        rungs: dict[str, Method] = {"importance": importance, "tempered": Tempered(tempering)}
+        able = {
+            name: rung for name, rung in rungs.items() if most_worth(draws_of(rung) or 0) >= needed
         }
+        return able | {"nuts": chains}
 
     @override
     def draw(self, bench: Bench) -> Answer:
@@ -104,11 +110,11 @@ class Auto(AbstractMethod):
             if steps and time.perf_counter() >= deadline:
                 steps.append(Step(name, 0.0, why="the time was up"))
                 continue
-            step, found = self._try(name, method, _within(bench, deadline if best else np.inf))
+            step, found = self._try(name, method, _within(bench, deadline if steps else np.inf))
             steps.append(step)
             # Of two in doubt the dearer one is nearer to exact.
             if found is not None and (best is None or step.error <= best[0].error):
-                best = step, found
+                best = step, dataclasses.replace(found, beside=InTime(method, deadline))
             if step.taken:
                 break
             again = not again and np.isfinite(step.error)
@@ -166,6 +172,26 @@ class Auto(AbstractMethod):
             "steps": [_as_said(each) for each in steps],
         }
         return dataclasses.replace(found, problems=problems, said=found.said | {"auto": said})
+
+
+@dataclasses.dataclass(frozen=True)
+class InTime(AbstractMethod):
+    """A method that has to be done by a time of this process.
+
+    Args:
+        method: Any method.
+        deadline: Of `time.perf_counter`, s; nothing begins later, and chains stop then.
+    """
+
+    method: Method
+    deadline: float
+
+    @override
+    def draw(self, bench: Bench) -> Answer:
+        if time.perf_counter() < self.deadline:
+            with contextlib.suppress(_TimeIsUpError):
+                return answer(self.method, _within(bench, self.deadline))
+        raise FitError("the time was up", where="method='auto'", mend="give more seconds")
 
 
 class Step(NamedTuple):

@@ -1,5 +1,7 @@
 """How far means and standard deviations may be off, as the draws themselves tell."""
 
+from collections.abc import Callable
+
 import jax
 import numpy as np
 import scipy.stats
@@ -32,18 +34,35 @@ def expected_error(answer: Answer, program: Program, data: Observations) -> floa
     Raises:
         Nothing.
     """
-    drawn = scalars_of(program, answer.z, data)
-    mean, sd = standard_errors(drawn)
-    if answer.weighted is not None:
-        z, weights = answer.weighted
-        whole = scalars_of(program, z[None], data)[:, 0]
-        weighted = _of_weighted(whole, weights)
-        # What is lost by choosing is at most what as many independent draws would lose.
-        mean, sd = np.hypot(weighted[0], mean), np.hypot(weighted[1], sd)
+    mean, sd = errors_of(answer, lambda z: scalars_of(program, z, data))
     errors = np.concatenate([mean, sd])
     if not np.isfinite(errors).all():
         return float("inf")
     return float(errors.max() * quantile(len(errors)))
+
+
+def errors_of(
+    answer: Answer, describe: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Monte Carlo standard errors of means and standard deviations, in standard deviations.
+
+    Args:
+        answer: Draws of chains, independent ones, or weighted ones and those chosen from them.
+        describe: From unconstrained draws, (chain, draw, size), to numbers, (scalar, chain, draw).
+
+    Returns:
+        Of the means and of the standard deviations, each (scalar,); NaN for what never moved.
+
+    Raises:
+        Nothing.
+    """
+    mean, sd = standard_errors(describe(answer.z))
+    if answer.weighted is None:
+        return mean, sd
+    z, weights = answer.weighted
+    weighted = _of_weighted(describe(z[None])[:, 0], weights)
+    # What is lost by choosing is at most what as many independent draws would lose.
+    return np.hypot(weighted[0], mean), np.hypot(weighted[1], sd)
 
 
 def quantile(count: int) -> float:

@@ -10,18 +10,18 @@ import numpy as np
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.bench import Bench
-from polar_bayes.inference.ground import WholeGround
+from polar_bayes.inference.ground import STARTS, WholeGround
 from polar_bayes.inference.method import AbstractMethod, Answer
 from polar_bayes.inference.modes import Modes
 from polar_bayes.ladder.weighing import choose, generator, log_densities
 from polar_bayes.pixels.importance import LARGEST_TRUSTED, effective_draws, smooth
 from polar_bayes.pixels.mixtures import Mixture, draw_mixture, log_density
 
-MODES = 4
-"""Heaviest modes that draws are made at."""
-
 LEAST_SHARE = 1e-3
 """Of the Laplace evidence: lighter modes get no draws."""
+
+SIDE_BY_SIDE = 1024
+"""Draws whose density is computed together: that of all modes at once would fill the memory."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,8 +29,9 @@ class Importance(AbstractMethod):
     """Laplace with importance correction.
 
     Draws come from a mixture of Student t distributions with 8 degrees of freedom, one at each
-    mode, as heavy as its Laplace evidence. Weighing them by the posterior corrects what the
-    normal approximation gets wrong, as far as the mixture reaches; Pareto k-hat says how far.
+    mode that holds 0.1% of the Laplace evidence or more, as heavy as its evidence. Weighing them
+    by the posterior corrects what the normal approximation gets wrong, as far as the mixture
+    reaches; Pareto k-hat says how far.
 
     Args:
         draws: Of the mixture, at least 256.
@@ -91,13 +92,19 @@ class Importance(AbstractMethod):
 @functools.partial(jax.jit, static_argnums=1)
 def _drawn(proposal: Mixture, count: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     places = draw_mixture(proposal, count, key)
-    return places, log_density(proposal, places)
+    densities = jax.lax.map(
+        lambda z: log_density(proposal, z[None])[0], places, batch_size=min(SIDE_BY_SIDE, count)
+    )
+    return places, densities
 
 
 def _proposal(modes: Modes, dtype: np.dtype) -> Mixture:
-    """A component for each heavy mode; always as many, so that one program draws from all."""
-    heavy = np.flatnonzero(modes.weight >= LEAST_SHARE)[:MODES]
-    which = np.resize(heavy, MODES)
+    """A component for each heavy mode; always as many, so that one program draws from all.
+
+    There are never more modes than climbs; a mode has several components where there are fewer.
+    """
+    heavy = np.flatnonzero(modes.weight >= LEAST_SHARE)
+    which = np.resize(heavy, max(STARTS, heavy.size))
     times = np.bincount(which, minlength=len(modes.weight))[which]
     share = modes.weight[which] / times
     size = modes.z.shape[1]

@@ -5,9 +5,11 @@ import functools
 import math
 from typing import Any
 
+from polar_bayes.errors import FitError
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.request import Method
 from polar_bayes.ladder.tempered import Tempered
+from polar_bayes.pixels.tempering import PixelTempering
 
 
 @functools.singledispatch
@@ -40,7 +42,53 @@ def _(method: Nuts, factor: float) -> Method:
 @with_draws.register
 def _(method: Tempered, factor: float) -> Method:
     settings = method.settings
-    crowds = max(1, math.ceil(factor * settings.draws / settings.crowd))
-    draws = crowds * settings.crowd
-    worth = settings.effective_draws * draws / settings.draws
-    return Tempered(dataclasses.replace(settings, draws=draws, effective_draws=worth))
+    wanted = factor * settings.answer_draws
+    if wanted < settings.crowd:
+        raise FitError(
+            f"{wanted:g} draws are fewer than the crowd of {settings.crowd}",
+            where="Tempered",
+            mend="give a smaller crowd, or more draws",
+        )
+    more = with_answer_draws(settings, wanted)
+    worth = settings.effective_draws * more.answer_draws / settings.answer_draws
+    return Tempered(dataclasses.replace(more, effective_draws=worth))
+
+
+def with_answer_draws(settings: PixelTempering, count: float) -> PixelTempering:
+    """The same settings with at least so many draws in an answer.
+
+    Args:
+        settings: Of tempered draws.
+        count: Draws of an answer, above 0; rounded up to a multiple of the crowd.
+
+    Returns:
+        The settings; what the draws must be worth is as it was, or half of the draws if fewer.
+
+    Raises:
+        Nothing.
+    """
+    whole = settings.crowd * max(1, math.ceil(count / settings.crowd))
+    worth = min(settings.effective_draws, 0.5 * whole)
+    return dataclasses.replace(settings, draws=whole // 2, effective_draws=worth)
+
+
+@functools.singledispatch
+def draws_of(method: Method) -> int | None:
+    """How many draws a method makes, at least.
+
+    Args:
+        method: Settings of any method.
+
+    Returns:
+        The number; None where the method draws nothing.
+
+    Raises:
+        Nothing.
+    """
+    draws = getattr(method, "draws", None)
+    return draws if isinstance(draws, int) else None
+
+
+@draws_of.register
+def _(method: Tempered) -> int | None:
+    return method.settings.answer_draws

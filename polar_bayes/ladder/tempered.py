@@ -97,7 +97,7 @@ class Tempered(AbstractMethod):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Counting(Engine):
-    """The programs of a layout, and how often one fit runs them."""
+    """The programs of a layout, and how often one fit runs them; made for each fit."""
 
     counts: collections.Counter = dataclasses.field(default_factory=collections.Counter)
 
@@ -112,22 +112,21 @@ class _Counting(Engine):
         return super().propose(*arguments)
 
 
-_ENGINES: Kept[tuple[Prepared, _Counting]] = Kept(MOST_KEPT)
+_ENGINES: Kept[tuple[Prepared, Engine]] = Kept(MOST_KEPT)
 """With what they were made for, so that its identity is not given to another."""
 
 
 def _engine(bench: Bench) -> _Counting:
-    """The programs of the bench's layout, kept from fit to fit; their counts begin at zero."""
-    _, engine = _ENGINES.of(id(bench.prepared), functools.partial(_make, bench))
-    engine.counts.clear()
-    return engine
+    """The programs of the bench's layout, kept from fit to fit, and counts that begin at zero."""
+    _, kept = _ENGINES.of(id(bench.prepared), functools.partial(_make, bench))
+    return _Counting(kept.program, kept.rough, kept.candidates, kept.precision, kept.programs)
 
 
-def _make(bench: Bench) -> tuple[Prepared, _Counting]:
+def _make(bench: Bench) -> tuple[Prepared, Engine]:
     candidates = np.zeros((1, bench.program.size))  # nothing climbs here
     rough = _rough(bench)
     with TRACING:
-        return bench.prepared, _Counting(bench.program, rough, candidates, bench.request.precision)
+        return bench.prepared, Engine(bench.program, rough, candidates, bench.request.precision)
 
 
 def _rough(bench: Bench) -> Program:

@@ -74,6 +74,22 @@ def choose(
     return random.permutation(chosen).reshape(CHAINS, each)
 
 
+def most_worth(count: int) -> float:
+    """How many independent draws the chosen ones stand for at best, all weights being equal.
+
+    Args:
+        count: Weighted draws.
+
+    Returns:
+        The number; the errors of weighing and of choosing are both in it.
+
+    Raises:
+        Nothing.
+    """
+    chosen = min(count, CHAINS * MOST)
+    return count * chosen / (count + chosen) if count else 0.0
+
+
 def generator(key: Array) -> np.random.Generator:
     """NumPy's random numbers from a key of JAX."""
     return np.random.default_rng(np.asarray(jax.random.key_data(key)))

@@ -79,12 +79,14 @@ class Engine:
         rough: The same model in single precision, in which climbs begin.
         candidates: Unconstrained vectors among which each pixel finds its start.
         precision: "double" or "single".
+        programs: Those that depend on settings, by these; they go when the engine goes.
     """
 
     program: Program
     rough: Program
     candidates: np.ndarray
     precision: str
+    programs: dict[Any, Callable] = dataclasses.field(default_factory=dict)
 
     def ready(self) -> "Engine":
         """The engine with its programs made, though not yet traced."""
@@ -150,7 +152,7 @@ class Engine:
             center, half = (np.float32(x) for x in proposal)
             given = [np.float32(x) for x in points]
             with TRACING:  # no two threads make the same program
-                draws = self._draws(weighted)
+                draws = self._kept(self._draws, weighted)
             return self._map(functools.partial(draws, *given), near, center, half)
 
     def sample(
@@ -175,7 +177,7 @@ class Engine:
         """
         with jax.enable_x64(self.precision == "double"):
             with TRACING:
-                several = self._chains(settings)
+                several = self._kept(self._chains, settings)
             states = np.asarray(z, self.dtype), np.asarray(half, self.dtype), keys
             kept, draws = self._map(several, pixels.in_precision(self.dtype), *states, batch=FEW)
         r_hat = [max(array_stats.rhat(x) for x in np.moveaxis(one, -1, 0)) for one in kept]
@@ -201,7 +203,9 @@ class Engine:
         """
         with jax.enable_x64(False):
             with TRACING:
-                crowded = functools.partial(self._tempered(settings), CROWD - np.uint32(attempt))
+                crowded = functools.partial(
+                    self._kept(self._tempered, settings), CROWD - np.uint32(attempt)
+                )
             return self._map(crowded, pixels.in_precision(np.float32), keys, batch=FEW)
 
     def propose(
@@ -231,7 +235,7 @@ class Engine:
         """
         with jax.enable_x64(False):
             with TRACING:
-                proposed = self._proposed(settings)
+                proposed = self._kept(self._proposed, settings)
             proposed = functools.partial(proposed, np.uint32(number))
             states = np.float32(z), np.float32(weights), keys
             return self._map(proposed, pixels.in_precision(np.float32), *states, batch=FEW)
@@ -298,7 +302,13 @@ class Engine:
             parts.append(jax.tree.map(np.asarray, self._all_crowned(z, slopes)))
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(climbers.z)], *parts)
 
-    @functools.cache  # noqa: B019 - an engine lives as long as its map
+    def _kept(self, make: Callable[[Any], Callable], settings: Any) -> Callable:
+        """A program for these settings, made if there is none; the caller holds `TRACING`."""
+        key = make.__name__, settings
+        if key not in self.programs:
+            self.programs[key] = make(settings)
+        return self.programs[key]
+
     def _draws(self, weighted: bool) -> Callable:
         def draws(
             points: Array, log_density: Array, data: Observations, center: Array, half: Array
@@ -312,7 +322,6 @@ class Engine:
 
         return batched(draws, given=2, side_by_side=DRAWN)
 
-    @functools.cache  # noqa: B019 - an engine lives as long as its map
     def _chains(self, settings: PixelNuts) -> Callable:
         def pixel(data: Observations, z: Array, half: Array, key: Array) -> tuple[Array, Values]:
             if settings.start is None:
@@ -323,14 +332,12 @@ class Engine:
 
         return batched(pixel, side_by_side=1)
 
-    @functools.cache  # noqa: B019 - an engine lives as long as its map
     def _tempered(self, settings: PixelTempering) -> Callable:
         def pixel(number: Array, data: Observations, key: Array) -> Tempered:
             return temper(self.rough, settings, data, jax.random.fold_in(key, number))
 
         return batched(pixel, given=1, side_by_side=1)
 
-    @functools.cache  # noqa: B019 - an engine lives as long as its map
     def _proposed(self, settings: PixelTempering) -> Callable:
         def pixel(
             number: Array, data: Observations, z: Array, weights: Array, key: Array

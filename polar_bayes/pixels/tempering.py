@@ -104,6 +104,11 @@ class PixelTempering:
         """Draws that are tempered."""
         return self.walks * self.length
 
+    @property
+    def answer_draws(self) -> int:
+        """Weighted draws of an answer: those of two rounds."""
+        return 2 * self.draws
+
 
 class Crowd(NamedTuple):
     """Draws on their way.

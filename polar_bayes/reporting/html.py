@@ -132,7 +132,7 @@ def render(result: xr.DataTree) -> str:
     name = one_line(str((provenance.get("capture") or {}).get("name", "capture")))
     content: dict[str, Any] = {
         "name": name,
-        "method": METHODS[method],
+        "method": METHODS.get(method, one_line(method)),
         "provenance": provenance,
         "verdict": judged,
         "headline": sentences.headline(method, judged.converged, judged.cautions),

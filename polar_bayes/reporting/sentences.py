@@ -33,10 +33,16 @@ HEADLINES = {
     ("point", False): "Least squares failed: do not use these numbers.",
 }
 
+OTHERS = {
+    True: "The method raised no alarm.",
+    False: "The method failed: do not use these numbers.",
+}
+"""Of a method of the user's own."""
+
 
 def headline(method: str, converged: bool, cautions: Sequence[str]) -> str:
     """The verdict in one sentence."""
-    text = HEADLINES[method, converged]
+    text = HEADLINES.get((method, converged), OTHERS[converged])
     return f"{text} Mind the cautions." if converged and cautions else text
 
 

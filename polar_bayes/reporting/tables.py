@@ -12,6 +12,7 @@ import xarray as xr
 from polar_bayes.budget.ledger import ledger_rows
 from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, laplace_k_hat
 from polar_bayes.diagnostics.parameters import (
+    APPROXIMATIONS,
     Scalar,
     is_hyperparameter,
     stats_of,
@@ -270,14 +271,28 @@ def sampler_facts(result: xr.DataTree, method: str, provenance: Mapping[str, Any
     if "step_size" in stats:
         sizes = stats["step_size"].isel(draw=-1).to_numpy()
         facts["step size of each chain"] = [f"{size:.3g}" for size in sizes]
-    if method == "laplace" and "log_weight" in stats:
-        k_hat = laplace_k_hat(result)
-        facts[f"Pareto k-hat (at most {LARGEST_K_HAT})"] = or_dash(k_hat, "{:.2f}")
+    facts |= _weight_facts(result, method, provenance)
     modes = provenance.get("modes") or {}
     if modes.get("weights"):
         facts["weights of the modes found"] = [f"{weight:.3g}" for weight in modes["weights"]]
         facts["climbs towards modes"] = f"{modes.get('starts')}, failed: {modes.get('failures')}"
     return fact_rows(facts)
+
+
+def _weight_facts(
+    result: xr.DataTree, method: str, provenance: Mapping[str, Any]
+) -> dict[str, object]:
+    """How far the draws of an approximation, or weighted ones, can be trusted."""
+    k_hat = provenance.get("k_hat")
+    if method in APPROXIMATIONS and "log_weight" in stats_of(result):
+        k_hat = laplace_k_hat(result)
+    worth = provenance.get("effective_draws")
+    facts: dict[str, object] = {}
+    if k_hat is not None:
+        facts[f"Pareto k-hat (at most {LARGEST_K_HAT})"] = or_dash(k_hat, "{:.2f}")
+    if worth is not None:
+        facts["independent draws that they are worth"] = f"{worth:.0f}"
+    return facts
 
 
 def effect_table(ledger: xr.Dataset) -> Table:

@@ -12,16 +12,20 @@ import xarray as xr
 from toy_models import capture, line, of_line, squared
 
 import polar_bayes as pb
-from polar_bayes.budget import fresh
+from polar_bayes.budget import dials, fresh
 from polar_bayes.budget.accuracy import AS_GIVEN
 from polar_bayes.budget.dials import AbstractDial
 from polar_bayes.budget.fresh import run_fresh
-from polar_bayes.budget.reference import run_reference
+from polar_bayes.budget.reference import Judge, nearest, run_reference
 from polar_bayes.budget.trial import Trial, bench_of
 from polar_bayes.budget.variants import parts_of
 from polar_bayes.inference.bench import Bench
 from polar_bayes.inference.method import AbstractMethod, Answer
+from polar_bayes.inference.mixing import standard_errors
 from polar_bayes.inference.request import resolve
+from polar_bayes.ladder.expected import errors_of
+from polar_bayes.ladder.scaling import draws_of
+from polar_bayes.ladder.weighing import choose
 
 LINKS = {"q": pb.StokesLink()}
 ROUGHLY = pb.Reference(error=0.05, longer=0)
@@ -59,6 +63,20 @@ class Broken(AbstractMethod):
         raise pb.FitError("it cannot be", where="Broken", mend="nothing")
 
 
+@dataclasses.dataclass(frozen=True)
+class Stuck(AbstractDial):
+    """A dial that cannot be turned."""
+
+    @property
+    @override
+    def name(self) -> str:
+        return "stuck"
+
+    @override
+    def turn(self, request, method):
+        raise pb.FitError("it is rusty", where="Stuck", mend="oil it")
+
+
 @pytest.fixture(scope="module")
 def study() -> xr.DataTree:
     return pb.accuracy(
@@ -66,7 +84,7 @@ def study() -> xr.DataTree:
         model=line,
         links=LINKS,
         rungs={"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()},
-        dials=(pb.DrawsDial(0.1), pb.FacetsDial(2.0), pb.PrecisionDial()),
+        dials=(pb.DrawsDial(0.1), pb.FacetsDial(2.0), pb.PrecisionDial(), Stuck()),
         reference=ROUGHLY,
         fresh=False,
     )
@@ -100,6 +118,28 @@ def test_a_rung_that_fails_is_a_row_that_says_why(study):
     assert "it cannot be" in table.loc["broken", "problems"]
     assert np.isnan(table.loc["broken", "error"])
     assert not table.loc["broken", "on_front"]
+
+
+def test_a_dial_that_fails_is_a_row_that_says_why(study):
+    table = pb.accuracy_table(study)
+    for rung in ("biased", "right", "broken"):
+        assert "it is rusty" in table.loc[f"{rung}, stuck", "problems"]
+        assert np.isnan(table.loc[f"{rung}, stuck", "error"])
+
+
+def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
+    tries = []
+
+    def refuse(*arguments, **keywords):
+        tries.append(arguments)
+        raise pb.FitError("no peak", where="choose_effects", mend="nothing")
+
+    monkeypatch.setattr(dials, "choose_effects", refuse)
+    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    for method in (pb.Laplace(), pb.Nuts()):
+        with pytest.raises(pb.FitError, match="no peak"):
+            pb.EffectsDial().turn(request, method)
+    assert len(tries) == 1
 
 
 def test_dials_turn_what_they_can_and_leave_the_rest_out(study):
@@ -140,12 +180,26 @@ def test_facets_are_turned_where_there_are_any():
     assert pb.PrecisionDial().turn(single, pb.Nuts()) is None
 
 
+def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
+    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    quarter = pb.DrawsDial(0.25)
+    for name, method in pb.LADDER.items():
+        turned = quarter.turn(request, method)
+        assert (turned is None) == (name == "point")
+        if turned is not None:
+            assert draws_of(turned[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
+    # A crowd and a half, of which half would be three quarters: no multiple of the crowd.
+    odd = pb.Tempered(pb.PixelTempering(draws=1536))
+    assert pb.DrawsDial(0.5).turn(request, odd) is None
+    assert pb.DrawsDial(0.25).turn(request, odd) is None
+
+
 def test_every_dial_has_a_name_of_its_own():
-    dials: list[AbstractDial] = [
+    every: list[AbstractDial] = [
         pb.DrawsDial(0.25), pb.DrawsDial(4.0), pb.FacetsDial(0.5), pb.FacetsDial(2.0),
         pb.EffectsDial(), pb.PrecisionDial(),
     ]  # fmt: skip
-    names = [dial.name for dial in dials]
+    names = [dial.name for dial in every]
     assert names[:3] == ["draws / 4", "draws x 4", "facets / 2"]
     assert len(set(names)) == len(names)
 
@@ -155,8 +209,50 @@ def test_chains_that_miss_a_mode_hand_the_reference_over():
     judge = run_reference(ROUGHLY, bench_of(request, jax.random.key(0)))
     assert judge.made_by == "tempered draws"
     assert not judge.doubts
+    # Its own error is that of the weights, too.
+    assert (judge.mean_error > 1.1 * standard_errors(judge.draws)[0]).all()
     share = np.mean(judge.draws[judge.labels.index("root")] > 0.0)
     assert abs(share - 0.5) < 5 * 0.5 * 0.05
+
+
+def judged(biases: tuple[str, ...], error: float) -> Judge:
+    errors = np.array([error, 0.5 * error])
+    return Judge(("x", "y"), np.zeros((2, 4, 9)), "made", errors, errors, None, None, biases)
+
+
+def test_noise_is_no_reason_to_take_a_biased_reference():
+    noisy, biased = judged((), 0.03)._replace(noise="its error is 0.03"), judged(("R-hat",), 0.001)
+    assert len(noisy.doubts) == len(biased.doubts) == 1
+    assert nearest([biased, noisy]) is noisy
+    assert nearest([judged(("R-hat", "a mode"), 0.001), biased]) is biased
+    assert nearest([judged((), np.nan), noisy]) is nearest([noisy, judged((), np.nan)]) is noisy
+
+
+def test_draws_chosen_by_weight_have_the_error_of_their_weights_too():
+    """Over 60 choices the error that is told is that of weights and choice together."""
+    random = np.random.default_rng(0)
+    count, told, seen = 2000, [], []
+    for _ in range(60):
+        z = 1.5 * random.standard_normal((count, 1))
+        weights = np.exp(-0.5 * z[:, 0] ** 2 * (1.0 - 1.0 / 1.5**2))
+        weights /= weights.sum()
+        chosen = z[choose(weights, 1.0 / np.sum(weights**2), random)]
+        found = Answer("tempered", chosen, {}, weighted=(z, weights))
+        mean, _ = errors_of(found, lambda z: np.moveaxis(z, -1, 0))
+        told.append(mean[0])
+        seen.append(chosen.mean())
+    # A standard normal, of which the weights alone lose 0.0197 and choosing as many as they are
+    # worth at most 0.0245; the sd of 60 means is known to 9%.
+    assert np.mean(told) == pytest.approx(np.hypot(0.0197, 0.0245), rel=0.05)
+    assert np.std(seen) < (1.0 + 4 * 0.09) * np.mean(told)
+
+
+def test_the_tempered_reference_draws_what_its_own_error_takes():
+    settings = pb.Reference(error=0.02).tempered.settings
+    assert settings.effective_draws == pytest.approx(4.0 / 0.02**2)
+    least = 4 * settings.effective_draws
+    assert least <= settings.answer_draws < least + settings.crowd
+    assert settings.crowd == 8192
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from polar_bayes.diagnostics.convergence import (
     summary,
     verdict,
 )
+from polar_bayes.diagnostics.parameters import method_of
 from polar_bayes.errors import FitError
 
 
@@ -156,6 +157,34 @@ def test_cautions_do_not_fail(change: dict, words: str) -> None:
     assert any(words in caution for caution in judged.cautions)
 
 
+@pytest.mark.parametrize(
+    ("method", "words"),
+    [
+        ("laplace", "only the heaviest is described here; use method='nuts'"),
+        ("variational", "only the heaviest is described here; use method='nuts'"),
+        ("nuts", "chains may not have visited them in proportion"),
+        ("importance", "the draws are of both"),
+        ("mine", "another explanation of the readings exists; add views"),
+    ],
+)
+def test_another_mode_is_told_as_the_method_sees_it(method: str, words: str) -> None:
+    tree = make_result(draws=1000)
+    judged = verdict(edit_provenance(tree, method=method, modes={"weights": [0.6, 0.4]}))
+    (caution,) = judged.cautions
+    assert words in caution
+    assert ("only the heaviest" in caution) == (method in ("laplace", "variational"))
+    assert ("use method='nuts'" in caution) == (method in ("laplace", "variational"))
+
+
+def test_the_method_is_called_as_it_was_stated() -> None:
+    tree = make_result(method="laplace")
+    assert method_of(tree) == "laplace"
+    assert method_of(edit_provenance(tree, method="mine")) == "mine"
+    assert json_summary(edit_provenance(tree, method="mine"))["method"] == "mine"
+    assert method_of(edit_provenance(tree, method=None)) == "laplace"
+    assert method_of(edit_provenance(make_result(), method=None)) == "nuts"
+
+
 def test_deep_trees_are_a_caution_once_they_are_many() -> None:
     tree = make_result()
     deep = np.zeros((4, 250), bool)
@@ -184,6 +213,15 @@ def test_k_hat_has_the_right_sign(width: float, trusted: bool) -> None:
     assert judged.converged
     assert bool(judged.cautions) == (not trusted)
     assert trusted or "Pareto k-hat" in judged.cautions[0]
+
+
+def test_a_guide_is_judged_by_its_weights_as_laplace_is() -> None:
+    z = np.random.default_rng(3).normal(0.0, 0.3, (4, 1000))
+    tree = laplace_tree(stats.norm.logpdf(z) - stats.norm.logpdf(z, scale=0.3))
+    (caution,) = verdict(edit_provenance(tree, method="variational")).cautions
+    assert "Pareto k-hat of the guide's draws is" in caution
+    # Weights of draws that were chosen by weight are another matter.
+    assert not verdict(edit_provenance(tree, method="tempered")).cautions
 
 
 @pytest.mark.parametrize(

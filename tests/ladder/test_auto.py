@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import time
 from collections.abc import Iterator
 from typing import override
 
@@ -11,9 +12,12 @@ import pytest
 from toy_models import capture, funnel, line, of_line
 
 import polar_bayes as pb
+from polar_bayes.budget.trial import bench_of
 from polar_bayes.inference import fit as fitting
 from polar_bayes.inference.bench import Bench
 from polar_bayes.inference.method import AbstractMethod, Answer
+from polar_bayes.inference.request import resolve
+from polar_bayes.ladder.auto import InTime
 
 LINKS = {"q": pb.StokesLink()}
 
@@ -53,6 +57,26 @@ class Made(AbstractMethod):
 
 
 @dataclasses.dataclass(frozen=True)
+class Reporting(Made):
+    """Takes half a second, and says so."""
+
+    @override
+    def draw(self, bench: Bench) -> Answer:
+        time.sleep(0.5)
+        bench.progress("sampling", 0.5)
+        return super().draw(bench)
+
+
+@dataclasses.dataclass(frozen=True)
+class Handing(Made):
+    """Has another method fit the comparisons."""
+
+    @override
+    def draw(self, bench: Bench) -> Answer:
+        return dataclasses.replace(super().draw(bench), beside=Made(draws=1000))
+
+
+@dataclasses.dataclass(frozen=True)
 class Given(pb.Auto):
     """An automatic choice among given rungs."""
 
@@ -61,6 +85,11 @@ class Given(pb.Auto):
     @override
     def rungs(self, bench: Bench):
         return dict(self.given)
+
+
+def bench(model) -> Bench:
+    request = resolve(capture(), model, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    return bench_of(request, jax.random.key(0))
 
 
 def fitted(*rungs, **settings):
@@ -77,6 +106,13 @@ def test_the_first_rung_that_is_good_enough_is_taken():
     assert pb.verdict(result).converged
     (sentence,) = pb.auto_sentences(result)
     assert "was taken: its means and standard deviations are expected within" in sentence
+
+
+def test_what_a_method_says_of_its_draws_stays_with_the_result():
+    said = json.loads(
+        pb.fit(capture(), model=line, links=LINKS, method=Made(k_hat=2.0)).attrs["polar_bayes"]
+    )
+    assert (said["k_hat"], said["effective_draws"], said["r_hat"]) == (2.0, 4000.0, None)
 
 
 @pytest.mark.parametrize(
@@ -126,6 +162,43 @@ def test_after_its_time_nothing_begins():
     _, said = fitted(Made(k_hat=0.9), Made(), seconds=1e-9)
     assert [step["why"] for step in said["auto"]["steps"]][1] == "the time was up"
     assert not said["auto"]["met"]
+
+
+def test_only_the_first_is_let_off_the_time_though_it_had_no_answer():
+    """Chains that report progress after the time are stopped."""
+    with pytest.raises(pb.FitError, match=r"rung 0: .*no peak.*rung 1: the time was up"):
+        fitted(Made(fails="no peak"), Reporting(), seconds=0.3)
+    # The first one always ends.
+    assert fitted(Reporting(), seconds=0.3)[1]["auto"]["met"]
+
+
+def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left():
+    taken = Made()
+    here = Given(given=(("rung 0", Made(k_hat=0.9)), ("rung 1", taken)), seconds=600.0)
+    beside = here.draw(bench(line)).beside
+    assert beside.method == taken
+    assert beside.draw(bench(line)).effective_draws == taken.draws
+    late = dataclasses.replace(beside, deadline=0.0)
+    with pytest.raises(pb.FitError, match="the time was up; give more seconds"):
+        late.draw(bench(line))
+    soon = InTime(Reporting(), time.perf_counter() + 0.3)
+    with pytest.raises(pb.FitError, match="the time was up; give more seconds"):
+        soon.draw(bench(line))
+
+
+def test_the_fit_beside_is_made_by_the_method_of_the_answer():
+    """The instrument is told apart by comparing: never by choosing a method once more."""
+    scene = pb.Scene(pb.SmoothSurface(), instrument=pb.Instrument((pb.Discrepancy(),)))
+    result = pb.fit(capture(), model=line, links=LINKS, scene=scene, method=Handing())
+    assert result["posterior"].sizes["draw"] == 1000
+    assert result["without_discrepancy"].sizes["draw"] == 250
+    assert result["without_instrument"].sizes["draw"] == 250
+
+
+def test_tolerances_that_weighted_draws_cannot_meet_are_left_to_chains():
+    here = bench(line)
+    assert list(pb.Auto(tolerance=0.03).rungs(here)) == ["importance", "tempered", "nuts"]
+    assert list(pb.Auto(tolerance=0.01).rungs(here)) == ["nuts"]
 
 
 def test_where_every_rung_fails_the_fit_is_refused():

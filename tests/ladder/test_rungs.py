@@ -11,10 +11,13 @@ from toy_models import capture, funnel, line, of_line, squared
 import polar_bayes as pb
 from polar_bayes.budget.trial import bench_of, labeled
 from polar_bayes.errors import FitError
+from polar_bayes.inference.modes import Modes
 from polar_bayes.inference.request import resolve
 from polar_bayes.ladder.builtin import answer
 from polar_bayes.ladder.expected import draws_needed, expected_error, quantile
-from polar_bayes.ladder.scaling import with_draws
+from polar_bayes.ladder.importance import _proposal
+from polar_bayes.ladder.scaling import draws_of, with_answer_draws, with_draws
+from polar_bayes.ladder.tempered import _engine
 from polar_bayes.ladder.visiting import unvisited_weight
 
 SMALL = {
@@ -87,6 +90,20 @@ def test_both_modes_are_weighed_alike(name):
     assert abs(share - 0.5) < 5.0 * 0.5 / np.sqrt(min(found.effective_draws, draws[0].size))
 
 
+def test_every_mode_of_weight_gets_draws():
+    weight = np.array([0.25, 0.2, 0.2, 0.15, 0.1, 0.0995, 0.0005])
+    z = np.arange(7.0)[:, None] * np.ones(2)
+    modes = Modes(z, np.tile(np.eye(2), (7, 1, 1)), weight, np.zeros(7), 16, 9)
+    mixture = _proposal(modes, np.dtype(float))
+    at, share = np.asarray(mixture.mean)[:, 0], np.exp(np.asarray(mixture.log_share))
+    held = np.array([share[at == number].sum() for number in range(7)])
+    np.testing.assert_allclose(held[:6], weight[:6] / weight[:6].sum(), rtol=1e-12)
+    assert held[6] == 0.0
+    # One program serves any number of modes.
+    one = Modes(z[:1], modes.covariance[:1], np.ones(1), np.zeros(1), 16, 0)
+    assert _proposal(one, np.dtype(float)).mean.shape == mixture.mean.shape
+
+
 def test_chains_that_missed_a_mode_are_told():
     here = bench(squared)
     both = answer(SMALL["importance"], here)
@@ -138,6 +155,14 @@ def test_draws_that_are_no_numbers_have_an_infinite_error():
     assert np.isposinf(expected_error(found, here.program, here.data))
 
 
+def test_each_tempered_fit_counts_for_itself_with_the_same_programs():
+    here = bench(line)
+    first, second = _engine(here), _engine(here)
+    assert first.programs is second.programs
+    first.counts["rounds"] += 3
+    assert second.counts["rounds"] == 0
+
+
 def test_draws_are_scaled_and_settings_kept():
     assert with_draws(pb.Laplace(draws=500), 2.0) == pb.Laplace(draws=1000)
     chains = with_draws(pb.Nuts(warmup=77), 2.0)
@@ -145,7 +170,25 @@ def test_draws_are_scaled_and_settings_kept():
     assert chains.warmup == 77
     tempered = with_draws(pb.Tempered(pb.PixelTempering(draws=2048)), 4.0).settings
     assert (tempered.draws, tempered.effective_draws) == (8192, 800.0)
+    assert draws_of(pb.Tempered(tempered)) == tempered.answer_draws == 16384
+    # Half crowds count: a quarter is a quarter.
+    fewer = with_draws(pb.Tempered(pb.PixelTempering(draws=2048)), 0.25).settings
+    assert (fewer.draws, fewer.effective_draws) == (512, 50.0)
+    with pytest.raises(FitError, match="512 draws are fewer than the crowd of 1024"):
+        with_draws(pb.Tempered(pb.PixelTempering(draws=1024)), 0.25)
     assert with_draws(pb.Point(), 2.0) is None
+
+
+def test_tempered_answers_have_as_many_draws_as_are_asked_for():
+    settings = pb.PixelTempering()
+    for count, draws in ((1.0, 1024), (1024, 1024), (1025, 2048), (5000, 5120)):
+        assert with_answer_draws(settings, count).answer_draws == draws
+    auto, here = pb.Auto(tolerance=0.1), bench(line)
+    needed = draws_needed(0.1, 2)
+    rungs = auto.rungs(here)
+    assert 8 * needed <= rungs["tempered"].settings.answer_draws < 8 * needed + settings.crowd
+    assert rungs["tempered"].settings.effective_draws == needed
+    assert rungs["importance"].draws == 16 * needed
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polar_bayes.ladder.weighing import CHAINS, FEWEST, MOST, choose
+from polar_bayes.ladder.weighing import CHAINS, FEWEST, MOST, choose, most_worth
 
 
 def test_each_draw_is_chosen_as_often_as_it_weighs():
@@ -19,6 +19,12 @@ def test_each_draw_is_chosen_as_often_as_it_weighs():
 def test_as_many_are_chosen_as_the_weighted_ones_are_worth(worth, each):
     weights = np.full(5000, 1 / 5000)
     assert choose(weights, worth, np.random.default_rng(0)).shape == (CHAINS, each)
+
+
+def test_what_is_chosen_is_worth_half_at_best_and_has_a_limit():
+    assert most_worth(0) == 0.0
+    assert most_worth(1000) == pytest.approx(500.0)
+    assert most_worth(10**9) == pytest.approx(CHAINS * MOST, rel=1e-3)
 
 
 def test_chosen_draws_come_in_random_order():

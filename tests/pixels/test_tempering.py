@@ -1,5 +1,9 @@
 """Crowds from the prior, and mixtures fitted to them: two modes, a skewed pixel, densities."""
 
+import dataclasses
+import gc
+import weakref
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -131,6 +135,21 @@ def fitted(engine: Engine, settings: PixelTempering | PixelNuts, pixels: Stack):
 
     numbers = np.arange(len(pixels))
     return fit_stack(engine, settings, pixels, numbers, 0, describe), found
+
+
+def test_an_engine_goes_when_nobody_holds_it() -> None:
+    """Its programs are its own, one for each setting."""
+    plan = planned(WEAK)
+    engine = Engine(plan.engine.program, plan.engine.rough, np.zeros((8, 2)), "single")
+    first = engine._kept(engine._tempered, SETTINGS)
+    assert engine._kept(engine._tempered, SETTINGS) is first
+    assert engine._kept(engine._proposed, SETTINGS) is not first
+    other = dataclasses.replace(SETTINGS, rounds=SETTINGS.rounds + 1)
+    assert engine._kept(engine._tempered, other) is not first
+    gone = weakref.ref(engine)
+    del engine, first
+    gc.collect()
+    assert gone() is None
 
 
 def test_chains_begin_in_every_mode_and_tempered_draws_stay_where_they_do_not_mix() -> None:

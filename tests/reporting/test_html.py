@@ -32,6 +32,14 @@ def small() -> tuple[xr.DataTree, Page]:
     return result, Page(render(result))
 
 
+def test_a_method_of_ones_own_has_its_own_name(small) -> None:
+    result = edit_provenance(make_result(**SMALL, method="laplace"), method="my <b>own</b>")
+    page = Page(render(result))
+    assert "my <b>own</b>" in page.text
+    assert "Laplace" not in page.text
+    assert "The method raised no alarm." in page.text
+
+
 def test_it_stands_alone(page: Page) -> None:
     assert page.open == []
     assert not {"script", "link", "iframe", "object", "embed", "base"} & set(page.tags)

@@ -1,0 +1,16 @@
+"""Errors that cross from one process to another."""
+
+import pickle
+
+import pytest
+
+from polar_bayes.errors import CaptureError, FitError, PolarBayesError, SceneError
+
+
+@pytest.mark.parametrize("kind", [PolarBayesError, CaptureError, FitError, SceneError])
+def test_an_error_arrives_as_it_was_sent(kind):
+    sent = kind("it is\ntorn", where="view 3", mend="measure it again")
+    came = pickle.loads(pickle.dumps(sent))
+    assert type(came) is kind
+    assert str(came) == str(sent) == "view 3: it is\\ntorn; measure it again"
+    assert (came.what, came.where, came.mend) == (sent.what, sent.where, sent.mend)
