@@ -146,15 +146,22 @@ def said(found: xr.DataTree) -> str:
     return "\n".join(lines)
 
 
-def main(what: str, count: int, keep: Path | None) -> None:
+def main(what: str, count: int, keep: Path | None, seed: int, only: str) -> None:
     print(f"{platform.machine()}, {os.cpu_count()} cores; {count} simulations each", flush=True)
     if keep is not None:
         keep.mkdir(parents=True, exist_ok=True)
     for title, capture, arguments in EVERY[what]():
+        if only not in title:
+            continue
         store = None if keep is None else keep / title.replace(",", "").replace(" ", "-")
         start = time.perf_counter()
         found = pb.calibrate(
-            capture, simulations=count, seed=1, store=store, resume=store is not None, **arguments
+            capture,
+            simulations=count,
+            seed=seed,
+            store=store,
+            resume=store is not None,
+            **arguments,
         )
         seconds = time.perf_counter() - start
         print(f"\n{title}: {seconds:.0f} s, {count / seconds:.3f} fits/s with compilation")
@@ -166,5 +173,7 @@ if __name__ == "__main__":
     parser.add_argument("what", choices=list(EVERY))
     parser.add_argument("count", type=int, nargs="?", default=200)
     parser.add_argument("--keep", type=Path)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="", help="titles that hold this text")
     given = parser.parse_args()
-    main(given.what, given.count, given.keep)
+    main(given.what, given.count, given.keep, given.seed, given.only)
