@@ -142,8 +142,9 @@ def sample(
         progress: Called with the fraction of all draws that is done.
 
     Returns:
-        Unconstrained draws of the model (chain, draw, size); statistics, each (chain, draw); and
-        whether the goals for mixing were reached before `most_draws`.
+        Unconstrained draws of the model (chain, draw, size); statistics, each (chain, draw), of
+        which `n_steps` and `warmup_steps` count gradients; and whether the goals for mixing were
+        reached before `most_draws`.
     """
     warmup, acceptance = _warmup(settings, target)
     fixed = _Fixed(
@@ -156,12 +157,11 @@ def sample(
     advance = sampler.advance(states[0], target.given)
 
     rounds: list[Step] = []
+    steps_before = np.zeros(settings.chains, int)
     mixed = False
     warmup_blocks, least, most = (
         -(-draws // settings.block) for draws in (warmup, settings.draws, settings.most_draws)
     )
-    # Blocks are whole: warm-up ends inside the first kept block only if it does not divide.
-    surplus = warmup_blocks * settings.block - warmup
 
     def advance_all(states: list[infer.hmc.HMCState]) -> tuple[list[infer.hmc.HMCState], Step]:
         advanced = list(pool.map(lambda state: advance(state, target.given), states))
@@ -173,10 +173,11 @@ def sample(
     with ThreadPoolExecutor(settings.threads) as pool:
         for done in range(warmup_blocks + most):
             states, steps = advance_all(states)
-            if done == warmup_blocks - 1 and surplus:
-                steps = jax.tree.map(lambda x: x[:, -surplus:], steps)
-            if done >= warmup_blocks or (done == warmup_blocks - 1 and surplus):
-                rounds.append(steps)
+            # Blocks are whole: one may hold the end of the warm-up and the first draws.
+            before = int(np.clip(warmup - done * settings.block, 0, settings.block))
+            steps_before += steps.n_steps[:, :before].sum(axis=1)
+            if before < settings.block:
+                rounds.append(jax.tree.map(lambda x, first=before: x[:, first:], steps))
             progress(min((done + 1) / (warmup_blocks + least), 1.0))
             if done + 1 >= warmup_blocks + least and (mixed := _mixed(rounds, settings)):
                 break
@@ -185,6 +186,7 @@ def sample(
     z = stats.pop("z")
     step_size = np.array([float(state.adapt_state.step_size) for state in states])
     stats["step_size"] = np.broadcast_to(step_size[:, None], z.shape[:2])
+    stats["warmup_steps"] = np.broadcast_to(steps_before[:, None], z.shape[:2])
     stats["reached_max_treedepth"] = stats["n_steps"] >= 2**settings.max_tree_depth - 1
     return z, stats, mixed
 

@@ -1,0 +1,39 @@
+"""The loop around the NUTS kernel, on a normal distribution of known width."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import polar_bayes as pb
+from polar_bayes.inference import nuts
+
+
+def density(z: jax.Array, center: jax.Array) -> jax.Array:
+    return 0.5 * jnp.sum((z - center) ** 2)
+
+
+def target(size: int, chains: int) -> nuts.Target:
+    starts = np.random.default_rng(0).standard_normal((chains, size))
+    return nuts.Target(
+        samplers=nuts.Samplers(density),
+        given=jnp.zeros(size),
+        potential=lambda z: (0.5 * float(z @ z), z),
+        starts=starts,
+        metric=np.eye(size),
+        place=lambda z: z,
+    )
+
+
+def test_how_draws_are_cut_into_blocks_changes_nothing() -> None:
+    """A warm-up that ends inside a block, too: its steps are counted, its draws are not kept."""
+    told = []
+    with jax.enable_x64(True):
+        for block in (60, 35):  # 60 divides the warm-up and the draws, 35 does neither
+            settings = pb.Nuts(chains=2, warmup=60, draws=120, most_draws=120, block=block)
+            told.append(nuts.sample(target(3, 2), jax.random.key(1), settings))
+    (z, stats, _), (again, others, _) = told
+    assert z.shape == (2, 120, 3)
+    assert np.array_equal(z, again)
+    for name in ("n_steps", "warmup_steps", "energy"):
+        assert np.array_equal(stats[name], others[name]), name
+    assert np.all(stats["warmup_steps"] >= 60)  # a draw takes one step at least
