@@ -185,7 +185,7 @@ def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
     quarter = pb.DrawsDial(0.25)
     for name, method in pb.LADDER.items():
         turned = quarter.turn(request, method)
-        assert (turned is None) == (name == "point")
+        assert (turned is None) == (name in ("point", "nuts short"))  # no draws, or too few
         if turned is not None:
             assert draws_of(turned[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
     # A crowd and a half, of which half would be three quarters: no multiple of the crowd.
