@@ -35,13 +35,16 @@ class Tempered(AbstractMethod):
     nothing is differentiated.
 
     Args:
-        settings: Of the crowd, and of the mixtures that are fitted to it.
+        settings: Of the crowd, and of the mixtures that are fitted to it; one fit alone has time
+            for more draws than each of thousands.
 
     Raises:
         FitError: A setting is outside its range.
     """
 
-    settings: PixelTempering = dataclasses.field(default_factory=PixelTempering)
+    settings: PixelTempering = dataclasses.field(
+        default_factory=functools.partial(PixelTempering, draws=4096)
+    )
 
     @override
     def draw(self, bench: Bench) -> Answer:
@@ -80,7 +83,8 @@ class Tempered(AbstractMethod):
         walks, length = self.settings.walks, self.settings.length
         steps = int(row.outcome.steps[0]) * walks * (length - 1)
         drawn = engine.counts["rounds"] * self.settings.draws
-        densities = engine.counts["crowds"] * self.settings.crowd + steps + drawn
+        looked = engine.counts["crowds"] * self.settings.looks * self.settings.crowd
+        densities = looked + steps + drawn
         return Answer(
             kind="tempered",
             z=z[index],

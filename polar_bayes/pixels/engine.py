@@ -26,6 +26,7 @@ from polar_bayes.pixels.derivatives import AnyArray, expand, score
 from polar_bayes.pixels.importance import Points
 from polar_bayes.pixels.mixtures import Proposed, draw_mixture, fit_mixture
 from polar_bayes.pixels.sampling import PixelNuts, around_mode, chains
+from polar_bayes.pixels.scores import ScoredProgram, Scores
 from polar_bayes.pixels.stack import Stack
 from polar_bayes.pixels.tempering import PixelTempering, Tempered, temper
 
@@ -196,7 +197,7 @@ class Engine:
             attempt: Number of the crowd, which random numbers follow.
 
         Returns:
-            The crowds, with a leading pixel axis.
+            The crowds, with a leading pixel axis; in the coordinates of each pixel's prior.
 
         Raises:
             Nothing.
@@ -212,7 +213,8 @@ class Engine:
         self,
         pixels: Stack,
         settings: PixelTempering,
-        z: np.ndarray,
+        scores: Scores,
+        u: np.ndarray,
         weights: np.ndarray,
         keys: np.ndarray,
         number: int,
@@ -222,13 +224,14 @@ class Engine:
         Args:
             pixels: The readings.
             settings: How many components, and draws.
-            z: Unconstrained vectors of the weighted draws, (pixel, draw, size).
+            scores: Coordinates of each pixel.
+            u: Normal scores of the weighted draws, (pixel, draw, size).
             weights: They sum to one in each pixel.
             keys: One for each pixel.
             number: Of the round, which random numbers follow.
 
         Returns:
-            The mixtures, their draws, and what the posterior is there.
+            The mixtures, their draws, and the density of their scores there.
 
         Raises:
             Nothing.
@@ -237,7 +240,7 @@ class Engine:
             with TRACING:
                 proposed = self._kept(self._proposed, settings)
             proposed = functools.partial(proposed, np.uint32(number))
-            states = np.float32(z), np.float32(weights), keys
+            states = scores, np.float32(u), np.float32(weights), keys
             return self._map(proposed, pixels.in_precision(np.float32), *states, batch=FEW)
 
     @property
@@ -340,18 +343,24 @@ class Engine:
 
     def _proposed(self, settings: PixelTempering) -> Callable:
         def pixel(
-            number: Array, data: Observations, z: Array, weights: Array, key: Array
+            number: Array,
+            data: Observations,
+            scores: Scores,
+            u: Array,
+            weights: Array,
+            key: Array,
         ) -> Proposed:
             key_fit, key_draw = jax.random.split(jax.random.fold_in(key, number))
-            mixture = fit_mixture(z, weights, settings.components, key_fit)
-            places = draw_mixture(mixture, settings.draws, key_draw)
+            mixture = fit_mixture(u, weights, settings.components, key_fit)
+            drawn = draw_mixture(mixture, settings.draws, key_draw)
+            scored = ScoredProgram(self.rough, scores)
 
-            def look(z: Array) -> tuple[Values, Array]:
-                return self.rough.parameters(z, data), self.rough.potential(z, data)
+            def look(u: Array) -> tuple[Values, Array]:
+                return scored.parameters(u, data), scored.potential(u, data)
 
-            parameters, values = jax.lax.map(look, places, batch_size=LOOKED)
+            parameters, values = jax.lax.map(look, drawn, batch_size=LOOKED)
             log_posterior = jnp.where(jnp.isnan(values), -jnp.inf, -values)
-            return Proposed(mixture, places, parameters, log_posterior)
+            return Proposed(mixture, drawn, parameters, log_posterior)
 
         return batched(pixel, given=1, side_by_side=1)
 

@@ -29,6 +29,7 @@ from polar_bayes.pixels.outcome import (
 )
 from polar_bayes.pixels.pooling import pool
 from polar_bayes.pixels.sampling import PixelNuts
+from polar_bayes.pixels.scores import place
 from polar_bayes.pixels.stack import Stack
 from polar_bayes.pixels.tempering import LIFT, PixelTempering
 
@@ -240,15 +241,16 @@ def _rounds(
     """A crowd from the prior of each; mixtures fitted to it until their draws are worth enough."""
     crowd = engine.temper(pixels.subset(at), settings, keys[at], attempt)
     row.outcome.steps[at] += crowd.stages
-    left = np.flatnonzero((crowd.temperature >= 1.0) & np.isfinite(crowd.z).all(axis=(1, 2)))
+    left = np.flatnonzero((crowd.temperature >= 1.0) & np.isfinite(crowd.u).all(axis=(1, 2)))
     count = 2 * settings.draws
-    z = np.tile(crowd.z[left], (1, count // settings.crowd, 1))
-    weights, before = np.full(z.shape[:2], 1.0 / count), None
+    u = np.tile(crowd.u[left], (1, count // settings.crowd, 1))
+    weights, before = np.full(u.shape[:2], 1.0 / count), None
     for number in range(settings.rounds):
         if not left.size:
             return
         some, round_key = pixels.subset(at[left]), attempt * settings.rounds + number
-        drawn = engine.propose(some, settings, z, weights, keys[at[left]], round_key)
+        scores = rows(crowd.scores, left)
+        drawn = engine.propose(some, settings, scores, u, weights, keys[at[left]], round_key)
         found = pool(drawn if before is None else before, drawn)
         possible = np.isfinite(found.weights).all(axis=-1)
         settled = np.zeros(left.size, bool)
@@ -258,10 +260,12 @@ def _rounds(
         is_last = number == settings.rounds - 1
         answer = np.flatnonzero(settled | (is_last & possible))
         if answer.size:
-            yield at[left[answer]], rows(found, answer), settled[answer]
+            told = rows(found, answer)
+            told = told._replace(z=place(rows(scores, answer), told.z))
+            yield at[left[answer]], told, settled[answer]
         on = ~settled & possible
         left, before = left[on], rows(drawn, on)
-        z, weights = found.z[on], found.weights[on]
+        u, weights = found.z[on], found.weights[on]
 
 
 def _climb(engine: Engine, pixels: Stack) -> Settled:

@@ -52,7 +52,7 @@ class Proposed(NamedTuple):
 
     Args:
         mixture: It, with a leading pixel axis.
-        z: Its draws, (pixel, draw, size).
+        z: Its draws, in the coordinates in which it was fitted, (pixel, draw, size).
         parameters: The same by name, each (pixel, draw, ...).
         log_posterior: There, (pixel, draw), up to a constant per pixel; minus infinity where there
             is none.

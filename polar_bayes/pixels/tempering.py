@@ -5,6 +5,7 @@ $$ p_t(z) \propto p(z) \, p(y|z)^t, \quad 0 = t_0 < t_1 < ... < 1 $$
 A crowd that begins as draws from the prior sees every mode before any of them is narrow, and keeps
 what the data leave open. After each step the crowd is thinned to a few by weight, and each of these
 walks on; all places along the walks are the next crowd, so that no evaluation of the model is lost.
+All walk in normal scores of the prior, where a step can reach a mode in a long tail.
 """
 
 import dataclasses
@@ -19,6 +20,7 @@ from jaxtyping import Array, Float
 from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
+from polar_bayes.pixels.scores import ScoredProgram, Scores, normal_scores
 
 HALVINGS = 20
 """Of the interval in which the next temperature lies."""
@@ -40,6 +42,8 @@ class PixelTempering:
     Args:
         walks: How many of the crowd walk on after each step of temperature, >= 16.
         length: Places of each walk, its first included, >= 2; all together are the crowd.
+        looks: Draws from the prior for each of the crowd, >= 1: more find a narrow mode more often,
+            and the first step of temperature is longer.
         effective_share: Share of the crowd that its weights must be worth after a step of
             temperature, between 0.1 and 0.95.
         draws: Of a mixture in every round; half a multiple of the crowd. An answer has the draws of
@@ -55,12 +59,13 @@ class PixelTempering:
         FitError: A setting is outside its range.
     """
 
-    walks: int = 128
+    walks: int = 256
     length: int = 8
+    looks: int = 2
     effective_share: float = 0.5
-    draws: int = 2048
+    draws: int = 1024
     components: int = 4
-    rounds: int = 6
+    rounds: int = 8
     crowds: int = 3
     effective_draws: float = 200.0
 
@@ -68,6 +73,7 @@ class PixelTempering:
         least = {
             "walks": 16,
             "length": 2,
+            "looks": 1,
             "components": 1,
             "rounds": 2,
             "crowds": 1,
@@ -114,12 +120,12 @@ class Crowd(NamedTuple):
     """Draws on their way.
 
     Args:
-        z: Unconstrained vectors, (draw, size).
+        u: Normal scores, (draw, size).
         log_prior: Their log prior density, (draw,).
         log_likelihood: Log posterior minus log prior; minus infinity where there is none. (draw,).
     """
 
-    z: Float[Array, "draw size"]
+    u: Float[Array, "draw size"]
     log_prior: Float[Array, " draw"]
     log_likelihood: Float[Array, " draw"]
 
@@ -128,12 +134,14 @@ class Tempered(NamedTuple):
     """A crowd that has arrived, or not.
 
     Args:
-        z: Unconstrained vectors, (draw, size).
+        u: Normal scores, (draw, size).
+        scores: What they are scores of.
         temperature: 1 where it arrived.
-        stages: Steps of temperature.
+        stages: Steps of temperature after which the crowd walked.
     """
 
-    z: Float[Array | np.ndarray, "draw size"]
+    u: Float[Array | np.ndarray, "draw size"]
+    scores: Scores
     temperature: Float[Array | np.ndarray, ""]
     stages: Array | np.ndarray
 
@@ -158,37 +166,45 @@ def temper(program: Program, settings: PixelTempering, data: Observations, key: 
         Jasra, Stephens, Doucet & Tsagaris (2011), Scand. J. Stat. 38(1), 1-22: adaptive steps.
     """
     walks, count, size = settings.walks, settings.crowd, program.size
+    key_start, key_crowd, key_stages = jax.random.split(key, 3)
+    keys = jax.random.split(key_start, settings.looks * count)
+    z = jax.vmap(lambda key: program.from_prior(key, data))(keys)
+    scores = normal_scores(z)
+    scored = ScoredProgram(program, scores)
 
-    def look(z: Array) -> Crowd:
-        prior = -jax.vmap(lambda z: program.prior_potential(z, data))(z)
-        likelihood = -jax.vmap(lambda z: program.potential(z, data))(z) - prior
-        return Crowd(z, prior, jnp.where(jnp.isnan(likelihood), -jnp.inf, likelihood))
+    def look(u: Array) -> Crowd:
+        prior = -jax.vmap(lambda u: scored.prior_potential(u, data))(u)
+        likelihood = -jax.vmap(lambda u: scored.potential(u, data))(u) - prior
+        return Crowd(u, prior, jnp.where(jnp.isnan(likelihood), -jnp.inf, likelihood))
+
+    def heat(crowd: Crowd, temperature: Array) -> tuple[Array, Array]:
+        """The next temperature, and the weights that it gives."""
+        rise = _rise(crowd.log_likelihood, 1.0 - temperature, settings.effective_share * count)
+        weights = jax.nn.softmax(jnp.where(rise > 0.0, rise * crowd.log_likelihood, 0.0))
+        return jnp.minimum(temperature + rise, 1.0), weights
 
     def goes_on(state: tuple) -> Array:
         temperature, *_, stages = state
-        return (temperature < 1.0) & (stages < MOST_STAGES)
+        # What was thinned repeats itself until it has walked, even if it has arrived.
+        return ((temperature < 1.0) | (stages < 1)) & (stages < MOST_STAGES)
 
     def stage(state: tuple) -> tuple:
         temperature, crowd, stride, key, stages = state
         key, key_thin, key_walk = jax.random.split(key, 3)
-        rise = _rise(crowd.log_likelihood, 1.0 - temperature, settings.effective_share * count)
-        weights = jax.nn.softmax(jnp.where(rise > 0.0, rise * crowd.log_likelihood, 0.0))
-        temperature = jnp.minimum(temperature + rise, 1.0)
-        even = (jnp.arange(walks) + jax.random.uniform(key_thin)) / walks
-        kept = jnp.clip(jnp.searchsorted(jnp.cumsum(weights), even), 0, count - 1)
-        half = spread(crowd.z, weights)[1]
+        temperature, weights = heat(crowd, temperature)
+        half = spread(crowd.u, weights)[1]
 
         def walk(at: Crowd, key: Array) -> tuple[Crowd, tuple[Crowd, Array]]:
             key_step, key_choice = jax.random.split(key)
-            noise = jax.random.normal(key_step, at.z.shape, at.z.dtype)
-            tried = look(at.z + stride * noise @ half.T)
+            noise = jax.random.normal(key_step, at.u.shape, at.u.dtype)
+            tried = look(at.u + stride * noise @ half.T)
             gain = tried.log_prior - at.log_prior
             gain += temperature * (tried.log_likelihood - at.log_likelihood)
             taken = jnp.log(jax.random.uniform(key_choice, gain.shape, gain.dtype)) < gain
             moved = jax.tree.map(lambda new, old: _choose(taken, new, old), tried, at)
             return moved, (moved, jnp.mean(taken))
 
-        first = jax.tree.map(lambda x: x[kept], crowd)
+        first = _thin(crowd, weights, walks, key_thin)
         keys = jax.random.split(key_walk, settings.length - 1)
         _, (rest, accepted) = jax.lax.scan(walk, first, keys)
         crowd = jax.tree.map(
@@ -197,13 +213,12 @@ def temper(program: Program, settings: PixelTempering, data: Observations, key: 
         longer = jnp.exp(jnp.clip(2.0 * (jnp.mean(accepted) - ACCEPTED), -1.0, 1.0))
         return temperature, crowd, stride * longer, key, stages + 1
 
-    key_start, key_stages = jax.random.split(key)
-    keys = jax.random.split(key_start, count)
-    z = jax.vmap(lambda key: program.from_prior(key, data))(keys)
-    one = jnp.ones((), z.dtype)
-    state = (0.0 * one, look(z), 2.38 / size**0.5 * one, key_stages, jnp.int32(0))
+    seen, one = look(scores.score(z)), jnp.ones((), z.dtype)
+    temperature, weights = heat(seen, 0.0 * one)
+    crowd = _thin(seen, weights, count, key_crowd)
+    state = (temperature, crowd, 2.38 / size**0.5 * one, key_stages, jnp.int32(0))
     temperature, crowd, *_, stages = jax.lax.while_loop(goes_on, stage, state)
-    return Tempered(crowd.z, temperature, stages)
+    return Tempered(crowd.u, scores, temperature, stages)
 
 
 def spread(
@@ -245,6 +260,13 @@ def _rise(log_likelihood: Array, most: Array, effective: float) -> Array:
 
     low, _ = jax.lax.fori_loop(0, HALVINGS, halve, (jnp.zeros_like(most), most))
     return jnp.where(is_worth(most), most, low)
+
+
+def _thin(crowd: Crowd, weights: Array, count: int, key: Array) -> Crowd:
+    """So many of the crowd, each as often as it weighs, evenly."""
+    even = (jnp.arange(count) + jax.random.uniform(key)) / count
+    kept = jnp.clip(jnp.searchsorted(jnp.cumsum(weights), even), 0, len(weights) - 1)
+    return jax.tree.map(lambda x: x[kept], crowd)
 
 
 def _choose(taken: Array, new: Array, old: Array) -> Array:

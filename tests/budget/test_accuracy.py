@@ -189,7 +189,7 @@ def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
         if turned is not None:
             assert draws_of(turned[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
     # A crowd and a half, of which half would be three quarters: no multiple of the crowd.
-    odd = pb.Tempered(pb.PixelTempering(draws=1536))
+    odd = pb.Tempered(pb.PixelTempering(draws=3072))
     assert pb.DrawsDial(0.5).turn(request, odd) is None
     assert pb.DrawsDial(0.25).turn(request, odd) is None
 

@@ -168,20 +168,20 @@ def test_draws_are_scaled_and_settings_kept():
     chains = with_draws(pb.Nuts(warmup=77), 2.0)
     assert (chains.draws, chains.most_draws, chains.effective_draws) == (1000, 8000, 900.0)
     assert chains.warmup == 77
-    tempered = with_draws(pb.Tempered(pb.PixelTempering(draws=2048)), 4.0).settings
-    assert (tempered.draws, tempered.effective_draws) == (8192, 800.0)
-    assert draws_of(pb.Tempered(tempered)) == tempered.answer_draws == 16384
+    tempered = with_draws(pb.Tempered(pb.PixelTempering(draws=4096)), 4.0).settings
+    assert (tempered.draws, tempered.effective_draws) == (16384, 800.0)
+    assert draws_of(pb.Tempered(tempered)) == tempered.answer_draws == 32768
     # Half crowds count: a quarter is a quarter.
-    fewer = with_draws(pb.Tempered(pb.PixelTempering(draws=2048)), 0.25).settings
-    assert (fewer.draws, fewer.effective_draws) == (512, 50.0)
-    with pytest.raises(FitError, match="512 draws are fewer than the crowd of 1024"):
+    fewer = with_draws(pb.Tempered(pb.PixelTempering(draws=4096)), 0.25).settings
+    assert (fewer.draws, fewer.effective_draws) == (1024, 50.0)
+    with pytest.raises(FitError, match="512 draws are fewer than the crowd of 2048"):
         with_draws(pb.Tempered(pb.PixelTempering(draws=1024)), 0.25)
     assert with_draws(pb.Point(), 2.0) is None
 
 
 def test_tempered_answers_have_as_many_draws_as_are_asked_for():
     settings = pb.PixelTempering()
-    for count, draws in ((1.0, 1024), (1024, 1024), (1025, 2048), (5000, 5120)):
+    for count, draws in ((1.0, 2048), (2048, 2048), (2049, 4096), (5000, 6144)):
         assert with_answer_draws(settings, count).answer_draws == draws
     auto, here = pb.Auto(tolerance=0.1), bench(line)
     needed = draws_needed(0.1, 2)
