@@ -194,7 +194,7 @@ class WholeGrounds(AbstractGrounds):
     @override
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractGround:
         potential = CompiledPotential(self.program, data)
-        starts = np.asarray(from_prior(self.program, key, STARTS, data))
+        starts = from_prior(self.program, key, STARTS, data)
         modes = find_modes(potential, starts, progress)
         said = _describe(modes) | {"gradients": potential.calls}
         return WholeGround(self, data, potential, modes, said)

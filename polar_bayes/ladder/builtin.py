@@ -95,7 +95,7 @@ def _(method: point.Point, bench: Bench) -> Answer:
     What the readings do not determine has no standard error, and is drawn without any width.
     """
     key_starts = jax.random.split(bench.key)[0]
-    starts = np.asarray(from_prior(bench.program, key_starts, STARTS, bench.data))
+    starts = from_prior(bench.program, key_starts, STARTS, bench.data)
     least_squares = bench.prepared.least_squares
     found = point.to_numpy(least_squares(jnp.asarray(starts[: method.starts]), bench.data))
     free = np.isinf(np.diagonal(found.covariance))

@@ -22,7 +22,7 @@ from spectral_plates import spectral_plate
 
 import polar_bayes as pb
 from polar_bayes.budget.effects import ChosenScene
-from polar_bayes.inference import anchoring, ground
+from polar_bayes.inference import anchoring, ground, search
 from polar_bayes.inference import fit as fitting
 from polar_bayes.inference.kept import Kept, key_of_story, last_edit
 from polar_bayes.inference.modes import quiet_line_search
@@ -127,6 +127,27 @@ def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
     assert np.array_equal(many[:1234], few)
 
 
+def test_any_number_of_prior_draws_is_served_by_one_program(
+    compiled: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(search, "KEYS", 8)
+    with jax.enable_x64(True):
+        data = observe(one(1))
+        program = prepared(one(1)).program
+        few = search.from_prior(program, jax.random.key(5), 3, data)
+        compiled.clear()
+        more = search.from_prior(program, jax.random.key(5), 7, data)
+        assert compiled == []
+        many = search.from_prior(program, jax.random.key(5), 20, data)
+        assert "jit(draw)" not in compiled
+        alone = program.from_prior(jax.random.split(jax.random.key(5), 20)[19], data)
+    assert few.shape == (3, program.size)
+    assert np.array_equal(few, many[:3])
+    assert np.array_equal(more, many[:7])
+    # Inside the loop the compiler may round otherwise.
+    np.testing.assert_allclose(many[19], alone, rtol=1e-12)
+
+
 # --- what is shared, and what is not --------------------------------------------------------------
 
 
@@ -140,12 +161,12 @@ def prepared(capture: xr.Dataset, *, precision: str = "double", **asked: object)
             ("links", LINKS),
         )
     )
-    request = resolve(capture, model, NUTS, scene, priors, links, None, 0, precision)
+    wish = resolve(capture, model, NUTS, scene, priors, links, None, 0, precision)
     with jax.enable_x64(precision == "double"):
-        data = observe(request.capture)
+        data = observe(wish.capture)
         if precision == "single":
             data = data.in_single_precision()
-        return prepare(request, request.scene, data)
+        return prepare(wish, wish.scene, data)
 
 
 def held(value: float) -> handlers.condition:
