@@ -22,12 +22,13 @@ from spectral_plates import spectral_plate
 
 import polar_bayes as pb
 from polar_bayes.budget.effects import ChosenScene
-from polar_bayes.inference import anchoring, ground, search
+from polar_bayes.inference import anchoring, ground, request, search
 from polar_bayes.inference import fit as fitting
 from polar_bayes.inference.kept import Kept, key_of_story, last_edit
 from polar_bayes.inference.modes import quiet_line_search
 from polar_bayes.inference.prepared import prepare
 from polar_bayes.inference.request import resolve
+from polar_bayes.inference.story import Story, read_story
 from polar_bayes.observation.data import observe
 
 # The goals let chains of other readings stop at another length.
@@ -210,6 +211,24 @@ OTHER: dict[str, tuple[dict, dict]] = {
 def test_the_same_question_shares_what_is_compiled(what: str) -> None:
     first, second = SAME[what]
     assert prepared(one(1), **first) is prepared(one(2), **second)
+
+
+def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: list[tuple[int, ...]] = []
+
+    def watched(model, data, *others) -> Story:
+        told.append(data.shape)
+        return read_story(model, data, *others)
+
+    monkeypatch.setattr(request, "read_story", watched)
+    asked = (shifted(0.25), "nuts", PLATE, None, LINKS, None, 0, "double")
+    first, again = (resolve(one(seed), *asked) for seed in (1, 2))
+    assert told == [(6,)]
+    assert first.declared == again.declared == {"mean": "Normal"}
+    resolve(plate_capture(np.linspace(30.0, 75.0, 7), 0.02, 1), *asked)
+    assert told == [(6,), (7,)]
 
 
 @pytest.mark.parametrize("what", OTHER)
