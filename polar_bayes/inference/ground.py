@@ -238,9 +238,9 @@ def make_grounds(model: Model, program: Program, data: Observations) -> Abstract
     groups = find_groups(program, data)
     lone = None if groups is None else find_lone(model, groups, data)
     if groups is None or lone is None:
-        return WholeGrounds(program, nuts.Samplers(program.potential))
+        return WholeGrounds(program, nuts.Samplers(program.told_once))
     transport = Transport(program, groups)
-    return PatchGrounds(lone, transport, nuts.Samplers(transport.potential))
+    return PatchGrounds(lone, transport, nuts.Samplers(transport.told_once))
 
 
 class CompiledPotential:

@@ -148,9 +148,14 @@ class Program:
         }
 
     @functools.cached_property
+    def told_once(self) -> Callable[[Array, Observations], Array]:
+        """The potential; the model is told once, however many programs compute it."""
+        return jax.jit(self.potential, inline=True)
+
+    @functools.cached_property
     def value_and_gradient(self) -> Callable[[Array, Observations], tuple[Array, Array]]:
         """The potential with its gradient, compiled."""
-        return TracedOnce(jax.jit(jax.value_and_grad(self.potential)))
+        return TracedOnce(jax.jit(jax.value_and_grad(self.told_once)))
 
     @functools.cached_property
     def drawn_from_prior(self) -> Callable[[np.ndarray, int, Observations], Array]:
