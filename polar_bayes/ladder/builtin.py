@@ -54,8 +54,7 @@ def _(method: Nuts, bench: Bench) -> Answer:
     drawn = bench.ground.draw(bench.key_of_draws, method, bench.progress)
     bulk, tail, r_hat = measure(np.moveaxis(drawn.z, -1, 0))
     steps = drawn.stats["n_steps"]
-    # Warm-up leaves no record: its trajectories are counted as long as the kept ones.
-    warmup = (300 if method.warmup is None else method.warmup) * method.chains * np.mean(steps)
+    warmup = np.sum(drawn.stats["warmup_steps"][:, 0])
     climbing = float(bench.ground.said.get("gradients", np.nan))
     return Answer(
         kind="nuts",
@@ -64,7 +63,7 @@ def _(method: Nuts, bench: Bench) -> Answer:
         problems=[*drawn.problems, *_divergence(drawn.stats)],
         r_hat=float(np.max(r_hat)),
         effective_draws=float(min(np.min(bulk), np.min(tail))),
-        gradients=climbing + float(np.sum(steps) + warmup),
+        gradients=climbing + float(warmup + np.sum(steps)),
         densities=0.0,
         said={"modes": bench.ground.said, "goals_reached": drawn.goals_reached},
     )
