@@ -100,7 +100,7 @@ def find_peak(density: Density, key: Array, progress: Progress) -> Peak:
         FitError: No start reached one.
     """
     size = density.program.size
-    starts = np.asarray(from_prior(density.program, key, STARTS, density.data))
+    starts = from_prior(density.program, key, STARTS, density.data)
     plain = _with_gradient(density, np.zeros(size), np.eye(size), FIRST_STEP)
     modes = find_modes(plain, starts, progress)
     return _climb(density, modes.z[0], modes.covariance[0])

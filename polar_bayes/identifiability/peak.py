@@ -71,7 +71,7 @@ def pose(
     )
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     program = compile_program(request.bind(request.scene), data)
-    drawn = np.asarray(from_prior(program, jax.random.key(seed), PRIOR_DRAWS, data))
+    drawn = from_prior(program, jax.random.key(seed), PRIOR_DRAWS, data)
     return Question(request, data, program, drawn)
 
 

@@ -218,7 +218,7 @@ def _widen(
     prior = question.prior
     if program.size != question.program.size:
         key = jax.random.key(request.seed)
-        prior = np.asarray(from_prior(program, key, PRIOR_DRAWS, data))
+        prior = from_prior(program, key, PRIOR_DRAWS, data)
     return Question(wide, data, program, prior)
 
 

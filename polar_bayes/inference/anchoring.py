@@ -184,7 +184,7 @@ def _find_peaks(
 ) -> Peaks:
     """Climb each patch with noise and instrument of its own, then with those of all."""
     groups = transport.groups
-    drawn = np.asarray(from_prior(transport.program, key, TYPICAL_DRAWS, data))
+    drawn = from_prior(transport.program, key, TYPICAL_DRAWS, data)
     number = int(np.clip(ALL_STARTS // groups.count, FEWEST_STARTS, MOST_STARTS))
     common = np.median(drawn[:, groups.common], axis=0).astype(drawn.dtype)
     movable = ~_of_population(surveyor, drawn[0], groups)

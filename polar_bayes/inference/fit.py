@@ -116,7 +116,7 @@ def _run(request: Request, progress: Progress) -> xr.DataTree:
     fitted = _fit_scene(request, prepared, data, key_main, progress, clock)
     describe = _per_draw(fitted.program)
     posterior = describe(key_posterior, fitted.z, data)
-    prior_z = np.asarray(from_prior(fitted.program, key_prior, PRIOR_DRAWS, data))
+    prior_z = from_prior(fitted.program, key_prior, PRIOR_DRAWS, data)
     prior = describe(key_prior, prior_z[None], data)
     clock.lap("prediction")
 
@@ -153,7 +153,7 @@ def _fit_scene(
         said = {"method": answer.kind} | finite | answer.said
         return _Fitted(program, answer.z, answer.stats, answer.problems, said, answer.beside)
     if isinstance(request.method, point.Point):
-        starts = np.asarray(from_prior(program, key_starts, STARTS, data))
+        starts = from_prior(program, key_starts, STARTS, data)
         fitted = _fit_point(prepared, data, starts, request.method)
         clock.lap("least squares")
         return fitted

@@ -194,7 +194,7 @@ class WholeGrounds(AbstractGrounds):
     @override
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractGround:
         potential = CompiledPotential(self.program, data)
-        starts = np.asarray(from_prior(self.program, key, STARTS, data))
+        starts = from_prior(self.program, key, STARTS, data)
         modes = find_modes(potential, starts, progress)
         said = _describe(modes) | {"gradients": potential.calls}
         return WholeGround(self, data, potential, modes, said)
@@ -238,9 +238,9 @@ def make_grounds(model: Model, program: Program, data: Observations) -> Abstract
     groups = find_groups(program, data)
     lone = None if groups is None else find_lone(model, groups, data)
     if groups is None or lone is None:
-        return WholeGrounds(program, nuts.Samplers(program.potential))
+        return WholeGrounds(program, nuts.Samplers(program.told_once))
     transport = Transport(program, groups)
-    return PatchGrounds(lone, transport, nuts.Samplers(transport.potential))
+    return PatchGrounds(lone, transport, nuts.Samplers(transport.told_once))
 
 
 class CompiledPotential:

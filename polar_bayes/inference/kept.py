@@ -12,6 +12,7 @@ import jax
 from dask.base import tokenize
 from numpyro import distributions as dist
 
+from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 
@@ -76,6 +77,11 @@ def key_of_story(
     ]
     # One by one: a token depends on which objects of what it is made of are the same one.
     return tokenize([tokenize(part) for part in parts])
+
+
+def layout_of(data: Observations) -> tuple[str, ...]:
+    """What programs know of a capture: variables, axes, lengths and types, and no reading."""
+    return (str(jax.tree.structure(data)), *(f"{x.dtype}{x.shape}" for x in jax.tree.leaves(data)))
 
 
 def last_edit() -> int:

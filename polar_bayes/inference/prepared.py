@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from polar_bayes.inference import point
 from polar_bayes.inference.ground import AbstractGrounds, make_grounds
-from polar_bayes.inference.kept import Kept, key_of_story
+from polar_bayes.inference.kept import Kept, key_of_story, layout_of
 from polar_bayes.inference.program import Model, Program, compile_program
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.tracing import TRACING, TracedByShape
@@ -64,13 +64,8 @@ def prepare(request: Request, scene: Scene, data: Observations) -> Prepared:
     Raises:
         Nothing.
     """
-    layout = [(str(x.dtype), x.shape) for x in jax.tree.leaves(data)]
     key = key_of_story(
-        request.model,
-        scene,
-        request.priors,
-        request.links,
-        (request.precision, layout, str(jax.tree.structure(data))),
+        request.model, scene, request.priors, request.links, request.precision, layout_of(data)
     )
 
     def make() -> Prepared:

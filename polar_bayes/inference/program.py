@@ -148,16 +148,30 @@ class Program:
         }
 
     @functools.cached_property
-    def value_and_gradient(self) -> Callable[[Array, Observations], tuple[Array, Array]]:
-        """The potential with its gradient, compiled."""
-        return TracedOnce(jax.jit(jax.value_and_grad(self.potential)))
+    def told_once(self) -> Callable[[Array, Observations], Array]:
+        """The potential; the model is told once, however many programs compute it."""
+        return jax.jit(self.potential, inline=True)
 
     @functools.cached_property
-    def drawn_from_prior(self) -> Callable[[Array, Observations], Array]:
-        """Vectors drawn from the prior, one for each key, compiled for any number of keys."""
-        return TracedByShape(
-            jax.jit(lambda keys, data: jax.lax.map(lambda k: self.from_prior(k, data), keys))
-        )
+    def value_and_gradient(self) -> Callable[[Array, Observations], tuple[Array, Array]]:
+        """The potential with its gradient, compiled."""
+        return TracedOnce(jax.jit(jax.value_and_grad(self.told_once)))
+
+    @functools.cached_property
+    def drawn_from_prior(self) -> Callable[[np.ndarray, int, Observations], Array]:
+        """Vectors drawn from the prior, one for each of the first keys, compiled.
+
+        The others are zero: how many are wanted is no part of what is compiled.
+        """
+
+        def draw(keys: Array, count: int, data: Observations) -> Array:
+            wrapped = jax.random.wrap_key_data(keys)
+            nothing = jnp.zeros((len(keys), self.size), data.brightness.dtype)
+            return jax.lax.fori_loop(
+                0, count, lambda i, z: z.at[i].set(self.from_prior(wrapped[i], data)), nothing
+            )
+
+        return TracedOnce(jax.jit(draw))
 
     @functools.cached_property
     def described(self) -> Callable[[Array, Array, Observations], Draw]:

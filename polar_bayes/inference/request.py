@@ -13,11 +13,13 @@ from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
+from polar_bayes.inference.kept import Kept, key_of_story, layout_of
 from polar_bayes.inference.laplace import Laplace
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.point import Point
-from polar_bayes.inference.story import read_story
+from polar_bayes.inference.story import Story, read_story
+from polar_bayes.inference.tracing import TRACING
 from polar_bayes.models.gp_spectral import gp_spectral
 from polar_bayes.models.hierarchical import Hierarchical
 from polar_bayes.models.per_material import per_material
@@ -34,6 +36,8 @@ MODELS: dict[str, Callable] = {
     "gp_spectral": gp_spectral,
 }
 METHODS: dict[str, Method] = {"nuts": Nuts(), "laplace": Laplace(), "point": Point()}
+
+_STORIES: Kept[Story] = Kept(32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +120,7 @@ def resolve(
     story = model if callable(model) else _find(MODELS, "model", model)
     with jax.enable_x64(precision == "double"):
         data = observe(capture, largest_view_zenith=limit)
-        found = read_story(story, data, setup.scene, PriorTable(priors), chosen)
+        found = _read(story, data, setup.scene, priors, chosen)
     swapped = {
         "scene": not isinstance(scene, str),
         "model": callable(model),
@@ -141,6 +145,20 @@ def resolve(
         seed=int(seed),
         precision=precision,
     )
+
+
+def _read(
+    model: Callable,
+    data: Observations,
+    scene: Scene,
+    priors: Mapping[str, dist.Distribution] | None,
+    links: Mapping[str, AbstractLink],
+) -> Story:
+    """What the model says about itself, kept from the last capture of that layout."""
+    table = PriorTable(priors)
+    key = key_of_story(model, scene, priors or {}, links, layout_of(data))
+    with TRACING:
+        return _STORIES.of(key, lambda: read_story(model, data, scene, table, links))
 
 
 def _name_of(model: Callable) -> str:

@@ -13,9 +13,12 @@ from polar_bayes.observation.data import Observations
 
 Progress = Callable[[str, float], None]
 
+KEYS = 500
+"""Draws from the prior that one call of a compiled program can make."""
 
-def from_prior(program: Program, key: Array, draws: int, data: Observations) -> Array:
-    """Unconstrained vectors drawn from the prior.
+
+def from_prior(program: Program, key: Array, draws: int, data: Observations) -> np.ndarray:
+    """Unconstrained vectors drawn from the prior; other numbers of them compile nothing new.
 
     Args:
         program: The model.
@@ -26,7 +29,13 @@ def from_prior(program: Program, key: Array, draws: int, data: Observations) -> 
     Returns:
         Shape (draws, size).
     """
-    return program.drawn_from_prior(jax.random.split(key, draws), data)
+    # A key depends on its place alone, so a round number of them serves any number of draws.
+    keys = np.asarray(jax.random.key_data(jax.random.split(key, KEYS * -(-draws // KEYS))))
+    drawn = [
+        program.drawn_from_prior(keys[begin : begin + KEYS], min(KEYS, draws - begin), data)
+        for begin in range(0, draws, KEYS)
+    ]
+    return np.concatenate(drawn)[:draws]
 
 
 def find_modes(potential: ValueAndGradient, starts: np.ndarray, progress: Progress) -> Modes:

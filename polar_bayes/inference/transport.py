@@ -123,9 +123,14 @@ class Transport:
         return jax.jvp(slope, (local,), (jnp.ones_like(local),))
 
     @functools.cached_property
+    def told_once(self) -> Callable[[Array, Anchored], Array]:
+        """The potential; the model is told once, however many programs compute it."""
+        return jax.jit(self.potential, inline=True)
+
+    @functools.cached_property
     def value_and_gradient(self) -> Callable[[Array, Anchored], tuple[Array, Array]]:
         """The potential with its gradient, compiled."""
-        return TracedOnce(jax.jit(jax.value_and_grad(self.potential)))
+        return TracedOnce(jax.jit(jax.value_and_grad(self.told_once)))
 
     @functools.cached_property
     def there(self) -> Callable[[Array, Anchored], Array]:

@@ -54,8 +54,7 @@ def _(method: Nuts, bench: Bench) -> Answer:
     drawn = bench.ground.draw(bench.key_of_draws, method, bench.progress)
     bulk, tail, r_hat = measure(np.moveaxis(drawn.z, -1, 0))
     steps = drawn.stats["n_steps"]
-    # Warm-up leaves no record: its trajectories are counted as long as the kept ones.
-    warmup = (300 if method.warmup is None else method.warmup) * method.chains * np.mean(steps)
+    warmup = np.sum(drawn.stats["warmup_steps"][:, 0])
     climbing = float(bench.ground.said.get("gradients", np.nan))
     return Answer(
         kind="nuts",
@@ -64,7 +63,7 @@ def _(method: Nuts, bench: Bench) -> Answer:
         problems=[*drawn.problems, *_divergence(drawn.stats)],
         r_hat=float(np.max(r_hat)),
         effective_draws=float(min(np.min(bulk), np.min(tail))),
-        gradients=climbing + float(np.sum(steps) + warmup),
+        gradients=climbing + float(warmup + np.sum(steps)),
         densities=0.0,
         said={"modes": bench.ground.said, "goals_reached": drawn.goals_reached},
     )
@@ -95,7 +94,7 @@ def _(method: point.Point, bench: Bench) -> Answer:
     What the readings do not determine has no standard error, and is drawn without any width.
     """
     key_starts = jax.random.split(bench.key)[0]
-    starts = np.asarray(from_prior(bench.program, key_starts, STARTS, bench.data))
+    starts = from_prior(bench.program, key_starts, STARTS, bench.data)
     least_squares = bench.prepared.least_squares
     found = point.to_numpy(least_squares(jnp.asarray(starts[: method.starts]), bench.data))
     free = np.isinf(np.diagonal(found.covariance))

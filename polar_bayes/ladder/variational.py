@@ -137,7 +137,7 @@ def _fitter(program: Program, settings: AbstractGuide) -> Callable[..., Any]:
             whole = dist.ImproperUniform(dist.constraints.real_vector, (), (size,))
             w = numpyro.sample("w", whole)
             with handlers.block():  # the sites of the model itself are no concern of the guide
-                log_density = -program.potential(center + half @ w, data)
+                log_density = -program.told_once(center + half @ w, data)
             numpyro.factor("posterior", log_density)
 
         def rate(step: Array) -> Array:
@@ -164,7 +164,7 @@ def _fitter(program: Program, settings: AbstractGuide) -> Callable[..., Any]:
             log_guide = posterior.log_prob(w)
         z = center + w @ half.T
         flat = z.reshape(-1, size)
-        log_posterior = jax.lax.map(lambda z: -program.potential(z, data), flat, batch_size=64)
+        log_posterior = jax.lax.map(lambda z: -program.told_once(z, data), flat, batch_size=64)
         log_ratio = log_posterior.reshape(shape) - log_guide
         return z, jnp.where(jnp.isnan(log_ratio), -jnp.inf, log_ratio), losses[-1]
 

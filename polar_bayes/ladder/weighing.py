@@ -98,7 +98,7 @@ def generator(key: Array) -> np.random.Generator:
 @functools.lru_cache(maxsize=8)
 def _looker(program: Program) -> Callable[[Array, Observations], Array]:
     def look(z: Array, data: Observations) -> Array:
-        return jax.lax.map(lambda z: -program.potential(z, data), z, batch_size=SIDE_BY_SIDE)
+        return jax.lax.map(lambda z: -program.told_once(z, data), z, batch_size=SIDE_BY_SIDE)
 
     with TRACING:
         return TracedOnce(jax.jit(look))

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import numpy as np
 
 from polar_bayes.inference.kept import key_of_story
 from polar_bayes.inference.program import Program, compile_program
@@ -93,4 +92,4 @@ def make_engine(recipe: Recipe) -> Engine:
     with jax.enable_x64(request.precision == "double"):
         key = jax.random.key(request.seed)
         starts = from_prior(exact, key, recipe.candidates, given[request.precision])
-    return Engine(exact, rough, np.asarray(starts), request.precision).ready()
+    return Engine(exact, rough, starts, request.precision).ready()

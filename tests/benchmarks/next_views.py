@@ -110,7 +110,7 @@ class Designer:
     def __init__(self, engine: Engine, data: Any) -> None:
         program = engine.program
         self.size, self.measured = program.size, len(MEASURED)
-        self.prior = np.asarray(from_prior(program, jax.random.key(9), 500, data))
+        self.prior = from_prior(program, jax.random.key(9), 500, data)
 
         def told(z: Any) -> Any:
             slopes = jax.jacfwd(lambda z: flat_parameters(program, z, data))(z)

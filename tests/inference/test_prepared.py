@@ -22,12 +22,13 @@ from spectral_plates import spectral_plate
 
 import polar_bayes as pb
 from polar_bayes.budget.effects import ChosenScene
-from polar_bayes.inference import anchoring, ground
+from polar_bayes.inference import anchoring, ground, request, search
 from polar_bayes.inference import fit as fitting
 from polar_bayes.inference.kept import Kept, key_of_story, last_edit
 from polar_bayes.inference.modes import quiet_line_search
 from polar_bayes.inference.prepared import prepare
 from polar_bayes.inference.request import resolve
+from polar_bayes.inference.story import Story, read_story
 from polar_bayes.observation.data import observe
 
 # The goals let chains of other readings stop at another length.
@@ -127,6 +128,27 @@ def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
     assert np.array_equal(many[:1234], few)
 
 
+def test_any_number_of_prior_draws_is_served_by_one_program(
+    compiled: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(search, "KEYS", 8)
+    with jax.enable_x64(True):
+        data = observe(one(1))
+        program = prepared(one(1)).program
+        few = search.from_prior(program, jax.random.key(5), 3, data)
+        compiled.clear()
+        more = search.from_prior(program, jax.random.key(5), 7, data)
+        assert compiled == []
+        many = search.from_prior(program, jax.random.key(5), 20, data)
+        assert "jit(draw)" not in compiled
+        alone = program.from_prior(jax.random.split(jax.random.key(5), 20)[19], data)
+    assert few.shape == (3, program.size)
+    assert np.array_equal(few, many[:3])
+    assert np.array_equal(more, many[:7])
+    # Inside the loop the compiler may round otherwise.
+    np.testing.assert_allclose(many[19], alone, rtol=1e-12)
+
+
 # --- what is shared, and what is not --------------------------------------------------------------
 
 
@@ -140,12 +162,12 @@ def prepared(capture: xr.Dataset, *, precision: str = "double", **asked: object)
             ("links", LINKS),
         )
     )
-    request = resolve(capture, model, NUTS, scene, priors, links, None, 0, precision)
+    wish = resolve(capture, model, NUTS, scene, priors, links, None, 0, precision)
     with jax.enable_x64(precision == "double"):
-        data = observe(request.capture)
+        data = observe(wish.capture)
         if precision == "single":
             data = data.in_single_precision()
-        return prepare(request, request.scene, data)
+        return prepare(wish, wish.scene, data)
 
 
 def held(value: float) -> handlers.condition:
@@ -189,6 +211,24 @@ OTHER: dict[str, tuple[dict, dict]] = {
 def test_the_same_question_shares_what_is_compiled(what: str) -> None:
     first, second = SAME[what]
     assert prepared(one(1), **first) is prepared(one(2), **second)
+
+
+def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: list[tuple[int, ...]] = []
+
+    def watched(model, data, *others) -> Story:
+        told.append(data.shape)
+        return read_story(model, data, *others)
+
+    monkeypatch.setattr(request, "read_story", watched)
+    asked = (shifted(0.25), "nuts", PLATE, None, LINKS, None, 0, "double")
+    first, again = (resolve(one(seed), *asked) for seed in (1, 2))
+    assert told == [(6,)]
+    assert first.declared == again.declared == {"mean": "Normal"}
+    resolve(plate_capture(np.linspace(30.0, 75.0, 7), 0.02, 1), *asked)
+    assert told == [(6,), (7,)]
 
 
 @pytest.mark.parametrize("what", OTHER)

@@ -70,6 +70,16 @@ def test_a_normal_posterior_is_found_by_every_rung(name):
     assert not found.r_hat > 1.01
 
 
+def test_gradients_of_a_warm_up_are_counted_as_they_were_made():
+    here = bench(line)
+    method = pb.Nuts(chains=2, warmup=60, draws=50, most_draws=50, block=50)
+    found = answer(method, here)
+    climbing = here.ground.said["gradients"]
+    before = sum(found.stats["warmup_steps"][:, 0])
+    assert before >= 60 * 2  # a draw takes one step at least
+    assert found.gradients == climbing + before + found.stats["n_steps"].sum()
+
+
 def test_a_point_fit_has_the_width_of_its_standard_errors():
     here = bench(line)
     found = answer(SMALL["point"], here)
