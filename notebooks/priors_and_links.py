@@ -154,4 +154,5 @@ print(said["fixed"], said["links"])
 # A link that forgives wild readings also forgives a wrong scene: readings that the optics cannot
 # explain look like bad ones. Where several neighbors are off together, ask for an effect that the
 # scene is missing rather than for longer tails; [effects](../effects.md) lists the candidates.
-# Models of your own: [swapping](../swapping.md) and [extending](../extending.md).
+# Models of your own: [swapping](../swapping.md) and [extending](../extending.md). Next: [many
+# materials and colors](pooling_and_spectra.md).
