@@ -1,0 +1,101 @@
+# %% [markdown]
+# # What accuracy costs in time
+#
+# Least squares answer in an instant, long chains in a minute. Which is good enough? That depends on
+# the capture: on how far its posterior is from a normal distribution. So measure it: run the
+# methods on the capture itself, hold each against a long reference whose own error is known, and
+# look at error against time.
+
+# %%
+# %matplotlib inline
+import numpy as np
+import xarray as xr
+
+import polar_bayes as pb
+
+# %% [markdown]
+# Six readings of a polished plate with a weak body: few, so that the posterior is not normal, and
+# quickly fitted.
+
+# %%
+plate = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
+links = {"q": pb.StokesLink(stated_errors=True)}
+zenith = np.linspace(35.0, 75.0, 6)
+directions = {
+    "view_zenith": zenith,
+    "view_azimuth": np.full(6, 180.0),
+    "light_zenith": zenith,
+    "light_azimuth": np.zeros(6),
+}
+truth = {"subsurface_fraction": 0.02, "refractive_index": 1.50}
+q = np.asarray(plate.predict(truth, pb.Geometry.from_degrees(**directions))["q"])
+q = np.clip(q + 0.02 * np.random.default_rng(0).normal(size=6), -1.0, 1.0)
+capture = xr.Dataset(
+    {name: ("view", values) for name, values in directions.items()}
+    | {"q": ("view", q), "q_error": ("view", np.full(6, 0.02))},
+    attrs={"name": "six readings"},
+)
+
+# %% [markdown]
+# ## The study
+#
+# Five rungs of the ladder, none of its dials, all in this process. (`fresh=True`, the default,
+# gives each its own process and measures memory and the time of a first fit, compilation included;
+# that takes minutes.)
+
+# %%
+names = ("point", "laplace", "importance", "nuts short", "nuts")
+study = pb.accuracy(
+    capture,
+    scene=plate,
+    links=links,
+    rungs={name: pb.LADDER[name] for name in names},
+    dials=(),
+    fresh=False,
+    reference=pb.Reference(error=0.03),
+)
+columns = ["error", "worst", "resolved", "effective_draws", "gradients", "seconds_again"]
+pb.accuracy_table(study)[columns].round(3)
+
+# %%
+pb.plot_accuracy(study)
+
+# %% [markdown]
+# `error` is the largest error of any mean or standard deviation, in posterior standard deviations;
+# `worst` says of which parameter. It is the factor on the stated errors each time: six readings
+# tell little of it, and its posterior leans to one side, which a normal distribution cannot. Least
+# squares knows of no noise and is off by more than one and a half. Weights help, chains help more.
+# `resolved` is False where the error is at most twice what the reference itself may be off by: from
+# there on the study cannot tell errors from nothing, and the figure is gray.
+#
+# The seconds are those of a second fit, when all programs are compiled, on the machine that built
+# this page and whatever else it did then.
+#
+# The same as a sentence:
+
+# %%
+print(pb.accuracy_advice(study))
+
+# %% [markdown]
+# That is said of this capture. With more readings a posterior comes closer to a normal
+# distribution, and cheap methods closer to right; [accuracy](../accuracy.md) says how all of this
+# is measured.
+#
+# ## Let it choose
+#
+# `method="auto"` needs no reference. It climbs the ladder and takes the first rung whose own
+# diagnostics say that it is good enough: here within a quarter of a posterior standard deviation.
+
+# %%
+result = pb.fit(capture, scene=plate, links=links, method=pb.Auto(tolerance=0.25, seconds=600.0))
+print(*pb.auto_sentences(result), sep="\n")
+pb.summary(result).round(3)
+
+# %% [markdown]
+# It asked importance sampling twice, the second time with more draws, and did not believe it: the
+# weights themselves say that a few draws carry much. The study above knows better, since it has a
+# reference; a choice without one has to be careful. Tempered draws satisfied it. Most of the
+# seconds are compilation, which a second fit of this layout does not pay.
+#
+# What no diagnostic here sees is a wrong scene: every method is measured against the posterior, not
+# against the truth. [Measured data](measured_plates.md) shows the difference.
