@@ -27,6 +27,7 @@ from polar_bayes.models.spectra import (
 )
 from polar_bayes.models.spectral_process import SpectralProcess
 
+from polar_bayes.cards import Carded
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -36,7 +37,7 @@ OF_A_PATCH = ("wavelength", "view")
 
 
 @dataclasses.dataclass(frozen=True)
-class GpSpectral:
+class GpSpectral(Carded):
     """Spectra of one material, or of many patches, as Gaussian processes over wavelength.
 
     Args:

@@ -13,6 +13,7 @@ from polar_bayes.models.axes import draw_own, material_parameters, unchanging
 from polar_bayes.models.population import check_members, check_pooled, draw_pooled
 from polar_bayes.models.readings import declare_readings
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
@@ -20,7 +21,7 @@ from polar_bayes.physics.scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)
-class Hierarchical:
+class Hierarchical(Carded):
     """Parameters of all patches drawn from common populations.
 
     Args:

@@ -10,6 +10,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 from tinygp import kernels
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
 
 KERNELS = ("Exp", "ExpSquared", "Matern32", "Matern52")
@@ -23,7 +24,7 @@ NUGGET_OF_REMAINDER = 1e-8
 
 
 @dataclasses.dataclass(frozen=True)
-class SpectralProcess:
+class SpectralProcess(Carded):
     r"""A Gaussian process over wavelength, of unit amplitude.
 
     $$ f(\lambda) = k(\lambda, U)\, V L^{-T} w, \qquad L L^T = V^T [k(U, U) + \nu I] V, \qquad

@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import SceneError
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
 from polar_bayes.physics.scene import Scene
@@ -14,7 +15,7 @@ from polar_bayes.physics.scenes import SCENES
 
 
 @dataclasses.dataclass(frozen=True)
-class Setup:
+class Setup(Carded):
     """One way to measure.
 
     Args:

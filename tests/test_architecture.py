@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 
 # The rows of the design, first to last: a file may import from its own row and rows above it.
 LAYERS = (
-    ("polar_bayes.errors",),
+    ("polar_bayes.errors", "polar_bayes.cards", "polar_bayes.progress"),
     ("polar_bayes.capture",),
     ("polar_bayes.physics",),
     ("polar_bayes.observation",),

@@ -18,10 +18,10 @@ from polar_bayes.budget.trial import Measured, Trial, bench_of, run_trial
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.request import Method, Request, resolve
 from polar_bayes.inference.result import PROVENANCE
-from polar_bayes.inference.search import Progress
 from polar_bayes.ladder.rungs import LADDER
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
+from polar_bayes.progress import Progress, silent, watched
 
 AS_GIVEN = "as given"
 FOLD = 7
@@ -51,6 +51,7 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
 }
 
 
+@watched
 def accuracy(
     capture: xr.Dataset,
     *,
@@ -98,7 +99,7 @@ def accuracy(
     request = resolve(
         capture, model, "nuts", scene, priors, links, largest_view_zenith, seed, "double"
     )
-    show = progress or _silent
+    show = progress or silent
     trials = _trials(request, LADDER if rungs is None else rungs, tuple(dials))
     show("reference", 0.0)
     with jax.enable_x64(True):
@@ -264,7 +265,3 @@ def _dataset(rows: list[Row], judge: Judge) -> xr.Dataset:
             "reference_doubts": "; ".join(judge.doubts),
         },
     )
-
-
-def _silent(stage: str, fraction: float) -> None:
-    """No progress to show."""

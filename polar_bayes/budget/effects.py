@@ -15,11 +15,11 @@ from polar_bayes.budget.scales import Scales
 from polar_bayes.budget.variants import effects_of, simplify
 from polar_bayes.errors import FitError
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.search import Progress
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.scenes import FULL_SCENES
 from polar_bayes.priors import resolve_priors
+from polar_bayes.progress import Progress, silent, watched
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -40,6 +40,7 @@ class ChosenScene(Scene):
         return repr(simplify(self, ()))  # as one would write it
 
 
+@watched
 def choose_effects(
     capture: xr.Dataset,
     *,
@@ -101,7 +102,7 @@ def choose_effects(
     wishes = Wishes.of(effects, keep, drop)
     names = None if parameters is None else tuple(parameters)
     with jax.enable_x64(True):
-        scales = Scales(request, priors, progress or _silent)
+        scales = Scales(request, priors, progress or silent)
         # What is refused here is refused before minutes are spent.
         resolve_priors(scales.priors(full).read, priors)
         weighed = weigh(scales, full, effects, names)
@@ -121,7 +122,3 @@ def choose_effects(
 
 def _fields(scene: Scene) -> dict[str, Any]:
     return {field.name: getattr(scene, field.name) for field in dataclasses.fields(Scene)}
-
-
-def _silent(stage: str, fraction: float) -> None:
-    """No progress to show."""

@@ -23,7 +23,8 @@ from jaxtyping import Array
 
 from polar_bayes.budget.density import Density, Readings
 from polar_bayes.inference.modes import Status, ValueAndGradient, climb
-from polar_bayes.inference.search import Progress, find_modes, from_prior
+from polar_bayes.inference.search import find_modes, from_prior
+from polar_bayes.progress import Progress
 
 STARTS = 6
 """Prior draws from which the peak of the full scene is sought."""

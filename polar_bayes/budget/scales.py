@@ -12,11 +12,11 @@ from polar_bayes.budget.cost import Cost, run_seconds
 from polar_bayes.budget.density import Density, Readings, compile_density
 from polar_bayes.budget.linearized import Change, Peak, compare, find_peak
 from polar_bayes.inference.request import Request
-from polar_bayes.inference.search import Progress
 from polar_bayes.inference.story import read_story
 from polar_bayes.observation.data import observe
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import PriorTable
+from polar_bayes.progress import Progress
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

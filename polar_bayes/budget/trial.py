@@ -19,6 +19,7 @@ from polar_bayes.inference.request import Method, Request
 from polar_bayes.inference.result import posterior_of
 from polar_bayes.ladder.builtin import answer
 from polar_bayes.observation.data import Observations, observe
+from polar_bayes.progress import silent
 
 try:
     import resource
@@ -110,7 +111,7 @@ def bench_of(request: Request, key: Array) -> Bench:
     if request.precision == "single":
         data = data.in_single_precision()
     prepared = prepare(request, request.scene, data)
-    return Bench(request, prepared, data, key, _silent)
+    return Bench(request, prepared, data, key, silent)
 
 
 def labeled(
@@ -132,7 +133,3 @@ def _memory() -> float:
         return math.nan
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MEBIBYTE
-
-
-def _silent(stage: str, fraction: float) -> None:
-    """No progress to show."""

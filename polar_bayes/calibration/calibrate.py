@@ -27,6 +27,7 @@ from polar_bayes.pixels.making import key_of
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.tempering import PixelTempering
 from polar_bayes.priors import describe_prior
+from polar_bayes.progress import Counter, counted, silent
 
 METHODS: dict[str, Method] = {
     "laplace": PixelLaplace(weighted=False),
@@ -37,6 +38,7 @@ METHODS: dict[str, Method] = {
 FEWEST = 20
 
 
+@counted("fits")
 def calibrate(
     capture: xr.Dataset,
     *,
@@ -53,7 +55,7 @@ def calibrate(
     store: str | os.PathLike[str] | None = None,
     resume: bool = False,
     scheduler: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Counter | None = None,
 ) -> xr.DataTree:
     """Simulation-based calibration: do the intervals of this fit hold?
 
@@ -135,7 +137,7 @@ def calibrate(
     kept = None if store is None else Store(as_path(store, "store"), question_of(plan))
     found = kept.begin(resume=resume) if kept is not None else []
     missing = _missing(found, simulations)
-    show = progress or _silent
+    show = progress or silent
     found += _fit_all(plan, missing, simulations, kept, scheduler, show)
     about = _provenance(request, settings, truth, simulations)
     about["seconds"] = round(time.perf_counter() - clock, 3)
@@ -209,7 +211,7 @@ def _fit_all(
     every: int,
     kept: Store | None,
     scheduler: str | None,
-    progress: Callable[[int, int], None],
+    progress: Counter,
 ) -> list[Block]:
     """Blocks of fits on threads or workers; who fits what changes nothing."""
     found: list[Block] = []
@@ -225,10 +227,6 @@ def _fit_all(
             done += len(block.numbers)
             progress(done, every)
     return found
-
-
-def _silent(done: int, every: int) -> None:
-    """No progress to show."""
 
 
 def _provenance(

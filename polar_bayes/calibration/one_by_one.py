@@ -25,6 +25,7 @@ from polar_bayes.observation.data import READINGS, Observations
 from polar_bayes.pixels.importance import smooth
 from polar_bayes.pixels.outcome import Approach, Describe, Outcome, Status, no_outcome
 from polar_bayes.pixels.stack import Stack
+from polar_bayes.progress import silent
 
 OneByOne = Nuts | Laplace
 BLOCK = 4
@@ -108,8 +109,8 @@ def _fit(
     if isinstance(settings, Nuts):
         settings = dataclasses.replace(settings, threads=1)
     try:
-        ground = grounds.find(data, key_starts, _silent)
-        drawn = ground.draw(key_draws, settings, _silent)
+        ground = grounds.find(data, key_starts, silent)
+        drawn = ground.draw(key_draws, settings, silent)
     except (FitError, np.linalg.LinAlgError):  # no peak, or no width around it
         return None
     parameters = parameters_of(program, drawn.z, data)
@@ -156,7 +157,3 @@ def _scalars(parameters: Values) -> np.ndarray:
     """Every number that a fit estimates, (scalar, chain, draw)."""
     flat = [np.asarray(x).reshape(*np.shape(x)[:2], -1) for x in parameters.values()]
     return np.moveaxis(np.concatenate(flat, axis=-1), -1, 0)
-
-
-def _silent(stage: str, fraction: float) -> None:
-    """No progress to show."""

@@ -8,7 +8,8 @@ import click
 
 import polar_bayes as pb
 from polar_bayes.cli.places import check_writable
-from polar_bayes.cli.printing import NOT_CONVERGED, counting_bar, progress_bars
+from polar_bayes.cli.printing import NOT_CONVERGED
+from polar_bayes.progress import stages
 
 
 @click.command()
@@ -39,8 +40,7 @@ def calibrate(
     if resume and out.exists() and not store.exists():
         raise pb.FitError("nothing is left to resume", where=str(out), mend="give another --out")
     settings |= {"readings": not no_readings, "store": store, "resume": resume}
-    with counting_bar("fits") as progress:
-        calibration = pb.calibrate(data, progress=progress, **settings)
+    calibration = pb.calibrate(data, **settings)
     pb.save_result(calibration, out)
     table, said = pb.calibration_table(calibration), pb.calibration_verdict(calibration)
     is_ranked = "predictive_pit" in calibration.children
@@ -97,7 +97,7 @@ def identify(
     """Which parameters a capture determines, which trade off, and where to look next."""
     data = pb.load_capture(capture)
     tables, said = {}, {}
-    with progress_bars() as progress:
+    with stages() as progress:
         found = pb.identify(data, progress=progress, **settings)
         tables["parameters"] = pb.identifiability_table(found)
         said["said"] = pb.identifiability_sentences(found)
@@ -151,8 +151,7 @@ def accuracy(
         raise click.UsageError(f"no rung {', '.join(strange)}: give {', '.join(pb.LADDER)}")
     settings["rungs"] = {name: pb.LADDER[name] for name in rungs or pb.LADDER}
     settings |= {"dials": ()} if no_dials else {}
-    with progress_bars() as progress:
-        study = pb.accuracy(data, progress=progress, **settings)
+    study = pb.accuracy(data, **settings)
     pb.save_result(study, out)
     table, advice = pb.accuracy_table(study), pb.accuracy_advice(study, tolerance)
     if as_json:

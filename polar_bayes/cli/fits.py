@@ -8,7 +8,8 @@ import click
 
 import polar_bayes as pb
 from polar_bayes.cli.places import check_writable, in_setup, make_folder
-from polar_bayes.cli.printing import counting_bar, print_table, progress_bars, status
+from polar_bayes.cli.printing import print_table, status
+from polar_bayes.progress import stages
 
 
 @click.command()
@@ -22,7 +23,7 @@ def demo(out: Path, seed: int) -> int:
     make_folder(out)
     capture = pb.simulate("plastic", seed=seed)
     pb.save_capture(capture, out / "capture.nc")
-    with progress_bars() as progress:
+    with stages() as progress:
         result = pb.fit(capture, seed=seed, progress=progress)
         pb.save_result(result, out / "fit.nc")
         progress("writing the report", 0.0)
@@ -65,7 +66,7 @@ def fit(
         raise click.UsageError("--seconds needs --method auto")
     data = pb.load_capture(capture)
     check_writable(out)
-    with progress_bars() as progress:
+    with stages() as progress:
         if choose:
             data = in_setup(data, scene)
             options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
@@ -97,9 +98,7 @@ def fit(
 @click.option("--resume", is_flag=True, help="Go on with a map that was broken off.")
 def map_(capture: Path, out: Path, draws: int, **settings: Any) -> None:
     """Fit every pixel of an image."""
-    with counting_bar("pixels") as progress:
-        method = pb.PixelLaplace(draws=draws)
-        maps = pb.map_file(capture, out, method=method, progress=progress, **settings)
+    maps = pb.map_file(capture, out, method=pb.PixelLaplace(draws=draws), **settings)
     counts = ", ".join(f"{count} {what}" for what, count in pb.count_pixels(maps).items() if count)
     click.echo(f"{out}: {counts}")
 
@@ -121,7 +120,7 @@ def effects(
     data = in_setup(pb.load_capture(capture), scene)
     if out is not None:
         check_writable(out)
-    with progress_bars() as progress:
+    with stages() as progress:
         ledger = pb.choose_effects(data, progress=progress, **settings).ledger
     if out is not None:
         pb.save_result(ledger, out)

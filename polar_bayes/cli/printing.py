@@ -1,19 +1,9 @@
-"""What commands print: tables, counts, progress."""
+"""What commands print: tables and counts."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskProgressColumn,
-    TimeRemainingColumn,
-)
 
 import polar_bayes as pb
 
@@ -62,33 +52,3 @@ def print_masked(capture: Any) -> None:
     if reasons:
         told = ", ".join(f"{number} {reason}" for reason, number in reasons.items())
         click.echo(f"masked: {told}")
-
-
-@contextmanager
-def progress_bars() -> Iterator[Callable[[str, float], None]]:
-    """One bar per stage on the error stream; silent where that is not a terminal."""
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bars:
-        tasks: dict[str, Any] = {}
-
-        def progress(stage: str, fraction: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=1.0)
-            bars.update(tasks[stage], completed=fraction)
-
-        yield progress
-
-
-@contextmanager
-def counting_bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    """How many are done, how many a second, the time that is left; where there is a terminal."""
-    console = Console(stderr=True)
-    columns = (
-        BarColumn(),
-        MofNCompleteColumn(),
-        TaskProgressColumn(what, show_speed=True),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
-        task = bars.add_task(what, total=None)
-        yield lambda done, every: bars.update(task, completed=done, total=every)

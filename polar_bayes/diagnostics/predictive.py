@@ -41,6 +41,7 @@ class Loo:
         p_loo: Effective number of parameters.
         pareto_k: Of each reading; above 0.7 its own share cannot be trusted.
         pit: Share of the prediction from all other readings that lies below each reading.
+        parts: Log density of each reading given all others, unit nat.
     """
 
     elpd: float
@@ -48,6 +49,7 @@ class Loo:
     p_loo: float
     pareto_k: np.ndarray
     pit: np.ndarray
+    parts: np.ndarray
 
     @property
     def unreliable(self) -> int:
@@ -253,6 +255,7 @@ def _loo(part: _Part, efficiency: float, correction: np.ndarray | None) -> Loo |
         p_loo=float(np.sum(p_loo)),
         pareto_k=pareto_k,
         pit=_pit(part, np.exp(log_weights)),
+        parts=elpd,
     )
 
 

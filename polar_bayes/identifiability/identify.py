@@ -28,11 +28,11 @@ from polar_bayes.identifiability.peak import (
 )
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import PROVENANCE
-from polar_bayes.inference.search import Progress
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.notation import notation
 from polar_bayes.physics.scene import Scene
+from polar_bayes.progress import Progress, watched
 
 
 class Expected(NamedTuple):
@@ -55,6 +55,7 @@ class Expected(NamedTuple):
     values: np.ndarray
 
 
+@watched
 def identify(
     capture: xr.Dataset,
     *,

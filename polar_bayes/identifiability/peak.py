@@ -16,10 +16,11 @@ from polar_bayes.inference.modes import Modes, ValueAndGradient
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import posterior_of
-from polar_bayes.inference.search import Progress, find_modes, from_prior
+from polar_bayes.inference.search import find_modes, from_prior
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
+from polar_bayes.progress import Progress
 
 PRIOR_DRAWS = 500
 

@@ -30,9 +30,9 @@ from polar_bayes.identifiability.peak import (
 )
 from polar_bayes.identifiability.tracking import make_follow
 from polar_bayes.inference.result import PROVENANCE, posterior_of
-from polar_bayes.inference.search import Progress
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
+from polar_bayes.progress import Progress, watched
 
 KINDS = ("posterior", "likelihood")
 
@@ -53,6 +53,7 @@ class Place(NamedTuple):
     held: int
 
 
+@watched
 def profile(
     capture: xr.Dataset,
     parameter: str,

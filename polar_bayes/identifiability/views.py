@@ -42,10 +42,11 @@ from polar_bayes.identifiability.spread import draws_at, draws_of, embed
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import PROVENANCE
-from polar_bayes.inference.search import Progress, from_prior
+from polar_bayes.inference.search import from_prior
 from polar_bayes.observation.data import ANGLES, Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
+from polar_bayes.progress import Progress, watched
 
 APART = ("wavelength", "reading")
 WIDTH = 2.0 * 1.959963984540054
@@ -77,6 +78,7 @@ class Design(NamedTuple):
         return slopes @ np.linalg.inv(information) @ np.swapaxes(slopes, -1, -2)
 
 
+@watched
 def next_views(
     capture: xr.Dataset,
     candidates: xr.Dataset | None = None,

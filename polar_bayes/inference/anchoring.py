@@ -19,9 +19,10 @@ from jaxtyping import Array
 from polar_bayes.inference.alone import Alone, Lone, Starts
 from polar_bayes.inference.groups import Groups
 from polar_bayes.inference.modes import Modes, ValueAndGradient
-from polar_bayes.inference.search import Progress, from_prior
+from polar_bayes.inference.search import from_prior
 from polar_bayes.inference.transport import Anchored, Anchors, Transport
 from polar_bayes.observation.data import Observations
+from polar_bayes.progress import Progress
 
 TYPICAL_DRAWS = 200
 FEWEST_STARTS, MOST_STARTS, ALL_STARTS = 4, 16, 256

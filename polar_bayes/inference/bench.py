@@ -11,8 +11,8 @@ from polar_bayes.inference.ground import AbstractGround
 from polar_bayes.inference.prepared import Prepared
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.request import Request
-from polar_bayes.inference.search import Progress
 from polar_bayes.observation.data import Observations
+from polar_bayes.progress import Progress
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

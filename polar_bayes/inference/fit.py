@@ -31,12 +31,13 @@ from polar_bayes.inference.prepared import Prepared, prepare
 from polar_bayes.inference.program import Draw, Program
 from polar_bayes.inference.request import MODELS, Method, Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
-from polar_bayes.inference.search import Progress, from_prior
+from polar_bayes.inference.search import from_prior
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior, support_bounds
+from polar_bayes.progress import Progress, silent
 
 PRIOR_DRAWS = 500
 BLOCK = 500
@@ -90,7 +91,7 @@ def fit(
         capture, model, method, scene, priors, links, largest_view_zenith, seed, precision
     )
     with jax.enable_x64(precision == "double"):
-        return _run(request, progress or _silent)
+        return _run(request, progress or silent)
 
 
 class _Fitted(NamedTuple):
@@ -180,10 +181,6 @@ class _Clock:
         self._last = now
 
 
-def _silent(stage: str, fraction: float) -> None:
-    """No progress to show."""
-
-
 def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], Draw]:
     """Describe every draw, a block at a time inside one compiled loop of fixed length."""
 
@@ -245,7 +242,7 @@ def _fit_beside(
         try:
             prepared = prepare(request, scene, data)
             simpler = dataclasses.replace(request, scene=scene, method=method)
-            fitted = _fit_scene(simpler, prepared, data, key, _silent, _Clock())
+            fitted = _fit_scene(simpler, prepared, data, key, silent, _Clock())
         except FitError as error:  # a failed comparison must not cost the user the fit, but is told
             comparisons_failed[name] = str(error)
             continue

@@ -21,9 +21,10 @@ from polar_bayes.inference.alone import Lone, find_lone
 from polar_bayes.inference.groups import find_groups
 from polar_bayes.inference.modes import SETTLED, Modes, ValueAndGradient
 from polar_bayes.inference.program import Model, Program
-from polar_bayes.inference.search import Progress, find_modes, from_prior
+from polar_bayes.inference.search import find_modes, from_prior
 from polar_bayes.inference.transport import Transport
 from polar_bayes.observation.data import Observations
+from polar_bayes.progress import Progress
 
 STARTS = 16
 

@@ -16,6 +16,7 @@ from jaxtyping import Array
 from numpyro import handlers
 from numpyro.infer.autoguide import AutoLaplaceApproximation
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
 from polar_bayes.inference.modes import Modes, ValueAndGradient
 from polar_bayes.inference.program import Program
@@ -24,7 +25,7 @@ from polar_bayes.observation.data import Observations
 
 
 @dataclasses.dataclass(frozen=True)
-class Laplace:
+class Laplace(Carded):
     """Settings of the approximation.
 
     Args:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from polar_bayes.cards import Carded
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Answer:
@@ -45,7 +47,7 @@ class Answer:
 
 
 @dataclasses.dataclass(frozen=True)
-class AbstractMethod(abc.ABC):
+class AbstractMethod(Carded, abc.ABC):
     """How draws of a posterior are made; a small frozen dataclass of settings."""
 
     @abc.abstractmethod

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpyro import infer
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
 from polar_bayes.inference.kept import Kept
 from polar_bayes.inference.mixing import measure
@@ -34,7 +35,7 @@ MOST_KEPT = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class Nuts:
+class Nuts(Carded):
     """Settings of the sampler.
 
     Args:

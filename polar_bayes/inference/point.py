@@ -13,13 +13,14 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 
 
 @dataclasses.dataclass(frozen=True)
-class Point:
+class Point(Carded):
     """Settings of the least squares.
 
     Args:

@@ -1,7 +1,5 @@
 """The way to the modes that every fit begins with: climbs from many prior draws."""
 
-from collections.abc import Callable
-
 import jax
 import numpy as np
 from jaxtyping import Array
@@ -10,8 +8,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.modes import Modes, ValueAndGradient, climb, distinct, quiet_line_search
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
-
-Progress = Callable[[str, float], None]
+from polar_bayes.progress import Progress
 
 KEYS = 500
 """Draws from the prior that one call of a compiled program can make."""

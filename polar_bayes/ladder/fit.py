@@ -9,12 +9,12 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference import fit as core
 from polar_bayes.inference.request import METHODS as CORE
 from polar_bayes.inference.request import Method
-from polar_bayes.inference.search import Progress
 from polar_bayes.ladder.auto import Auto
 from polar_bayes.ladder.importance import Importance
 from polar_bayes.ladder.tempered import Tempered
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
+from polar_bayes.progress import Progress, watched
 
 METHODS: dict[str, Method] = {
     **CORE,
@@ -24,6 +24,7 @@ METHODS: dict[str, Method] = {
 }
 
 
+@watched
 def fit(
     capture: xr.Dataset,
     *,

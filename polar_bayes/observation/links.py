@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
@@ -34,7 +35,7 @@ Noise = Mapping[str, Float[Array, ""]]
 
 
 @dataclasses.dataclass(frozen=True)
-class AbstractLink(abc.ABC):
+class AbstractLink(Carded, abc.ABC):
     """How one recorded variable scatters around its prediction."""
 
     observables: ClassVar[tuple[str, ...]]

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
 
 SMOOTHING = 0.5
@@ -18,7 +19,7 @@ SMOOTHING = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class ConcentrationSchedule:
+class ConcentrationSchedule(Carded):
     r"""Concentration of the degree of polarization: bright, upright views are sharper.
 
     $$ \kappa = \kappa_{\min} + \kappa_{scale} (I/I_{\max})^\eta \cos(\theta_v)^\gamma $$
@@ -65,7 +66,7 @@ class ConcentrationSchedule:
 
 
 @dataclasses.dataclass(frozen=True)
-class ScaleSchedule:
+class ScaleSchedule(Carded):
     r"""Scale of the intensity noise: it grows towards full scale and towards grazing.
 
     $$ \sigma = \sigma_0 (1 - I/I_{\max})^{-\delta} \cos(\theta_v)^{-\zeta} $$

@@ -11,6 +11,7 @@ from typing import ClassVar, override
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.part import Part, check_setting
@@ -63,7 +64,7 @@ class AbstractInstrumentTerm(Part):
 
 
 @dataclasses.dataclass(frozen=True)
-class Instrument:
+class Instrument(Carded):
     """Terms that act one after the other.
 
     Args:

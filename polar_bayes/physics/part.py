@@ -12,6 +12,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import SceneError
 
 Setting = float | str
@@ -19,7 +20,7 @@ Setting = float | str
 
 
 @dataclasses.dataclass(frozen=True)
-class Part(abc.ABC):  # noqa: B024 - its subclasses are the abstract ones
+class Part(Carded, abc.ABC):
     """One effect of a scene."""
 
     parameters: ClassVar[tuple[str, ...]] = ()

@@ -2,17 +2,19 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import ClassVar, override
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
+from polar_bayes.cards import Carded, Grid
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import AbstractCoat
 from polar_bayes.physics.dispersion import AbstractDispersion
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.instrument import AbstractInstrumentTerm, Instrument
 from polar_bayes.physics.mixing import AbstractMixing
+from polar_bayes.physics.notation import notation
 from polar_bayes.physics.part import Part, check_part, parameters_of
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization, to_stokes
@@ -45,7 +47,7 @@ MATERIAL_PARAMETERS = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Scene:
+class Scene(Carded):
     """Parts that are there act; parts that are None are absent from the compiled program.
 
     Args:
@@ -119,6 +121,11 @@ class Scene:
         """Those of `parameters` that are not the instrument's."""
         instrument = () if self.instrument is None else self.instrument.parameters
         return tuple(name for name in self.parameters if name not in instrument)
+
+    @override
+    def more_on_card(self) -> tuple[Grid, ...]:
+        rows = [(name, *notation(name)) for name in self.parameters]
+        return (Grid(("parameter", "symbol", "meaning", "unit"), tuple(rows)),)
 
     def light(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> Light:
         """Light that reaches the viewer, before any instrument.

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
 from polar_bayes.pixels.adapting import FEWEST_EFFECTIVE, TIMES, Proposal, heavy_points, learn
 from polar_bayes.pixels.climbing import Peak
@@ -48,7 +49,7 @@ SAME_MODE = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
-class PixelLaplace:
+class PixelLaplace(Carded):
     """The normal approximation of every pixel, checked and corrected.
 
     Args:

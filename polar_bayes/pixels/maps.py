@@ -22,11 +22,13 @@ from polar_bayes.pixels.marginals import Marginals
 from polar_bayes.pixels.outcome import Status, no_outcome
 from polar_bayes.pixels.stack import IMAGE
 from polar_bayes.priors import describe_prior
+from polar_bayes.progress import Counter, counted
 
 BLOCK = 4096
 """Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
 
 
+@counted("pixels")
 def fit_pixels(
     capture: xr.Dataset,
     *,
@@ -38,7 +40,7 @@ def fit_pixels(
     largest_view_zenith: float | None = None,
     seed: int = 0,
     precision: str = "double",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Counter | None = None,
 ) -> xr.Dataset:
     """Fit every pixel of an image by itself.
 
@@ -219,9 +221,7 @@ def cut(capture: xr.Dataset, pixels: int = BLOCK) -> Iterator[dict[str, slice]]:
             yield {"y": slice(y, min(y + high, rows)), "x": slice(x, min(x + wide, columns))}
 
 
-def _at_once(
-    capture: xr.Dataset, plan: Plan, progress: Callable[[int, int], None] | None
-) -> xr.Dataset:
+def _at_once(capture: xr.Dataset, plan: Plan, progress: Counter | None) -> xr.Dataset:
     """Blocks on threads, put together in memory."""
     maps = blank(capture, plan).copy(deep=True)
     every, done = capture.sizes["y"] * capture.sizes["x"], 0

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpyro import infer
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
@@ -17,7 +18,7 @@ MOST_DOUBLINGS = 8
 
 
 @dataclasses.dataclass(frozen=True)
-class PixelNuts:
+class PixelNuts(Carded):
     """NUTS in each of many pixels, with a metric that is known before.
 
     Args:

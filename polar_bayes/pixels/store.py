@@ -7,7 +7,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from polar_bayes.observation.data import READINGS
 from polar_bayes.pixels.blocks import Plan, fit_block
 from polar_bayes.pixels.executors import as_completed, workers
 from polar_bayes.pixels.maps import blank, cut, fit_pixels, numbered_block, plan_map, said_of
+from polar_bayes.progress import Counter, counted
 
 BLOCK = 65536
 """Most pixels of a block, and of a chunk on the disk: few files, little memory."""
@@ -37,13 +38,14 @@ DEFAULTS: dict[str, Any] = {
 }
 
 
+@counted("pixels")
 def map_file(
     capture: str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
     scheduler: str | None = None,
     resume: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Counter | None = None,
     **asked: Any,
 ) -> xr.Dataset:
     """Fit every pixel of an image in a file, and write the maps to another.

@@ -17,6 +17,7 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 
+from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
@@ -36,7 +37,7 @@ LIFT = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
-class PixelTempering:
+class PixelTempering(Carded):
     """Tempered draws of every pixel, corrected by weights.
 
     Args:

@@ -6,8 +6,8 @@ from polar_bayes.priors.resolve import (
     check_support,
     in_this_precision,
     resolve_priors,
-    support_bounds,
 )
+from polar_bayes.priors.support import support_bounds
 from polar_bayes.priors.table import PRIORS, RANGES, Beta
 
 __all__ = [

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpyro import distributions as dist
 
-from polar_bayes.priors.resolve import support_bounds
+from polar_bayes.priors.support import support_bounds
 
 
 def describe_prior(prior: dist.Distribution) -> str:

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpyro import distributions as dist
-from numpyro.distributions import constraints
 
 from polar_bayes.errors import FitError
+from polar_bayes.priors.support import support_bounds
 from polar_bayes.priors.table import PRIORS, RANGES
 
 
@@ -141,16 +141,6 @@ def _in_range(least: float, most: float) -> str:
         return "give a HalfNormal or LogNormal distribution"
     bound = f"low={least:g}" if math.isinf(most) else f"low={least:g}, high={most:g}"
     return f"truncate it, for example TruncatedNormal(..., {bound})"
-
-
-def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
-    """Smallest and largest value that a prior allows, infinite where it has no bound."""
-    support = prior.support
-    while isinstance(support, constraints.independent):
-        support = support.base_constraint
-    low = getattr(support, "lower_bound", -math.inf)
-    high = getattr(support, "upper_bound", math.inf)
-    return float(np.min(low)), float(np.max(high))
 
 
 def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> None:

@@ -13,6 +13,10 @@ from typing import override
 from jaxtyping import Array
 from numpyro import distributions as dist
 
+from polar_bayes.cards import Card, Grid
+from polar_bayes.physics.notation import notation
+from polar_bayes.priors.describe import describe_prior
+
 
 class Beta(dist.Beta):
     """The Beta distribution, two Python numbers until it is used.
@@ -44,7 +48,15 @@ class Beta(dist.Beta):
         return dist.Beta(self.concentration1, self.concentration0).log_prob(value)
 
 
-PRIORS: dict[str, dist.Distribution] = {
+class Priors(dict[str, dist.Distribution]):
+    """A dictionary of priors that a notebook shows with their numbers."""
+
+    def _repr_html_(self) -> str:
+        rows = tuple((n, notation(n).meaning, describe_prior(x)) for n, x in self.items())
+        return Card("Priors", (), (Grid(("parameter", "meaning", "prior"), rows),))._repr_html_()
+
+
+_ROWS: dict[str, dist.Distribution] = {
     # The material: the paper, section 2.
     "roughness": dist.HalfNormal(0.2),
     "subsurface_fraction": Beta(2.0, 2.0),
@@ -113,6 +125,9 @@ PRIORS: dict[str, dist.Distribution] = {
     "exposure": dist.LogNormal(0.0, 3.0),
     "intensity_scale": dist.LogNormal(math.log(0.02), 1.0),
 }
+
+PRIORS = Priors(_ROWS)
+"""What is believed before any data, by the name of the parameter."""
 
 RANGES: dict[str, tuple[float, float]] = {
     "roughness": (0.0, math.inf),

@@ -26,7 +26,9 @@ from polar_bayes.reporting.style import (
     PURPLE,
     SKY,
     VERMILLION,
+    Drawing,
     lighten,
+    paper,
     plain,
     quiet_ticks,
     styled,
@@ -87,7 +89,7 @@ def plot_accuracy(
             where="plot_accuracy",
             mend=f"give some of {', '.join(TIME_LABELS)}",
         )
-    figure = Figure(figsize=(5.2 * len(shown), 4.4), layout="constrained")
+    figure = Drawing(figsize=(5.2 * len(shown), 4.4), layout="constrained")
     for at, name in enumerate(shown):
         axes = figure.add_subplot(1, len(shown), at + 1)
         front_panel(axes, found, name)
@@ -194,7 +196,7 @@ def _name_points(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, s
             va="center",
             fontsize=8,
             color=colors[name],
-            path_effects=[withStroke(linewidth=2.5, foreground="white")],
+            path_effects=[withStroke(linewidth=2.5, foreground=paper())],
         )
 
 

@@ -28,6 +28,7 @@ from polar_bayes.reporting.style import (
     PURPLE,
     SKY,
     VERMILLION,
+    Drawing,
     grid,
     plain,
     quiet_ticks,
@@ -155,7 +156,7 @@ def interval_coverage(
     """
     colors = colors_of(beside)
     tall = 0.3 + 0.12 * len(beside)
-    figure = Figure(figsize=(8.2, tall * len(parts) + 1.0), layout="constrained")
+    figure = Drawing(figsize=(8.2, tall * len(parts) + 1.0), layout="constrained")
     axes = figure.add_subplot()
     rows = []
     for part in parts:

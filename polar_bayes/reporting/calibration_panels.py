@@ -16,11 +16,11 @@ from polar_bayes.calibration.joint import limit_of
 from polar_bayes.calibration.verdict import calibration_scalars, calibration_table
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.reporting.style import (
-    BLACK,
     BLUE,
     GRAY,
     ORANGE,
     VERMILLION,
+    ink,
     lighten,
     title_of,
     wrapped,
@@ -275,7 +275,7 @@ def _mark_outside(axes: Axes, part: Ranked, band: EcdfBand) -> None:
     away = below / part.answered.size - band.at[1:-1]
     outside = (away < band.lower[1:-1] - 1e-9) | (away > band.upper[1:-1] + 1e-9)
     if outside.any():
-        axes.plot(band.at[1:-1][outside], away[outside], "o", color=BLACK, ms=2.6, zorder=4)
+        axes.plot(band.at[1:-1][outside], away[outside], "o", color=ink(), ms=2.6, zorder=4)
 
 
 def _ranks(part: Ranked) -> xr.Dataset:

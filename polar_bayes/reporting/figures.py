@@ -1,7 +1,7 @@
 """Figures of a fit: each is drawn from the saved tree alone.
 
-`readings` (its own file) shows the data; here are the parameters and the checks. In a notebook a
-figure is the last line of a cell; `figure.savefig("name.pdf")` writes it.
+`plot_readings` (its own file) shows the data; here are the parameters and the checks. In a notebook
+a figure is the last line of a cell; `figure.savefig("name.pdf")` writes it.
 """
 
 from typing import Any
@@ -24,17 +24,16 @@ from polar_bayes.diagnostics.parameters import (
 )
 from polar_bayes.diagnostics.predictive import Check, pit_band, predictive_checks
 from polar_bayes.errors import FitError
-from polar_bayes.reporting.readings import readings as readings
-from polar_bayes.reporting.readings import residuals as residuals
 from polar_bayes.reporting.style import (
-    BLACK,
     BLUE,
     CHAIN_COLORS,
     GRAY,
     ORANGE,
     QUANTITIES,
     VERMILLION,
+    Drawing,
     grid,
+    ink,
     lighten,
     quiet_ticks,
     styled,
@@ -77,7 +76,7 @@ def _first_material_first(scalar: Scalar) -> tuple[bool, list[int]]:
 
 
 @styled
-def pairs(result: xr.DataTree) -> Figure:
+def plot_pairs(result: xr.DataTree) -> Figure:
     """Joint draws of the material parameters (the first material, at most 8), and correlations.
 
     Args:
@@ -93,7 +92,7 @@ def pairs(result: xr.DataTree) -> Figure:
     found = [s for s in found if _first_material_first(s) == _first_material_first(found[0])]
     found = found[:MOST_PAIRED]
     if len(found) < 2:
-        raise _nothing("pairs", "two material parameters with draws")
+        raise _nothing("plot_pairs", "two material parameters with draws")
     posterior = result["posterior"].to_dataset()
     labels = [_narrow(title_of(scalar, posterior)) for scalar in found]
     size = len(found)
@@ -126,7 +125,7 @@ def pairs(result: xr.DataTree) -> Figure:
 
 
 @styled
-def ranks(result: xr.DataTree) -> Figure:
+def plot_ranks(result: xr.DataTree) -> Figure:
     """How each chain's draws rank among all draws: flat and overlapping lines are good.
 
     Args:
@@ -140,7 +139,7 @@ def ranks(result: xr.DataTree) -> Figure:
     """
     found = drawable(result)
     if not found or found[0].draws.shape[0] < 2:
-        raise _nothing("ranks", "two chains")
+        raise _nothing("plot_ranks", "two chains")
     r_hat = array_stats.rhat(np.stack([scalar.draws for scalar in found]))
     worst = np.sort(np.argsort(-r_hat, kind="stable")[:MOST_PANELS])
     found = [found[i] for i in worst]
@@ -169,7 +168,7 @@ def ranks(result: xr.DataTree) -> Figure:
 
 
 @styled
-def prior_posterior(result: xr.DataTree) -> Figure:
+def plot_prior_posterior(result: xr.DataTree) -> Figure:
     """Prior against posterior: what the data added.
 
     Args:
@@ -188,7 +187,7 @@ def prior_posterior(result: xr.DataTree) -> Figure:
         before = {s.label: s.draws for s in scalars(result["prior"].to_dataset())}
     found = [scalar for scalar in drawable(result) if scalar.label in before]
     if not found:
-        raise _nothing("prior_posterior", "draws of the prior")
+        raise _nothing("plot_prior_posterior", "draws of the prior")
     posterior = result["posterior"].to_dataset()
     # Populations and processes, which concern all members, before the first members.
     names = set(map(str, posterior.data_vars))
@@ -204,7 +203,7 @@ def prior_posterior(result: xr.DataTree) -> Figure:
         _hill(axes, draws, limits, BLUE, 0.45)
         low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
         axes.plot([low, high], [-0.09, -0.09], color=BLUE, lw=3, solid_capstyle="butt")
-        axes.plot([middle], [-0.09], "|", color=BLACK, ms=8)
+        axes.plot([middle], [-0.09], "|", color=ink(), ms=8)
         true = truth_of(result, scalar)
         if np.isfinite(true):
             any_truth = True
@@ -226,7 +225,7 @@ def prior_posterior(result: xr.DataTree) -> Figure:
 
 
 @styled
-def pit(result: xr.DataTree, checks: dict[str, Check] | None = None) -> Figure:
+def plot_pit(result: xr.DataTree, checks: dict[str, Check] | None = None) -> Figure:
     """PIT and leave-one-out PIT of every variable: distance from the uniform distribution.
 
     Args:
@@ -242,8 +241,8 @@ def pit(result: xr.DataTree, checks: dict[str, Check] | None = None) -> Figure:
     checks = predictive_checks(result) if checks is None else checks
     rows = [check for check in checks.values() if check.pit.size >= 2]
     if not rows:
-        raise _nothing("pit", "two readings and 100 draws")
-    figure = Figure(figsize=(8.2, 2.1 * len(rows) + 0.5), layout="constrained")
+        raise _nothing("plot_pit", "two readings and 100 draws")
+    figure = Drawing(figsize=(8.2, 2.1 * len(rows) + 0.5), layout="constrained")
     panels = figure.subplots(len(rows), 2, sharex=True, sharey="row", squeeze=False)
     for row, check in enumerate(rows):
         parts = {"PIT": check.pit, "leave-one-out PIT": check.loo.pit if check.loo else None}
@@ -260,7 +259,7 @@ def _square(size: int, *, lines: int) -> tuple[Figure, np.ndarray]:
     """Panels for pairs, placed by hand: a layout engine takes seconds for this many axes."""
     side = max(5.6, min(1.35 * size + 0.9, 9.6))
     margin = 0.42 + 0.16 * lines
-    figure = Figure(figsize=(side, side))
+    figure = Drawing(figsize=(side, side))
     place = {"left": (margin + 0.25) / side, "bottom": margin / side, "right": 0.985, "top": 0.99}
     panels = figure.subplots(
         size, size, squeeze=False, gridspec_kw={**place, "hspace": 0.12, "wspace": 0.12}
@@ -338,7 +337,7 @@ def _correlation(axes: Axes, value: float) -> None:
         va="center",
         transform=axes.transAxes,
         fontsize=8.0 + 3.0 * strength,
-        color=BLACK if strength > 0.3 else GRAY,
+        color=ink() if strength > 0.3 else GRAY,
     )
 
 

@@ -29,11 +29,11 @@ from polar_bayes.reporting.accuracy_page import accuracy_section, render_accurac
 from polar_bayes.reporting.calibration_page import render_calibration
 from polar_bayes.reporting.map_page import render_map
 from polar_bayes.reporting.page import Picture, fill, picture, write_page
-from polar_bayes.reporting.population import shrinkage_plot
+from polar_bayes.reporting.population import plot_shrinkage
 from polar_bayes.reporting.provenance import provenance_groups, swapped_sentence
-from polar_bayes.reporting.readings import variables
-from polar_bayes.reporting.spectrum import spectra, spectrum
-from polar_bayes.reporting.style import QUANTITIES
+from polar_bayes.reporting.readings import plot_readings, plot_residuals, variables
+from polar_bayes.reporting.spectrum import plot_spectrum, spectra
+from polar_bayes.reporting.style import QUANTITIES, in_house_style
 
 RESULT = "result.nc"
 CALIBRATION = "calibration.nc"
@@ -54,6 +54,7 @@ METHODS = {
 }
 
 
+@in_house_style
 def report(
     result: xr.DataTree | xr.Dataset,
     directory: str | os.PathLike[str],
@@ -204,7 +205,7 @@ def _population(result: xr.DataTree, posterior: xr.Dataset) -> dict[str, Any] | 
         "left_out": max(len(drawn) - MOST_POPULATIONS, 0),
         "pictures": [
             picture(
-                shrinkage_plot(result, label, summary, members),
+                plot_shrinkage(result, label, summary, members),
                 f"Shrinkage of {label}: each member alone and pooled",
                 caption if at == 0 else "The same.",
             )
@@ -226,7 +227,7 @@ def _spectrum_pictures(result: xr.DataTree) -> list[Picture]:
     )
     return [
         picture(
-            spectrum(result, name, found),
+            plot_spectrum(result, name, found),
             f"{name.replace('_', ' ').capitalize()} against wavelength",
             tied if found[name][0].between.size else free,
         )
@@ -253,7 +254,7 @@ def _pictures(
         "readings": _reading_pictures(result, has_draws),
         "pairs": _optional(
             has_draws and len(figures.drawable(result, material=True)) > 1,
-            lambda: figures.pairs(result),
+            lambda: figures.plot_pairs(result),
             "Pair plot of the material parameters",
             "Each dot is a joint draw. A long narrow cloud means that the data fix a combination "
             "of the two better than either; numbers above the diagonal are correlations. Orange "
@@ -261,21 +262,21 @@ def _pictures(
         ),
         "prior": _optional(
             has_prior,
-            lambda: figures.prior_posterior(result),
+            lambda: figures.plot_prior_posterior(result),
             "Prior and posterior of each parameter",
             "Curves are scaled to equal height. Where blue covers gray, the data said nothing "
             "about this parameter.",
         ),
         "ranks": _optional(
             method == "nuts" and has_draws,
-            lambda: figures.ranks(result),
+            lambda: figures.plot_ranks(result),
             "Rank plot of each chain",
             "Each line is one chain. Lines that are flat and overlap mean that all chains "
             "describe one distribution; a chain that leans or piles up saw another part of it.",
         ),
         "pit": _optional(
             any(check.pit.size > 1 for check in checks.values()),
-            lambda: figures.pit(result, checks),
+            lambda: figures.plot_pit(result, checks),
             "PIT and leave-one-out PIT of each variable",
             "For a model that expects its readings the curve stays in the gray band in 95 of 100 "
             "captures. Up, then down: readings scatter more than the model says; down, then up: "
@@ -295,7 +296,7 @@ def _reading_pictures(result: xr.DataTree, has_draws: bool) -> list[Picture]:
         quantity = QUANTITIES[name]
         pictures.append(
             picture(
-                figures.readings(result, name),
+                plot_readings(result, name),
                 f"Readings of {quantity} and the fitted curve against view zenith",
                 f"Readings of {quantity} with the fitted curve{bands if has_draws else '.'}",
             )
@@ -303,7 +304,7 @@ def _reading_pictures(result: xr.DataTree, has_draws: bool) -> list[Picture]:
         if name != "intensity":
             pictures.append(
                 picture(
-                    figures.residuals(result, name),
+                    plot_residuals(result, name),
                     f"Readings of {quantity} minus the fitted curve against view zenith",
                     "The same after subtracting the fitted curve. A wave that many neighbors "
                     "share is a smooth error of the instrument or of the model.",

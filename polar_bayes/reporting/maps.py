@@ -10,13 +10,12 @@ from polar_bayes.errors import FitError
 from polar_bayes.physics.notation import notation
 from polar_bayes.reporting.style import (
     BLUE,
-    GRAY,
     GREEK,
     GREEN,
     ORANGE,
     SKY,
     VERMILLION,
-    lighten,
+    Drawing,
     styled,
     wrapped,
 )
@@ -25,9 +24,9 @@ MOST_PIXELS = 800
 """Longest side of a picture; of larger images every second, third, ... pixel is drawn."""
 
 LARGEST_K = 1.0
-NO_ANSWER = lighten(GRAY, 0.75)
-APPROACHES = (lighten(GRAY, 0.75), SKY, BLUE, GREEN, ORANGE)
-STATUSES = (BLUE, lighten(GRAY, 0.75), SKY, VERMILLION, ORANGE)
+NO_ANSWER = "#dadada"
+APPROACHES = (NO_ANSWER, SKY, BLUE, GREEN, ORANGE)
+STATUSES = (BLUE, NO_ANSWER, SKY, VERMILLION, ORANGE)
 
 
 @styled
@@ -54,7 +53,7 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
     shown = shown.isel(y=slice(None, None, step), x=slice(None, None, step))
     columns = max(len(names), 3)
     tall = 2.0 * min(max(maps.sizes["y"] / maps.sizes["x"], 0.4), 1.6) + 0.7
-    figure = Figure(figsize=(2.6 * columns, 3.0 * tall), layout="constrained")
+    figure = Drawing(figsize=(2.6 * columns, 3.0 * tall), layout="constrained")
     for at, name in enumerate(names):
         symbol, meaning, unit = notation(name)
         meaning = meaning.removesuffix(" relative to scattering")  # too long for a panel

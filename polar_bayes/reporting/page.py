@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from polar_bayes.errors import FitError
-from polar_bayes.reporting.style import STYLE
+from polar_bayes.reporting.style import ALWAYS
 
 PAGE = "index.html"
 
@@ -48,7 +48,7 @@ def picture(figure: Figure, alternative: str, caption: str) -> Picture:
         The picture; the same figure gives the same bytes.
     """
     buffer = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(ALWAYS):
         # No date and a fixed salt: the same result gives the same page, byte for byte.
         figure.savefig(buffer, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
     encoded = base64.b64encode(buffer.getvalue()).decode("ascii")

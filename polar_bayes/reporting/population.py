@@ -24,7 +24,9 @@ from polar_bayes.reporting.style import (
     GRAY,
     ORANGE,
     PURPLE,
+    Drawing,
     lighten,
+    paper,
     place_of,
     plain,
     quiet_ticks,
@@ -43,7 +45,7 @@ WIDE = 15.0
 
 
 @styled
-def shrinkage_plot(
+def plot_shrinkage(
     result: xr.DataTree,
     label: str,
     summary: pd.DataFrame | None = None,
@@ -69,7 +71,7 @@ def shrinkage_plot(
     if label not in found or label not in summary.index:
         raise FitError(
             f"{label!r} is no pooled parameter",
-            where="shrinkage_plot: label",
+            where="plot_shrinkage: label",
             mend=f"choose one of {', '.join(summary.index) or 'none'}",
         )
     population, whole = found[label], summary.loc[label]
@@ -77,7 +79,7 @@ def shrinkage_plot(
     if not np.isfinite(rows["mean"]).all():
         raise FitError(
             "its draws are not finite on the population's scale",
-            where=f"shrinkage_plot: {label}",
+            where=f"plot_shrinkage: {label}",
             mend="see the verdict",
         )
     rows["true"] = [truth_of(result, scalar) for scalar in population.members]
@@ -106,7 +108,7 @@ def _draw(
     result: xr.DataTree, population: Population, whole: pd.Series, rows: pd.DataFrame, count: int
 ) -> Figure:
     height = ROW if len(rows) <= 30 else LOW_ROW
-    figure = Figure(figsize=(7.0, max(height * len(rows), 0.7) + 1.5), layout="constrained")
+    figure = Drawing(figsize=(7.0, max(height * len(rows), 0.7) + 1.5), layout="constrained")
     axes = figure.subplots()
     axes.set_xlim(_limits(axes, population, whole, rows))
     axes.axvspan(whole["new_q2.5"], whole["new_q97.5"], color=lighten(GRAY, 0.85), lw=0)
@@ -170,7 +172,7 @@ def _draw_member(axes: Axes, at: float, row: pd.Series, *, small: bool) -> None:
         axes.plot(
             [row["alone_q2.5"], row["alone_q97.5"]], [at + APART] * 2, color=faint, lw=0.9, zorder=2
         )
-        style: dict[str, Any] = {"mfc": "white", "mec": PURPLE, "mew": 1.1, "clip_on": False}
+        style: dict[str, Any] = {"mfc": paper(), "mec": PURPLE, "mew": 1.1, "clip_on": False}
         axes.plot([seen], [at + APART], outside, ms=size, zorder=4, **style)
     else:
         axes.plot([low, high], [at + APART] * 2, color=faint, lw=0.9, ls=(0, (1, 3)), zorder=2)
@@ -182,7 +184,7 @@ def _draw_member(axes: Axes, at: float, row: pd.Series, *, small: bool) -> None:
             [at - APART],
             "d",
             mfc=ORANGE,
-            mec="white",
+            mec=paper(),
             mew=0.6,
             ms=size + 1.2,
             zorder=6,
@@ -190,7 +192,7 @@ def _draw_member(axes: Axes, at: float, row: pd.Series, *, small: bool) -> None:
 
 
 def _legend(rows: pd.DataFrame) -> list[Line2D | Patch]:
-    hollow: dict[str, Any] = {"mfc": "white", "mec": PURPLE, "mew": 1.1, "ms": 5}
+    hollow: dict[str, Any] = {"mfc": paper(), "mec": PURPLE, "mew": 1.1, "ms": 5}
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=BLUE, lw=1.8, marker="o", ms=5, label="pooled: mean and 95%"),
     ]
@@ -207,6 +209,6 @@ def _legend(rows: pd.DataFrame) -> list[Line2D | Patch]:
     ]
     if np.isfinite(rows["true"]).any():
         handles.append(
-            Line2D([], [], ls="", marker="d", mfc=ORANGE, mec="white", ms=6.5, label="true value")
+            Line2D([], [], ls="", marker="d", mfc=ORANGE, mec=paper(), ms=6.5, label="true value")
         )
     return handles

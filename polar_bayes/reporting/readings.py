@@ -15,12 +15,13 @@ from polar_bayes.diagnostics.parameters import SAMPLE_DIMS, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting.style import (
-    BLACK,
     BLUE,
     GRAY,
     QUANTITIES,
     SHORT,
     VERMILLION,
+    Drawing,
+    ink,
     lighten,
     place_of,
     plain,
@@ -120,7 +121,7 @@ def curves(result: xr.DataTree, name: str) -> list[Curve]:
 
 
 @styled
-def readings(result: xr.DataTree, name: str) -> Figure:
+def plot_readings(result: xr.DataTree, name: str) -> Figure:
     """One recorded variable against view zenith, with posterior median and predictive bands.
 
     With 2 to 4 azimuths between view and light: a row for every material and wavelength (at most
@@ -140,7 +141,7 @@ def readings(result: xr.DataTree, name: str) -> Figure:
 
 
 @styled
-def residuals(result: xr.DataTree, name: str) -> Figure:
+def plot_residuals(result: xr.DataTree, name: str) -> Figure:
     """The same after subtracting the fitted curve: where the model misses, and by how much.
 
     Args:
@@ -148,7 +149,7 @@ def residuals(result: xr.DataTree, name: str) -> Figure:
         name: dop, q, u or intensity.
 
     Returns:
-        The figure, with the layout of `readings`.
+        The figure, with the layout of `plot_readings`.
 
     Raises:
         FitError: The result has no such variable.
@@ -181,7 +182,7 @@ def _draw_by_azimuth(
 ) -> tuple[Figure, int, set[str]]:
     """A row for each curve, a column for each azimuth."""
     shown = found[:MOST_ROWS]
-    figure = Figure(figsize=(8.2, 1.75 * len(shown) + 0.9), layout="constrained")
+    figure = Drawing(figsize=(8.2, 1.75 * len(shown) + 0.9), layout="constrained")
     panels = figure.subplots(len(shown), len(azimuths), sharex=True, sharey=True, squeeze=False)
     drawn: set[str] = set()
     shorter = {words: SHORT[name] for name, words in QUANTITIES.items()}
@@ -203,7 +204,7 @@ def _draw_wrapped(
     columns = {1: 1, 2: 2, 4: 2}.get(len(shown), WRAP)
     rows = -(-len(shown) // columns)
     size = (8.2, 2.1 * rows + 0.9) if columns > 1 else (6.6, 3.9)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Drawing(figsize=size, layout="constrained")
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     drawn: set[str] = set()
     for axes, curve in zip(panels.flat, shown, strict=False):
@@ -298,7 +299,7 @@ def _panel(axes: Axes, curve: Curve, limit: float) -> set[str]:
             **_masked_style(),
         )
     if limit < 90.0:
-        axes.axvspan(limit, 90.0, color="#efefef", lw=0, zorder=0)
+        axes.axvspan(limit, 90.0, color=lighten(GRAY, 0.9), lw=0, zorder=0)
         drawn.add("aside")
     return drawn
 
@@ -339,8 +340,8 @@ def _limits(axes: Axes, found: list[Curve], *, is_share: bool) -> None:
 
 def _mark(axes: Axes, key: str, x: np.ndarray, y: np.ndarray) -> None:
     style: dict[str, Any] = {
-        "reading": {"marker": "o", "ms": 3.4, "color": BLACK},
-        "saturated": {"marker": "^", "ms": 5.5, "color": VERMILLION, "mec": BLACK, "mew": 0.5},
+        "reading": {"marker": "o", "ms": 3.4, "color": ink()},
+        "saturated": {"marker": "^", "ms": 5.5, "color": VERMILLION, "mec": ink(), "mew": 0.5},
     }[key]
     axes.plot(x, y, ls="none", zorder=5, **style)
 
@@ -352,12 +353,12 @@ def _masked_style() -> dict[str, Any]:
 def _legend() -> dict[str, Line2D | Patch]:
     none: dict[str, Any] = {"ls": "none"}
     return {
-        "reading": Line2D([], [], marker="o", ms=3.4, color=BLACK, label="reading", **none),
+        "reading": Line2D([], [], marker="o", ms=3.4, color=ink(), label="reading", **none),
         "saturated": Line2D(
-            [], [], marker="^", ms=5.5, color=VERMILLION, mec=BLACK, label="saturated", **none
+            [], [], marker="^", ms=5.5, color=VERMILLION, mec=ink(), label="saturated", **none
         ),
         "masked": Line2D([], [], label="masked: not fitted", **_masked_style()),
-        "aside": Patch(color="#efefef", label="set aside: beyond the angle limit"),
+        "aside": Patch(color=lighten(GRAY, 0.9), label="set aside: beyond the angle limit"),
         "median": Line2D([], [], color=BLUE, lw=1.4, label="fitted curve"),
         "half": Patch(color=lighten(BLUE, 0.5), label="50% of new readings"),
         "most": Patch(color=lighten(BLUE, 0.78), label="95% of new readings"),

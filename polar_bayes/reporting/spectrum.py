@@ -26,6 +26,7 @@ from polar_bayes.reporting.style import (
     ORANGE,
     grid,
     lighten,
+    paper,
     place_of,
     plain,
     quiet_ticks,
@@ -105,7 +106,7 @@ def spectra(result: xr.DataTree) -> dict[str, list[Spectrum]]:
 
 
 @styled
-def spectrum(
+def plot_spectrum(
     result: xr.DataTree, name: str, found: dict[str, list[Spectrum]] | None = None
 ) -> Figure:
     """One parameter over wavelength: median, 50% and 95%, a panel for each member.
@@ -126,7 +127,7 @@ def spectrum(
     if name not in found:
         raise FitError(
             f"{name} was not fitted over wavelength",
-            where="spectrum",
+            where="plot_spectrum",
             mend=f"choose one of {', '.join(found) or 'none'}",
         )
     shown = found[name]
@@ -235,12 +236,12 @@ def _panel(axes: Axes, each: Spectrum) -> None:
     else:
         axes.vlines(each.measured, each.levels[0], each.levels[4], color=BLUE, lw=1.1)
         axes.vlines(each.measured, each.levels[1], each.levels[3], color=BLUE, lw=3.6)
-        ring: dict[str, Any] = {"mfc": "white", "mec": BLUE, "ms": 4.5}
+        ring: dict[str, Any] = {"mfc": paper(), "mec": BLUE, "ms": 4.5}
         axes.plot(each.measured, each.levels[2], "o", ls="", **ring)
         margin = 0.08 * np.ptp(each.measured)
         axes.set_xlim(each.measured.min() - margin, each.measured.max() + margin)
     known = np.isfinite(each.true)
-    style: dict[str, Any] = {"mfc": ORANGE, "mec": "white", "mew": 0.6, "ms": 6.5}
+    style: dict[str, Any] = {"mfc": ORANGE, "mec": paper(), "mew": 0.6, "ms": 6.5}
     axes.plot(each.measured[known], each.true[known], "d", ls="", zorder=6, **style)
     if each.between.size:
         axes.set_xlim(each.between[0], each.between[-1])
@@ -266,13 +267,13 @@ def _legend(shown: list[Spectrum]) -> list[Line2D | Patch]:
         ]
     else:
         handles = [
-            Line2D([], [], color=BLUE, marker="o", mfc="white", ls="", label="posterior median"),
+            Line2D([], [], color=BLUE, marker="o", mfc=paper(), ls="", label="posterior median"),
             Line2D([], [], color=BLUE, lw=3.6, label="50%"),
             Line2D([], [], color=BLUE, lw=1.1, label="95%"),
         ]
     if any(np.isfinite(each.true).any() for each in shown):
         label = "true value"
         handles.append(
-            Line2D([], [], ls="", marker="d", mfc=ORANGE, mec="white", ms=6.5, label=label)
+            Line2D([], [], ls="", marker="d", mfc=ORANGE, mec=paper(), ms=6.5, label=label)
         )
     return handles

@@ -1,16 +1,20 @@
 """How figures look: colors that everybody can tell apart, labels in words with units.
 
-Nothing here changes matplotlib's global settings for longer than one figure takes, and no figure
-belongs to pyplot, so drawing a report leaves a notebook as it was.
+Whoever has chosen a matplotlib style, by `matplotlib.style.context` or for good, gets it: the house
+style fills in what they left alone. Ink and paper follow the style; colors that stand for something
+stay. Nothing here changes matplotlib's settings for longer than one figure takes, and no figure
+belongs to pyplot, so drawing leaves a notebook as it was.
 """
 
 import functools
+import io
 import math
 import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import matplotlib
+import matplotlib.style
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -21,13 +25,12 @@ from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import one_line
 
 # Okabe and Ito, "Color universal design" (2008).
-BLACK, GRAY = "#000000", "#6b6b6b"
+GRAY = "#6b6b6b"
 ORANGE, SKY, GREEN, BLUE = "#e69f00", "#56b4e9", "#009e73", "#0072b2"
 VERMILLION, PURPLE = "#d55e00", "#cc79a7"
 CHAIN_COLORS = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
 
 STYLE: Any = {
-    "font.family": ["DejaVu Sans"],
     "font.size": 9.0,
     "axes.titlesize": 9.0,
     "axes.labelsize": 9.0,
@@ -39,12 +42,10 @@ STYLE: Any = {
     "axes.edgecolor": GRAY,
     "xtick.color": GRAY,
     "ytick.color": GRAY,
-    "xtick.labelcolor": BLACK,
-    "ytick.labelcolor": BLACK,
-    "axes.grid": False,
-    "figure.facecolor": "white",
-    "axes.facecolor": "white",
-    "savefig.facecolor": "white",
+}
+"""Of the house, each where the user has not said otherwise."""
+
+ALWAYS: Any = {
     # Names of captures and materials are text, whatever dollar signs they contain.
     "text.parse_math": False,
     "text.usetex": False,
@@ -53,6 +54,7 @@ STYLE: Any = {
     "svg.hashsalt": "polar_bayes",
     "path.simplify": True,
 }
+"""Whatever the user's style says."""
 
 QUANTITIES = {
     "dop": "degree of polarization",
@@ -65,14 +67,56 @@ GREEK = {"beta": "β"}
 
 
 def styled[**P, R](draw: Callable[P, R]) -> Callable[P, R]:
-    """Run a drawing function in the house style and leave the settings as they were."""
+    """Run a drawing function in the user's style, the house's beneath it; settings stay."""
 
     @functools.wraps(draw)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
-        with matplotlib.rc_context(STYLE):
+        with matplotlib.rc_context(_settings()):
             return draw(*args, **kwargs)
 
     return wrapper
+
+
+def in_house_style[**P, R](write: Callable[P, R]) -> Callable[P, R]:
+    """Run what writes a report in the house style alone: the same result gives the same page."""
+
+    @functools.wraps(write)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        with matplotlib.style.context("default"):
+            return write(*args, **kwargs)
+
+    return wrapper
+
+
+def _settings() -> Any:
+    """What the user has set, and where they have not, what the house does."""
+    own: Any = matplotlib.rcParams
+    default: Any = matplotlib.rcParamsDefault
+    wanted = {**STYLE, **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), own["text.color"])}
+    house = {key: value for key, value in wanted.items() if own[key] == default[key]}
+    families = own["font.family"]
+    # Every letter of a name can be drawn, whatever font comes first.
+    fonts = [*([] if families == default["font.family"] else families), "DejaVu Sans"]
+    return {**house, **ALWAYS, "font.family": fonts}
+
+
+def ink() -> str:
+    """The color of text and readings, in the style that is drawn in."""
+    return str(matplotlib.colors.to_hex(matplotlib.rcParams["text.color"]))
+
+
+def paper() -> str:
+    """The color behind them."""
+    return str(matplotlib.colors.to_hex(matplotlib.rcParams["axes.facecolor"]))
+
+
+class Drawing(Figure):
+    """A figure that a notebook shows by itself, whether pyplot is there or not."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", facecolor=self.get_facecolor())
+        return buffer.getvalue()
 
 
 def grid(
@@ -92,7 +136,7 @@ def grid(
     """
     columns = max(1, min(columns, count))
     rows = max(1, math.ceil(count / columns))
-    figure = Figure(figsize=(width, rows * panel_height + header), layout="constrained")
+    figure = Drawing(figsize=(width, rows * panel_height + header), layout="constrained")
     axes = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
     return figure, axes
 
@@ -130,16 +174,16 @@ def wrapped(text: str, width: int, lines: int = 2) -> str:
 
 
 def lighten(color: str, share: float) -> tuple[float, float, float]:
-    """A color mixed with white, so that areas need no transparency (print, old readers)."""
-    rgb = np.array(matplotlib.colors.to_rgb(color))
-    red, green, blue = rgb + (1.0 - rgb) * share
+    """A color mixed with the paper's, so that areas need no transparency (print, old readers)."""
+    rgb, white = (np.array(matplotlib.colors.to_rgb(each)) for each in (color, paper()))
+    red, green, blue = rgb + (white - rgb) * share
     return float(red), float(green), float(blue)
 
 
 def quiet_ticks(axes: Axes | Sequence[Axes]) -> None:
     """Fix tick sizes now: matplotlib would look them up only when the figure is drawn."""
     for axis in [axes] if isinstance(axes, Axes) else axes:
-        axis.tick_params(labelsize=STYLE["xtick.labelsize"], length=3.0, color=GRAY)
+        axis.tick_params(labelsize=matplotlib.rcParams["xtick.labelsize"], length=3.0, color=GRAY)
 
 
 @functools.cache

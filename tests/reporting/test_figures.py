@@ -11,7 +11,7 @@ from synthetic_results import edit_provenance, make_result, replace
 
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import figures
-from polar_bayes.reporting.readings import curves
+from polar_bayes.reporting.readings import curves, plot_readings, plot_residuals
 
 CASES = {
     "three wavelengths, four azimuths": {"azimuths": (180.0, 150.0, 120.0, 60.0)},
@@ -37,14 +37,14 @@ def result_of(case: str):
 @pytest.mark.parametrize("case", CASES)
 def test_readings_of_every_layout(case: str) -> None:
     result = result_of(case)
-    for draw, name in ((figures.readings, "dop"), (figures.residuals, "intensity")):
+    for draw, name in ((plot_readings, "dop"), (plot_residuals, "intensity")):
         figure = draw(result, name if name in result["observed_data"].data_vars else "q")
         assert clipped(figure) == []
         assert figure.legends[0].get_texts()
 
 
 @pytest.mark.parametrize(
-    "draw", [figures.pairs, figures.ranks, figures.prior_posterior, figures.pit]
+    "draw", [figures.plot_pairs, figures.plot_ranks, figures.plot_prior_posterior, figures.plot_pit]
 )
 @pytest.mark.parametrize(
     "case",
@@ -64,10 +64,10 @@ def test_parameters_and_checks_of_every_layout(case: str, draw) -> None:
 def test_nothing_global_changes() -> None:
     before = dict(matplotlib.rcParams)
     result = result_of("one wavelength")
-    figures.readings(result, "dop")
-    figures.pairs(result)
+    plot_readings(result, "dop")
+    figures.plot_pairs(result)
     with pytest.raises(FitError):
-        figures.readings(result, "u")
+        plot_readings(result, "u")
     assert dict(matplotlib.rcParams) == before
 
 
@@ -76,7 +76,7 @@ def test_saturated_masked_and_set_aside_views_are_marked() -> None:
     saturated = np.zeros(40, "int8")
     saturated[20] = 1
     result = replace(result, "constant_data", "saturated", saturated)
-    figure = figures.readings(result, "intensity")
+    figure = plot_readings(result, "intensity")
     words = [text.get_text() for text in figure.legends[0].get_texts()]
     for expected in ("saturated", "masked: not fitted", "set aside: beyond the angle limit"):
         assert expected in words
@@ -97,24 +97,24 @@ def test_bands_hold_their_share_of_new_readings() -> None:
 def test_no_band_where_the_scatter_is_not_known() -> None:
     """A masked view has no stated error, so its predicted scatter means nothing."""
     result = make_result(wavelengths=(), limit=70.0, draws=100)
-    axes = figures.readings(result, "dop").axes[0]
+    axes = plot_readings(result, "dop").axes[0]
     reach = max(path.vertices[:, 0].max() for band in axes.collections for path in band.get_paths())
     assert reach <= 70.0
     assert axes.lines[0].get_xdata().max() > 80.0
 
 
 def test_a_point_fit_has_a_curve_and_no_bands() -> None:
-    figure = figures.readings(result_of("point"), "dop")
+    figure = plot_readings(result_of("point"), "dop")
     assert not figure.axes[0].collections
 
 
 @pytest.mark.parametrize(
     ("draw", "needed"),
     [
-        (figures.pairs, "two material parameters with draws"),
-        (figures.ranks, "two chains"),
-        (figures.prior_posterior, "draws of the prior"),
-        (figures.pit, "two readings and 100 draws"),
+        (figures.plot_pairs, "two material parameters with draws"),
+        (figures.plot_ranks, "two chains"),
+        (figures.plot_prior_posterior, "draws of the prior"),
+        (figures.plot_pit, "two readings and 100 draws"),
     ],
 )
 def test_nothing_to_draw_is_an_error_of_one_line(draw, needed: str) -> None:
@@ -130,12 +130,12 @@ def test_parameters_that_do_not_move_are_left_out() -> None:
     assert "roughness" not in names
     assert "subsurface_fraction" not in names
     assert "discrepancy_weights" not in names
-    assert clipped(figures.pairs(result)) == []
+    assert clipped(figures.plot_pairs(result)) == []
 
 
 def test_figures_need_no_provenance() -> None:
     result = edit_provenance(make_result(draws=100, wavelengths=()))
     result.attrs.clear()
-    for draw in (figures.pairs, figures.ranks, figures.pit):
+    for draw in (figures.plot_pairs, figures.plot_ranks, figures.plot_pit):
         assert isinstance(draw(result), Figure)
-    assert isinstance(figures.readings(result, "dop"), Figure)
+    assert isinstance(plot_readings(result, "dop"), Figure)

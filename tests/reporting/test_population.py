@@ -10,7 +10,7 @@ from polar_bayes.diagnostics.population import population_summary, populations, 
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import sentences, tables
 from polar_bayes.reporting.html import render
-from polar_bayes.reporting.population import MOST_MEMBERS, shrinkage_plot
+from polar_bayes.reporting.population import MOST_MEMBERS, plot_shrinkage
 from polar_bayes.reporting.provenance import provenance_groups, swapped_sentence
 
 EVIL = '<script>alert(1)</script>"><img src=x onerror=alert(2)>'
@@ -24,7 +24,7 @@ def pooled(count, *parameters, names=None, **settings):
 
 @pytest.mark.parametrize("count", [2, 12, 35, 75])
 def test_members_of_every_number_are_drawn(count: int) -> None:
-    figure = shrinkage_plot(pooled(count, views=4), "refractive_index")
+    figure = plot_shrinkage(pooled(count, views=4), "refractive_index")
     assert clipped(figure) == []
     (axes,) = figure.axes
     assert len(axes.get_yticks()) == min(count, MOST_MEMBERS)
@@ -40,7 +40,7 @@ def test_members_stand_in_order_of_their_estimates() -> None:
     result = pooled(5)
     means = shrinkage(result)["mean"].to_numpy()
     names = [f"leaf {i}" for i in np.argsort(means)]
-    axes = shrinkage_plot(result, "refractive_index").axes[0]
+    axes = plot_shrinkage(result, "refractive_index").axes[0]
     assert [text.get_text() for text in axes.get_yticklabels()] == names
 
 
@@ -53,7 +53,7 @@ def test_a_member_that_says_nothing_alone_is_drawn_as_such() -> None:
     posterior["refractive_index"][{"material": 2}] = drawn.to_numpy()
     result["posterior"] = xr.DataTree(posterior)
     assert np.isnan(shrinkage(result)["alone"].iloc[2])
-    figure = shrinkage_plot(result, "refractive_index")
+    figure = plot_shrinkage(result, "refractive_index")
     said = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "alone it says nothing" in said
 
@@ -65,16 +65,16 @@ def test_a_wide_population_of_a_positive_parameter_has_a_log_axis() -> None:
     posterior["roughness"] = np.abs(posterior["roughness"]) * xr.DataArray(width, dims="material")
     posterior["roughness_spread"] = 2.0 + 0.0 * posterior["roughness_spread"]
     result["posterior"] = xr.DataTree(posterior)
-    figure = shrinkage_plot(result, "roughness")
+    figure = plot_shrinkage(result, "roughness")
     assert figure.axes[0].get_xscale() == "log"
     assert clipped(figure) == []
 
 
 def test_what_is_not_pooled_cannot_be_drawn() -> None:
     with pytest.raises(FitError, match="choose one of refractive_index"):
-        shrinkage_plot(pooled(3), "roughness")
+        plot_shrinkage(pooled(3), "roughness")
     with pytest.raises(FitError, match="choose one of none"):
-        shrinkage_plot(make_result(wavelengths=(), views=4, draws=20), "roughness")
+        plot_shrinkage(make_result(wavelengths=(), views=4, draws=20), "roughness")
 
 
 # --- the page -------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import polar_bayes as pb
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import spectrum as module
 from polar_bayes.reporting.html import render
-from polar_bayes.reporting.spectrum import LEVELS, spectra, spectrum
+from polar_bayes.reporting.spectrum import LEVELS, plot_spectrum, spectra
 
 SMALL = {"views": 6, "draws": 60, "variables": ("dop",)}
 
@@ -45,7 +45,7 @@ def test_intervals_where_nothing_ties_the_colors() -> None:
     assert index.between.size == 0
     true = result["constant_data"]["true_refractive_index"].to_numpy()
     assert index.true == pytest.approx(true)
-    figure = spectrum(result, "refractive_index")
+    figure = plot_spectrum(result, "refractive_index")
     assert clipped(figure) == []
 
 
@@ -59,7 +59,7 @@ def test_a_law_of_dispersion_has_bands_between_and_beyond_the_colors() -> None:
     assert index.band[:, at] == pytest.approx(index.levels)
     assert found["absorption"][0].between.size == 0
     for name in found:
-        assert clipped(spectrum(result, name, found)) == []
+        assert clipped(plot_spectrum(result, name, found)) == []
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_a_process_is_drawn_from_its_prediction(monkeypatch) -> None:
     assert found["absorption"][3].between.size > module.FINE
     assert found["absorption"][3].title == "material d"
     assert found["refractive_index"][0].between.size == 0
-    figure = spectrum(result, "absorption", found)
+    figure = plot_spectrum(result, "absorption", found)
     assert clipped(figure) == []
     assert len(figure.axes) == module.MOST_MEMBERS
     assert figure.get_supxlabel() == "wavelength [nm] (the first 12 of 14)"
@@ -119,7 +119,7 @@ def test_no_spectrum_where_there_is_none(settings) -> None:
     assert 'id="spectrum"' not in text
     assert 'href="#spectrum"' not in text
     with pytest.raises(FitError, match="choose one of none"):
-        spectrum(result, "absorption")
+        plot_spectrum(result, "absorption")
 
 
 def test_draws_that_are_not_finite_are_not_drawn() -> None:

@@ -1,0 +1,123 @@
+"""A result is a plain tree: ArviZ draws of the answer of every method what it draws of any tree."""
+
+import arviz_plots
+import arviz_stats
+import jax
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import xarray as xr
+from plates import LINKS, PLATE, plate_capture
+from synthetic_results import make_result
+
+import polar_bayes as pb
+from polar_bayes.errors import FitError
+from polar_bayes.inference import fit as fitting
+
+METHODS = {
+    "nuts": pb.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50),
+    "laplace": pb.Laplace(chains=2, draws=100),
+    "importance": pb.Importance(),
+    "normal guide": pb.NormalGuide(steps=200, draws=200),
+    "flow guide": pytest.param("flow guide", marks=pytest.mark.thorough),
+    "tempered": pytest.param("tempered", marks=pytest.mark.thorough),
+}
+DEAR = {
+    "flow guide": pb.FlowGuide(steps=200, draws=200),
+    "tempered": pb.Tempered(pb.PixelTempering(draws=4096)),
+}
+OF_DRAWS = (
+    "plot_dist",
+    "plot_forest",
+    "plot_pair",
+    "plot_ppc_dist",
+    "plot_ppc_interval",
+    "plot_ppc_pit",
+    "plot_loo_pit",
+    "plot_prior_posterior",
+    "plot_psense_dist",
+    "plot_trace",
+    "plot_trace_dist",
+    "plot_autocorr",
+    "plot_ess",
+    "plot_rank",
+)
+OF_AN_ESTIMATE = ("plot_dist", "plot_forest", "plot_pair", "plot_ppc_interval", "plot_trace_dist")
+
+
+@pytest.fixture(autouse=True)
+def figures_go() -> None:
+    with matplotlib.rc_context({"backend": "agg"}):
+        yield
+        plt.close("all")
+
+
+@pytest.fixture(scope="module")
+def fitted() -> dict[str, xr.DataTree]:
+    return {}
+
+
+def result_of(name: str, fitted: dict[str, xr.DataTree]) -> xr.DataTree:
+    """One fit for each method, as small as it goes."""
+    if name not in fitted:
+        capture = plate_capture(np.linspace(20.0, 80.0, 12), 0.02, seed=3)
+        method = {**METHODS, **DEAR, "point": pb.Point(starts=2)}[name]
+        jax.config.update("jax_disable_most_optimizations", True)
+        few = {"STARTS": 4, "PRIOR_DRAWS": 100, "BLOCK": 100}
+        with pytest.MonkeyPatch.context() as patch:
+            for constant, value in few.items():
+                patch.setattr(fitting, constant, value)
+            fitted[name] = pb.fit(capture, scene=PLATE, links=LINKS, method=method, seed=7)
+        jax.config.update("jax_disable_most_optimizations", False)
+    return fitted[name]
+
+
+@pytest.mark.parametrize("plot", OF_DRAWS)
+@pytest.mark.parametrize("name", [each if name in DEAR else name for name, each in METHODS.items()])
+def test_arviz_draws_the_draws_of_every_method(name: str, plot: str, fitted) -> None:
+    drawn = getattr(arviz_plots, plot)(result_of(name, fitted))
+    assert drawn.viz["figure"].item().get_axes()
+
+
+@pytest.mark.parametrize("plot", OF_AN_ESTIMATE)
+def test_arviz_draws_an_estimate(plot: str, fitted) -> None:
+    assert getattr(arviz_plots, plot)(result_of("point", fitted))
+
+
+def test_arviz_sums_it_up(fitted) -> None:
+    table = arviz_stats.summary(result_of("laplace", fitted), round_to="none")
+    assert set(table.index) == {"refractive_index", "subsurface_fraction", "stokes_error_factor"}
+
+
+# --- readings in one row --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def masked() -> xr.DataTree:
+    return make_result(views=14, materials=("leaf", "fruit"), masked=(2, 5), limit=80.0)
+
+
+@pytest.mark.parametrize("plot", ["plot_ppc_pit", "plot_loo_pit", "plot_ppc_dist"])
+@pytest.mark.parametrize("name", ["dop", "intensity"])
+def test_masked_readings_are_set_aside_for_arviz(masked, plot: str, name: str) -> None:
+    stacked = pb.stack_readings(masked)
+    assert getattr(arviz_plots, plot)(stacked, var_names=name)
+
+
+def test_stacking_keeps_what_was_fitted_and_nothing_else(masked) -> None:
+    stacked = pb.stack_readings(masked)
+    kept = masked["constant_data"]["valid"].to_numpy() == 1
+    observed = masked["observed_data"]["dop"].to_numpy()[kept]
+    assert stacked["observed_data"]["dop"].dims == ("dop_reading",)
+    np.testing.assert_array_equal(stacked["observed_data"]["dop"], observed)
+    draws = masked["log_likelihood"]["dop"].to_numpy()[..., kept]
+    np.testing.assert_array_equal(stacked["log_likelihood"]["dop"], draws)
+    assert stacked["posterior"].identical(masked["posterior"])
+    assert stacked.attrs == masked.attrs
+    assert masked["observed_data"]["dop"].dims == ("material", "wavelength", "view")
+
+
+def test_what_holds_no_readings_is_refused() -> None:
+    with pytest.raises(FitError, match="it holds no readings"):
+        pb.stack_readings(xr.DataTree())

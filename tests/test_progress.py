@@ -1,0 +1,124 @@
+"""Bars for whoever watches a long run; not a byte for a file."""
+
+import contextlib
+import io
+import sys
+import types
+
+import pytest
+
+from polar_bayes import progress
+from polar_bayes.progress import counted, counts, stages, watched
+
+
+@watched
+def two_steps(*, progress=None) -> list[str]:
+    progress("climbing", 0.5)
+    progress("climbing", 1.0)
+    return ["done"]
+
+
+@counted("pixels")
+def two_pixels(*, progress=None) -> None:
+    progress(1, 2)
+    progress(2, 2)
+
+
+class Handle:
+    """Stands in for what IPython gives back of a display."""
+
+    def __init__(self, seen) -> None:
+        self.seen = seen
+
+    def update(self, picture, *, raw) -> None:
+        assert raw
+        self.seen.append(picture)
+
+
+@pytest.fixture
+def notebook(monkeypatch) -> list[dict[str, str]]:
+    """A process that looks like the kernel of a notebook, and what it shows."""
+    seen: list[dict[str, str]] = []
+
+    def display(picture, *, raw, display_id) -> Handle:
+        assert (raw, display_id) == (True, True)
+        seen.append(picture)
+        return Handle(seen)
+
+    shell = types.SimpleNamespace(kernel=object())
+    ipython = types.SimpleNamespace(get_ipython=lambda: shell)
+    monkeypatch.setitem(sys.modules, "IPython", ipython)
+    monkeypatch.setitem(sys.modules, "IPython.display", types.SimpleNamespace(display=display))
+    monkeypatch.setattr(progress, "PAUSE", 0.0)
+    return seen
+
+
+def test_a_log_holds_no_bar() -> None:
+    log = io.StringIO()
+    with contextlib.redirect_stderr(log), contextlib.redirect_stdout(log):
+        assert two_steps() == ["done"]
+        two_pixels()
+    assert log.getvalue() == ""
+
+
+def test_a_terminal_shows_bars_and_takes_them_back(monkeypatch) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # what makes a stream count as a terminal
+    monkeypatch.setenv("TERM", "xterm")
+    screen = io.StringIO()
+    with contextlib.redirect_stderr(screen):
+        two_steps()
+        two_pixels()
+    assert "climbing" in screen.getvalue()
+    assert "pixels" in screen.getvalue()
+    assert screen.getvalue().endswith("\x1b[2K")  # the line is wiped
+
+
+def test_a_notebook_shows_bars_and_keeps_none(notebook) -> None:
+    two_steps()
+    assert [picture["text/plain"] for picture in notebook] == [
+        "climbing: 50%",
+        "climbing: 100%",
+        "",
+    ]
+    assert '<progress value="0.5000"' in notebook[0]["text/html"]
+    assert notebook[-1]["text/html"] == ""
+
+
+def test_a_counting_bar_names_what_it_counts(notebook) -> None:
+    two_pixels()
+    assert notebook[0]["text/plain"] == "pixels: 1 of 2"
+
+
+def test_a_stage_is_text_and_nothing_else(notebook) -> None:
+    with stages() as show:
+        show("<script>alert(1)</script>", 0.5)
+    assert "<script>" not in notebook[0]["text/html"]
+
+
+def test_what_a_run_calls_adds_no_bars_of_its_own(notebook) -> None:
+    with counts("fits") as show:
+        two_steps()
+        show(1, 2)
+    assert [picture["text/plain"] for picture in notebook] == ["fits: 1 of 2", ""]
+    two_steps()
+    assert len(notebook) == 5
+
+
+def test_bars_go_where_a_run_breaks_off(notebook) -> None:
+    @watched
+    def breaks(*, progress=None) -> None:
+        progress("climbing", 0.5)
+        raise KeyError
+
+    with pytest.raises(KeyError):
+        breaks()
+    assert notebook[-1]["text/plain"] == ""
+    two_steps()  # and the next run has its own again
+    assert notebook[-2]["text/plain"] == "climbing: 100%"
+
+
+def test_a_progress_of_ones_own_is_called_instead(notebook) -> None:
+    seen = []
+    two_steps(progress=lambda stage, share: seen.append((stage, share)))
+    assert seen == [("climbing", 0.5), ("climbing", 1.0)]
+    assert notebook == []
