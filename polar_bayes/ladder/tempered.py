@@ -18,9 +18,9 @@ from polar_bayes.inference.tracing import TRACING
 from polar_bayes.ladder.weighing import choose, generator
 from polar_bayes.observation.data import Observations
 from polar_bayes.pixels.engine import Engine
-from polar_bayes.pixels.fitting import tempered_draws
 from polar_bayes.pixels.importance import LARGEST_TRUSTED
 from polar_bayes.pixels.outcome import Row, Status, Weighted
+from polar_bayes.pixels.rounds import tempered_draws
 from polar_bayes.pixels.stack import Stack
 from polar_bayes.pixels.tempering import PixelTempering
 
