@@ -8,7 +8,7 @@ import click
 
 import polar_bayes as pb
 from polar_bayes.cli.places import check_writable, in_setup, make_folder
-from polar_bayes.cli.printing import print_table, status
+from polar_bayes.cli.printing import NOT_CONVERGED, print_table, status
 from polar_bayes.progress import stages
 
 
@@ -155,6 +155,26 @@ def report(
     click.echo(f"report: {page}")
 
 
+@click.command()
+@click.argument("fits", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write.")
+def compare(fits: tuple[Path, ...], out: Path) -> int:
+    """Put fits of one capture side by side: predictions, parameters, and what the priors did."""
+    if len({path.stem for path in fits}) < len(fits):
+        raise click.UsageError("two of the files have the same name")
+    results = {path.stem: pb.load_result(path) for path in fits}
+    comparison = pb.compare_fits(results)
+    page = pb.report(results, out)
+    if not comparison.loo.empty:
+        shown = comparison.loo.rename(columns={"elpd_diff": "difference", "dse": "error"})
+        click.echo(shown.to_string(float_format=lambda x: f"{x:.4g}") + "\n")
+    for sentence in pb.comparison_of_fits_sentences(comparison):
+        click.echo(sentence)
+    click.echo(f"report: {page}")
+    good = all(verdict.converged for verdict in comparison.verdicts.values())
+    return 0 if good else NOT_CONVERGED
+
+
 def _by_name(paths: tuple[Path, ...]) -> dict[str, Any]:
     """Calibrations by the names of their files."""
     if len({path.stem for path in paths}) < len(paths):
@@ -171,4 +191,4 @@ def _opened(path: Path) -> Any:
     return pb.load_calibration(path) if pb.holds_calibration(path) else pb.load_result(path)
 
 
-COMMANDS = (demo, fit, map_, effects, report)
+COMMANDS = (demo, fit, map_, effects, report, compare)

@@ -18,6 +18,7 @@ from polar_bayes.errors import one_line
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.reporting.accuracy import plot_accuracy
 from polar_bayes.reporting.page import Picture, fill, picture
+from polar_bayes.reporting.provenance import made_by
 from polar_bayes.reporting.tables import Row, Table, fact_rows
 from polar_bayes.reporting.text import DASH, or_dash
 
@@ -49,8 +50,9 @@ def render_accuracy(result: xr.DataTree) -> str:
     """
     about = json.loads(result.attrs.get(PROVENANCE, "{}"))
     content = {
+        "kind": "Accuracy against time",
         "name": one_line(str(about.get("capture", "capture"))),
-        "provenance": about,
+        "under": [made_by(about, "every method of the ladder")],
         "facts_of_study": fact_rows(
             {str(key).replace("_", " "): value for key, value in about.items()}
         ),
@@ -119,8 +121,8 @@ def reference_sentence(result: xr.DataTree | xr.Dataset) -> str:
 def study_table(found: xr.Dataset) -> Table:
     """A row for each method and dial."""
     noise = float(found.attrs["reference_error"])
-    rows = []
-    for name, row in accuracy_table(found).iterrows():
+    rows, table = [], accuracy_table(found)
+    for name, row in table.iterrows():
         error = or_dash(row["error"], "{:.2g}")
         if math.isfinite(row["error"]) and not row["resolved"]:
             error = f"< {RESOLVED * noise:.2g}"
@@ -139,16 +141,15 @@ def study_table(found: xr.Dataset) -> Table:
         )
         words = "; ".join(filter(None, ["*" if row["on_front"] else "", row["problems"]]))
         rows.append(Row(str(name), words or str(name), cells))
-    return Table(CAPTION, HEADS, tuple(rows))
+    return Table(CAPTION, HEADS, tuple(rows), table)
 
 
 def parameter_table(found: xr.Dataset) -> Table:
     """Errors of every parameter by the methods as given."""
-    errors = parameter_errors(found)
-    given = found["dial"].to_numpy() == AS_GIVEN
+    errors = parameter_errors(found)[found["dial"].to_numpy() == AS_GIVEN]
     rows = tuple(
         Row(str(name), str(name), tuple(or_dash(value, "{:.2g}") for value in row))
-        for name, row in errors[given].iterrows()
+        for name, row in errors.iterrows()
     )
     caption = "The larger error of mean and standard deviation of each, in posterior sds."
-    return Table(caption, ("method", *map(str, errors.columns)), rows)
+    return Table(caption, ("method", *map(str, errors.columns)), rows, errors)

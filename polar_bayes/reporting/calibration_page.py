@@ -26,6 +26,7 @@ from polar_bayes.reporting.calibration_readings import (
     reading_rows,
 )
 from polar_bayes.reporting.page import Picture, fill, picture
+from polar_bayes.reporting.provenance import made_by
 from polar_bayes.reporting.text import spoken
 
 MOST_PANELS = 12
@@ -74,10 +75,11 @@ def render_calibration(
     judged = calibration_readings(calibration) if has_readings else None
     headline, is_good = tables.verdict_head(table, judged)
     content: dict[str, Any] = {
+        "kind": "Calibration report",
         "name": _name(provenance),
-        "provenance": {key: value for key, value in provenance.items() if value is not None},
-        "method": method,
-        "simulations": next(iter(parts.values())).pit.size,
+        "under": [
+            f"{next(iter(parts.values())).pit.size:,} simulations. {made_by(provenance, method)}"
+        ],
         "headline": headline,
         "is_good": is_good,
         "said": [said[0], *_broken(provenance), *tables.interval_words(table, parts)],

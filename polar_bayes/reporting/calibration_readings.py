@@ -93,4 +93,6 @@ def reading_rows(parts: list[ReadingRanks]) -> Table:
         cells.append(DASH if np.isnan(row["untrusted"]) else f"{int(row['untrusted']):,}")
         rows.append(Row(part.label, part.title, tuple(cells)))
     heads = ("reading", "p", "the ranks", "failed", "mean rank", "spread", "untrusted")
-    return Table(CAPTION.format(level=parts[0].level, k=LARGEST_TRUSTED), heads, tuple(rows))
+    behind = pd.DataFrame({part.label: part.row for part in parts}).T
+    caption = CAPTION.format(level=parts[0].level, k=LARGEST_TRUSTED)
+    return Table(caption, heads, tuple(rows), behind)

@@ -121,7 +121,7 @@ def calibration_rows(
         "probability score: means over the fits, in the unit of the parameter; ranks cannot see a "
         "posterior that ignores the data, these can."
     )
-    return Table(caption, heads, tuple(rows))
+    return Table(caption, heads, tuple(rows), table)
 
 
 def comparison_rows(compared: pd.DataFrame, parts: Mapping[str, Part]) -> Table:
@@ -146,7 +146,7 @@ def comparison_rows(compared: pd.DataFrame, parts: Mapping[str, Part]) -> Table:
         "fit by fit where both have an answer, minus one; below zero is better, the number after ± "
         "is its standard error; a dash where the simulations are not the same."
     )
-    return Table(caption, (*heads, *NUMBERS), tuple(rows))
+    return Table(caption, (*heads, *NUMBERS), tuple(rows), compared)
 
 
 def fit_tables(calibration: xr.DataTree, parts: Mapping[str, Part]) -> list[tuple[str, Table]]:
@@ -250,14 +250,17 @@ def _flag_table(
     words = [name.lower().replace("_", " ") for name in names.split()]
     places = np.asarray(flags.attrs.get("flag_values", range(len(words))))
     values = flags.to_numpy()
-    rows = []
+    rows, behind = [], {}
     for place, word in zip(places, words, strict=True):
         which = values == place
         count = int(which.sum())
         if count:
+            behind[word] = [count, count / values.size, int(answered[which].sum())]
             cells = (f"{count:,}", share(count, values.size), f"{int(answered[which].sum()):,}")
             rows.append(Row(word, meanings.get(word, ""), cells))
-    return Table(caption, (str(flags.name), "fits", "share", "with ranks"), tuple(rows))
+    heads = ("fits", "share", "with ranks")
+    frame = pd.DataFrame.from_dict(behind, orient="index", columns=list(heads))
+    return Table(caption, (str(flags.name), *heads), tuple(rows), frame)
 
 
 def _numbers(row: pd.Series) -> list[str]:

@@ -27,10 +27,11 @@ from polar_bayes.ladder.words import auto_sentences
 from polar_bayes.reporting import figures, sentences, tables
 from polar_bayes.reporting.accuracy_page import accuracy_section, render_accuracy
 from polar_bayes.reporting.calibration_page import render_calibration
+from polar_bayes.reporting.comparison_page import render_comparison
 from polar_bayes.reporting.map_page import render_map
 from polar_bayes.reporting.page import Picture, fill, picture, write_page
 from polar_bayes.reporting.population import plot_shrinkage
-from polar_bayes.reporting.provenance import provenance_groups, swapped_sentence
+from polar_bayes.reporting.provenance import made_by, provenance_groups, swapped_sentence
 from polar_bayes.reporting.readings import plot_readings, plot_residuals, variables
 from polar_bayes.reporting.spectrum import plot_spectrum, spectra
 from polar_bayes.reporting.style import QUANTITIES, in_house_style
@@ -56,14 +57,14 @@ METHODS = {
 
 @in_house_style
 def report(
-    result: xr.DataTree | xr.Dataset,
+    result: xr.DataTree | xr.Dataset | Mapping[str, xr.DataTree],
     directory: str | os.PathLike[str],
     *,
     truth: xr.Dataset | None = None,
     uncorrected: xr.Dataset | None = None,
     beside: Mapping[str, xr.DataTree] | None = None,
 ) -> Path:
-    """Write the standard report of a fit, map, calibration or accuracy study: one `index.html`.
+    """Write the standard report of any result, or of several fits side by side: one `index.html`.
 
     The page needs no network, no script and no other file. Everything on it is computed from the
     result, so a report of a file read back is the same report. Beside the page of a fit lies
@@ -73,7 +74,8 @@ def report(
 
     Args:
         result: A tree that `polar_bayes.fit`, `polar_bayes.calibrate` or `polar_bayes.accuracy`
-            returned, or maps of `polar_bayes.fit_pixels`; or one of them read back from a file.
+            returned, or maps of `polar_bayes.fit_pixels`; or one of them read back from a file. Or
+            several fits of one capture by name, which are compared.
         directory: The folder; made if it is not there. An older report in it is replaced.
         truth: Of maps: the simulated capture, whose `true_<parameter>` the intervals are checked
             against.
@@ -87,13 +89,15 @@ def report(
 
     Raises:
         CaptureError: The directory is no path, or `truth` does not fit the maps.
-        FitError: It holds no posterior and no maps, an argument does not apply, or the folder
-            cannot be written.
+        FitError: It holds no posterior and no maps, fits are not of one capture, an argument does
+            not apply, or the folder cannot be written.
     """
     folder = as_path(directory, "report")
     of_calibration = is_calibration(result)
     _refuse({"truth": truth, "uncorrected": uncorrected}, isinstance(result, xr.Dataset), "maps")
     _refuse({"beside": beside}, of_calibration, "calibrations")
+    if isinstance(result, Mapping) and not isinstance(result, xr.Dataset | xr.DataTree):
+        return write_page(folder, render_comparison(result))
     if isinstance(result, xr.Dataset):
         return write_page(folder, render_map(result, truth, uncorrected))
     if is_accuracy(result):
@@ -132,9 +136,12 @@ def render(result: xr.DataTree) -> str:
     population = None if is_point else _population(result, posterior)
     name = one_line(str((provenance.get("capture") or {}).get("name", "capture")))
     content: dict[str, Any] = {
+        "kind": "Fit report",
         "name": name,
-        "method": METHODS.get(method, one_line(method)),
-        "provenance": provenance,
+        "under": [
+            made_by(provenance, METHODS.get(method, one_line(method))),
+            *filter(None, [swapped_sentence(provenance)]),
+        ],
         "verdict": judged,
         "headline": sentences.headline(method, judged.converged, judged.cautions),
         # What a failed fit says about the material is not worth a sentence.
@@ -142,10 +149,10 @@ def render(result: xr.DataTree) -> str:
             *sentences.determined(found, prior, posterior),
             *(population["said"] if population else []),
             *sentences.expected(checks),
+            sentences.trust(method, judged.cautions, checks),
         ]
         if judged.converged
         else [],
-        "swapped": swapped_sentence(provenance),
         "population": population,
         "parameters": tables.estimate_table(result, found, table)
         if is_point
@@ -180,6 +187,13 @@ def _without(
         }
         for what, table in compared.items()
         if not table.empty
+    ] + [
+        {
+            "what": WITHOUT.get(part.removeprefix("without_"), one_line(part)),
+            "table": None,
+            "sentences": [f"This comparison failed, so nothing is said of it: {one_line(why)}."],
+        }
+        for part, why in (provenance_of(result).get("comparisons_failed") or {}).items()
     ]
 
 

@@ -16,7 +16,7 @@ from polar_bayes.pixels.stack import IMAGE
 from polar_bayes.reporting import map_tables
 from polar_bayes.reporting.maps import MOST_PIXELS, plot_maps
 from polar_bayes.reporting.page import Picture, fill, picture
-from polar_bayes.reporting.provenance import provenance_groups, swapped_sentence
+from polar_bayes.reporting.provenance import made_by, provenance_groups, swapped_sentence
 from polar_bayes.reporting.text import spoken
 
 TRUST = ("pareto_k", "approach", "status")
@@ -56,13 +56,15 @@ def render_map(
     cases = map_tables.count_cases(maps)
     said, is_enough = map_tables.headline(cases)
     is_bare = _is_bare(provenance)
+    size = " x ".join(f"{maps.sizes[dim]:,}" for dim in IMAGE)
     coverage = None if truth is None else _coverage(maps, found, truth, uncorrected)
     content: dict[str, Any] = {
+        "kind": "Map report",
         "name": _name(maps, provenance, truth),
-        "size": " x ".join(f"{maps.sizes[dim]:,}" for dim in IMAGE),
-        "provenance": provenance,
-        "method": BARE if is_bare else CORRECTED,
-        "swapped": swapped_sentence(provenance),
+        "under": [
+            f"{size} pixels. {made_by(provenance, BARE if is_bare else CORRECTED)}",
+            *filter(None, [swapped_sentence(provenance)]),
+        ],
         "headline": said,
         "is_enough": is_enough,
         "said": [*map_tables.verdict(cases), *(coverage["said"] if coverage else [])],

@@ -157,12 +157,14 @@ def _cases_table(
         cells += [] if good is None else [f"{int(good[word]):,}"]
         rows.append(Row(str(word), meanings.get(str(word), str(word)), tuple(cells)))
     heads = (head, "pixels", "share", *([] if good is None else ["good"]))
-    return Table(caption, heads, tuple(rows))
+    behind = pd.DataFrame({"pixels": counts, "share": counts / max(every, 1)})
+    behind = behind if good is None else behind.assign(good=good)
+    return Table(caption, heads, tuple(rows), behind)
 
 
 def parameter_table(maps: xr.Dataset, found: Sequence[Scalar]) -> Table:
     """Every parameter over the good pixels: what it is, how it varies, how well it is known."""
-    rows = []
+    rows, behind = [], {}
     for scalar in found:
         mean = _over_good(maps, scalar, "")
         sd, width = _over_good(maps, scalar, "_sd"), _over_good(maps, scalar, "_quantile")
@@ -175,7 +177,9 @@ def parameter_table(maps: xr.Dataset, found: Sequence[Scalar]) -> Table:
             *numbers([middles[2]], scale),
         ]
         rows.append(_row(scalar, named(scalar), cells))
+        behind[scalar.label] = [middles[0], *ends, *middles[1:]]
     heads = ("parameter", "median", "5% below", "5% above", "typical sd", "95% width")
+    frame = pd.DataFrame.from_dict(behind, orient="index", columns=list(heads[1:]))
     caption = (
         "Over the good pixels: median of the posterior means, the values that 5% of them lie "
         "below and above, and medians of the standard deviations and of the widths of the 95% "
@@ -183,7 +187,7 @@ def parameter_table(maps: xr.Dataset, found: Sequence[Scalar]) -> Table:
         "is uncertain: where the spread is not much larger than the sd, it says little about the "
         "material."
     )
-    return Table(caption, heads, tuple(rows))
+    return Table(caption, heads, tuple(rows), frame)
 
 
 def _over_good(maps: xr.Dataset, scalar: Scalar, ending: str) -> np.ndarray:
@@ -227,7 +231,10 @@ def coverage_table(
         "some are held more often and some less. Marked: too few, beyond chance and by more than "
         f"{100 * SLIGHT:g} in 100 pixels."
     )
-    return Table(caption, tuple(heads), tuple(rows))
+    behind = coverage
+    if uncorrected is not None:
+        behind = coverage.join(uncorrected.add_suffix("_uncorrected"))
+    return Table(caption, tuple(heads), tuple(rows), behind)
 
 
 def _held(table: pd.DataFrame, label: str, claimed: int) -> list[str]:

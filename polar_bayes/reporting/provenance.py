@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from polar_bayes.errors import one_line
 from polar_bayes.reporting.tables import Row, fact_rows
 from polar_bayes.reporting.text import spoken
 
@@ -10,6 +11,18 @@ HELD = " held fixed"
 PRIOR = "prior of "
 MARK = "swapped"
 MOST_NAMED = 6
+
+
+def made_by(provenance: Mapping[str, Any], method: str) -> str:
+    """Scene, model, method and seed in one line."""
+    said = {
+        key: f"{key} {one_line(str(provenance[key]))}"
+        for key in ("scene", "model", "seed")
+        if provenance.get(key) is not None
+    }
+    parts = [said.get("scene", ""), said.get("model", ""), method, said.get("seed", "")]
+    text = ", ".join(filter(None, parts))
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 def swapped_sentence(provenance: Mapping[str, Any]) -> str:

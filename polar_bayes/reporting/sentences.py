@@ -174,6 +174,22 @@ def expected(checks: Mapping[str, Check]) -> list[str]:
     return sentences
 
 
+def trust(method: str, cautions: Sequence[str], checks: Mapping[str, Check]) -> str:
+    """Whether the intervals can be trusted, as far as one fit can tell."""
+    if method == "point":
+        return (
+            "Standard errors are those of least squares: they know no prior and no range, so do "
+            "not read them as intervals."
+        )
+    bands = [pit_band(check.loo.pit if check.loo else check.pit) for check in checks.values()]
+    if cautions or any(band is not None and band.leaves for band in bands):
+        return "Trust the intervals with care: what speaks against them is said on this page."
+    return (
+        "Nothing here speaks against the intervals. How often such intervals hold the truth, a "
+        "calibration of this layout shows."
+    )
+
+
 def shape(band: Band) -> str:
     """In which way the readings depart from the prediction, once the curve leaves its band."""
     above = np.flatnonzero(band.difference > band.upper)

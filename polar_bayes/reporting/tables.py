@@ -21,6 +21,7 @@ from polar_bayes.diagnostics.parameters import (
 from polar_bayes.diagnostics.population import Population
 from polar_bayes.diagnostics.predictive import PROBABILITIES, Check
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE
+from polar_bayes.reporting.download import csv_link
 from polar_bayes.reporting.style import QUANTITIES, title_of
 from polar_bayes.reporting.text import DASH, interval, numbers, or_dash, percent
 
@@ -46,13 +47,30 @@ class Row:
     block: str = MAIN
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Table:
-    """A table: `heads` has a name for the first column and one for each cell."""
+    """A table of a page, and the numbers behind it.
+
+    Args:
+        caption: How to read it.
+        heads: A name for the first column and one for each cell.
+        rows: What is shown.
+        numbers: The same unrounded, a row for each row; None where the texts say it all.
+    """
 
     caption: str
     heads: tuple[str, ...]
     rows: tuple[Row, ...]
+    numbers: pd.DataFrame | None = None
+
+    @property
+    def download(self) -> str:
+        """A link that holds the table as a CSV file."""
+        texts = pd.DataFrame.from_records(
+            [row.cells for row in self.rows], columns=list(self.heads[1:])
+        )
+        texts.index = pd.Index([row.name for row in self.rows])
+        return csv_link(texts if self.numbers is None else self.numbers, self.heads[0])
 
     @property
     def blocks(self) -> list[tuple[str, list[Row]]]:
@@ -83,13 +101,16 @@ def parameter_table(
         cells += [_truth_cell(truths[scalar.label], row)] if known else []
         cells += [percent(gain["prior_inside"]), str(gain["verdict"])]
         rows.append(_row(scalar, posterior, cells))
+    shown = [scalar.label for scalar in found]
+    behind = table.loc[shown].join(prior[["prior_inside", "verdict"]])
+    behind = behind.assign(true_value=pd.Series(truths)) if known else behind
     caption = (
         "Posterior mean, standard deviation and equal-tailed 95% interval. Prior inside: the "
         "prior's probability of that interval, 95% if the data said nothing; up to "
         f"{DETERMINED:.0%} the parameter counts as determined by the data, up to {PARTLY:.0%} as "
         "partly determined."
     )
-    return Table(caption, tuple(heads), tuple(rows))
+    return Table(caption, tuple(heads), tuple(rows), behind)
 
 
 def estimate_table(result: xr.DataTree, found: Sequence[Scalar], table: pd.DataFrame) -> Table:
@@ -105,8 +126,10 @@ def estimate_table(result: xr.DataTree, found: Sequence[Scalar], table: pd.DataF
         cells += numbers([truths[scalar.label]], row["sd"]) if known else []
         rows.append(_row(scalar, posterior, cells))
     heads = ("parameter", "estimate", "standard error", *(["true value"] if known else []))
+    behind = table[["mean", "sd"]].set_axis(["estimate", "standard_error"], axis="columns")
+    behind = behind.assign(true_value=pd.Series(truths)) if known else behind
     caption = "Least squares; standard errors from the curvature and the residuals."
-    return Table(caption, tuple(heads), tuple(rows))
+    return Table(caption, tuple(heads), tuple(rows), behind)
 
 
 def convergence_table(found: Sequence[Scalar], table: pd.DataFrame, posterior: xr.Dataset) -> Table:
@@ -123,7 +146,8 @@ def convergence_table(found: Sequence[Scalar], table: pd.DataFrame, posterior: x
         rows.append(_row(scalar, posterior, cells))
     heads = ("parameter", "R-hat", "ESS bulk", "ESS tail", "error of the mean")
     caption = "Wanted: R-hat at most 1.01 and both effective sample sizes (ESS) at least 400."
-    return Table(caption, tuple(heads), tuple(rows))
+    behind = table[["r_hat", "ess_bulk", "ess_tail", "mcse_mean"]]
+    return Table(caption, tuple(heads), tuple(rows), behind)
 
 
 def discrepancy_table(
@@ -150,7 +174,7 @@ def discrepancy_table(
         f"The fit of this report beside the same fit without {what}. Width: that of the interval "
         "without it over that with it."
     )
-    return Table(caption, tuple(heads), tuple(rows))
+    return Table(caption, tuple(heads), tuple(rows), compared)
 
 
 def sensitivity_table(found: Sequence[Scalar], prior: pd.DataFrame, posterior: xr.Dataset) -> Table:
@@ -174,7 +198,7 @@ def sensitivity_table(found: Sequence[Scalar], prior: pd.DataFrame, posterior: x
         "fast the posterior moves when all priors, or all data, count a little more; from "
         f"{SENSITIVE} on it matters."
     )
-    return Table(caption, tuple(heads), tuple(rows))
+    return Table(caption, tuple(heads), tuple(rows), prior)
 
 
 def population_table(summary: pd.DataFrame, found: Sequence[Population]) -> Table:
@@ -201,7 +225,7 @@ def population_table(summary: pd.DataFrame, found: Sequence[Population]) -> Tabl
         "alone, 1 where all share one value; above 0.5 the population says more than the readings "
         "of a member."
     )
-    return Table(caption, (*heads, "a new member", "pooling factor"), tuple(rows))
+    return Table(caption, (*heads, "a new member", "pooling factor"), tuple(rows), summary)
 
 
 def member_table(result: xr.DataTree, members: pd.DataFrame, found: Sequence[Population]) -> Table:
@@ -221,7 +245,7 @@ def member_table(result: xr.DataTree, members: pd.DataFrame, found: Sequence[Pop
         "population's share in the precision of the estimate."
     )
     heads = ("parameter", "mean", "95% interval", "alone", "95% alone", "leaning")
-    return Table(caption, heads, tuple(rows))
+    return Table(caption, heads, tuple(rows), members)
 
 
 def check_table(checks: Mapping[str, Check]) -> Table:
@@ -242,7 +266,17 @@ def check_table(checks: Mapping[str, Check]) -> Table:
             "given all others, summed; p the effective number of parameters; k > 0.7 counts "
             "readings for which this cannot be trusted. Saturated readings are not compared."
         )
-    return Table(caption, tuple(heads), tuple(rows))
+    behind = pd.DataFrame.from_dict({c.name: _check_numbers(c) for c in checks.values()}, "index")
+    return Table(caption, tuple(heads), tuple(rows), behind)
+
+
+def _check_numbers(check: Check) -> dict[str, float]:
+    found = {"readings": check.count, "residual_rms": check.residual_rms}
+    found |= {f"inside_{probability:g}": share for probability, share in check.coverage.items()}
+    if check.loo:
+        found |= {"elpd": check.loo.elpd, "elpd_error": check.loo.standard_error}
+        found |= {"p_loo": check.loo.p_loo, "unreliable": check.loo.unreliable}
+    return found
 
 
 def _predictive_cells(check: Check) -> list[str]:
@@ -310,7 +344,8 @@ def effect_table(ledger: xr.Dataset) -> Table:
         "normal. Operations and time: the effect's share of one log density with everything on. "
         f"What changes no parameter by more than {ledger.attrs['tolerance']:g} may go."
     )
-    return Table(caption, heads, rows)
+    single = [name for name in ledger.data_vars if ledger[name].dims == ("effect",)]
+    return Table(caption, heads, rows, ledger[single].to_dataframe())
 
 
 def _row(scalar: Scalar, posterior: xr.Dataset, cells: Sequence[str]) -> Row:

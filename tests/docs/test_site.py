@@ -5,7 +5,6 @@ All in one file, so that one worker executes the notebooks and builds the site f
 
 import functools
 import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -20,7 +19,7 @@ import nbformat
 import pytest
 from bs4 import BeautifulSoup
 from nbclient import NotebookClient
-from playwright.sync_api import Browser, sync_playwright
+from browsers import WIDTHS, browser, console, open_page, sideways
 
 import polar_bayes as pb
 
@@ -125,35 +124,18 @@ class Quiet(SimpleHTTPRequestHandler):
         """Say nothing."""
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    path = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
-    if path is None:
-        pytest.skip("no chromium: install it to look at the site in a browser")
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield opened
-        opened.close()
-
-
-@pytest.mark.parametrize("width", [390, 1200])
+@pytest.mark.parametrize("width", WIDTHS)
 def test_pages_fit_the_window_and_raise_no_error(
-    site: Path, address: str, browser: Browser, width: int
+    site: Path, address: str, tmp_path: Path, width: int
 ) -> None:
-    window = browser.new_page(viewport={"width": width, "height": 900})
-    errors: list[str] = []
-    window.on("pageerror", lambda error: errors.append(f"{window.url}: {error}"))
-    window.on(
-        "console",
-        lambda said: errors.append(f"{window.url}: {said.text}") if said.type == "error" else None,
-    )
-    wide = {}
-    for page in pages(site):
-        place = page.parent.relative_to(site).as_posix()
-        window.goto(f"{address}/{place}/")
-        needed = window.evaluate("document.documentElement.scrollWidth")
-        if needed > width:
-            wide[place] = needed
-    window.close()
+    errors, wide = [], {}
+    with browser(tmp_path) as window:
+        for page in pages(site):
+            place = page.parent.relative_to(site).as_posix()
+            open_page(window, f"{address}/{place}/", width)
+            errors += [f"{place}: {said}" for said in console(window)]
+            room, needed = sideways(window)
+            if needed > room:
+                wide[place] = needed
     assert not errors
     assert not wide

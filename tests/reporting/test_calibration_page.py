@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from clipping import clipped
-from pages import EVIL, Page, widths_in_a_browser
+from pages import EVIL, Page
 from synthetic_calibrations import NAMES, make_calibration
 from synthetic_results import make_result
 
@@ -41,7 +41,7 @@ def test_it_stands_alone_and_its_anchors_lead_somewhere(page: Page) -> None:
     assert all(value.startswith("data:image/svg+xml;base64,") for value in page.values("src"))
     ids = page.values("id")
     assert len(ids) == len(set(ids))
-    assert {value[1:] for value in page.values("href")} <= set(ids)
+    assert {value[1:] for value in page.values("href") if value.startswith("#")} <= set(ids)
     assert set(page.values("aria-labelledby")) <= set(ids)
 
 
@@ -155,13 +155,6 @@ def test_names_are_text_and_nothing_else(evil_page: str) -> None:
     assert not [name for _, name, _ in page.attributes if name.startswith("on")]
     assert f"Calibration report: {EVIL}" in page.text
     assert "default-src 'none'" in evil_page
-
-
-@pytest.mark.parametrize("width", [390, 1200])
-def test_no_sideways_scrolling(tmp_path: Path, evil_page: str, width: int) -> None:
-    client, scroll = widths_in_a_browser(tmp_path, evil_page, width)
-    assert width - 20 <= client <= width
-    assert scroll <= client
 
 
 def test_every_table_scrolls_in_a_box_of_its_own(evil_page: str) -> None:

@@ -85,7 +85,7 @@ def test_parameters_are_described_over_the_good_pixels(page: str) -> None:
 def test_provenance_is_there(page: str) -> None:
     text = text_of(page)
     assert "Map report: leaf" in text
-    assert "10 x 20 pixels, scene paper, model per_material" in text
+    assert "10 x 20 pixels. Scene paper, model per_material" in text
     assert "roughness Beta(2, 3)" in text
 
 

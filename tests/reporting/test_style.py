@@ -20,6 +20,7 @@ from polar_bayes.reporting.html import report
 DRAWN = {
     "plot_accuracy": lambda: pb.plot_accuracy(make_accuracy()),
     "plot_calibration": lambda: pb.plot_calibration(make_calibration()),
+    "plot_comparison": lambda: pb.plot_comparison(compared()),
     "plot_maps": lambda: pb.plot_maps(make_maps({"roughness": np.eye(4)})),
     "plot_pairs": lambda: pb.plot_pairs(make_result(**SMALL)),
     "plot_pit": lambda: pb.plot_pit(make_result(**SMALL)),
@@ -31,6 +32,10 @@ DRAWN = {
     "plot_spectrum": lambda: pb.plot_spectrum(make_result(views=12, draws=150), "absorption"),
 }
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
+
+
+def compared():
+    return pb.compare_fits({"a": make_result(**SMALL), "b": make_result(**SMALL, method="point")})
 
 
 def pooled():
