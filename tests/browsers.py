@@ -61,8 +61,9 @@ def open_page(driver: webdriver.Chrome, page: Path | str, width: int) -> None:
 
 
 def console(driver: webdriver.Chrome) -> list[str]:
-    """What the page has said since it was asked last; a browser says errors only."""
-    return [entry["message"] for entry in driver.get_log("browser")]
+    """Errors and warnings of the page since it was asked last."""
+    said = driver.get_log("browser")
+    return [entry["message"] for entry in said if entry["level"] not in ("INFO", "DEBUG")]
 
 
 def sideways(driver: webdriver.Chrome) -> tuple[int, int]:

@@ -17,9 +17,9 @@ from urllib.parse import urlsplit
 import jupytext
 import nbformat
 import pytest
+from browsers import WIDTHS, browser, console, open_page, sideways
 from bs4 import BeautifulSoup
 from nbclient import NotebookClient
-from browsers import WIDTHS, browser, console, open_page, sideways
 
 import polar_bayes as pb
 
