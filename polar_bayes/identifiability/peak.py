@@ -20,7 +20,7 @@ from polar_bayes.inference.search import find_modes, from_prior
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.progress import Progress
+from polar_bayes.progress import Progress, silent
 
 PRIOR_DRAWS = 500
 
@@ -94,10 +94,6 @@ def find_peaks(
     """
     potential = potential or CompiledPotential(question.program, question.data)
     return find_modes(potential, question.prior[:STARTS], progress or silent)
-
-
-def silent(stage: str, fraction: float) -> None:
-    """No progress to show."""
 
 
 def flat_parameters(

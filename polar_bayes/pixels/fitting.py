@@ -116,8 +116,7 @@ def fit_stack(
         _sample_all(engine, settings, pixels, keys, enough, row)
         return row.outcome
     if isinstance(settings, PixelTempering):
-        for begin in range(0, enough.size, HARD):
-            _temper_all(engine, settings, pixels, keys, enough[begin : begin + HARD], row)
+        _temper_all(engine, settings, pixels, keys, enough, row)
         return row.outcome
     points = normal_points(settings.draws, size, seed)
     further = heavy_points(TIMES * settings.draws, size, seed)

@@ -5,7 +5,7 @@
 
 The simulations of `calibration_models.py material`, kept in the same folder. A fit is suspicious
 where the true roughness stands in the lowest or highest thousandth of its posterior; one in 500
-does so by right. Each is made again with 32 times the crowd, 8 times the draws. Where the truth
+does so by right. Each is made again with 16 times the crowd and the draws. Where the truth
 then stands elsewhere, the first crowd had missed a mode.
 """
 
