@@ -7,7 +7,7 @@ written as a divergence plus Stirling remainders, so that concentrations of 1e8 
 
 import functools
 import math
-from typing import override
+from typing import NamedTuple, override
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from numpyro.distributions.util import promote_shapes
 
 HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
-TAIL_NODES, TAIL_POWERS = 24, 12
+TAIL_NODES, TAIL_POWERS = 24, 20
 """Of the tail of Student's t: enough for the last digit of double precision."""
 
 
@@ -69,15 +69,13 @@ class MeanConcentrationBeta(dist.Distribution):
         other = 1.0 - mean
         step = value - mean
         divergence = _excess(mean, value, step) + _excess(other, 1.0 - value, -step)
-        remainders = (
-            _stirling_remainder(concentration)
-            - _stirling_remainder(mean * concentration)
-            - _stirling_remainder(other * concentration)
-        )
-        spread = 0.5 * jnp.log(concentration * mean * other) - HALF_LOG_TWO_PI
-        return (
-            -concentration * divergence - jnp.log(value) - jnp.log1p(-value) + spread + remainders
-        )
+        total = _stirling_remainder(concentration)
+        first, second = (_stirling_remainder(part * concentration) for part in (mean, other))
+        # One logarithm for four: in double precision they are what this density costs.
+        factors = jnp.sqrt(concentration * mean * other) * total.factor
+        constant = jnp.log(factors / (first.factor * second.factor)) - HALF_LOG_TWO_PI
+        constant += total.rest - first.rest - second.rest
+        return constant - concentration * divergence - jnp.log(value) - jnp.log1p(-value)
 
     @property
     @override
@@ -180,13 +178,15 @@ def log_survival(distance: Float[Array, "..."], degrees_of_freedom: float) -> Fl
     """
     dtype = jnp.result_type(float, distance)
     # With tan(angle) = sqrt(nu) / |t| the tail is an integral of sin(phi) ** (nu - 1) over phi up
-    # to the angle: angle ** nu times something so smooth that a short series tells its logarithm.
-    angle = jnp.arctan2(jnp.asarray(math.sqrt(degrees_of_freedom), dtype), jnp.abs(distance))
-    place = angle * angle * (8.0 / math.pi**2) - 1.0
+    # to the angle: half ** nu, with half = tan(angle / 2), times something so smooth in half ** 2
+    # that a short series tells its logarithm.
+    away = jnp.abs(distance) / jnp.asarray(math.sqrt(degrees_of_freedom), dtype)
+    half = 1.0 / (away + jnp.hypot(away, jnp.ones_like(away)))
+    place = 2.0 * half * half - 1.0
     series = jnp.zeros_like(place)
     for coefficient in _tail_series(degrees_of_freedom):
         series = series * place + coefficient
-    log_tail = degrees_of_freedom * jnp.log(angle) + series
+    log_tail = degrees_of_freedom * jnp.log(half) + series
     return jnp.where(distance > 0.0, log_tail, jnp.log1p(-jnp.exp(log_tail)))
 
 
@@ -199,15 +199,17 @@ def _log_survival_derivative(degrees_of_freedom, primals, tangents):
 
 @functools.cache
 def _tail_series(degrees_of_freedom: float) -> tuple[float, ...]:
-    """The log of the tail over angle ** nu, in powers of 2 (2 angle / pi)^2 - 1, highest first."""
+    """The log of the tail over half ** nu, in powers of 2 half ** 2 - 1, highest first."""
     power = degrees_of_freedom - 1.0
     nodes, weights = scipy.special.roots_jacobi(TAIL_NODES, 0.0, power)
     scale = 2.0**degrees_of_freedom * scipy.special.beta(0.5 * degrees_of_freedom, 0.5)
 
     def log_mean(place: np.ndarray) -> np.ndarray:
-        angle = 0.5 * math.pi * np.sqrt(0.5 * (place + 1.0))
+        half = np.sqrt(0.5 * (place + 1.0))
+        angle = 2.0 * np.arctan(half)
         rise = np.sinc(angle[:, None] * 0.5 * (nodes + 1.0) / math.pi) ** power
-        return np.log(rise @ (weights / scale))
+        grown = np.where(half > 0.0, angle / np.where(half > 0.0, half, 1.0), 2.0)
+        return degrees_of_freedom * np.log(grown) + np.log(rise @ (weights / scale))
 
     found = np.polynomial.Chebyshev.interpolate(log_mean, TAIL_POWERS)
     return tuple(float(x) for x in found.convert(kind=np.polynomial.Polynomial).coef[::-1])
@@ -221,18 +223,27 @@ def _excess(
     The first-order terms cancel near the mean, hence the series; far from it the logarithm takes
     the quotient itself, since `1 + step / mean` has lost its digits where that is nearly 0.
     """
-    relative = step / mean
-    near = jnp.abs(relative) < 0.1
-    small = jnp.where(near, relative, 0.0)
+    # log(value / mean) = 2 artanh(slant), an odd series whose first term is known.
+    slant = step / (value + mean)
+    near = jnp.abs(slant) < 0.05
+    small = jnp.where(near, slant, 0.0)
+    square = small * small
     series = jnp.zeros_like(small)
-    for power in range(17, 1, -1):  # 0.1 ** 17 / 17 is below double precision of step ** 2 / 2
-        series = small * series + (-1.0) ** power / power
-    series = mean * small * small * series
+    for power in range(13, 1, -2):  # 2 * 0.05 ** 15 / 15 is below double precision of step ** 2
+        series = square * series + 2.0 / power
+    series = small * (step - mean * square * series)
     quotient = jnp.where(near, 1.0, value / mean)
     return jnp.where(near, series, step - mean * jnp.log(quotient))
 
 
-def _stirling_remainder(z: Float[Array, "..."]) -> Float[Array, "..."]:
+class _Remainder(NamedTuple):
+    """`log(factor) + rest`."""
+
+    factor: Array
+    rest: Array
+
+
+def _stirling_remainder(z: Float[Array, "..."]) -> _Remainder:
     """`log gamma(z)` less Stirling's `(z - 1/2) log z - z + log(2 pi) / 2`, for z > 0.
 
     Below 10 the recurrence of the gamma function moves the argument up by eight, so that only
@@ -242,17 +253,12 @@ def _stirling_remainder(z: Float[Array, "..."]) -> Float[Array, "..."]:
     big = jnp.where(large, z, 10.0)
     small = jnp.where(large, 1.0, z)
     shifted = small + 8.0
-    product = small
-    for step in range(1, 8):
+    product = small + 1.0
+    for step in range(2, 8):
         product = product * (small + step)
-    moved = (
-        (shifted - 0.5) * jnp.log(shifted)
-        - (small - 0.5) * jnp.log(small)
-        - jnp.log(product)
-        - 8.0
-        + _stirling_series(shifted)
-    )
-    return jnp.where(large, _stirling_series(big), moved)
+    rest = (small + 0.5) * jnp.log(shifted / small) - 8.0 + _stirling_series(shifted)
+    factor = jnp.where(large, 1.0, shifted**7 / product)
+    return _Remainder(factor, jnp.where(large, _stirling_series(big), rest))
 
 
 def _stirling_series(z: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -118,7 +118,9 @@ class ScaleSchedule(Carded):
         spare = (1.0 - brightness - self.least_headroom) / width
         headroom = self.least_headroom + width * jax.nn.softplus(spare)
         cosine = jnp.maximum(cos_view, self.least_cosine)
-        return base * headroom**-self.headroom_exponent * cosine**-self.angle_exponent
+        # Not `headroom ** -exponent`: a power is computed number by number, these in bunches.
+        growth = jnp.exp(-self.headroom_exponent * jnp.log(headroom))
+        return base * growth * cosine**-self.angle_exponent
 
 
 def trusted_precision(
