@@ -29,11 +29,22 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             raise PluginError(f"{notebook} is missing; run: {COMMAND}")
         resources = {"unique_key": name, "output_files_dir": name}
         page, resources = MarkdownExporter().from_filename(str(notebook), resources=resources)
-        files.append(File.generated(config, f"notebooks/{name}.md", content=page))
+        files.append(File.generated(config, f"notebooks/{name}.md", content=told(page)))
         PICTURES[name] = list(resources["outputs"])
         for path, picture in resources["outputs"].items():
             files.append(File.generated(config, f"notebooks/{path}", content=picture))
     return files
+
+
+def told(page: str) -> str:
+    """The page with its pictures named after the section that they stand in, for who hears it."""
+    section, lines, is_code = "", [], False
+    for line in page.splitlines():
+        is_code ^= line.startswith("```")
+        if line.startswith("#") and not is_code:
+            section = line.strip("# ")
+        lines.append(line.replace("![png](", f"![Picture of the section: {section}]("))
+    return "\n".join(lines) + "\n"
 
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:

@@ -19,19 +19,17 @@ from polar_bayes.inference.request import Request
 from polar_bayes.inference.tracing import TRACING
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.pixels.engine import Engine
-from polar_bayes.pixels.fitting import PixelLaplace, fit_stack
+from polar_bayes.pixels.fitting import PixelMethod, candidates_of, fit_stack
 from polar_bayes.pixels.making import Recipe, make_engine
 from polar_bayes.pixels.marginals import Marginals
 from polar_bayes.pixels.outcome import Describe, Outcome
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.stack import Stack
-from polar_bayes.pixels.tempering import PixelTempering
 
-Method = PixelLaplace | PixelNuts | PixelTempering | one_by_one.OneByOne
+Method = PixelMethod | one_by_one.OneByOne
 BLOCK = 64
 """Simulations of a block: what one thread or worker fits at a time, and what a crash can lose."""
 
-CANDIDATES = 32
 RANKED = 128
 """About so many draws of a chain are ranked: far enough apart to be nearly independent."""
 
@@ -96,9 +94,7 @@ class Plan:
     @property
     def engine(self) -> Engine:
         """The compiled programs, which the next calibration of the same model finds."""
-        candidates = CANDIDATES
-        if isinstance(self.settings, PixelLaplace):
-            candidates = self.settings.candidates
+        candidates = candidates_of(self.settings)
         recipe = Recipe(self.request, lambda: self.data, candidates, self.recipe_key)
         with TRACING:
             return make_engine(recipe)

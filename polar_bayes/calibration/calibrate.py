@@ -10,7 +10,7 @@ import xarray as xr
 from dask.base import tokenize
 from numpyro import distributions as dist
 
-from polar_bayes.calibration.block import CANDIDATES, Block, Method, Plan, cut, fit_block, join
+from polar_bayes.calibration.block import Block, Method, Plan, cut, fit_block, join
 from polar_bayes.calibration.one_by_one import has_further_axes
 from polar_bayes.calibration.question import question_of
 from polar_bayes.calibration.result import assemble
@@ -22,7 +22,7 @@ from polar_bayes.inference.request import Request, resolve
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.pixels.executors import as_completed, workers
-from polar_bayes.pixels.fitting import PixelLaplace
+from polar_bayes.pixels.fitting import PixelLaplace, candidates_of
 from polar_bayes.pixels.making import key_of
 from polar_bayes.pixels.sampling import PixelNuts
 from polar_bayes.pixels.tempering import PixelTempering
@@ -191,9 +191,8 @@ def planned(request: Request, told: Request | None, settings: Method, readings: 
     Raises:
         Nothing.
     """
-    candidates = settings.candidates if isinstance(settings, PixelLaplace) else CANDIDATES
     limit = request.largest_view_zenith
-    recipe_key = key_of(request, candidates, limit)
+    recipe_key = key_of(request, candidates_of(settings), limit)
     told_key = "" if told is None else key_of(told)
     key = tokenize(recipe_key, told_key, repr(settings), readings, tokenize(request.capture))
     return Plan(request, told, settings, readings, recipe_key, key)

@@ -91,14 +91,25 @@ def fit(
 @click.option("--model", default="per_material", show_default=True)
 @click.option("--scene", help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
-@click.option("--draws", type=int, default=256, show_default=True, help="Weighted, in each pixel.")
+@click.option(
+    "--method",
+    type=click.Choice(("laplace", "tempered")),
+    default="laplace",
+    show_default=True,
+    help="One mode of each pixel, corrected; or all modes, many times slower.",
+)
+@click.option("--draws", type=int, help="Of laplace, weighted, in each pixel.  [default: 256]")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 @click.option("--precision", default="double", show_default=True, help="double or single.")
 @click.option("--scheduler", help="Address of a dask.distributed scheduler; default: threads.")
 @click.option("--resume", is_flag=True, help="Go on with a map that was broken off.")
-def map_(capture: Path, out: Path, draws: int, **settings: Any) -> None:
+def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: Any) -> None:
     """Fit every pixel of an image."""
-    maps = pb.map_file(capture, out, method=pb.PixelLaplace(draws=draws), **settings)
+    if draws is not None and method != "laplace":
+        raise click.UsageError("--draws needs --method laplace")
+    asked = {} if draws is None else {"draws": draws}
+    chosen = pb.PixelLaplace(**asked) if method == "laplace" else pb.PixelTempering()
+    maps = pb.map_file(capture, out, method=chosen, **settings)
     counts = ", ".join(f"{count} {what}" for what, count in pb.count_pixels(maps).items() if count)
     click.echo(f"{out}: {counts}")
 

@@ -15,7 +15,7 @@ from polar_bayes.inference.tracing import TRACING
 from polar_bayes.observation.data import READINGS, Observations, observe
 from polar_bayes.physics.notation import notation
 from polar_bayes.pixels.engine import Engine
-from polar_bayes.pixels.fitting import PixelLaplace, fit_stack
+from polar_bayes.pixels.fitting import PixelMethod, candidates_of, fit_stack
 from polar_bayes.pixels.making import Recipe, make_engine
 from polar_bayes.pixels.marginals import LEVELS, Marginals
 from polar_bayes.pixels.outcome import Approach, Outcome, Status, no_outcome
@@ -51,7 +51,7 @@ class Plan:
     """
 
     request: Request
-    settings: PixelLaplace
+    settings: PixelMethod
     intensity_unit: float | None
     own_directions: frozenset[str]
     key: str
@@ -69,7 +69,9 @@ class Plan:
         """The compiled programs, made at first use in each process."""
         observe = functools.partial(self.pixel, "double")
         with TRACING:
-            return make_engine(Recipe(self.request, observe, self.settings.candidates, self.key))
+            return make_engine(
+                Recipe(self.request, observe, candidates_of(self.settings), self.key)
+            )
 
     @property
     def layout(self) -> Layout:

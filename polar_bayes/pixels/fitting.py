@@ -41,6 +41,9 @@ PIECE = 4096
 HARD = 1024
 """The same of pixels that have several times as many."""
 
+CANDIDATES = 32
+"""Prior draws among which a start is found unless settings say otherwise."""
+
 SAME_MODE = 1e-3
 """Difference of two potentials that is no difference."""
 
@@ -66,7 +69,7 @@ class PixelLaplace(Carded):
 
     draws: int = 256
     weighted: bool = True
-    candidates: int = 32
+    candidates: int = CANDIDATES
     rounds: int = 3
     sampler: PixelNuts | PixelTempering | None = dataclasses.field(default_factory=PixelNuts)
 
@@ -83,9 +86,18 @@ class PixelLaplace(Carded):
             raise FitError(f"rounds is {self.rounds}", where="PixelLaplace", mend="give 0 or more")
 
 
+PixelMethod = PixelLaplace | PixelNuts | PixelTempering
+"""What may be done in every pixel."""
+
+
+def candidates_of(settings: object) -> int:
+    """Prior draws among which a start is found by settings of any kind."""
+    return settings.candidates if isinstance(settings, PixelLaplace) else CANDIDATES
+
+
 def fit_stack(
     engine: Engine,
-    settings: PixelLaplace | PixelNuts | PixelTempering,
+    settings: PixelMethod,
     pixels: Stack,
     numbers: np.ndarray,
     seed: int,

@@ -16,7 +16,7 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.pixels.blocks import NUMBER, Plan, fit_block, maps_of, set_aside
 from polar_bayes.pixels.executors import as_completed, workers
-from polar_bayes.pixels.fitting import FEWEST_VIEWS, PixelLaplace
+from polar_bayes.pixels.fitting import FEWEST_VIEWS, PixelLaplace, PixelMethod
 from polar_bayes.pixels.making import key_of
 from polar_bayes.pixels.marginals import Marginals
 from polar_bayes.pixels.outcome import Status, no_outcome
@@ -33,7 +33,7 @@ def fit_pixels(
     capture: xr.Dataset,
     *,
     model: str | Callable = "per_material",
-    method: PixelLaplace | None = None,
+    method: PixelMethod | None = None,
     scene: str | Scene | None = None,
     priors: Mapping[str, dist.Distribution] | None = None,
     links: AbstractLink | Mapping[str, AbstractLink] | None = None,
@@ -45,15 +45,16 @@ def fit_pixels(
     """Fit every pixel of an image by itself.
 
     Each pixel is the fit that `polar_bayes.fit` makes of it, by the normal approximation at its
-    mode: the same model, priors and links. Noise parameters are each pixel's own unless the model
-    holds them (`numpyro.handlers.condition`). A map has the marginals of each pixel and nothing
-    joint: to ask for the mean of a region, fit the region.
+    mode unless `method` says otherwise: the same model, priors and links. Noise parameters are
+    each pixel's own unless the model holds them (`numpyro.handlers.condition`). A map has the
+    marginals of each pixel and nothing joint: to ask for the mean of a region, fit the region.
 
     Args:
         capture: A capture with dims y and x. In chunks (Dask), it is read block by block, and the
             maps come in the same chunks, computed when they are asked for.
         model: See `polar_bayes.fit`; the other arguments too.
-        method: What is done in each pixel; by default `PixelLaplace()`.
+        method: What is done in each pixel; by default `PixelLaplace()`. `PixelTempering()` sees
+            all modes of a pixel, at many times the cost; `PixelNuts()` runs chains in each.
         scene: A name in `SETUPS` or a `Scene`.
         priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
         links: One link for the polarization, or a mapping from variable to link.
@@ -107,7 +108,7 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
 def plan_map(
     capture: xr.Dataset,
     model: str | Callable,
-    method: PixelLaplace | None,
+    method: PixelMethod | None,
     scene: str | Scene | None,
     priors: Mapping[str, dist.Distribution] | None,
     links: AbstractLink | Mapping[str, AbstractLink] | None,
@@ -135,11 +136,11 @@ def plan_map(
         PolarBayesError: Something cannot be used; see `fit_pixels`.
     """
     settings = PixelLaplace() if method is None else method
-    if not isinstance(settings, PixelLaplace):
+    if not isinstance(settings, PixelMethod):
         raise FitError(
             f"{method!r} is no way to fit pixels",
             where="fit_pixels: method",
-            mend="give settings such as PixelLaplace(draws=512), or leave it out",
+            mend="give settings such as PixelLaplace(draws=512) or PixelTempering()",
         )
     missing = [dim for dim in IMAGE if dim not in capture.dims]
     if missing:
@@ -275,6 +276,7 @@ def said_of(plan: Plan) -> str:
     request = plan.request
     about = {
         "method": "pixels",
+        "fitted_by": type(plan.settings).__name__,
         "settings": dataclasses.asdict(plan.settings),
         "model": request.model_name,
         "scene": request.scene_name,

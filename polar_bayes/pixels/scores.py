@@ -74,7 +74,7 @@ def normal_scores(z: Float[Array, "draw size"]) -> Scores:
     Source:
         van der Waerden (1952), Indag. Math. 14, 453-458: normal scores.
     """
-    values = _quantiles(z.T, ndtr(KNOTS))
+    values = _quantiles(z.T, ndtr(KNOTS.astype(float)))
     steps = jnp.diff(values)
     steps = jnp.maximum(steps, FLATTEST * jnp.mean(steps, axis=-1, keepdims=True))
     return Scores(jnp.concatenate([values[:, :1], values[:, :1] + jnp.cumsum(steps, 1)], axis=1))

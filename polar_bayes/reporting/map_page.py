@@ -24,7 +24,11 @@ COLUMNS = 4
 """Parameters of one picture: more would be too small to read."""
 
 BARE = "bare normal approximation of each pixel"
-CORRECTED = "normal approximation of each pixel, checked and corrected"
+FITTED_BY = {
+    "PixelLaplace": "normal approximation of each pixel, checked and corrected",
+    "PixelTempering": "tempered draws of each pixel",
+    "PixelNuts": "chains in each pixel",
+}
 UNCHECKED = (
     "The approximation was taken as it is (weighted=False): good means that the climb to the mode "
     "converged, and nothing says how far the numbers can be trusted."
@@ -55,14 +59,14 @@ def render_map(
     maps, provenance = at_hand(maps), _provenance(maps)
     cases = map_tables.count_cases(maps)
     said, is_enough = map_tables.headline(cases)
-    is_bare = _is_bare(provenance)
+    is_bare, fitted_by = _is_bare(provenance), provenance.get("fitted_by", "PixelLaplace")
     size = " x ".join(f"{maps.sizes[dim]:,}" for dim in IMAGE)
     coverage = None if truth is None else _coverage(maps, found, truth, uncorrected)
     content: dict[str, Any] = {
         "kind": "Map report",
         "name": _name(maps, provenance, truth),
         "under": [
-            f"{size} pixels. {made_by(provenance, BARE if is_bare else CORRECTED)}",
+            f"{size} pixels. {made_by(provenance, BARE if is_bare else FITTED_BY[fitted_by])}",
             *filter(None, [swapped_sentence(provenance)]),
         ],
         "headline": said,

@@ -39,6 +39,7 @@ APPROACHES = {
     "importance": "the normal approximation corrected by weights",
     "adapted": "a proposal fitted to its own draws and corrected by weights",
     "nuts": "sampling (NUTS)",
+    "tempered": "tempered draws",
 }
 
 
@@ -118,8 +119,7 @@ def verdict(cases: pd.DataFrame) -> list[str]:
     phrases = {
         "masked": "{} masked: no reading there is valid.",
         "too few views": f"{{}} read in fewer than {FEWEST_VIEWS} views and not fitted.",
-        "not converged": "{} not converged: from no start was a mode reached, and the maps are "
-        "NaN there.",
+        "not converged": "{} not converged: no start led to an answer, and the maps are NaN there.",
         "not trusted": f"{{}} not trusted: Pareto k is above {LARGEST_TRUSTED:g}, and nothing else "
         "confirmed the approximation. The maps show its numbers there; do not quote them.",
     }

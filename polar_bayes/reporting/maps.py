@@ -13,6 +13,7 @@ from polar_bayes.reporting.style import (
     GREEK,
     GREEN,
     ORANGE,
+    PURPLE,
     SKY,
     VERMILLION,
     Drawing,
@@ -25,7 +26,7 @@ MOST_PIXELS = 800
 
 LARGEST_K = 1.0
 NO_ANSWER = "#dadada"
-APPROACHES = (NO_ANSWER, SKY, BLUE, GREEN, ORANGE)
+APPROACHES = (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE)
 STATUSES = (BLUE, NO_ANSWER, SKY, VERMILLION, ORANGE)
 
 

@@ -85,6 +85,10 @@ WRONG = {
     "map of no image": (["map", "PLATE", "--out", "OUT"], "it has no axis y or x; give an image"),
     "no image": (["map", "nowhere.zarr", "--out", "OUT"], "nowhere.zarr: there is no such store"),
     "draws": (["map", "PLATE", "--draws", "5", "--out", "OUT"], "draws is 5; give 64, 128"),
+    "draws of what": (
+        ["map", "PLATE", "--method", "tempered", "--draws", "256", "--out", "OUT"],
+        "--draws needs --method laplace",
+    ),
     "report of a capture": (["report", "PLATE", "--out", "OUT"], "it holds no fit"),
     "preset": (["simulate", "--preset", "x", "--out", "OUT"], "no such material"),
     "views": (["simulate", "--views", "1", "--out", "OUT"], "views is 1"),

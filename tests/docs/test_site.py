@@ -98,6 +98,13 @@ def test_links_that_lead_elsewhere_are_well_formed(site: Path) -> None:
                 assert address.scheme in ("", "data"), f"{page}: {address.geturl()}"
 
 
+def test_every_picture_says_in_words_what_it_shows(site: Path) -> None:
+    for page in pages(site):
+        for picture in BeautifulSoup(page.read_text(), "html.parser").find_all("img"):
+            words = picture.get("alt", "")
+            assert len(words.removeprefix("Picture of the section:")) > 5, f"{page}: {picture}"
+
+
 def test_the_reference_has_every_public_name_once(site: Path) -> None:
     headings = [
         heading.get_text().split()[0]

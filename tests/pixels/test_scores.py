@@ -74,3 +74,13 @@ def test_a_coordinate_that_repeats_itself_keeps_an_inverse() -> None:
     assert (steps >= 0.9 * FLATTEST * steps.mean()).all()
     u = jnp.asarray(KNOTS, float)[:, None]
     assert np.asarray(found.score(found.place(u)[0])) == pytest.approx(np.asarray(u), abs=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_knots_are_at_the_quantiles_of_the_draws(dtype: type) -> None:
+    draws = DRAWS.astype(dtype)
+    values = np.asarray(jax.jit(normal_scores)(draws).values)
+    assert values.dtype == dtype
+    expected = np.quantile(draws.astype(float), scipy.stats.norm.cdf(KNOTS), axis=0).T
+    # Sums of steps: one rounding for each knot.
+    assert values == pytest.approx(expected, abs=len(KNOTS) * np.finfo(dtype).eps * 10.0)

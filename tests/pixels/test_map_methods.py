@@ -1,0 +1,58 @@
+"""Maps by other ways than one mode: tempered draws and chains in every pixel."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, plate_image
+
+import polar_bayes as pb
+from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.pixels.outcome import Approach, Status
+from polar_bayes.reporting.maps import APPROACHES
+
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
+TEMPERING = pb.PixelTempering(walks=64, draws=256, effective_draws=100.0)
+
+
+@pytest.fixture(scope="module")
+def image() -> xr.Dataset:
+    return plate_image(3, 4, seed=6)
+
+
+@pytest.fixture(scope="module")
+def tempered(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
+    return pb.fit_pixels(image, method=TEMPERING, **ASKED)
+
+
+def test_tempered_maps_are_those_of_a_grid(image: xr.Dataset, tempered: xr.Dataset) -> None:
+    assert (tempered["status"] == Status.GOOD).all()
+    assert (tempered["approach"] == Approach.TEMPERED).all()
+    apart = []
+    for y, x in np.ndindex(3, 4):
+        truth = on_a_grid(image["q"].values[y, x], NOISE, VIEWS)
+        for name in NAMES:
+            mean, sd, _ = truth[name]
+            error = sd / np.sqrt(tempered["effective_draws"].values[y, x])
+            apart.append((tempered[name].values[y, x] - mean) / error)
+    # 24 standard normals, in pairs that depend on each other: the largest is above 4 in fewer than
+    # two of a thousand cases.
+    assert np.abs(apart).max() < 4.0
+
+
+def test_the_map_says_how_it_was_made(tempered: xr.Dataset, tmp_path: Path) -> None:
+    assert json.loads(tempered.attrs[PROVENANCE])["fitted_by"] == "PixelTempering"
+    page = pb.report(tempered, tmp_path / "report").read_text()
+    assert "tempered draws of each pixel" in page
+    assert len(APPROACHES) == len(Approach)  # each has a color
+    assert "all by tempered draws" in page
+
+
+def test_files_give_the_same_map(image: xr.Dataset, tempered: xr.Dataset, tmp_path: Path) -> None:
+    image.to_zarr(tmp_path / "image.zarr", consolidated=False)
+    stored = pb.map_file(tmp_path / "image.zarr", tmp_path / "map.zarr", method=TEMPERING, **ASKED)
+    for name in tempered.data_vars:
+        np.testing.assert_array_equal(stored[name], tempered[name], err_msg=str(name))
