@@ -16,6 +16,9 @@ from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.pixels.outcome import Status
 
+MOST = 0.5
+"""Share of fits that are not trusted above which their ranks say nothing of the model."""
+
 
 def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
     """One row for each parameter of a calibration.
@@ -49,7 +52,7 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
 
     Returns:
         First whether the ranks pass, then each parameter that does not and how it strays, then the
-        fits that failed, then what the readings say, which are judged by themselves.
+        fits that failed (and a word where most are not trusted), then what the readings say, which are judged by themselves.
 
     Raises:
         FitError: It is no calibration.
@@ -68,6 +71,11 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
         lost = int(np.sum(statuses == status))
         if status != Status.GOOD and lost:
             said.append(f"{lost} of {statuses.size} fits: {status.name.lower().replace('_', ' ')}.")
+    if np.mean(statuses == Status.NOT_TRUSTED) > MOST:
+        said.append(
+            "Most fits say themselves that they cannot be trusted: the ranks judge the method, not "
+            "the model. Calibrate by another one: nuts, or the chains of a fit (pb.Nuts())."
+        )
     return said + readings_verdict(calibration)
 
 

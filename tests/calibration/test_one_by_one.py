@@ -107,7 +107,9 @@ def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Datase
     assert (fits["approach"] == Approach.NUTS).all()
     assert (fits["effective_draws"] < 400.0).all()
     assert np.isfinite(found["prior_sbc"]["level"]).all()
-    assert "20 of 20 fits: not trusted." in pb.calibration_verdict(found)
+    said = pb.calibration_verdict(found)
+    assert "20 of 20 fits: not trusted." in said
+    assert any("the ranks judge the method, not the model" in sentence for sentence in said)
 
 
 def test_fits_without_draws_are_counted(
