@@ -52,7 +52,8 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
 
     Returns:
         First whether the ranks pass, then each parameter that does not and how it strays, then the
-        fits that failed (and a word where most are not trusted), then what the readings say, which are judged by themselves.
+        fits that failed (and a word where most are not trusted), then what the readings say, which
+        are judged by themselves.
 
     Raises:
         FitError: It is no calibration.
