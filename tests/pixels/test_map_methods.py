@@ -43,6 +43,19 @@ def test_tempered_maps_are_those_of_a_grid(image: xr.Dataset, tempered: xr.Datas
     assert np.abs(apart).max() < 4.0
 
 
+def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, tempered: xr.Dataset) -> None:
+    chains = pb.fit_pixels(image.isel(y=[0], x=[0, 1]), method=pb.PixelNuts(), **ASKED)
+    assert (chains["approach"] == Approach.NUTS).all()
+    assert (chains["status"] == Status.GOOD).all()
+    for name in NAMES:
+        one, other = chains[name].values[0], tempered[name].values[0, :2]
+        worth = 1.0 / chains["effective_draws"].values[0]
+        worth += 1.0 / tempered["effective_draws"].values[0, :2]
+        # Four standard normals, in two pairs: the largest is above 4 in 3 of ten thousand cases.
+        error = tempered[f"{name}_sd"].values[0, :2] * np.sqrt(worth)
+        assert (np.abs(one - other) < 4.0 * error).all()
+
+
 def test_the_map_says_how_it_was_made(tempered: xr.Dataset, tmp_path: Path) -> None:
     assert json.loads(tempered.attrs[PROVENANCE])["fitted_by"] == "PixelTempering"
     page = pb.report(tempered, tmp_path / "report").read_text()
