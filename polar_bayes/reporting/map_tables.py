@@ -30,7 +30,7 @@ STATUSES = {
     "good": "an answer that the checks let pass",
     "masked": "no valid reading",
     "too few views": f"fewer than {FEWEST_VIEWS} valid views",
-    "not converged": "no mode was reached; NaN",
+    "not converged": "no answer was reached; NaN",
     "not trusted": "numbers of the bare normal approximation, which no check confirms",
 }
 APPROACHES = {
@@ -120,8 +120,9 @@ def verdict(cases: pd.DataFrame) -> list[str]:
         "masked": "{} masked: no reading there is valid.",
         "too few views": f"{{}} read in fewer than {FEWEST_VIEWS} views and not fitted.",
         "not converged": "{} not converged: no start led to an answer, and the maps are NaN there.",
-        "not trusted": f"{{}} not trusted: Pareto k is above {LARGEST_TRUSTED:g}, and nothing else "
-        "confirmed the approximation. The maps show its numbers there; do not quote them.",
+        "not trusted": f"{{}} not trusted: Pareto k is above {LARGEST_TRUSTED:g}, or draws are "
+        "worth too little, and nothing else confirmed them. The maps show its numbers there; do "
+        "not quote them.",
     }
     for word, phrase in phrases.items():
         if number := count.get(word):
