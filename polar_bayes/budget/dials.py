@@ -78,7 +78,7 @@ class DrawsDial(AbstractDial):
         before, after = draws_of(method), None if turned is None else draws_of(turned)
         if turned is None or not before or not after:
             return None
-        # Some draw whole crowds only: what is called so must be so.
+        # Numbers are rounded, or have a least: what is called so must be so.
         is_so = abs(after / before / self.factor - 1.0) < NEARLY
         return (request, turned) if is_so and turned != method else None
 

@@ -59,7 +59,7 @@ def with_answer_draws(settings: PixelTempering, count: float) -> PixelTempering:
 
     Args:
         settings: Of tempered draws.
-        count: Draws of an answer, above 0; rounded up to a multiple of the crowd.
+        count: Draws of an answer, above 0; as many as the crowd has, at least.
 
     Returns:
         The settings; what the draws must be worth is as it was, or half of the draws if fewer.
@@ -67,9 +67,9 @@ def with_answer_draws(settings: PixelTempering, count: float) -> PixelTempering:
     Raises:
         Nothing.
     """
-    whole = settings.crowd * max(1, math.ceil(count / settings.crowd))
-    worth = min(settings.effective_draws, 0.5 * whole)
-    return dataclasses.replace(settings, draws=whole // 2, effective_draws=worth)
+    half = math.ceil(0.5 * max(count, settings.crowd))
+    worth = min(settings.effective_draws, float(half))
+    return dataclasses.replace(settings, draws=half, effective_draws=worth)
 
 
 @functools.singledispatch

@@ -63,8 +63,10 @@ def _rounds(
     row.outcome.steps[at] += crowd.stages
     left = np.flatnonzero((crowd.temperature >= 1.0) & np.isfinite(crowd.u).all(axis=(1, 2)))
     count = 2 * settings.draws
-    u = np.tile(crowd.u[left], (1, count // settings.crowd, 1))
-    weights, before = np.full(u.shape[:2], 1.0 / count), None
+    again = np.arange(count) % settings.crowd  # the crowd once, or some of it more often
+    u = crowd.u[left][:, again]
+    even = 1.0 / (settings.crowd * np.bincount(again)[again])
+    weights, before = np.tile(even, (left.size, 1)), None
     for number in range(settings.rounds):
         if not left.size:
             return

@@ -47,8 +47,8 @@ class PixelTempering(Carded):
             and the first step of temperature is longer.
         effective_share: Share of the crowd that its weights must be worth after a step of
             temperature, between 0.1 and 0.95.
-        draws: Of a mixture in every round; half a multiple of the crowd. An answer has the draws of
-            two rounds.
+        draws: Of a mixture in every round, at least half the crowd. An answer has the draws of two
+            rounds.
         components: Of the mixtures, >= 1.
         rounds: In which a mixture is fitted to the weighted draws, at most, >= 2.
         crowds: What has not come to an answer in these rounds begins again from a new crowd, until
@@ -61,10 +61,10 @@ class PixelTempering(Carded):
     """
 
     walks: int = 256
-    length: int = 8
+    length: int = 7
     looks: int = 2
     effective_share: float = 0.5
-    draws: int = 1024
+    draws: int = 896
     components: int = 4
     rounds: int = 8
     crowds: int = 3
@@ -93,11 +93,11 @@ class PixelTempering(Carded):
                 where="PixelTempering",
                 mend="give a number from 0.1 to 0.95",
             )
-        if 2 * self.draws < self.crowd or 2 * self.draws % self.crowd:
+        if 2 * self.draws < self.crowd:
             raise FitError(
                 f"draws is {self.draws}, and the crowd {self.crowd}",
                 where="PixelTempering",
-                mend="give half a multiple of walks * length",
+                mend="give at least half of walks * length",
             )
         if self.effective_draws >= 2 * self.draws:
             raise FitError(

@@ -203,8 +203,8 @@ def test_skewed_pixels_have_the_posteriors_of_a_grid(chains: bool) -> None:
         ({"rounds": 1}, "rounds is 1; give 2 or more"),
         ({"looks": 0}, "looks is 0; give 1 or more"),
         ({"effective_share": 0.99}, "effective_share is 0.99; give a number from 0.1 to 0.95"),
-        ({"draws": 1000}, "draws is 1000, and the crowd 2048; give half a multiple of walks"),
-        ({"effective_draws": 5000.0}, "effective_draws is 5000.0, and there are 2048 draws"),
+        ({"draws": 800}, "draws is 800, and the crowd 1792; give at least half of walks"),
+        ({"effective_draws": 5000.0}, "effective_draws is 5000.0, and there are 1792 draws"),
     ],
 )
 def test_mistakes_are_told(settings: dict, said: str) -> None:
