@@ -27,6 +27,7 @@ _HOMES = {
     "capture.detector": ("Detector",),
     "capture.files": ("load_capture", "save_capture"),
     "capture.goniometer": ("from_goniometer",),
+    "capture.listed": ("from_table",),
     "capture.mosaic": ("from_mosaic",),
     "capture.places": ("Direction", "Highlight", "Position", "Surroundings"),
     "capture.polarizer": ("from_polarizer",),

@@ -70,12 +70,7 @@ def read_table(path: str | os.PathLike[str], columns: Sequence[str] | None = Non
     Raises:
         CaptureError: The file, line and column that are wrong.
     """
-    file = existing_file(path, "table")
-    source = str(file)
-    rows = _split_rows(_rows(_text(file)))
-    if not rows:
-        raise CaptureError("it holds no rows", where=source, mend=EACH_READING)
-    names, body = _take_header(rows, source)
+    source, names, body = _parts(path)
     if not body:
         raise CaptureError("it holds names but no rows", where=source, mend=EACH_READING)
     for line, cells in body:
@@ -97,6 +92,30 @@ def read_table(path: str | os.PathLike[str], columns: Sequence[str] | None = Non
         steps={name: pair[:, 1] for name, pair in pairs.items()},
         lines=tuple(line for line, _ in body),
     )
+
+
+def column_names(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Names of the columns of a text table, as `read_table` reads it.
+
+    Args:
+        path: A text file of at most 50 MB.
+
+    Returns:
+        The names; without a header line column_1, column_2, ...
+
+    Raises:
+        CaptureError: There is no table.
+    """
+    return tuple(_parts(path)[1])
+
+
+def _parts(path: str | os.PathLike[str]) -> tuple[str, list[str], list[Row]]:
+    """Path, names of the columns, and the rows below them."""
+    file = existing_file(path, "table")
+    rows = _split_rows(_rows(_text(file)))
+    if not rows:
+        raise CaptureError("it holds no rows", where=str(file), mend=EACH_READING)
+    return str(file), *_take_header(rows, str(file))
 
 
 def _text(file: Path) -> str:

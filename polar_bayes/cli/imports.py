@@ -36,6 +36,41 @@ def goniometer(s: str, p: str, table: Path | None, out: Path, **settings: Any) -
     print_counts(capture, out)
 
 
+@import_.command()
+@click.argument("table", type=click.Path(path_type=Path))
+@click.option(
+    "--column",
+    "columns",
+    type=(str, str),
+    multiple=True,
+    metavar="VARIABLE COLUMN",
+    help="Column of a variable, where it has another name; give it once for each.",
+)
+@click.option(
+    "--constant",
+    "constants",
+    type=(str, float),
+    multiple=True,
+    metavar="VARIABLE NUMBER",
+    help="A variable that is the same everywhere, such as light_zenith 45.",
+)
+@click.option("--ignore", "ignored", multiple=True, metavar="COLUMN", help="Leave it out.")
+@click.option("--setup", help="Set-up that a fit takes by default.")
+@click.option("--saturation-level", type=float, help="Intensity of a full pixel.")
+@click.option("--name", help="Name of the capture.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Capture to write.")
+def table(
+    table: Path,
+    columns: tuple[tuple[str, str], ...],
+    constants: tuple[tuple[str, float], ...],
+    out: Path,
+    **settings: Any,
+) -> None:
+    """Any readings, listed a line each with their directions."""
+    given = {"columns": dict(columns), "constants": dict(constants)}
+    _write(pb.from_table(table, **given, **settings), out)
+
+
 def of_a_picture(command: Callable) -> Callable:
     """The options that every import of pictures has."""
     options = (

@@ -64,7 +64,7 @@ def _rounds(
     left = np.flatnonzero((crowd.temperature >= 1.0) & np.isfinite(crowd.u).all(axis=(1, 2)))
     count = 2 * settings.draws
     again = np.arange(count) % settings.crowd  # the crowd once, or some of it more often
-    u = crowd.u[left][:, again]
+    u = np.asarray(crowd.u)[left][:, again]
     even = 1.0 / (settings.crowd * np.bincount(again)[again])
     weights, before = np.tile(even, (left.size, 1)), None
     for number in range(settings.rounds):

@@ -31,7 +31,7 @@ STATUSES = {
     "masked": "no valid reading",
     "too few views": f"fewer than {FEWEST_VIEWS} valid views",
     "not converged": "no answer was reached; NaN",
-    "not trusted": "numbers of the bare normal approximation, which no check confirms",
+    "not trusted": "numbers that no check confirms, by the approach told below",
 }
 APPROACHES = {
     "none": "no numbers",

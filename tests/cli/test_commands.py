@@ -41,6 +41,23 @@ def test_a_fit_whose_diagnostics_fail_is_written_and_exits_with_2(
     assert out.exists()
 
 
+def test_a_table_of_readings_becomes_a_capture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table, out = tmp_path / "leaf.csv", tmp_path / "leaf.nc"
+    table.write_text("theta,dop,time\n10,.02,7\n20,.04,8\n")
+    words = ["import", "table", str(table), "--column", "view_zenith", "theta", "--out", str(out)]
+    assert main(words) == 1
+    assert "column time: a capture has no variable 'time'" in capsys.readouterr().err
+    directions = {"view_azimuth": 180, "light_zenith": 45, "light_azimuth": 0}
+    for name, degrees in directions.items():
+        words += ["--constant", name, str(degrees)]
+    words += ["--ignore", "time", "--setup", "camera"]
+    assert main(words) == 0
+    assert capsys.readouterr().out == f"{out}: 2 views, 0 masked, 0 saturated\n"
+    assert pb.load_capture(out).attrs["setup"] == "camera"
+
+
 def test_combine_puts_captures_side_by_side(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
