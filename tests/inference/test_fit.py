@@ -128,7 +128,8 @@ def test_laplace_is_numpyros_guide(capture: xr.Dataset) -> None:
             for n in sorted(start)
         ]
     )
-    found = minimize(lambda z: float(program.potential(jnp.asarray(z), data)), flat, tol=1e-10)
+    potential = jax.jit(program.potential)
+    found = minimize(lambda z: float(potential(z, data)), flat, tol=1e-10)
     order = guide._unpack_latent(jnp.arange(3.0))
     place = {name: int(value) for name, value in order.items()}
     location = np.empty(3)
