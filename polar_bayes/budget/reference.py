@@ -65,7 +65,7 @@ class Reference:
     def tempered(self) -> Tempered:
         """What takes over where chains do not find each other's modes."""
         goal = 4.0 / self.error**2  # half of it is lost where draws are chosen by weight
-        settings = with_answer_draws(PixelTempering(walks=1024, length=8, draws=4096), 4.0 * goal)
+        settings = with_answer_draws(PixelTempering(walks=1024, draws=4096), 4.0 * goal)
         return Tempered(dataclasses.replace(settings, effective_draws=goal))
 
 

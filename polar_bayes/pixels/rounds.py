@@ -65,8 +65,8 @@ def _rounds(
     count = 2 * settings.draws
     again = np.arange(count) % settings.crowd  # the crowd once, or some of it more often
     u = np.asarray(crowd.u)[left][:, again]
-    even = 1.0 / (settings.crowd * np.bincount(again)[again])
-    weights, before = np.tile(even, (left.size, 1)), None
+    weights = np.asarray(crowd.weights)[left][:, again] / np.bincount(again)[again]
+    before = None
     for number in range(settings.rounds):
         if not left.size:
             return

@@ -183,14 +183,14 @@ def test_draws_are_scaled_and_settings_kept():
     assert draws_of(pb.Tempered(tempered)) == tempered.answer_draws == 32768
     fewer = with_draws(pb.Tempered(pb.PixelTempering(draws=4096)), 0.25).settings
     assert (fewer.draws, fewer.effective_draws) == (1024, 50.0)
-    with pytest.raises(FitError, match="512 draws are fewer than the crowd of 1792"):
+    with pytest.raises(FitError, match="512 draws are fewer than the crowd of 2048"):
         with_draws(pb.Tempered(pb.PixelTempering(draws=1024)), 0.25)
     assert with_draws(pb.Point(), 2.0) is None
 
 
 def test_tempered_answers_have_as_many_draws_as_are_asked_for():
     settings = pb.PixelTempering()
-    for count, draws in ((1.0, 1792), (1792, 1792), (1793, 1794), (5000, 5000)):
+    for count, draws in ((1.0, 2048), (2048, 2048), (2049, 2050), (5000, 5000)):
         assert with_answer_draws(settings, count).answer_draws == draws
     auto, here = pb.Auto(tolerance=0.1), bench(line)
     needed = draws_needed(0.1, 2)
