@@ -188,10 +188,12 @@ def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
         assert (turned is None) == (name in ("point", "nuts short"))  # no draws, or too few
         if turned is not None:
             assert draws_of(turned[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
-    # A crowd and a half, of which half would be three quarters: no multiple of the crowd.
-    odd = pb.Tempered(pb.PixelTempering(draws=3072))
-    assert pb.DrawsDial(0.5).turn(request, odd) is None
-    assert pb.DrawsDial(0.25).turn(request, odd) is None
+    # A crowd and a half, of which half would be three quarters: fewer than the crowd.
+    few = pb.Tempered(pb.PixelTempering(draws=1536))
+    assert pb.DrawsDial(0.5).turn(request, few) is None
+    enough = pb.DrawsDial(0.5).turn(request, pb.Tempered(pb.PixelTempering(draws=3072)))
+    assert enough is not None
+    assert draws_of(enough[1]) == 3072
 
 
 def test_every_dial_has_a_name_of_its_own():
