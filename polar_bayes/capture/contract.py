@@ -1,7 +1,9 @@
 """The capture contract as data: names, units, ranges and dims, each written once."""
 
 import dataclasses
+import difflib
 import re
+from collections.abc import Sequence
 from typing import Any, Literal
 
 LEADING = ((), ("material",), ("patch",), ("y", "x"))
@@ -108,6 +110,13 @@ CONTRACT = (
     Variable("interpolated", "flag", "1", UNIT, "filled in between readings", ZERO_ONE),
 )
 WAVELENGTH = Variable("wavelength", "label", "nm", POSITIVE, "wavelength", NANOMETERS)
+
+
+def nearest_name(name: object, known: Sequence[str]) -> str | None:
+    """The known name that is most like this one; None where it is known, or tells a truth."""
+    if name in known or (isinstance(name, str) and TRUTH.fullmatch(name)):
+        return None
+    return difflib.get_close_matches(str(name), known, n=1, cutoff=0.0)[0]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ line that repeats both begins another. A column `patch` or `material` puts captu
 import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
+from numbers import Real
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ import numpy as np
 import xarray as xr
 
 from polar_bayes.capture.combine import DIMS, combine
-from polar_bayes.capture.contract import CONTRACT, TRUTH, WAVELENGTH, Variable
+from polar_bayes.capture.contract import CONTRACT, WAVELENGTH, Variable, nearest_name
 from polar_bayes.capture.schema import validate
 from polar_bayes.capture.tables import column_names, read_table
 from polar_bayes.errors import CaptureError
@@ -78,18 +78,14 @@ def from_table(
     attributes: dict[str, str] = {"source": Path(source).name}
     if setup is not None:
         attributes["setup"] = setup
-    leading = next((dim for dim in DIMS if dim in lines.values), None)
-    if leading is None:
-        capture = _capture(lines.values, saturation_level)
+    leading = [dim for dim in DIMS if dim in lines.values]
+    if len(leading) > 1:
+        mend = "ignore one of both"
+        raise CaptureError("it has materials and patches", where=source, mend=mend)
+    if leading:
+        capture = _side_by_side(lines.values, leading[0], saturation_level)
     else:
-        labels = lines.values.pop(leading)
-        parts = {
-            f"{label:g}": _capture(
-                {name: x[labels == label] for name, x in lines.values.items()}, saturation_level
-            )
-            for label in np.unique(labels)
-        }
-        capture = combine(parts, dim=leading)
+        capture = _capture(lines.values, saturation_level)
     named = attributes | {"name": name or Path(source).stem}
     return validate(capture.assign_attrs(named), source=source)
 
@@ -99,8 +95,10 @@ def _read(
 ) -> _Lines:
     """Values of each variable in each line."""
     taken = _taken(column_names(source), columns, ignored, source)
-    for variable in constants:
+    for variable, value in constants.items():
         _check_name(variable, None, source)
+        if not isinstance(value, Real):
+            raise CaptureError(f"{variable} is {value!r}", where=source, mend="give a number")
         if variable in taken:
             what = f"{variable} is a constant and the column {taken[variable]!r}"
             raise CaptureError(what, where=source, mend="give one of both, or ignore the column")
@@ -140,15 +138,12 @@ def _taken(
 
 
 def _check_name(variable: str, column: str | None, source: str) -> None:
-    if variable in KNOWN or variable in DIMS or TRUTH.fullmatch(variable):
-        return
-    known = [*KNOWN, *DIMS]
-    near = get_close_matches(variable, known, n=1, cutoff=0.0)[0]
-    raise CaptureError(
-        f"a capture has no variable {variable!r}",
-        where=source if column is None else f"{source}: column {column}",
-        mend=f"say what it is (nearest: {near}), call it true_<name> or ignore it",
-    )
+    if near := nearest_name(variable, [*KNOWN, *DIMS]):
+        raise CaptureError(
+            f"a capture has no variable {variable!r}",
+            where=source if column is None else f"{source}: column {column}",
+            mend=f"say what it is (nearest: {near}), call it true_<name> or ignore it",
+        )
 
 
 def _check(lines: _Lines, source: str) -> None:
@@ -167,6 +162,19 @@ def _check(lines: _Lines, source: str) -> None:
             where += f", column {lines.columns[variable]}"
         what = f"{variable} is {values[first]:g}, which is outside {row.range}"
         raise CaptureError(what, where=where, mend=row.mend)
+
+
+def _side_by_side(
+    values: dict[str, np.ndarray], dim: str, saturation_level: float | None
+) -> xr.Dataset:
+    """The lines of each patch or material, by its number."""
+    rest = {name: x for name, x in values.items() if name != dim}
+    parts = {}
+    for number in np.unique(values[dim]):
+        own = {name: x[values[dim] == number] for name, x in rest.items()}
+        # All digits: two numbers never have one label.
+        parts[repr(float(number)).removesuffix(".0")] = _capture(own, saturation_level)
+    return combine(parts, dim=dim)
 
 
 def _capture(values: dict[str, np.ndarray], saturation_level: float | None) -> xr.Dataset:

@@ -9,7 +9,6 @@ wavelength must, in nanometers. Known truth rides along as `true_<anything>`, ov
 capture's dims, NaN where it is not known.
 """
 
-import difflib
 from collections.abc import Hashable, Mapping, Sequence
 
 import numpy as np
@@ -30,6 +29,7 @@ from polar_bayes.capture.contract import (
     WAVELENGTH,
     Layout,
     Variable,
+    nearest_name,
 )
 from polar_bayes.errors import CaptureError
 
@@ -102,8 +102,7 @@ def count(capture: xr.Dataset) -> dict[str, int]:
 def _check_names(dataset: xr.Dataset, source: str) -> None:
     known = [*(row.name for row in CONTRACT), WAVELENGTH.name, *LABELS]
     for name in dataset.variables:
-        if name not in known and not (isinstance(name, str) and TRUTH.fullmatch(name)):
-            near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.0)[0]
+        if near := nearest_name(name, known):
             raise CaptureError(
                 "a capture has no such variable",
                 where=f"{source}: {name}",

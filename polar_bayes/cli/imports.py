@@ -39,21 +39,13 @@ def goniometer(s: str, p: str, table: Path | None, out: Path, **settings: Any) -
 @import_.command()
 @click.argument("table", type=click.Path(path_type=Path))
 @click.option(
-    "--column",
-    "columns",
-    type=(str, str),
-    multiple=True,
-    metavar="VARIABLE COLUMN",
+    "--column", "columns", type=(str, str), multiple=True, metavar="VARIABLE COLUMN",
     help="Column of a variable, where it has another name; give it once for each.",
-)
+)  # fmt: skip
 @click.option(
-    "--constant",
-    "constants",
-    type=(str, float),
-    multiple=True,
-    metavar="VARIABLE NUMBER",
+    "--constant", "constants", type=(str, float), multiple=True, metavar="VARIABLE NUMBER",
     help="A variable that is the same everywhere, such as light_zenith 45.",
-)
+)  # fmt: skip
 @click.option("--ignore", "ignored", multiple=True, metavar="COLUMN", help="Leave it out.")
 @click.option("--setup", help="Set-up that a fit takes by default.")
 @click.option("--saturation-level", type=float, help="Intensity of a full pixel.")

@@ -74,6 +74,12 @@ def test_patches_stand_side_by_side(write, dim):
     assert capture.attrs["name"] == "leaf"
 
 
+def test_long_numbers_of_patches_stay_apart(write):
+    text = "patch,view_zenith,dop\n20261122,10,.1\n20261123,20,.2\n"
+    capture = from_table(write(text), constants=ANGLES)
+    assert capture["patch"].values.tolist() == ["20261122", "20261123"]
+
+
 def test_readings_that_are_not_valid_are_not_looked_at(write):
     capture = from_table(write("view_zenith,dop,valid\n10,7,0\n20,.2,1\n"), constants=ANGLES)
     assert capture["valid"].values.tolist() == [False, True]
@@ -100,6 +106,13 @@ REFUSED = [
     (PLAIN, {"ignored": ["time"]}, "there is no column 'time'", "choose from"),
     (PLAIN, {"columns": {"dopp": "dop"}}, "no variable 'dopp'", "nearest: dop"),
     (PLAIN, {"constants": {"ligth": 3.0}}, "no variable 'ligth'", "nearest: light"),
+    (PLAIN, {"constants": {"dop_error": "1%"}}, "dop_error is '1%'", "give a number"),
+    (
+        "patch,material,view_zenith,dop\n1,1,10,.1\n",
+        {"constants": ANGLES},
+        "it has materials and patches",
+        "ignore one of both",
+    ),
     (PLAIN, {"constants": {"dop": 0.1}}, "dop is a constant and the column 'dop'", "one of both"),
     (
         PLAIN,
