@@ -59,7 +59,8 @@ def from_table(
     Args:
         table: A text table of numbers whose first line names the columns. Columns that are named
             as the variables of a capture (`view_zenith` in degrees, `dop`, ...) are these.
-        columns: Column of a variable, where it has another name: `{"dop": "DoLP"}`.
+        columns: Column of a variable, where it has another name: `{"dop": "DoLP"}`. One column may
+            be several: the angle of a mirror is that of view and light.
         constants: Variables that are the same everywhere: `{"light_zenith": 45.0}`.
         ignored: Columns to leave out.
         setup: Which scene, links and limits a fit takes by default; None: the paper's.
@@ -121,19 +122,16 @@ def _taken(
         if column not in names:
             mend = f"choose from {', '.join(names)}"
             raise CaptureError(f"there is no column {column!r}", where=source, mend=mend)
-    variables = {column: variable for variable, column in columns.items()}
-    if len(variables) < len(columns):
-        mend = "give each variable a column of its own"
-        raise CaptureError("a column is given twice", where=f"{source}: columns", mend=mend)
-    taken: dict[str, str] = {}
-    for column in (name for name in names if name not in ignored):
-        variable = variables.get(column, column)
+    for variable, column in columns.items():
         _check_name(variable, column, source)
-        if variable in taken:
-            what = f"{variable} is the column {taken[variable]!r}, too"
-            mend = "ignore one of both"
-            raise CaptureError(what, where=f"{source}: column {column}", mend=mend)
-        taken[variable] = column
+    taken = dict(columns)
+    for column in (name for name in names if name not in (*columns.values(), *ignored)):
+        _check_name(column, column, source)
+        if column in taken:
+            what = f"{column} is the column {taken[column]!r}, too"
+            where = f"{source}: column {column}"
+            raise CaptureError(what, where=where, mend="ignore one of both")
+        taken[column] = column
     return taken
 
 

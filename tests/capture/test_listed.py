@@ -48,6 +48,14 @@ def test_columns_of_other_names_are_said_and_the_rest_ignored(write):
     assert capture["dop"].values.tolist() == [0.02, 0.04]
 
 
+def test_one_column_may_be_several_variables(write):
+    columns = {"view_zenith": "angle", "light_zenith": "angle"}
+    azimuths = {"view_azimuth": 180.0, "light_azimuth": 0.0}
+    capture = from_table(write("angle,q\n20,.1\n40,.3\n"), columns=columns, constants=azimuths)
+    assert capture["view_zenith"].values.tolist() == [20.0, 40.0]
+    assert capture["light_zenith"].values.tolist() == [20.0, 40.0]
+
+
 def test_lines_of_the_same_directions_are_one_view_of_several_wavelengths(write):
     text = (
         "view_zenith,wavelength,dop,saturated\n"
@@ -117,7 +125,7 @@ REFUSED = [
     (
         PLAIN,
         {"columns": {"dop": "intensity"}},
-        "column intensity: dop is the column 'dop', too",
+        "column dop: dop is the column 'intensity', too",
         "ignore one of both",
     ),
     ("view_zenith,DoLP\n10,.1\n", {}, "column DoLP: a capture has no variable", "say what it is"),
@@ -136,7 +144,6 @@ REFUSED = [
     ("view_zenith,dop\n10,x\n", {"constants": ANGLES}, "line 2, column dop: 'x'", "correct it"),
     ("view_zenith\n10\n", {"constants": ANGLES}, "no reading is there", "add dop"),
     ("# nothing\n", {}, "it holds no rows", "a line for each reading"),
-    (PLAIN, {"columns": {"q": "dop", "u": "dop"}}, "a column is given twice", "of its own"),
 ]
 
 
