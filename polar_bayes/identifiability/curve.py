@@ -12,11 +12,11 @@ from polar_bayes.identifiability.tracking import (
     SETTLED,
     WEIGHTS,
     Follow,
-    Split,
+    Parts,
     slice_at,
-    split_density,
 )
 from polar_bayes.inference.modes import Modes
+from polar_bayes.observation.data import Observations
 
 DROP = 1.92
 """Half the 95% quantile of chi squared with one degree of freedom."""
@@ -45,11 +45,12 @@ class Curve(NamedTuple):
 Density = Callable[[np.ndarray, float], tuple[float, np.ndarray]]
 
 
-def compile_density(question: Question) -> Density:
+def compile_density(split: Parts, data: Observations) -> Density:
     """Minus log likelihood and weighted log prior, with their gradient, as one program.
 
     Args:
-        question: The model on its data.
+        split: The log density of the coordinates in its two parts.
+        data: The capture.
 
     Returns:
         A function of an unconstrained vector and the weight of the prior.
@@ -59,13 +60,13 @@ def compile_density(question: Question) -> Density:
     """
 
     def loss(z: jax.Array, weight: jax.Array, data: Any) -> jax.Array:
-        parts: Split = split_density(question.program, z, data)
+        parts = split(z, data)
         return -(parts.likelihood + weight * parts.prior)
 
     compiled = jax.jit(jax.value_and_grad(loss))
 
     def density(z: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
-        value, gradient = compiled(jnp.asarray(z), jnp.asarray(weight), question.data)
+        value, gradient = compiled(jnp.asarray(z), jnp.asarray(weight), data)
         return float(value), np.asarray(gradient, float)
 
     return density

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -28,7 +29,7 @@ from polar_bayes.identifiability.peak import (
     pose,
     with_labels,
 )
-from polar_bayes.identifiability.tracking import make_follow
+from polar_bayes.identifiability.tracking import make_follow, split_density
 from polar_bayes.inference.result import PROVENANCE, posterior_of
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -74,9 +75,11 @@ def profile(
 
     over all other parameters, those of the noise included, from the mode outwards in both
     directions. The values of $\theta$ at which it has fallen by less than 1.92 are the 95%
-    interval of the likelihood ratio. A thousandth of the log prior stays in the likelihood, so
-    that what the data do not determine stays where it can be found; the profile of the posterior
-    has all of it (as a density of the unconstrained coordinates).
+    interval of the likelihood ratio. What is known of the instrument belongs to the likelihood:
+    the priors of its parameters stay whole (but for the one that is followed). Of all others a
+    thousandth of the log prior stays, so that what the data do not determine stays where it can be
+    found; the profile of the posterior has all of it (as a density of the unconstrained
+    coordinates).
 
     Args:
         capture: As for `polar_bayes.fit`; model, scene, priors, links, largest_view_zenith too.
@@ -114,9 +117,10 @@ def profile(
         question = pose(capture, model, scene, priors, links, largest_view_zenith, seed)
         place = _place_of(question, parameter)
         given = None if values is None else _coordinates_of(question, place, values)
-        density = compile_density(question)
+        split = partial(split_density, question.program, _known_beside(question, place))
+        density = compile_density(split, question.data)
         modes = find_peaks(question, progress, lambda z: density(z, 1.0))
-        follow = make_follow(question.program, place.held)
+        follow = make_follow(split, place.held)
 
         def draw(grid: np.ndarray) -> Curve:
             return draw_curve(question, place.held, modes, density, follow, grid)
@@ -150,6 +154,13 @@ def _place_of(question: Question, parameter: str) -> Place:
             mend=f"give one of {', '.join(place.label for place in (found or places)[:12])}",
         )
     return found[0]
+
+
+def _known_beside(question: Question, place: Place) -> tuple[str, ...]:
+    """Parameters of the instrument, but for the one that is followed."""
+    instrument = question.request.scene.instrument
+    told = () if instrument is None else instrument.parameters
+    return tuple(name for name in told if name != place.site)
 
 
 def _coordinates_of(question: Question, place: Place, values: Sequence[float]) -> np.ndarray:

@@ -6,10 +6,11 @@ $$ \max_{z_{-i}} [\log L(z) + w \log \pi(z)] $$
 
 from where the value before left them. With $w = 1$ it is the posterior that is followed. With
 $w$ = `FAINT` it is the likelihood: a thousandth of the prior keeps those coordinates from running
-away of which the data say nothing.
+away of which the data say nothing. What is known of the instrument stays whole in both: its
+imperfections are told by a calibration, and with none of it they trade for one another without end.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import jax
@@ -33,17 +34,20 @@ SETTLED = 0.03
 
 
 class Split(NamedTuple):
-    """Log likelihood and log prior of the coordinates."""
+    """Log likelihood, with what is known beside the readings, and log prior of the rest."""
 
     likelihood: Float[Array, ""]
     prior: Float[Array, ""]
 
 
-def split_density(program: Program, z: Float[Array, " size"], data: Observations) -> Split:
+def split_density(
+    program: Program, known: Collection[str], z: Float[Array, " size"], data: Observations
+) -> Split:
     """The log posterior density of the coordinates in its two parts.
 
     Args:
         program: The model.
+        known: Sites whose prior belongs to the first part.
         z: Where.
         data: The capture.
 
@@ -57,10 +61,13 @@ def split_density(program: Program, z: Float[Array, " size"], data: Observations
     moves = {name: dist.biject_to(program.supports[name]) for name in free}
     latent = {name: move(free[name]) for name, move in moves.items()}
     whole, trace = log_density(program.model, (data,), {}, latent)
-    volumes = [jnp.sum(moves[n].log_abs_det_jacobian(free[n], latent[n])) for n in free]
-    readings = [jnp.sum(trace[n]["fn"].log_prob(trace[n]["value"])) for n in program.observed]
-    likelihood = jnp.sum(jnp.stack(readings))
-    return Split(likelihood, whole - likelihood + jnp.sum(jnp.stack(volumes)))
+    volumes = {n: jnp.sum(moves[n].log_abs_det_jacobian(free[n], latent[n])) for n in free}
+    beside = [name for name in free if name in known]
+    told = [
+        jnp.sum(trace[n]["fn"].log_prob(trace[n]["value"])) for n in (*program.observed, *beside)
+    ]
+    likelihood = jnp.sum(jnp.stack([*told, *(volumes[n] for n in beside)]))
+    return Split(likelihood, whole + jnp.sum(jnp.stack([*volumes.values()])) - likelihood)
 
 
 class Slice(NamedTuple):
@@ -101,14 +108,15 @@ def slice_at(covariance: Float[np.ndarray, "size size"], index: int) -> Slice:
     return Slice(index, slope, width)
 
 
+Parts = Callable[[Array, Observations], Split]
 Follow = Callable[[Array, Array, Array, Array, Observations], Array]
 
 
-def make_follow(program: Program, index: int) -> Follow:
+def make_follow(split: Parts, index: int) -> Follow:
     """Compile the way of all tracks along their targets.
 
     Args:
-        program: The model.
+        split: The log density of the coordinates in its two parts.
         index: The coordinate that is moved.
 
     Returns:
@@ -119,7 +127,7 @@ def make_follow(program: Program, index: int) -> Follow:
     solver = optx.BFGS(rtol=1e-6, atol=1e-5)
 
     def plain(y: Array, guess: Array, weight: Array, width: Array, data: Observations) -> Array:
-        parts = split_density(program, guess + width @ y, data)
+        parts = split(guess + width @ y, data)
         value = -(parts.likelihood + weight * parts.prior)
         return jnp.where(jnp.isfinite(value), value, jnp.inf)
 

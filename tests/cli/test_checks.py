@@ -54,7 +54,9 @@ def test_identify_says_what_is_told_and_where_to_look(
     assert 0.0 < told["parameters"]["refractive_index"]["prior_share"] < 0.5
     assert told["said"]
     curve = told["profile of subsurface_fraction"]
-    assert max(row["likelihood"] for row in curve.values() if row["likelihood"]) <= 0.0
+    followed = [row["likelihood"] for row in curve.values()]
+    assert None not in followed
+    assert max(followed) == 0.0
     assert told["profile of subsurface_fraction: said"][0].startswith("subsurface_fraction is ")
     widths = told["next views"]["refractive_index"]
     assert widths["after 2"] < widths["after 1"] < widths["now"]

@@ -1,5 +1,6 @@
 """Profiles against closed forms, in words, and where they cannot be found."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -7,7 +8,8 @@ from identifiability.lines import ASKED, NOISE, PRIOR, line, line_capture, preci
 
 import polar_bayes as pb
 from polar_bayes.identifiability.curve import interval
-from polar_bayes.identifiability.tracking import FAINT
+from polar_bayes.identifiability.peak import pose
+from polar_bayes.identifiability.tracking import FAINT, split_density
 
 ZENITHS = np.array([20.0, 40.0, 60.0, 70.0])
 
@@ -59,6 +61,17 @@ def test_a_grid_of_ones_own_keeps_its_values() -> None:
     assert found["open_below"].all()
     said = pb.profile_sentences(found)
     assert said[0].startswith("level is flat: the data exclude nothing below as far as the grid")
+
+
+def test_what_is_known_beside_the_readings_is_of_the_likelihood() -> None:
+    question = pose(line_capture(ZENITHS), line, ASKED["scene"], None, None, None, 0)
+    z = jnp.array([0.3, -0.2])
+    bare = split_density(question.program, (), z, question.data)
+    told = split_density(question.program, ("level", "dark_level"), z, question.data)
+    level = question.program.unravel(z)["level"]
+    known = -0.5 * (level / PRIOR) ** 2 - np.log(PRIOR * np.sqrt(2.0 * np.pi))
+    np.testing.assert_allclose(told.likelihood - bare.likelihood, known, rtol=1e-5)
+    np.testing.assert_allclose(sum(told), sum(bare), rtol=1e-5)
 
 
 def test_a_gap_is_left_out_and_counted(slope: xr.Dataset) -> None:
