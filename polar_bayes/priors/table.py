@@ -16,6 +16,7 @@ from numpyro import distributions as dist
 from polar_bayes.cards import Card, Grid
 from polar_bayes.physics.notation import notation
 from polar_bayes.priors.describe import describe_prior
+from polar_bayes.priors.half_normal import HalfNormal
 
 
 class Beta(dist.Beta):
@@ -107,7 +108,7 @@ _ROWS: dict[str, dist.Distribution] = {
     # The instrument: what a careful set-up leaves unknown.
     "dolp_gain": Beta(10.0, 1.5),
     "channel_gain_ratio": dist.LogNormal(0.0, 0.1),
-    "leakage": dist.HalfNormal(0.01),
+    "leakage": HalfNormal(0.01),
     "dark_level": dist.Normal(0.0, 0.001),
     "angle_zero": dist.Normal(0.0, 0.75),
     "beam_overlap_zenith": dist.TruncatedNormal(80.0, 5.0, low=45.0, high=89.0),

@@ -1,0 +1,86 @@
+"""A half-normal prior in its normal score: against fifty digits, and far out in both tails."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from numpyro import distributions as dist
+from numpyro.distributions import biject_to
+
+from polar_bayes.priors import PRIORS
+from polar_bayes.priors.half_normal import HalfNormal, folded, unfolded
+
+SCALE = 0.01
+SCORES = (-37.0, -20.0, -9.0, -5.0, -1.0, -1e-3, 0.0, 1e-3, 1.0, 5.0, 9.0, 20.0, 36.0)
+REACH = {np.float64: 38.0, np.float32: 12.5}
+"""Scores whose tails are numbers in a precision; those beyond are far out."""
+
+FAR = (-1e3, -60.0, -39.0, 38.0, 39.0, 60.0, 1e3)
+
+
+def value_in_digits(z: float) -> mpmath.mpf:
+    """The half-normal value x with 1 - Phi(x) = (1 - Phi(z)) / 2, to fifty digits."""
+    with mpmath.workdps(50):
+        wanted = mpmath.erfc(mpmath.mpf(z) / mpmath.sqrt(2)) / 2
+        low, high = mpmath.mpf(0), mpmath.mpf(50)
+        for _ in range(250):  # halvings, to fifty digits of 1e-19
+            middle = (low + high) / 2
+            above = mpmath.erfc(middle / mpmath.sqrt(2)) > wanted
+            low, high = (middle, high) if above else (low, middle)
+        return high
+
+
+@pytest.mark.parametrize(
+    ("z", "dtype"),
+    [(z, dtype) for z in SCORES for dtype in (np.float64, np.float32) if abs(z) < REACH[dtype]],
+)
+def test_values_and_slopes_agree_with_fifty_digits(z: float, dtype: type) -> None:
+    """The error of a score is that of its rounding, z dz relative in its value."""
+    given = dtype(z)
+    if z > -9.0:
+        exact = value_in_digits(float(given))
+    else:  # the value is its tail probability, to all digits
+        exact = mpmath.sqrt(mpmath.pi / 2) * mpmath.ncdf(float(given))
+    slope = mpmath.exp((exact**2 - mpmath.mpf(float(given)) ** 2) / 2) / 2
+    allowed = 30.0 * float(np.finfo(dtype).eps) * max(1.0, z**2)
+    assert float(folded(jnp.asarray(given))) == pytest.approx(float(exact), rel=allowed)
+    assert float(jax.grad(folded)(jnp.asarray(given))) == pytest.approx(float(slope), rel=allowed)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("z", [*SCORES, *FAR])
+def test_what_is_far_out_is_finite_and_comes_back(z: float, dtype: type) -> None:
+    """Value, gradient and Hessian of the density of a score; where the value is not yet zero."""
+    move = biject_to(HalfNormal(SCALE).support)
+
+    def log_density(z: jax.Array) -> jax.Array:
+        value = move(z)  # may be zero, of which NumPyro's own density warns
+        own = 0.5 * jnp.log(2.0 / jnp.pi) - jnp.log(SCALE) - 0.5 * (value / SCALE) ** 2
+        return own + move.log_abs_det_jacobian(z, value)
+
+    at = jnp.asarray(z, dtype)
+    normal = -0.5 * np.log(2.0 * np.pi) - 0.5 * float(at) ** 2
+    rounding = 40.0 * float(np.finfo(dtype).eps) * (1.0 + z**2)
+    assert float(log_density(at)) == pytest.approx(normal, abs=rounding)
+    assert np.isfinite([jax.grad(log_density)(at), jax.grad(jax.grad(log_density))(at)]).all()
+    value = folded(at)
+    if value > np.finfo(dtype).tiny:
+        assert float(unfolded(value)) == pytest.approx(z, abs=40.0 * rounding / (1.0 + abs(z)))
+
+
+def test_scores_of_draws_are_standard_normal() -> None:
+    """Mean, variance and every tenth of 20,000, within 4 standard errors."""
+    drawn = HalfNormal(SCALE).sample(jax.random.key(3), (20_000,))
+    scores = np.asarray(biject_to(HalfNormal(SCALE).support).inv(drawn))
+    assert abs(scores.mean()) < 4.0 / 20_000**0.5
+    assert abs(scores.var() - 1.0) < 4.0 * (2.0 / 20_000) ** 0.5
+    shares = np.arange(0.1, 0.95, 0.1)
+    below = [(scores < dist.Normal().icdf(share)).mean() for share in shares]
+    assert (np.abs(below - shares) < 4.0 * np.sqrt(shares * (1 - shares) / 20_000)).all()
+
+
+def test_the_table_samples_leakage_so() -> None:
+    assert PRIORS["leakage"].support.eq(HalfNormal(SCALE).support)
+    assert not PRIORS["leakage"].support.eq(HalfNormal(0.02).support)
+    assert PRIORS["leakage"].support(jnp.array([0.0, 1e-9, 1.0])).tolist() == [False, True, True]
