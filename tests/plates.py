@@ -9,6 +9,10 @@ import polar_bayes as pb
 PLATE = pb.Scene(surface=pb.SmoothSurface(), subsurface=pb.Unpolarized(), mixing=pb.StokesMixing())
 LINKS = {"q": pb.StokesLink(stated_errors=True)}
 
+GONIOMETER = {"scene": "goniometer", "links": pb.SETUPS["goniometer"].links}
+GONIOMETER_VIEWS = np.arange(12.0, 79.0, 3.0)
+"""How and where a plate on a goniometer is read, with all that is unknown of the instrument."""
+
 
 def plate_capture(zeniths: np.ndarray, error: float, seed: int) -> xr.Dataset:
     """A plate of index 1.5 and fraction 0.02, with normal errors of q."""

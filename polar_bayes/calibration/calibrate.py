@@ -11,7 +11,7 @@ from dask.base import tokenize
 from numpyro import distributions as dist
 
 from polar_bayes.calibration.block import Block, Method, Plan, cut, fit_block, join
-from polar_bayes.calibration.one_by_one import has_further_axes
+from polar_bayes.calibration.one_by_one import calls_for_chains
 from polar_bayes.calibration.question import question_of
 from polar_bayes.calibration.result import assemble
 from polar_bayes.calibration.store import Store
@@ -72,8 +72,9 @@ def calibrate(
             default for one material in one color), "nuts" (chains that begin at such draws), or
             what begins at one mode: "importance" (the normal approximation, its draws weighed by
             the posterior, corrected as in maps), "laplace" (the same unweighed). Where the capture
-            has patches, materials or wavelengths the default is "nuts", and these chains are those
-            of `polar_bayes.fit`. Or settings, those of `polar_bayes.fit` (`Nuts`, `Laplace`) too.
+            has patches, materials or wavelengths, or the scene a discrepancy, the default is
+            "nuts", and these chains are those of `polar_bayes.fit`. Or settings, those of
+            `polar_bayes.fit` (`Nuts`, `Laplace`) too.
         scene: A name, a `Scene` or None.
         priors: Overrides.
         links: One link, a mapping or None.
@@ -113,7 +114,6 @@ def calibrate(
         raise FitError(
             f"simulations is {simulations}", where="calibrate", mend=f"give {FEWEST} or more"
         )
-    settings = _settings(method, capture)
     asked = {"model": model, "scene": scene, "priors": priors, "links": links}
     strange = set(truth or {}) - set(asked)
     if strange:
@@ -126,6 +126,7 @@ def calibrate(
         _resolved(capture, {**asked, **differing}, largest_view_zenith, seed)
         for differing in ({}, truth or {})
     )
+    settings = _settings(method, request)
     clock = time.perf_counter()
     plan = planned(request, told if truth else None, settings, readings)
     if not plan.shared:
@@ -148,10 +149,10 @@ def calibrate(
     return assemble(plan.program, request, plan.data, join(found, simulations), about)
 
 
-def _settings(method: str | Method | None, capture: xr.Dataset) -> Method:
+def _settings(method: str | Method | None, request: Request) -> Method:
     if isinstance(method, Method):
         return method
-    if has_further_axes(capture) and method in (None, "nuts"):
+    if calls_for_chains(request) and method in (None, "nuts"):
         return Nuts()
     if method is None:
         return METHODS["tempered"]

@@ -8,7 +8,6 @@ import dataclasses
 
 import jax
 import numpy as np
-import xarray as xr
 from jaxtyping import Array
 
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT, SMALLEST_ESS
@@ -20,8 +19,10 @@ from polar_bayes.inference.mixing import measure
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.prepared import Prepared
 from polar_bayes.inference.program import Program, Values
+from polar_bayes.inference.request import Request
 from polar_bayes.inference.tracing import TRACING
 from polar_bayes.observation.data import READINGS, Observations
+from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.pixels.importance import smooth
 from polar_bayes.pixels.outcome import Approach, Describe, Outcome, Status, no_outcome
 from polar_bayes.pixels.stack import Stack
@@ -32,22 +33,22 @@ BLOCK = 4
 """Simulations of a block: few, since each may take half a minute."""
 
 
-def has_further_axes(capture: xr.Dataset) -> bool:
-    """Whether a capture has several patches, materials or wavelengths.
+def calls_for_chains(request: Request) -> bool:
+    """Whether the posteriors of a capture are out of reach of weighted draws.
 
     Args:
-        capture: As a caller gives it.
+        request: What is to be fitted, checked.
 
     Returns:
-        False where any model of it is that of a pixel.
+        True with several patches, materials or wavelengths, and with a discrepancy: their
+        unknowns are so many that mixtures fitted to a crowd may be worth a few draws.
 
     Raises:
         Nothing.
     """
-    if not isinstance(capture, xr.Dataset):
-        return False  # which is refused elsewhere, in words
-    read = [capture[name].sizes for name in READINGS if name in capture]
-    return any(dim != "view" and length > 1 for sizes in read for dim, length in sizes.items())
+    read = [request.capture[name].sizes for name in READINGS if name in request.capture]
+    several = any(dim != "view" and length > 1 for sizes in read for dim, length in sizes.items())
+    return several or request.scene.has(Discrepancy)
 
 
 def fit_each(

@@ -228,8 +228,7 @@ def _fit_beside(
     request: Request, method: Method, data: Observations, key: Array, progress: Progress
 ) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
     """Posteriors of the same fit without what makes its intervals honest, and which ones failed."""
-    terms = () if request.scene.instrument is None else request.scene.instrument.terms
-    if isinstance(method, point.Point) or not any(isinstance(term, Discrepancy) for term in terms):
+    if isinstance(method, point.Point) or not request.scene.has(Discrepancy):
         return {}, {}
     scenes = {
         "without_discrepancy": request.scene.without(Discrepancy),

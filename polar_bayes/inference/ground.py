@@ -145,6 +145,7 @@ class PatchGround(AbstractGround):
             metric=np.eye(size, dtype=dtype) if few else np.ones(size, dtype),
             place=self._place,
             acceptance=0.98 if few else 0.7,
+            warmup=300 if few else 150,
         )
 
     @override

@@ -58,7 +58,7 @@ class Nuts(Carded):
     chains: int = 4
     warmup: int | None = None
     draws: int = 500
-    most_draws: int = 4000
+    most_draws: int = 8000
     effective_draws: float = 450.0
     target_acceptance: float | None = None
     max_tree_depth: int = 8
@@ -112,6 +112,7 @@ class Target(NamedTuple):
         metric: Covariance, (size, size), to begin with; or variances, (size,), to stay with.
         place: From vectors (chain, draw, size) to the model's unconstrained coordinates.
         acceptance: What to aim at where the settings leave it open.
+        warmup: Draws spent on step size and metric where the settings leave them open.
     """
 
     samplers: "Samplers"
@@ -121,6 +122,7 @@ class Target(NamedTuple):
     metric: np.ndarray
     place: Callable[[np.ndarray], np.ndarray]
     acceptance: float = 0.9
+    warmup: int = 300
 
     @property
     def knows_its_metric(self) -> bool:
@@ -194,9 +196,8 @@ def sample(
 
 def _warmup(settings: Nuts, target: Target) -> tuple[int, float]:
     """Length and goal of the warm-up, where the settings leave them open."""
-    usual = 150 if target.knows_its_metric else 300
     return (
-        usual if settings.warmup is None else settings.warmup,
+        target.warmup if settings.warmup is None else settings.warmup,
         target.acceptance if settings.target_acceptance is None else settings.target_acceptance,
     )
 

@@ -184,6 +184,22 @@ class Scene(Carded):
         dop = degree_of_linear_polarization(q, u)
         return {"dop": dop, "q": q, "u": u, "intensity": intensity}
 
+    def has(self, term: type[AbstractInstrumentTerm]) -> bool:
+        """Whether the instrument has such a term.
+
+        Args:
+            term: Class of the term, such as DarkLevel.
+
+        Returns:
+            False too where there is no instrument.
+
+        Raises:
+            Nothing.
+        """
+        return self.instrument is not None and any(
+            isinstance(part, term) for part in self.instrument.terms
+        )
+
     def without(self, term: type[AbstractInstrumentTerm]) -> "Scene":
         """The same scene with one instrument term removed.
 

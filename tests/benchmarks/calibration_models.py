@@ -3,6 +3,7 @@
     python tests/benchmarks/calibration_models.py material 3000        so many simulations
     python tests/benchmarks/calibration_models.py hierarchical         200 of them
     python tests/benchmarks/calibration_models.py spectral
+    python tests/benchmarks/calibration_models.py goniometer 40
     python tests/benchmarks/calibration_models.py links --keep FOLDER  kept there, and gone on with
 
 `material`: one material of the paper's scene, 40 views of the degree of polarization and of
@@ -10,7 +11,8 @@ intensity, by tempered draws. `links`: the same, 16 views, each way in which rea
 by tempered draws and by chains. `hierarchical`: 4 smooth plates, 6 views of q with stated errors,
 indices and fractions from one population. `spectral`: a smooth plate in 4 colors, 6 views of q,
 index a Gaussian process over wavelength. Both by `pb.Nuts()`. `rough-hierarchical` and
-`rough-spectral`: the same axes by the paper's scene, 16 views; minutes for each fit. The paper's
+`rough-spectral`: the same axes by the paper's scene, 16 views; minutes for each fit. `goniometer`:
+a plate by the scene of that name, 23 views of q, eleven unknowns, by both methods. The paper's
 scene has four facets on the way out here; priors are the default ones. Prints the joint verdict,
 the table, what became of the fits, and seconds.
 """
@@ -31,7 +33,7 @@ import pandas as pd
 import xarray as xr
 from one_material import SCENE, layout
 from patches import patch_capture
-from plates import LINKS, PLATE, plates
+from plates import GONIOMETER, GONIOMETER_VIEWS, LINKS, PLATE, plate_capture, plates
 from spectral_plates import spectral_plate
 
 import polar_bayes as pb
@@ -98,6 +100,12 @@ def spectral() -> Asked:
     yield "a plate in 4 colors, 6 views", capture, SMOOTH | {"model": "gp_spectral"}
 
 
+def goniometer() -> Asked:
+    capture = plate_capture(GONIOMETER_VIEWS, ERROR, seed=1)
+    for name, method in {"tempered": "tempered", "pb.Nuts()": pb.Nuts()}.items():
+        yield f"a plate on a goniometer, {name}", capture, GONIOMETER | {"method": method}
+
+
 def rough_hierarchical() -> Asked:
     capture = patch_capture(np.full(4, 1.45), views=VIEWS)
     yield "4 patches, 16 views", capture, ROUGH | {"model": "hierarchical"}
@@ -112,6 +120,7 @@ EVERY = {
     "links": links,
     "hierarchical": hierarchical,
     "spectral": spectral,
+    "goniometer": goniometer,
     "rough-hierarchical": rough_hierarchical,
     "rough-spectral": rough_spectral,
 }

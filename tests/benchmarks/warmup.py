@@ -2,9 +2,11 @@
 
     python tests/benchmarks/warmup.py                      300 (the default), 200 and 100 draws
     python tests/benchmarks/warmup.py --lengths 300 250 --cases "leaf, 40 views"
+    python tests/benchmarks/warmup.py --lengths 300 600 --seeds 8 --cases "goniometer, 23 views"
 
 The scenes are those of `accuracy_scenes.py`, each with other readings for every seed; then glass
-plates of two and of four materials by the hierarchical model. A row is of all seeds together:
+plates of two and of four materials by the hierarchical model, one on a goniometer with all that is
+unknown there, and a leaf in three colors. A row is of all seeds together:
 parameters, gradients of the warm-up and of the draws (in thousands, mean), draws a chain (mean),
 effective draws for a thousand gradients (least of all parameters, warm-up included, mean), the
 worst R-hat, bulk and tail effective sample size, all divergences, fits whose goals were not
@@ -26,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 import xarray as xr
 from accuracy_scenes import CASES
-from plates import LINKS, PLATE, plates
+from plates import GONIOMETER, GONIOMETER_VIEWS, LINKS, PLATE, plate_capture, plates
 
 import polar_bayes as pb
 from polar_bayes.inference.mixing import measure, standard_errors
@@ -46,6 +48,11 @@ FITS: Mapping[str, Asked] = {
         name: (case.capture, {"scene": case.scene, "links": case.links})
         for name, case in CASES.items()
     },
+    "goniometer, 23 views": (
+        lambda seed: plate_capture(GONIOMETER_VIEWS, 0.02, seed=seed),
+        GONIOMETER,
+    ),
+    "leaf in three colors": (lambda seed: pb.simulate("leaf", seed=seed), {}),
     "two glasses": population(TWO),
     "four glasses": population(FOUR),
 }

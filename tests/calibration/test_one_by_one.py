@@ -10,9 +10,11 @@ import pytest
 import xarray as xr
 from numpyro import distributions as dist
 from plates import LINKS, PLATE, plate_capture, plates
+from spectral_plates import spectral_plate
 
 import polar_bayes as pb
 from polar_bayes.calibration import one_by_one
+from polar_bayes.calibration.block import Method
 from polar_bayes.calibration.calibrate import METHODS, _settings
 from polar_bayes.errors import FitError
 from polar_bayes.inference import anchoring
@@ -141,13 +143,22 @@ def test_fits_without_draws_are_counted(
     assert (table["failed"] == lost.sum()).all()
 
 
-def test_nuts_by_name_is_that_of_a_pixel_where_there_is_but_one(capture: xr.Dataset) -> None:
+def test_chains_are_those_of_a_fit_where_weighted_draws_do_not_reach(capture: xr.Dataset) -> None:
     one = plate_capture(np.linspace(30.0, 75.0, 6), 0.02, seed=1)
-    colors = one.expand_dims(wavelength=[450.0, 650.0])
-    assert _settings("nuts", one) == METHODS["nuts"]
-    assert _settings("nuts", capture) == pb.Nuts()
-    assert _settings("nuts", colors) == pb.Nuts()
-    assert _settings(SHORT, one) == SHORT
+    colors = spectral_plate({450.0: 1.5, 650.0: 1.5}, error=0.02, seed=1)
+
+    def taken(
+        method: str | Method | None, capture: xr.Dataset, scene: str | pb.Scene = PLATE
+    ) -> Method:
+        request = resolve(capture, "per_material", "laplace", scene, None, LINKS, None, 0, "double")
+        return _settings(method, request)
+
+    assert taken(None, one) == METHODS["tempered"]
+    assert taken("nuts", one) == METHODS["nuts"]
+    for many in ((capture,), (colors,), (one, "goniometer")):
+        assert taken(None, *many) == taken("nuts", *many) == pb.Nuts()
+        assert taken("tempered", *many) == METHODS["tempered"]
+    assert taken(SHORT, one) == SHORT
 
 
 def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:

@@ -176,7 +176,7 @@ def test_each_tempered_fit_counts_for_itself_with_the_same_programs():
 def test_draws_are_scaled_and_settings_kept():
     assert with_draws(pb.Laplace(draws=500), 2.0) == pb.Laplace(draws=1000)
     chains = with_draws(pb.Nuts(warmup=77), 2.0)
-    assert (chains.draws, chains.most_draws, chains.effective_draws) == (1000, 8000, 900.0)
+    assert (chains.draws, chains.most_draws, chains.effective_draws) == (1000, 16000, 900.0)
     assert chains.warmup == 77
     tempered = with_draws(pb.Tempered(pb.PixelTempering(draws=4096)), 4.0).settings
     assert (tempered.draws, tempered.effective_draws) == (16384, 800.0)

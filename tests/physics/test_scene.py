@@ -9,6 +9,7 @@ import pytest
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.dispersion import Cauchy
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
@@ -149,6 +150,8 @@ def test_a_term_removed_is_absent_from_the_program(term: AbstractInstrumentTerm)
     rest = tuple(part for part in scene.instrument.terms if part != term)
     never_there = Scene(scene.surface, scene.subsurface, scene.mixing, instrument=Instrument(rest))
     removed = scene.without(type(term))
+    assert scene.has(type(term))
+    assert not removed.has(type(term))
     assert operations(removed) == operations(never_there)
     assert len(operations(removed)) < len(operations(scene))
     assert not set(term.parameters) & set(removed.parameters)
@@ -168,6 +171,7 @@ def test_a_part_switched_off_costs_no_operation() -> None:
     for term in whole.instrument.terms:
         emptied = emptied.without(type(term))
     assert emptied.instrument is None
+    assert not emptied.has(Discrepancy)
     assert flops(emptied) == flops(Scene(whole.surface, whole.subsurface, whole.mixing))
 
 
