@@ -15,6 +15,9 @@ RESOLVED = 2.0
 MUCH = 2.0
 """Times faster, from which a method is worth taking for most parameters alone."""
 
+ALIKE = 1.2
+"""Times faster, below which two times are the same: they differ so from run to run."""
+
 TOLERANCE = 0.1
 TIMES = ("seconds_first", "seconds_again")
 
@@ -203,7 +206,9 @@ def _advice(table: pd.DataFrame, errors: pd.DataFrame, tolerance: float) -> str:
     slower = table[good & table.index.str.startswith("nuts") & (seconds > seconds[fastest])]
     if len(slower):
         other = str(seconds[slower.index].idxmin())
-        said += f" and {seconds[other] / seconds[fastest]:.2g} times faster than {other}"
+        times = seconds[other] / seconds[fastest]
+        faster = f"{times:.2g} times faster than" if times >= ALIKE else "as fast as"
+        said += f" and {faster} {other}"
     return f"{said}; use it."
 
 

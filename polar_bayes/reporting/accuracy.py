@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import NullFormatter, StrMethodFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from matplotlib.transforms import Bbox
 
 from polar_bayes.budget.accuracy import AS_GIVEN
@@ -53,6 +53,9 @@ AROUND = (
     (-6, -18),
 )
 """Where a label may stand beside its point, unit point; the first free place is taken."""
+
+NEAR = 8
+"""Unit point: a label that is higher or lower has a line to its point."""
 
 TIME_LABELS = {
     "seconds_first": "time of a first fit, compilation included [s]",
@@ -147,6 +150,7 @@ def front_panel(axes: Axes, found: xr.Dataset, time: str) -> None:
         )
     _limits(axes, known, time, noise)
     axes.set_xlabel(TIME_LABELS[time])
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # often less than a decade
     for axis in (axes.xaxis, axes.yaxis):  # the style reads no formulas
         axis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axis.set_minor_formatter(NullFormatter())
@@ -196,6 +200,9 @@ def _name_points(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, s
             va="center",
             fontsize=8,
             color=colors[name],
+            arrowprops={"arrowstyle": "-", "color": colors[name], "lw": 0.6}
+            if abs(up) > NEAR
+            else None,
             path_effects=[withStroke(linewidth=2.5, foreground=paper())],
         )
 

@@ -52,6 +52,15 @@ def test_a_cheap_method_that_is_good_for_all_is_advised_without_reserve():
     )
 
 
+def test_times_that_hardly_differ_are_alike():
+    rows = ROWS | {("nuts long", "as given"): ([0.02, 0.01, 0.01], 31.0, 9.0)}
+    rows |= {("nuts", "as given"): ([0.05, 0.02, 0.02], 30.0, 9.0)}
+    rows |= {("laplace", "as given"): ([0.4, 0.3, 0.3], 30.0, 9.0)}
+    assert pb.accuracy_advice(make_accuracy(rows)) == (
+        "nuts is within 0.05 sd here and as fast as nuts long; use it."
+    )
+
+
 def test_a_smaller_tolerance_asks_for_more():
     assert pb.accuracy_advice(make_accuracy(), tolerance=0.03) == (
         "nuts is within 0.03 sd here and 3.3 times faster than nuts long, but for "

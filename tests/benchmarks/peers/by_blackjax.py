@@ -7,13 +7,10 @@ from typing import Any
 import blackjax
 import jax
 import numpy as np
-import numpyro
 from posterior import CHAINS, AbstractPeer, Round
 
 WARMUP = 1000
 DRAWS = 500
-
-numpyro.set_host_device_count(CHAINS)  # a device for each chain, before the first array
 
 
 class Peer(AbstractPeer):

@@ -1,17 +1,14 @@
-"""NumPyro with its defaults: NUTS, a diagonal metric, a warm-up of 1000, four chains at once."""
+"""NumPyro with its defaults: NUTS, diagonal metric, warm-up of 1000, a device for each chain."""
 
 from collections.abc import Iterator
 
 import jax
 import numpy as np
-import numpyro
 from numpyro.infer import MCMC, NUTS
 from posterior import CHAINS, AbstractPeer, Posterior, Round
 
 WARMUP = 1000
 DRAWS = 1000
-
-numpyro.set_host_device_count(CHAINS)  # before the first array
 
 
 class Peer(AbstractPeer):

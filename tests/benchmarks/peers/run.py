@@ -42,6 +42,8 @@ from polar_bayes.inference.mixing import measure
 PEERS = (
     "polar_bayes", "tempering", "numpyro", "blackjax", "pymc", "emcee", "bumps", "scipy",
 )  # fmt: skip
+DEVICE_EACH = ("numpyro", "blackjax")
+"""Whose guides ask for a device for each chain, which is set before JAX is imported."""
 LARGEST_R_HAT, LEAST_WORTH = 1.01, 400.0
 PATIENCE = 4
 """Limits after which a process is stopped: a round that has begun may take longer than its time."""
@@ -130,6 +132,7 @@ def main(names: list[str], limit: float) -> None:
             command = [sys.executable, __file__, "--one", name, "--folder", path]
             command += ["--limit", str(limit), "--began", str(time.time())]
             quiet = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+            quiet |= {"JAX_NUM_CPU_DEVICES": "4"} if name in DEVICE_EACH else {}
             try:
                 done = subprocess.run(
                     command, env=quiet, capture_output=True, text=True, timeout=PATIENCE * limit
