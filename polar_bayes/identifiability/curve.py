@@ -16,6 +16,7 @@ from polar_bayes.identifiability.tracking import (
     slice_at,
 )
 from polar_bayes.inference.modes import Modes
+from polar_bayes.inference.tracing import compiled
 from polar_bayes.observation.data import Observations
 
 DROP = 1.92
@@ -63,10 +64,10 @@ def compile_density(split: Parts, data: Observations) -> Density:
         parts = split(z, data)
         return -(parts.likelihood + weight * parts.prior)
 
-    compiled = jax.jit(jax.value_and_grad(loss))
+    run = compiled(jax.value_and_grad(loss))
 
     def density(z: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
-        value, gradient = compiled(jnp.asarray(z), jnp.asarray(weight), data)
+        value, gradient = run(jnp.asarray(z), jnp.asarray(weight), data)
         return float(value), np.asarray(gradient, float)
 
     return density

@@ -28,6 +28,7 @@ from polar_bayes.identifiability.peak import (
 )
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.inference.tracing import compiled
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.notation import notation
@@ -114,7 +115,7 @@ def identify(
 def _expect(question: Question, z: np.ndarray) -> Expected:
     program = question.program
 
-    @jax.jit
+    @compiled
     def found(z: jax.Array, data: Observations) -> tuple:
         seen = look(program, z, data)
         return (

@@ -17,6 +17,7 @@ from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import posterior_of
 from polar_bayes.inference.search import find_modes, from_prior
+from polar_bayes.inference.tracing import compiled
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -139,7 +140,7 @@ def label_parameters(question: Question) -> Labels:
         Nothing.
     """
     program, data = question.program, question.data
-    told = jax.jit(jax.vmap(lambda z: program.parameters(z, data)))(question.prior)
+    told = compiled(jax.vmap(lambda z: program.parameters(z, data)))(question.prior)
     draws = {name: np.asarray(x)[None] for name, x in told.items()}
     found = scalars(with_labels(posterior_of(program, draws), question.request.capture))
     begins, begin = {}, 0

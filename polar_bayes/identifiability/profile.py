@@ -31,6 +31,7 @@ from polar_bayes.identifiability.peak import (
 )
 from polar_bayes.identifiability.tracking import make_follow, split_density
 from polar_bayes.inference.result import PROVENANCE, posterior_of
+from polar_bayes.inference.tracing import compiled
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, watched
@@ -189,11 +190,11 @@ def _coordinates_of(question: Question, place: Place, values: Sequence[float]) -
 def _assemble(question: Question, place: Place, curve: Curve) -> xr.Dataset:
     program, data = question.program, question.data
     labels = label_parameters(question)
-    told = jax.jit(jax.vmap(lambda z: flat_parameters(program, z, data)))
+    told = compiled(jax.vmap(lambda z: flat_parameters(program, z, data)))
     others = np.asarray(told(curve.at.reshape(-1, program.size))).reshape(*curve.value.shape, -1)
     others = others[..., labels.rows]
     grid = jnp.asarray(np.where(np.arange(program.size) == place.held, curve.z[:, None], 0.0))
-    values = jax.jit(jax.vmap(lambda z: jnp.ravel(program.constrain(z)[place.site])[place.entry]))
+    values = compiled(jax.vmap(lambda z: jnp.ravel(program.constrain(z)[place.site])[place.entry]))
     theta = np.asarray(values(grid))
     best = np.array([np.nanmax(row) if np.isfinite(row).any() else np.nan for row in curve.value])
     order = np.argsort(theta)

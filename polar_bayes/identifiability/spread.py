@@ -14,6 +14,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.identifiability.peak import Question
 from polar_bayes.inference.modes import Modes
 from polar_bayes.inference.program import Program
+from polar_bayes.inference.tracing import compiled
 
 FOLD = 7
 """Sets the key of these draws apart from that of the prior's."""
@@ -104,7 +105,7 @@ def unconstrain(
         return ravel_pytree(moved)[0]
 
     sites = {name: jnp.asarray(values[name]) for name in program.supports}
-    return np.asarray(jax.jit(jax.vmap(free))(sites))
+    return np.asarray(compiled(jax.vmap(free))(sites))
 
 
 def embed(program: Program, wide: Program) -> Int[np.ndarray, " size"]:

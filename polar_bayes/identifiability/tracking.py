@@ -22,6 +22,7 @@ from numpyro import distributions as dist
 from numpyro.infer.util import log_density
 
 from polar_bayes.inference.program import Program
+from polar_bayes.inference.tracing import compiled
 from polar_bayes.observation.data import Observations
 
 FAINT = 1e-3
@@ -174,4 +175,4 @@ def make_follow(split: Parts, index: int) -> Follow:
 
         return jax.lax.map(one, (starts, targets))
 
-    return jax.jit(follow)
+    return compiled(follow)

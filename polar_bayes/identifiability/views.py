@@ -43,6 +43,7 @@ from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.inference.search import from_prior
+from polar_bayes.inference.tracing import compiled
 from polar_bayes.observation.data import ANGLES, Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
@@ -254,10 +255,10 @@ def _design(
         slopes = jax.jacfwd(lambda z: flat_parameters(program, z, data))(z)
         return information_of_each(program, z, data, kept), slopes
 
-    run = jax.jit(lambda z, data: jax.lax.map(lambda one: told(one, data), z))
+    run = compiled(lambda z, data: jax.lax.map(lambda one: told(one, data), z))
     found, slopes = jax.tree.map(np.asarray, run(jnp.asarray(z), wide.data))
     curvature = np.asarray(
-        jax.jit(lambda z, data: prior_precision(program, z, data))(center, wide.data)
+        compiled(lambda z, data: prior_precision(program, z, data))(center, wide.data)
     )
     size, many = program.size, wide.data.shape[-1]
     by_view = {n: x.reshape(count, -1, many, size, size) for n, x in found.items()}

@@ -26,7 +26,9 @@ from polar_bayes.inference import point
 from polar_bayes.inference.bench import Bench
 from polar_bayes.inference.draws import parameters_of
 from polar_bayes.inference.ground import STARTS
+from polar_bayes.inference.laplace import Laplace
 from polar_bayes.inference.method import AbstractMethod
+from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.prepared import Prepared, prepare
 from polar_bayes.inference.program import Draw, Program
 from polar_bayes.inference.request import MODELS, Method, Request, resolve
@@ -114,6 +116,8 @@ def _run(request: Request, progress: Progress) -> xr.DataTree:
         jax.random.key(request.seed), 4
     )
     prepared = prepare(request, request.scene, data)
+    _expect(prepared, data, request.method)
+    _expect_draws(prepared.program, data)
     fitted = _fit_scene(request, prepared, data, key_main, progress, clock)
     describe = _per_draw(fitted.program)
     posterior = describe(key_posterior, fitted.z, data)
@@ -181,6 +185,22 @@ class _Clock:
         self._last = now
 
 
+def _expect(prepared: Prepared, data: Observations, method: Method) -> None:
+    """Begin to compile the sampler, beside the search."""
+    if isinstance(method, Nuts | Laplace):
+        prepared.grounds.expect(data, method)
+
+
+def _expect_draws(program: Program, data: Observations) -> None:
+    """Begin to compile what will describe them, beside the search and the sampler."""
+    keys = jax.random.key_data(jax.random.key(0))
+    program.described.begin(
+        jax.ShapeDtypeStruct((BLOCK, *keys.shape), keys.dtype),
+        jax.ShapeDtypeStruct((BLOCK, program.size), data.brightness.dtype),
+        data,
+    )
+
+
 def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], Draw]:
     """Describe every draw, a block at a time inside one compiled loop of fixed length."""
 
@@ -236,12 +256,14 @@ def _fit_beside(
     }
     beside: dict[str, xr.Dataset] = {}
     comparisons_failed: dict[str, str] = {}
+    every = {name: prepare(request, scene, data) for name, scene in scenes.items()}
+    for prepared in every.values():
+        _expect(prepared, data, method)
     for number, (name, scene) in enumerate(scenes.items()):
         progress("comparing", number / len(scenes))
         try:
-            prepared = prepare(request, scene, data)
             simpler = dataclasses.replace(request, scene=scene, method=method)
-            fitted = _fit_scene(simpler, prepared, data, key, silent, _Clock())
+            fitted = _fit_scene(simpler, every[name], data, key, silent, _Clock())
         except FitError as error:  # a failed comparison must not cost the user the fit, but is told
             comparisons_failed[name] = str(error)
             continue

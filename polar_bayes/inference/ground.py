@@ -164,6 +164,18 @@ class PatchGround(AbstractGround):
 class AbstractGrounds(abc.ABC):
     """The grounds of all captures of one layout."""
 
+    def expect(self, data: Observations, method: nuts.Nuts | laplace.Laplace) -> None:
+        """Begin to compile what the method will need, beside the search; where that is known.
+
+        Args:
+            data: A capture.
+            method: Settings.
+
+        Raises:
+            Nothing.
+        """
+        del data, method
+
     @abc.abstractmethod
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractGround:
         """Search for the peaks of one capture.
@@ -192,6 +204,21 @@ class WholeGrounds(AbstractGrounds):
     def guide(self) -> laplace.Guide:
         """The normal approximation."""
         return laplace.compiled_guide(self.program)
+
+    @override
+    def expect(self, data: Observations, method: nuts.Nuts | laplace.Laplace) -> None:
+        if not isinstance(method, nuts.Nuts):
+            return
+        nothing, size = np.zeros((1, self.program.size)), self.program.size
+        target = nuts.Target(
+            samplers=self.samplers,
+            given=data,
+            potential=lambda z: (0.0, z),
+            starts=nothing,
+            metric=np.eye(size),
+            place=lambda z: z,
+        )
+        nuts.expect(target, method)
 
     @override
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractGround:

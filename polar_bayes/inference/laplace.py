@@ -102,7 +102,7 @@ def compiled_guide(program: Program) -> Guide:
     Raises:
         Nothing.
     """
-    return TracedOnce(jax.jit(functools.partial(_guide, program)))
+    return TracedOnce(functools.partial(_guide, program))
 
 
 def _guide(

@@ -9,7 +9,7 @@ threads there are.
 
 import dataclasses
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +23,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.kept import Kept
 from polar_bayes.inference.mixing import measure
 from polar_bayes.inference.modes import Modes, ValueAndGradient
-from polar_bayes.inference.tracing import TRACING
+from polar_bayes.inference.tracing import TRACING, compile_beside, compiled
 
 Progress = Callable[[float], None]
 
@@ -149,15 +149,12 @@ def sample(
         which `n_steps` and `warmup_steps` count gradients; and whether the goals for mixing were
         reached before `most_draws`.
     """
-    warmup, acceptance = _warmup(settings, target)
-    fixed = _Fixed(
-        warmup, acceptance, settings.max_tree_depth, settings.block, target.knows_its_metric
-    )
-    sampler = target.samplers.of(fixed)
+    warmup, _ = _warmup(settings, target)
+    sampler = _sampler(target, settings)
     keys = jax.random.split(key, settings.chains)
     states = [sampler.begin(target, key, at) for key, at in zip(keys, target.starts, strict=True)]
     # Compiled before the threads start: all then share one executable.
-    advance = sampler.advance(states[0], target.given)
+    advance = sampler.advance(states[0], target.given).result()
 
     rounds: list[Step] = []
     steps_before = np.zeros(settings.chains, int)
@@ -192,6 +189,27 @@ def sample(
     stats["warmup_steps"] = np.broadcast_to(steps_before[:, None], z.shape[:2])
     stats["reached_max_treedepth"] = stats["n_steps"] >= 2**settings.max_tree_depth - 1
     return z, stats, mixed
+
+
+def expect(target: Target, settings: Nuts) -> None:
+    """Begin to compile what `sample` will need, beside whatever follows.
+
+    Args:
+        target: Its shapes are what counts, and which potential, starts and metric it has is not.
+        settings: What to do.
+
+    Raises:
+        Nothing.
+    """
+    sampler = _sampler(target, settings)
+    sampler.advance(sampler.begin(target, jax.random.key(0), target.starts[0]), target.given)
+
+
+def _sampler(target: Target, settings: Nuts) -> "_Sampler":
+    warmup, acceptance = _warmup(settings, target)
+    return target.samplers.of(
+        _Fixed(warmup, acceptance, settings.max_tree_depth, settings.block, target.knows_its_metric)
+    )
 
 
 def _warmup(settings: Nuts, target: Target) -> tuple[int, float]:
@@ -263,7 +281,7 @@ class _Sampler:
 
     def __init__(self, density: Callable[[Array, Any], Array], fixed: _Fixed) -> None:
         self.fixed = fixed
-        self._compiled: Callable | None = None
+        self._begun: Future | None = None
         self._init, self._next = infer.hmc.hmc(
             potential_fn_gen=lambda given: lambda z: density(z, given), algo="NUTS"
         )
@@ -286,12 +304,12 @@ class _Sampler:
             rng_key=key,
         )
 
-    def advance(self, state: infer.hmc.HMCState, given: Any) -> Callable:
-        """From a state and the data to the state after a block and its steps, compiled."""
+    def advance(self, state: infer.hmc.HMCState, given: Any) -> Future:
+        """From a state and the data to the state after a block and its steps, being compiled."""
         with TRACING:
-            if self._compiled is None:
-                self._compiled = jax.jit(self._advance).lower(state, given).compile()
-            return self._compiled
+            if self._begun is None:
+                self._begun = compile_beside(compiled(self._advance), state, given)
+            return self._begun
 
     def _advance(self, state: infer.hmc.HMCState, given: Any) -> tuple[infer.hmc.HMCState, Step]:
         def step(state: infer.hmc.HMCState, _: None) -> tuple[infer.hmc.HMCState, Step]:

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 from collections.abc import Callable
 
-import jax
 from jaxtyping import Array
 
 from polar_bayes.inference import point
@@ -42,9 +41,7 @@ class Prepared:
     @functools.cached_property
     def least_squares(self) -> Callable[[Array, Observations], point.Estimate]:
         """The least squares from some starts, compiled."""
-        return TracedByShape(
-            jax.jit(lambda starts, data: point.estimate(self.program, data, starts))
-        )
+        return TracedByShape(lambda starts, data: point.estimate(self.program, data, starts))
 
 
 _KEPT: Kept[Prepared] = Kept(MOST_KEPT)

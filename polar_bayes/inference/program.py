@@ -155,7 +155,7 @@ class Program:
     @functools.cached_property
     def value_and_gradient(self) -> Callable[[Array, Observations], tuple[Array, Array]]:
         """The potential with its gradient, compiled."""
-        return TracedOnce(jax.jit(jax.value_and_grad(self.told_once)))
+        return TracedOnce(jax.value_and_grad(self.told_once))
 
     @functools.cached_property
     def drawn_from_prior(self) -> Callable[[np.ndarray, int, Observations], Array]:
@@ -171,28 +171,28 @@ class Program:
                 0, count, lambda i, z: z.at[i].set(self.from_prior(wrapped[i], data)), nothing
             )
 
-        return TracedOnce(jax.jit(draw))
+        return TracedOnce(draw)
 
     @functools.cached_property
-    def described(self) -> Callable[[Array, Array, Observations], Draw]:
+    def described(self) -> TracedByShape:
         """Many draws described, compiled; keys as the numbers that they hold, (draw, ...)."""
 
         def describe(keys: Array, z: Array, data: Observations) -> Draw:
             wrapped = jax.random.wrap_key_data(keys)
             return jax.lax.map(lambda kz: self.describe(kz[0], kz[1], data), (wrapped, z))
 
-        return TracedByShape(jax.jit(describe))
+        return TracedByShape(describe)
 
     @functools.cached_property
     def parameters_of_chains(self) -> Callable[[Array, Observations], dict[str, Array]]:
         """The parameters of chains of draws, (chain, draw, size), compiled."""
         over_draws = jax.vmap(self.parameters, in_axes=(0, None))
-        return TracedByShape(jax.jit(jax.vmap(over_draws, in_axes=(0, None))))
+        return TracedByShape(jax.vmap(over_draws, in_axes=(0, None)))
 
     @functools.cached_property
     def slopes(self) -> Callable[[Array], dict[str, Array]]:
         """Derivatives of the latent sites in the vector, compiled."""
-        return TracedOnce(jax.jit(jax.jacfwd(self.constrain)))
+        return TracedOnce(jax.jacfwd(self.constrain))
 
 
 def compile_program(model: Model, data: Observations) -> Program:

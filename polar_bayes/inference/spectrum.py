@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import bounds_of, provenance_of
+from polar_bayes.inference.tracing import compiled
 from polar_bayes.models.gp_spectral import GpSpectral
 from polar_bayes.models.spectra import SPECTRA, around, widening_of
 from polar_bayes.models.spectral_process import SpectralProcess
@@ -216,7 +217,7 @@ def _condition(
     if process.fits_length:
         draws["length"] = posterior[f"{name}_length"].transpose("chain", "draw").to_numpy().ravel()
     with jax.enable_x64(True):
-        found = jax.jit(lambda all_draws: jax.lax.map(one, all_draws, batch_size=BATCH))(draws)
+        found = compiled(lambda all_draws: jax.lax.map(one, all_draws, batch_size=BATCH))(draws)
     spectra = np.asarray(found, dtype)[..., again]
     return _label(spectra.reshape(*level.shape, new.size), level, new)
 

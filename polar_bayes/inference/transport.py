@@ -130,17 +130,17 @@ class Transport:
     @functools.cached_property
     def value_and_gradient(self) -> Callable[[Array, Anchored], tuple[Array, Array]]:
         """The potential with its gradient, compiled."""
-        return TracedOnce(jax.jit(jax.value_and_grad(self.told_once)))
+        return TracedOnce(jax.value_and_grad(self.told_once))
 
     @functools.cached_property
     def there(self) -> Callable[[Array, Anchored], Array]:
         """`to_program` without the volume, compiled."""
-        return TracedOnce(jax.jit(lambda w, given: self.to_program(w, given)[0]))
+        return TracedOnce(lambda w, given: self.to_program(w, given)[0])
 
     @functools.cached_property
     def back(self) -> Callable[[Array, Anchored], Array]:
         """`from_program`, compiled."""
-        return TracedOnce(jax.jit(self.from_program))
+        return TracedOnce(self.from_program)
 
     @functools.cached_property
     def chains_there(self) -> Callable[[Array, Anchored], Array]:
@@ -151,12 +151,12 @@ class Transport:
                 lambda chain: jax.lax.map(lambda x: self.to_program(x, given)[0], chain), w
             )
 
-        return TracedByShape(jax.jit(place))
+        return TracedByShape(place)
 
     @functools.cached_property
     def of_population(self) -> Callable[[Array, Array, Observations], tuple[Array, Array]]:
         """`population`, compiled."""
-        return TracedOnce(jax.jit(self.population))
+        return TracedOnce(self.population)
 
     def _prior(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """Minus the log prior density of all groups' coordinates."""

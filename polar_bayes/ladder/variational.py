@@ -169,4 +169,4 @@ def _fitter(program: Program, settings: AbstractGuide) -> Callable[..., Any]:
         return z, jnp.where(jnp.isnan(log_ratio), -jnp.inf, log_ratio), losses[-1]
 
     with TRACING:
-        return TracedOnce(jax.jit(run))
+        return TracedOnce(run)

@@ -101,4 +101,4 @@ def _looker(program: Program) -> Callable[[Array, Observations], Array]:
         return jax.lax.map(lambda z: -program.told_once(z, data), z, batch_size=SIDE_BY_SIDE)
 
     with TRACING:
-        return TracedOnce(jax.jit(look))
+        return TracedOnce(look)

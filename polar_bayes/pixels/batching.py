@@ -32,7 +32,6 @@ def batched(function: Callable, *, given: int = 0, side_by_side: int = CLIMBING)
     the batch are wanted, which comes before the batch. The others fill it up, and cost nothing.
     """
 
-    @jax.jit
     def run(*arguments: Any) -> Any:
         common, (wanted, own, shared, *states) = arguments[:given], arguments[given:]
         grouped = jax.tree.map(lambda x: x.reshape(-1, side_by_side, *x.shape[1:]), (own, states))
