@@ -256,15 +256,19 @@ def _fit_beside(
     }
     beside: dict[str, xr.Dataset] = {}
     comparisons_failed: dict[str, str] = {}
-    every = {name: prepare(request, scene, data) for name, scene in scenes.items()}
-    for prepared in every.values():
-        _expect(prepared, data, method)
-    for number, (name, scene) in enumerate(scenes.items()):
-        progress("comparing", number / len(scenes))
+    every: dict[str, Prepared] = {}
+    for name, scene in scenes.items():
         try:
-            simpler = dataclasses.replace(request, scene=scene, method=method)
-            fitted = _fit_scene(simpler, every[name], data, key, silent, _Clock())
+            every[name] = prepare(request, scene, data)
+            _expect(every[name], data, method)
         except FitError as error:  # a failed comparison must not cost the user the fit, but is told
+            comparisons_failed[name] = str(error)
+    for number, name in enumerate(every):
+        progress("comparing", number / len(every))
+        try:
+            simpler = dataclasses.replace(request, scene=scenes[name], method=method)
+            fitted = _fit_scene(simpler, every[name], data, key, silent, _Clock())
+        except FitError as error:
             comparisons_failed[name] = str(error)
             continue
         draws = parameters_of(fitted.program, fitted.z, data)

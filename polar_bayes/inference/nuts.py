@@ -202,7 +202,9 @@ def expect(target: Target, settings: Nuts) -> None:
         Nothing.
     """
     sampler = _sampler(target, settings)
-    sampler.advance(sampler.begin(target, jax.random.key(0), target.starts[0]), target.given)
+    if not sampler.is_begun:
+        state = sampler.begin(target, jax.random.key(0), target.starts[0])
+        sampler.advance(state, target.given)
 
 
 def _sampler(target: Target, settings: Nuts) -> "_Sampler":
@@ -285,6 +287,11 @@ class _Sampler:
         self._init, self._next = infer.hmc.hmc(
             potential_fn_gen=lambda given: lambda z: density(z, given), algo="NUTS"
         )
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether it is compiled, or being compiled."""
+        return self._begun is not None
 
     def begin(self, target: Target, key: Array, start: np.ndarray) -> infer.hmc.HMCState:
         value, gradient = target.potential(start)

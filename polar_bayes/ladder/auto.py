@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 import time
 from typing import Any, NamedTuple, override
 
@@ -119,8 +120,9 @@ class Auto(AbstractMethod):
                 break
             again = not again and np.isfinite(step.error)
             if again:
-                times = min(MARGIN * (step.error / self.tolerance) ** 2, MOST_TIMES)
-                more = with_draws(method, times)
+                times = MARGIN * (step.error / self.tolerance) ** 2
+                # Powers of two: of a layout, few numbers of draws are ever compiled.
+                more = with_draws(method, min(2.0 ** math.ceil(math.log2(times)), MOST_TIMES))
                 waiting[:0] = [] if more is None else [(name, more)]
         if best is None:
             raise FitError(
