@@ -15,7 +15,7 @@ import jax
 TRACING = threading.RLock()
 
 QUICK = {"xla_backend_optimization_level": 1}
-"""Of three levels: programs run as fast as with all, and compile in four fifths of the time."""
+"""Of three levels: fits run as fast as with all, first ones take three quarters of the time."""
 
 _BESIDE = ThreadPoolExecutor(1, "polar_bayes compiles")
 
