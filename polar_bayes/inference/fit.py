@@ -26,7 +26,6 @@ from polar_bayes.inference import point
 from polar_bayes.inference.bench import Bench
 from polar_bayes.inference.draws import parameters_of
 from polar_bayes.inference.ground import STARTS
-from polar_bayes.inference.laplace import Laplace
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.prepared import Prepared, prepare
@@ -187,7 +186,7 @@ class _Clock:
 
 def _expect(prepared: Prepared, data: Observations, method: Method) -> None:
     """Begin to compile the sampler, beside the search."""
-    if isinstance(method, Nuts | Laplace):
+    if isinstance(method, Nuts):
         prepared.grounds.expect(data, method)
 
 

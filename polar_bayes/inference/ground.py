@@ -164,8 +164,8 @@ class PatchGround(AbstractGround):
 class AbstractGrounds(abc.ABC):
     """The grounds of all captures of one layout."""
 
-    def expect(self, data: Observations, method: nuts.Nuts | laplace.Laplace) -> None:
-        """Begin to compile what the method will need, beside the search; where that is known.
+    def expect(self, data: Observations, method: nuts.Nuts) -> None:
+        """Begin to compile the sampler beside the search, where its shapes are known before it.
 
         Args:
             data: A capture.
@@ -206,15 +206,13 @@ class WholeGrounds(AbstractGrounds):
         return laplace.compiled_guide(self.program)
 
     @override
-    def expect(self, data: Observations, method: nuts.Nuts | laplace.Laplace) -> None:
-        if not isinstance(method, nuts.Nuts):
-            return
-        nothing, size = np.zeros((1, self.program.size)), self.program.size
+    def expect(self, data: Observations, method: nuts.Nuts) -> None:
+        size = self.program.size
         target = nuts.Target(
             samplers=self.samplers,
             given=data,
             potential=lambda z: (0.0, z),
-            starts=nothing,
+            starts=np.zeros((1, size)),
             metric=np.eye(size),
             place=lambda z: z,
         )

@@ -149,8 +149,8 @@ def sample(
         which `n_steps` and `warmup_steps` count gradients; and whether the goals for mixing were
         reached before `most_draws`.
     """
-    warmup, _ = _warmup(settings, target)
     sampler = _sampler(target, settings)
+    warmup = sampler.fixed.warmup
     keys = jax.random.split(key, settings.chains)
     states = [sampler.begin(target, key, at) for key, at in zip(keys, target.starts, strict=True)]
     # Compiled before the threads start: all then share one executable.

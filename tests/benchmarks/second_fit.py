@@ -17,9 +17,9 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-import jax
 import numpy as np
 import xarray as xr
+from compilations import compilations
 from plates import LINKS, PLATE, plate_capture, plates
 from spectral_plates import spectral_plate
 
@@ -51,22 +51,14 @@ FITS: dict[str, tuple[Callable[[int], xr.Dataset], Any, str]] = {
 
 
 def main() -> None:
-    compiled: list[str] = []
-
-    def listen(event: str, seconds: float, **about: object) -> None:
-        del seconds
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(str(about.get("fun_name")))
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
     print(f"{platform.machine()}, {os.cpu_count()} cores")
     print(f"{'':<24}{'first s':>9}{'programs':>10}{'second s':>10}{'programs':>10}")
     for title, (capture, model, method) in FITS.items():
         told = ""
         for seed in (1, 2):
-            compiled.clear()
-            start = time.perf_counter()
-            pb.fit(capture(seed), model=model, method=method, scene=PLATE, links=LINKS, seed=seed)
+            readings, start = capture(seed), time.perf_counter()
+            with compilations() as compiled:
+                pb.fit(readings, model=model, method=method, scene=PLATE, links=LINKS, seed=seed)
             told += f"{time.perf_counter() - start:>{9 if seed == 1 else 10}.1f}{len(compiled):>10}"
         print(f"{title:<24}{told}", flush=True)
 

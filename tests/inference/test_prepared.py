@@ -14,6 +14,7 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
+from compilations import compilations
 from numpyro import distributions as dist
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture, plates
@@ -65,16 +66,8 @@ def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Itera
 @pytest.fixture
 def compiled() -> Iterator[list[str]]:
     """What JAX compiles or reads from its cache, as it happens."""
-    found: list[str] = []
-
-    def listen(event: str, seconds: float, **about: object) -> None:
-        del seconds
-        if event == "/jax/core/compile/backend_compile_duration":
-            found.append(str(about.get("fun_name")))
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield found
-    jax.monitoring.unregister_event_duration_listener(listen)
+    with compilations() as found:
+        yield found
 
 
 SPECTRAL = pb.GpSpectral(coupled=("refractive_index",))

@@ -6,27 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import compilations
 
 import polar_bayes as pb
 from polar_bayes.inference.kept import Kept
 from polar_bayes.inference.tracing import TracedByShape, compile_beside, compiled
 
-SECONDS = "/jax/core/compile/backend_compile_duration"
-
 
 @pytest.fixture
 def programs() -> Iterator[list[str]]:
     """Names of the programs that are compiled meanwhile, in any thread."""
-    found: list[str] = []
-
-    def listen(event: str, seconds: float, **about: object) -> None:
-        del seconds
-        if event == SECONDS:
-            found.append(str(about.get("fun_name")))
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield found
-    jax.monitoring.unregister_event_duration_listener(listen)
+    with compilations() as found:
+        yield found
 
 
 def test_what_was_begun_is_compiled_once(programs: list[str]) -> None:

@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import jax
 import numpy as np
 from one_material import SCENE, layout
-from posterior import Posterior
+from posterior import CHAINS, Posterior
 
 import polar_bayes as pb
 from polar_bayes.inference.mixing import measure
@@ -132,7 +132,7 @@ def main(names: list[str], limit: float) -> None:
             command = [sys.executable, __file__, "--one", name, "--folder", path]
             command += ["--limit", str(limit), "--began", str(time.time())]
             quiet = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-            quiet |= {"JAX_NUM_CPU_DEVICES": "4"} if name in DEVICE_EACH else {}
+            quiet |= {"JAX_NUM_CPU_DEVICES": str(CHAINS)} if name in DEVICE_EACH else {}
             try:
                 done = subprocess.run(
                     command, env=quiet, capture_output=True, text=True, timeout=PATIENCE * limit

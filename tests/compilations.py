@@ -1,0 +1,21 @@
+"""What JAX compiles, counted by tests and benchmarks."""
+
+import contextlib
+from collections.abc import Iterator
+
+import jax
+
+
+@contextlib.contextmanager
+def compilations() -> Iterator[list[str]]:
+    """Names of the programs that are compiled or read from a cache meanwhile, in any thread."""
+    found: list[str] = []
+
+    def listen(event: str, seconds: float, **about: object) -> None:
+        del seconds
+        if event == "/jax/core/compile/backend_compile_duration":
+            found.append(str(about.get("fun_name")))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield found
+    jax.monitoring.unregister_event_duration_listener(listen)
