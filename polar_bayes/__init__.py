@@ -38,7 +38,7 @@ _HOMES = {
     "diagnostics.coverage": ("map_coverage",),
     "diagnostics.population": ("population_summary",),
     "diagnostics.stacking": ("stack_readings",),
-    "errors": ("CaptureError", "FitError", "PolarBayesError", "SceneError"),
+    "errors": ("CaptureError", "FitError", "OutputError", "PolarBayesError", "SceneError"),
     "identifiability.criteria": ("AOptimal", "DOptimal", "SingleParameter"),
     "identifiability.identify": ("identify",),
     "identifiability.profile": ("profile",),

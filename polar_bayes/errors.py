@@ -36,6 +36,10 @@ class FitError(PolarBayesError):
     """A model, prior, link or sampler setting cannot be used."""
 
 
+class OutputError(PolarBayesError):
+    """An output cannot be written where it was asked for, or would destroy what is there."""
+
+
 def one_line(text: str) -> str:
     """Text that stays on one line, whatever a file's names or attributes contain.
 

@@ -4,10 +4,10 @@ import pickle
 
 import pytest
 
-from polar_bayes.errors import CaptureError, FitError, PolarBayesError, SceneError
+from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
 
 
-@pytest.mark.parametrize("kind", [PolarBayesError, CaptureError, FitError, SceneError])
+@pytest.mark.parametrize("kind", [PolarBayesError, CaptureError, FitError, OutputError, SceneError])
 def test_an_error_arrives_as_it_was_sent(kind):
     sent = kind("it is\ntorn", where="view 3", mend="measure it again")
     came = pickle.loads(pickle.dumps(sent))

@@ -4,8 +4,8 @@ import os
 
 import xarray as xr
 
-from polar_bayes.capture.paths import existing_file
 from polar_bayes.errors import FitError
+from polar_bayes.paths import existing_file
 
 
 def is_accuracy(tree: object) -> bool:

@@ -15,11 +15,11 @@ from polar_bayes.calibration.one_by_one import calls_for_chains
 from polar_bayes.calibration.question import question_of
 from polar_bayes.calibration.result import assemble
 from polar_bayes.calibration.store import Store
-from polar_bayes.capture.paths import as_path
 from polar_bayes.errors import FitError
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.observation.links import AbstractLink
+from polar_bayes.paths import as_path
 from polar_bayes.physics.scene import Scene
 from polar_bayes.pixels.executors import as_completed, workers
 from polar_bayes.pixels.fitting import PixelLaplace, candidates_of

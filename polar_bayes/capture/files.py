@@ -1,14 +1,12 @@
 """Captures in netCDF files: read whole, written whole or not at all."""
 
 import os
-import tempfile
-from pathlib import Path
 
 import xarray as xr
 
-from polar_bayes.capture.paths import as_path, existing_file, system_error
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError
+from polar_bayes.paths import existing_file, replacing, system_error
 
 
 def load_capture(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -44,29 +42,17 @@ def load_capture(path: str | os.PathLike[str]) -> xr.Dataset:
 def save_capture(capture: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a capture to a netCDF-4 file.
 
-    It is written beside its place and then moved there, so a failure leaves what was there before.
+    It is written beside its place and then moved there, so a failure leaves what was there before
+    (`polar_bayes.paths.replacing`).
 
     Args:
         capture: The capture; it is validated first.
-        path: The file; an older one is replaced.
+        path: The file; an older one is replaced and its mode kept.
 
     Raises:
-        CaptureError: It is not a capture, or the file cannot be written.
+        CaptureError: It is not a capture.
+        OutputError: The file cannot be written, or is none that may be replaced.
     """
-    file = as_path(path, "capture")
     checked = validate(capture)
-    try:
-        if file.is_dir():
-            raise CaptureError("it is a folder", where=str(file), mend="give the path of a file")
-        with tempfile.TemporaryDirectory(dir=file.parent, prefix=".capture-") as folder:
-            unfinished = Path(folder) / "capture.nc"
-            checked.to_netcdf(unfinished, engine="netcdf4", format="NETCDF4")
-            unfinished.replace(file)
-    except FileNotFoundError as error:
-        mend = "make the folder first"
-        raise CaptureError("its folder is not there", where=str(file), mend=mend) from error
-    except OSError as error:
-        raise system_error(error, file) from error
-    except (RuntimeError, UnicodeError) as error:  # so the netCDF library tells of a full disk
-        mend = "check its name and the room on the disk"
-        raise CaptureError("it could not be written", where=str(file), mend=mend) from error
+    with replacing(path) as unfinished:
+        checked.to_netcdf(unfinished, engine="netcdf4", format="NETCDF4")

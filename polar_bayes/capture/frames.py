@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from polar_bayes.capture.paths import existing_file
 from polar_bayes.errors import CaptureError
+from polar_bayes.paths import existing_file
 
 Frame = str | os.PathLike[str] | np.ndarray
 

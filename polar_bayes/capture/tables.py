@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from polar_bayes.capture.paths import existing_file, system_error
 from polar_bayes.errors import CaptureError
+from polar_bayes.paths import existing_file, system_error
 
 LARGEST_FILE = 50_000_000  # bytes
 SEMICOLON, TABS, COMMA = re.compile(";"), re.compile(r"\t+"), re.compile(",")

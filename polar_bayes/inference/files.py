@@ -1,14 +1,12 @@
 """Results in netCDF files: one DataTree a file, whole or not at all."""
 
 import os
-import tempfile
-from pathlib import Path
 
 import xarray as xr
 
-from polar_bayes.capture.paths import as_path, existing_file, system_error
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.paths import existing_file, replacing, system_error
 
 
 def load_result(path: str | os.PathLike[str]) -> xr.DataTree:
@@ -48,21 +46,10 @@ def save_result(result: xr.DataTree, path: str | os.PathLike[str]) -> None:
 
     Args:
         result: A tree that `polar_bayes.fit` returned.
-        path: The file; an older one is replaced.
+        path: The file; an older one is replaced and its mode kept.
 
     Raises:
-        CaptureError: The file cannot be written.
-        FitError: Its folder is not there.
+        OutputError: The file cannot be written, or is none that may be replaced.
     """
-    file = as_path(path, "result")
-    try:
-        with tempfile.TemporaryDirectory(dir=file.parent, prefix=".result-") as folder:
-            unfinished = Path(folder) / "result.nc"
-            result.to_netcdf(unfinished, engine="netcdf4")
-            unfinished.replace(file)
-    except FileNotFoundError as error:
-        raise FitError(
-            "its folder is not there", where=str(file), mend="make the folder first"
-        ) from error
-    except OSError as error:
-        raise system_error(error, file) from error
+    with replacing(path) as unfinished:
+        result.to_netcdf(unfinished, engine="netcdf4")

@@ -4,9 +4,9 @@ import os
 
 import xarray as xr
 
-from polar_bayes.capture.paths import as_path
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.paths import as_path
 from polar_bayes.pixels.store import open_image
 
 MOST_BYTES = 2**31

@@ -15,9 +15,9 @@ import xarray as xr
 import zarr
 
 from polar_bayes.capture.files import load_capture
-from polar_bayes.capture.paths import as_path
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.observation.data import READINGS
+from polar_bayes.paths import as_path
 from polar_bayes.pixels.blocks import Plan, fit_block
 from polar_bayes.pixels.executors import as_completed, workers
 from polar_bayes.pixels.maps import blank, cut, fit_pixels, numbered_block, plan_map, said_of

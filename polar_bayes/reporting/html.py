@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from polar_bayes.budget.accuracy_files import is_accuracy
 from polar_bayes.budget.ledger import ledger_sentence
 from polar_bayes.calibration.files import is_calibration
-from polar_bayes.capture.paths import as_path
 from polar_bayes.diagnostics.convergence import judge, summary
 from polar_bayes.diagnostics.discrepancy import WITHOUT, compare_without
 from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars
@@ -24,6 +23,7 @@ from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import save_result
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.ladder.words import auto_sentences
+from polar_bayes.paths import as_path
 from polar_bayes.reporting import figures, sentences, tables
 from polar_bayes.reporting.accuracy_page import accuracy_section, render_accuracy
 from polar_bayes.reporting.calibration_page import render_calibration

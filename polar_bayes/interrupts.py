@@ -1,0 +1,41 @@
+"""What a program that is told to stop does before it ends: cleanups, newest first.
+
+A signal reaches the main thread while others are inside compiled code, which cannot be interrupted.
+The command line therefore ends the process at once (`polar_bayes.cli.entry`); whoever holds
+something that must not outlive the process (temporary files, child processes, a hidden cursor)
+registers its removal here for as long as it holds it.
+"""
+
+import contextlib
+import itertools
+import threading
+from collections.abc import Callable, Iterator
+
+_CLEANUPS: dict[int, Callable[[], str | None]] = {}
+_NUMBERS = itertools.count()
+_LOCK = threading.Lock()
+
+
+@contextlib.contextmanager
+def on_interrupt(cleanup: Callable[[], str | None]) -> Iterator[None]:
+    """Register a cleanup while the block runs; it may return a sentence for the user."""
+    with _LOCK:
+        number = next(_NUMBERS)
+        _CLEANUPS[number] = cleanup
+    try:
+        yield
+    finally:
+        with _LOCK:
+            _CLEANUPS.pop(number, None)
+
+
+def clean_up() -> list[str]:
+    """Run every cleanup, newest first, whatever the others do; returns their sentences."""
+    with _LOCK:
+        cleanups = [_CLEANUPS[number] for number in sorted(_CLEANUPS, reverse=True)]
+        _CLEANUPS.clear()
+    sentences = []
+    for cleanup in cleanups:
+        with contextlib.suppress(Exception):  # the process ends: nobody is left to mend it
+            sentences.append(cleanup())
+    return [sentence for sentence in sentences if sentence]

@@ -1,0 +1,184 @@
+"""Paths as users give them, and outputs that are written whole or not at all.
+
+Every output of the package goes through `replacing`: it never takes the place of an input, of a
+device or of a folder; it is written beside its place, synced to the disk, renamed, and the folder
+is synced. A process that dies at any moment leaves the older file or the new one, never a part.
+"""
+
+import contextlib
+import os
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from polar_bayes.errors import CaptureError, OutputError
+from polar_bayes.interrupts import on_interrupt
+
+PathLike = str | os.PathLike[str]
+
+UNFINISHED = ".polar-bayes-"
+"""Prefix of the folders in which unfinished outputs stand, beside their place."""
+
+
+def as_path(path: PathLike, what: str) -> Path:
+    """The path, not resolved, or a clear error when it is none.
+
+    Args:
+        path: Text or a path-like object.
+        what: What the path is for, such as "capture".
+
+    Raises:
+        CaptureError: It is empty, of another type, or holds a NUL.
+    """
+    try:
+        text = os.fspath(path)
+    except TypeError:
+        text = None
+    if not isinstance(text, str) or not text or "\0" in text:
+        raise CaptureError(f"{path!r} is not a path", where=what, mend="give the path of a file")
+    return Path(text)
+
+
+def existing_file(path: PathLike, what: str) -> Path:
+    """The path of a file that is there, not resolved.
+
+    Args:
+        path: Text or a path-like object.
+        what: What the path is for, such as "capture".
+
+    Raises:
+        CaptureError: Nothing is there, or it is a folder or a device, or it is empty.
+    """
+    file = as_path(path, what)
+    try:
+        if not file.exists():
+            raise CaptureError("there is no such file", where=str(file), mend="check the path")
+        if not file.is_file():
+            mend = "give the path of a file"
+            raise CaptureError("it is a folder or device", where=str(file), mend=mend)
+        if file.stat().st_size == 0:
+            raise CaptureError("the file is empty", where=str(file), mend="write it again")
+    except OSError as error:
+        raise system_error(error, file) from error
+    return file
+
+
+def system_error(error: OSError, path: Path) -> CaptureError:
+    """What the operating system said of an input, as one line."""
+    reason = (error.strerror or str(error)).lower()
+    return CaptureError(reason, where=str(path), mend="check the path, its rights and the disk")
+
+
+def check_output(path: PathLike, inputs: Iterable[PathLike] = ()) -> Path:
+    """Refuse an output that cannot be written, or must not be, before anything is computed.
+
+    Args:
+        path: The file to write; an older regular file there will be replaced.
+        inputs: Files that are read; none of them may be the output, under any name.
+
+    Returns:
+        The path, links followed: what a link points to is replaced, not the link.
+
+    Raises:
+        OutputError: It is one of the inputs, a folder or a device, or its folder is not there or
+            cannot be written.
+    """
+    try:
+        given = as_path(path, "output")
+    except CaptureError as error:
+        raise OutputError(error.what, where="output", mend=error.mend) from error
+    where = str(given)
+    try:
+        file = given.resolve(strict=False)
+        for each in inputs:
+            if is_same_place(file, Path(each)):
+                raise OutputError(
+                    "it is one of the inputs", where=where, mend="give another path to write"
+                )
+        if file.is_dir():
+            raise OutputError("it is a folder", where=where, mend="give the path of a file")
+        if file.exists() and not stat.S_ISREG(file.stat().st_mode):
+            raise OutputError("it is no regular file", where=where, mend="give the path of a file")
+        if not file.parent.is_dir():
+            raise OutputError("its folder is not there", where=where, mend="make the folder first")
+        with tempfile.TemporaryFile(dir=file.parent):
+            pass
+    except (OSError, RuntimeError) as error:  # RuntimeError: a circle of links
+        raise output_error(error, given) from error
+    return file
+
+
+def is_same_place(one: Path, other: Path) -> bool:
+    """Whether two paths name one file, by whatever links; neither has to be there."""
+    try:
+        return one.samefile(other)
+    except OSError:
+        return one.resolve() == other.resolve()
+
+
+def output_error(error: Exception, path: Path) -> OutputError:
+    """What the operating system or a library said of an output, as one line."""
+    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return OutputError(
+        f"it could not be written ({reason.lower()})",
+        where=str(path),
+        mend="check the path, its rights and the room on the disk",
+    )
+
+
+@contextlib.contextmanager
+def replacing(path: PathLike, inputs: Iterable[PathLike] = ()) -> Iterator[Path]:
+    """A path to write to, whose file takes the place of `path` when the block ends without error.
+
+    The file keeps the mode of the one that it replaces.
+
+    Args:
+        path: See `check_output`.
+        inputs: See `check_output`.
+
+    Yields:
+        A path in the same folder's file system, where nothing is yet.
+
+    Raises:
+        OutputError: See `check_output`; or it could not be written.
+    """
+    file = check_output(path, inputs)
+    try:
+        with unfinished_folder(file.parent) as folder:
+            unfinished = folder / file.name
+            yield unfinished
+            if file.exists():
+                unfinished.chmod(stat.S_IMODE(file.stat().st_mode))
+            sync(unfinished)
+            unfinished.replace(file)
+            sync(file.parent)
+    except OutputError:
+        raise
+    except (OSError, RuntimeError, UnicodeError) as error:  # netCDF raises RuntimeError: disk full
+        raise output_error(error, file) from error
+
+
+@contextlib.contextmanager
+def unfinished_folder(beside: Path) -> Iterator[Path]:
+    """A new folder for what is not finished, removed in the end, by an interrupt too."""
+    with tempfile.TemporaryDirectory(dir=beside, prefix=UNFINISHED) as made:
+        folder = Path(made)
+
+        def remove() -> None:
+            shutil.rmtree(folder, ignore_errors=True)
+
+        with on_interrupt(remove):
+            yield folder
+
+
+def sync(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk."""
+    if path.is_dir() and os.name != "posix":
+        return  # only POSIX systems open folders
+    opened = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
