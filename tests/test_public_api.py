@@ -48,7 +48,7 @@ def test_a_name_that_does_not_exist_is_an_attribute_error():
 
 
 def test_every_error_can_be_caught_as_one_kind():
-    for name in ("CaptureError", "SceneError", "FitError"):
+    for name in ("CaptureError", "SceneError", "FitError", "OutputError"):
         assert issubclass(getattr(pb, name), pb.PolarBayesError)
         assert issubclass(getattr(pb, name), ValueError)
 
