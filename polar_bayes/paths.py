@@ -1,8 +1,9 @@
 """Paths as users give them, and outputs that are written whole or not at all.
 
-Every output of the package goes through `replacing`: it never takes the place of an input, of a
-device or of a folder; it is written beside its place, synced to the disk, renamed, and the folder
-is synced. A process that dies at any moment leaves the older file or the new one, never a part.
+Every file that the package writes goes through `check_output`: it never takes the place of an
+input, a device, a folder or a file of another kind. It is written beside its place, synced to the
+disk, renamed, and the folder is synced: a process that dies at any moment leaves the older file or
+the new one, never a part.
 """
 
 import contextlib
@@ -10,10 +11,10 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from polar_bayes.errors import CaptureError, OutputError
+from polar_bayes.errors import CaptureError, OutputError, PolarBayesError
 from polar_bayes.interrupts import on_interrupt
 
 PathLike = str | os.PathLike[str]
@@ -22,22 +23,23 @@ UNFINISHED = ".polar-bayes-"
 """Prefix of the folders in which unfinished outputs stand, beside their place."""
 
 
-def as_path(path: PathLike, what: str) -> Path:
+def as_path(path: PathLike, what: str, error: type[PolarBayesError] = CaptureError) -> Path:
     """The path, not resolved, or a clear error when it is none.
 
     Args:
         path: Text or a path-like object.
         what: What the path is for, such as "capture".
+        error: What is raised.
 
     Raises:
-        CaptureError: It is empty, of another type, or holds a NUL.
+        PolarBayesError: It is empty, of another type, or holds a NUL.
     """
     try:
         text = os.fspath(path)
     except TypeError:
         text = None
     if not isinstance(text, str) or not text or "\0" in text:
-        raise CaptureError(f"{path!r} is not a path", where=what, mend="give the path of a file")
+        raise error(f"{path!r} is not a path", where=what, mend="give the path of a file")
     return Path(text)
 
 
@@ -71,43 +73,59 @@ def system_error(error: OSError, path: Path) -> CaptureError:
     return CaptureError(reason, where=str(path), mend="check the path, its rights and the disk")
 
 
-def check_output(path: PathLike, inputs: Iterable[PathLike] = ()) -> Path:
+def check_output(
+    path: PathLike, replaces: Callable[[Path], bool], inputs: Iterable[PathLike] = ()
+) -> Path:
     """Refuse an output that cannot be written, or must not be, before anything is computed.
 
     Args:
-        path: The file to write; an older regular file there will be replaced.
-        inputs: Files that are read; none of them may be the output, under any name.
+        path: The file to write.
+        replaces: Whether an older file may be replaced: whether it holds what will be written. An
+            empty one may always be.
+        inputs: Files and folders that are read; the output may be none of them, under any name,
+            nor lie inside one.
 
     Returns:
         The path, links followed: what a link points to is replaced, not the link.
 
     Raises:
-        OutputError: It is one of the inputs, a folder or a device, or its folder is not there or
-            cannot be written.
+        OutputError: It is one of the inputs, a folder, a device or a file of another kind, or its
+            folder is not there or cannot be written.
     """
-    try:
-        given = as_path(path, "output")
-    except CaptureError as error:
-        raise OutputError(error.what, where="output", mend=error.mend) from error
+    given = as_path(path, "output", OutputError)
     where = str(given)
     try:
         file = given.resolve(strict=False)
-        for each in inputs:
-            if is_same_place(file, Path(each)):
-                raise OutputError(
-                    "it is one of the inputs", where=where, mend="give another path to write"
-                )
+        refuse_inputs(given, inputs)
         if file.is_dir():
             raise OutputError("it is a folder", where=where, mend="give the path of a file")
-        if file.exists() and not stat.S_ISREG(file.stat().st_mode):
+        if file.exists() and not file.is_file():
             raise OutputError("it is no regular file", where=where, mend="give the path of a file")
         if not file.parent.is_dir():
             raise OutputError("its folder is not there", where=where, mend="make the folder first")
+        if file.exists() and file.stat().st_size and not replaces(file):
+            raise OutputError(
+                "the file there holds something else",
+                where=where,
+                mend="give another path, or remove it first",
+            )
         with tempfile.TemporaryFile(dir=file.parent):
             pass
     except (OSError, RuntimeError) as error:  # RuntimeError: a circle of links
         raise output_error(error, given) from error
     return file
+
+
+def refuse_inputs(path: Path, inputs: Iterable[PathLike]) -> None:
+    """Refuse an output that is one of the inputs, or lies inside one."""
+    for each in map(Path, inputs):
+        inside = each.is_dir() and any(is_same_place(up, each) for up in path.resolve().parents)
+        if inside or is_same_place(path, each):
+            raise OutputError(
+                f"it {'lies inside' if inside else 'is'} one of the inputs",
+                where=str(path),
+                mend="give another path to write",
+            )
 
 
 def is_same_place(one: Path, other: Path) -> bool:
@@ -129,35 +147,41 @@ def output_error(error: Exception, path: Path) -> OutputError:
 
 
 @contextlib.contextmanager
-def replacing(path: PathLike, inputs: Iterable[PathLike] = ()) -> Iterator[Path]:
+def replacing(path: PathLike, replaces: Callable[[Path], bool]) -> Iterator[Path]:
     """A path to write to, whose file takes the place of `path` when the block ends without error.
-
-    The file keeps the mode of the one that it replaces.
 
     Args:
         path: See `check_output`.
-        inputs: See `check_output`.
+        replaces: See `check_output`.
 
     Yields:
-        A path in the same folder's file system, where nothing is yet.
+        A path in the same file system, where nothing is yet.
 
     Raises:
         OutputError: See `check_output`; or it could not be written.
     """
-    file = check_output(path, inputs)
+    file = check_output(path, replaces)
+    with written(file), unfinished_folder(file.parent) as folder:
+        yield folder / file.name
+        move_into_place(folder / file.name, file)
+
+
+def move_into_place(unfinished: Path, file: Path) -> None:
+    """Put a finished file where it belongs: synced, with the mode of the file that it replaces."""
+    if file.exists():
+        unfinished.chmod(stat.S_IMODE(file.stat().st_mode))
+    sync(unfinished)
+    unfinished.replace(file)
+    sync(file.parent)
+
+
+@contextlib.contextmanager
+def written(path: Path) -> Iterator[None]:
+    """What goes wrong while an output is written, as one line."""
     try:
-        with unfinished_folder(file.parent) as folder:
-            unfinished = folder / file.name
-            yield unfinished
-            if file.exists():
-                unfinished.chmod(stat.S_IMODE(file.stat().st_mode))
-            sync(unfinished)
-            unfinished.replace(file)
-            sync(file.parent)
-    except OutputError:
-        raise
-    except (OSError, RuntimeError, UnicodeError) as error:  # netCDF raises RuntimeError: disk full
-        raise output_error(error, file) from error
+        yield
+    except (OSError, RuntimeError, UnicodeError) as error:  # RuntimeError: netCDF, of a full disk
+        raise output_error(error, path) from error
 
 
 @contextlib.contextmanager

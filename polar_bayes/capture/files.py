@@ -1,12 +1,16 @@
 """Captures in netCDF files: read whole, written whole or not at all."""
 
 import os
+from pathlib import Path
 
 import xarray as xr
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError
 from polar_bayes.paths import existing_file, replacing, system_error
+
+OF_RESULTS = ("polar_bayes", "chosen_scene")
+"""Root attributes of results: provenance, and that of a ledger of effects."""
 
 
 def load_capture(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -47,12 +51,33 @@ def save_capture(capture: xr.Dataset, path: str | os.PathLike[str]) -> None:
 
     Args:
         capture: The capture; it is validated first.
-        path: The file; an older one is replaced and its mode kept.
+        path: The file; an older capture there is replaced and its mode kept.
 
     Raises:
         CaptureError: It is not a capture.
         OutputError: The file cannot be written, or is none that may be replaced.
     """
     checked = validate(capture)
-    with replacing(path) as unfinished:
+    with replacing(path, is_capture) as unfinished:
         checked.to_netcdf(unfinished, engine="netcdf4", format="NETCDF4")
+
+
+def is_capture(file: Path) -> bool:
+    """Whether a file holds a capture; no value is read."""
+    opened = _opened(file)
+    return opened is not None and "view_zenith" in opened.variables
+
+
+def is_result(file: Path) -> bool:
+    """Whether a file holds a result that `save_result` wrote, of any kind; no value is read."""
+    opened = _opened(file)
+    return opened is not None and any(name in opened.attrs for name in OF_RESULTS)
+
+
+def _opened(file: Path) -> xr.Dataset | None:
+    """Names and attributes of a netCDF file; None of anything else."""
+    try:
+        with xr.open_dataset(file.absolute(), engine="netcdf4", decode_times=False) as opened:
+            return opened
+    except Exception:  # the libraries below raise nearly every type for what is no netCDF
+        return None

@@ -6,13 +6,18 @@ from typing import Any
 import click
 
 import polar_bayes as pb
+from polar_bayes.cli.options import CAPTURE_FILE, INPUT, MATERIAL, SCENE, command
 from polar_bayes.cli.printing import print_counts
 
 
-@click.command()
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Capture to write.")
-@click.option("--preset", default="leaf", show_default=True, help="Material to simulate.")
-@click.option("--scene", default="paper", show_default=True, help="Named scene to simulate.")
+@command()
+@click.option("--out", type=CAPTURE_FILE, required=True, help="Capture to write.")
+@click.option(
+    "--preset", type=MATERIAL, default="leaf", show_default=True, help="Material to simulate."
+)
+@click.option(
+    "--scene", type=SCENE, default="paper", show_default=True, help="Named scene to simulate."
+)
 @click.option("--views", type=int, default=40, show_default=True)
 @click.option("--largest-view-zenith", type=float, default=85.0, show_default=True, help="Degrees.")
 @click.option(
@@ -38,11 +43,11 @@ def simulate(
     print_counts(capture, out)
 
 
-@click.command()
-@click.argument("captures", type=click.Path(path_type=Path), nargs=-1, required=True)
+@command()
+@click.argument("captures", type=INPUT, nargs=-1, required=True)
 @click.option("--dim", default="material", show_default=True, help="material or patch.")
 @click.option("--drop", multiple=True, help="Variable to leave out; give it once per variable.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Capture to write.")
+@click.option("--out", type=CAPTURE_FILE, required=True, help="Capture to write.")
 def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Path) -> None:
     """Put captures side by side, to be fitted together; each is labeled by its name."""
     named: dict[str, Any] = {}

@@ -7,20 +7,22 @@ from typing import Any
 import click
 
 import polar_bayes as pb
-from polar_bayes.cli.places import check_writable
+from polar_bayes.cli.options import CALIBRATION_METHOD, INPUT, MODEL, RESULT_FILE, SCENE, command
 from polar_bayes.cli.printing import NOT_CONVERGED
 from polar_bayes.progress import stages
 
 
-@click.command()
-@click.argument("capture", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="File to write.")
-@click.option("--model", default="per_material", show_default=True)
+@command()
+@click.argument("capture", type=INPUT)
+@click.option("--out", type=RESULT_FILE, required=True, help="File to write.")
+@click.option("--model", type=MODEL, default="per_material", show_default=True)
 @click.option(
-    "--method", help="laplace, importance, tempered or nuts; by default what suits the capture."
+    "--method",
+    type=CALIBRATION_METHOD,
+    help="laplace, importance, tempered or nuts; by default what suits the capture.",
 )
 @click.option("--simulations", type=int, default=1000, show_default=True)
-@click.option("--scene", help="Named scene; by default the one that the capture names.")
+@click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 @click.option("--no-readings", is_flag=True, help="Rank parameters only.")
@@ -35,7 +37,6 @@ def calibrate(
 ) -> int:
     """Simulate captures of this layout, fit each, and see whether the intervals hold."""
     data = pb.load_capture(capture)
-    check_writable(out)
     store = out.with_name(f"{out.name}.fits")
     if resume and out.exists() and not store.exists():
         raise pb.FitError("nothing is left to resume", where=str(out), mend="give another --out")
@@ -59,10 +60,10 @@ def calibrate(
     return 0 if pb.is_calibrated(table) else NOT_CONVERGED
 
 
-@click.command()
-@click.argument("capture", type=click.Path(path_type=Path))
-@click.option("--model", default="per_material", show_default=True)
-@click.option("--scene", help="Named scene; by default the one that the capture names.")
+@command()
+@click.argument("capture", type=INPUT)
+@click.option("--model", type=MODEL, default="per_material", show_default=True)
+@click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
 @click.option(
     "--profile",
@@ -123,11 +124,11 @@ def identify(
         click.echo("\n".join(["", *sentences]))
 
 
-@click.command()
-@click.argument("capture", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Study to write.")
-@click.option("--model", default="per_material", show_default=True)
-@click.option("--scene", help="Named scene; by default the one that the capture names.")
+@command()
+@click.argument("capture", type=INPUT)
+@click.option("--out", type=RESULT_FILE, required=True, help="Study to write.")
+@click.option("--model", type=MODEL, default="per_material", show_default=True)
+@click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
 @click.option("--rung", "rungs", multiple=True, help="Method to try; by default the whole ladder.")
 @click.option("--no-dials", is_flag=True, help="Methods alone, nothing turned beside them.")
@@ -145,7 +146,6 @@ def accuracy(
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
     data = pb.load_capture(capture)
-    check_writable(out)
     strange = [name for name in rungs if name not in pb.LADDER]
     if strange:
         raise click.UsageError(f"no rung {', '.join(strange)}: give {', '.join(pb.LADDER)}")

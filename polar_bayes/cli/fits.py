@@ -7,21 +7,34 @@ from typing import Any
 import click
 
 import polar_bayes as pb
-from polar_bayes.cli.places import check_writable, in_setup, make_folder
+from polar_bayes.cli.options import (
+    FIT_METHOD,
+    FOLDER,
+    INPUT,
+    MODEL,
+    RESULT_FILE,
+    SCENE,
+    STORE,
+    command,
+)
 from polar_bayes.cli.printing import NOT_CONVERGED, print_table, status
+from polar_bayes.paths import written
 from polar_bayes.progress import stages
 
+DEMO = "polar-bayes demo"
+"""Attribute of the capture of a demo, by which the next one knows its folder."""
 
-@click.command()
+
+@command()
 @click.option(
-    "--out", type=click.Path(path_type=Path), default=Path("polar-bayes-demo"),
+    "--out", type=FOLDER, default=Path("polar-bayes-demo"),
     show_default=True, help="Folder to write.",
 )  # fmt: skip
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 def demo(out: Path, seed: int) -> int:
     """Capture, fit, diagnostics and report of an embedded example."""
-    make_folder(out)
-    capture = pb.simulate("plastic", seed=seed)
+    _make_folder(out)
+    capture = pb.simulate("plastic", seed=seed).assign_attrs(made_by=DEMO)
     pb.save_capture(capture, out / "capture.nc")
     with stages() as progress:
         result = pb.fit(capture, seed=seed, progress=progress)
@@ -34,16 +47,16 @@ def demo(out: Path, seed: int) -> int:
     return status(result)
 
 
-@click.command()
-@click.argument("capture", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Result to write.")
-@click.option("--model", default="per_material", show_default=True)
+@command()
+@click.argument("capture", type=INPUT)
+@click.option("--out", type=RESULT_FILE, required=True, help="Result to write.")
+@click.option("--model", type=MODEL, default="per_material", show_default=True)
 @click.option(
-    "--method", default="nuts", show_default=True,
+    "--method", type=FIT_METHOD, default="nuts", show_default=True,
     help="point, laplace, importance, tempered, nuts, or auto: the cheapest that is good enough.",
 )  # fmt: skip
 @click.option("--seconds", type=float, help="Of --method auto; 60 by default.")
-@click.option("--scene", help="Named scene; by default the one that the capture names.")
+@click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
 @click.option("--choose-effects", "choose", is_flag=True, help="Fit what `effects` would keep.")
 @click.option("--tolerance", type=float, help="Of --choose-effects and --method auto; 0.1 sd.")
@@ -65,10 +78,9 @@ def fit(
     if settings["seconds"] is not None and not is_auto:
         raise click.UsageError("--seconds needs --method auto")
     data = pb.load_capture(capture)
-    check_writable(out)
     with stages() as progress:
         if choose:
-            data = in_setup(data, scene)
+            data = _in_setup(data, scene)
             options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             scene = pb.choose_effects(data, progress=progress, **options)
@@ -85,11 +97,11 @@ def fit(
     return status(result)
 
 
-@click.command(name="map")
-@click.argument("capture", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Zarr store to write.")
-@click.option("--model", default="per_material", show_default=True)
-@click.option("--scene", help="Named scene; by default the one that the capture names.")
+@command(name="map")
+@click.argument("capture", type=INPUT)
+@click.option("--out", type=STORE, required=True, help="Zarr store to write.")
+@click.option("--model", type=MODEL, default="per_material", show_default=True)
+@click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
 @click.option(
     "--method",
@@ -114,23 +126,23 @@ def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: A
     click.echo(f"{out}: {counts}")
 
 
-@click.command()
-@click.argument("capture", type=click.Path(path_type=Path))
-@click.option("--scene", help="Named set-up; by default the one that the capture names.")
+@command()
+@click.argument("capture", type=INPUT)
+@click.option(
+    "--scene", type=SCENE, help="Named set-up; by default the one that the capture names."
+)
 @click.option("--tolerance", type=float, default=0.1, show_default=True, help="Posterior sd.")
 @click.option("--keep", multiple=True, help="Effect that stays; give it once per effect.")
 @click.option("--drop", multiple=True, help="Effect that goes; give it once per effect.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print the ledger as JSON.")
-@click.option("--out", type=click.Path(path_type=Path), help="Ledger to write.")
+@click.option("--out", type=RESULT_FILE, help="Ledger to write.")
 def effects(
     capture: Path, scene: str | None, as_json: bool, out: Path | None, **settings: Any
 ) -> None:
     """What each effect changes and costs; which of them this capture can see."""
-    data = in_setup(pb.load_capture(capture), scene)
-    if out is not None:
-        check_writable(out)
+    data = _in_setup(pb.load_capture(capture), scene)
     with stages() as progress:
         ledger = pb.choose_effects(data, progress=progress, **settings).ledger
     if out is not None:
@@ -141,16 +153,16 @@ def effects(
         click.echo(f"{pb.ledger_table(ledger)}\n\n{pb.ledger_sentence(ledger)}")
 
 
-@click.command()
-@click.argument("fit", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write.")
-@click.option("--truth", type=click.Path(path_type=Path), help="Of a map: its simulated capture.")
+@command()
+@click.argument("fit", type=INPUT)
+@click.option("--out", type=FOLDER, required=True, help="Folder to write.")
+@click.option("--truth", type=INPUT, help="Of a map: its simulated capture.")
 @click.option(
-    "--uncorrected", type=click.Path(path_type=Path),
+    "--uncorrected", type=INPUT,
     help="With --truth: the same map without weights, to stand beside.",
 )  # fmt: skip
 @click.option(
-    "--beside", type=click.Path(path_type=Path), multiple=True,
+    "--beside", type=INPUT, multiple=True,
     help="Of a calibration: another of the same layout; give it once for each.",
 )  # fmt: skip
 def report(
@@ -166,9 +178,9 @@ def report(
     click.echo(f"report: {page}")
 
 
-@click.command()
-@click.argument("fits", type=click.Path(path_type=Path), nargs=-1, required=True)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write.")
+@command()
+@click.argument("fits", type=INPUT, nargs=-1, required=True)
+@click.option("--out", type=FOLDER, required=True, help="Folder to write.")
 def compare(fits: tuple[Path, ...], out: Path) -> int:
     """Put fits of one capture side by side: predictions, parameters, and what the priors did."""
     if len({path.stem for path in fits}) < len(fits):
@@ -184,6 +196,27 @@ def compare(fits: tuple[Path, ...], out: Path) -> int:
     click.echo(f"report: {page}")
     good = all(verdict.converged for verdict in comparison.verdicts.values())
     return 0 if good else NOT_CONVERGED
+
+
+def _in_setup(capture: Any, setup: str | None) -> Any:
+    """The capture as if it named that set-up, so that scene, links and limits fit together."""
+    return capture if setup is None else capture.assign_attrs(setup=setup)
+
+
+def _make_folder(folder: Path) -> None:
+    """The folder of a demo: new, empty, or that of an earlier demo."""
+    with written(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        held = {path.name for path in folder.iterdir()}
+    if not held:
+        return
+    made_by = ""
+    if held <= {"capture.nc", "fit.nc", "report"} and "capture.nc" in held:
+        made_by = pb.load_capture(folder / "capture.nc").attrs.get("made_by", "")
+    if made_by != DEMO:
+        raise pb.OutputError(
+            "it holds files that no demo made", where=str(folder), mend="give another --out"
+        )
 
 
 def _by_name(paths: tuple[Path, ...]) -> dict[str, Any]:

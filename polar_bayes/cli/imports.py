@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 import polar_bayes as pb
+from polar_bayes.cli.options import CAPTURE_FILE, COLUMN_OR_INPUT, INPUT, Command
 from polar_bayes.cli.printing import print_counts, print_masked
 
 
@@ -15,10 +16,22 @@ def import_() -> None:
     """Turn raw measurements into a capture."""
 
 
-@import_.command()
-@click.option("--s", "s", required=True, help="Table of s readings, or column name in --table.")
-@click.option("--p", "p", required=True, help="Table of p readings, or column name in --table.")
-@click.option("--table", type=click.Path(path_type=Path), help="One table with both channels.")
+@import_.command(cls=Command)
+@click.option(
+    "--s",
+    "s",
+    type=COLUMN_OR_INPUT,
+    required=True,
+    help="Table of s readings, or column name in --table.",
+)
+@click.option(
+    "--p",
+    "p",
+    type=COLUMN_OR_INPUT,
+    required=True,
+    help="Table of p readings, or column name in --table.",
+)
+@click.option("--table", type=INPUT, help="One table with both channels.")
 @click.option("--angle", help="Column of --table with the angle of incidence in degrees.")
 @click.option("--s-incident", type=float, help="Reading of the incident beam, s.")
 @click.option("--p-incident", type=float, help="Reading of the incident beam, p.")
@@ -28,7 +41,7 @@ def import_() -> None:
 @click.option("--relative-error", type=float, default=0.01, show_default=True)
 @click.option("--wavelength", type=float, help="Nanometers.")
 @click.option("--name", help="Name of the sample.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Capture to write.")
+@click.option("--out", type=CAPTURE_FILE, required=True, help="Capture to write.")
 def goniometer(s: str, p: str, table: Path | None, out: Path, **settings: Any) -> None:
     """Tables of s and p readings against the angle of incidence, together or apart."""
     capture = pb.from_goniometer(s, p, table=table, **settings)
@@ -36,8 +49,8 @@ def goniometer(s: str, p: str, table: Path | None, out: Path, **settings: Any) -
     print_counts(capture, out)
 
 
-@import_.command()
-@click.argument("table", type=click.Path(path_type=Path))
+@import_.command(cls=Command)
+@click.argument("table", type=INPUT)
 @click.option(
     "--column", "columns", type=(str, str), multiple=True, metavar="VARIABLE COLUMN",
     help="Column of a variable, where it has another name; give it once for each.",
@@ -50,7 +63,7 @@ def goniometer(s: str, p: str, table: Path | None, out: Path, **settings: Any) -
 @click.option("--setup", help="Set-up that a fit takes by default.")
 @click.option("--saturation-level", type=float, help="Intensity of a full pixel.")
 @click.option("--name", help="Name of the capture.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Capture to write.")
+@click.option("--out", type=CAPTURE_FILE, required=True, help="Capture to write.")
 def table(
     table: Path,
     columns: tuple[tuple[str, str], ...],
@@ -71,11 +84,11 @@ def of_a_picture(command: Callable) -> Callable:
             help="A sphere in the frame [pixels]; give it once for each.",
         ),
         click.option(
-            "--rim", "rims", type=click.Path(path_type=Path), multiple=True,
+            "--rim", "rims", type=INPUT, multiple=True,
             help="Table of points (row, column) on a sphere's outline; give it once for each.",
         ),
         click.option(
-            "--normals", type=click.Path(path_type=Path), help="Unit normals in a .npy file."
+            "--normals", type=INPUT, help="Unit normals in a .npy file."
         ),
         click.option("--light", type=float, nargs=3, metavar="X Y Z", help="Towards far light."),
         click.option(
@@ -91,9 +104,9 @@ def of_a_picture(command: Callable) -> Callable:
             "--view-position", type=float, nargs=3, metavar="X Y Z",
             help="Place of a near camera [pixels]: 0 0 and its focal length.",
         ),
-        click.option("--dark", type=click.Path(path_type=Path), help="Frame without light."),
+        click.option("--dark", type=INPUT, help="Frame without light."),
         click.option("--dark-level", type=float, help="Count without light, in place of --dark."),
-        click.option("--flat", type=click.Path(path_type=Path), help="Frame of even light."),
+        click.option("--flat", type=INPUT, help="Frame of even light."),
         click.option("--saturation-level", type=float, help="Count of a full pixel."),
         click.option("--gain", type=float, help="Counts per electron."),
         click.option(
@@ -104,7 +117,7 @@ def of_a_picture(command: Callable) -> Callable:
         click.option("--wavelength", type=float, help="Nanometers."),
         click.option("--name", help="Name of the capture."),
         click.option(
-            "--out", type=click.Path(path_type=Path), required=True, help="Capture to write."
+            "--out", type=CAPTURE_FILE, required=True, help="Capture to write."
         ),
     )  # fmt: skip
     for option in reversed(options):
@@ -112,9 +125,9 @@ def of_a_picture(command: Callable) -> Callable:
     return command
 
 
-@import_.command()
+@import_.command(cls=Command)
 @click.option(
-    "--frame", "frames", type=(float, click.Path(path_type=Path)), multiple=True, required=True,
+    "--frame", "frames", type=(float, INPUT), multiple=True, required=True,
     metavar="ANGLE FILE", help="Angle of the polarizer [degrees], frame; give it once for each.",
 )  # fmt: skip
 @of_a_picture
@@ -125,8 +138,8 @@ def polarizer(frames: tuple[tuple[float, Path], ...], out: Path, **options: Any)
     _write(pb.from_polarizer(files, angles, **_setting(options)), out)
 
 
-@import_.command()
-@click.argument("frame", type=click.Path(path_type=Path))
+@import_.command(cls=Command)
+@click.argument("frame", type=INPUT)
 @of_a_picture
 @click.option(
     "--layout", type=float, nargs=4, default=(90.0, 45.0, 135.0, 0.0), show_default=True,

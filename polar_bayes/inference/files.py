@@ -4,6 +4,7 @@ import os
 
 import xarray as xr
 
+from polar_bayes.capture.files import is_result
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.paths import existing_file, replacing, system_error
@@ -46,10 +47,10 @@ def save_result(result: xr.DataTree, path: str | os.PathLike[str]) -> None:
 
     Args:
         result: A tree that `polar_bayes.fit` returned.
-        path: The file; an older one is replaced and its mode kept.
+        path: The file; an older result there is replaced and its mode kept.
 
     Raises:
         OutputError: The file cannot be written, or is none that may be replaced.
     """
-    with replacing(path) as unfinished:
+    with replacing(path, is_result) as unfinished:
         result.to_netcdf(unfinished, engine="netcdf4")

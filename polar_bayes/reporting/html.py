@@ -89,8 +89,10 @@ def report(
 
     Raises:
         CaptureError: The directory is no path, or `truth` does not fit the maps.
-        FitError: It holds no posterior and no maps, fits are not of one capture, an argument does
-            not apply, or the folder cannot be written.
+        FitError: It holds no posterior and no maps, fits are not of one capture, or an argument
+            does not apply.
+        OutputError: The folder cannot be written, or holds a file of such a name that is no part
+            of a report.
     """
     folder = as_path(directory, "report")
     of_calibration = is_calibration(result)

@@ -4,7 +4,6 @@ import base64
 import dataclasses
 import io
 import re
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,12 @@ import matplotlib
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from polar_bayes.errors import FitError
+from polar_bayes.paths import check_output, move_into_place, unfinished_folder, written
 from polar_bayes.reporting.style import ALWAYS
 
 PAGE = "index.html"
+MARK, HEAD = b'<meta name="generator" content="polar_bayes">', 1024
+"""What every page of ours has among its first bytes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +85,7 @@ def fill(template: str, content: Mapping[str, Any]) -> str:
 def write_page(
     folder: Path, page: str, others: Mapping[str, Callable[[Path], object]] | None = None
 ) -> Path:
-    """Write a page and what lies beside it; an older report in the folder is replaced.
+    """Write a page and the files that go with it; an older report in the folder is replaced.
 
     Args:
         folder: Made if it is not there.
@@ -95,20 +96,26 @@ def write_page(
         The path of the page.
 
     Raises:
-        FitError: The folder cannot be written.
+        OutputError: The folder cannot be written, or holds a file of such a name that is no part
+            of a report.
     """
-    try:
+    with written(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".report-") as unfinished:
-            (Path(unfinished) / PAGE).write_text(page, encoding="utf-8")
-            for name, write in (others or {}).items():
-                write(Path(unfinished) / name)
-            for name in (*(others or {}), PAGE):
-                (Path(unfinished) / name).replace(folder / name)
-    except OSError as error:
-        raise FitError(
-            (error.strerror or str(error)).lower(),
-            where=str(folder),
-            mend="give a folder that can be written",
-        ) from error
+    is_report = is_page(folder / PAGE)
+    names = (*(others or {}), PAGE)
+    files = {name: check_output(folder / name, lambda _: is_report) for name in names}
+    with written(folder), unfinished_folder(folder) as unfinished:
+        (unfinished / PAGE).write_text(page, encoding="utf-8")
+        for name, write in (others or {}).items():
+            write(unfinished / name)
+        for name, file in files.items():
+            move_into_place(unfinished / name, file)
     return folder / PAGE
+
+
+def is_page(file: Path) -> bool:
+    """Whether a file is a page that `fill` made."""
+    try:
+        return MARK in file.read_bytes()[:HEAD]
+    except OSError:
+        return False

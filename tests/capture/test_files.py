@@ -13,7 +13,7 @@ import xarray as xr
 from polar_bayes.capture.contract import LEADING
 from polar_bayes.capture.files import load_capture, save_capture
 from polar_bayes.capture.schema import validate
-from polar_bayes.errors import CaptureError
+from polar_bayes.errors import CaptureError, OutputError
 
 
 def assert_same(left, right):
@@ -169,7 +169,7 @@ def test_wrong_packing_is_a_clear_error(foreign):
 def test_what_is_no_path_is_refused(make_capture, path):
     with pytest.raises(CaptureError, match=r"capture: .* is not a path; give the path of a file"):
         load_capture(path)
-    with pytest.raises(CaptureError, match=r"capture: .* is not a path; give the path of a file"):
+    with pytest.raises(OutputError, match=r"output: .* is not a path; give the path of a file"):
         save_capture(make_capture(), path)
 
 
@@ -207,14 +207,14 @@ def test_a_file_without_rights_is_named(make_capture, tmp_path, monkeypatch):
 
 def test_a_place_that_cannot_be_written_is_named(make_capture, tmp_path):
     capture = make_capture()
-    with pytest.raises(CaptureError, match="its folder is not there; make the folder first"):
+    with pytest.raises(OutputError, match="its folder is not there; make the folder first"):
         save_capture(capture, tmp_path / "gone" / "leaf.nc")
-    with pytest.raises(CaptureError, match="it is a folder; give the path of a file"):
+    with pytest.raises(OutputError, match="it is a folder; give the path of a file"):
         save_capture(capture, tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(CaptureError, match="not a directory; check the path"):
+    with pytest.raises(OutputError, match="its folder is not there; make the folder first"):
         save_capture(capture, tmp_path / "file" / "leaf.nc")
-    with pytest.raises(CaptureError, match="name too long; check the path"):
+    with pytest.raises(OutputError, match="name too long"):
         save_capture(capture, tmp_path / ("x" * 300))
 
 
@@ -235,7 +235,8 @@ def test_a_failed_write_leaves_the_older_capture(make_capture, tmp_path, monkeyp
 
     monkeypatch.setattr(xr.Dataset, "to_netcdf", fail)
     with pytest.raises(
-        CaptureError, match=r"leaf\.nc: (no space left on device|it could not be written); ch"
+        OutputError,
+        match=r"leaf\.nc: it could not be written \((no space left on device|hdf)\); check",
     ):
         save_capture(make_capture(seed=2), path)
     monkeypatch.undo()
@@ -246,13 +247,13 @@ def test_a_failed_write_leaves_the_older_capture(make_capture, tmp_path, monkeyp
 FULL_DISK = """
 import resource, sys
 from polar_bayes.capture.files import load_capture, save_capture
-from polar_bayes.errors import CaptureError
+from polar_bayes.errors import OutputError
 capture = load_capture(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_FSIZE, (5000, resource.RLIM_INFINITY))
 try:
     save_capture(capture, sys.argv[1])
-except CaptureError as error:
-    sys.exit(f"CaptureError: {error}")
+except OutputError as error:
+    sys.exit(f"OutputError: {error}")
 """
 
 
@@ -269,7 +270,7 @@ def test_a_full_disk_is_an_error_and_leaves_the_older_capture(make_capture, tmp_
         cwd=root,
         check=False,
     )
-    assert run.stderr.startswith("CaptureError: ")
-    assert "could not be written; check its name and the room on the disk" in run.stderr
+    assert run.stderr.startswith("OutputError: ")
+    assert "check the path, its rights and the room on the disk" in run.stderr
     assert os.listdir(tmp_path) == ["leaf.nc"]
     assert_same(load_capture(path), validate(make_capture()))

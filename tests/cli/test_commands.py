@@ -91,7 +91,7 @@ WRONG = {
         ["fit", "PLATE", "--largest-view-zenith", "21", "--out", "OUT"],
         "only 1 valid view",
     ),
-    "folder": (["fit", "PLATE", "--out", "/nowhere/fit.nc"], "cannot write there"),
+    "folder": (["fit", "PLATE", "--out", "/nowhere/fit.nc"], "its folder is not there"),
     "effect": (["effects", "PLATE", "--drop", "Fog"], "drop='Fog': the scene has no such effect"),
     "set-up": (["effects", "PLATE", "--scene", "x"], "no such scene"),
     "tolerance": (["effects", "PLATE", "--tolerance", "0"], "tolerance is 0.0"),

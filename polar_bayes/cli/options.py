@@ -1,0 +1,124 @@
+"""Types of options, and what they refuse before anything is computed and before JAX is loaded."""
+
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, override
+
+import click
+
+from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
+from polar_bayes.paths import as_path, check_output, refuse_inputs
+
+
+class Name(click.ParamType):
+    """One of the names of a table of the package, which is not loaded to know them."""
+
+    name = "text"
+
+    def __init__(self, kind: str, names: tuple[str, ...], error: type[PolarBayesError]) -> None:
+        self.kind, self.names, self.error = kind, names, error
+
+    @override
+    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+        if value not in self.names:
+            option = param.name.rstrip("s")
+            raise self.error(
+                f"no such {self.kind}",
+                where=f"{option}={value!r}",
+                mend=f"give one of {', '.join(self.names)}",
+            )
+        return str(value)
+
+
+MODEL = Name("model", ("per_material", "hierarchical", "gp_spectral"), FitError)
+SCENE = Name("scene", ("paper", "camera", "picture", "goniometer"), SceneError)
+MATERIAL = Name("material", ("leaf", "fruit", "plastic", "coating", "glass", "water"), CaptureError)
+FIT_METHOD = Name(
+    "method", ("nuts", "laplace", "point", "importance", "tempered", "auto"), FitError
+)
+CALIBRATION_METHOD = Name("method", ("laplace", "importance", "tempered", "nuts"), FitError)
+
+
+class Input(click.ParamType):
+    """The path of a file or folder that is read; it is there, unless it may be something else."""
+
+    name = "path"
+
+    def __init__(self, *, is_path: bool = True) -> None:
+        self.is_path = is_path
+
+    @override
+    def convert(self, value: Any, param: Any, ctx: Any) -> Path | str:
+        if not self.is_path:
+            return str(value)
+        path = as_path(value, param.opts[0])
+        if not path.exists():
+            what = "store" if path.suffix == ".zarr" else "file"
+            raise CaptureError(f"there is no such {what}", where=str(path), mend="check the path")
+        return path
+
+
+class Output(click.ParamType):
+    """The path of an output; it is checked when all inputs are known.
+
+    A folder or store, of no `kind`, is checked further by what writes it.
+    """
+
+    name = "path"
+
+    def __init__(self, kind: str | None = None) -> None:
+        self.kind = kind
+
+    @override
+    def convert(self, value: Any, param: Any, ctx: Any) -> Path:
+        return as_path(value, param.opts[0], OutputError)
+
+    def check(self, path: Path, inputs: list[Path]) -> None:
+        """Refuse what must not be written."""
+        if self.kind is None:
+            refuse_inputs(path, inputs)
+            return
+        from polar_bayes.capture.files import is_capture, is_result
+
+        kinds = {"capture": is_capture, "result": is_result}
+        check_output(path, kinds[self.kind], inputs)
+
+
+INPUT, COLUMN_OR_INPUT = Input(), Input(is_path=False)
+CAPTURE_FILE, RESULT_FILE, FOLDER, STORE = Output("capture"), Output("result"), Output(), Output()
+
+
+class Command(click.Command):
+    """A command whose outputs are checked against its inputs before it begins."""
+
+    @override
+    def invoke(self, ctx: click.Context) -> Any:
+        inputs = [
+            Path(each)
+            for param in self.params
+            if _reads(param.type)
+            for each in _paths(ctx.params[str(param.name)])
+        ]
+        for param in self.params:
+            path = ctx.params[str(param.name)]
+            if isinstance(param.type, Output) and path is not None:
+                param.type.check(path, inputs)
+        return super().invoke(ctx)
+
+
+command = functools.partial(click.command, cls=Command)
+
+
+def _reads(kind: click.ParamType) -> bool:
+    parts = kind.types if isinstance(kind, click.Tuple) else [kind]
+    return any(isinstance(part, Input) for part in parts)
+
+
+def _paths(value: Any) -> Iterator[str | Path]:
+    """Every path or text in the value of an option that may be given several times."""
+    if isinstance(value, str | Path):
+        yield value
+    elif isinstance(value, tuple):
+        for each in value:
+            yield from _paths(each)

@@ -1,0 +1,161 @@
+"""What commands must never write over, and what they refuse before anything is loaded."""
+
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from synthetic_results import make_result
+
+import polar_bayes as pb
+from polar_bayes.cli import main
+from polar_bayes.cli import options as cli_options
+
+ROOT = Path(__file__).parents[2]
+
+
+def digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+@pytest.fixture
+def inputs(plate: Path, tmp_path: Path) -> Path:
+    """A folder with an input of every kind."""
+    (tmp_path / "x.nc").write_bytes(plate.read_bytes())
+    (tmp_path / "y.nc").write_bytes(plate.read_bytes())
+    (tmp_path / "t.csv").write_text("angle,s,p\n" + "".join(f"{a},3,2\n" for a in range(20, 60, 5)))
+    for angle in (0, 45, 90):
+        Image.fromarray(np.full((4, 4), 10 + angle, np.uint8)).save(tmp_path / f"g{angle}.png")
+    return tmp_path
+
+
+COLUMNS = ("--angle", "angle", "--s", "s", "--p", "p")
+FRAMES = ("--frame", "0", "g0.png", "--frame", "45", "g45.png", "--frame", "90", "g90.png")
+PLACE = ("--sphere", "2", "2", "2", "--light", "0", "0", "1")
+DESTROYING = {
+    "table": ("import", "goniometer", "--table", "t.csv", *COLUMNS, "--out", "t.csv"),
+    "two tables": ("import", "goniometer", "--s", "t.csv", "--p", "t.csv", "--out", "t.csv"),
+    "list": ("import", "table", "t.csv", "--out", "./t.csv"),
+    "frame": ("import", "polarizer", *FRAMES, *PLACE, "--out", "g0.png"),
+    "mosaic": ("import", "mosaic", "g0.png", *PLACE, "--out", "g0.png"),
+    "flat": ("import", "mosaic", "g0.png", *PLACE, "--flat", "g45.png", "--out", "g45.png"),
+    "fit": ("fit", "x.nc", "--out", "x.nc"),
+    "effects": ("effects", "x.nc", "--out", "x.nc"),
+    "map": ("map", "x.nc", "--out", "x.nc"),
+    "calibrate": ("calibrate", "x.nc", "--out", "x.nc"),
+    "accuracy": ("accuracy", "x.nc", "--out", "x.nc"),
+    "combine": ("combine", "x.nc", "y.nc", "--out", "y.nc"),
+    "report": ("report", "x.nc", "--out", "x.nc"),
+    "compare": ("compare", "x.nc", "y.nc", "--out", "y.nc"),
+}
+
+
+@pytest.mark.parametrize("command", DESTROYING)
+def test_no_command_writes_over_its_input(command, inputs, monkeypatch, capsys):
+    monkeypatch.chdir(inputs)
+    before = {file.name: digest(file) for file in inputs.iterdir()}
+    assert main(list(DESTROYING[command])) == 1
+    told = capsys.readouterr()
+    assert "it is one of the inputs; give another path to write" in told.err
+    assert told.err.count("\n") == 1
+    assert {file.name: digest(file) for file in inputs.iterdir()} == before
+
+
+@pytest.mark.parametrize("words", [("fit", "x.nc"), ("calibrate", "x.nc"), ("accuracy", "x.nc")])
+@pytest.mark.parametrize("other", ["y.nc", "t.csv", "g0.png"])
+def test_a_result_takes_the_place_of_no_other_file(words, other, inputs, monkeypatch, capsys):
+    monkeypatch.chdir(inputs)
+    before = digest(inputs / other)
+    assert main([*words, "--out", other]) == 1
+    assert f"{other}: the file there holds something else" in capsys.readouterr().err
+    assert digest(inputs / other) == before
+
+
+@pytest.mark.parametrize(
+    "words", [("simulate",), ("fit", "x.nc"), ("map", "x.nc"), ("report", "x.nc"), ("demo",)]
+)
+@pytest.mark.parametrize("out", ["", "a\0b"])
+def test_no_path_is_one_line(words, out, inputs, monkeypatch, capsys):
+    monkeypatch.chdir(inputs)
+    assert main([*words, "--out", out]) == 1
+    told = capsys.readouterr().err
+    assert "is not a path" in told
+    assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["index.html", "result.nc"])
+def test_a_report_replaces_only_a_report(name, tmp_path):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(pb.OutputError, match=f"{name}: the file there holds something else"):
+        pb.report(make_result(), tmp_path)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine")]
+
+
+def test_a_report_is_made_again_in_its_folder_beside_what_is_there(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    page = pb.report(make_result(), tmp_path)
+    page.chmod(0o640)
+    first = digest(page)
+    pb.report(pb.load_result(tmp_path / "result.nc"), tmp_path)
+    assert digest(page) == first
+    assert page.stat().st_mode & 0o777 == 0o640
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "index.html", "notes.txt", "result.nc",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("held", [{"capture.nc": "plate"}, {"fit.nc": "text"}, {"photo.png": "x"}])
+def test_a_demo_writes_in_no_folder_of_anothers(held, plate, tmp_path, capsys):
+    for name, kind in held.items():
+        (tmp_path / name).write_bytes(plate.read_bytes() if kind == "plate" else b"mine")
+    before = {file.name: digest(file) for file in tmp_path.iterdir()}
+    assert main(["demo", "--out", str(tmp_path)]) == 1
+    assert "it holds files that no demo made" in capsys.readouterr().err
+    assert {file.name: digest(file) for file in tmp_path.iterdir()} == before
+
+
+def test_names_of_options_are_those_of_the_tables():
+    from polar_bayes.calibration.calibrate import METHODS as CALIBRATION_METHODS
+    from polar_bayes.inference.request import MODELS
+    from polar_bayes.ladder.fit import METHODS
+
+    known = {
+        cli_options.MODEL: MODELS,
+        cli_options.SCENE: pb.SETUPS,
+        cli_options.MATERIAL: pb.PRESETS,
+        cli_options.FIT_METHOD: METHODS,
+        cli_options.CALIBRATION_METHOD: CALIBRATION_METHODS,
+    }
+    for kind, table in known.items():
+        assert kind.names == tuple(table), kind.kind
+
+
+WITHOUT_JAX = """
+import sys
+from polar_bayes.cli import main
+assert main(sys.argv[1:]) == 1
+assert not {"jax", "numpyro", "arviz", "matplotlib"} & set(sys.modules), "loaded in vain"
+"""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("fit", "nowhere.nc", "--out", "o.nc"),
+        ("fit", "x.nc", "--method", "nutz", "--out", "o.nc"),
+        ("map", "x.nc", "--scene", "moon", "--out", "o.zarr"),
+        ("calibrate", "x.nc", "--method", "magic", "--out", "o.nc"),
+        ("simulate", "--preset", "gold", "--out", "o.nc"),
+        ("fit", "t.csv", "--out", "o.nc"),
+        ("fit", "x.nc", "--out", "y.nc"),
+    ],
+)
+def test_what_is_known_before_jax_is_refused_before_jax(words, inputs):
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_JAX, *words], cwd=inputs, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
