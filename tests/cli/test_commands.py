@@ -81,7 +81,7 @@ def test_combine_puts_captures_side_by_side(
 WRONG = {
     "no command": (["frob"], "No such command"),
     "no file": (["fit", "nowhere.nc", "--out", "fit.nc"], "nowhere.nc: there is no such file"),
-    "no out": (["fit", "nowhere.nc"], "Missing option '--out'"),
+    "no out": (["fit", "PLATE"], "Missing option '--out'"),
     "model": (["fit", "PLATE", "--model", "x", "--out", "OUT"], "no such model"),
     "method": (["fit", "PLATE", "--method", "x", "--out", "OUT"], "no such method"),
     "scene": (["fit", "PLATE", "--scene", "x", "--out", "OUT"], "no such scene"),

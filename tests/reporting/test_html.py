@@ -181,7 +181,7 @@ def test_no_comparison_without_one(small) -> None:
 def test_the_folder_holds_page_and_result_and_nothing_else(tmp_path: Path) -> None:
     result, folder = make_result(**SMALL), tmp_path / "deep" / "er"
     folder.mkdir(parents=True)
-    (folder / "index.html").write_text("an older report")
+    report(make_result(**SMALL, seed=5), folder)  # an older report is replaced
     assert report(result, folder) == folder / "index.html"
     assert sorted(path.name for path in folder.iterdir()) == ["index.html", "result.nc"]
     assert (folder / "index.html").read_text().startswith("<!DOCTYPE html>")
@@ -194,7 +194,7 @@ def test_the_folder_holds_page_and_result_and_nothing_else(tmp_path: Path) -> No
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     for place in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(PolarBayesError, match="give a folder that can be written") as error:
+        with pytest.raises(PolarBayesError, match="it could not be written") as error:
             report(make_result(**SMALL, method="point"), place)
         assert "\n" not in str(error.value)
         assert str(place) in str(error.value)
