@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,16 +12,18 @@ import numpy as np
 from polar_bayes.calibration.block import Block
 from polar_bayes.calibration.question import differing
 from polar_bayes.errors import FitError
+from polar_bayes.paths import UNFINISHED, move_into_place, unfinished_folder
 from polar_bayes.pixels.outcome import Outcome
 
-QUESTION, BLOCKS, UNFINISHED = "question.json", "*.npz", ".tmp"
+QUESTION, BLOCKS = "question.json", "*.npz"
 
 
 class Store:
     """Blocks on the disk, each in a file that is there whole or not at all.
 
-    A file is moved to its place when it is on the disk. What a crash left unfinished, or what
-    cannot be read, counts as not there: its simulations are fitted again, to the same bits.
+    A file is moved to its place when it is on the disk, and its archive holds a checksum of each
+    array. What a crash left unfinished, or what cannot be read, counts as not there: its
+    simulations are fitted again, to the same bits.
 
     Args:
         folder: Where.
@@ -55,11 +56,11 @@ class Store:
             names = [path.name for path in self._folder.iterdir()]
         if head.name in names:
             self._check(head)
-        elif any(not name.endswith(UNFINISHED) for name in names):
+        elif any(not name.startswith(UNFINISHED) for name in names):
             raise FitError("it holds no calibration", where=where, mend="give another --out")
         else:  # new, or broken off before it said what is asked
             told = json.dumps(self._question, indent=1, sort_keys=True).encode()
-            with self._whole(head) as unfinished:
+            with self._whole(QUESTION) as unfinished:
                 unfinished.write_bytes(told)
         found = (read_block(path) for path in sorted(self._folder.glob(BLOCKS)))
         return [block for block in found if block is not None]
@@ -74,7 +75,7 @@ class Store:
             FitError: It cannot be written.
         """
         first, last = int(block.numbers.min()), int(block.numbers.max())
-        with self._whole(self._folder / f"{first:08d}-{last:08d}.npz") as unfinished:
+        with self._whole(f"{first:08d}-{last:08d}.npz") as unfinished:
             with unfinished.open("wb") as file:
                 np.savez(file, allow_pickle=False, **_flat(block._asdict()))
 
@@ -96,14 +97,11 @@ class Store:
             )
 
     @contextlib.contextmanager
-    def _whole(self, file: Path) -> Iterator[Path]:
+    def _whole(self, name: str) -> Iterator[Path]:
         """A file to write to, which then takes its place at once."""
-        unfinished = file.with_name(f"{file.name}.{os.getpid()}{UNFINISHED}")
-        with self._written():
-            yield unfinished
-            with unfinished.open("rb") as written:
-                os.fsync(written.fileno())
-            unfinished.replace(file)
+        with self._written(), unfinished_folder(self._folder) as unfinished:
+            yield unfinished / name
+            move_into_place(unfinished / name, self._folder / name)
 
     @contextlib.contextmanager
     def _written(self) -> Iterator[None]:

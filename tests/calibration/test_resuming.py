@@ -82,7 +82,9 @@ def assert_same_bits(found: xr.DataTree, expected: xr.DataTree) -> None:
 
 def test_what_was_broken_off_goes_on_to_the_same_bits(capture, whole, begun, tmp_path) -> None:
     store, seen = copied(begun, tmp_path), []
-    (store / "00000036-00000039.npz.7.tmp").write_bytes(b"half a blo")
+    left = store / ".polar-bayes-crashed"
+    left.mkdir()
+    (left / "00000036-00000039.npz").write_bytes(b"half a blo")
     found = pb.calibrate(
         capture,
         simulations=COUNT,
