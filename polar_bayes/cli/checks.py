@@ -7,7 +7,15 @@ from typing import Any
 import click
 
 import polar_bayes as pb
-from polar_bayes.cli.options import CALIBRATION_METHOD, INPUT, MODEL, RESULT_FILE, SCENE, command
+from polar_bayes.cli.options import (
+    CALIBRATION_METHOD,
+    INPUT,
+    MODEL,
+    RESULT_FILE,
+    RUNG,
+    SCENE,
+    command,
+)
 from polar_bayes.cli.printing import NOT_CONVERGED
 from polar_bayes.progress import stages
 
@@ -130,7 +138,10 @@ def identify(
 @click.option("--model", type=MODEL, default="per_material", show_default=True)
 @click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
-@click.option("--rung", "rungs", multiple=True, help="Method to try; by default the whole ladder.")
+@click.option(
+    "--rung", "rungs", type=RUNG, multiple=True,
+    help="Method to try; by default the whole ladder.",
+)  # fmt: skip
 @click.option("--no-dials", is_flag=True, help="Methods alone, nothing turned beside them.")
 @click.option("--tolerance", type=float, default=0.1, show_default=True, help="Of the advice.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
@@ -146,9 +157,6 @@ def accuracy(
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
     data = pb.load_capture(capture)
-    strange = [name for name in rungs if name not in pb.LADDER]
-    if strange:
-        raise click.UsageError(f"no rung {', '.join(strange)}: give {', '.join(pb.LADDER)}")
     settings["rungs"] = {name: pb.LADDER[name] for name in rungs or pb.LADDER}
     settings |= {"dials": ()} if no_dials else {}
     study = pb.accuracy(data, **settings)

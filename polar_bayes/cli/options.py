@@ -38,6 +38,14 @@ FIT_METHOD = Name(
     "method", ("nuts", "laplace", "point", "importance", "tempered", "auto"), FitError
 )
 CALIBRATION_METHOD = Name("method", ("laplace", "importance", "tempered", "nuts"), FitError)
+RUNG = Name(
+    "rung",
+    (
+        *("point", "laplace", "importance", "tempered", "normal guide", "flow guide"),
+        *("nuts short", "nuts", "nuts long"),
+    ),
+    FitError,
+)
 
 
 class Input(click.ParamType):
