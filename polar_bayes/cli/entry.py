@@ -64,6 +64,7 @@ def _own_process() -> int:
 
 def _run(arguments: list[str] | None) -> int:
     """Run one command; whatever goes wrong is one line."""
+    output = sys.stdout
     try:
         status = commands.main(arguments, prog_name="polar-bayes", standalone_mode=False)
     except (click.exceptions.Abort, KeyboardInterrupt):
@@ -78,9 +79,8 @@ def _run(arguments: list[str] | None) -> int:
     except PolarBayesError as error:
         click.echo(str(error), err=True)
         return 1
-    except SystemExit as error:  # click, of a broken pipe or a shell that completes words
-        is_broken = isinstance(error.__context__, BrokenPipeError)
-        return BROKEN_PIPE if is_broken else int(error.code or 0)
+    except SystemExit as error:  # click, which replaces a stream whose pipe is broken
+        return BROKEN_PIPE if sys.stdout is not output else int(error.code or 0)
     except Exception as error:
         return _last_resort(error)
     return int(status or 0)
