@@ -13,6 +13,7 @@ import numpy as np
 from polar_bayes.calibration.block import Block
 from polar_bayes.calibration.question import differing
 from polar_bayes.errors import FitError
+from polar_bayes.interrupts import on_interrupt
 from polar_bayes.pixels.outcome import Outcome
 
 QUESTION, BLOCKS, UNFINISHED = "question.json", "*.npz", ".tmp"
@@ -103,7 +104,7 @@ class Store:
     def _whole(self, file: Path) -> Iterator[Path]:
         """A file to write to, which then takes its place at once."""
         unfinished = file.with_name(f"{file.name}.{os.getpid()}{UNFINISHED}")
-        with self._written():
+        with self._written(), on_interrupt(lambda: unfinished.unlink(missing_ok=True)):
             yield unfinished
             with unfinished.open("rb") as written:
                 os.fsync(written.fileno())

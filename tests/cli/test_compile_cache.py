@@ -1,6 +1,8 @@
 """Compiled programs are native code: they are loaded from no folder that others can write to."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -85,3 +87,42 @@ def test_a_folder_that_the_user_gives_is_used_as_it_is(base: Path, capsys, monke
     assert os.environ[FOLDER] == "/nowhere"
     assert not base.exists()
     assert capsys.readouterr().err == ""
+
+
+COMPILES = """
+import sys
+import polar_bayes as pb
+from polar_bayes.cli import console
+
+def simulate(*_, **__):
+    import jax  # which reads the environment now
+    for shape in range(1, 4):
+        jax.jit(lambda x: x + 1.0)(jax.numpy.ones(shape))
+    raise pb.CaptureError("it is broken", where="x.nc", mend="give another")
+
+pb.simulate = simulate
+sys.argv = ["polar-bayes", "simulate", "--out", "x.nc"]
+console()
+"""
+
+
+def test_damaged_entries_are_one_line_however_many_there_are(base: Path) -> None:
+    base.mkdir(mode=0o700)
+    compiled = base / "polar_bayes" / "compiled"
+    clean = {name: value for name, value in os.environ.items() if "COMPILATION_CACHE" not in name}
+
+    def said() -> list[str]:
+        words = [sys.executable, "-c", COMPILES]
+        done = subprocess.run(words, env=clean, capture_output=True, text=True, check=False)
+        return done.stderr.splitlines()
+
+    assert said() == ["x.nc: it is broken; give another"]
+    entries = list(compiled.glob("*-cache"))
+    assert len(entries) > 3
+    for entry in entries:
+        entry.write_bytes(entry.read_bytes()[:50])
+    assert said() == [
+        f"{compiled}: compiled programs there are damaged and are compiled again; "
+        "delete the folder to have them kept",
+        "x.nc: it is broken; give another",
+    ]

@@ -1,6 +1,8 @@
 """Signals end a command within seconds, in real processes: nothing is left behind but one line."""
 
+import contextlib
 import contextvars
+import itertools
 import os
 import re
 import signal
@@ -18,6 +20,7 @@ import polar_bayes as pb
 from polar_bayes import interrupts
 from polar_bayes.budget import fresh
 from polar_bayes.cli.process import SIGNALS, run_until_signal
+from polar_bayes.paths import unfinished_folder
 
 LIMIT = 5.0
 """Seconds that a command may take to end."""
@@ -164,6 +167,28 @@ def test_cleanups_run_and_their_sentences_are_said_in_one_line(tmp_path: Path) -
     said = stopped(script(text, tmp_path), signal.SIGTERM)
     assert said == "polar-bayes: stopped. out: --resume goes on\n"
     assert not left_in(tmp_path)
+
+
+def test_a_thread_that_still_writes_leaves_nothing_behind(tmp_path: Path) -> None:
+    ends = threading.Event()
+
+    def write() -> None:
+        with contextlib.suppress(OSError), unfinished_folder(tmp_path) as folder:
+            for number in itertools.count():
+                (folder / f"{number}").write_text("a part")
+                if ends.is_set():
+                    return
+
+    writing = threading.Thread(target=write)
+    writing.start()
+    try:
+        time.sleep(0.2)
+        interrupts.clean_up()
+        assert not list(tmp_path.iterdir())
+        writing.join(5.0)
+        assert not writing.is_alive()
+    finally:
+        ends.set()
 
 
 def hanging(limit: float) -> str:
