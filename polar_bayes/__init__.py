@@ -4,8 +4,11 @@ Names are loaded when they are first used: `import polar_bayes` starts no array 
 reading a capture does not load a sampler.
 """
 
+import contextlib
 import importlib
+import random
 import sys
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 _HOMES = {
@@ -136,9 +139,24 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'polar_bayes' has no attribute {name!r}")
     _wake_numpyro()
-    value = getattr(importlib.import_module(f"polar_bayes.{_MODULE_OF[name]}"), name)
+    with _random_state_of_the_caller():
+        value = getattr(importlib.import_module(f"polar_bayes.{_MODULE_OF[name]}"), name)
     globals()[name] = value
     return value
+
+
+@contextlib.contextmanager
+def _random_state_of_the_caller() -> Iterator[None]:
+    """Undo what JAX (`numpy.random`) and Rich (`random`) draw from global states when imported."""
+    numpy_random = sys.modules.get("numpy.random")  # not there: nobody has seeded it
+    state = random.getstate()
+    numpy_state = None if numpy_random is None else numpy_random.get_state(legacy=False)
+    try:
+        yield
+    finally:
+        random.setstate(state)
+        if numpy_random is not None:
+            numpy_random.set_state(numpy_state)
 
 
 def _wake_numpyro() -> None:

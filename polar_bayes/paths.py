@@ -191,7 +191,9 @@ def unfinished_folder(beside: Path) -> Iterator[Path]:
         folder = Path(made)
 
         def remove() -> None:
-            shutil.rmtree(folder, ignore_errors=True)
+            # Threads that still write there find no folder, so they add nothing to what is removed.
+            hidden = folder.rename(folder.with_name(f"{folder.name}-"))
+            shutil.rmtree(hidden, ignore_errors=True)
 
         with on_interrupt(remove):
             yield folder

@@ -26,6 +26,8 @@ from rich.progress import (
 )
 from rich.progress import Progress as Bars
 
+from polar_bayes.interrupts import on_interrupt
+
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and the fraction of it that is done."""
 
@@ -109,7 +111,8 @@ def _board(what: str) -> Iterator[_Board | None]:
         return
     board: _Board = _Notebook(what) if kernel else _Terminal(console, what)
     try:
-        yield board
+        with on_interrupt(board.clear):  # the cursor of a terminal is hidden
+            yield board
     finally:
         board.clear()
         _shown.release()

@@ -7,7 +7,7 @@ import types
 
 import pytest
 
-from polar_bayes import progress
+from polar_bayes import interrupts, progress
 from polar_bayes.progress import counted, counts, stages, watched
 
 
@@ -71,6 +71,18 @@ def test_a_terminal_shows_bars_and_takes_them_back(monkeypatch) -> None:
     assert "climbing" in screen.getvalue()
     assert "pixels" in screen.getvalue()
     assert screen.getvalue().endswith("\x1b[2K")  # the line is wiped
+
+
+def test_an_interrupt_gives_the_cursor_of_a_terminal_back(monkeypatch) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    screen = io.StringIO()
+    shown = "\x1b[?25h"
+    with contextlib.redirect_stderr(screen), stages() as show:
+        show("climbing", 0.5)
+        assert shown not in screen.getvalue()
+        interrupts.clean_up()
+        assert shown in screen.getvalue()
 
 
 def test_a_notebook_shows_bars_and_keeps_none(notebook) -> None:

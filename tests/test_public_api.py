@@ -119,6 +119,36 @@ def test_importing_every_module_makes_no_array_flips_no_flag_and_prints_nothing(
     assert run(EVERY_MODULE) == ""
 
 
+EVERY_NAME = """
+import random, sys, threading, warnings
+import numpy as np
+
+def spy(original):
+    def add(*args, **kwargs):
+        caller = sys._getframe(1).f_globals["__name__"]
+        assert not caller.startswith("polar_bayes"), f"{caller} adds a filter of warnings"
+        return original(*args, **kwargs)
+    return add
+
+for name in ("filterwarnings", "simplefilter", "resetwarnings"):
+    setattr(warnings, name, spy(getattr(warnings, name)))
+random.seed(7)
+np.random.seed(7)
+import polar_bayes as pb
+for name in pb.__all__:
+    before = random.getstate(), str(np.random.get_state())
+    getattr(pb, name)
+    assert (random.getstate(), str(np.random.get_state())) == before, f"{name} draws"
+assert threading.enumerate() == [threading.main_thread()]
+assert "jax" in sys.modules and "rich" in sys.modules
+"""
+
+
+def test_importing_every_name_draws_nothing_starts_no_thread_and_filters_no_warning():
+    """JAX and Rich draw from the global states of NumPy and Python when they are imported."""
+    assert run(EVERY_NAME) == ""
+
+
 # --- others ---------------------------------------------------------------------------------------
 
 WHOLE = """

@@ -11,11 +11,14 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from subprocess import PIPE
 
 import cloudpickle
 
 from polar_bayes.budget.trial import Measured, Trial, run_trial
 from polar_bayes.errors import FitError, PolarBayesError
+from polar_bayes.interrupts import on_interrupt
+from polar_bayes.paths import unfinished_folder
 
 LAST_WORDS = 300
 """Characters of what a process that broke down has said."""
@@ -34,16 +37,21 @@ def run_fresh(trial: Trial) -> Measured:
         FitError: The method does not suit the capture, found nothing, or its process broke down;
             other errors of the package as the trial raised them.
     """
-    with tempfile.TemporaryDirectory(prefix="polar-bayes-") as folder:
-        given, made = Path(folder) / "trial", Path(folder) / "measured"
+    with unfinished_folder(Path(tempfile.gettempdir())) as folder:
+        given, made = folder / "trial", folder / "measured"
         given.write_bytes(cloudpickle.dumps(trial))
         words = [sys.executable, "-m", "polar_bayes.budget.fresh", str(given), str(made)]
-        done = subprocess.run(
-            words, env=_environment(), capture_output=True, text=True, check=False
-        )
+        with subprocess.Popen(
+            words, env=_environment(), stdout=PIPE, stderr=PIPE, text=True
+        ) as process:
+            with on_interrupt(process.kill):
+                try:
+                    _, said = process.communicate()
+                finally:
+                    process.kill()  # an exception must not wait for it
         if not made.exists():
             raise FitError(
-                f"its process ended with {done.returncode}: {done.stderr[-LAST_WORDS:].strip()}",
+                f"its process ended with {process.returncode}: {said[-LAST_WORDS:].strip()}",
                 where="accuracy",
                 mend="try the same method with polar_bayes.fit, or a smaller capture",
             )

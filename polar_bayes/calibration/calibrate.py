@@ -1,5 +1,6 @@
 """The public verb: draw from the prior, simulate, fit again, and see where the truth stands."""
 
+import contextlib
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -18,6 +19,7 @@ from polar_bayes.calibration.store import Store
 from polar_bayes.errors import FitError
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.request import Request, resolve
+from polar_bayes.interrupts import on_interrupt
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.paths import as_path
 from polar_bayes.physics.scene import Scene
@@ -139,7 +141,8 @@ def calibrate(
     found = kept.begin(resume=resume) if kept is not None else []
     missing = _missing(found, simulations)
     show = progress or silent
-    found += _fit_all(plan, missing, simulations, kept, scheduler, show)
+    with on_interrupt(kept.resume_hint) if kept is not None else contextlib.nullcontext():
+        found += _fit_all(plan, missing, simulations, kept, scheduler, show)
     about = _provenance(request, settings, truth, simulations)
     about["seconds"] = round(time.perf_counter() - clock, 3)
     if missing.size < simulations:

@@ -79,6 +79,10 @@ class Store:
             with unfinished.open("wb") as file:
                 np.savez(file, allow_pickle=False, **_flat(block._asdict()))
 
+    def resume_hint(self) -> str:
+        """What an interrupt leaves, for the user."""
+        return f"{self._folder}: what is done is kept; repeat the command with --resume to go on"
+
     def _check(self, head: Path) -> None:
         try:
             begun = json.loads(head.read_text())

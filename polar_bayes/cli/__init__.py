@@ -1,5 +1,5 @@
 """The command line: thin; it parses, calls the Python interface and prints."""
 
-from polar_bayes.cli.entry import commands, main
+from polar_bayes.cli.entry import commands, console, main
 
-__all__ = ["commands", "main"]
+__all__ = ["commands", "console", "main"]

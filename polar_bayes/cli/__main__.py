@@ -1,8 +1,6 @@
 """`python -m polar_bayes.cli` is `polar-bayes`."""
 
-import sys
-
-from polar_bayes.cli.entry import main
+from polar_bayes.cli.entry import console
 
 if __name__ == "__main__":
-    sys.exit(main())
+    console()

@@ -1,34 +1,73 @@
 """One program with many commands.
 
-Exit status: 0 done; 1 the input or the options are wrong (one line: where, what, the mend); 2 the
-fit ran but its diagnostics fail, with the result still written.
+Exit status: 0 done; 1 the input or the options are wrong, or something broke (one line: where,
+what, the hint); 2 the fit ran but its diagnostics fail, with the result still written; 128 + n
+stopped by signal n: 130 Ctrl-C, 143 terminated, 141 nobody reads the output.
 """
 
 import os
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import NoReturn
 
 import click
-import platformdirs
 
-import polar_bayes as pb
 from polar_bayes.cli.captures import COMMANDS as OF_CAPTURES
 from polar_bayes.cli.checks import COMMANDS as OF_CHECKS
+from polar_bayes.cli.compile_cache import keep_compiled_programs
 from polar_bayes.cli.fits import COMMANDS as OF_FITS
 from polar_bayes.cli.imports import COMMANDS as OF_IMPORTS
+from polar_bayes.cli.process import TRACEBACK, end, quiet_libraries, run_until_signal
+from polar_bayes.errors import PolarBayesError, one_line
+from polar_bayes.paths import system_error
+
+BROKEN_PIPE = 141
+"""Exit status of a program whose output nobody reads: 128 + SIGPIPE."""
+
+
+def console() -> NoReturn:
+    """The program `polar-bayes`: run the words of this process as a command, and end it."""
+    end(main())
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command.
 
     Args:
-        arguments: Words after the program's name; those of the process by default.
+        arguments: Words after the program's name. By default those of the process, which then
+            belongs to the command: a signal ends it, compiled programs are kept for later runs,
+            and libraries log nothing.
 
     Returns:
         The exit status.
     """
-    _remember_compiled_programs()
+    if arguments is not None or threading.current_thread() is not threading.main_thread():
+        return _run(arguments)
+    return run_until_signal(_own_process)
+
+
+def _own_process() -> int:
+    """The command of the process itself; its output is flushed while an error still has a line."""
+    quiet_libraries()
+    keep_compiled_programs()
+    status = _run(None)
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        # What is left in the buffer would be an error again when Python ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE if isinstance(error, BrokenPipeError) else _last_resort(error)
+    return status
+
+
+def _run(arguments: list[str] | None) -> int:
+    """Run one command; whatever goes wrong is one line."""
+    output = sys.stdout
     try:
         status = commands.main(arguments, prog_name="polar-bayes", standalone_mode=False)
-    except click.exceptions.Abort:
+    except (click.exceptions.Abort, KeyboardInterrupt):
         click.echo("polar-bayes: stopped", err=True)
         return 130
     except click.ClickException as error:
@@ -37,18 +76,33 @@ def main(arguments: list[str] | None = None) -> int:
         line = " ".join(error.format_message().split())
         click.echo(f"{where}: {line} (see `{where} --help`)", err=True)
         return 1
-    except pb.PolarBayesError as error:
+    except PolarBayesError as error:
         click.echo(str(error), err=True)
         return 1
+    except SystemExit as error:  # click, which replaces a stream whose pipe is broken
+        return BROKEN_PIPE if sys.stdout is not output else int(error.code or 0)
+    except Exception as error:
+        return _last_resort(error)
     return int(status or 0)
 
 
-def _remember_compiled_programs() -> None:
-    """Keep compiled programs between runs; a second run of the same fit compiles nothing."""
-    cache = platformdirs.user_cache_path("polar_bayes") / "compiled"
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+def _last_resort(error: Exception) -> int:
+    """One line for an error that no command expects, and the exit status."""
+    if os.environ.get(TRACEBACK):
+        traceback.print_exception(error)
+    said = next(iter(str(error).strip().splitlines()), "")
+    kind = type(error).__name__
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in said:
+        line = f"out of memory ({kind}: {said}); give it less at a time: readings, pixels or draws"
+    elif isinstance(error, OSError) and error.errno is not None:
+        line = str(system_error(error, Path(error.filename or "the operating system")))
+    else:
+        line = (
+            f"internal error ({kind}: {said}); this is a defect of polar_bayes: "
+            f"set {TRACEBACK}=1 for the traceback and report it"
+        )
+    click.echo(f"polar-bayes: {one_line(line)}", err=True)
+    return 1
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

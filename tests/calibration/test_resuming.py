@@ -19,6 +19,7 @@ from plates import LINKS, PLATE, plate_capture
 from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
+from polar_bayes import interrupts
 from polar_bayes.calibration import block as module
 from polar_bayes.calibration.question import digest
 
@@ -81,7 +82,12 @@ def assert_same_bits(found: xr.DataTree, expected: xr.DataTree) -> None:
 
 
 def test_what_was_broken_off_goes_on_to_the_same_bits(capture, whole, begun, tmp_path) -> None:
-    store, seen = copied(begun, tmp_path), []
+    store, seen, said = copied(begun, tmp_path), [], []
+
+    def progress(done: int, every: int) -> None:
+        seen.append(done)
+        said.extend(interrupts.clean_up())  # as an interrupt does
+
     left = store / ".polar-bayes-crashed"
     left.mkdir()
     (left / "00000036-00000039.npz").write_bytes(b"half a blo")
@@ -90,9 +96,10 @@ def test_what_was_broken_off_goes_on_to_the_same_bits(capture, whole, begun, tmp
         simulations=COUNT,
         store=store,
         resume=True,
-        progress=lambda done, every: seen.append(done),
+        progress=progress,
         **ASKED,
     )
+    assert said == [f"{store}: what is done is kept; repeat the command with --resume to go on"]
     assert seen[0] > 24
     assert seen[-1] == COUNT
     assert_same_bits(found, whole)
