@@ -24,6 +24,7 @@ from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference import point
 from polar_bayes.inference.bench import Bench
+from polar_bayes.inference.deadline import OutOfTimeError, run_until
 from polar_bayes.inference.draws import parameters_of
 from polar_bayes.inference.ground import STARTS
 from polar_bayes.inference.method import AbstractMethod
@@ -88,11 +89,12 @@ def fit(
         SceneError: No such scene.
         FitError: A model, method, prior or link cannot be used.
     """
+    begun = time.perf_counter()
     request = resolve(
         capture, model, method, scene, priors, links, largest_view_zenith, seed, precision
     )
     with jax.enable_x64(precision == "double"):
-        return _run(request, progress or silent)
+        return _run(request, progress or silent, begun)
 
 
 class _Fitted(NamedTuple):
@@ -104,10 +106,11 @@ class _Fitted(NamedTuple):
     problems: list[str]
     extra: dict[str, Any]
     beside: Method | None = None
+    deadline: float = math.inf
 
 
-def _run(request: Request, progress: Progress) -> xr.DataTree:
-    clock = _Clock()
+def _run(request: Request, progress: Progress, begun: float) -> xr.DataTree:
+    clock = _Clock(begun)
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     if request.precision == "single":
         data = data.in_single_precision()
@@ -124,8 +127,7 @@ def _run(request: Request, progress: Progress) -> xr.DataTree:
     prior = describe(key_prior, prior_z[None], data)
     clock.lap("prediction")
 
-    method = fitted.beside or request.method
-    beside, comparisons_failed = _fit_beside(request, method, data, key_plain, progress)
+    beside, comparisons_failed = _fit_beside(request, fitted, data, key_plain, progress)
     if isinstance(request.scene.ledger, xr.Dataset):
         beside["effects"] = request.scene.ledger  # how the scene was chosen stays with the result
     if comparisons_failed:
@@ -150,12 +152,20 @@ def _fit_scene(
     key_starts, key_draws = jax.random.split(key)
     program = prepared.program
     if isinstance(request.method, AbstractMethod):
-        answer = request.method.draw(Bench(request, prepared, data, key, progress))
+        answer = request.method.draw(Bench(request, prepared, data, key, progress, clock.begun))
         clock.lap("draws")
         own = {name: getattr(answer, name) for name in OF_DRAWS}
         finite = {name: x if math.isfinite(x) else None for name, x in own.items()}
         said = {"method": answer.kind} | finite | answer.said
-        return _Fitted(program, answer.z, answer.stats, answer.problems, said, answer.beside)
+        return _Fitted(
+            program,
+            answer.z,
+            answer.stats,
+            answer.problems,
+            said,
+            answer.beside,
+            answer.deadline,
+        )
     if isinstance(request.method, point.Point):
         starts = from_prior(program, key_starts, STARTS, data)
         fitted = _fit_point(prepared, data, starts, request.method)
@@ -174,8 +184,9 @@ def _fit_scene(
 class _Clock:
     """Seconds spent in each stage, compilation included."""
 
-    def __init__(self) -> None:
+    def __init__(self, begun: float) -> None:
         self.laps: dict[str, float] = {}
+        self.begun = begun
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
@@ -244,36 +255,55 @@ def _fit_point(
 
 
 def _fit_beside(
-    request: Request, method: Method, data: Observations, key: Array, progress: Progress
+    request: Request, fitted: _Fitted, data: Observations, key: Array, progress: Progress
 ) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
     """Posteriors of the same fit without what makes its intervals honest, and which ones failed."""
+    method = fitted.beside or request.method
     if isinstance(method, point.Point) or not request.scene.has(Discrepancy):
         return {}, {}
     scenes = {
         "without_discrepancy": request.scene.without(Discrepancy),
         "without_instrument": dataclasses.replace(request.scene, instrument=None),
     }
+    requests = {
+        name: dataclasses.replace(request, scene=scene, method=method)
+        for name, scene in scenes.items()
+    }
     beside: dict[str, xr.Dataset] = {}
-    comparisons_failed: dict[str, str] = {}
-    every: dict[str, Prepared] = {}
-    for name, scene in scenes.items():
-        try:
-            every[name] = prepare(request, scene, data)
-            _expect(every[name], data, method)
-        except FitError as error:  # a failed comparison must not cost the user the fit, but is told
-            comparisons_failed[name] = str(error)
-    for number, name in enumerate(every):
-        progress("comparing", number / len(every))
-        try:
-            simpler = dataclasses.replace(request, scene=scenes[name], method=method)
-            fitted = _fit_scene(simpler, every[name], data, key, silent, _Clock())
-        except FitError as error:
-            comparisons_failed[name] = str(error)
-            continue
-        draws = parameters_of(fitted.program, fitted.z, data)
-        beside[name] = posterior_of(fitted.program, draws)
+    failed: dict[str, str] = {}
+
+    def compare(progress: Progress) -> None:
+        every: dict[str, Prepared] = {}
+        for name, asked in requests.items():
+            try:
+                every[name] = prepare(asked, asked.scene, data)
+                _expect(every[name], data, method)
+            except FitError as error:  # a failed comparison must not cost the user the fit
+                failed[name] = str(error)
+        for number, (name, prepared) in enumerate(every.items()):
+            at = number / len(every)
+            progress("comparing", at)
+            try:
+                beside[name] = _compare(
+                    requests[name], prepared, data, key, lambda *_, at=at: progress("comparing", at)
+                )
+            except FitError as error:
+                failed[name] = str(error)
+
+    try:
+        run_until(fitted.deadline, progress, compare)
+    except OutOfTimeError as late:
+        failed |= {name: str(late) for name in requests if name not in beside | failed}
     progress("comparing", 1.0)
-    return beside, comparisons_failed
+    return dict(beside), dict(failed)  # an abandoned thread may still write to its own
+
+
+def _compare(
+    request: Request, prepared: Prepared, data: Observations, key: Array, progress: Progress
+) -> xr.Dataset:
+    """The posterior of another scene."""
+    found = _fit_scene(request, prepared, data, key, progress, _Clock(time.perf_counter()))
+    return posterior_of(found.program, parameters_of(found.program, found.z, data))
 
 
 def _settings_of(model: Callable) -> dict[str, Any]:

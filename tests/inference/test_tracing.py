@@ -10,7 +10,7 @@ from compilations import compilations
 
 import polar_bayes as pb
 from polar_bayes.inference.kept import Kept
-from polar_bayes.inference.tracing import TracedByShape, compile_beside, compiled
+from polar_bayes.inference.tracing import TracedByShape, TracedOnce
 
 
 @pytest.fixture
@@ -35,7 +35,9 @@ def test_what_was_begun_is_compiled_once(programs: list[str]) -> None:
 
 def test_precision_is_that_of_the_caller_not_of_the_thread() -> None:
     with jax.enable_x64(True):
-        found = compile_beside(compiled(lambda x: x / 3.0), jnp.ones(2)).result()(jnp.ones(2))
+        divide = TracedOnce(lambda x: x / 3.0)
+        divide.begin(jnp.ones(2))
+        found = divide(jnp.ones(2))
     assert found.dtype == np.float64
     assert found[0] == 1.0 / 3.0
 
