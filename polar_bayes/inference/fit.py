@@ -34,6 +34,7 @@ from polar_bayes.inference.program import Draw, Program
 from polar_bayes.inference.request import MODELS, Method, Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.inference.search import from_prior
+from polar_bayes.inference.tracing import check_memory
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.discrepancy import Discrepancy
@@ -118,9 +119,11 @@ def _run(request: Request, progress: Progress, begun: float) -> xr.DataTree:
         jax.random.key(request.seed), 4
     )
     prepared = prepare(request, request.scene, data)
+    _check_room(prepared.program, data, PRIOR_DRAWS)
     _expect(prepared, data, request.method)
     _expect_draws(prepared.program, data)
     fitted = _fit_scene(request, prepared, data, key_main, progress, clock)
+    _check_room(fitted.program, data, fitted.z[..., 0].size + PRIOR_DRAWS)
     describe = _per_draw(fitted.program)
     posterior = describe(key_posterior, fitted.z, data)
     prior_z = from_prior(fitted.program, key_prior, PRIOR_DRAWS, data)
@@ -211,6 +214,13 @@ def _expect_draws(program: Program, data: Observations) -> None:
     )
 
 
+def _check_room(program: Program, data: Observations, draws: int) -> None:
+    """Refuse what is described of so many draws where the memory cannot hold it."""
+    readings = len(program.observed) * data.brightness.dtype.itemsize * math.prod(data.shape)
+    # Noise-free readings, predicted ones and the density of each; in blocks, then all of them.
+    check_memory((draws + THREADS * BLOCK) * 3 * readings)
+
+
 def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], Draw]:
     """Describe every draw, a block at a time inside one compiled loop of fixed length."""
 
@@ -220,22 +230,25 @@ def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], D
         # A key depends on its place alone, so a round number of them serves draws of any number.
         every = jax.random.split(key, KEYS * -(-len(flat) // KEYS))
         keys = np.asarray(jax.random.key_data(every))
+
         # Posterior and prior have different lengths; blocks of one length compile once, and run on
         # threads as the chains do.
-        blocks = []
-        for start in range(0, len(flat), BLOCK):
+        def run(start: int) -> Draw:
             index = np.minimum(np.arange(start, start + BLOCK), len(flat) - 1)
-            blocks.append((keys[index], flat[index]))
-
-        def run(block: tuple[np.ndarray, np.ndarray]) -> Draw:
             with jax.enable_x64(dtype == jnp.float64):  # a thread does not inherit it
-                of_block, drawn = (jnp.asarray(part) for part in block)
+                of_block, drawn = jnp.asarray(keys[index]), jnp.asarray(flat[index])
                 return jax.tree.map(np.asarray, program.described(of_block, drawn, data))
 
-        done = [run(blocks[0])]  # compiled before the threads start
+        first = run(0)  # compiled before the threads start
+        joined = jax.tree.map(lambda x: np.empty((len(flat), *x.shape[1:]), x.dtype), first)
+
+        def fill(start: int, block: Draw) -> None:
+            for whole, part in zip(jax.tree.leaves(joined), jax.tree.leaves(block), strict=True):
+                whole[start : start + BLOCK] = part[: len(flat) - start]
+
+        fill(0, first)
         with ThreadPoolExecutor(THREADS) as pool:
-            done += pool.map(run, blocks[1:])
-        joined = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(flat)], *done)
+            list(pool.map(lambda start: fill(start, run(start)), range(BLOCK, len(flat), BLOCK)))
         return jax.tree.map(lambda x: x.reshape(*z.shape[:2], *x.shape[1:]), joined)
 
     return describe
