@@ -2,9 +2,12 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Iterator
-from typing import override
+from typing import ClassVar, override
 
 import jax
 import numpy as np
@@ -67,12 +70,35 @@ class Reporting(Made):
 
 
 @dataclasses.dataclass(frozen=True)
-class Handing(Made):
-    """Has another method fit the comparisons."""
+class Stuck(Made):
+    """Reports nothing and does not end, as if it compiled or ran compiled code."""
+
+    seconds: ClassVar[float] = 60.0
+    released: ClassVar[threading.Event] = threading.Event()
 
     @override
     def draw(self, bench: Bench) -> Answer:
-        return dataclasses.replace(super().draw(bench), beside=Made(draws=1000))
+        self.released.wait(self.seconds)
+        return super().draw(bench)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def whoever_is_stuck_is_let_go() -> Iterator[None]:
+    yield
+    Stuck.released.set()
+
+
+@dataclasses.dataclass(frozen=True)
+class Handing(Made):
+    """Has another method fit the comparisons."""
+
+    other: AbstractMethod = Made(draws=1000)
+    seconds: float = np.inf
+
+    @override
+    def draw(self, bench: Bench) -> Answer:
+        deadline = time.perf_counter() + self.seconds
+        return dataclasses.replace(super().draw(bench), beside=self.other, deadline=deadline)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,6 +197,62 @@ def test_only_the_first_is_let_off_the_time_though_it_had_no_answer():
     assert fitted(Reporting(), seconds=0.3)[1]["auto"]["met"]
 
 
+def test_what_is_stuck_is_abandoned_and_the_best_answer_so_far_is_returned():
+    """Neither compilation nor compiled programs can be interrupted."""
+    rungs = (("rung 0", Made(k_hat=0.9)), ("rung 1", Stuck()), ("rung 2", Made()))
+    here = bench(line)
+    Given(given=rungs[:1]).draw(here)  # what judges draws is compiled
+    begin = time.perf_counter()
+    found = Given(given=rungs, seconds=1.0).draw(dataclasses.replace(here, begun=begin))
+    assert time.perf_counter() - begin < 0.5 * Stuck.seconds
+    said = found.said["auto"]
+    assert [step["why"] for step in said["steps"]] == [
+        "its Pareto k-hat is 0.90",
+        "abandoned when the time was up",
+        "the time was up",
+    ]
+    assert (said["chosen"], said["met"]) == ("rung 0", False)
+    assert "no method met the tolerance of 0.1 posterior sd within 1 s" in found.problems[-1]
+
+
+def test_the_time_is_counted_from_when_the_fit_was_asked_for(monkeypatch: pytest.MonkeyPatch):
+    at_once = fitting.resolve
+
+    def slowly(*asked: object):
+        time.sleep(0.6)
+        return at_once(*asked)
+
+    fitted(Made())
+    monkeypatch.setattr(fitting, "resolve", slowly)
+    _, said = fitted(Made(k_hat=0.9), Made(), seconds=0.5)
+    assert [step["why"] for step in said["auto"]["steps"]][1] == "the time was up"
+
+
+@pytest.mark.thorough
+def test_the_time_is_kept_on_a_busy_machine():
+    """Two other processes want both cores; the rungs of this capture are long."""
+    scene = pb.Scene(pb.RoughSurface(), pb.Unpolarized(), pb.StokesMixing())
+    hard = pb.simulate("fruit", seed=0, protocol=pb.Protocol(views=8, wavelengths=()))
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    seconds, begin = 10.0, time.perf_counter()
+    try:
+        result = pb.fit(
+            hard, scene=scene, method="auto", tolerance=0.02, seconds=seconds, progress=ignored
+        )
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    took = time.perf_counter() - begin
+    first, *others = json.loads(result.attrs["polar_bayes"])["auto"]["steps"]
+    assert "the time was up" in others[-1]["why"]
+    assert took <= 1.2 * seconds + first["seconds"]
+
+
+def ignored(stage: str, fraction: float) -> None:
+    """Nobody watches."""
+
+
 def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left():
     taken, here = Made(), bench(line)
     auto = Given(given=(("rung 0", Made(k_hat=0.9)), ("rung 1", taken)), seconds=600.0)
@@ -186,6 +268,22 @@ def test_the_fit_beside_is_made_by_the_method_of_the_answer():
     assert result["posterior"].sizes["draw"] == 1000
     assert result["without_discrepancy"].sizes["draw"] == 250
     assert result["without_instrument"].sizes["draw"] == 250
+
+
+def test_comparisons_that_are_stuck_are_abandoned_and_told():
+    scene = pb.Scene(pb.SmoothSurface(), instrument=pb.Instrument((pb.Discrepancy(),)))
+    asked = {"model": line, "links": LINKS, "scene": scene}
+    late = pb.fit(capture(), method=Handing(seconds=-1.0), **asked)
+    said = json.loads(late.attrs["polar_bayes"])["comparisons_failed"]
+    assert set(said.values()) == {"the time was up"}
+    begin = time.perf_counter()
+    result = pb.fit(capture(), method=Handing(other=Stuck(), seconds=3.0), **asked)
+    assert time.perf_counter() - begin < 0.5 * Stuck.seconds
+    assert "without_discrepancy" not in result.children
+    said = json.loads(result.attrs["polar_bayes"])["comparisons_failed"]
+    assert said == dict.fromkeys(
+        ("without_discrepancy", "without_instrument"), "abandoned when the time was up"
+    )
 
 
 def test_tolerances_that_weighted_draws_cannot_meet_are_left_to_chains():
