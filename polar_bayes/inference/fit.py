@@ -88,7 +88,7 @@ def fit(
     Raises:
         CaptureError: The capture does not hold what a fit needs.
         SceneError: No such scene.
-        FitError: A model, method, prior or link cannot be used.
+        FitError: A model, method, prior or link cannot be used, or the memory is too small.
     """
     begun = time.perf_counter()
     request = resolve(

@@ -185,7 +185,7 @@ def check_memory(needed: int) -> None:
     there = memory_limit()
     if there is not None and needed > there:
         raise FitError(
-            f"this fit would need {needed / 1e9:.1f} GB at once, and there are {there / 1e9:.1f}",
+            f"this fit would need {needed / 1e9:.1f} GB at once, of {there / 1e9:.1f} GB",
             where="memory",
             mend="average neighboring views, or take a sample of them",
         )
