@@ -20,7 +20,7 @@ from polar_bayes.inference.tracing import TRACING
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.pixels.engine import Engine
 from polar_bayes.pixels.fitting import PixelMethod, candidates_of, fit_stack
-from polar_bayes.pixels.making import Recipe, make_engine
+from polar_bayes.pixels.making import MAKING, Recipe, make_engine
 from polar_bayes.pixels.marginals import Marginals
 from polar_bayes.pixels.outcome import Describe, Outcome
 from polar_bayes.pixels.sampling import PixelNuts
@@ -96,7 +96,7 @@ class Plan:
         """The compiled programs, which the next calibration of the same model finds."""
         candidates = candidates_of(self.settings)
         recipe = Recipe(self.request, lambda: self.data, candidates, self.recipe_key)
-        with TRACING:
+        with MAKING:
             return make_engine(recipe)
 
     @property
@@ -165,10 +165,10 @@ def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
     seed, shared = plan.request.seed, plan.shared
     filled = np.resize(numbers, plan.block)  # so that all blocks run the same program
     wanted = np.arange(len(numbers))
-    with jax.enable_x64(True), TRACING:
+    is_ranked = plan.readings and not plan.untold
+    with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), 1)
         drawn = draw_numbered(plan.teller, plan.data, filled, key)
-        is_ranked = plan.readings and not plan.untold
         fresh = draw_fresh(plan.teller, plan.data, drawn, filled, key) if is_ranked else {}
     truth = {name: np.asarray(drawn.truth[name])[wanted] for name in shared}
     captures = drawn.captures.subset(wanted)
@@ -289,9 +289,9 @@ def _shared_by(plan: Plan) -> dict[str, tuple[int, ...]]:
 
 @functools.lru_cache(maxsize=4)
 def _untold_of(plan: Plan) -> str:
-    given = _shapes(plan.program, plan.data)
+    given, program, teller = _shapes(plan.program, plan.data), plan.program, plan.teller
     with jax.enable_x64(True), TRACING:
-        return why_untold(plan.program, plan.teller, plan.data, given)
+        return why_untold(program, teller, plan.data, given)
 
 
 def _shapes(program: Program, data: Observations) -> dict[str, tuple[int, ...]]:

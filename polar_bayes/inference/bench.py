@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import time
 
 import jax
 import numpy as np
@@ -25,6 +26,7 @@ class Bench:
         data: The capture.
         key: Random key of the whole fit.
         progress: Called with the name of a stage and the fraction of it that is done.
+        begun: When the fit was asked for, of `time.perf_counter`, s.
     """
 
     request: Request
@@ -32,6 +34,7 @@ class Bench:
     data: Observations
     key: Array
     progress: Progress
+    begun: float = dataclasses.field(default_factory=time.perf_counter)
 
     @property
     def program(self) -> Program:
@@ -47,6 +50,13 @@ class Bench:
     def ground(self) -> AbstractGround:
         """The peaks of the posterior, searched for once however many methods ask."""
         return self.prepared.grounds.find(self.data, jax.random.split(self.key)[0], self.progress)
+
+    def reporting(self, progress: Progress) -> "Bench":
+        """The same with another callback; the peaks go with it where they are found already."""
+        other = dataclasses.replace(self, progress=progress)
+        if "ground" in self.__dict__:
+            other.__dict__["ground"] = self.ground
+        return other
 
     @property
     def dtype(self) -> np.dtype:

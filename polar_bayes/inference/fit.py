@@ -24,6 +24,7 @@ from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference import point
 from polar_bayes.inference.bench import Bench
+from polar_bayes.inference.deadline import OutOfTimeError, run_until
 from polar_bayes.inference.draws import parameters_of
 from polar_bayes.inference.ground import STARTS
 from polar_bayes.inference.method import AbstractMethod
@@ -33,6 +34,7 @@ from polar_bayes.inference.program import Draw, Program
 from polar_bayes.inference.request import MODELS, Method, Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.inference.search import from_prior
+from polar_bayes.inference.tracing import check_memory
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.discrepancy import Discrepancy
@@ -86,13 +88,14 @@ def fit(
     Raises:
         CaptureError: The capture does not hold what a fit needs.
         SceneError: No such scene.
-        FitError: A model, method, prior or link cannot be used.
+        FitError: A model, method, prior or link cannot be used, or the memory is too small.
     """
+    begun = time.perf_counter()
     request = resolve(
         capture, model, method, scene, priors, links, largest_view_zenith, seed, precision
     )
     with jax.enable_x64(precision == "double"):
-        return _run(request, progress or silent)
+        return _run(request, progress or silent, begun)
 
 
 class _Fitted(NamedTuple):
@@ -104,10 +107,11 @@ class _Fitted(NamedTuple):
     problems: list[str]
     extra: dict[str, Any]
     beside: Method | None = None
+    deadline: float = math.inf
 
 
-def _run(request: Request, progress: Progress) -> xr.DataTree:
-    clock = _Clock()
+def _run(request: Request, progress: Progress, begun: float) -> xr.DataTree:
+    clock = _Clock(begun)
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     if request.precision == "single":
         data = data.in_single_precision()
@@ -115,17 +119,18 @@ def _run(request: Request, progress: Progress) -> xr.DataTree:
         jax.random.key(request.seed), 4
     )
     prepared = prepare(request, request.scene, data)
+    _check_room(prepared.program, data, PRIOR_DRAWS)
     _expect(prepared, data, request.method)
     _expect_draws(prepared.program, data)
     fitted = _fit_scene(request, prepared, data, key_main, progress, clock)
+    _check_room(fitted.program, data, fitted.z[..., 0].size + PRIOR_DRAWS)
     describe = _per_draw(fitted.program)
     posterior = describe(key_posterior, fitted.z, data)
     prior_z = from_prior(fitted.program, key_prior, PRIOR_DRAWS, data)
     prior = describe(key_prior, prior_z[None], data)
     clock.lap("prediction")
 
-    method = fitted.beside or request.method
-    beside, comparisons_failed = _fit_beside(request, method, data, key_plain, progress)
+    beside, comparisons_failed = _fit_beside(request, fitted, data, key_plain, progress)
     if isinstance(request.scene.ledger, xr.Dataset):
         beside["effects"] = request.scene.ledger  # how the scene was chosen stays with the result
     if comparisons_failed:
@@ -150,12 +155,20 @@ def _fit_scene(
     key_starts, key_draws = jax.random.split(key)
     program = prepared.program
     if isinstance(request.method, AbstractMethod):
-        answer = request.method.draw(Bench(request, prepared, data, key, progress))
+        answer = request.method.draw(Bench(request, prepared, data, key, progress, clock.begun))
         clock.lap("draws")
         own = {name: getattr(answer, name) for name in OF_DRAWS}
         finite = {name: x if math.isfinite(x) else None for name, x in own.items()}
         said = {"method": answer.kind} | finite | answer.said
-        return _Fitted(program, answer.z, answer.stats, answer.problems, said, answer.beside)
+        return _Fitted(
+            program,
+            answer.z,
+            answer.stats,
+            answer.problems,
+            said,
+            answer.beside,
+            answer.deadline,
+        )
     if isinstance(request.method, point.Point):
         starts = from_prior(program, key_starts, STARTS, data)
         fitted = _fit_point(prepared, data, starts, request.method)
@@ -174,8 +187,9 @@ def _fit_scene(
 class _Clock:
     """Seconds spent in each stage, compilation included."""
 
-    def __init__(self) -> None:
+    def __init__(self, begun: float) -> None:
         self.laps: dict[str, float] = {}
+        self.begun = begun
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
@@ -200,6 +214,13 @@ def _expect_draws(program: Program, data: Observations) -> None:
     )
 
 
+def _check_room(program: Program, data: Observations, draws: int) -> None:
+    """Refuse what is described of so many draws where the memory cannot hold it."""
+    readings = len(program.observed) * data.brightness.dtype.itemsize * math.prod(data.shape)
+    # Noise-free readings, predicted ones and the density of each; in blocks, then all of them.
+    check_memory((draws + THREADS * BLOCK) * 3 * readings)
+
+
 def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], Draw]:
     """Describe every draw, a block at a time inside one compiled loop of fixed length."""
 
@@ -209,22 +230,25 @@ def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], D
         # A key depends on its place alone, so a round number of them serves draws of any number.
         every = jax.random.split(key, KEYS * -(-len(flat) // KEYS))
         keys = np.asarray(jax.random.key_data(every))
+
         # Posterior and prior have different lengths; blocks of one length compile once, and run on
         # threads as the chains do.
-        blocks = []
-        for start in range(0, len(flat), BLOCK):
+        def run(start: int) -> Draw:
             index = np.minimum(np.arange(start, start + BLOCK), len(flat) - 1)
-            blocks.append((keys[index], flat[index]))
-
-        def run(block: tuple[np.ndarray, np.ndarray]) -> Draw:
             with jax.enable_x64(dtype == jnp.float64):  # a thread does not inherit it
-                of_block, drawn = (jnp.asarray(part) for part in block)
+                of_block, drawn = jnp.asarray(keys[index]), jnp.asarray(flat[index])
                 return jax.tree.map(np.asarray, program.described(of_block, drawn, data))
 
-        done = [run(blocks[0])]  # compiled before the threads start
+        first = run(0)  # compiled before the threads start
+        joined = jax.tree.map(lambda x: np.empty((len(flat), *x.shape[1:]), x.dtype), first)
+
+        def fill(start: int, block: Draw) -> None:
+            for whole, part in zip(jax.tree.leaves(joined), jax.tree.leaves(block), strict=True):
+                whole[start : start + BLOCK] = part[: len(flat) - start]
+
+        fill(0, first)
         with ThreadPoolExecutor(THREADS) as pool:
-            done += pool.map(run, blocks[1:])
-        joined = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(flat)], *done)
+            list(pool.map(lambda start: fill(start, run(start)), range(BLOCK, len(flat), BLOCK)))
         return jax.tree.map(lambda x: x.reshape(*z.shape[:2], *x.shape[1:]), joined)
 
     return describe
@@ -244,36 +268,55 @@ def _fit_point(
 
 
 def _fit_beside(
-    request: Request, method: Method, data: Observations, key: Array, progress: Progress
+    request: Request, fitted: _Fitted, data: Observations, key: Array, progress: Progress
 ) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
     """Posteriors of the same fit without what makes its intervals honest, and which ones failed."""
+    method = fitted.beside or request.method
     if isinstance(method, point.Point) or not request.scene.has(Discrepancy):
         return {}, {}
     scenes = {
         "without_discrepancy": request.scene.without(Discrepancy),
         "without_instrument": dataclasses.replace(request.scene, instrument=None),
     }
+    requests = {
+        name: dataclasses.replace(request, scene=scene, method=method)
+        for name, scene in scenes.items()
+    }
     beside: dict[str, xr.Dataset] = {}
-    comparisons_failed: dict[str, str] = {}
-    every: dict[str, Prepared] = {}
-    for name, scene in scenes.items():
-        try:
-            every[name] = prepare(request, scene, data)
-            _expect(every[name], data, method)
-        except FitError as error:  # a failed comparison must not cost the user the fit, but is told
-            comparisons_failed[name] = str(error)
-    for number, name in enumerate(every):
-        progress("comparing", number / len(every))
-        try:
-            simpler = dataclasses.replace(request, scene=scenes[name], method=method)
-            fitted = _fit_scene(simpler, every[name], data, key, silent, _Clock())
-        except FitError as error:
-            comparisons_failed[name] = str(error)
-            continue
-        draws = parameters_of(fitted.program, fitted.z, data)
-        beside[name] = posterior_of(fitted.program, draws)
+    failed: dict[str, str] = {}
+
+    def compare(progress: Progress) -> None:
+        every: dict[str, Prepared] = {}
+        for name, asked in requests.items():
+            try:
+                every[name] = prepare(asked, asked.scene, data)
+                _expect(every[name], data, method)
+            except FitError as error:  # a failed comparison must not cost the user the fit
+                failed[name] = str(error)
+        for number, (name, prepared) in enumerate(every.items()):
+            at = number / len(every)
+            progress("comparing", at)
+            try:
+                beside[name] = _compare(
+                    requests[name], prepared, data, key, lambda *_, at=at: progress("comparing", at)
+                )
+            except FitError as error:
+                failed[name] = str(error)
+
+    try:
+        run_until(fitted.deadline, progress, compare)
+    except OutOfTimeError as late:
+        failed |= {name: str(late) for name in requests if name not in beside | failed}
     progress("comparing", 1.0)
-    return beside, comparisons_failed
+    return dict(beside), dict(failed)  # an abandoned thread may still write to its own
+
+
+def _compare(
+    request: Request, prepared: Prepared, data: Observations, key: Array, progress: Progress
+) -> xr.Dataset:
+    """The posterior of another scene."""
+    found = _fit_scene(request, prepared, data, key, progress, _Clock(time.perf_counter()))
+    return posterior_of(found.program, parameters_of(found.program, found.z, data))
 
 
 def _settings_of(model: Callable) -> dict[str, Any]:

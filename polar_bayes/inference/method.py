@@ -30,6 +30,7 @@ class Answer:
         said: What else belongs into the provenance; JSON must hold it.
         beside: Settings that fit the comparisons beside this answer, where a method has chosen
             another; None where they are its own.
+        deadline: Of `time.perf_counter`, s; comparisons that are not done by then are abandoned.
     """
 
     kind: str
@@ -44,6 +45,7 @@ class Answer:
     densities: float = np.nan
     said: dict[str, Any] = dataclasses.field(default_factory=dict)
     beside: Any = None
+    deadline: float = np.inf
 
 
 @dataclasses.dataclass(frozen=True)

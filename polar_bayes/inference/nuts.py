@@ -9,7 +9,7 @@ threads there are.
 
 import dataclasses
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +23,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.kept import Kept
 from polar_bayes.inference.mixing import measure
 from polar_bayes.inference.modes import Modes, ValueAndGradient
-from polar_bayes.inference.tracing import TRACING, compile_beside, compiled
+from polar_bayes.inference.tracing import TracedOnce
 
 Progress = Callable[[float], None]
 
@@ -154,7 +154,7 @@ def sample(
     keys = jax.random.split(key, settings.chains)
     states = [sampler.begin(target, key, at) for key, at in zip(keys, target.starts, strict=True)]
     # Compiled before the threads start: all then share one executable.
-    advance = sampler.advance(states[0], target.given).result()
+    advance = sampler.advance.program(states[0], target.given)
 
     rounds: list[Step] = []
     steps_before = np.zeros(settings.chains, int)
@@ -202,9 +202,9 @@ def expect(target: Target, settings: Nuts) -> None:
         Nothing.
     """
     sampler = _sampler(target, settings)
-    if not sampler.is_begun:
+    if not sampler.advance.is_begun:
         state = sampler.begin(target, jax.random.key(0), target.starts[0])
-        sampler.advance(state, target.given)
+        sampler.advance.begin(state, target.given)
 
 
 def _sampler(target: Target, settings: Nuts) -> "_Sampler":
@@ -283,15 +283,11 @@ class _Sampler:
 
     def __init__(self, density: Callable[[Array, Any], Array], fixed: _Fixed) -> None:
         self.fixed = fixed
-        self._begun: Future | None = None
+        # From a state and the data to the state after a block and its steps.
+        self.advance = TracedOnce(self._advance)
         self._init, self._next = infer.hmc.hmc(
             potential_fn_gen=lambda given: lambda z: density(z, given), algo="NUTS"
         )
-
-    @property
-    def is_begun(self) -> bool:
-        """Whether it is compiled, or being compiled."""
-        return self._begun is not None
 
     def begin(self, target: Target, key: Array, start: np.ndarray) -> infer.hmc.HMCState:
         value, gradient = target.potential(start)
@@ -310,13 +306,6 @@ class _Sampler:
             model_args=(target.given,),
             rng_key=key,
         )
-
-    def advance(self, state: infer.hmc.HMCState, given: Any) -> Future:
-        """From a state and the data to the state after a block and its steps, being compiled."""
-        with TRACING:
-            if self._begun is None:
-                self._begun = compile_beside(compiled(self._advance), state, given)
-            return self._begun
 
     def _advance(self, state: infer.hmc.HMCState, given: Any) -> tuple[infer.hmc.HMCState, Step]:
         def step(state: infer.hmc.HMCState, _: None) -> tuple[infer.hmc.HMCState, Step]:

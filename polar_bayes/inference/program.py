@@ -171,7 +171,7 @@ class Program:
                 0, count, lambda i, z: z.at[i].set(self.from_prior(wrapped[i], data)), nothing
             )
 
-        return TracedOnce(draw)
+        return TracedByShape(draw)
 
     @functools.cached_property
     def described(self) -> TracedByShape:

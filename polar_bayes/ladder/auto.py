@@ -1,6 +1,5 @@
 """The cheapest method that is good enough, found by trying: from cheap to exact."""
 
-import contextlib
 import dataclasses
 import math
 import time
@@ -10,6 +9,7 @@ import numpy as np
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.bench import Bench
+from polar_bayes.inference.deadline import OutOfTimeError, run_until
 from polar_bayes.inference.method import AbstractMethod, Answer
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.request import Method
@@ -48,8 +48,9 @@ class Auto(AbstractMethod):
     Args:
         tolerance: Largest error of a posterior mean or standard deviation, in posterior standard
             deviations, above 0 and at most 1.
-        seconds: No method begins later, and chains stop then, > 0; those of the fits beside this
-            one, too, which are made by the method that was taken. The first one always ends.
+        seconds: Of the whole fit, counted from the call of `fit`, > 0. What is not done by then is
+            abandoned, fits beside this one included, which are made by the method that was taken;
+            only the first method always ends.
 
     Raises:
         FitError: A setting is out of range.
@@ -101,21 +102,19 @@ class Auto(AbstractMethod):
 
     @override
     def draw(self, bench: Bench) -> Answer:
-        deadline = time.perf_counter() + self.seconds
+        deadline = bench.begun + self.seconds
         steps: list[Step] = []
         best: tuple[Step, Answer] | None = None
         waiting = list(self.rungs(bench).items())
         again = False
         while waiting:
             name, method = waiting.pop(0)
-            if steps and time.perf_counter() >= deadline:
-                steps.append(Step(name, 0.0, why="the time was up"))
-                continue
-            step, found = self._try(name, method, _within(bench, deadline if steps else np.inf))
+            # The first one always ends: there is nothing else to return.
+            step, found = self._try(name, method, bench, deadline if steps else np.inf)
             steps.append(step)
             # Of two in doubt the dearer one is nearer to exact.
             if found is not None and (best is None or step.error <= best[0].error):
-                best = step, dataclasses.replace(found, beside=InTime(method, deadline))
+                best = step, dataclasses.replace(found, beside=method, deadline=deadline)
             if step.taken:
                 break
             again = not again and np.isfinite(step.error)
@@ -132,14 +131,24 @@ class Auto(AbstractMethod):
             )
         return self._told(*best, steps)
 
-    def _try(self, name: str, method: Method, bench: Bench) -> tuple["Step", Answer | None]:
-        """One rung, judged by its own diagnostics."""
+    def _try(
+        self, name: str, method: Method, bench: Bench, deadline: float
+    ) -> tuple["Step", Answer | None]:
+        """One rung, judged by its own diagnostics, or abandoned at the deadline."""
         begin = time.perf_counter()
         try:
-            found = answer(method, bench)
-        except (FitError, _TimeIsUpError) as failure:
-            seconds = time.perf_counter() - begin
-            return Step(name, seconds, why=str(failure)), None
+            return run_until(
+                deadline,
+                bench.progress,
+                lambda progress: self._judged(name, method, bench.reporting(progress)),
+            )
+        except (FitError, OutOfTimeError) as failure:
+            return Step(name, time.perf_counter() - begin, why=str(failure)), None
+
+    def _judged(self, name: str, method: Method, bench: Bench) -> tuple["Step", Answer]:
+        """A rung's own diagnostics."""
+        begin = time.perf_counter()
+        found = answer(method, bench)
         error = expected_error(found, bench.program, bench.data)
         doubts = _doubts(found, bench)
         biased = bool(doubts)
@@ -176,26 +185,6 @@ class Auto(AbstractMethod):
         return dataclasses.replace(found, problems=problems, said=found.said | {"auto": said})
 
 
-@dataclasses.dataclass(frozen=True)
-class InTime(AbstractMethod):
-    """A method that has to be done by a time of this process.
-
-    Args:
-        method: Any method.
-        deadline: Of `time.perf_counter`, s; nothing begins later, and chains stop then.
-    """
-
-    method: Method
-    deadline: float
-
-    @override
-    def draw(self, bench: Bench) -> Answer:
-        if time.perf_counter() < self.deadline:
-            with contextlib.suppress(_TimeIsUpError):
-                return answer(self.method, _within(bench, self.deadline))
-        raise FitError("the time was up", where="method='auto'", mend="give more seconds")
-
-
 class Step(NamedTuple):
     """One method that was tried.
 
@@ -220,26 +209,6 @@ class Step(NamedTuple):
     r_hat: float = np.nan
     k_hat: float = np.nan
     effective_draws: float = np.nan
-
-
-class _TimeIsUpError(Exception):
-    """Chains were stopped."""
-
-
-def _within(bench: Bench, deadline: float) -> Bench:
-    """The same bench, whose methods are stopped after the deadline where they report progress."""
-    if not np.isfinite(deadline):
-        return bench
-
-    def progress(stage: str, fraction: float) -> None:
-        if time.perf_counter() > deadline:
-            raise _TimeIsUpError("the time was up before it was done")
-        bench.progress(stage, fraction)
-
-    limited = dataclasses.replace(bench, progress=progress)
-    if "ground" in bench.__dict__:  # the peaks are found already
-        limited.__dict__["ground"] = bench.ground
-    return limited
 
 
 def _doubts(found: Answer, bench: Bench) -> list[str]:

@@ -52,7 +52,8 @@ def fit(
             `Nuts(draws=2000)`.
         tolerance: Of "auto": largest error of a posterior mean or standard deviation, in posterior
             standard deviations, above 0 and at most 1; by default 0.1.
-        seconds: Of "auto": no method begins later, and chains stop then; by default 60.
+        seconds: Of "auto": wall time of the whole fit, by default 60. Only the first method always
+            ends; what is not done by then is abandoned, and the best answer so far is returned.
         scene: A name in `SETUPS` or a `Scene`; by default the set-up that the capture names in
             its attribute `setup`, else "paper".
         priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
@@ -73,7 +74,7 @@ def fit(
     Raises:
         CaptureError: The capture does not hold what a fit needs.
         SceneError: No such scene.
-        FitError: A model, method, prior or link cannot be used.
+        FitError: A model, method, prior or link cannot be used, or the memory is too small.
     """
     return core.fit(
         capture,

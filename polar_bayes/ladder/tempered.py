@@ -23,6 +23,7 @@ from polar_bayes.pixels.outcome import Row, Status, Weighted
 from polar_bayes.pixels.rounds import tempered_draws
 from polar_bayes.pixels.stack import Stack
 from polar_bayes.pixels.tempering import PixelTempering
+from polar_bayes.progress import Progress, silent
 
 MOST_KEPT = 4
 
@@ -62,6 +63,7 @@ class Tempered(AbstractMethod):
         at = np.zeros(1, int)
         for _, answer in tempered_draws(engine, self.settings, pixels, keys, at, row):
             found = answer
+        bench.progress("tempering", 1.0)
         if found is None:
             raise FitError(
                 "the crowd did not arrive at the posterior", where="Tempered", mend="use 'nuts'"
@@ -104,16 +106,23 @@ class _Counting(Engine):
     """The programs of a layout, and how often one fit runs them; made for each fit."""
 
     counts: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+    progress: Progress = silent
 
     @override
-    def temper(self, *arguments: Any) -> Any:
-        self.counts["crowds"] += 1
-        return super().temper(*arguments)
+    def temper(self, pixels: Stack, settings: PixelTempering, *others: Any) -> Any:
+        self._count("crowds", settings)
+        return super().temper(pixels, settings, *others)
 
     @override
-    def propose(self, *arguments: Any) -> Any:
-        self.counts["rounds"] += 1
-        return super().propose(*arguments)
+    def propose(self, pixels: Stack, settings: PixelTempering, *others: Any) -> Any:
+        self._count("rounds", settings)
+        return super().propose(pixels, settings, *others)
+
+    def _count(self, what: str, settings: PixelTempering) -> None:
+        """Of every attempt, one crowd and some rounds; what is abandoned ends here."""
+        every = settings.crowds * (settings.rounds + 1)
+        self.progress("tempering", self.counts.total() / every)
+        self.counts[what] += 1
 
 
 _ENGINES: Kept[tuple[Prepared, Engine]] = Kept(MOST_KEPT)
@@ -123,7 +132,14 @@ _ENGINES: Kept[tuple[Prepared, Engine]] = Kept(MOST_KEPT)
 def _engine(bench: Bench) -> _Counting:
     """The programs of the bench's layout, kept from fit to fit, and counts that begin at zero."""
     _, kept = _ENGINES.of(id(bench.prepared), functools.partial(_make, bench))
-    return _Counting(kept.program, kept.rough, kept.candidates, kept.precision, kept.programs)
+    return _Counting(
+        kept.program,
+        kept.rough,
+        kept.candidates,
+        kept.precision,
+        kept.programs,
+        progress=bench.progress,
+    )
 
 
 def _make(bench: Bench) -> tuple[Prepared, Engine]:

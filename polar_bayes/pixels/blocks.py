@@ -16,7 +16,7 @@ from polar_bayes.observation.data import READINGS, Observations, observe
 from polar_bayes.physics.notation import notation
 from polar_bayes.pixels.engine import Engine
 from polar_bayes.pixels.fitting import PixelMethod, candidates_of, fit_stack
-from polar_bayes.pixels.making import Recipe, make_engine
+from polar_bayes.pixels.making import MAKING, Recipe, make_engine
 from polar_bayes.pixels.marginals import LEVELS, Marginals
 from polar_bayes.pixels.outcome import Approach, Outcome, Status, no_outcome
 from polar_bayes.pixels.stack import IMAGE, stack
@@ -68,7 +68,7 @@ class Plan:
     def engine(self) -> Engine:
         """The compiled programs, made at first use in each process."""
         observe = functools.partial(self.pixel, "double")
-        with TRACING:
+        with MAKING:
             return make_engine(
                 Recipe(self.request, observe, candidates_of(self.settings), self.key)
             )
@@ -76,8 +76,7 @@ class Plan:
     @property
     def layout(self) -> Layout:
         """Own axes of every parameter that a map shows."""
-        with TRACING:
-            return _layout_of(self)
+        return _layout_of(self)
 
     def pixel(self, precision: str) -> Observations:
         """The pixel that stands for all, as arrays."""
@@ -197,7 +196,7 @@ def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, layout: Layou
 def _layout_of(plan: Plan) -> Layout:
     engine, pixel = plan.engine, plan.pixel(plan.request.precision)
     program = engine.program
-    with jax.enable_x64(engine.precision == "double"):
+    with jax.enable_x64(engine.precision == "double"), TRACING:
         shapes = jax.eval_shape(program.parameters, np.zeros(program.size, engine.dtype), pixel)
     dims = dims_of(program)
     return {name: (tuple(dims[name]), x.shape) for name, x in shapes.items()}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -11,8 +12,13 @@ from polar_bayes.inference.kept import key_of_story
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.search import from_prior
+from polar_bayes.inference.tracing import TRACING
 from polar_bayes.observation.data import Observations
 from polar_bayes.pixels.engine import Engine
+
+MAKING = threading.RLock()
+"""Held by whoever calls `make_engine`, so that no two threads make the same; always taken before
+`TRACING`, because an engine compiles and runs the program that draws its candidates."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,7 +90,7 @@ def make_engine(recipe: Recipe) -> Engine:
     given = {"double": data, "single": data.in_single_precision()}
 
     def program(precision: str) -> Program:
-        with jax.enable_x64(precision == "double"):
+        with jax.enable_x64(precision == "double"), TRACING:
             model = dataclasses.replace(request, precision=precision).bind(request.scene)
             return compile_program(model, given[precision])
 

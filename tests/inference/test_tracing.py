@@ -1,16 +1,23 @@
 """What is compiled beside something else: the same program, once; its errors are told."""
 
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from compilations import compilations
+from toy_models import capture, line
 
 import polar_bayes as pb
+from polar_bayes.inference import fit as fitting
+from polar_bayes.inference import tracing
 from polar_bayes.inference.kept import Kept
-from polar_bayes.inference.tracing import TracedByShape, compile_beside, compiled
+from polar_bayes.inference.tracing import TracedByShape, TracedOnce, bytes_of
 
 
 @pytest.fixture
@@ -35,7 +42,9 @@ def test_what_was_begun_is_compiled_once(programs: list[str]) -> None:
 
 def test_precision_is_that_of_the_caller_not_of_the_thread() -> None:
     with jax.enable_x64(True):
-        found = compile_beside(compiled(lambda x: x / 3.0), jnp.ones(2)).result()(jnp.ones(2))
+        divide = TracedOnce(lambda x: x / 3.0)
+        divide.begin(jnp.ones(2))
+        found = divide(jnp.ones(2))
     assert found.dtype == np.float64
     assert found[0] == 1.0 / 3.0
 
@@ -55,8 +64,173 @@ def test_the_sampler_is_compiled_beside_the_search_and_once(
 ) -> None:
     """The program that is begun before any state of a chain is known is the one that runs."""
     monkeypatch.setattr("polar_bayes.inference.prepared._KEPT", Kept(1))
-    capture = pb.simulate("plastic", seed=0, protocol=pb.Protocol(views=9, wavelengths=()))
+    plastic = pb.simulate("plastic", seed=0, protocol=pb.Protocol(views=9, wavelengths=()))
     scene = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
-    pb.fit(capture, scene=scene, method=pb.Nuts(draws=50, most_draws=50))
+    pb.fit(plastic, scene=scene, method=pb.Nuts(draws=50, most_draws=50))
     assert programs.count("jit(_advance)") == 1
     assert programs.count("jit(describe)") == 1
+
+
+class Gate:
+    """Where a thread waits, and another one sees that it does."""
+
+    def __init__(self) -> None:
+        self.reached, self.open = threading.Event(), threading.Event()
+
+    def wait(self) -> None:
+        self.reached.set()
+        assert self.open.wait(60.0)
+
+
+@pytest.fixture
+def gate() -> Iterator[Gate]:
+    gate = Gate()
+    yield gate
+    gate.open.set()
+
+
+def slow_to_run(gate: Gate) -> Callable[[jax.Array], jax.Array]:
+    def slow(x: jax.Array) -> jax.Array:
+        def wait(x: np.ndarray) -> np.ndarray:
+            gate.wait()
+            return x
+
+        return jax.pure_callback(wait, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
+
+    return slow
+
+
+@pytest.fixture
+def slow_to_compile(gate: Gate, monkeypatch: pytest.MonkeyPatch) -> None:
+    at_once = jax.stages.Lowered.compile
+
+    def compile_slowly(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+        if "slow" in lowered.as_text()[:200]:
+            gate.wait()
+        return at_once(lowered)
+
+    monkeypatch.setattr(jax.stages.Lowered, "compile", compile_slowly)
+
+
+def test_who_compiles_keeps_nobody_from_tracing(gate: Gate, slow_to_compile: None) -> None:
+    def slow(x: jax.Array) -> jax.Array:
+        return 2.0 * x
+
+    run = TracedByShape(slow)
+    with ThreadPoolExecutor(2) as pool:
+        waiting = [pool.submit(run, np.ones(3)) for _ in range(2)]
+        assert gate.reached.wait(60.0)
+        other = ThreadPoolExecutor(1).submit(TracedOnce(lambda x: x + 1.0), np.ones(3))
+        try:
+            assert np.array_equal(other.result(60.0), np.full(3, 2.0))
+            assert not any(each.done() for each in waiting)
+        finally:
+            gate.open.set()
+        assert all(np.array_equal(each.result(60.0), np.full(3, 2.0)) for each in waiting)
+
+
+def test_who_runs_for_the_first_time_keeps_nobody_from_tracing(gate: Gate) -> None:
+    with ThreadPoolExecutor(1) as pool, ThreadPoolExecutor(1) as another:
+        waiting = pool.submit(TracedOnce(slow_to_run(gate)), np.ones(3))
+        assert gate.reached.wait(60.0)
+        other = another.submit(TracedOnce(lambda x: x + 1.0), np.ones(3))
+        try:
+            assert np.array_equal(other.result(60.0), np.full(3, 2.0))
+            assert not waiting.done()
+        finally:
+            gate.open.set()
+        assert np.array_equal(waiting.result(60.0), np.ones(3))
+
+
+def test_what_waits_in_the_queue_is_compiled_by_who_needs_it(
+    gate: Gate, slow_to_compile: None
+) -> None:
+    """A compilation that nobody waits for any more holds up no other one."""
+
+    def slow(x: jax.Array) -> jax.Array:
+        return 2.0 * x
+
+    TracedOnce(slow).begin(np.ones(3))
+    assert gate.reached.wait(60.0)
+    needed = TracedOnce(lambda x: x + 1.0)
+    needed.begin(np.ones(3))
+    with ThreadPoolExecutor(1) as pool:
+        try:
+            assert np.array_equal(pool.submit(needed, np.ones(3)).result(60.0), np.full(3, 2.0))
+        finally:
+            gate.open.set()
+
+
+def test_two_threads_never_trace_at_once_and_compile_a_program_once(programs: list[str]) -> None:
+    inside: list[int] = []
+    most: list[int] = []
+
+    def telling() -> TracedOnce:
+        def told(x: jax.Array) -> jax.Array:
+            inside.append(1)
+            most.append(len(inside))
+            time.sleep(0.05)
+            inside.pop()
+            return x + 1.0
+
+        return TracedOnce(told)
+
+    first, second = telling(), telling()
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda run: run(np.ones(3)), [first, second, first, second]))
+    assert most == [1, 1]
+    assert programs.count("jit(told)") == 2
+
+
+# --- memory ---------------------------------------------------------------------------------------
+
+
+def test_the_memory_of_a_program_is_known_before_it_runs() -> None:
+    def squares(x: jax.Array) -> jax.Array:
+        return jnp.outer(x, x)
+
+    x = jnp.ones(1000)
+    found = bytes_of(TracedOnce(squares).program(x))
+    assert 8.0e6 <= found <= 1.7e7
+
+
+def test_a_program_that_the_memory_cannot_hold_is_refused_and_not_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def many(x: jax.Array) -> jax.Array:
+        return jnp.sort(jnp.broadcast_to(x, (10**12, 3)), axis=0)
+
+    run = TracedOnce(many)
+    said = r"memory: this fit would need 2\d{4}\.\d GB at once, of \d+\.\d GB; average neighb"
+    for _ in range(2):  # nor later
+        with pytest.raises(pb.FitError, match=said):
+            run(jnp.ones(3))
+    monkeypatch.setattr(tracing, "memory_limit", lambda: None)  # where nobody knows, nobody refuses
+    assert TracedOnce(lambda x: x + 1.0)(jnp.ones(3))[0] == 2.0
+
+
+@pytest.mark.parametrize("method", ["point", "laplace", pb.Importance()])
+def test_a_fit_is_refused_in_one_line_where_memory_is_short(
+    method: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = {"model": line, "links": {"q": pb.StokesLink()}}
+    said = r"memory: this fit would need .*; average neighboring"
+    monkeypatch.setattr(tracing, "memory_limit", lambda: 1000)
+    with pytest.raises(pb.FitError, match=said):  # what is described of draws would not fit
+        pb.fit(capture(), method=method, **asked)
+    monkeypatch.setattr(fitting, "_check_room", lambda *_: None)
+    with pytest.raises(pb.FitError, match=said):  # nor would the programs
+        pb.fit(capture(), method=method, **asked)
+
+
+def test_the_limit_is_that_of_the_container_where_it_is_lower(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = tracing.memory_limit()
+    assert machine is not None
+    assert machine > 1e8
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(tracing, "CONTAINER_LIMITS", (str(limit),))
+    for text, found in (("max\n", None), ("1000000\n", 1_000_000)):
+        limit.write_text(text)
+        assert tracing.memory_limit() == (found or machine)

@@ -2,13 +2,17 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Iterator
-from typing import override
+from typing import ClassVar, override
 
 import jax
 import numpy as np
 import pytest
+from plates import plate_capture
 from toy_models import capture, funnel, line, of_line
 
 import polar_bayes as pb
@@ -17,7 +21,6 @@ from polar_bayes.inference import fit as fitting
 from polar_bayes.inference.bench import Bench
 from polar_bayes.inference.method import AbstractMethod, Answer
 from polar_bayes.inference.request import resolve
-from polar_bayes.ladder.auto import InTime
 
 LINKS = {"q": pb.StokesLink()}
 
@@ -68,12 +71,35 @@ class Reporting(Made):
 
 
 @dataclasses.dataclass(frozen=True)
-class Handing(Made):
-    """Has another method fit the comparisons."""
+class Stuck(Made):
+    """Reports nothing and does not end, as if it compiled or ran compiled code."""
+
+    seconds: ClassVar[float] = 60.0
+    released: ClassVar[threading.Event] = threading.Event()
 
     @override
     def draw(self, bench: Bench) -> Answer:
-        return dataclasses.replace(super().draw(bench), beside=Made(draws=1000))
+        self.released.wait(self.seconds)
+        return super().draw(bench)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def whoever_is_stuck_is_let_go() -> Iterator[None]:
+    yield
+    Stuck.released.set()
+
+
+@dataclasses.dataclass(frozen=True)
+class Handing(Made):
+    """Has another method fit the comparisons."""
+
+    other: AbstractMethod = Made(draws=1000)
+    seconds: float = np.inf
+
+    @override
+    def draw(self, bench: Bench) -> Answer:
+        deadline = time.perf_counter() + self.seconds
+        return dataclasses.replace(super().draw(bench), beside=self.other, deadline=deadline)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,24 +192,69 @@ def test_after_its_time_nothing_begins():
 
 def test_only_the_first_is_let_off_the_time_though_it_had_no_answer():
     """Chains that report progress after the time are stopped."""
-    with pytest.raises(pb.FitError, match=r"rung 0: .*no peak.*rung 1: the time was up"):
+    with pytest.raises(pb.FitError, match=r"rung 0: .*no peak.*rung 1: .*the time was up"):
         fitted(Made(fails="no peak"), Reporting(), seconds=0.3)
     # The first one always ends.
     assert fitted(Reporting(), seconds=0.3)[1]["auto"]["met"]
 
 
+def test_what_is_stuck_is_abandoned_and_the_best_answer_so_far_is_returned():
+    """Neither compilation nor compiled programs can be interrupted."""
+    rungs = (("rung 0", Made(k_hat=0.9)), ("rung 1", Stuck()), ("rung 2", Made()))
+    here = bench(line)
+    Given(given=rungs[:1]).draw(here)  # what judges draws is compiled
+    begin = time.perf_counter()
+    found = Given(given=rungs, seconds=1.0).draw(dataclasses.replace(here, begun=begin))
+    assert time.perf_counter() - begin < 0.5 * Stuck.seconds
+    said = found.said["auto"]
+    assert [step["why"] for step in said["steps"]] == [
+        "its Pareto k-hat is 0.90",
+        "abandoned when the time was up",
+        "the time was up",
+    ]
+    assert (said["chosen"], said["met"]) == ("rung 0", False)
+    assert "no method met the tolerance of 0.1 posterior sd within 1 s" in found.problems[-1]
+
+
+def test_the_time_is_counted_from_when_the_fit_was_asked_for(monkeypatch: pytest.MonkeyPatch):
+    at_once = fitting.resolve
+
+    def slowly(*asked: object):
+        time.sleep(0.6)
+        return at_once(*asked)
+
+    fitted(Made())
+    monkeypatch.setattr(fitting, "resolve", slowly)
+    _, said = fitted(Made(k_hat=0.9), Made(), seconds=0.5)
+    assert [step["why"] for step in said["auto"]["steps"]][1] == "the time was up"
+
+
+@pytest.mark.thorough
+def test_the_time_is_kept_on_a_busy_machine():
+    """Two other processes want both cores, and two views are too few for the first rungs."""
+    scene = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
+    links = {"q": pb.StokesLink(stated_errors=True)}
+    hard = plate_capture(np.array([55.0, 57.0]), 0.01, 0)
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    seconds, begin = 20.0, time.perf_counter()
+    try:
+        result = pb.fit(hard, scene=scene, links=links, method="auto", seconds=seconds)
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    took = time.perf_counter() - begin
+    first, *others = json.loads(result.attrs["polar_bayes"])["auto"]["steps"]
+    assert "the time was up" in others[-1]["why"]
+    assert took <= 1.2 * seconds + first["seconds"]
+
+
 def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left():
-    taken = Made()
-    here = Given(given=(("rung 0", Made(k_hat=0.9)), ("rung 1", taken)), seconds=600.0)
-    beside = here.draw(bench(line)).beside
-    assert beside.method == taken
-    assert beside.draw(bench(line)).effective_draws == taken.draws
-    late = dataclasses.replace(beside, deadline=0.0)
-    with pytest.raises(pb.FitError, match="the time was up; give more seconds"):
-        late.draw(bench(line))
-    soon = InTime(Reporting(), time.perf_counter() + 0.3)
-    with pytest.raises(pb.FitError, match="the time was up; give more seconds"):
-        soon.draw(bench(line))
+    taken, here = Made(), bench(line)
+    auto = Given(given=(("rung 0", Made(k_hat=0.9)), ("rung 1", taken)), seconds=600.0)
+    found = auto.draw(here)
+    assert found.beside == taken
+    assert found.deadline == here.begun + 600.0
 
 
 def test_the_fit_beside_is_made_by_the_method_of_the_answer():
@@ -193,6 +264,22 @@ def test_the_fit_beside_is_made_by_the_method_of_the_answer():
     assert result["posterior"].sizes["draw"] == 1000
     assert result["without_discrepancy"].sizes["draw"] == 250
     assert result["without_instrument"].sizes["draw"] == 250
+
+
+def test_comparisons_that_are_stuck_are_abandoned_and_told():
+    scene = pb.Scene(pb.SmoothSurface(), instrument=pb.Instrument((pb.Discrepancy(),)))
+    asked = {"model": line, "links": LINKS, "scene": scene}
+    late = pb.fit(capture(), method=Handing(seconds=-1.0), **asked)
+    said = json.loads(late.attrs["polar_bayes"])["comparisons_failed"]
+    assert set(said.values()) == {"the time was up"}
+    begin = time.perf_counter()
+    result = pb.fit(capture(), method=Handing(other=Stuck(), seconds=3.0), **asked)
+    assert time.perf_counter() - begin < 0.5 * Stuck.seconds
+    assert "without_discrepancy" not in result.children
+    said = json.loads(result.attrs["polar_bayes"])["comparisons_failed"]
+    assert said == dict.fromkeys(
+        ("without_discrepancy", "without_instrument"), "abandoned when the time was up"
+    )
 
 
 def test_tolerances_that_weighted_draws_cannot_meet_are_left_to_chains():
