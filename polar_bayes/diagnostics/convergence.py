@@ -100,7 +100,7 @@ def verdict(result: xr.DataTree) -> Verdict:
 def judge(result: xr.DataTree, table: pd.DataFrame) -> Verdict:
     """The verdict of `verdict`, from a table that is already there."""
     method, provenance = method_of(result), provenance_of(result)
-    problems = [f"{_sentence(problem)}." for problem in provenance.get("problems", [])]
+    problems = [f"{_sentence(problem)}." for problem in provenance.get("problems", ())]
     problems += _not_finite(posterior_scalars(result), method)
     if method == "nuts":
         problems += _chains_disagree(table) + _divergences(result)

@@ -22,6 +22,7 @@ from polar_bayes.diagnostics.parameters import (
     posterior_scalars,
     stats_of,
 )
+from polar_bayes.inference.files import check_fit
 
 PROBABILITIES = (0.5, 0.8, 0.95)
 BAND = 0.95
@@ -115,6 +116,7 @@ def predictive_checks(result: xr.DataTree) -> dict[str, Check]:
     Raises:
         FitError: The tree holds no posterior.
     """
+    check_fit(result)
     efficiency = _relative_efficiency(result)
     correction = _correction(result)
     checks = {}
