@@ -43,7 +43,8 @@ def read_netcdf[Data: (xr.Dataset, xr.DataTree)](
         with open_netcdf(kind, file) as opened:
             data = opened.load()
             expected = data.attrs.pop(CHECKSUM, None)
-            is_whole = expected is None or expected == _checksum(data)
+        # A dataset is the root group alone, the digest that of all groups.
+        is_whole = expected in (None, _checksum(data)) or expected == _checksum_of(file)
     except PermissionError as error:
         raise system_error(error, file) from error
     except Exception as error:  # the libraries below raise nearly every type for a broken file
@@ -60,8 +61,7 @@ def read_netcdf[Data: (xr.Dataset, xr.DataTree)](
 def write_netcdf(data: xr.Dataset | xr.DataTree, path: Path) -> None:
     """Write a netCDF-4 file with a checksum, at a path that `polar_bayes.paths.replacing` gives."""
     data.to_netcdf(path, engine="netcdf4", format="NETCDF4")
-    with open_netcdf(type(data), path) as written:
-        attribute = {CHECKSUM: _checksum(written)}
+    attribute = {CHECKSUM: _checksum_of(path)}
     xr.Dataset(attrs=attribute).to_netcdf(path, engine="netcdf4", mode="a")
 
 
@@ -72,9 +72,15 @@ def open_netcdf(kind: type, file: Path) -> Any:
     return open_file(file.absolute(), engine="netcdf4", decode_times=False)
 
 
+def _checksum_of(file: Path) -> str:
+    """The digest of all groups of a file, of which a dataset is the first."""
+    with open_netcdf(xr.DataTree, file) as tree:
+        return _checksum(tree)
+
+
 def _checksum(data: xr.Dataset | xr.DataTree) -> str:
     """The digest of everything but itself; no version of a library changes it."""
-    groups = {"/": data} if isinstance(data, xr.Dataset) else dict(data.subtree_with_keys)
+    groups = {".": data} if isinstance(data, xr.Dataset) else dict(data.subtree_with_keys)
     digest = hashlib.sha256()
     for path, group in sorted(groups.items()):
         for part in _parts(group if isinstance(group, xr.Dataset) else group.to_dataset(False)):

@@ -134,13 +134,15 @@ FIT = Schema(
             DRAWS, others=False, tied=True, kinds=dict.fromkeys(_FLAGS, FLAGS), names=STATISTICS
         ),
         "log_prior": Group(DRAWS, tied=True, labeled=False),
-        "observed_data": Group(marks={"saturation_level?": FINITE}),
+        "observed_data": Group(never=DRAWS, marks={"saturation_level?": FINITE}),
         "posterior_predictive": _OF_READINGS,
         "noise_free": _OF_READINGS,
         "log_likelihood": _OF_READINGS,
         "prior_predictive": Group(DRAWS, like=Like("observed_data", {"": DRAWS})),
         "constant_data": Group(
-            kinds=dict.fromkeys(_FLAGS, FLAGS), names=(*GEOMETRY, *_FLAGS, "true_*")
+            kinds=dict.fromkeys(_FLAGS, FLAGS),
+            names=(*GEOMETRY, *_FLAGS, "true_*"),
+            inside=dict.fromkeys((*GEOMETRY, *_FLAGS), "observed_data"),
         ),
         "without_discrepancy": Group(DRAWS, labeled=False),
         "without_instrument": Group(DRAWS, labeled=False),
@@ -200,7 +202,7 @@ def load_tree(path: str | os.PathLike[str], schema: Schema) -> xr.DataTree:
     broken = FitError("it cannot be read as netCDF", where=str(file), mend=mend)
     tree = read_netcdf(xr.DataTree, file, broken)
     if not schema.describes(tree) or PROVENANCE not in tree.attrs:
-        raise FitError(f"it holds no {schema.kind} of polar_bayes", where=str(file), mend=mend)
+        raise FitError(f"it holds no {schema.kind}", where=str(file), mend=mend)
     schema.check(tree, str(file))
     return tree
 

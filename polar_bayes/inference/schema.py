@@ -120,6 +120,7 @@ class Group:
     Args:
         dims: Dims that every variable has.
         others: Whether it may have others.
+        never: Dims that none has.
         needed: Whether the tree has the group.
         tied: Whether it has the chains and draws of the posterior.
         labeled: Whether the labels of its dims are those of the other groups.
@@ -127,12 +128,14 @@ class Group:
         variables: Variables that are there, and all their dims.
         names: Patterns of the names that are read; None: all.
         like: The shape of another group.
+        inside: By the name of a variable, the group whose variables all have its dims.
         attributes: Of the group.
         marks: Attributes of each variable.
     """
 
     dims: tuple[str, ...] = ()
     others: bool = True
+    never: tuple[str, ...] = ()
     needed: bool = False
     tied: bool = False
     labeled: bool = True
@@ -140,6 +143,7 @@ class Group:
     variables: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     names: tuple[str, ...] | None = None
     like: Like | None = None
+    inside: Mapping[str, str] = dataclasses.field(default_factory=dict)
     attributes: Mapping[str, Spec] = dataclasses.field(default_factory=dict)
     marks: Mapping[str, Spec] = dataclasses.field(default_factory=dict)
 
@@ -197,11 +201,11 @@ class Schema:
         read: dict[str, Variables] = {}
         for name, group in self.groups.items():
             if name in tree.children:
+                yield from _repeated(tree.children[name], name)
                 read[name] = _variables(group, tree.children[name])
                 yield from _of_group(group, read[name], tree.children[name].attrs, name)
         for name, variables in read.items():
-            if (like := self.groups[name].like) is not None:
-                yield from _unlike(like, variables, read.get(like.group, {}), name)
+            yield from _unlike(self.groups[name], variables, read, name)
         yield from self._lengths(read)
         labeled = {name: tree.children[name] for name in read if self.groups[name].labeled}
         yield from _labels(labeled)
@@ -216,6 +220,13 @@ class Schema:
                 first, expected = sizes.setdefault(str(dim), (name, size))
                 if size != expected:
                     yield name, f"its {dim} has {size} entries, that of {first} {expected}"
+
+
+def _repeated(node: xr.DataTree, place: str) -> Departures:
+    """Dims of one variable with one name, which xarray allows and cannot handle."""
+    for name, variable in node.variables.items():
+        if len(set(variable.dims)) < variable.ndim:
+            yield f"{place}/{name}", f"its dims are {_listed(variable.dims)}, one of them twice"
 
 
 def _variables(group: Group, node: xr.DataTree) -> Variables:
@@ -262,28 +273,37 @@ def _of_variable(group: Group, name: str, variable: xr.Variable, place: str) -> 
         yield place, f"it holds {variable.dtype}, not {_WORDS[kinds]}"
     yield from ((place, f"{dim!r} is no name of a dim") for dim in dims if type(dim) is not str)
     expected = group.variables.get(name, group.dims)
-    if not dims >= set(expected) or (dims != set(expected) and not _may_differ(group, name)):
+    is_closed = name in group.variables or not group.others
+    if not dims >= set(expected) or (is_closed and dims != set(expected)):
         yield place, f"its dims are {_listed(variable.dims)}, not {_listed(expected)}"
+    if odd := [dim for dim in group.never if dim in dims]:
+        yield place, f"it has the dim {odd[0]}"
     yield from _mismatches(variable.attrs, group.marks, place)
 
 
 _WORDS = {NUMBERS: "real numbers", FLAGS: "whole numbers or truth values", TEXTS: "text"}
 
 
-def _may_differ(group: Group, name: str) -> bool:
-    return group.others and name not in group.variables
-
-
-def _unlike(like: Like, own: Variables, others: Variables, group: str) -> Departures:
-    for name, other in others.items():
+def _unlike(group: Group, own: Variables, read: Mapping[str, Variables], place: str) -> Departures:
+    """Where the dims of a group are not those that other groups ask for."""
+    for name, other in group.inside.items():
+        for host, variable in read.get(other, {}).items() if name in own else ():
+            if not set(own[name].dims) <= set(variable.dims):
+                yield (
+                    f"{place}/{name}",
+                    f"{other}/{host} has not its dims {_listed(own[name].dims)}",
+                )
+    like = group.like or Like("", {})
+    for name, variable in read.get(like.group, {}).items():
         for ending, besides in like.endings.items():
-            key = f"{name}{ending}"
-            if key in own:
-                if set(own[key].dims) != {*besides, *other.dims}:
-                    expected = _listed((*besides, *other.dims))
-                    yield f"{group}/{key}", f"its dims are {_listed(own[key].dims)}, not {expected}"
-            elif like.needed:
-                yield f"{group}/{key}", "it is missing"
+            key, expected = f"{name}{ending}", (*besides, *variable.dims)
+            if key in own and set(own[key].dims) != set(expected):
+                yield (
+                    f"{place}/{key}",
+                    f"its dims are {_listed(own[key].dims)}, not {_listed(expected)}",
+                )
+            if key not in own and like.needed:
+                yield f"{place}/{key}", "it is missing"
 
 
 def _listed(dims: Any) -> str:

@@ -191,7 +191,7 @@ def _bands(result: xr.DataTree, between: np.ndarray) -> dict[str, dict[int, np.n
     thin.attrs = dict(result.attrs)
     try:
         predicted = predict_spectrum(thin, between)
-    except (FitError, KeyError):
+    except FitError:
         # Nothing ties the colors together, or what does is known only to the user's own model.
         return {}
     found: dict[str, dict[int, np.ndarray]] = {}
