@@ -6,7 +6,7 @@ import xarray as xr
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.files import OF_ALL, holds, load_tree
-from polar_bayes.inference.schema import ANY, EACH, TEXT, Group, Like, Schema
+from polar_bayes.inference.schema import ANY, EACH, FLAGS, TEXT, Group, Like, Schema
 from polar_bayes.pixels.marginals import LEVELS
 
 _SIMULATION = ("simulation",)
@@ -32,7 +32,7 @@ CALIBRATION = Schema(
         "fits": Group(
             needed=True,
             variables={"status": _SIMULATION},
-            kinds={"status": "iu", "approach": "iu"},
+            kinds={"status": FLAGS, "approach": FLAGS},
             names=("status", "approach", "effective_draws", "pareto_k"),
             dims=_SIMULATION,
             others=False,

@@ -238,10 +238,11 @@ def _impossible(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[
     """Draws beyond the ends of their prior, or beyond what the parameter can be at all."""
     bad = {}
     for scalar in found:
+        if scalar.name in (provenance.get("declared") or {}):
+            continue  # a model of the user's own may give any name to anything
+        least, most = RANGES.get(scalar.name, (-math.inf, math.inf))
         low, high = bounds_of(provenance, scalar.name)
-        if scalar.name not in (provenance.get("declared") or {}):  # a model may use any name
-            least, most = RANGES.get(scalar.name, (-math.inf, math.inf))
-            low, high = max(low, least), min(high, most)
+        low, high = max(low, least), min(high, most)
         slack = [
             ROUNDING * max(1.0, abs(end)) if math.isfinite(end) else 0.0 for end in (low, high)
         ]

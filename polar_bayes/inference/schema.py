@@ -254,17 +254,21 @@ def _of_group(
 
 def _labels(labeled: Mapping[str, xr.DataTree]) -> Departures:
     """Dims that groups share have the same labels everywhere; wavelengths are lengths."""
-    labels: dict[Any, tuple[str, xr.Variable]] = {}
+    seen: dict[Any, tuple[str, xr.Variable | None]] = {}
     for name, node in labeled.items():
-        for dim in node.dims:
-            if dim not in DRAWS and dim in node.coords:
-                first, expected = labels.setdefault(dim, (name, node.variables[dim]))
-                if not expected.equals(node.variables[dim]):
-                    yield f"{name}/{dim}", f"its labels are not those of {first}"
-    if "wavelength" in labels:
-        name, found = labels["wavelength"]
-        if found.dtype.kind not in "iuf" or not np.all(np.isfinite(found) & (found > 0)):
-            yield f"{name}/wavelength", "a label is no length in nm"
+        for dim in (dim for dim in node.dims if dim not in DRAWS):
+            found = node.variables[dim] if dim in node.coords else None
+            first, expected = seen.setdefault(dim, (name, found))
+            is_same = found is expected or (
+                found is not None and expected is not None and expected.equals(found)
+            )
+            if not is_same:
+                yield f"{name}/{dim}", f"its labels are not those of {first}"
+    name, found = seen.get("wavelength", ("", None))
+    if found is not None and (
+        found.dtype.kind not in "iuf" or not np.all(np.isfinite(found) & (found > 0))
+    ):
+        yield f"{name}/wavelength", "a label is no length in nm"
 
 
 def _of_variable(group: Group, name: str, variable: xr.Variable, place: str) -> Departures:

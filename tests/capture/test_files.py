@@ -13,7 +13,7 @@ import xarray as xr
 from polar_bayes.capture.contract import LEADING
 from polar_bayes.capture.files import load_capture, save_capture
 from polar_bayes.capture.schema import validate
-from polar_bayes.errors import CaptureError
+from polar_bayes.errors import CaptureError, OutputError
 
 
 def assert_same(left, right):
@@ -169,7 +169,7 @@ def test_wrong_packing_is_a_clear_error(foreign):
 def test_what_is_no_path_is_refused(make_capture, path):
     with pytest.raises(CaptureError, match=r"capture: .* is not a path; give the path of a file"):
         load_capture(path)
-    with pytest.raises(CaptureError, match=r"capture: .* is not a path; give the path of a file"):
+    with pytest.raises(OutputError, match=r"output: .* is not a path; give the path of a file"):
         save_capture(make_capture(), path)
 
 
@@ -207,15 +207,72 @@ def test_a_file_without_rights_is_named(make_capture, tmp_path, monkeypatch):
 
 def test_a_place_that_cannot_be_written_is_named(make_capture, tmp_path):
     capture = make_capture()
-    with pytest.raises(CaptureError, match="its folder is not there; make the folder first"):
+    with pytest.raises(OutputError, match="its folder is not there; make the folder first"):
         save_capture(capture, tmp_path / "gone" / "leaf.nc")
-    with pytest.raises(CaptureError, match="it is a folder; give the path of a file"):
+    with pytest.raises(OutputError, match="it is a folder; give the path of a file"):
         save_capture(capture, tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(CaptureError, match="not a directory; check the path"):
+    with pytest.raises(OutputError, match="its folder is not there; make the folder first"):
         save_capture(capture, tmp_path / "file" / "leaf.nc")
-    with pytest.raises(CaptureError, match="name too long; check the path"):
+    with pytest.raises(OutputError, match="name too long"):
         save_capture(capture, tmp_path / ("x" * 300))
+
+
+# --- damaged files ----------------------------------------------------------------------------
+
+
+def flip(path, found, at=3):
+    """Flip a bit of what stands in a file, once, as these bytes."""
+    content = bytearray(path.read_bytes())
+    assert content.count(found) == 1
+    content[content.index(found) + at] ^= 1
+    damaged = path.with_stem("damaged")  # HDF5 keeps a damaged file open: a name of its own
+    damaged.unlink(missing_ok=True)
+    damaged.write_bytes(content)
+    return damaged
+
+
+@pytest.mark.parametrize(
+    "part", ["dop", "view_zenith", "valid", "wavelength", "true_exposure", "patch", "note"]
+)
+def test_a_flipped_bit_is_an_error_and_no_value(make_capture, tmp_path, part):
+    random = np.random.default_rng(0)
+    capture = make_capture("patch", spectral=True).assign(true_exposure=((), 1.2345678901))
+    capture["dop"][:] = random.uniform(0.1, 0.9, capture["dop"].shape)
+    capture["view_zenith"][:] = random.uniform(1.0, 80.0, capture["view_zenith"].shape)
+    valid = random.uniform(size=capture["dop"].shape) < 0.9
+    capture = capture.assign(valid=(capture["dop"].dims, valid))
+    capture = capture.assign_coords(
+        patch=[f"a long label {k}" for k in range(capture.sizes["patch"])]
+    ).assign_attrs(note="measured on a rainy day")
+    save_capture(capture, tmp_path / "leaf.nc")
+    assert_same(load_capture(tmp_path / "leaf.nc"), validate(capture.assign_attrs(name="leaf")))
+    found = b"rainy" if part == "note" else validate(capture)[part].values.tobytes()
+    if part == "patch":
+        found = b"long label 1"
+    damaged = flip(tmp_path / "leaf.nc", found)
+    what = "it cannot be read as netCDF" if part == "note" else "its checksum is wrong: it was dama"
+    with pytest.raises(CaptureError, match=rf"damaged\.nc: {what}"):
+        load_capture(damaged)
+
+
+def test_a_file_edited_elsewhere_says_what_to_do(make_capture, tmp_path):
+    save_capture(make_capture(), tmp_path / "leaf.nc")
+    with xr.open_dataset(tmp_path / "leaf.nc", engine="netcdf4") as opened:
+        edited = opened.load()
+    xr.testing.assert_identical(
+        edited.drop_attrs(deep=False), validate(make_capture()).drop_attrs(deep=False)
+    )
+    edited.to_netcdf(tmp_path / "same.nc")  # the same again, by another program, is no edit
+    load_capture(tmp_path / "same.nc")
+    edited["dop"][0] = 0.25
+    edited.to_netcdf(tmp_path / "edited.nc")
+    mend = "restore it from a copy, or after an edit delete its attribute polar_bayes_checksum"
+    with pytest.raises(CaptureError, match=rf"edited\.nc: its checksum is wrong: .*; {mend}"):
+        load_capture(tmp_path / "edited.nc")
+    del edited.attrs["polar_bayes_checksum"]
+    edited.to_netcdf(tmp_path / "again.nc")
+    assert load_capture(tmp_path / "again.nc")["dop"][0] == 0.25
 
 
 def test_what_is_no_capture_is_not_written(make_capture, tmp_path):
@@ -234,9 +291,7 @@ def test_a_failed_write_leaves_the_older_capture(make_capture, tmp_path, monkeyp
         raise error
 
     monkeypatch.setattr(xr.Dataset, "to_netcdf", fail)
-    with pytest.raises(
-        CaptureError, match=r"leaf\.nc: (no space left on device|it could not be written); ch"
-    ):
+    with pytest.raises(OutputError, match=r"leaf\.nc: it could not be written \((no space|hdf)"):
         save_capture(make_capture(seed=2), path)
     monkeypatch.undo()
     assert os.listdir(tmp_path) == ["leaf.nc"]
@@ -246,13 +301,13 @@ def test_a_failed_write_leaves_the_older_capture(make_capture, tmp_path, monkeyp
 FULL_DISK = """
 import resource, sys
 from polar_bayes.capture.files import load_capture, save_capture
-from polar_bayes.errors import CaptureError
+from polar_bayes.errors import OutputError
 capture = load_capture(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_FSIZE, (5000, resource.RLIM_INFINITY))
 try:
     save_capture(capture, sys.argv[1])
-except CaptureError as error:
-    sys.exit(f"CaptureError: {error}")
+except OutputError as error:
+    sys.exit(f"OutputError: {error}")
 """
 
 
@@ -269,7 +324,7 @@ def test_a_full_disk_is_an_error_and_leaves_the_older_capture(make_capture, tmp_
         cwd=root,
         check=False,
     )
-    assert run.stderr.startswith("CaptureError: ")
-    assert "could not be written; check its name and the room on the disk" in run.stderr
+    assert run.stderr.startswith("OutputError: ")
+    assert "could not be written (netcdf: hdf error); check the path" in run.stderr
     assert os.listdir(tmp_path) == ["leaf.nc"]
     assert_same(load_capture(path), validate(make_capture()))
