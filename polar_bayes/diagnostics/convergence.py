@@ -108,7 +108,7 @@ def judge(result: xr.DataTree, table: pd.DataFrame) -> Verdict:
     found = posterior_scalars(result)
     problems += _not_finite(found, method) + _impossible(found, provenance)
     if method != "point":
-        problems += _frozen(found)
+        problems += _frozen(found, provenance)
     if method == "nuts":
         problems += _chains_disagree(table) + _divergences(result)
     cautions = [
@@ -257,8 +257,10 @@ def _impossible(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[
     ]
 
 
-def _frozen(found: Iterable[Scalar]) -> list[str]:
-    same = {s.label: 0.0 for s in found if s.draws.min() == s.draws.max()}
+def _frozen(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]:
+    """Parameters whose draws say nothing of a width, but for those that were held fixed."""
+    free = (s for s in found if s.name not in (provenance.get("fixed") or {}))
+    same = {s.label: 0.0 for s in free if s.draws.min() == s.draws.max()}
     if not same:
         return []
     return [

@@ -50,10 +50,11 @@ def outcome(function, tree):
     try:
         return function(tree)
     except pb.PolarBayesError as error:
-        assert str(error).isprintable()
-        assert ": " in str(error)
-        assert "; " in str(error)
-        return None
+        message = str(error)
+    assert message.isprintable()
+    assert ": " in message
+    assert "; " in message
+    return None
 
 
 OF_FITS = (
