@@ -1,18 +1,25 @@
-"""Accuracy studies in netCDF files."""
+"""Accuracy studies in netCDF files, and what they hold."""
 
+import dataclasses
 import os
 
 import xarray as xr
 
-from polar_bayes.errors import FitError
-from polar_bayes.paths import existing_file
+from polar_bayes.inference.files import ACCURACY, OF_ALL, holds, load_tree
+from polar_bayes.inference.schema import Schema
+
+STUDY = Schema(
+    kind="accuracy study",
+    made_by="polar_bayes.accuracy or load_accuracy",
+    command="`polar-bayes accuracy`",
+    groups={"accuracy": dataclasses.replace(ACCURACY, needed=True)},
+    provenance=OF_ALL,
+)
 
 
 def is_accuracy(tree: object) -> bool:
     """Whether a tree is what `polar_bayes.accuracy` returns, and no fit."""
-    if not isinstance(tree, xr.DataTree) or "posterior" in tree.children:
-        return False
-    return "accuracy" in tree.children
+    return STUDY.describes(tree)
 
 
 def holds_accuracy(path: str | os.PathLike[str]) -> bool:
@@ -27,11 +34,7 @@ def holds_accuracy(path: str | os.PathLike[str]) -> bool:
     Raises:
         Nothing.
     """
-    try:
-        with _open(path) as tree:
-            return is_accuracy(tree)
-    except Exception:  # the libraries below raise nearly every type for a broken file
-        return False
+    return holds(path, STUDY)
 
 
 def load_accuracy(path: str | os.PathLike[str]) -> xr.DataTree:
@@ -45,19 +48,6 @@ def load_accuracy(path: str | os.PathLike[str]) -> xr.DataTree:
 
     Raises:
         CaptureError: The file is not there.
-        FitError: It holds no accuracy study.
+        FitError: It was damaged, or holds no accuracy study; the variable that is wrong.
     """
-    file = existing_file(path, "accuracy study")
-    if not holds_accuracy(file):
-        raise FitError(
-            "it holds no accuracy study",
-            where=str(file),
-            mend="give the file that `polar-bayes accuracy` wrote",
-        )
-    with _open(file) as tree:
-        return tree.load()
-
-
-def _open(path: str | os.PathLike[str]) -> xr.DataTree:
-    file = existing_file(path, "accuracy study")
-    return xr.open_datatree(file.absolute(), engine="netcdf4", decode_times=False)
+    return load_tree(path, STUDY)

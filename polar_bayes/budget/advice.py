@@ -7,7 +7,9 @@ import pandas as pd
 import xarray as xr
 
 from polar_bayes.budget.accuracy import AS_GIVEN
+from polar_bayes.budget.accuracy_files import STUDY
 from polar_bayes.errors import FitError
+from polar_bayes.inference.files import FIT
 
 RESOLVED = 2.0
 """An error is told from nothing where it is so many standard errors of the reference."""
@@ -34,15 +36,13 @@ def accuracy_of(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
     Raises:
         FitError: It has none.
     """
-    if isinstance(result, xr.DataTree) and "accuracy" in result.children:
-        return result["accuracy"].to_dataset()
-    if isinstance(result, xr.Dataset) and "reference_mean" in result:
-        return result
-    raise FitError(
-        "it holds no accuracy study",
-        where="accuracy",
-        mend="give what polar_bayes.accuracy returns",
-    )
+    if isinstance(result, xr.Dataset):
+        result = xr.DataTree(children={"accuracy": xr.DataTree(result)})
+    # A study may stand in the tree of a fit, which has checks of its own.
+    is_fit = isinstance(result, xr.DataTree) and FIT.describes(result)
+    check = FIT.check if is_fit and "accuracy" in result.children else STUDY.check
+    check(result, "accuracy")
+    return result["accuracy"].to_dataset()
 
 
 def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:

@@ -1,30 +1,85 @@
-"""Calibrations in netCDF files."""
+"""Calibrations in netCDF files, and what they hold."""
 
 import os
 
 import xarray as xr
 
 from polar_bayes.errors import FitError
-from polar_bayes.paths import existing_file
+from polar_bayes.inference.files import OF_ALL, holds, load_tree
+from polar_bayes.inference.schema import ANY, EACH, FLAGS, TEXT, Group, Like, Schema
+from polar_bayes.pixels.marginals import LEVELS
 
-GROUPS = frozenset({"prior_sbc", "truth", "marginals", "fits"})
+_SIMULATION = ("simulation",)
+_RANKS = Group(_SIMULATION, others=False)
+
+CALIBRATION = Schema(
+    kind="calibration",
+    made_by="polar_bayes.calibrate or load_calibration",
+    command="`polar-bayes calibrate`",
+    groups={
+        "prior_sbc": Group(_SIMULATION, needed=True),
+        "truth": Group(_SIMULATION, needed=True, like=Like("prior_sbc", {"": ()}, needed=True)),
+        "marginals": Group(
+            _SIMULATION,
+            needed=True,
+            variables={"quantile": ("quantile",)},
+            like=Like(
+                "prior_sbc",
+                {"": (), "_sd": (), "_crps": (), "_quantile": ("quantile",)},
+                needed=True,
+            ),
+        ),
+        "fits": Group(
+            needed=True,
+            variables={"status": _SIMULATION},
+            kinds={"status": FLAGS, "approach": FLAGS},
+            names=("status", "approach", "effective_draws", "pareto_k"),
+            dims=_SIMULATION,
+            others=False,
+            marks={"flag_meanings?": TEXT},
+        ),
+        "predictive_pit": _RANKS,
+        "loo_pit": Group(
+            _SIMULATION, others=False, like=Like("predictive_pit", {"": ()}, needed=True)
+        ),
+        "readings": Group(
+            _SIMULATION, others=False, like=Like("predictive_pit", {"_pareto_k": ()}, needed=True)
+        ),
+    },
+    provenance={**OF_ALL, "truth?": {EACH: ANY}, "readings_told?": TEXT},
+)
 
 
 def is_calibration(tree: object) -> bool:
-    """Whether a tree is what `polar_bayes.calibrate` returns.
+    """Whether a tree is what `polar_bayes.calibrate` returns."""
+    return CALIBRATION.describes(tree)
+
+
+def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
+    """Refuse what is no calibration, or does not hold together.
 
     Args:
-        tree: Anything.
-
-    Returns:
-        True where it has the groups of a calibration, and is no fit.
+        tree: Any object.
+        source: Its name in errors, for instance the file.
 
     Raises:
-        Nothing.
+        FitError: It is none; or the group, variable or provenance that is wrong.
     """
-    if not isinstance(tree, xr.DataTree) or "posterior" in tree.children:
-        return False
-    return set(tree.children) >= GROUPS
+    CALIBRATION.check(tree, source)
+    levels = tree["marginals"].to_dataset()["quantile"].to_numpy().tolist()
+    if missing := [level for level in LEVELS if levels.count(level) != 1]:
+        raise FitError(
+            f"the level {missing[0]} is not there once",
+            where=f"{source}: marginals/quantile",
+            mend=f"give the tree as {CALIBRATION.made_by} returned it",
+        )
+    groups = {"predictive_pit", "loo_pit", "readings"}
+    if (there := groups & set(tree.children)) and there != groups:
+        raise FitError(
+            f"it has no group {min(groups - there)}",
+            where=source,
+            mend=f"give the tree as {CALIBRATION.made_by} returned it, or drop {min(there)}",
+        )
 
 
 def holds_calibration(path: str | os.PathLike[str]) -> bool:
@@ -39,11 +94,7 @@ def holds_calibration(path: str | os.PathLike[str]) -> bool:
     Raises:
         Nothing.
     """
-    try:
-        with _open(path) as tree:
-            return is_calibration(tree)
-    except Exception:  # the libraries below raise nearly every type for a broken file
-        return False
+    return holds(path, CALIBRATION)
 
 
 def load_calibration(path: str | os.PathLike[str]) -> xr.DataTree:
@@ -57,19 +108,8 @@ def load_calibration(path: str | os.PathLike[str]) -> xr.DataTree:
 
     Raises:
         CaptureError: The file is not there.
-        FitError: It holds no calibration.
+        FitError: It was damaged, or holds no calibration; the group and variable that is wrong.
     """
-    file = existing_file(path, "calibration")
-    if not holds_calibration(file):
-        raise FitError(
-            "it holds no calibration",
-            where=str(file),
-            mend="give the file that `polar-bayes calibrate` wrote",
-        )
-    with _open(file) as tree:
-        return tree.load()
-
-
-def _open(path: str | os.PathLike[str]) -> xr.DataTree:
-    file = existing_file(path, "calibration")
-    return xr.open_datatree(file.absolute(), engine="netcdf4", decode_times=False)
+    tree = load_tree(path, CALIBRATION)
+    check_calibration(tree, str(path))
+    return tree

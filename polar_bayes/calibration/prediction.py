@@ -1,6 +1,5 @@
 """What a calibration says of readings: a small table, and in words."""
 
-import json
 import math
 from collections.abc import Iterator
 
@@ -8,10 +7,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from polar_bayes.calibration.files import check_calibration
 from polar_bayes.calibration.joint import FALSE_ALARMS, is_calibrated, which_stray
 from polar_bayes.calibration.uniformity import uniformity
 from polar_bayes.errors import FitError
-from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.inference.result import provenance_of
 from polar_bayes.pixels.importance import LARGEST_TRUSTED
 
 TESTS = {"predictive_pit": "fresh", "loo_pit": "left out"}
@@ -46,7 +46,8 @@ def calibration_readings(calibration: xr.DataTree) -> pd.DataFrame:
     Source:
         See `polar_bayes.calibration.readings.Readings`.
     """
-    if not isinstance(calibration, xr.DataTree) or not holds_readings(calibration):
+    check_calibration(calibration)
+    if not holds_readings(calibration):
         raise FitError(
             "it holds no ranks of readings",
             where="calibration",
@@ -76,7 +77,7 @@ def readings_verdict(calibration: xr.DataTree) -> list[str]:
         Nothing.
     """
     if not holds_readings(calibration):
-        why = json.loads(calibration.attrs.get(PROVENANCE, "{}")).get("readings_told", "")
+        why = provenance_of(calibration).get("readings_told", "")
         return [f"Readings were not ranked: {why}."] if why else []
     table = calibration_readings(calibration)
     passed = is_calibrated(table)

@@ -8,12 +8,12 @@ import scipy.special
 import scipy.stats
 import xarray as xr
 
+from polar_bayes.calibration.files import check_calibration
 from polar_bayes.calibration.joint import FALSE_ALARMS, is_calibrated, which_stray
 from polar_bayes.calibration.prediction import readings_verdict
 from polar_bayes.calibration.uniformity import uniformity
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.diagnostics.parameters import Scalar, scalars
-from polar_bayes.errors import FitError
 from polar_bayes.pixels.outcome import Status
 
 MOST = 0.5
@@ -135,14 +135,9 @@ def calibration_scalars(calibration: xr.DataTree, group: str) -> list[Scalar]:
         Material parameters first; `draws` is (1, simulation).
 
     Raises:
-        FitError: It has no such group.
+        FitError: It is no calibration.
     """
-    if not isinstance(calibration, xr.DataTree) or group not in calibration.children:
-        raise FitError(
-            f"it has no group {group}",
-            where="calibration",
-            mend="give what polar_bayes.calibrate returns",
-        )
+    check_calibration(calibration)
     dataset = calibration[group].to_dataset()
     return scalars(dataset.rename(simulation="draw").expand_dims("chain"))
 

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import xarray as xr
 
+from polar_bayes.capture.netcdf import open_netcdf, read_netcdf, write_netcdf
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError
-from polar_bayes.paths import existing_file, replacing, system_error
+from polar_bayes.paths import existing_file, replacing
 
 OF_RESULTS = ("polar_bayes", "chosen_scene")
 """Root attributes of results: provenance, and that of a ledger of effects."""
@@ -26,19 +27,12 @@ def load_capture(path: str | os.PathLike[str]) -> xr.Dataset:
         The validated capture.
 
     Raises:
-        CaptureError: The file cannot be read, or does not hold a capture.
+        CaptureError: The file cannot be read, was damaged, or does not hold a capture.
     """
     file = existing_file(path, "capture")
-    try:
-        # Absolute, so that netCDF takes no path for an address; times stay the numbers they are.
-        with xr.open_dataset(file.absolute(), engine="netcdf4", decode_times=False) as opened:
-            dataset = opened.load()
-    except PermissionError as error:
-        raise system_error(error, file) from error
-    except Exception as error:  # the libraries below raise nearly every type for a broken file
-        what = "it cannot be read as netCDF"
-        mend = "write it again with save_capture"
-        raise CaptureError(what, where=str(file), mend=mend) from error
+    mend = "write it again with save_capture"
+    broken = CaptureError("it cannot be read as netCDF", where=str(file), mend=mend)
+    dataset = read_netcdf(xr.Dataset, file, broken)
     dataset.attrs.setdefault("name", file.stem)
     return validate(dataset, source=str(file))
 
@@ -59,7 +53,7 @@ def save_capture(capture: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """
     checked = validate(capture)
     with replacing(path, is_capture) as unfinished:
-        checked.to_netcdf(unfinished, engine="netcdf4", format="NETCDF4")
+        write_netcdf(checked, unfinished)
 
 
 def is_capture(file: Path) -> bool:
@@ -77,7 +71,7 @@ def is_result(file: Path) -> bool:
 def _opened(file: Path) -> xr.Dataset | None:
     """Names and attributes of a netCDF file; None of anything else."""
     try:
-        with xr.open_dataset(file.absolute(), engine="netcdf4", decode_times=False) as opened:
+        with open_netcdf(xr.Dataset, file) as opened:
             return opened
     except Exception:  # the libraries below raise nearly every type for what is no netCDF
         return None

@@ -67,18 +67,27 @@ def read_array(path: str | os.PathLike[str], where: str) -> np.ndarray:
         The array.
 
     Raises:
-        CaptureError: The file is not there, or holds something else.
+        CaptureError: The file is not there, holds something else, or is shorter or longer than its
+            header says.
     """
     file = existing_file(path, where)
+    mend = "save one array with numpy.save"
     try:
-        values = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        mend = "save one array with numpy.save"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what old versions of NumPy wrote can still be read
+            # Mapped, so that a header that declares terabytes is compared with the file first.
+            mapped = np.load(file, mmap_mode="r", allow_pickle=False)
+        if isinstance(mapped, np.memmap):
+            if mapped.offset + mapped.nbytes != file.stat().st_size:
+                what = f"its header says {mapped.nbytes} bytes of numbers, and it holds others"
+                raise CaptureError(what, where=str(file), mend=mend)
+            return np.array(mapped)
+        mapped.close()  # a .npz archive
+    except CaptureError:
+        raise
+    except Exception as error:  # NumPy raises nearly every type for a broken header
         raise CaptureError("it cannot be read as .npy", where=str(file), mend=mend) from error
-    if not isinstance(values, np.ndarray):
-        mend = "save one array with numpy.save"
-        raise CaptureError("it holds several arrays", where=str(file), mend=mend)
-    return values
+    raise CaptureError("it holds several arrays", where=str(file), mend=mend)
 
 
 def _array(frame: Any, where: str) -> np.ndarray:

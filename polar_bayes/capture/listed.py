@@ -9,6 +9,7 @@ line that repeats both begins another. A column `patch` or `material` puts captu
 `polar_bayes.capture.combine` does. What no line holds is not made up: it is `valid=False`.
 """
 
+import math
 import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -98,8 +99,9 @@ def _read(
     taken = _taken(column_names(source), columns, ignored, source)
     for variable, value in constants.items():
         _check_name(variable, None, source)
-        if not isinstance(value, Real):
-            raise CaptureError(f"{variable} is {value!r}", where=source, mend="give a number")
+        if not _is_finite(value):
+            mend = "give a finite number"
+            raise CaptureError(f"{variable} is {value!r}", where=source, mend=mend)
         if variable in taken:
             what = f"{variable} is a constant and the column {taken[variable]!r}"
             raise CaptureError(what, where=source, mend="give one of both, or ignore the column")
@@ -112,6 +114,14 @@ def _read(
     count = len(read.lines)
     values |= {variable: np.full(count, float(x)) for variable, x in constants.items()}
     return _Lines(values, taken, np.array(read.lines))
+
+
+def _is_finite(value: object) -> bool:
+    """Whether it is a real number that a float can hold."""
+    try:
+        return isinstance(value, Real) and math.isfinite(value)
+    except OverflowError:  # an integer beyond the largest float
+        return False
 
 
 def _taken(
@@ -171,7 +181,8 @@ def _side_by_side(
     for number in np.unique(values[dim]):
         own = {name: x[values[dim] == number] for name, x in rest.items()}
         # All digits: two numbers never have one label.
-        parts[repr(float(number)).removesuffix(".0")] = _capture(own, saturation_level)
+        # Adding zero turns -0.0 into 0.0, which is the same patch.
+        parts[repr(float(number) + 0.0).removesuffix(".0")] = _capture(own, saturation_level)
     return combine(parts, dim=dim)
 
 

@@ -14,6 +14,7 @@ from polar_bayes.diagnostics.parameters import method_of, posterior_scalars
 from polar_bayes.diagnostics.predictive import LARGEST_PARETO_K, Loo, predictive_checks, usable
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import FitError, one_line
+from polar_bayes.inference.files import check_fit
 
 GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
 NUMBERS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
@@ -64,6 +65,8 @@ def compare_fits(fits: Mapping[str, xr.DataTree]) -> FitComparison:
             mend="give two or more fits by name, such as {'rough': a, 'smooth': b}",
         )
     named = {one_line(str(name)): fit for name, fit in fits.items()}
+    for name, fit in named.items():
+        check_fit(fit, f"compare_fits: {name}")
     tables = {name: summary(fit) for name, fit in named.items()}
     (first, reference), *others = named.items()
     for name, fit in others:

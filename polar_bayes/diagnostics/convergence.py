@@ -17,7 +17,8 @@ from polar_bayes.diagnostics.parameters import (
     posterior_scalars,
     stats_of,
 )
-from polar_bayes.inference.result import provenance_of
+from polar_bayes.inference.result import bounds_of, provenance_of
+from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
 INTERVAL = (0.025, 0.975)
@@ -29,6 +30,8 @@ LARGEST_SECOND_MODE = 0.01
 MANY_MASKED = 0.25
 MANY_DEEP = 0.01
 LONGEST_LIST = 4
+ROUNDING = 1e-6
+"""How far draws in single precision may lie beyond the end of their prior."""
 HEAVIEST = ", and only the heaviest is described here; use method='nuts', or "
 OTHER_MODES = {
     "laplace": HEAVIEST,
@@ -82,8 +85,9 @@ def summary(result: xr.DataTree) -> pd.DataFrame:
 def verdict(result: xr.DataTree) -> Verdict:
     """Whether the numbers of a fit may be used, and what a reader of them should know.
 
-    Sampling fails on any R-hat above 1.01, any effective sample size below 400, any divergence
-    and any draw that is not finite; every method fails on a problem that the fit itself noted.
+    Sampling fails on any R-hat above 1.01, any effective sample size below 400 and any divergence;
+    every method fails on a draw that is not finite or that its prior or physics rules out, on draws
+    of a parameter that are all equal, and on a problem that the fit itself noted.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
@@ -100,8 +104,11 @@ def verdict(result: xr.DataTree) -> Verdict:
 def judge(result: xr.DataTree, table: pd.DataFrame) -> Verdict:
     """The verdict of `verdict`, from a table that is already there."""
     method, provenance = method_of(result), provenance_of(result)
-    problems = [f"{_sentence(problem)}." for problem in provenance.get("problems", [])]
-    problems += _not_finite(posterior_scalars(result), method)
+    problems = [f"{_sentence(problem)}." for problem in provenance.get("problems", ())]
+    found = posterior_scalars(result)
+    problems += _not_finite(found, method) + _impossible(found, provenance)
+    if method != "point":
+        problems += _frozen(found, provenance)
     if method == "nuts":
         problems += _chains_disagree(table) + _divergences(result)
     cautions = [
@@ -179,6 +186,9 @@ def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
     # A draw that is not finite spoils its whole row, visibly, and no other.
     whole = np.isfinite(draws).all(axis=(1, 2))
     rows = np.full((len(found), len(COLUMNS)), np.nan)
+    if draws[0].size == 1:  # one draw is a number without a width
+        rows[whole, 0] = draws[whole, 0, 0]
+        return rows
     if not whole.any():
         return rows
     kept = draws[whole]
@@ -222,6 +232,41 @@ def _not_finite(found: Iterable[Scalar], method: str) -> list[str]:
         "point": "give starting values a chance with narrower priors",
     }.get(method, "check the readings that the fit could not explain, or narrow the priors")
     return [f"Not finite: {_list(bad, lambda x: f'{x:.0%} of its draws')}; {remedy}."]
+
+
+def _impossible(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]:
+    """Draws beyond the ends of their prior, or beyond what the parameter can be at all."""
+    bad = {}
+    for scalar in found:
+        if scalar.name in (provenance.get("declared") or {}):
+            continue  # a model of the user's own may give any name to anything
+        least, most = RANGES.get(scalar.name, (-math.inf, math.inf))
+        low, high = bounds_of(provenance, scalar.name)
+        low, high = max(low, least), min(high, most)
+        slack = [
+            ROUNDING * max(1.0, abs(end)) if math.isfinite(end) else 0.0 for end in (low, high)
+        ]
+        outside = (scalar.draws < low - slack[0]) | (scalar.draws > high + slack[1])
+        if share := float(np.mean(outside & np.isfinite(scalar.draws))):
+            bad[f"{scalar.label} [{low:g}, {high:g}]"] = share
+    if not bad:
+        return []
+    return [
+        f"Outside its range: {_list(bad, lambda x: f'{x:.0%} of its draws')}; no fit gives such "
+        "values, so the result was changed or damaged: fit the capture again."
+    ]
+
+
+def _frozen(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]:
+    """Parameters whose draws say nothing of a width, but for those that were held fixed."""
+    free = (s for s in found if s.name not in (provenance.get("fixed") or {}))
+    same = {s.label: 0.0 for s in free if s.draws.min() == s.draws.max()}
+    if not same:
+        return []
+    return [
+        f"All draws are equal: {_list(same, None)}; nothing is known of the width of the "
+        "posterior, so fit again with more draws, or hold the parameter fixed."
+    ]
 
 
 def _chains_disagree(table: pd.DataFrame) -> list[str]:

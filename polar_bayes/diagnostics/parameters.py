@@ -6,7 +6,8 @@ from collections.abc import Collection, Iterator, Mapping
 import numpy as np
 import xarray as xr
 
-from polar_bayes.errors import FitError, one_line
+from polar_bayes.errors import one_line
+from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
@@ -80,17 +81,12 @@ def scalars(group: xr.Dataset) -> list[Scalar]:
 
 
 def posterior_scalars(result: xr.DataTree) -> list[Scalar]:
-    """Every scalar of the posterior of a result.
+    """Every scalar of the posterior of a result, which is checked first.
 
     Raises:
-        FitError: The tree holds no posterior.
+        FitError: It is no fit, or does not hold together.
     """
-    if not isinstance(result, xr.DataTree) or "posterior" not in result.children:
-        raise FitError(
-            "it holds no posterior",
-            where="result",
-            mend="give the tree that polar_bayes.fit or load_result returned",
-        )
+    check_fit(result)
     return scalars(result["posterior"].to_dataset())
 
 
@@ -114,9 +110,8 @@ def stats_of(result: xr.DataTree) -> Mapping[str, xr.DataArray]:
 
 def method_of(result: xr.DataTree) -> str:
     """How the fit was made: the kind that its method gave, told by its statistics if not said."""
-    method = provenance_of(result).get("method")
-    if isinstance(method, str) and method:
-        return method
+    if method := provenance_of(result).get("method"):
+        return str(method)
     stats = stats_of(result)
     if "loss" in stats or result["posterior"].sizes.get("draw", 0) == 1:
         return "point"

@@ -177,7 +177,7 @@ def population_summary(result: xr.DataTree) -> pd.DataFrame:
     Source:
         Gelman & Pardoe (2006), Technometrics 48(2), 241-251: the pooling factor.
     """
-    found = [] if method_of(result) == "point" else populations(result)
+    found = _drawn(result)
     labels = pd.Index([each.label for each in found], dtype=object)
     rows = [_summary_row(each) for each in found]
     return pd.DataFrame(rows, columns=list(SUMMARY_COLUMNS), index=labels)
@@ -211,13 +211,19 @@ def shrinkage(result: xr.DataTree) -> pd.DataFrame:
     Raises:
         FitError: The tree holds no posterior.
     """
-    found = [] if method_of(result) == "point" else populations(result)
+    found = _drawn(result)
     rows, labels = [], []
     for each in found:
         labels += [scalar.label for scalar in each.members]
         rows += _member_rows(each)
     index = pd.Index(labels, dtype=object)
     return pd.DataFrame(rows, columns=list(MEMBER_COLUMNS), index=index, dtype=float)
+
+
+def _drawn(result: xr.DataTree) -> list[Population]:
+    """The populations of which there are draws."""
+    found = populations(result)
+    return [] if method_of(result) == "point" else found
 
 
 def _of_parameter(

@@ -22,6 +22,7 @@ from polar_bayes.diagnostics.parameters import (
     posterior_scalars,
     stats_of,
 )
+from polar_bayes.inference.files import check_fit
 
 PROBABILITIES = (0.5, 0.8, 0.95)
 BAND = 0.95
@@ -115,6 +116,7 @@ def predictive_checks(result: xr.DataTree) -> dict[str, Check]:
     Raises:
         FitError: The tree holds no posterior.
     """
+    check_fit(result)
     efficiency = _relative_efficiency(result)
     correction = _correction(result)
     checks = {}
@@ -214,8 +216,9 @@ def usable(result: xr.DataTree, name: str) -> np.ndarray:
 
 
 def _check(part: _Part, efficiency: float, correction: np.ndarray | None) -> Check:
-    residual = part.observed - part.center.mean(axis=0)
-    rms = float(np.sqrt(np.mean(residual**2)))
+    with np.errstate(all="ignore"):  # the square of huge numbers overflows
+        residual = part.observed - part.center.mean(axis=0)
+        rms = float(np.sqrt(np.mean(residual**2)))
     draws = len(part.predicted)
     if draws < LEAST_DRAWS or not np.isfinite(part.predicted).all():
         return Check(part.name, part.observed.size, rms, np.empty(0), {}, None)
@@ -241,14 +244,14 @@ def _loo(part: _Part, efficiency: float, correction: np.ndarray | None) -> Loo |
         return None
     ratios = -log_likelihood + (0.0 if correction is None else correction[:, None])
     log_weights, pareto_k = np.zeros_like(ratios), np.full(part.observed.size, -np.inf)
-    for i in np.flatnonzero(np.ptp(ratios, axis=0) > 1e-12):
-        with np.errstate(all="ignore"):  # smoothing an extreme tail overflows inside ArviZ
+    with np.errstate(all="ignore"):  # an extreme tail overflows: what is not known is NaN
+        for i in np.flatnonzero(np.ptp(ratios, axis=0) > 1e-12):
             log_weights[:, i], pareto_k[i] = array_stats.psislw(-ratios[:, i], r_eff=efficiency)
-    log_weights = log_weights - _log_sum(log_weights)
-    elpd = _log_sum(log_weights + log_likelihood)
-    base = 0.0 if correction is None else correction[:, None]
-    flat = np.zeros_like(log_likelihood) + base
-    p_loo = _log_sum(log_likelihood + flat - _log_sum(flat)) - elpd
+        log_weights = log_weights - _log_sum(log_weights)
+        elpd = _log_sum(log_weights + log_likelihood)
+        base = 0.0 if correction is None else correction[:, None]
+        flat = np.zeros_like(log_likelihood) + base
+        p_loo = _log_sum(log_likelihood + flat - _log_sum(flat)) - elpd
     return Loo(
         elpd=float(np.sum(elpd)),
         standard_error=_standard_error(elpd),

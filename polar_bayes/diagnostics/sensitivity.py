@@ -86,7 +86,8 @@ def _compare(prior: np.ndarray | None, posterior: np.ndarray) -> list[Any]:
     if prior is None or not np.isfinite(widths).all() or not widths[0] > 0.0:
         return [*before, low, high, math.nan, math.nan, math.nan, "unknown"]
     inside = float(np.mean((prior >= low) & (prior <= high)))
-    contraction = 1.0 - float(np.var(posterior) / np.var(prior))
+    with np.errstate(all="ignore"):  # the variance of huge numbers overflows
+        contraction = 1.0 - float(np.var(posterior) / np.var(prior))
     word = "not determined"
     if inside <= PARTLY:
         word = "determined" if inside <= DETERMINED else "partly"

@@ -5,6 +5,7 @@ import xarray as xr
 
 from polar_bayes.diagnostics.parameters import SAMPLE_DIMS
 from polar_bayes.errors import FitError
+from polar_bayes.inference.files import check_fit
 
 OF_READINGS = (
     "observed_data",
@@ -31,7 +32,7 @@ def stack_readings(result: xr.DataTree) -> xr.DataTree:
         other groups and attributes are the same.
 
     Raises:
-        FitError: The tree holds no readings.
+        FitError: The tree holds no readings, is no fit, or does not hold together.
     """
     if not isinstance(result, xr.DataTree) or "observed_data" not in result.children:
         raise FitError(
@@ -39,6 +40,7 @@ def stack_readings(result: xr.DataTree) -> xr.DataTree:
             where="stack_readings",
             mend="give the tree that polar_bayes.fit or load_result returned",
         )
+    check_fit(result)
     observed = result["observed_data"].to_dataset()
     kept = {str(name): _kept(result, observed[name]) for name in observed.data_vars}
     stacked = result.copy()

@@ -12,6 +12,7 @@ from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
 from polar_bayes.identifiability.peak import Question
+from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.modes import Modes
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.tracing import compiled
@@ -53,6 +54,7 @@ def draws_of(question: Question, result: xr.DataTree, count: int) -> Float[np.nd
     Raises:
         FitError: It is no fit of this model and layout.
     """
+    check_fit(result, "next_views: result")
     program = question.program
     whole = program.constrain(jnp.zeros(program.size))
     groups = [result.get(name) for name in ("posterior", "unconstrained_posterior")]

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 from arviz_base import from_dict
 
+from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Draw, Program
 from polar_bayes.observation.data import Observations
 from polar_bayes.physics.notation import notation
@@ -78,16 +79,30 @@ def assemble(
     return tree
 
 
-def provenance_of(result: xr.DataTree) -> dict:
+def provenance_of(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
     """What a result says about how it was made.
 
     Args:
-        result: A tree made by `assemble`, in memory or read back.
+        result: A tree or maps, in memory or read back.
 
     Returns:
-        The decoded root attribute; empty where there is none.
+        The decoded root attribute, without what is null; empty where there is none.
+
+    Raises:
+        FitError: The attribute is no JSON mapping.
     """
-    return json.loads(result.attrs.get(PROVENANCE, "{}"))
+    text = result.attrs.get(PROVENANCE, "{}")
+    try:
+        said = json.loads(text)
+    except (TypeError, ValueError, RecursionError):
+        said = None
+    if not isinstance(said, dict):
+        raise FitError(
+            "it is no mapping in JSON",
+            where=f"result: attribute {PROVENANCE}",
+            mend="give the result as it was saved, or delete the attribute",
+        )
+    return {key: value for key, value in said.items() if value is not None}
 
 
 def bounds_of(provenance: Mapping[str, Any], name: str) -> tuple[float, float]:

@@ -11,6 +11,7 @@ import xarray as xr
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
+from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import bounds_of, provenance_of
 from polar_bayes.inference.tracing import compiled
 from polar_bayes.models.gp_spectral import GpSpectral
@@ -55,6 +56,7 @@ def predict_spectrum(
             or scene must be given.
     """
     new = _checked(wavelengths)
+    check_fit(result)
     told = provenance_of(result)
     found: dict[str, xr.DataArray] = {}
     law = _law_of(told, scene)
@@ -127,22 +129,26 @@ def _model_of(told: Mapping[str, Any], model: GpSpectral | None) -> GpSpectral:
     process = settings.get("process", {})
     several = isinstance(process, list)
     rebuilt = tuple(_process_of(each) for each in (process if several else [process]))
-    return GpSpectral(
-        coupled=tuple(settings.get("coupled", SPECTRA)),
-        process=rebuilt if several else rebuilt[0],
-        pooled=tuple(settings.get("pooled", ())),
-    )
+    try:
+        return GpSpectral(
+            coupled=tuple(settings.get("coupled", SPECTRA)),
+            process=rebuilt if several else rebuilt[0],
+            pooled=tuple(settings.get("pooled", ())),
+        )
+    except (TypeError, IndexError) as error:
+        raise _unknown("the settings of the fit's model are not those of GpSpectral") from error
 
 
 def _process_of(settings: Mapping[str, Any]) -> SpectralProcess:
     try:
         return SpectralProcess(**settings)
     except (FitError, TypeError) as error:
-        raise FitError(
-            "the fit's kernel has no name to find it by",
-            where="predict_spectrum: model",
-            mend="give the model again: predict_spectrum(result, wavelengths, model=...)",
-        ) from error
+        raise _unknown("the fit's kernel has no name to find it by") from error
+
+
+def _unknown(what: str) -> FitError:
+    mend = "give the model again: predict_spectrum(result, wavelengths, model=...)"
+    return FitError(what, where="predict_spectrum: model", mend=mend)
 
 
 def _follow(law: AbstractDispersion, posterior: xr.Dataset, new: np.ndarray) -> xr.DataArray:
@@ -172,7 +178,16 @@ def _condition(
     seed: list[int],
 ) -> xr.DataArray:
     """A process given each draw of its weights, amplitude and length, drawn at `new`."""
-    posterior, coordinates = result["posterior"].dataset, result["unconstrained_posterior"].dataset
+    posterior = result["posterior"].dataset
+    coordinates = result.children.get("unconstrained_posterior", xr.DataTree()).dataset
+    needed = {name: posterior, f"{name}_level": posterior, f"{name}_weights": coordinates}
+    for variable, group in needed.items():
+        if variable not in group or (variable == name and "wavelength" not in group[name].coords):
+            raise FitError(
+                f"it has no draws of {variable} by wavelength",
+                where="predict_spectrum: result",
+                mend="give the tree that polar_bayes.fit or load_result returned",
+            )
     level = posterior[f"{name}_level"]
     leading = [dim for dim in level.dims if dim not in ("chain", "draw")]
     level = level.transpose("chain", "draw", *leading)
@@ -225,6 +240,6 @@ def _condition(
 def _label(values: np.ndarray, draws: xr.DataArray, new: np.ndarray) -> xr.DataArray:
     return xr.DataArray(
         values,
-        coords={**{dim: draws.coords[dim] for dim in draws.dims}, "wavelength": new},
+        coords={**{dim: draws[dim] for dim in draws.dims}, "wavelength": new},
         dims=(*draws.dims, "wavelength"),
     )

@@ -2,6 +2,7 @@
 
 import xarray as xr
 
+from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import provenance_of
 
 
@@ -16,8 +17,9 @@ def auto_sentences(result: xr.DataTree) -> list[str]:
         own choice.
 
     Raises:
-        Nothing.
+        FitError: It is no fit, or does not hold together.
     """
+    check_fit(result)
     told = provenance_of(result).get("auto")
     if not told:
         return []
@@ -25,10 +27,11 @@ def auto_sentences(result: xr.DataTree) -> list[str]:
     for step in told["steps"]:
         took = f"{step['name']} ({step['seconds']:.1f} s)"
         if step["taken"]:
-            error = step["monte_carlo"]
+            error = step.get("monte_carlo")
+            within = "an unknown number of" if error is None else f"{error:.2g}"
             sentences.append(
                 f"{took} was taken: its means and standard deviations are expected within "
-                f"{error:.2g} posterior sd, and {told['tolerance']:g} were asked for."
+                f"{within} posterior sd, and {told['tolerance']:g} were asked for."
             )
         else:
             sentences.append(f"{took} was not taken: {step['why']}.")

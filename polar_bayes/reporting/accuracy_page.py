@@ -1,6 +1,5 @@
 """The report of an accuracy study: advice, the picture, and the numbers behind it."""
 
-import json
 import math
 from typing import Any
 
@@ -15,7 +14,7 @@ from polar_bayes.budget.advice import (
     parameter_errors,
 )
 from polar_bayes.errors import one_line
-from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting.accuracy import plot_accuracy
 from polar_bayes.reporting.page import Picture, fill, picture
 from polar_bayes.reporting.provenance import made_by
@@ -48,7 +47,7 @@ def render_accuracy(result: xr.DataTree) -> str:
     Raises:
         FitError: It holds no accuracy study.
     """
-    about = json.loads(result.attrs.get(PROVENANCE, "{}"))
+    about = provenance_of(result)
     content = {
         "kind": "Accuracy against time",
         "name": one_line(str(about.get("capture", "capture"))),

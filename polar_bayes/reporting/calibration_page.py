@@ -1,6 +1,5 @@
 """The report of a calibration: verdict, ranks, coverage, estimates, and what became of the fits."""
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -16,7 +15,7 @@ from polar_bayes.calibration.verdict import (
     how_ranks_stray,
 )
 from polar_bayes.errors import FitError, one_line
-from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import calibration as figures
 from polar_bayes.reporting import calibration_tables as tables
 from polar_bayes.reporting.calibration_panels import MOST_SHOWN, Part, Ranked, parts_of
@@ -61,7 +60,7 @@ def render_calibration(
         FitError: One is no calibration, or of other parameters.
     """
     rivals = {one_line(str(name)): each for name, each in (beside or {}).items()}
-    provenance = json.loads(calibration.attrs.get(PROVENANCE, "{}"))
+    provenance = provenance_of(calibration)
     method = one_line(str(provenance.get("method", "this calibration")))
     _check_rivals(rivals, method)
     table = calibration_table(calibration)

@@ -182,10 +182,10 @@ def plot_prior_posterior(result: xr.DataTree) -> Figure:
     Raises:
         FitError: The tree holds no prior, or no parameter moves.
     """
-    before = {}
+    found, before = drawable(result), {}
     if "prior" in result.children:
         before = {s.label: s.draws for s in scalars(result["prior"].to_dataset())}
-    found = [scalar for scalar in drawable(result) if scalar.label in before]
+    found = [scalar for scalar in found if scalar.label in before]
     if not found:
         raise _nothing("plot_prior_posterior", "draws of the prior")
     posterior = result["posterior"].to_dataset()
@@ -248,7 +248,7 @@ def plot_pit(result: xr.DataTree, checks: dict[str, Check] | None = None) -> Fig
         parts = {"PIT": check.pit, "leave-one-out PIT": check.loo.pit if check.loo else None}
         for axes, (kind, values) in zip(panels[row], parts.items(), strict=True):
             _pit_panel(axes, values)
-            axes.set_title(f"{QUANTITIES[check.name]}: {kind}", loc="left")
+            axes.set_title(f"{QUANTITIES.get(check.name, check.name)}: {kind}", loc="left")
         panels[row, 0].set_ylabel("share below, minus uniform")
     quiet_ticks(list(panels.flat))
     figure.supxlabel("PIT: share of the prediction below the reading", fontsize=9)

@@ -1,6 +1,5 @@
 """The report of a map: what became of its pixels, pictures, tables, and coverage where known."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import xarray as xr
 from polar_bayes.diagnostics.coverage import map_coverage, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
-from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.inference.result import provenance_of
 from polar_bayes.pixels.opening import at_hand
 from polar_bayes.pixels.stack import IMAGE
 from polar_bayes.reporting import map_tables
@@ -111,7 +110,7 @@ def _is_bare(provenance: Mapping[str, Any], *, otherwise: bool = False) -> bool:
 
 
 def _provenance(maps: xr.Dataset) -> dict[str, Any]:
-    return json.loads(maps.attrs.get(PROVENANCE, "{}"))
+    return provenance_of(maps)
 
 
 def _name(maps: xr.Dataset, provenance: Mapping[str, Any], truth: xr.Dataset | None) -> str:

@@ -13,7 +13,8 @@ from matplotlib.patches import Patch
 
 from polar_bayes.diagnostics.parameters import SAMPLE_DIMS, scalars
 from polar_bayes.errors import FitError
-from polar_bayes.inference.result import provenance_of
+from polar_bayes.inference.files import check_fit
+from polar_bayes.inference.result import GEOMETRY, provenance_of
 from polar_bayes.reporting.style import (
     BLUE,
     GRAY,
@@ -34,7 +35,6 @@ LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
 MOST_AZIMUTHS = 4
 MOST_ROWS = 6
 WRAP = 3
-GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -93,9 +93,20 @@ class Curve:
 
 
 def variables(result: xr.DataTree) -> list[str]:
-    """The recorded variables of a result, polarization first."""
-    recorded = result["observed_data"].data_vars if "observed_data" in result.children else ()
-    return sorted(map(str, recorded), key=lambda name: list(QUANTITIES).index(name))
+    """The recorded variables of a result that can be drawn, polarization first."""
+    check_fit(result)
+    return [name for name in QUANTITIES if not _missing(result, name)]
+
+
+def _missing(result: xr.DataTree, name: str) -> str:
+    """What a result lacks to draw the readings of a variable: a path in the tree, or nothing."""
+    drawn = ("observed_data", "noise_free", "posterior_predictive")
+    parts = [(group, name) for group in drawn]
+    parts += [("constant_data", each) for each in (*GEOMETRY, "valid", "saturated")]
+    for group, variable in parts:
+        if group not in result.children or variable not in result.children[group].data_vars:
+            return f"{group}/{variable}"
+    return "" if result["observed_data"].to_dataset()[name].sizes.get("view") else "view"
 
 
 def curves(result: xr.DataTree, name: str) -> list[Curve]:
@@ -112,8 +123,9 @@ def curves(result: xr.DataTree, name: str) -> list[Curve]:
         FitError: The result has no such variable.
     """
     if name not in variables(result):
+        lacks = f", for it has no {_missing(result, name)}" if name in QUANTITIES else ""
         raise FitError(
-            f"the result has no readings of {name}",
+            f"the result has no readings of {name} to draw{lacks}",
             where="figure",
             mend=f"choose one of {', '.join(variables(result)) or 'none'}",
         )
@@ -222,10 +234,10 @@ def _draw_wrapped(
 def _curves(result: xr.DataTree, name: str) -> Iterator[Curve]:
     observed = result["observed_data"].to_dataset()[name]
     lead = [str(dim) for dim in observed.dims if dim != "view"]
-    values = observed.transpose(*lead, "view").to_numpy()
+    values = observed.transpose(*lead, "view").to_numpy().astype(float)
     order = (*SAMPLE_DIMS, *lead, "view")
     center, draws = (
-        result[group][name].transpose(*order).to_numpy().reshape(-1, *values.shape)
+        result[group][name].transpose(*order).to_numpy().astype(float).reshape(-1, *values.shape)
         for group in ("noise_free", "posterior_predictive")
     )
     center = np.median(center, axis=0)
@@ -239,7 +251,7 @@ def _curves(result: xr.DataTree, name: str) -> Iterator[Curve]:
         for key in GEOMETRY
     }
     fitted, saturated = (
-        constants[flag].transpose(*lead, "view").to_numpy().astype(bool)
+        constants[flag].broadcast_like(observed).transpose(*lead, "view").to_numpy().astype(bool)
         for flag in ("valid", "saturated")
     )
     titles = _titles(observed, lead)

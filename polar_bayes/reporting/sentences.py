@@ -150,7 +150,7 @@ def expected(checks: Mapping[str, Check]) -> list[str]:
     sentences = []
     for check in checks.values():
         band = pit_band(check.loo.pit if check.loo else check.pit)
-        name = QUANTITIES[check.name]
+        name = QUANTITIES.get(check.name, check.name)
         if band is not None and band.leaves:
             sentences.append(
                 f"The readings of {name} are not distributed as the model expects: {shape(band)}. "

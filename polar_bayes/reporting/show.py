@@ -4,7 +4,6 @@ A result stays the plain tree that ArviZ reads. What a notebook shows of it is x
 same result in the words of a report, without its figures.
 """
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -24,7 +23,7 @@ from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.diagnostics.parameters import method_of, posterior_scalars
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import one_line
-from polar_bayes.inference.result import PROVENANCE, provenance_of
+from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import calibration_tables, map_tables, sentences, tables
 from polar_bayes.reporting.accuracy_page import reference_sentence, study_table
 from polar_bayes.reporting.calibration_panels import parts_of
@@ -78,7 +77,7 @@ def _of_fit(result: xr.DataTree) -> Card:
 def _of_maps(maps: xr.Dataset) -> Card:
     found, cases = map_scalars(maps), map_tables.count_cases(maps)
     headline, is_enough = map_tables.headline(cases)
-    about = json.loads(maps.attrs.get(PROVENANCE, "{}"))
+    about = provenance_of(maps)
     said = [headline, *map_tables.verdict(cases)]
     return _card(_name(about, "map"), said, map_tables.parameter_table(maps, found), is_enough)
 

@@ -80,8 +80,9 @@ def spectra(result: xr.DataTree) -> dict[str, list[Spectrum]]:
         FitError: The tree holds no posterior.
     """
     found: dict[str, dict[tuple[str, ...], list[Scalar]]] = {}
-    names = {str(name) for name in result["posterior"].data_vars}
-    for scalar in posterior_scalars(result):
+    every = posterior_scalars(result)
+    names = {scalar.name for scalar in every}
+    for scalar in every:
         if "wavelength" in scalar.index and not is_hyperparameter(scalar.name, names):
             member = tuple(
                 place_of(dim, label) for dim, label in scalar.labels.items() if dim != "wavelength"
@@ -190,7 +191,7 @@ def _bands(result: xr.DataTree, between: np.ndarray) -> dict[str, dict[int, np.n
     thin.attrs = dict(result.attrs)
     try:
         predicted = predict_spectrum(thin, between)
-    except (FitError, KeyError):
+    except FitError:
         # Nothing ties the colors together, or what does is known only to the user's own model.
         return {}
     found: dict[str, dict[int, np.ndarray]] = {}

@@ -255,7 +255,7 @@ def check_table(checks: Mapping[str, Check]) -> Table:
     for check in checks.values():
         cells = [str(check.count), f"{check.residual_rms:.3g}"]
         cells += _predictive_cells(check) if has_draws else []
-        rows.append(Row(check.name, QUANTITIES[check.name], tuple(cells)))
+        rows.append(Row(check.name, QUANTITIES.get(check.name, check.name), tuple(cells)))
     heads = ["variable", "readings", "residual RMS"]
     caption = "Residual: reading minus the noise-free prediction, in the unit of the reading."
     if has_draws:

@@ -88,8 +88,9 @@ def test_rows_without_an_answer_are_neither_advised_nor_on_the_front():
 
 
 def test_what_holds_no_study_is_refused():
-    with pytest.raises(pb.FitError, match="it holds no accuracy study"):
-        pb.accuracy_table(make_accuracy()["accuracy"].to_dataset().drop_vars("reference_mean"))
+    study = make_accuracy()["accuracy"].to_dataset()
+    with pytest.raises(pb.FitError, match="accuracy/mean_error: it is missing; give the tree as"):
+        pb.accuracy_table(study.drop_vars("mean_error"))
 
 
 def test_a_tolerance_of_nothing_is_refused():

@@ -72,7 +72,7 @@ def test_what_are_no_repeats_is_refused() -> None:
     strangers = [*fits({"roughness": np.zeros(1)}), *fits({"absorption": np.zeros(1)})]
     with pytest.raises(pb.FitError, match="share no parameter"):
         pb.retest(strangers)
-    with pytest.raises(pb.FitError, match="it holds no posterior"):
+    with pytest.raises(pb.FitError, match="it holds no fit"):
         pb.retest([xr.DataTree(), xr.DataTree()])
 
 

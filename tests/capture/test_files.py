@@ -218,6 +218,70 @@ def test_a_place_that_cannot_be_written_is_named(make_capture, tmp_path):
         save_capture(capture, tmp_path / ("x" * 300))
 
 
+# --- damaged files ----------------------------------------------------------------------------
+
+
+def flip(path, found, at=3):
+    """Flip a bit of what stands in a file, once, as these bytes."""
+    content = bytearray(path.read_bytes())
+    assert content.count(found) == 1
+    content[content.index(found) + at] ^= 1
+    damaged = path.with_stem("damaged")  # HDF5 keeps a damaged file open: a name of its own
+    damaged.unlink(missing_ok=True)
+    damaged.write_bytes(content)
+    return damaged
+
+
+@pytest.mark.parametrize(
+    "part", ["dop", "view_zenith", "valid", "wavelength", "true_exposure", "patch", "note"]
+)
+def test_a_flipped_bit_is_an_error_and_no_value(make_capture, tmp_path, part):
+    random = np.random.default_rng(0)
+    capture = make_capture("patch", spectral=True).assign(true_exposure=((), 1.2345678901))
+    capture["dop"][:] = random.uniform(0.1, 0.9, capture["dop"].shape)
+    capture["view_zenith"][:] = random.uniform(1.0, 80.0, capture["view_zenith"].shape)
+    valid = random.uniform(size=capture["dop"].shape) < 0.9
+    capture = capture.assign(valid=(capture["dop"].dims, valid))
+    capture = capture.assign_coords(
+        patch=[f"a long label {k}" for k in range(capture.sizes["patch"])]
+    ).assign_attrs(note="measured on a rainy day")
+    save_capture(capture, tmp_path / "leaf.nc")
+    assert_same(load_capture(tmp_path / "leaf.nc"), validate(capture.assign_attrs(name="leaf")))
+    found = b"rainy" if part == "note" else validate(capture)[part].values.tobytes()
+    if part == "patch":
+        found = b"long label 1"
+    damaged = flip(tmp_path / "leaf.nc", found)
+    with pytest.raises(CaptureError, match=r"damaged\.nc: its checksum is wrong: .*; restore it"):
+        load_capture(damaged)
+
+
+def test_a_file_edited_elsewhere_has_no_checksum(make_capture, tmp_path):
+    save_capture(make_capture(), tmp_path / "leaf.nc")
+    with xr.open_dataset(tmp_path / "leaf.nc", engine="netcdf4") as opened:
+        edited = opened.load()
+    xr.testing.assert_identical(edited, validate(make_capture()))
+    edited["dop"][0] = 0.25
+    edited.to_netcdf(tmp_path / "edited.nc")
+    assert load_capture(tmp_path / "edited.nc")["dop"][0] == 0.25
+    with netCDF4.Dataset(tmp_path / "leaf.nc", "r+") as file:
+        file["dop"][0] = 0.5
+    assert load_capture(tmp_path / "leaf.nc")["dop"][0] == 0.5
+
+
+def test_a_file_cut_short_is_refused_or_whole(make_capture, tmp_path):
+    path = tmp_path / "leaf.nc"
+    save_capture(make_capture(), path)
+    content, expected = path.read_bytes(), load_capture(path)
+    for cut in (1, 60, 200):  # in the checksum, in it, and in what HDF5 reads
+        short = tmp_path / f"{cut}.nc"
+        short.write_bytes(content[:-cut])
+        if cut < 100:
+            assert_same(load_capture(short), expected)
+        else:
+            with pytest.raises(CaptureError, match="it cannot be read as netCDF"):
+                load_capture(short)
+
+
 def test_what_is_no_capture_is_not_written(make_capture, tmp_path):
     with pytest.raises(CaptureError, match=r"view_zenith: it is missing; add view_zenith in deg"):
         save_capture(make_capture().drop_vars("view_zenith"), tmp_path / "leaf.nc")
@@ -234,10 +298,7 @@ def test_a_failed_write_leaves_the_older_capture(make_capture, tmp_path, monkeyp
         raise error
 
     monkeypatch.setattr(xr.Dataset, "to_netcdf", fail)
-    with pytest.raises(
-        OutputError,
-        match=r"leaf\.nc: it could not be written \((no space left on device|hdf)\); check",
-    ):
+    with pytest.raises(OutputError, match=r"leaf\.nc: it could not be written \((no space|hdf)"):
         save_capture(make_capture(seed=2), path)
     monkeypatch.undo()
     assert os.listdir(tmp_path) == ["leaf.nc"]
@@ -271,6 +332,6 @@ def test_a_full_disk_is_an_error_and_leaves_the_older_capture(make_capture, tmp_
         check=False,
     )
     assert run.stderr.startswith("OutputError: ")
-    assert "check the path, its rights and the room on the disk" in run.stderr
+    assert "could not be written (netcdf: hdf error); check the path" in run.stderr
     assert os.listdir(tmp_path) == ["leaf.nc"]
     assert_same(load_capture(path), validate(make_capture()))

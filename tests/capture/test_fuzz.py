@@ -19,6 +19,7 @@ from mutations import (
 
 from polar_bayes.capture.contract import LEADING
 from polar_bayes.capture.files import load_capture, save_capture
+from polar_bayes.capture.frames import read_array, read_frame
 from polar_bayes.capture.goniometer import from_goniometer
 from polar_bayes.capture.schema import validate
 from polar_bayes.capture.tables import read_table
@@ -133,3 +134,72 @@ def test_a_file_cut_short_is_refused(make_capture, tmp_path, format):
         if capture is not None:  # nothing but padding was lost
             xr.testing.assert_identical(capture, expected)
         path.unlink()
+
+
+# --- damaged .npy frames ----------------------------------------------------------------------
+
+FRAMES = [
+    np.arange(12.0).reshape(3, 4), np.asfortranarray(np.arange(12.0).reshape(3, 4)),
+    np.arange(12, dtype=">u2").reshape(3, 4), np.float64(3.5), np.zeros((0, 3)),
+    np.zeros(3, dtype=[("a", "f4"), ("b", "i2")]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_damaged_header_is_refused_or_of_the_same_size(tmp_path, seed):
+    random = np.random.default_rng([4, seed])
+    passed = 0
+    for trial in range(600):
+        path = tmp_path / f"{trial}.npy"
+        frame = np.asarray(pick(random, FRAMES))
+        np.save(path, frame)
+        content = bytearray(path.read_bytes())
+        for _ in range(random.integers(1, 4)):
+            place = int(random.integers(128))
+            if random.random() < 0.5:
+                content[place] ^= 1 << int(random.integers(8))
+            else:
+                content[place : place + 1] = pick(random, PIECES).encode()
+        path.write_bytes(content)
+        found = outcome(read_array, path, "frame")
+        if found is not None:
+            passed += 1
+            assert type(found) is np.ndarray
+            assert found.nbytes == frame.nbytes
+            outcome(read_frame, path, "frame")
+    assert 5 < passed < 300
+
+
+@pytest.mark.parametrize("frame", FRAMES, ids=str)
+def test_a_whole_npy_file_is_read_as_it_was_saved(tmp_path, frame):
+    np.save(tmp_path / "frame.npy", frame)
+    found = read_array(tmp_path / "frame.npy", "frame")
+    assert type(found) is np.ndarray
+    np.testing.assert_array_equal(found, frame, strict=True)
+
+
+@pytest.mark.parametrize(
+    ("shape", "what"),
+    [
+        ("(1000000000000, 8)", "cannot be read"),
+        (f"({2**70}, 1)", "cannot be read"),
+        ("(" * 300 + ")" * 300, "cannot be read"),
+        ("(3, 4", "cannot be read"),
+        ("(3, -4)", "cannot be read"),
+        ("(3, 2)", "its header says 48 bytes of numbers"),
+    ],
+)
+def test_a_size_that_is_not_that_of_the_file_is_refused(tmp_path, shape, what):
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    start = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little")
+    path = tmp_path / "frame.npy"
+    path.write_bytes(start + header + np.zeros(12).tobytes())
+    with pytest.raises(CaptureError, match=what):
+        read_array(path, "frame")
+
+
+def test_several_arrays_are_no_frame(tmp_path):
+    np.savez(tmp_path / "frames.npz", np.zeros(3))
+    (tmp_path / "frame.npy").write_bytes((tmp_path / "frames.npz").read_bytes())
+    with pytest.raises(CaptureError, match="it holds several arrays; save one array"):
+        read_array(tmp_path / "frame.npy", "frame")

@@ -1,5 +1,7 @@
 """Tables with a line for each reading: what becomes a view, what is missing, and every refusal."""
 
+import math
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -88,6 +90,15 @@ def test_long_numbers_of_patches_stay_apart(write):
     assert capture["patch"].values.tolist() == ["20261122", "20261123"]
 
 
+@pytest.mark.parametrize(
+    ("number", "label"), [(1.5, "1.5"), (-0.0, "0"), (7, "7"), (1e300, "1e+300")]
+)
+def test_a_patch_may_be_a_constant(write, number, label):
+    capture = from_table(write(PLAIN), constants={**ANGLES, "patch": number})
+    assert capture["patch"].values.tolist() == [label]
+    assert capture.sizes == {"patch": 1, "view": 3}
+
+
 def test_readings_that_are_not_valid_are_not_looked_at(write):
     capture = from_table(write("view_zenith,dop,valid\n10,7,0\n20,.2,1\n"), constants=ANGLES)
     assert capture["valid"].values.tolist() == [False, True]
@@ -114,7 +125,12 @@ REFUSED = [
     (PLAIN, {"ignored": ["time"]}, "there is no column 'time'", "choose from"),
     (PLAIN, {"columns": {"dopp": "dop"}}, "no variable 'dopp'", "nearest: dop"),
     (PLAIN, {"constants": {"ligth": 3.0}}, "no variable 'ligth'", "nearest: light"),
-    (PLAIN, {"constants": {"dop_error": "1%"}}, "dop_error is '1%'", "give a number"),
+    (PLAIN, {"constants": {"dop_error": "1%"}}, "dop_error is '1%'", "give a finite number"),
+    (PLAIN, {"constants": {**ANGLES, "patch": math.nan}}, "patch is nan", "give a finite number"),
+    (PLAIN, {"constants": {**ANGLES, "material": math.inf}}, "material is inf", "finite number"),
+    (PLAIN, {"constants": {**ANGLES, "patch": 10**400}}, "patch is 1000", "give a finite number"),
+    (PLAIN, {"constants": {**ANGLES, "true_roughness": math.nan}}, "true_roughness is nan", "give"),
+    (PLAIN, {"constants": {**ANGLES, "dop_error": 1e300}}, "dop_error is 1e+300", "give a stand"),
     (
         "patch,material,view_zenith,dop\n1,1,10,.1\n",
         {"constants": ANGLES},

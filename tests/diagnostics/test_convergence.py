@@ -280,5 +280,5 @@ def test_a_file_gives_the_same_table(tmp_path) -> None:
 
 @pytest.mark.parametrize("wrong", [xr.DataTree(), "fit.nc", None])
 def test_what_is_no_result_is_refused(wrong: object) -> None:
-    with pytest.raises(FitError, match="result: it holds no posterior; give the tree"):
+    with pytest.raises(FitError, match="result: it holds no fit; give the tree"):
         summary(wrong)

@@ -241,5 +241,5 @@ def test_draws_that_are_not_finite_give_nan(rng) -> None:
 
 
 def test_what_is_no_result_is_refused() -> None:
-    with pytest.raises(FitError, match="it holds no posterior"):
+    with pytest.raises(FitError, match="it holds no fit"):
         populations(xr.DataTree())

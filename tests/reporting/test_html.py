@@ -202,7 +202,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("wrong", [None, xr.DataTree(), "fit.nc"])
 def test_what_is_no_result_leaves_no_folder(tmp_path: Path, wrong: object) -> None:
-    with pytest.raises(FitError, match="it holds no posterior"):
+    with pytest.raises(FitError, match="it holds no fit"):
         report(wrong, tmp_path / "report")
     assert not (tmp_path / "report").exists()
 

@@ -62,5 +62,5 @@ def test_a_long_table_is_cut_and_says_so() -> None:
 
 
 def test_what_is_no_result_is_refused() -> None:
-    with pytest.raises(FitError, match="it holds no posterior"):
+    with pytest.raises(FitError, match="it holds no fit"):
         pb.show("fit.nc")

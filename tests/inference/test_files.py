@@ -1,0 +1,375 @@
+"""Result files: what was written is what is read, and whatever is wrong is told in one line."""
+
+import json
+import math
+import re
+import warnings
+
+import arviz_base as az
+import numpy as np
+import pytest
+import xarray as xr
+from synthetic_accuracy import make_accuracy
+from synthetic_calibrations import make_calibration
+from synthetic_results import edit_provenance, make_result, pool, replace
+from tree_mutations import ODD_ATTRIBUTES, mutate, pick
+
+import polar_bayes as pb
+from polar_bayes.diagnostics.predictive import predictive_checks
+from polar_bayes.diagnostics.sensitivity import sensitivity
+
+SMALL = {"views": 4, "draws": 30, "chains": 2}
+AUTO = {
+    "tolerance": 0.1,
+    "met": True,
+    "chosen": "nuts",
+    "steps": [
+        {"name": "laplace", "taken": False, "why": "k-hat", "seconds": 1.0, "monte_carlo": None},
+        {"name": "nuts", "taken": True, "why": "", "seconds": 2.0, "monte_carlo": 0.02},
+    ],
+}
+MANY = pool(
+    edit_provenance(
+        make_result(**SMALL, wavelengths=(450.0, 550.0), materials=("a", "b")),
+        auto=AUTO,
+        bounds={"roughness": [0.0, None]},
+        comparisons_failed={"without_discrepancy": "why"},
+    ),
+    "roughness",
+)
+RESULTS = (
+    MANY,
+    make_result(views=4, draws=60, method="laplace", wavelengths=()),
+    make_result(views=4, method="point", wavelengths=()),
+)
+CALIBRATION = make_calibration(count=40, wavelengths=(450.0, 550.0), readings={"dop": 1.0})
+
+
+def outcome(function, tree):
+    """None after a refusal in one line; anything else is returned, or raised."""
+    try:
+        return function(tree)
+    except pb.PolarBayesError as error:
+        message = str(error)
+    assert message.isprintable()
+    assert ": " in message
+    assert "; " in message
+    return None
+
+
+OF_FITS = (
+    pb.summary,
+    pb.verdict,
+    lambda tree: json.dumps(pb.json_summary(tree), allow_nan=False),
+    lambda tree: pb.show(tree)._repr_html_(),
+    pb.auto_sentences,
+    pb.population_summary,
+    pb.stack_readings,
+    predictive_checks,
+    sensitivity,
+    lambda tree: pb.compare_fits({"this": tree, "that": RESULTS[1]}),
+)
+OF_CALIBRATIONS = (
+    pb.calibration_table,
+    pb.calibration_verdict,
+    pb.calibration_readings,
+    lambda tree: pb.show(tree)._repr_html_(),
+    lambda tree: pb.compare_calibrations({"this": tree, "that": CALIBRATION}),
+)
+OF_STUDIES = (pb.accuracy_table, pb.accuracy_advice, lambda tree: pb.show(tree)._repr_html_())
+
+
+def check_mutations(trees, functions, random, count):
+    """How many of the damaged trees are refused at the door."""
+    refused = 0
+    for _ in range(count):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what NumPy and xarray say of the mutation itself
+            damaged = mutate(pick(random, trees), random)
+        found = [outcome(function, damaged) for function in functions]
+        refused += found[0] is None
+    return refused
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_damaged_fit_is_refused_in_one_line_or_works(seed):
+    random = np.random.default_rng([11, seed])
+    assert 15 < check_mutations(RESULTS, OF_FITS, random, 50) < 45
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_damaged_calibration_is_refused_in_one_line_or_works(seed):
+    random = np.random.default_rng([12, seed])
+    assert 20 < check_mutations([CALIBRATION], OF_CALIBRATIONS, random, 40) < 40
+
+
+def test_a_damaged_study_is_refused_in_one_line_or_works():
+    random = np.random.default_rng([13])
+    assert 40 < check_mutations([make_accuracy()], OF_STUDIES, random, 120) < 120
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("seed", range(8))
+def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
+    random = np.random.default_rng([14, seed])
+    figures = (
+        lambda tree: pb.report(tree, tmp_path / "report"),
+        pb.plot_pairs,
+        pb.plot_ranks,
+        pb.plot_prior_posterior,
+        pb.plot_pit,
+        lambda tree: pb.plot_readings(tree, "dop"),
+        lambda tree: pb.plot_residuals(tree, "dop"),
+        lambda tree: pb.plot_shrinkage(tree, "roughness"),
+        lambda tree: pb.plot_spectrum(tree, "absorption"),
+        lambda tree: pb.predict_spectrum(tree, [500.0]),
+    )
+    check_mutations(RESULTS, (*OF_FITS, *figures), random, 100)
+    pages = (*OF_CALIBRATIONS, pb.plot_calibration, lambda t: pb.report(t, tmp_path / "report"))
+    check_mutations([CALIBRATION], pages, random, 30)
+    pages = (*OF_STUDIES, pb.plot_accuracy, lambda tree: pb.report(tree, tmp_path / "report"))
+    check_mutations([make_accuracy()], pages, random, 30)
+
+
+# --- provenance -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("odd", ODD_ATTRIBUTES, ids=lambda odd: str(odd)[:9])
+def test_provenance_that_is_no_mapping_is_refused(odd):
+    tree = RESULTS[1].copy()
+    tree.attrs["polar_bayes"] = odd
+    with pytest.raises(pb.FitError, match="attribute polar_bayes: it is no mapping in JSON; give"):
+        pb.summary(tree)
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"counts": {"views": "9"}}, "polar_bayes.counts.views: it is '9', not a count"),
+        ({"counts": [1]}, r"polar_bayes.counts: it is \[1\], not a mapping"),
+        ({"problems": "none"}, "polar_bayes.problems: it is 'none', not a list"),
+        ({"problems": [3]}, r"polar_bayes.problems\[0\]: it is 3, not text"),
+        ({"modes": {"weights": [1.0, "x"]}}, r"modes.weights\[1\]: it is 'x', not a finite number"),
+        ({"bounds": {"roughness": [0.0]}}, r"bounds.roughness: it is \[0.0\], not a least"),
+        ({"auto": {**AUTO, "steps": [{}]}}, r"auto.steps\[0\].name: it is missing"),
+        ({"method": 3}, "polar_bayes.method: it is 3, not text"),
+        ({"largest_view_zenith": math.inf}, "largest_view_zenith: it is inf, not a finite"),
+    ],
+)
+def test_provenance_of_the_wrong_type_is_refused(change, what):
+    tree = edit_provenance(RESULTS[1].copy(), **change)
+    with pytest.raises(pb.FitError, match=f"result: {what}|result: polar_bayes.{what}"):
+        pb.json_summary(tree)
+
+
+def test_provenance_may_lack_anything():
+    tree = RESULTS[0].copy()
+    tree.attrs = {}
+    assert pb.summary(tree).equals(pb.summary(RESULTS[0]))
+    assert pb.auto_sentences(tree) == []
+    for name in json.loads(MANY.attrs["polar_bayes"]):
+        pb.json_summary(edit_provenance(MANY.copy(), **{name: None}))
+
+
+# --- groups and variables ---------------------------------------------------------------------
+
+
+def _edited(change, group="posterior"):
+    tree = RESULTS[0].copy()
+    tree[group] = xr.DataTree(change(tree[group].to_dataset()))
+    return tree
+
+
+REFUSED = {
+    "text": (lambda x: x.assign(roughness=x["roughness"].astype(str)), "roughness: it holds <U"),
+    "complex": (lambda x: x * (1.0 + 0j), "posterior/roughness: it holds complex128, not real"),
+    "no chain": (lambda x: x.isel(chain=0), r"roughness: its dims are \(draw.*, not \(chain, draw"),
+    "no draws": (lambda x: x.isel(draw=slice(0)), "posterior: it is empty"),
+    "no variable": (lambda x: x[[]], "posterior: it is empty"),
+    "fewer draws": (
+        lambda x: x.isel(draw=slice(9)),
+        "its draw has 30 entries, that of posterior 9",
+    ),
+    "one color": (lambda x: x.isel(wavelength=[0]), "its wavelength has 2 entries, that of post"),
+    "other colors": (
+        lambda x: x.assign_coords(wavelength=[1.0, 2.0]),
+        "prior/wavelength: its labels are not those of posterior",
+    ),
+    "colors in words": (
+        lambda x: x.assign_coords(wavelength=["red", "blue"]),
+        "its labels are not those of posterior",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "what"), REFUSED.values(), ids=REFUSED)
+def test_a_posterior_that_does_not_hold_together_is_refused(change, what):
+    with pytest.raises(pb.FitError, match=f"result: .*{what}"):
+        pb.verdict(_edited(change))
+
+
+def test_readings_and_predictions_belong_together():
+    tree = _edited(lambda x: x.isel(view=slice(2)), "observed_data")
+    with pytest.raises(pb.FitError, match="its view has 4 entries, that of observed_data 2"):
+        pb.summary(tree)
+    tree = _edited(lambda x: x.rename(view="angle"), "noise_free")
+    with pytest.raises(pb.FitError, match=r"noise_free/dop: its dims are .*angle\), not .*view"):
+        pb.stack_readings(tree)
+
+
+def test_other_kinds_of_tree_are_named(tmp_path):
+    for function in (pb.summary, pb.stack_readings, pb.auto_sentences, pb.population_summary):
+        for wrong in (CALIBRATION, xr.Dataset(), None, "fit.nc"):
+            with pytest.raises(
+                pb.FitError, match=r"it holds no (fit|readings); give the tree that"
+            ):
+                function(wrong)
+    with pytest.raises(pb.FitError, match="calibration: it holds no calibration; give the tree"):
+        pb.calibration_table(MANY)
+    pb.save_result(CALIBRATION, tmp_path / "sbc.nc")
+    with pytest.raises(pb.FitError, match=r"sbc\.nc: it holds no fit; give the file that `polar"):
+        pb.load_result(tmp_path / "sbc.nc")
+    with pytest.raises(pb.FitError, match="a str is no result"):
+        pb.save_result("fit", tmp_path / "fit.nc")
+    odd = MANY.copy()
+    odd.attrs["what"] = {"a": 1}
+    with pytest.raises(pb.FitError, match=r"netCDF cannot hold it \(.*\); store numbers"):
+        pb.save_result(odd, tmp_path / "fit.nc")
+    with pytest.raises(pb.FitError, match="compare_fits: b: it holds no fit"):
+        pb.compare_fits({"a": MANY, "b": CALIBRATION})
+
+
+def test_a_tree_that_arviz_made_is_summed_up():
+    random = np.random.default_rng(5)
+    draws = {"mu": random.normal(size=(4, 500)), "tau": random.normal(size=(4, 500, 3))}
+    tree = az.from_dict(
+        {
+            "posterior": draws,
+            "sample_stats": {"diverging": np.zeros((4, 500), bool), "lp": draws["mu"]},
+            "log_likelihood": {"y": random.normal(size=(4, 500, 8))},
+            "observed_data": {"y": random.normal(size=8)},
+            "constant_data": {"x": np.array(["a", "b"])},
+        }
+    )
+    assert list(pb.summary(tree).index) == ["mu", "tau[0]", "tau[1]", "tau[2]"]
+    assert pb.verdict(tree).converged
+    with pytest.raises(pb.FitError, match="no readings of dop to draw, for it has no observed_dat"):
+        pb.plot_readings(tree, "dop")
+
+
+OPTIONAL = sorted(set(RESULTS[1].children) - {"posterior"})
+
+
+@pytest.mark.parametrize("group", OPTIONAL)
+def test_any_group_but_the_posterior_may_be_missing(group):
+    tree = RESULTS[1].copy()
+    del tree[group]
+    for function in OF_FITS[:5]:
+        function(tree)
+    if group in ("observed_data", "noise_free", "posterior_predictive", "constant_data"):
+        with pytest.raises(pb.FitError, match=f"no readings of dop to draw, for it has no {group}"):
+            pb.plot_readings(tree, "dop")
+
+
+def test_a_report_leaves_out_what_a_result_lacks(tmp_path):
+    tree = RESULTS[2].copy()
+    for group in ("noise_free", "constant_data", "prior"):
+        del tree[group]
+    page = pb.report(tree, tmp_path / "report").read_text()
+    assert "Readings of" not in page
+    assert "roughness" in page
+
+
+# --- checksums --------------------------------------------------------------------------------
+
+
+def test_a_file_gives_back_what_was_saved(tmp_path):
+    for number, tree in enumerate((*RESULTS, CALIBRATION, make_accuracy())):
+        path = tmp_path / f"{number}.nc"
+        pb.save_result(tree, path)
+        with xr.open_datatree(path, engine="netcdf4", decode_times=False) as opened:
+            assert set(opened.attrs) == {"polar_bayes"}
+            read = opened.load()
+        load = (pb.load_result, pb.load_calibration, pb.load_accuracy)[max(0, number - 2)]
+        xr.testing.assert_identical(load(path), read)
+        assert set(read.children) == set(tree.children)
+
+
+@pytest.mark.parametrize("part", ["posterior/roughness", "posterior/wavelength", "provenance"])
+def test_a_flipped_bit_is_an_error_and_no_value(tmp_path, part):
+    tree = edit_provenance(RESULTS[0].copy(), model_source="x" * 80_000 + "rainy" + "x" * 80_000)
+    pb.save_result(tree, tmp_path / "fit.nc")
+    pb.load_result(tmp_path / "fit.nc")
+    content = bytearray((tmp_path / "fit.nc").read_bytes())
+    found = b"rainy" if part == "provenance" else tree[part].values.tobytes()
+    content[content.index(found) + 2] ^= 1
+    (tmp_path / "damaged.nc").write_bytes(content)
+    with pytest.raises(pb.FitError, match=r"damaged\.nc: its checksum is wrong"):
+        pb.load_result(tmp_path / "damaged.nc")
+
+
+def test_a_result_edited_elsewhere_has_no_checksum(tmp_path):
+    pb.save_result(RESULTS[1], tmp_path / "fit.nc")
+    with xr.open_datatree(tmp_path / "fit.nc", engine="netcdf4") as opened:
+        tree = opened.load()
+    del tree["prior"]
+    tree.to_netcdf(tmp_path / "edited.nc", engine="netcdf4")
+    assert "prior" not in pb.load_result(tmp_path / "edited.nc").children
+
+
+def test_a_result_is_no_capture(tmp_path):
+    pb.save_result(RESULTS[1], tmp_path / "fit.nc")
+    with pytest.raises(pb.CaptureError, match=r"fit\.nc: view_zenith: it is missing"):
+        pb.load_capture(tmp_path / "fit.nc")
+
+
+# --- what no fit gives ------------------------------------------------------------------------
+
+
+def _with_draws(method, name, values, **provenance):
+    tree = edit_provenance(make_result(method=method, wavelengths=()), **provenance)
+    draws = tree["posterior"][name].to_numpy() * 0.0
+    return replace(tree, "posterior", name, draws + values)
+
+
+@pytest.mark.parametrize("method", ["nuts", "laplace", "importance", "tempered"])
+def test_draws_that_are_all_equal_are_a_problem(method):
+    kind = "nuts" if method == "nuts" else "laplace"
+    judged = pb.verdict(edit_provenance(_with_draws(kind, "roughness", 0.2), method=method))
+    assert not judged.converged
+    assert any("All draws are equal: roughness; nothing is known" in p for p in judged.problems)
+
+
+@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
+@pytest.mark.parametrize(
+    ("name", "value", "provenance", "words"),
+    [
+        ("refractive_index", -1.0, {}, r"refractive_index \[1, inf\] 100% of its draws"),
+        ("subsurface_fraction", 1.1, {}, r"subsurface_fraction \[0, 1\] 100%"),
+        ("roughness", 0.5, {"bounds": {"roughness": [None, 0.4]}}, r"roughness \[0, 0.4\] 100%"),
+        ("exposure", -0.1, {"bounds": {"exposure": [-9.0, None]}}, r"exposure \[0, inf\] 100%"),
+    ],
+)
+def test_draws_that_their_prior_rules_out_are_a_problem(method, name, value, provenance, words):
+    judged = pb.verdict(_with_draws(method, name, value, **provenance))
+    assert not judged.converged
+    problem = next(p for p in judged.problems if p.startswith("Outside its range"))
+    assert re.search(words, problem)
+
+
+def test_one_draw_beyond_the_end_is_a_problem_and_rounding_is_none():
+    tree = make_result(wavelengths=())
+    draws = tree["posterior"]["roughness"].to_numpy().copy()
+    bounds = {"roughness": [float(draws.min()), float(draws.max())]}
+    assert pb.verdict(edit_provenance(tree, bounds=bounds)).converged
+    single = replace(tree, "posterior", "roughness", draws.astype("float32"))
+    assert pb.verdict(single).converged
+    draws[0, 0] = draws.max() + 1e-4
+    assert not pb.verdict(replace(tree, "posterior", "roughness", draws)).converged
+
+
+def test_a_name_that_the_users_own_model_declares_means_what_it_wants():
+    tree = make_result(wavelengths=())
+    tree = replace(tree, "posterior", "roughness", tree["posterior"]["roughness"].to_numpy() - 0.4)
+    assert not pb.verdict(tree).converged
+    assert pb.verdict(edit_provenance(tree, declared={"roughness": "Normal"})).converged
