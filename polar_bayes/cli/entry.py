@@ -80,7 +80,9 @@ def _run(arguments: list[str] | None) -> int:
         click.echo(str(error), err=True)
         return 1
     except SystemExit as error:  # click, which replaces a stream whose pipe is broken
-        return BROKEN_PIPE if sys.stdout is not output else int(error.code or 0)
+        if sys.stdout is not output:
+            return BROKEN_PIPE
+        return error.code if isinstance(error.code, int) else int(error.code is not None)
     except Exception as error:
         return _last_resort(error)
     return int(status or 0)
@@ -90,7 +92,7 @@ def _last_resort(error: Exception) -> int:
     """One line for an error that no command expects, and the exit status."""
     if os.environ.get(TRACEBACK):
         traceback.print_exception(error)
-    said = next(iter(str(error).strip().splitlines()), "")
+    said = next(iter(str(error).strip().splitlines()), "")[:200]  # the hint must fit beside it
     kind = type(error).__name__
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in said:
         line = f"out of memory ({kind}: {said}); give it less at a time: readings, pixels or draws"

@@ -24,6 +24,7 @@ class XlaRuntimeError(RuntimeError):
 ERRORS = {
     "ours": (TypeError("no\nsuch"), f"internal error (TypeError: no); {DEFECT} and report it"),
     "empty": (KeyError(), f"internal error (KeyError: ); {DEFECT} and report it"),
+    "long": (ValueError("x" * 999), f"internal error (ValueError: {'x' * 200}); {DEFECT} and"),
     "recursion": (RecursionError("deep"), "internal error (RecursionError: deep); this is"),
     "xla": (XlaRuntimeError("INTERNAL: x"), "internal error (XlaRuntimeError: INTERNAL: x)"),
     "memory": (MemoryError("8 GiB"), f"out of memory (MemoryError: 8 GiB); {LESS}"),
