@@ -25,9 +25,11 @@ def test_what_is_no_whole_map_is_refused(tmp_path: Path) -> None:
     store.mkdir()
     with pytest.raises(pb.FitError, match="cannot be read as Zarr"):
         pb.open_map(store)
-    (tmp_path / "map.zarr.progress").touch()
+    begun = tmp_path / "begun.zarr"
+    maps = make_maps({"roughness": np.ones((1, 1))}).assign_attrs(request_sha256="0")
+    maps.to_zarr(begun, consolidated=False)
     with pytest.raises(pb.FitError, match="not finished; wait, or go on with"):
-        pb.open_map(store)
+        pb.open_map(begun)
     other = tmp_path / "other.zarr"
     make_maps({"roughness": np.ones((1, 1))}).drop_vars("status").to_zarr(other, consolidated=False)
     with pytest.raises(pb.FitError, match="it holds no maps"):
