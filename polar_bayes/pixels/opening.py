@@ -16,6 +16,7 @@ from polar_bayes.errors import CaptureError, FitError, PolarBayesError
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.data import READINGS
 from polar_bayes.paths import as_path
+from polar_bayes.pixels.marginals import LEVELS
 from polar_bayes.pixels.stack import IMAGE
 
 MOST_BYTES = 2**31
@@ -110,19 +111,19 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
 
 def _check_maps(maps: xr.Dataset, store: Path) -> None:
     """Refuse metadata that no map has, before anything trips over them."""
-    try:
-        is_known = isinstance(json.loads(maps.attrs[PROVENANCE]), dict)
-    except (TypeError, ValueError):
-        is_known = False
-    if not is_known:
+    if not _has_provenance(maps):
         raise FitError("its provenance cannot be read", where=str(store), mend=COPY)
+    if "quantile" in maps.dims and not np.array_equal(maps["quantile"], LEVELS):
+        raise FitError("its levels are not those of a map", where=f"{store}: quantile", mend=COPY)
     for name, variable in maps.variables.items():
         where, is_flag = f"{store}: {name}", name in ("status", "approach")
         if variable.dtype.kind not in ("iu" if is_flag else "iufUOT"):
             what = f"it holds {variable.dtype.name}, which no map does"
             raise FitError(what, where=where, mend=COPY)
-        if name in maps.data_vars and not set(IMAGE) <= set(variable.dims):
-            raise FitError("it has no axes y and x", where=where, mend=COPY)
+        mean = str(name).removesuffix("_sd").removesuffix("_quantile")
+        own = set(maps[mean].dims) if mean in maps else set(IMAGE)
+        if name in maps.data_vars and not set(IMAGE) <= set(variable.dims) - {"quantile"} == own:
+            raise FitError("its axes are not those of a map", where=where, mend=COPY)
         if is_flag and not _has_meanings(variable):
             raise FitError("its flags have no meanings", where=where, mend=COPY)
         is_ours = REQUEST in maps.attrs  # to_zarr of a user leaves out chunks of zeros
@@ -130,11 +131,20 @@ def _check_maps(maps: xr.Dataset, store: Path) -> None:
             raise FitError("its values are missing", where=where, mend=COPY)
 
 
+def _has_provenance(maps: xr.Dataset) -> bool:
+    try:
+        return isinstance(json.loads(maps.attrs[PROVENANCE]), dict)
+    except (TypeError, ValueError):
+        return False
+
+
 def _has_meanings(flags: xr.Variable) -> bool:
     """Whether every value of a flag has a word."""
     words = str(flags.attrs.get("flag_meanings", "")).split()
-    values = np.ravel(flags.attrs.get("flag_values", range(len(words))))
-    return 0 < len(words) == values.size and values.dtype.kind in "iu"
+    values = flags.attrs.get("flag_values", list(range(len(words))))
+    listed = list(values) if isinstance(values, list | tuple | np.ndarray) else [values]
+    are_whole = all(isinstance(value, int | np.integer) for value in listed)
+    return 0 < len(words) == len(listed) and are_whole
 
 
 def _missing(array: Path, error: type[PolarBayesError]) -> tuple[int, int]:

@@ -106,21 +106,25 @@ def map_file(
     check_apart(source, store)
     image = open_image(source)
     check_whole(source)
-    plan = plan_map(image, **(DEFAULTS | asked))
+    with _in_capture(source):
+        plan = plan_map(image, **(DEFAULTS | asked))
     work = _Work(store, image, plan)
     file = store.with_name(f"{store.name}{LEDGER}")
     with locked_ledger(file, work.request, resume=resume) as ledger:
-        if work.is_finished(resume=resume):
+        is_finished = work.is_finished(resume=resume)
+        with _written(store):
+            ledger.read()
+        if is_finished:
             work.check_finished()
         else:
-            ledger.read()
             work.check_readings(ledger)
             work.begin(ledger)
             kept = f"{store}: what is done is kept; repeat the command with --resume to go on"
             with on_interrupt(lambda: kept):
                 work.run(ledger, image if scheduler is None else source, scheduler, progress)
             work.finish(ledger)
-        ledger.end()
+        with _written(store):
+            ledger.end()
     return open_map(store)
 
 
@@ -141,12 +145,20 @@ def fit_file_block(source: Path | xr.Dataset, place: Place, plan: Plan) -> tuple
     """Fit one block of a capture, open or in a file: its maps, and a digest of what was read."""
     image = open_image(source) if isinstance(source, Path) else source
     block = _read(image, place)
-    try:
+    with _in_capture(f"{source if isinstance(source, Path) else image.attrs['name']}", place):
         return fit_block(numbered_block(block, place, image.sizes["x"]), plan), _digest(block)
+
+
+@contextlib.contextmanager
+def _in_capture(source: str | Path, place: Place | None = None) -> Iterator[None]:
+    """What is wrong with a capture, with its name and the block."""
+    where = f"{source}" if place is None else f"{source}: block {_label(place)}"
+    try:
+        yield
     except CaptureError as error:
-        name = source if isinstance(source, Path) else image.attrs.get("name", "capture")
-        where = f"{name}: block {_label(place)}: {error.where}"
-        raise CaptureError(error.what, where=where, mend=error.mend) from error
+        if error.where.startswith(str(source)):
+            raise
+        raise CaptureError(error.what, where=f"{where}: {error.where}", mend=error.mend) from error
 
 
 def _read(image: xr.Dataset, place: Place) -> xr.Dataset:
@@ -175,7 +187,9 @@ class _Work:
         self._maps = blank(image, plan)
         self._places = list(cut(image, _block(image)))
         self._chunks = {dim: part.stop for dim, part in self._places[0].items()}
-        asked = [said_of(plan), dict(image.sizes), self._chunks, plan.request.capture.to_dict()]
+        pixel = plan.request.capture.drop_attrs(deep=False)
+        read = pixel[sorted(READ & set(pixel.data_vars))].to_dict()
+        asked = [said_of(plan), dict(image.sizes), self._chunks, read]
         text = json.dumps(asked, sort_keys=True, default=str)
         self.request = hashlib.sha256(text.encode()).hexdigest()
 
