@@ -1,10 +1,15 @@
 """Maps are opened where they are whole, and refused in one line where they are not."""
 
+import pickle
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
+from plate_images import plate_image
 from synthetic_maps import make_maps
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
 import polar_bayes as pb
 
@@ -41,3 +46,51 @@ def test_a_capture_may_be_a_zarr_store_or_a_file(tmp_path: Path) -> None:
         pb.open_capture(str(tmp_path / "leaf.zarr"))
     with pytest.raises(pb.CaptureError, match="there is no such file"):
         pb.open_capture(str(tmp_path / "leaf.nc"))
+
+
+def test_a_capture_in_a_store_can_be_cut_into_chunks(tmp_path: Path) -> None:
+    image = plate_image(4, 6)
+    image.to_zarr(tmp_path / "leaf.zarr", consolidated=False)
+    opened = pb.open_capture(tmp_path / "leaf.zarr")
+    assert not opened["q"].variable._in_memory
+    xr.testing.assert_equal(opened.chunk(y=2).compute(scheduler="threads"), image)
+    xr.testing.assert_equal(pickle.loads(pickle.dumps(opened)).load(), image)
+    xr.testing.assert_equal(
+        opened.isel(y=[3, 0], x=slice(1, None, 2), view=2),
+        image.isel(y=[3, 0], x=slice(1, None, 2), view=2),
+    )
+
+
+def changes(store: Path) -> Iterator[str]:
+    """Every file of a store cut off, emptied, lost, and with a byte changed; one at a time."""
+    for file in sorted(path for path in store.rglob("*") if path.is_file()):
+        content = file.read_bytes()
+        middle = len(content) // 2
+        flipped = content[:middle] + bytes([content[middle] ^ 4]) + content[middle + 1 :]
+        for kind, changed in (("cut", content[:middle]), ("empty", b""), ("flipped", flipped)):
+            file.write_bytes(changed)
+            yield f"{file.relative_to(store)}: {kind}"
+        file.unlink()
+        yield f"{file.relative_to(store)}: lost"
+        file.write_bytes(content)
+
+
+def test_a_broken_map_is_an_error_of_one_line(tmp_path: Path) -> None:
+    store = tmp_path / "map.zarr"
+    maps = make_maps({"refractive_index": np.full((4, 3, 2), 1.5)}, wavelengths=(450.0, 650.0))
+    maps = maps.assign_attrs(request_sha256="1", capture_sha256="2")
+    compressors = {"compressors": (ZstdCodec(), Crc32cCodec())}
+    encoding = {name: compressors for name in maps.variables}
+    maps.chunk(y=2).to_zarr(store, consolidated=False, encoding=encoding)
+    expected = maps.load()
+    said: list[str] = []
+    for change in changes(store):
+        try:
+            found = pb.open_map(store).load()
+        except pb.FitError as error:
+            said.append(str(error))
+            continue
+        if not change.endswith("lost"):  # else it is counted as not fitted, or good once more
+            xr.testing.assert_equal(found, expected)
+    assert len(said) > 60
+    assert all(each.startswith(str(store)) and "\n" not in each for each in said)
