@@ -105,13 +105,13 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
         )
     counts = dict.fromkeys(Status, 0)
     for place in cut(maps, CHUNK):
-        found = true_status(maps.isel(place)).to_numpy()
+        found = checked_status(maps.isel(place)).to_numpy()
         for each in Status:
             counts[each] += int(np.sum(found == each))
     return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
 
 
-def true_status(maps: xr.Dataset) -> xr.DataArray:
+def checked_status(maps: xr.Dataset) -> xr.DataArray:
     """Statuses of maps, in memory; a pixel that is called good without numbers is not fitted.
 
     A chunk that was lost from a store reads as not a number.

@@ -108,21 +108,21 @@ def map_file(
     check_whole(source)
     with _in_capture(source):
         plan = plan_map(image, **(DEFAULTS | asked))
-    work = _Work(store, image, plan)
+    target = _MapStore(store, image, plan)
     file = store.with_name(f"{store.name}{LEDGER}")
-    with locked_ledger(file, work.request, resume=resume) as ledger:
-        is_finished = work.is_finished(resume=resume)
+    with locked_ledger(file, target.request, resume=resume) as ledger:
+        is_finished = target.is_finished(resume=resume)
         with _written(store):
             ledger.read()
         if is_finished:
-            work.check_finished()
+            target.check_finished()
         else:
-            work.check_readings(ledger)
-            work.begin(ledger)
+            target.check_readings(ledger)
+            target.begin(ledger)
             kept = f"{store}: what is done is kept; repeat the command with --resume to go on"
             with on_interrupt(lambda: kept):
-                work.run(ledger, image if scheduler is None else source, scheduler, progress)
-            work.finish(ledger)
+                target.run(ledger, image if scheduler is None else source, scheduler, progress)
+            target.finish(ledger)
         with _written(store):
             ledger.end()
     return open_map(store)
@@ -179,7 +179,7 @@ def _digest(block: xr.Dataset) -> str:
     return found.hexdigest()
 
 
-class _Work:
+class _MapStore:
     """One map that is being made: its request, its blocks, and the files of its store."""
 
     def __init__(self, store: Path, image: xr.Dataset, plan: Plan) -> None:
@@ -391,9 +391,9 @@ def _written(store: Path) -> Iterator[None]:
     except PolarBayesError:
         raise
     except Exception as error:  # Zarr raises nearly every type for a store that is not as it was
-        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        reason = (getattr(error, "strerror", None) or "").lower() or str(error)
         raise OutputError(
-            f"it could not be written ({reason})",
+            f"it could not be written ({reason or type(error).__name__})",
             where=str(store),
             mend="make room or give another --out; --resume goes on where it stopped",
         ) from error

@@ -13,7 +13,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.physics.notation import notation
 from polar_bayes.pixels.fitting import FEWEST_VIEWS
 from polar_bayes.pixels.importance import LARGEST_TRUSTED
-from polar_bayes.pixels.maps import cut, true_status
+from polar_bayes.pixels.maps import checked_status, cut
 from polar_bayes.pixels.outcome import Status
 from polar_bayes.pixels.stack import IMAGE
 from polar_bayes.reporting.style import GREEK, place_of, plain
@@ -60,7 +60,9 @@ def count_cases(maps: xr.Dataset) -> pd.DataFrame:
     for place in cut(maps, BLOCK):
         here = maps.isel(place)
         np.add.at(
-            counts, (flag_ranks(true_status(here), rows), flag_ranks(here["approach"], columns)), 1
+            counts,
+            (flag_ranks(checked_status(here), rows), flag_ranks(here["approach"], columns)),
+            1,
         )
     return pd.DataFrame(counts, index=list(rows.values()), columns=list(columns.values()))
 

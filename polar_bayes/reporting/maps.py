@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from polar_bayes.errors import FitError
 from polar_bayes.physics.notation import notation
-from polar_bayes.pixels.maps import true_status
+from polar_bayes.pixels.maps import checked_status
 from polar_bayes.reporting.map_tables import flag_ranks, flag_words
 from polar_bayes.reporting.style import (
     BLUE,
@@ -70,7 +70,7 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
     axes = figure.add_subplot(3, columns, 2 * columns + 1)
     _picture(axes, shown["pareto_k"], "Pareto k", "magma", ends=(0.0, LARGEST_K))
     for at, (flags, colors) in enumerate(
-        ((shown["approach"], APPROACHES), (true_status(shown), STATUSES))
+        ((shown["approach"], APPROACHES), (checked_status(shown), STATUSES))
     ):
         _flags(figure.add_subplot(3, columns, 2 * columns + 2 + at), flags, colors)
     return figure

@@ -1,5 +1,6 @@
 """Maps are opened where they are whole, and refused in one line where they are not."""
 
+import json
 import pickle
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from plate_images import plate_image
+from plate_images import ASKED, plate_image
 from synthetic_maps import make_maps
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
@@ -94,3 +95,40 @@ def test_a_broken_map_is_an_error_of_one_line(tmp_path: Path) -> None:
             xr.testing.assert_equal(found, expected)
     assert len(said) > 60
     assert all(each.startswith(str(store)) and "\n" not in each for each in said)
+
+
+def alter(**fields: object):
+    def change(source: Path) -> None:
+        metadata = json.loads((source / "q" / "zarr.json").read_text())
+        (source / "q" / "zarr.json").write_text(json.dumps(metadata | fields))
+
+    return change
+
+
+DAMAGE = {
+    "a chunk": (
+        lambda source: (source / "q" / "c" / "0" / "0" / "0").write_bytes(b"\x28\xb5"),
+        r"q\[y=0:1, x=0:4\]: it cannot be read",
+    ),
+    "no metadata": (lambda source: (source / "q" / "zarr.json").write_text(""), "cannot be read"),
+    "a dtype": (alter(data_type="complex128"), "."),
+    "a shape": (alter(shape=[3, -4, 6]), "."),
+    "another shape": (alter(shape=[3, 5, 6]), "."),
+    "names": (alter(dimension_names=["y", "x", "x"]), "."),
+    "no names": (alter(dimension_names=None), "."),
+    "codecs": (alter(codecs=[]), "."),
+    "attributes": (alter(attributes={"units": ["a", 1]}), "."),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_capture_is_one_line(tmp_path: Path, damage: str) -> None:
+    source = tmp_path / "plates.zarr"
+    plate_image(3, 4).to_zarr(source, consolidated=False)
+    spoil, says = DAMAGE[damage]
+    spoil(source)
+    with pytest.raises(pb.CaptureError, match=says) as error:
+        pb.map_file(source, tmp_path / "map.zarr", **ASKED)
+    assert "\n" not in str(error.value)
+    assert str(error.value).startswith(str(source))
+    assert [path.name for path in tmp_path.iterdir()] == ["plates.zarr"]
