@@ -202,16 +202,19 @@ class _Guarded(BackendArray):
         try:
             return self._variable[key].to_numpy()
         except Exception as cause:  # codecs raise nearly every type for a broken chunk
-            sizes = zip(self._variable.dims, key, self.shape, strict=True)
-            ranges = [
-                f"{dim}={part.indices(size)[0]}:{part.indices(size)[1]}"
-                for dim, part, size in sizes
-                if isinstance(part, slice) and dim in IMAGE
-            ]
+            parts = zip(self._variable.dims, key, self.shape, strict=True)
+            ranges = [f"{dim}={_range(part, n)}" for dim, part, n in parts if dim in IMAGE]
             place = f"[{', '.join(ranges)}]" if ranges else ""
             raise self._error(
                 f"it cannot be read ({cause})", where=f"{self._where}{place}", mend=self._mend
             ) from cause
+
+
+def _range(part: slice | np.ndarray | int, length: int) -> str:
+    """Where along an axis values were asked for."""
+    if isinstance(part, slice):
+        return "{}:{}".format(*part.indices(length))
+    return str(part) if np.ndim(part) == 0 else f"{np.min(part)}:{np.max(part) + 1}"
 
 
 def at_hand(maps: xr.Dataset) -> xr.Dataset:

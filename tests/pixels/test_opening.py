@@ -108,7 +108,7 @@ def alter(**fields: object):
 DAMAGE = {
     "a chunk": (
         lambda source: (source / "q" / "c" / "0" / "0" / "0").write_bytes(b"\x28\xb5"),
-        r"q\[y=0:1, x=0:4\]: it cannot be read",
+        r"q\[y=0, x=0:4\]: it cannot be read",
     ),
     "no metadata": (lambda source: (source / "q" / "zarr.json").write_text(""), "cannot be read"),
     "a dtype": (alter(data_type="complex128"), "."),
