@@ -121,7 +121,7 @@ def map_file(
             target.begin(ledger)
             kept = f"{store}: what is done is kept; repeat the command with --resume to go on"
             with on_interrupt(lambda: kept):
-                target.run(ledger, image if scheduler is None else source, scheduler, progress)
+                target.run(ledger, source, scheduler, progress)
             target.finish(ledger)
         with _written(store):
             ledger.end()
@@ -141,18 +141,20 @@ def check_apart(source: Path, store: Path) -> None:
             raise OutputError("its folder is not there", where=where, mend="make the folder first")
 
 
-def fit_file_block(source: Path | xr.Dataset, place: Place, plan: Plan) -> tuple[xr.Dataset, str]:
-    """Fit one block of a capture, open or in a file: its maps, and a digest of what was read."""
-    image = open_image(source) if isinstance(source, Path) else source
+def fit_file_block(
+    source: Path, place: Place, plan: Plan, opened: xr.Dataset | None = None
+) -> tuple[xr.Dataset, str]:
+    """Fit one block of a capture, which a worker opens: its maps, and a digest of its readings."""
+    image = open_image(source) if opened is None else opened
     block = _read(image, place)
-    with _in_capture(f"{source if isinstance(source, Path) else image.attrs['name']}", place):
+    with _in_capture(source, place):
         return fit_block(numbered_block(block, place, image.sizes["x"]), plan), _digest(block)
 
 
 @contextlib.contextmanager
-def _in_capture(source: str | Path, place: Place | None = None) -> Iterator[None]:
+def _in_capture(source: Path, place: Place | None = None) -> Iterator[None]:
     """What is wrong with a capture, with its name and the block."""
-    where = f"{source}" if place is None else f"{source}: block {_label(place)}"
+    where = str(source) if place is None else f"{source}: block {_label(place)}"
     try:
         yield
     except CaptureError as error:
@@ -276,19 +278,16 @@ class _MapStore:
             )
 
     def run(
-        self,
-        ledger: Ledger,
-        source: Path | xr.Dataset,
-        scheduler: str | None,
-        progress: Counter | None,
+        self, ledger: Ledger, source: Path, scheduler: str | None, progress: Counter | None
     ) -> None:
         """Fit and write every block that is not on the disk as the ledger says."""
         places = [place for place in self._places if not self._is_done(ledger, place)]
         every = sum(map(_size, self._places))
         done = every - sum(map(_size, places))
         with workers(scheduler) as (executor, count):
-            tasks = ((source, place, self._plan) for place in places)
-            for (_, place, _), (block, readings) in as_completed(
+            opened = self._image if scheduler is None else None  # a cluster opens it for itself
+            tasks = ((source, place, self._plan, opened) for place in places)
+            for (_, place, *_), (block, readings) in as_completed(
                 executor, count, fit_file_block, tasks
             ):
                 with _written(self._store):
