@@ -110,6 +110,7 @@ DAMAGE = {
         lambda source: (source / "q" / "c" / "0" / "0" / "0").write_bytes(b"\x28\xb5"),
         r"q\[y=0, x=0:4\]: it cannot be read",
     ),
+    "no group": (lambda source: (source / "zarr.json").write_text("{"), "cannot be read as Zarr"),
     "no metadata": (lambda source: (source / "q" / "zarr.json").write_text(""), "cannot be read"),
     "a dtype": (alter(data_type="complex128"), "."),
     "a shape": (alter(shape=[3, -4, 6]), "."),
