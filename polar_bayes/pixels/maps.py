@@ -82,8 +82,11 @@ def fit_pixels(
     )
     if capture.chunks:
         numbered = number_pixels(capture)
-        return xr.map_blocks(fit_block, numbered, args=[plan], template=blank(capture, plan))
-    return _at_once(capture, plan, progress)
+        maps = xr.map_blocks(fit_block, numbered, args=[plan], template=blank(capture, plan))
+    else:
+        maps = _at_once(capture, plan, progress)
+    maps["status"].encoding["fill_value"] = int(Status.NOT_FITTED)  # of chunks in a Zarr store
+    return maps
 
 
 def count_pixels(maps: xr.Dataset) -> dict[str, int]:

@@ -13,6 +13,7 @@ from synthetic_maps import make_maps
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 import polar_bayes as pb
+from polar_bayes.pixels.outcome import Status
 
 
 def test_what_was_written_is_read_when_it_is_needed(tmp_path: Path) -> None:
@@ -60,6 +61,15 @@ def test_a_capture_in_a_store_can_be_cut_into_chunks(tmp_path: Path) -> None:
         opened.isel(y=[3, 0], x=slice(1, None, 2), view=2),
         image.isel(y=[3, 0], x=slice(1, None, 2), view=2),
     )
+
+
+def test_what_a_user_has_not_written_yet_is_not_good(tmp_path: Path) -> None:
+    maps = pb.fit_pixels(plate_image(4, 6).chunk(y=2), **ASKED)
+    maps.to_zarr(tmp_path / "map.zarr", consolidated=False, compute=False)
+    found = pb.open_map(tmp_path / "map.zarr")
+    assert (found["status"] == Status.NOT_FITTED).all()
+    counts = pb.count_pixels(found)
+    assert {name: count for name, count in counts.items() if count} == {"not fitted": 24}
 
 
 def changes(store: Path) -> Iterator[str]:
