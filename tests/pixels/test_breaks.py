@@ -118,7 +118,7 @@ def test_a_killed_worker_loses_nothing_and_changes_no_bit(
     out = tmp_path / "map.zarr"
     with (
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address=None
+            n_workers=2, threads_per_worker=1, dashboard_address=":0"
         ) as cluster,
         started(capture, out, scheduler=cluster.scheduler_address) as process,
     ):
