@@ -34,7 +34,7 @@ def make_maps(
     found: dict = {}
     for name, mean in means.items():
         axes = ("y", "x", "wavelength")[: mean.ndim]
-        nothing = np.isin(status, (Status.MASKED, Status.TOO_FEW_VIEWS, Status.NOT_CONVERGED))
+        nothing = ~np.isin(status, (Status.GOOD, Status.NOT_TRUSTED))
         mean = np.where(nothing.reshape(*shape, *[1] * (mean.ndim - 2)), np.nan, mean)
         steps = (LEVELS_HERE - 0.5).reshape(-1, *[1] * mean.ndim)
         found[name] = (axes, np.float32(mean))

@@ -59,7 +59,8 @@ HOMES = {
         "polar_bayes.diagnostics",
         "polar_bayes.reporting",
     ),
-    "zarr": ("polar_bayes.pixels.store",),
+    "zarr": ("polar_bayes.pixels.store", "polar_bayes.pixels.opening"),
+    "portalocker": ("polar_bayes.pixels.ledger",),
     "distributed": ("polar_bayes.pixels.executors",),
     "xarray": (
         "polar_bayes.capture",

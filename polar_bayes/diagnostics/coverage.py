@@ -45,10 +45,10 @@ def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
     Returns:
         A row for each parameter whose truth is known (and wavelength, where it has several), with
         pixels whose truth is `unknown` (NaN), that are `masked` (never read), `unanswered` (read,
-        without an answer) and `answered`: counts that add up to the image. For each interval, as
-        for 50%: `held_50`, share of those answered; `held_50_low` and `held_50_high`, its 95%
-        interval (Wilson's, as if pixels were independent); `held_50_of_read`, share of those
-        answered and unanswered. NaN where there are none.
+        without an answer, or not fitted) and `answered`: counts that add up to the image. For each
+        interval, as for 50%: `held_50`, share of those answered; `held_50_low` and `held_50_high`,
+        its 95% interval (Wilson's, as if pixels were independent); `held_50_of_read`, share of
+        those answered and unanswered. NaN where there are none.
 
     Raises:
         CaptureError: It knows no parameter of the map, or is of another image.
@@ -132,7 +132,7 @@ def _count(status: xr.DataArray, bounds: xr.DataArray, true: xr.DataArray) -> np
     own = [dim for dim in bounds.dims if dim not in ("quantile", *IMAGE)]
     true = true.astype(bounds.dtype)
     is_known, is_masked = true.notnull(), status == Status.MASKED
-    has_answer = is_known & (status == Status.GOOD) & bounds.notnull().all("quantile")
+    has_answer = is_known & (status == Status.GOOD) & (abs(bounds) < np.inf).all("quantile")
     cases = [
         ~is_known,
         is_known & is_masked,

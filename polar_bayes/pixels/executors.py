@@ -29,8 +29,13 @@ def workers(scheduler: str | None) -> Iterator[tuple[Executor, int]]:
     """
     if scheduler is None:
         threads = os.cpu_count() or 1
-        with ThreadPoolExecutor(threads) as pool:
+        pool = ThreadPoolExecutor(threads)
+        try:
             yield pool, threads
+        except BaseException:  # an interrupt must not wait for blocks that take minutes
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        pool.shutdown()
         return
     try:
         distributed = importlib.import_module("distributed")

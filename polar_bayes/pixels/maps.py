@@ -27,6 +27,9 @@ from polar_bayes.progress import Counter, counted
 BLOCK = 4096
 """Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
 
+CHUNK = 65536
+"""Pixels that are looked at together: a chunk of a store."""
+
 
 @counted("pixels")
 def fit_pixels(
@@ -79,8 +82,11 @@ def fit_pixels(
     )
     if capture.chunks:
         numbered = number_pixels(capture)
-        return xr.map_blocks(fit_block, numbered, args=[plan], template=blank(capture, plan))
-    return _at_once(capture, plan, progress)
+        maps = xr.map_blocks(fit_block, numbered, args=[plan], template=blank(capture, plan))
+    else:
+        maps = _at_once(capture, plan, progress)
+    maps["status"].encoding["fill_value"] = int(Status.NOT_FITTED)  # of chunks in a Zarr store
+    return maps
 
 
 def count_pixels(maps: xr.Dataset) -> dict[str, int]:
@@ -90,7 +96,8 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
         maps: Of `fit_pixels`, or opened from a store.
 
     Returns:
-        How many are good, masked, with too few views, not converged and not trusted.
+        How many are good, masked, with too few views, not converged, not trusted and not fitted:
+        those whose chunk is lost, or whose numbers are not finite though they are called good.
 
     Raises:
         FitError: It holds no `status`.
@@ -99,10 +106,33 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
         raise FitError(
             "it holds no maps", where="count_pixels", mend="give what fit_pixels returns"
         )
-    counts = np.zeros(len(Status), int)
-    for place in cut(maps):
-        counts += np.bincount(maps["status"].isel(place).to_numpy().ravel(), minlength=len(Status))
-    return {each.name.lower().replace("_", " "): int(counts[each]) for each in Status}
+    counts = dict.fromkeys(Status, 0)
+    for place in cut(maps, CHUNK):
+        found = checked_status(maps.isel(place)).to_numpy()
+        for each in Status:
+            counts[each] += int(np.sum(found == each))
+    return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
+
+
+def checked_status(maps: xr.Dataset) -> xr.DataArray:
+    """Statuses of maps, in memory; a pixel that is called good without numbers is not fitted.
+
+    A chunk that was lost from a store reads as not a number.
+    """
+    answers = [
+        f"{name}{ending}"
+        for name in maps.data_vars
+        if f"{name}_quantile" in maps
+        for ending in ("", "_sd", "_quantile")
+        if f"{name}{ending}" in maps
+    ]
+    here = maps[["status", *answers]].load()
+    is_known = xr.ones_like(here["status"], dtype=bool)
+    for name in answers:
+        is_finite = abs(here[name]) < np.inf
+        is_known &= is_finite.all([dim for dim in is_finite.dims if dim not in IMAGE])
+    is_hole = (here["status"] == Status.GOOD) & ~is_known
+    return here["status"].where(~is_hole, Status.NOT_FITTED).astype(here["status"].dtype)
 
 
 def plan_map(
@@ -173,10 +203,10 @@ def number_pixels(capture: xr.Dataset) -> xr.Dataset:
     return capture.assign({NUMBER: along[0] * columns + along[1]})
 
 
-def numbered_block(capture: xr.Dataset, place: Mapping[str, slice]) -> xr.Dataset:
-    """A block of an image whose pixels know where they stand in the whole."""
+def numbered_block(block: xr.Dataset, place: Mapping[str, slice], columns: int) -> xr.Dataset:
+    """A block of an image so many columns wide, whose pixels know where they stand in the whole."""
     y, x = (xr.Variable((d,), np.arange(place[d].start, place[d].stop)) for d in IMAGE)
-    return capture.isel(place).assign({NUMBER: y * capture.sizes["x"] + x})
+    return block.assign({NUMBER: y * columns + x})
 
 
 def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
@@ -193,7 +223,9 @@ def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
         Nothing.
     """
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
-    tiny = maps_of(Marginals(1, plan.sizes), no_outcome(1), corner, plan.layout)
+    nothing = no_outcome(1)
+    nothing.status[:] = Status.NOT_FITTED
+    tiny = maps_of(Marginals(1, plan.sizes), nothing, corner, plan.layout)
     one = tiny.isel({dim: 0 for dim in IMAGE}, drop=True)
     whole = one.expand_dims({dim: capture.sizes[dim] for dim in IMAGE})
     whole = whole.assign_coords({dim: capture[dim] for dim in IMAGE if dim in capture.coords})
@@ -228,9 +260,12 @@ def _at_once(capture: xr.Dataset, plan: Plan, progress: Counter | None) -> xr.Da
     every, done = capture.sizes["y"] * capture.sizes["x"], 0
     with workers(None) as (pool, count):
         tasks = ((place,) for place in cut(capture))
-        blocks = as_completed(
-            pool, count, lambda place: fit_block(numbered_block(capture, place), plan), tasks
-        )
+
+        def fit(place: dict[str, slice]) -> xr.Dataset:
+            block = numbered_block(capture.isel(place), place, capture.sizes["x"])
+            return fit_block(block, plan)
+
+        blocks = as_completed(pool, count, fit, tasks)
         for (place,), block in blocks:
             for name, values in block.items():
                 maps[name][place] = values

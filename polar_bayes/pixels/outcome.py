@@ -13,13 +13,14 @@ from polar_bayes.pixels.importance import LARGEST_TRUSTED, effective_draws, effe
 
 
 class Status(enum.IntEnum):
-    """What became of a pixel."""
+    """What became of a pixel; the last is what chunks that are not written read as."""
 
     GOOD = 0
     MASKED = 1
     TOO_FEW_VIEWS = 2
     NOT_CONVERGED = 3
     NOT_TRUSTED = 4
+    NOT_FITTED = -1
 
 
 class Approach(enum.IntEnum):

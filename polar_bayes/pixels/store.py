@@ -1,4 +1,10 @@
-"""Maps of images that do not fit into memory: block by block from file to file, resumable."""
+"""Maps of images that do not fit into memory: block by block from file to file, resumable.
+
+A map is a Zarr store that appears whole, without values, under a fingerprint of what was asked
+(`opening.REQUEST`). Each block is on the disk before its line is in the ledger beside the store
+(`ledger.py`). The attribute `opening.FINISHED` is written last. Nothing is written to a store that
+does not hold the fingerprint, and nothing is removed but the ledger and folders of our own.
+"""
 
 import contextlib
 import hashlib
@@ -6,21 +12,38 @@ import inspect
 import json
 import math
 import os
-import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import xarray as xr
-import zarr
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from polar_bayes.capture.files import load_capture
-from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.observation.data import READINGS
-from polar_bayes.paths import as_path
+from polar_bayes.capture.contract import CONTRACT, LABELS, WAVELENGTH
+from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError
+from polar_bayes.interrupts import on_interrupt
+from polar_bayes.paths import as_path, is_same_place, sync, unfinished_folder
 from polar_bayes.pixels.blocks import Plan, fit_block
 from polar_bayes.pixels.executors import as_completed, workers
+from polar_bayes.pixels.ledger import (
+    BEGUN_OTHERWISE,
+    REPEAT,
+    Entry,
+    Ledger,
+    locked_ledger,
+    taken_over,
+)
 from polar_bayes.pixels.maps import blank, cut, fit_pixels, numbered_block, plan_map, said_of
+from polar_bayes.pixels.opening import (
+    FINISHED,
+    LEDGER,
+    REQUEST,
+    check_whole,
+    open_image,
+    open_map,
+)
+from polar_bayes.pixels.outcome import Status
+from polar_bayes.pixels.stack import IMAGE
 from polar_bayes.progress import Counter, counted
 
 BLOCK = 65536
@@ -28,6 +51,11 @@ BLOCK = 65536
 
 PARTS, LEAST = 4, 1024
 """Blocks of a smaller image, so that every core has work; but none has fewer pixels."""
+
+READ = frozenset((*(row.name for row in CONTRACT), WAVELENGTH.name, *LABELS))
+"""What a fit reads of a capture; known truths and variables of the user's own are not among it."""
+
+METADATA = "zarr.json"
 
 Place = dict[str, slice]
 
@@ -59,7 +87,8 @@ def map_file(
         out: The folder of a Zarr store to write.
         scheduler: Address of a `dask.distributed` scheduler whose workers can read `capture`; by
             default threads of this process.
-        resume: Go on with a map that was broken off; what is done stays.
+        resume: Go on with a map that was broken off; what is done stays. Blocks whose files are
+            missing or altered are fitted again. A finished map of the same capture is returned.
         progress: Called with the pixels that are done, and all.
         asked: Arguments of `polar_bayes.fit_pixels`.
 
@@ -68,155 +97,276 @@ def map_file(
 
     Raises:
         CaptureError: The capture cannot be read, or is not what a fit needs.
-        FitError: Something asked for cannot be used, the store is there already (or, to resume,
-            is finished or was begun otherwise), or it cannot be written.
+        FitError: Something asked for cannot be used; or, to resume, the map was begun otherwise or
+            the capture has changed since.
+        OutputError: The store cannot be written, is there already, is (to resume) no map of ours or
+            not as it was written, or another process is writing it.
     """
     source, store = as_path(capture, "capture"), as_path(out, "out")
+    check_apart(source, store)
     image = open_image(source)
-    _check_whole(source)
-    plan = plan_map(image, **(DEFAULTS | asked))
-    ledger = _Ledger(store, image, plan)
-    if ledger.begin(resume=resume):
-        _write_blank(image, plan, store)
-        ledger.open()
-    places = [place for place in cut(image, _block(image)) if not ledger.has(place)]
-    every = image.sizes["y"] * image.sizes["x"]
-    done = every - sum(_size(place) for place in places)
-    with workers(scheduler) as (executor, count):
-        tasks = ((source, place, plan) for place in places)
-        for (_, place, _), block in as_completed(executor, count, fit_file_block, tasks):
-            _write(block, store, place)
-            ledger.add(place)
-            done += _size(place)
-            if progress is not None:
-                progress(done, every)
-    ledger.end()
-    return xr.open_zarr(store, chunks=None, consolidated=False)
+    check_whole(source)
+    with _in_capture(source):
+        plan = plan_map(image, **(DEFAULTS | asked))
+    target = _MapStore(store, image, plan)
+    file = store.with_name(f"{store.name}{LEDGER}")
+    with locked_ledger(file, target.request, resume=resume) as ledger:
+        is_finished = target.is_finished(resume=resume)
+        with _written(store):
+            ledger.read()
+        if is_finished:
+            target.check_finished()
+        else:
+            target.check_readings(ledger)
+            target.begin(ledger)
+            kept = f"{store}: what is done is kept; repeat the command with --resume to go on"
+            with on_interrupt(lambda: kept):
+                target.run(ledger, source, scheduler, progress)
+            target.finish(ledger)
+        with _written(store):
+            ledger.end()
+    return open_map(store)
 
 
-def open_image(path: Path) -> xr.Dataset:
-    """A capture from a file, its values read when they are needed where it is a Zarr store.
+def check_apart(source: Path, store: Path) -> None:
+    """Refuse a store that is the source, or in it, or around it; or that has nowhere to stand."""
+    where, mend = str(store), "give another --out"
+    with _written(store):
+        one, other = source.resolve(), store.resolve()
+        is_nested = other.is_relative_to(one) or one.is_relative_to(other)
+        if is_nested or is_same_place(source, store):
+            what = "it is the capture, inside it, or around it"
+            raise OutputError(what, where=where, mend=mend)
+        if not store.parent.is_dir():
+            raise OutputError("its folder is not there", where=where, mend="make the folder first")
 
-    Args:
-        path: A netCDF file or the folder of a Zarr store.
 
-    Returns:
-        The capture; of a Zarr store it is validated block by block, later.
+def fit_file_block(
+    source: Path, place: Place, plan: Plan, opened: xr.Dataset | None = None
+) -> tuple[xr.Dataset, str]:
+    """Fit one block of a capture, which a worker opens: its maps, and a digest of its readings."""
+    image = open_image(source) if opened is None else opened
+    block = _read(image, place)
+    with _in_capture(source, place):
+        return fit_block(numbered_block(block, place, image.sizes["x"]), plan), _digest(block)
 
-    Raises:
-        CaptureError: It cannot be read.
-    """
-    if path.suffix != ".zarr":
-        return load_capture(path)
-    where = str(path)
-    if not path.is_dir():
-        raise CaptureError("there is no such store", where=where, mend="check the path")
+
+@contextlib.contextmanager
+def _in_capture(source: Path, place: Place | None = None) -> Iterator[None]:
+    """What is wrong with a capture, with its name and the block."""
+    where = str(source) if place is None else f"{source}: block {_label(place)}"
     try:
-        image = xr.open_zarr(path, chunks=None, decode_times=False, consolidated=False)
-    except Exception as error:  # the libraries below raise nearly every type for a broken store
-        raise CaptureError(
-            "it cannot be read as Zarr", where=where, mend="write it again with to_zarr"
-        ) from error
-    image.attrs.setdefault("name", path.stem)
-    return image
+        yield
+    except CaptureError as error:
+        if error.where.startswith(str(source)):
+            raise
+        raise CaptureError(error.what, where=f"{where}: {error.where}", mend=error.mend) from error
 
 
-def _check_whole(path: Path) -> None:
-    """Refuse a store with holes, which would read as missing readings; once for the whole map."""
-    for name in READINGS:
-        if path.suffix != ".zarr" or not (path / name).is_dir():
-            continue
-        array = zarr.open_array(path / name, mode="r")
-        missing = array.nchunks - array.nchunks_initialized
-        if missing:
-            raise CaptureError(
-                f"{missing} of {array.nchunks} chunks are missing",
-                where=f"{path}: {name}",
-                mend="copy the store again, or write it again with to_zarr",
-            )
+def _read(image: xr.Dataset, place: Place) -> xr.Dataset:
+    """A block of a capture in memory: what a fit reads of it."""
+    return image[[name for name in image.data_vars if name in READ]].isel(place).load()
 
 
-def fit_file_block(source: Path, place: Place, plan: Plan) -> xr.Dataset:
-    """Fit one block of a capture in a file; this is what a worker is sent.
-
-    Args:
-        source: The capture.
-        place: Slices of y and x.
-        plan: What is done.
-
-    Returns:
-        The maps of the block.
-
-    Raises:
-        CaptureError: The block cannot be read or is not what the contract of captures allows.
-    """
-    return fit_block(numbered_block(open_image(source), place), plan)
+def _digest(block: xr.Dataset) -> str:
+    """SHA-256 of names, axes, types and values."""
+    found = hashlib.sha256()
+    for name in sorted(READ & set(block.variables)):
+        variable = block.variables[name]
+        values = variable.to_numpy()
+        head = [name, variable.dims, values.shape, values.dtype.str]
+        found.update(json.dumps(head).encode())
+        is_plain = values.dtype.kind in "biuf"
+        found.update(values.tobytes() if is_plain else json.dumps(values.tolist()).encode())
+    return found.hexdigest()
 
 
-class _Ledger:
-    """Which blocks are written: a line for each, in a file beside the store.
-
-    A line is added after its block is on the disk. A line that was cut off by a crash counts as
-    not there, and its block is fitted again, to the same bits.
-    """
+class _MapStore:
+    """One map that is being made: its request, its blocks, and the files of its store."""
 
     def __init__(self, store: Path, image: xr.Dataset, plan: Plan) -> None:
-        self._store = store
-        self._file = store.with_name(f"{store.name}.progress")
-        pixel = plan.request.capture.to_dict()
-        told = json.dumps([said_of(plan), dict(image.sizes), pixel], sort_keys=True, default=str)
-        self._head = hashlib.sha256(told.encode()).hexdigest()
-        self._done: set[str] = set()
+        self._store, self._image, self._plan = store, image, plan
+        self._maps = blank(image, plan)
+        self._places = list(cut(image, _block(image)))
+        self._chunks = {dim: part.stop for dim, part in self._places[0].items()}
+        pixel = plan.request.capture.drop_attrs(deep=False)
+        read = pixel[sorted(READ & set(pixel.data_vars))].to_dict()
+        asked = [said_of(plan), dict(image.sizes), self._chunks, read]
+        text = json.dumps(asked, sort_keys=True, default=str)
+        self.request = hashlib.sha256(text.encode()).hexdigest()
 
-    def begin(self, *, resume: bool) -> bool:
-        """True where nothing is there yet; then a file says that something was begun."""
+    def is_finished(self, *, resume: bool) -> bool:
+        """Whether the store is a finished map; one that is not of this request is refused."""
         where = str(self._store)
+        if not os.path.lexists(self._store):
+            return False
         if not resume:
-            if self._store.exists() or self._file.exists():
+            mend = "give another --out, or --resume"
+            raise OutputError("it is there already", where=where, mend=mend)
+        attributes = _metadata(self._store)["attributes"]
+        if REQUEST not in attributes:
+            mend = "give another --out"
+            raise OutputError("it is not a map that can be resumed", where=where, mend=mend)
+        if attributes[REQUEST] != self.request:
+            raise FitError(BEGUN_OTHERWISE, where=where, mend=REPEAT)
+        return FINISHED in attributes
+
+    def check_finished(self) -> None:
+        """Refuse a finished map of readings that have changed, or that has lost chunks."""
+        where, mend = str(self._store), "give another --out"
+        readings = [_digest(_read(self._image, place)) for place in self._places]
+        if _metadata(self._store)["attributes"][FINISHED] != self._combined(readings):
+            raise FitError("the capture has changed since it was made", where=where, mend=mend)
+        files = [file for place in self._places for file in self._files(place)]
+        if missing := sum(not file.is_file() for file in files):
+            what = f"{missing} of {len(files)} chunks are missing"
+            raise OutputError(what, where=where, mend="copy the store again, or give another --out")
+
+    def check_readings(self, ledger: Ledger) -> None:
+        """Refuse to go on where the readings of a block that is done have changed."""
+        for place in self._places:
+            label = _label(place)
+            if label not in ledger.entries:
+                continue
+            if _digest(_read(self._image, place)) != ledger.entries[label].readings:
                 raise FitError(
-                    "it is there already", where=where, mend="give another --out, or --resume"
+                    f"the capture has changed since block {label} was fitted",
+                    where=str(self._store),
+                    mend="give another --out",
                 )
-            return self._start()
-        if self._store.exists() and not self._file.exists():
-            raise FitError("nothing is left to resume", where=where, mend="give another --out")
-        lines = self._file.read_text().split("\n") if self._file.exists() else [""]
-        if len(lines) < 2:  # broken off before the store was whole
-            shutil.rmtree(self._store, ignore_errors=True)
-            return self._start()
-        if lines[0] != self._head:
-            raise FitError(
-                "it was begun with another capture or other settings",
-                where=where,
-                mend="repeat the command as it was, or give another --out",
+
+    def begin(self, ledger: Ledger) -> None:
+        """Put the store without values in its place, or see that it is as it was put there."""
+        with _written(self._store), unfinished_folder(self._store.parent) as folder:
+            empty = folder / self._store.name
+            self._write_blank(empty)
+            files = sorted(path.relative_to(empty) for path in empty.rglob("*") if path.is_file())
+            if self._store.exists():
+                for file in files:
+                    self._check_same(empty, file)
+                ledger.begin()
+                return
+            for path in (*empty.rglob("*"), empty):
+                sync(path)
+            ledger.begin()
+            empty.rename(self._store)
+            sync(self._store.parent)
+
+    def _write_blank(self, path: Path) -> None:
+        """The store with names, axes and attributes; what is not written reads as not fitted."""
+        compressors = (ZstdCodec(), Crc32cCodec())
+        encoding: dict = {str(name): {"compressors": compressors} for name in self._maps.variables}
+        encoding["status"]["fill_value"] = int(Status.NOT_FITTED)
+        self._maps.chunk(self._chunks).assign_attrs({REQUEST: self.request}).to_zarr(
+            path,
+            mode="w-",
+            encoding=encoding,
+            compute=False,
+            consolidated=False,
+            zarr_format=3,
+            write_empty_chunks=True,
+        )
+
+    def _check_same(self, empty: Path, file: Path) -> None:
+        """Refuse a store whose metadata or axes are not those that were written."""
+        found = self._store / file
+        if not found.is_file() or found.read_bytes() != (empty / file).read_bytes():
+            raise OutputError(
+                "it is missing, or not as it was written",
+                where=f"{self._store}: {file}",
+                mend="give another --out",
             )
-        self._done = set(lines[1:-1])
-        return False
 
-    def _start(self) -> bool:
-        """Before the store: whoever is stopped between the two can go on."""
+    def run(
+        self, ledger: Ledger, source: Path, scheduler: str | None, progress: Counter | None
+    ) -> None:
+        """Fit and write every block that is not on the disk as the ledger says."""
+        places = [place for place in self._places if not self._is_done(ledger, place)]
+        every = sum(map(_size, self._places))
+        done = every - sum(map(_size, places))
+        with workers(scheduler) as (executor, count):
+            opened = self._image if scheduler is None else None  # a cluster opens it for itself
+            tasks = ((source, place, self._plan, opened) for place in places)
+            for (_, place, *_), (block, readings) in as_completed(
+                executor, count, fit_file_block, tasks
+            ):
+                with _written(self._store):
+                    self._write(block, place)
+                    entry = Entry(readings, _contents(self._files(place)))
+                    ledger.add(_label(place), entry)
+                done += _size(place)
+                if progress is not None:
+                    progress(done, every)
+
+    def _is_done(self, ledger: Ledger, place: Place) -> bool:
+        entry = ledger.entries.get(_label(place))
+        files = self._files(place)
+        if entry is None or not all(file.is_file() for file in files):
+            return False
         with _written(self._store):
-            self._file.touch()
-        return True
+            return _contents(files) == entry.chunks
 
-    def open(self) -> None:
-        """The store is there: from now on there is something to resume."""
-        self._append(self._head)
+    def _write(self, block: xr.Dataset, place: Place) -> None:
+        """Write a block and wait until it is on the disk."""
+        values = block.drop_vars(list(block.coords))
+        region = {dim: part for dim, part in place.items()}
+        values.to_zarr(self._store, region=region, consolidated=False, write_empty_chunks=True)
+        files = self._files(place)
+        folders = {
+            folder
+            for file in files
+            for folder in file.parents
+            if folder.is_relative_to(self._store)
+        }
+        for path in (*files, *sorted(folders)):
+            sync(path)
 
-    def has(self, place: Place) -> bool:
-        return _label(place) in self._done
+    def _files(self, place: Place) -> list[Path]:
+        """Chunk files of a block: one of each array, as the default names of Zarr have it."""
+        found = []
+        for name, variable in self._maps.data_vars.items():
+            at = [place[d].start // self._chunks[d] if d in IMAGE else 0 for d in variable.dims]
+            found.append(self._store.joinpath(str(name), "c", *map(str, at)))
+        return found
 
-    def add(self, place: Place) -> None:
-        self._append(_label(place))
+    def finish(self, ledger: Ledger) -> None:
+        """Say in the store itself that it is finished, and of which readings."""
+        readings = [ledger.entries[_label(place)].readings for place in self._places]
+        with _written(self._store), unfinished_folder(self._store.parent) as folder:
+            metadata = _metadata(self._store)
+            if metadata["attributes"].get(REQUEST) != self.request:
+                raise taken_over(self._store)
+            metadata["attributes"][FINISHED] = self._combined(readings)
+            unfinished = folder / METADATA
+            unfinished.write_text(json.dumps(metadata, indent=2))
+            sync(unfinished)
+            unfinished.replace(self._store / METADATA)
+            sync(self._store)
 
-    def end(self) -> None:
-        """Nothing is left to do."""
-        self._file.unlink()
+    def _combined(self, readings: Iterable[str]) -> str:
+        """Digest of the readings of all blocks."""
+        labels = map(_label, self._places)
+        text = "\n".join(f"{label} {one}" for label, one in zip(labels, readings, strict=True))
+        return hashlib.sha256(text.encode()).hexdigest()
 
-    def _append(self, line: str) -> None:
-        with _written(self._store), self._file.open("a") as file:
-            file.write(f"{line}\n")
-            file.flush()
-            os.fsync(file.fileno())
+
+def _contents(files: Iterable[Path]) -> str:
+    """SHA-256 of files, one after the other."""
+    found = hashlib.sha256()
+    for file in files:
+        found.update(hashlib.sha256(file.read_bytes()).digest())
+    return found.hexdigest()
+
+
+def _metadata(store: Path) -> dict[str, Any]:
+    """Metadata of a store, without attributes where there are none that can be read."""
+    try:
+        found = json.loads((store / METADATA).read_text())
+    except (OSError, ValueError):
+        found = None
+    found = found if isinstance(found, dict) else {}
+    is_known = isinstance(found.get("attributes"), dict)
+    return found if is_known else {**found, "attributes": {}}
 
 
 def _label(place: Place) -> str:
@@ -232,29 +382,17 @@ def _block(image: xr.Dataset) -> int:
     return min(BLOCK, max(LEAST, image.sizes["y"] * image.sizes["x"] // PARTS))
 
 
-def _write_blank(image: xr.Dataset, plan: Plan, store: Path) -> None:
-    """The store with names, axes and attributes, and no values."""
-    first = next(cut(image, _block(image)))
-    chunks = {dim: part.stop - part.start for dim, part in first.items()}
-    maps = blank(image, plan).chunk(chunks)
-    with _written(store):
-        maps.to_zarr(store, mode="w-", compute=False, consolidated=False, zarr_format=3)
-
-
-def _write(block: xr.Dataset, store: Path, place: Place) -> None:
-    values = block.drop_vars(list(block.coords))
-    with _written(store):
-        values.to_zarr(store, region={**place}, consolidated=False)
-
-
 @contextlib.contextmanager
 def _written(store: Path) -> Iterator[None]:
-    """What the operating system says of a store, as one line."""
+    """What the system or the libraries below say of a store that cannot be written, as one line."""
     try:
         yield
-    except OSError as error:
-        raise FitError(
-            f"it could not be written ({error.strerror})",
+    except PolarBayesError:
+        raise
+    except Exception as error:  # Zarr raises nearly every type for a store that is not as it was
+        reason = (getattr(error, "strerror", None) or "").lower() or str(error)
+        raise OutputError(
+            f"it could not be written ({reason or type(error).__name__})",
             where=str(store),
             mend="make room or give another --out; --resume goes on where it stopped",
         ) from error

@@ -9,11 +9,13 @@ import xarray as xr
 
 from polar_bayes.diagnostics.coverage import BLOCK, INTERVALS
 from polar_bayes.diagnostics.parameters import Scalar
+from polar_bayes.errors import FitError
 from polar_bayes.physics.notation import notation
 from polar_bayes.pixels.fitting import FEWEST_VIEWS
 from polar_bayes.pixels.importance import LARGEST_TRUSTED
-from polar_bayes.pixels.maps import cut
+from polar_bayes.pixels.maps import checked_status, cut
 from polar_bayes.pixels.outcome import Status
+from polar_bayes.pixels.stack import IMAGE
 from polar_bayes.reporting.style import GREEK, place_of, plain
 from polar_bayes.reporting.tables import INSTRUMENT, MAIN, Row, Table
 from polar_bayes.reporting.text import DASH, numbers, percent, spoken
@@ -32,6 +34,7 @@ STATUSES = {
     "too few views": f"fewer than {FEWEST_VIEWS} valid views",
     "not converged": "no answer was reached; NaN",
     "not trusted": "numbers that no check confirms, by the approach told below",
+    "not fitted": "called good without finite numbers, or never written",
 }
 APPROACHES = {
     "none": "no numbers",
@@ -52,23 +55,41 @@ def count_cases(maps: xr.Dataset) -> pd.DataFrame:
     Returns:
         Counts; block by block, so that a large map stays where it is.
     """
-    rows, columns = (_meanings(maps[name]) for name in ("status", "approach"))
-    size = max(*rows, *columns) + 1
-    counts = np.zeros(size * size, int)
+    rows, columns = (flag_words(maps[name]) for name in ("status", "approach"))
+    counts = np.zeros((len(rows), len(columns)), int)
     for place in cut(maps, BLOCK):
-        status, approach = (
-            maps[name].isel(place).to_numpy().ravel().astype(int) for name in ("status", "approach")
+        here = maps.isel(place)
+        np.add.at(
+            counts,
+            (flag_ranks(checked_status(here), rows), flag_ranks(here["approach"], columns)),
+            1,
         )
-        counts += np.bincount(status * size + approach, minlength=size * size)
-    table = pd.DataFrame(counts.reshape(size, size)).loc[list(rows), list(columns)]
-    return table.set_axis(list(rows.values()), axis=0).set_axis(list(columns.values()), axis=1)
+    return pd.DataFrame(counts, index=list(rows.values()), columns=list(columns.values()))
 
 
-def _meanings(flags: xr.DataArray) -> dict[int, str]:
+def flag_ranks(flags: xr.DataArray, known: Mapping[int, str]) -> np.ndarray:
+    """Which of the known flags each pixel has, in the order of the axes of an image."""
+    values = flags.transpose(*IMAGE).to_numpy().ravel()
+    found = np.full(values.size, -1)
+    for rank, value in enumerate(known):
+        found[values == value] = rank
+    if (found < 0).any():
+        raise FitError(
+            f"{values[np.argmin(found)]} has no meaning there",
+            where=f"maps: {flags.name}",
+            mend="copy the store again, or make the map again",
+        )
+    return found
+
+
+def flag_words(flags: xr.DataArray) -> dict[int, str]:
     """Words of each flag: those that the map itself knows, whatever became of the code since."""
     words = [word.replace("_", " ") for word in str(flags.attrs["flag_meanings"]).split()]
     values = np.asarray(flags.attrs.get("flag_values", range(len(words))))
-    return dict(zip(map(int, values), words, strict=True))
+    known = dict(zip(map(int, values), words, strict=True))
+    if flags.name == "status":  # a map may lose chunks, whether or not its maker knew the word
+        known.setdefault(int(Status.NOT_FITTED), "not fitted")
+    return known
 
 
 def headline(cases: pd.DataFrame) -> tuple[str, bool]:
@@ -80,6 +101,9 @@ def headline(cases: pd.DataFrame) -> tuple[str, bool]:
         return "No pixel has an answer: do not use these maps.", False
     if good == read:
         return "Every pixel that was read has an answer.", True
+    if lost := int(cases.sum(axis=1).get("not fitted", 0)):
+        every = int(cases.to_numpy().sum())
+        return f"{lost:,} of {every:,} pixels are not fitted: this map has holes.", False
     said = f"{good:,} of {read:,} pixels that were read have an answer ({share(good, read)})."
     return said, good >= FEW * read
 
@@ -123,6 +147,8 @@ def verdict(cases: pd.DataFrame) -> list[str]:
         "not trusted": f"{{}} not trusted: Pareto k is above {LARGEST_TRUSTED:g}, or draws are "
         "worth too little, and nothing else confirmed them. The maps show its numbers there; do "
         "not quote them.",
+        "not fitted": "{} not fitted: they are called good without finite numbers, or were never "
+        "written. Copy the store again, or make the map again.",
     }
     for word, phrase in phrases.items():
         if number := count.get(word):
@@ -201,8 +227,8 @@ def _over_good(maps: xr.Dataset, scalar: Scalar, ending: str) -> np.ndarray:
         if "quantile" in here.dims:
             low, high = (here.sel(quantile=level, drop=True) for level in ends)
             here = high - low
-        good = maps["status"].isel(place) == Status.GOOD
-        found.append(here.to_numpy()[(good & here.notnull()).transpose(*here.dims).to_numpy()])
+        good = (maps["status"].isel(place) == Status.GOOD).load()
+        found.append(here.to_numpy()[(good & np.isfinite(here)).transpose(*here.dims).to_numpy()])
     return np.concatenate(found)
 
 

@@ -8,6 +8,8 @@ from matplotlib.figure import Figure
 
 from polar_bayes.errors import FitError
 from polar_bayes.physics.notation import notation
+from polar_bayes.pixels.maps import checked_status
+from polar_bayes.reporting.map_tables import flag_ranks, flag_words
 from polar_bayes.reporting.style import (
     BLUE,
     GREEK,
@@ -27,7 +29,7 @@ MOST_PIXELS = 800
 LARGEST_K = 1.0
 NO_ANSWER = "#dadada"
 APPROACHES = (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE)
-STATUSES = (BLUE, NO_ANSWER, SKY, VERMILLION, ORANGE)
+STATUSES = (BLUE, NO_ANSWER, SKY, VERMILLION, ORANGE, PURPLE)
 
 
 @styled
@@ -67,8 +69,10 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
         _picture(figure.add_subplot(3, columns, columns + at + 1), width, "95% width", "cividis")
     axes = figure.add_subplot(3, columns, 2 * columns + 1)
     _picture(axes, shown["pareto_k"], "Pareto k", "magma", ends=(0.0, LARGEST_K))
-    for at, (name, colors) in enumerate((("approach", APPROACHES), ("status", STATUSES))):
-        _flags(figure.add_subplot(3, columns, 2 * columns + 2 + at), shown[name], colors)
+    for at, (flags, colors) in enumerate(
+        ((shown["approach"], APPROACHES), (checked_status(shown), STATUSES))
+    ):
+        _flags(figure.add_subplot(3, columns, 2 * columns + 2 + at), flags, colors)
     return figure
 
 
@@ -107,9 +111,10 @@ def _picture(
 
 def _flags(axes: Axes, flags: xr.DataArray, colors: tuple) -> None:
     """A map of a few cases, each with a color of its own."""
-    words = [word.replace("_", " ") for word in str(flags.attrs["flag_meanings"]).split()]
+    known = flag_words(flags)
+    words = list(known.values())
     norm = BoundaryNorm(np.arange(len(words) + 1) - 0.5, len(words))
-    pixels = flags.transpose("y", "x").to_numpy()
+    pixels = flag_ranks(flags, known).reshape(flags.sizes["y"], flags.sizes["x"])
     drawn = axes.imshow(pixels, cmap=ListedColormap(colors), norm=norm, interpolation="nearest")
     scale = axes.figure.colorbar(drawn, ax=axes, shrink=0.85, ticks=range(len(words)))
     scale.ax.set_yticklabels(words)

@@ -59,15 +59,15 @@ def test_ends_count_as_inside_in_the_precision_of_the_map() -> None:
 
 
 def test_pixels_without_an_answer_are_counted_and_never_held() -> None:
-    status = np.array([list(Status), [Status.GOOD] * 5])
-    true = np.full((2, 5), 0.5)
-    true[1, 3:] = 9.0, np.nan
-    maps = make_maps({"roughness": np.full((2, 5), 0.5)}, status=status)
+    status = np.array([list(Status), [Status.GOOD] * 6])
+    true = np.full((2, 6), 0.5)
+    true[1, 4:] = 9.0, np.nan
+    maps = make_maps({"roughness": np.full((2, 6), 0.5)}, status=status)
     row = pb.map_coverage(maps, known(roughness=true)).loc["roughness"]
-    # Good: one of the first row and four of the second, one of whose truths lies outside.
-    assert row[["unknown", "masked", "unanswered", "answered"]].tolist() == [1, 1, 3, 5]
-    assert row["held_95"] == 4 / 5
-    assert row["held_95_of_read"] == 4 / 8
+    # Good: one of the first row and five of the second, one of whose truths lies outside.
+    assert row[["unknown", "masked", "unanswered", "answered"]].tolist() == [1, 1, 4, 6]
+    assert row["held_95"] == 5 / 6
+    assert row["held_95_of_read"] == 5 / 10
 
 
 def test_without_answers_there_is_no_share() -> None:

@@ -93,6 +93,24 @@ def test_a_killed_map_goes_on_to_the_bits_of_one_that_was_not(
     xr.testing.assert_identical(read(out), whole)
 
 
+def test_ten_kills_in_a_row_change_no_bit(capture: Path, whole: xr.Dataset, tmp_path: Path) -> None:
+    """Four are killed when they have done another block, six some seconds after their start."""
+    out = tmp_path / "map.zarr"
+    for kill in range(10):
+        with started(capture, out, resume=kill > 0) as process:
+            assert process.stdout is not None
+            if kill % 3:
+                time.sleep(kill)
+            else:
+                assert process.stdout.readline()
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+    with started(capture, out, resume=True) as process:
+        assert process.wait() == 0
+    xr.testing.assert_identical(read(out), whole)
+    assert not out.with_name("map.zarr.progress").exists()
+
+
 def test_a_killed_worker_loses_nothing_and_changes_no_bit(
     capture: Path, whole: xr.Dataset, tmp_path: Path
 ) -> None:
@@ -100,7 +118,7 @@ def test_a_killed_worker_loses_nothing_and_changes_no_bit(
     out = tmp_path / "map.zarr"
     with (
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address=None
+            n_workers=2, threads_per_worker=1, dashboard_address=":0"
         ) as cluster,
         started(capture, out, scheduler=cluster.scheduler_address) as process,
     ):

@@ -150,6 +150,35 @@ def test_a_map_that_was_not_checked_says_so_and_an_empty_one_fails() -> None:
         assert not re.search(r"\bnan\b", text_of(page))
 
 
+@pytest.mark.parametrize("name", ["roughness", "roughness_sd", "concentration_scale_quantile"])
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_pixel_that_is_called_good_without_numbers_is_not(name: str, number: float) -> None:
+    maps = make_maps(MEANS)
+    assert map_tables.headline(map_tables.count_cases(maps))[0].startswith("Every pixel")
+    maps[name][{"y": 2, "x": slice(3, 10)}] = number
+    assert pb.count_pixels(maps) == dict.fromkeys(pb.count_pixels(maps), 0) | {
+        "good": 193,
+        "not fitted": 7,
+    }
+    page = render_map(maps)
+    for said in (
+        "7 of 200 pixels are not fitted: this map has holes.",
+        "Of 200 pixels 193 are good (96%)",
+        "7 pixels are not fitted: they are called good without finite numbers, or were never",
+    ):
+        assert said in text_of(page)
+        assert said in " ".join(str(pb.show(maps)).split())
+    assert 'class="verdict failed"' in page
+    assert "Every pixel" not in page
+
+
+def test_a_status_without_a_meaning_is_refused() -> None:
+    maps = make_maps(MEANS)
+    maps["status"][1, 1] = 77
+    with pytest.raises(pb.FitError, match="maps: status: 77 has no meaning there; copy the store"):
+        pb.show(maps)
+
+
 def test_shares_are_never_rounded_to_all_or_nothing() -> None:
     assert map_tables.share(99_999, 100_000) == "above 99.9%"
     assert map_tables.share(9_960, 10_000) == "above 99.5%"

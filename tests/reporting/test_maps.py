@@ -41,6 +41,17 @@ def test_every_parameter_has_its_mean_and_its_width(wavelengths: tuple[float, ..
     assert ("absorption a, 450 nm" in titles) == bool(wavelengths)
 
 
+def test_a_pixel_without_numbers_is_not_drawn_as_good() -> None:
+    image = maps()
+    image["status"][:] = 0
+    image["status"][3, 4] = -1
+    panel = pb.plot_maps(image).axes
+    status = next(axes for axes in panel if axes.get_title("left") == "status")
+    drawn = np.asarray(status.images[0].get_array())
+    assert set(zip(*np.nonzero(drawn), strict=True)) == {(0, 0), (3, 4)}  # the first has no mean
+    assert drawn[0, 0] == drawn[3, 4] == 5
+
+
 def test_a_large_image_is_drawn_smaller() -> None:
     figure = pb.plot_maps(maps(1700, 10))
     assert max(image.get_array().shape[0] for axes in figure.axes for image in axes.images) <= 800
