@@ -115,6 +115,9 @@ class Alone:
             with jax.enable_x64(self._dtype == jnp.float64):
                 return self._climb(patch, starts(patch), common, movable)
 
+        # Compiled before the threads start: a deadline reaches this thread only.
+        z = jnp.zeros(self._program.size, self._dtype)
+        self._program.value_and_gradient.program(z, self._parts[0])
         found: list[Modes] = []
         with quiet_line_search(), ThreadPoolExecutor(self._threads) as pool:
             for modes in pool.map(climb_one, range(len(self._parts))):

@@ -303,12 +303,14 @@ def _fit_beside(
             except FitError as error:
                 failed[name] = str(error)
 
+    late = ""
     try:
         run_until(fitted.deadline, progress, compare)
-    except OutOfTimeError as late:
-        failed |= {name: str(late) for name in requests if name not in beside | failed}
+    except OutOfTimeError as error:
+        late = str(error)
     progress("comparing", 1.0)
-    return dict(beside), dict(failed)  # an abandoned thread may still write to its own
+    done = dict(beside)  # an abandoned thread may still write to its own
+    return done, {name: late for name in requests if late and name not in done} | failed
 
 
 def _compare(

@@ -153,7 +153,7 @@ class Program:
         return jax.jit(self.potential, inline=True)
 
     @functools.cached_property
-    def value_and_gradient(self) -> Callable[[Array, Observations], tuple[Array, Array]]:
+    def value_and_gradient(self) -> TracedOnce:
         """The potential with its gradient, compiled."""
         return TracedOnce(jax.value_and_grad(self.told_once))
 
