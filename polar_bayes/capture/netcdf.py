@@ -96,7 +96,7 @@ def _parts(dataset: xr.Dataset) -> Iterator[object]:
             kind, content = "text", repr(_plain(values)).encode("utf-8", "backslashreplace")
         else:
             kind = values.dtype.name
-            content = values.astype(values.dtype.newbyteorder("<")).tobytes()
+            content = values.astype(values.dtype.newbyteorder("<"), copy=False).tobytes()
         content_digest = hashlib.sha256(content).hexdigest()
         attributes = _attributes(variable.attrs)
         yield str(name), variable.dims, variable.shape, kind, attributes, content_digest
