@@ -42,7 +42,7 @@ def accuracy_of(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
     is_fit = isinstance(result, xr.DataTree) and FIT.describes(result)
     check = FIT.check if is_fit and "accuracy" in result.children else STUDY.check
     check(result, "accuracy")
-    return result["accuracy"].to_dataset()
+    return result["accuracy"].to_dataset().transpose("row", "parameter", ...)
 
 
 def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:

@@ -72,7 +72,8 @@ def assemble(
     tree["observed_data"] = xr.DataTree(_observed(program, capture, data, coords))
     tree["constant_data"] = xr.DataTree(_constants(capture, data, coords))
     for name, dataset in beside.items():
-        tree[name] = xr.DataTree(dataset)
+        labels = {dim: values for dim, values in coords.items() if dim in dataset.dims}
+        tree[name] = xr.DataTree(dataset.assign_coords(labels))
     for group in ("posterior", "prior"):
         _annotate(tree.children[group])
     tree.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)

@@ -244,7 +244,7 @@ def _of_group(
             yield f"{place}/{name}", "it is missing"
     for name, variable in variables.items():
         names = (name, *variable.dims)
-        if odd := [each for each in names if type(each) is not str]:
+        if odd := [each for each in names if not isinstance(each, str)]:
             yield place, f"{odd[0]!r} is no name"
         else:
             yield from _of_variable(group, name, variable, f"{place}/{name}")
@@ -275,7 +275,6 @@ def _of_variable(group: Group, name: str, variable: xr.Variable, place: str) -> 
     kinds, dims = group.kinds.get(name, NUMBERS), set(variable.dims)
     if variable.dtype.kind not in kinds:
         yield place, f"it holds {variable.dtype}, not {_WORDS[kinds]}"
-    yield from ((place, f"{dim!r} is no name of a dim") for dim in dims if type(dim) is not str)
     expected = group.variables.get(name, group.dims)
     is_closed = name in group.variables or not group.others
     if not dims >= set(expected) or (is_closed and dims != set(expected)):

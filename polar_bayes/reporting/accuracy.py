@@ -127,7 +127,8 @@ def front_panel(axes: Axes, found: xr.Dataset, time: str) -> None:
         time: "seconds_first" or "seconds_again".
     """
     table, noise = accuracy_table(found), float(found.attrs["reference_error"])
-    known = table[table["error"].notna() & np.isfinite(table["error"]) & table[time].notna()]
+    # Axes of logarithms have no place for a time of zero.
+    known = table[np.isfinite(table["error"]) & np.isfinite(table[time]) & (table[time] > 0.0)]
     rungs, dials = (list(dict.fromkeys(table[name])) for name in ("rung", "dial"))
     colors = dict(zip(rungs, _repeat(COLORS, len(rungs)), strict=True))
     markers = dict(zip(dials, _repeat(MARKERS, len(dials)), strict=True))

@@ -135,5 +135,5 @@ def test_mistakes_are_told(capture: xr.Dataset) -> None:
         pb.calibrate(capture, method="hmc", **ASKED)
     with pytest.raises(pb.FitError, match="seed cannot differ"):
         pb.calibrate(capture, truth={"seed": 1}, **ASKED)
-    with pytest.raises(pb.FitError, match="it has no group prior_sbc"):
+    with pytest.raises(pb.FitError, match="it holds no calibration; give the tree"):
         pb.calibration_table(xr.DataTree())

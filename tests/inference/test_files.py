@@ -4,6 +4,7 @@ import json
 import math
 import re
 import warnings
+from types import SimpleNamespace
 
 import arviz_base as az
 import numpy as np
@@ -15,8 +16,10 @@ from synthetic_results import edit_provenance, make_result, pool, replace
 from tree_mutations import ODD_ATTRIBUTES, mutate, pick
 
 import polar_bayes as pb
+from polar_bayes.diagnostics.discrepancy import compare_without
 from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
+from polar_bayes.inference.result import GEOMETRY, assemble, posterior_of
 
 SMALL = {"views": 4, "draws": 30, "chains": 2}
 AUTO = {
@@ -278,6 +281,33 @@ def test_a_report_leaves_out_what_a_result_lacks(tmp_path):
     page = pb.report(tree, tmp_path / "report").read_text()
     assert "Readings of" not in page
     assert "roughness" in page
+
+
+def test_comparisons_have_the_labels_of_the_fit():
+    program = SimpleNamespace(
+        auxiliary=(),
+        dims={"absorption": ("wavelength",)},
+        events={"absorption": ()},
+        plates={"wavelength": 2},
+        observed=(),
+    )
+    views = {name: ("view", np.zeros(3)) for name in GEOMETRY}
+    capture = xr.Dataset(views, {"wavelength": [450.0, 650.0]})
+    data = SimpleNamespace(
+        dims=(("view", 3), ("wavelength", 2)),
+        valid=np.ones((3, 2), bool),
+        saturated=np.zeros((3, 2), bool),
+        intensity_unit=1.0,
+    )
+    parameters = {"absorption": np.zeros((1, 5, 2))}
+    names = ("predictive", "center", "log_likelihood", "log_prior")
+    draws = SimpleNamespace(parameters=parameters, **{name: {} for name in names})
+    comparison = posterior_of(program, parameters)
+    tree = assemble(
+        program, capture, data, draws, draws, {}, {"without_instrument": comparison}, {"seed": 0}
+    )
+    assert tree["without_instrument"]["wavelength"].values.tolist() == [450.0, 650.0]
+    assert list(compare_without(tree, "instrument").index) == ["absorption[450]", "absorption[650]"]
 
 
 # --- checksums --------------------------------------------------------------------------------

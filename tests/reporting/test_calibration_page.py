@@ -206,7 +206,7 @@ def test_a_row_for_each_parameter(broken: xr.DataTree) -> None:
     assert len(some.axes) == 3
     with pytest.raises(pb.FitError, match="no parameter gloss; give some of roughness, "):
         pb.plot_calibration(broken, parameters=["gloss"])
-    with pytest.raises(pb.FitError, match="it has no group prior_sbc"):
+    with pytest.raises(pb.FitError, match="it holds no calibration; give the tree"):
         pb.plot_calibration(xr.DataTree())
 
 
