@@ -233,10 +233,13 @@ def test_the_links_of_a_page_lead_somewhere(page: Path) -> None:
 # --- what single pages promise --------------------------------------------------------------
 
 
-def test_every_formula_has_a_test() -> None:
-    """Each test that a section of the equations names stands in a file that the section names."""
+def test_every_formula_and_every_promise_has_a_test() -> None:
+    """Each test that a section or a row names stands in a file that the section or row names."""
     _, *sections = (ROOT / "docs" / "equations.md").read_text().split("\n## ")
-    for section in sections:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text()
+    rows = [line for line in page.splitlines() if line.startswith("|") and "`tests/" in line]
+    assert len(rows) > 20
+    for section in sections + rows:
         files = re.findall(r"`(tests/[\w/]+\.py)`", section)
         there = {
             node.name
