@@ -1,13 +1,16 @@
-"""`polar-bayes report` of a map: told by the end of its name."""
+"""Commands with a map: finished ones are resumed and reported, told by the end of their name."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
+from plate_images import plate_image
 from synthetic_maps import make_maps
 
 from polar_bayes.cli import main
+from polar_bayes.pixels import store
+from polar_bayes.pixels.maps import blank
 
 
 @pytest.fixture
@@ -50,3 +53,20 @@ def test_a_mistake_gets_one_line(
     assert says in told.err
     assert told.err.count("\n") == 1
     assert not (files / "report").exists()
+
+
+def test_a_finished_map_is_resumed_with_status_0(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store, "fit_block", lambda block, plan: blank(block, plan).load())
+    capture, out = tmp_path / "plates.zarr", tmp_path / "map.zarr"
+    plate_image(3, 4).to_zarr(capture, consolidated=False)
+    words = ["map", str(capture), "--out", str(out), "--scene", "camera"]
+    for more in ([], ["--resume"]):
+        assert main([*words, *more]) == 0
+        assert capsys.readouterr().out == f"{out}: 12 not fitted\n"
+    assert main(words) == 1
+    assert f"{out}: it is there already; give another --out, or --resume" in capsys.readouterr().err
+    plate_image(3, 4, seed=1)[["q"]].to_zarr(capture, mode="r+", consolidated=False)
+    assert main([*words, "--resume"]) == 1
+    assert "it was begun with another capture or other settings" in capsys.readouterr().err
