@@ -49,7 +49,7 @@ RUNG = Name(
 
 
 class Input(click.ParamType):
-    """The path of a file or folder that is read; it is there, unless it may be something else."""
+    """The path of a file or folder that is read; `check` says that it must be there."""
 
     name = "path"
 
@@ -58,13 +58,13 @@ class Input(click.ParamType):
 
     @override
     def convert(self, value: Any, param: Any, ctx: Any) -> Path | str:
-        if not self.is_path:
-            return str(value)
-        path = as_path(value, param.opts[0])
-        if not path.exists():
+        return as_path(value, param.opts[0]) if self.is_path else str(value)
+
+    def check(self, path: Path) -> None:
+        """Refuse what is not there, unless it may be the name of a column."""
+        if self.is_path and not path.exists():
             what = "store" if path.suffix == ".zarr" else "file"
             raise CaptureError(f"there is no such {what}", where=str(path), mend="check the path")
-        return path
 
 
 class Output(click.ParamType):
@@ -98,16 +98,16 @@ CAPTURE_FILE, RESULT_FILE, FOLDER, STORE = Output("capture"), Output("result"), 
 
 
 class Command(click.Command):
-    """A command whose outputs are checked against its inputs before it begins."""
+    """A command whose inputs and outputs are checked before it begins."""
 
     @override
     def invoke(self, ctx: click.Context) -> Any:
-        inputs = [
-            Path(each)
-            for param in self.params
-            if _reads(param.type)
-            for each in _paths(ctx.params[str(param.name)])
-        ]
+        inputs = []
+        for param in self.params:
+            for kind in _inputs(param.type):
+                for path in _paths(ctx.params[str(param.name)]):
+                    kind.check(path)
+                    inputs.append(path)
         for param in self.params:
             path = ctx.params[str(param.name)]
             if isinstance(param.type, Output) and path is not None:
@@ -118,15 +118,16 @@ class Command(click.Command):
 command = functools.partial(click.command, cls=Command)
 
 
-def _reads(kind: click.ParamType) -> bool:
+def _inputs(kind: click.ParamType) -> list[Input]:
+    """The types of an option that are paths to read."""
     parts = kind.types if isinstance(kind, click.Tuple) else [kind]
-    return any(isinstance(part, Input) for part in parts)
+    return [part for part in parts if isinstance(part, Input)]
 
 
-def _paths(value: Any) -> Iterator[str | Path]:
-    """Every path or text in the value of an option that may be given several times."""
+def _paths(value: Any) -> Iterator[Path]:
+    """Every path in the value of an option that may be given several times."""
     if isinstance(value, str | Path):
-        yield value
+        yield Path(value)
     elif isinstance(value, tuple):
         for each in value:
             yield from _paths(each)
