@@ -9,7 +9,6 @@ which has none.
 """
 
 import hashlib
-import re
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,10 @@ import xarray as xr
 from polar_bayes.errors import PolarBayesError
 from polar_bayes.paths import system_error
 
-LINE = b"\npolar_bayes sha256 %s\n"
-LINES = re.compile(re.escape(LINE).replace(b"%s", rb"([0-9a-f]{64})"))
-LENGTH = len(LINE % (b"0" * 64))
+MARK = b"\npolar_bayes sha256 "
+TAIL = 4096
+"""Bytes at the end of a file in which the mark is looked for, should more have been added."""
+
 BLOCK = 2**20
 
 
@@ -65,7 +65,7 @@ def write_netcdf(data: xr.Dataset | xr.DataTree, path: Path) -> None:
     data.to_netcdf(path, engine="netcdf4", format="NETCDF4")
     digest = _digest(path, path.stat().st_size)
     with path.open("ab") as file:
-        file.write(LINE % digest.encode())
+        file.write(MARK + digest.encode() + b"\n")
 
 
 def open_netcdf(kind: type, file: Path) -> Any:
@@ -77,13 +77,14 @@ def open_netcdf(kind: type, file: Path) -> Any:
 
 def _is_whole(path: Path) -> bool:
     """Whether a file is what was written, as far as it says so."""
-    size = path.stat().st_size - LENGTH
-    if size < 0:
-        return True
+    size = path.stat().st_size
     with path.open("rb") as file:
-        file.seek(size)
-        found = LINES.fullmatch(file.read())
-    return found is None or found[1].decode() == _digest(path, size)
+        file.seek(max(0, size - TAIL))
+        tail = file.read()
+    before, mark, line = tail.rpartition(MARK)
+    if not mark:
+        return True
+    return line == _digest(path, size - len(tail) + len(before)).encode() + b"\n"
 
 
 def _digest(path: Path, size: int) -> str:

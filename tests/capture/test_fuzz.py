@@ -10,6 +10,7 @@ import xarray as xr
 from mutations import (
     ODD_ATTRIBUTES,
     ODD_NUMBERS,
+    PIECES,
     assert_inside_contract,
     damage_text,
     mutate,

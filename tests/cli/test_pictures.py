@@ -94,7 +94,7 @@ def rim() -> np.ndarray:
         ([*LIGHT], "give one of --sphere or --rim, --normals"),
         ([*SPHERE], "give one of --light, --light-position, --highlight, --surroundings"),
         ([*SPHERE, *LIGHT, "--surroundings"], "give one of --light"),
-        ([*SPHERE, *LIGHT, "--dark", "d.npy", "--dark-level", "3"], "exclude each other"),
+        ([*SPHERE, *LIGHT, "--dark", __file__, "--dark-level", "3"], "exclude each other"),
         ([*SPHERE, *LIGHT], "saturation_level: the frames do not say"),
         ([*SPHERE, *LIGHT, *FULL, "--dark", "none.npy"], "none.npy: there is no such file"),
         ([*SPHERE, "--highlight", "0", "0", *FULL], "there is no surface"),

@@ -20,6 +20,7 @@ from numpyro import distributions as dist
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture
 from polar_bayes.models.per_material import per_material
+from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.identifiability.exchange import choose
@@ -161,7 +162,8 @@ def test_the_choice_is_said_in_words() -> None:
         ({"readings": {"q": pb.NormalLink()}}, "new readings of q scatter otherwise"),
         ({"readings": ("color",)}, "there is no such reading"),
         ({"readings": ()}, "new views record nothing"),
-        ({"result": xr.DataTree()}, "it has no draws of level"),
+        ({"result": xr.DataTree()}, "next_views: result: it holds no fit"),
+        ({"result": make_result(views=4, chains=1, draws=4)}, "it has no draws of level"),
     ],
 )
 def test_what_cannot_be_is_told(asked, match) -> None:
