@@ -201,6 +201,7 @@ class Schema:
         read: dict[str, Variables] = {}
         for name, group in self.groups.items():
             if name in tree.children:
+                yield from _unreadable(tree.children[name], name)
                 yield from _repeated(tree.children[name], name)
                 read[name] = _variables(group, tree.children[name])
                 yield from _of_group(group, read[name], tree.children[name].attrs, name)
@@ -220,6 +221,14 @@ class Schema:
                 first, expected = sizes.setdefault(str(dim), (name, size))
                 if size != expected:
                     yield name, f"its {dim} has {size} entries, that of {first} {expected}"
+
+
+def _unreadable(node: xr.DataTree, place: str) -> Departures:
+    """A group whose variables do not fit together, as an edit that xarray broke off leaves it."""
+    try:
+        node.to_dataset()
+    except ValueError as error:
+        yield place, f"its variables do not fit together ({error})"
 
 
 def _repeated(node: xr.DataTree, place: str) -> Departures:

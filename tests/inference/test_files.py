@@ -211,6 +211,15 @@ def test_a_posterior_that_does_not_hold_together_is_refused(change, what):
         pb.verdict(_edited(change))
 
 
+@pytest.mark.parametrize("number", [1596, 2340, 2419])
+def test_a_group_that_xarray_cannot_read_is_refused(number):
+    """Cases of `benchmarks/fuzz.py`: edits that xarray allows, and whose group it then refuses."""
+    whole = make_result(views=12, chains=2, draws=60)
+    tree = mutate(whole, np.random.default_rng([0, 5, number]))
+    with pytest.raises(pb.FitError, match="its variables do not fit together"):
+        pb.summary(tree)
+
+
 def test_readings_and_predictions_belong_together():
     tree = _edited(lambda x: x.isel(view=slice(2)), "observed_data")
     with pytest.raises(pb.FitError, match="its view has 4 entries, that of observed_data 2"):
