@@ -22,7 +22,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from polar_bayes.capture.contract import CONTRACT, LABELS, WAVELENGTH
 from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError
 from polar_bayes.interrupts import on_interrupt
-from polar_bayes.paths import as_path, is_same_place, sync, unfinished_folder
+from polar_bayes.paths import as_path, is_same_place, move_into_place, sync, unfinished_folder
 from polar_bayes.pixels.blocks import Plan, fit_block
 from polar_bayes.pixels.executors import as_completed, workers
 from polar_bayes.pixels.ledger import (
@@ -339,9 +339,7 @@ class _MapStore:
             metadata["attributes"][FINISHED] = self._combined(readings)
             unfinished = folder / METADATA
             unfinished.write_text(json.dumps(metadata, indent=2))
-            sync(unfinished)
-            unfinished.replace(self._store / METADATA)
-            sync(self._store)
+            move_into_place(unfinished, self._store / METADATA)
 
     def _combined(self, readings: Iterable[str]) -> str:
         """Digest of the readings of all blocks."""
