@@ -72,7 +72,7 @@ def table(
     **settings: Any,
 ) -> None:
     """Any readings, listed a line each with their directions."""
-    given = {"columns": dict(columns), "constants": dict(constants)}
+    given = {"columns": _once(columns, "--column"), "constants": _once(constants, "--constant")}
     _write(pb.from_table(table, **given, **settings), out)
 
 
@@ -149,6 +149,14 @@ def polarizer(frames: tuple[tuple[float, Path], ...], out: Path, **options: Any)
 def mosaic(frame: Path, layout: tuple[float, ...], out: Path, **options: Any) -> None:
     """One raw frame of a polarization camera."""
     _write(pb.from_mosaic(frame, layout=(layout[:2], layout[2:]), **_setting(options)), out)
+
+
+def _once(pairs: tuple[tuple[str, Any], ...], option: str) -> dict[str, Any]:
+    """A mapping from an option that is given once for each variable."""
+    names = [name for name, _ in pairs]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise click.UsageError(f"{option} names {twice[0]} twice")
+    return dict(pairs)
 
 
 def _write(capture: Any, out: Path) -> None:

@@ -53,6 +53,8 @@ def test_a_table_of_readings_becomes_a_capture(
     for name, degrees in directions.items():
         words += ["--constant", name, str(degrees)]
     words += ["--ignore", "time", "--setup", "camera"]
+    assert main([*words, "--constant", "light_zenith", "30"]) == 1
+    assert "--constant names light_zenith twice" in capsys.readouterr().err
     assert main(words) == 0
     assert capsys.readouterr().out == f"{out}: 2 views, 0 masked, 0 saturated\n"
     assert pb.load_capture(out).attrs["setup"] == "camera"
