@@ -42,7 +42,16 @@ def accuracy_of(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
     is_fit = isinstance(result, xr.DataTree) and FIT.describes(result)
     check = FIT.check if is_fit and "accuracy" in result.children else STUDY.check
     check(result, "accuracy")
-    return result["accuracy"].to_dataset().transpose("row", "parameter", ...)
+    found = result["accuracy"].to_dataset().transpose("row", "parameter", ...)
+    pairs = (found[name].to_numpy().tolist() for name in ("rung", "dial"))
+    names = list(zip(*pairs, strict=True))
+    if len(set(names)) < len(names):
+        raise FitError(
+            "two rows have one name",
+            where="accuracy",
+            mend="give what polar_bayes.accuracy returned",
+        )
+    return found
 
 
 def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:

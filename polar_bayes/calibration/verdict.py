@@ -14,6 +14,7 @@ from polar_bayes.calibration.prediction import readings_verdict
 from polar_bayes.calibration.uniformity import uniformity
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.diagnostics.parameters import Scalar, scalars
+from polar_bayes.errors import FitError
 from polar_bayes.pixels.outcome import Status
 
 MOST = 0.5
@@ -40,6 +41,12 @@ def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
     found = calibration_scalars(calibration, "prior_sbc")
     truths = {each.label: each.draws[0] for each in calibration_scalars(calibration, "truth")}
     marginals = calibration["marginals"].to_dataset()
+    if any(each.label not in truths for each in found):
+        raise FitError(
+            "its labels are not those of prior_sbc",
+            where="calibration: truth",
+            mend="give what polar_bayes.calibrate returned",
+        )
     rows = {each.label: _row(each, truths[each.label], marginals) for each in found}
     return pd.DataFrame.from_dict(rows, orient="index")
 

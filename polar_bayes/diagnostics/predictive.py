@@ -242,7 +242,7 @@ def _loo(part: _Part, efficiency: float, correction: np.ndarray | None) -> Loo |
     log_likelihood = part.log_likelihood
     if log_likelihood is None or not np.isfinite(log_likelihood).all():
         return None
-    ratios = -log_likelihood + (0.0 if correction is None else correction[:, None])
+    ratios = (0.0 if correction is None else correction[:, None]) - log_likelihood
     log_weights, pareto_k = np.zeros_like(ratios), np.full(part.observed.size, -np.inf)
     with np.errstate(all="ignore"):  # an extreme tail overflows: what is not known is NaN
         for i in np.flatnonzero(np.ptp(ratios, axis=0) > 1e-12):

@@ -257,7 +257,8 @@ def _of_group(
             yield place, f"{odd[0]!r} is no name"
         else:
             yield from _of_variable(group, name, variable, f"{place}/{name}")
-    if group.needed and not any(variable.size for variable in variables.values()):
+    sizes = [variables[name].size for name in group.variables if name in variables]
+    if group.needed and not (all(sizes) and any(x.size for x in variables.values())):
         yield place, "it is empty"
 
 

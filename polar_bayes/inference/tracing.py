@@ -82,6 +82,7 @@ class TracedOnce:
         self._function = compiled(function)
         self._begun: _Compilation | None = None
         self._run: Callable | None = None
+        self._device: Any = None
 
     @property
     def is_begun(self) -> bool:
@@ -90,8 +91,7 @@ class TracedOnce:
 
     def __call__(self, *arguments: Any) -> Any:
         """Run it; the first time, trace and compile it before."""
-        run = self._run
-        return (self.program(*arguments) if run is None else run)(*arguments)
+        return self.program(*arguments)(*arguments)
 
     def begin(self, *arguments: Any) -> None:
         """Trace it for arguments of such shapes and types, and compile it beside what follows."""
@@ -110,14 +110,17 @@ class TracedOnce:
         Raises:
             FitError: It needs more memory than there is.
         """
-        if self._run is None:
-            self._run = self._traced(*arguments).result()
-        return self._run
+        run = self._run
+        if run is None or self._device != jax.config.jax_default_device:
+            run = self._run = self._traced(*arguments).result()
+        return run
 
     def _traced(self, *arguments: Any) -> "_Compilation":
         with TRACING:
-            if self._begun is None:
-                self._begun = _Compilation(self._function.lower(*arguments))
+            device = jax.config.jax_default_device  # a compiled program runs where it was made for
+            if self._begun is None or self._device != device:
+                self._begun, self._run = _Compilation(self._function.lower(*arguments)), None
+                self._device = device
             return self._begun
 
 

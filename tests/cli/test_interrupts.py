@@ -124,6 +124,7 @@ def test_a_signal_ends_every_long_command_at_any_moment(
     process = command(words, tmp_path)
     time.sleep(moment)
     if name != "calibrate" and process.poll() is not None:
+        process.communicate()
         pytest.skip(f"{name} was done before {moment} s")
     said = stopped(process, number)
     assert said.startswith("polar-bayes: stopped")

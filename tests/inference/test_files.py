@@ -111,6 +111,8 @@ def test_a_damaged_study_is_refused_in_one_line_or_works():
     assert 40 < check_mutations([make_accuracy()], OF_STUDIES, random, 120) < 120
 
 
+# Matplotlib says that an axis from 1e-300 to 1e300 overflows; the figure is drawn all the same.
+@pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning:matplotlib")
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(8))
 def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
@@ -209,6 +211,14 @@ REFUSED = {
 def test_a_posterior_that_does_not_hold_together_is_refused(change, what):
     with pytest.raises(pb.FitError, match=f"result: .*{what}"):
         pb.verdict(_edited(change))
+
+
+@pytest.mark.parametrize("dim", ["row", "parameter"])
+def test_a_study_of_nothing_is_refused(dim):
+    study = make_accuracy()
+    study["accuracy"] = xr.DataTree(study["accuracy"].to_dataset().isel({dim: slice(0)}))
+    with pytest.raises(pb.FitError, match="accuracy: it is empty"):
+        pb.accuracy_advice(study)
 
 
 @pytest.mark.parametrize("number", [1596, 2340, 2419])
