@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compilations import compilations
-from toy_models import capture, line
+from plates import plate_capture
+from toy_models import line
 
 import polar_bayes as pb
 from polar_bayes.inference import fit as fitting
@@ -214,13 +215,15 @@ def test_a_fit_is_refused_in_one_line_where_memory_is_short(
     method: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = {"model": line, "links": {"q": pb.StokesLink()}}
+    views = np.linspace(20.0, 70.0, 9)  # a layout of its own: no other test has its programs
+    readings = plate_capture(views, 0.05, seed=0)
     said = r"memory: this fit would need .*; average neighboring"
     monkeypatch.setattr(tracing, "memory_limit", lambda: 1000)
     with pytest.raises(pb.FitError, match=said):  # what is described of draws would not fit
-        pb.fit(capture(), method=method, **asked)
+        pb.fit(readings, method=method, **asked)
     monkeypatch.setattr(fitting, "_check_room", lambda *_: None)
     with pytest.raises(pb.FitError, match=said):  # nor would the programs
-        pb.fit(capture(), method=method, **asked)
+        pb.fit(readings, method=method, **asked)
 
 
 def test_the_limit_is_that_of_the_container_where_it_is_lower(
