@@ -10,6 +10,7 @@ import contextlib
 import itertools
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 _CLEANUPS: dict[int, Callable[[], str | None]] = {}
 _NUMBERS = itertools.count()
@@ -39,3 +40,8 @@ def clean_up() -> list[str]:
         with contextlib.suppress(Exception):  # the process ends: nobody is left to mend it
             sentences.append(cleanup())
     return [sentence for sentence in sentences if sentence]
+
+
+def resume_hint(path: Path) -> str:
+    """The sentence of a cleanup whose work can be resumed."""
+    return f"{path}: what is done is kept; repeat the command with --resume to go on"

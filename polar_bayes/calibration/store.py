@@ -12,6 +12,7 @@ import numpy as np
 from polar_bayes.calibration.block import Block
 from polar_bayes.calibration.question import differing
 from polar_bayes.errors import FitError
+from polar_bayes.interrupts import resume_hint
 from polar_bayes.paths import UNFINISHED, move_into_place, unfinished_folder
 from polar_bayes.pixels.outcome import Outcome
 
@@ -81,7 +82,7 @@ class Store:
 
     def resume_hint(self) -> str:
         """What an interrupt leaves, for the user."""
-        return f"{self._folder}: what is done is kept; repeat the command with --resume to go on"
+        return resume_hint(self._folder)
 
     def _check(self, head: Path) -> None:
         try:

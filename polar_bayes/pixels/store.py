@@ -21,7 +21,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from polar_bayes.capture.contract import CONTRACT, LABELS, WAVELENGTH
 from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError
-from polar_bayes.interrupts import on_interrupt
+from polar_bayes.interrupts import on_interrupt, resume_hint
 from polar_bayes.paths import as_path, is_same_place, move_into_place, sync, unfinished_folder
 from polar_bayes.pixels.blocks import Plan, fit_block
 from polar_bayes.pixels.executors import as_completed, workers
@@ -119,8 +119,7 @@ def map_file(
         else:
             target.check_readings(ledger)
             target.begin(ledger)
-            kept = f"{store}: what is done is kept; repeat the command with --resume to go on"
-            with on_interrupt(lambda: kept):
+            with on_interrupt(lambda: resume_hint(store)):
                 target.run(ledger, source, scheduler, progress)
             target.finish(ledger)
         with _written(store):
