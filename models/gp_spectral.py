@@ -74,15 +74,7 @@ class GpSpectral(Carded):
         priors: Mapping[str, dist.Distribution],
         links: Mapping[str, AbstractLink],
     ) -> None:
-        """Declare the story of a capture with a wavelength axis.
-
-        Args:
-            data: The capture as arrays.
-            scene: The optics; with a law of dispersion in it, the law gives the index.
-            priors: A distribution for every parameter, the levels, amplitudes and lengths of the
-                processes among them.
-            links: For each recorded variable, how it scatters.
-        """
+        """Declare the story of a capture with a wavelength axis."""
         check_capture(self.coupled, data, scene)
         check_members(self.pooled, data, scene)
         parameters = {}

@@ -49,15 +49,7 @@ class Hierarchical(Carded):
         priors: Mapping[str, dist.Distribution],
         links: Mapping[str, AbstractLink],
     ) -> None:
-        """Declare the story of a capture with a leading axis (patch or material).
-
-        Args:
-            data: The capture as arrays.
-            scene: The optics; it says which parameters it reads.
-            priors: A distribution for every parameter, `<name>_location` and `<name>_spread` of
-                the populations among them.
-            links: For each recorded variable, how it scatters.
-        """
+        """Declare the story of a capture with a leading axis (patch or material)."""
         check_members(self.pooled, data, scene)
         parameters = {}
         for name in material_parameters(scene):

@@ -38,13 +38,7 @@ STYLE = """<style>
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """Rows of texts under heads; the first cell of a row names it.
-
-    Args:
-        heads: A text for each column.
-        rows: As many cells as heads in each.
-        numeric: True where all cells but the first are numbers.
-    """
+    """Rows of texts under heads; the first cell of a row names it."""
 
     heads: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -78,14 +72,7 @@ class Grid:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Card:
-    """A title, sentences and tables: HTML in a notebook, text everywhere else.
-
-    Args:
-        title: One line.
-        said: Sentences.
-        grids: Tables below them.
-        good: True or False colors the edge of the card; None leaves it gray.
-    """
+    """A title, sentences and tables: HTML in a notebook, text everywhere else."""
 
     title: str
     said: tuple[str, ...] = ()
@@ -114,24 +101,12 @@ class Carded:
         return framed(f"{_title(self)}{_fields(self, reads=not more)}{grids}")
 
     def more_on_card(self) -> tuple[Grid, ...]:
-        """Tables below the fields.
-
-        Returns:
-            None of them, unless a class has something to add.
-        """
+        """Tables below the fields."""
         return ()
 
 
 def framed(inside: str, good: bool | None = None) -> str:
-    """HTML in the frame of a card.
-
-    Args:
-        inside: HTML, escaped.
-        good: True or False colors the edge.
-
-    Returns:
-        HTML with its style.
-    """
+    """HTML in the frame of a card."""
     kind = {None: "", True: " good", False: " bad"}[good]
     return f'<div class="pb-card{kind}">{STYLE}{inside}</div>'
 

@@ -41,13 +41,6 @@ class OutputError(PolarBayesError):
 
 
 def one_line(text: str) -> str:
-    """Text that stays on one line, whatever a file's names or attributes contain.
-
-    Args:
-        text: Any string; control characters and line breaks are escaped.
-
-    Returns:
-        A printable string of at most 400 characters.
-    """
+    """Text that stays on one line, whatever a file's names or attributes contain."""
     printable = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return printable if len(printable) <= 400 else printable[:397] + "..."

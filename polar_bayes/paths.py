@@ -24,16 +24,7 @@ UNFINISHED = ".polar-bayes-"
 
 
 def as_path(path: PathLike, what: str, error: type[PolarBayesError] = CaptureError) -> Path:
-    """The path, not resolved, or a clear error when it is none.
-
-    Args:
-        path: Text or a path-like object.
-        what: What the path is for, such as "capture".
-        error: What is raised.
-
-    Raises:
-        PolarBayesError: It is empty, of another type, or holds a NUL.
-    """
+    """The path, not resolved, or a clear error when it is none."""
     try:
         text = os.fspath(path)
     except TypeError:
@@ -44,15 +35,7 @@ def as_path(path: PathLike, what: str, error: type[PolarBayesError] = CaptureErr
 
 
 def existing_file(path: PathLike, what: str) -> Path:
-    """The path of a file that is there, not resolved.
-
-    Args:
-        path: Text or a path-like object.
-        what: What the path is for, such as "capture".
-
-    Raises:
-        CaptureError: Nothing is there, or it is a folder or a device, or it is empty.
-    """
+    """The path of a file that is there, not resolved."""
     file = as_path(path, what)
     try:
         if not file.exists():
@@ -76,22 +59,7 @@ def system_error(error: OSError, path: Path) -> CaptureError:
 def check_output(
     path: PathLike, replaces: Callable[[Path], bool], inputs: Iterable[PathLike] = ()
 ) -> Path:
-    """Refuse an output that cannot be written, or must not be, before anything is computed.
-
-    Args:
-        path: The file to write.
-        replaces: Whether an older file may be replaced: whether it holds what will be written. An
-            empty one may always be.
-        inputs: Files and folders that are read; the output may be none of them, under any name,
-            nor lie inside one.
-
-    Returns:
-        The path, links followed: what a link points to is replaced, not the link.
-
-    Raises:
-        OutputError: It is one of the inputs, a folder, a device or a file of another kind, or its
-            folder is not there or cannot be written.
-    """
+    """Refuse an output that cannot be written, or must not be, before anything is computed."""
     given = as_path(path, "output", OutputError)
     where = str(given)
     try:
@@ -148,18 +116,7 @@ def output_error(error: Exception, path: Path) -> OutputError:
 
 @contextlib.contextmanager
 def replacing(path: PathLike, replaces: Callable[[Path], bool]) -> Iterator[Path]:
-    """A path to write to, whose file takes the place of `path` when the block ends without error.
-
-    Args:
-        path: See `check_output`.
-        replaces: See `check_output`.
-
-    Yields:
-        A path in the same file system, where nothing is yet.
-
-    Raises:
-        OutputError: See `check_output`; or it could not be written.
-    """
+    """A path to write to, whose file takes the place of `path` when the block ends without error."""
     file = check_output(path, replaces)
     with written(file), unfinished_folder(file.parent) as folder:
         yield folder / file.name

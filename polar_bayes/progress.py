@@ -79,25 +79,14 @@ def _shows[**P, R](run: Callable[P, R], bars: Callable[[], Any]) -> Callable[P, 
 
 @contextmanager
 def stages() -> Iterator[Progress]:
-    """A bar for each stage, where somebody watches.
-
-    Yields:
-        What to call with the name of a stage and the fraction of it that is done.
-    """
+    """A bar for each stage, where somebody watches."""
     with _board("") as board:
         yield silent if board is None else lambda stage, share: board.show(stage, share, 1.0)
 
 
 @contextmanager
 def counts(what: str) -> Iterator[Counter]:
-    """One bar that counts, with the time that is left, where somebody watches.
-
-    Args:
-        what: What is counted, such as pixels.
-
-    Yields:
-        What to call with how many are done, and how many there are.
-    """
+    """One bar that counts, with the time that is left, where somebody watches."""
     with _board(what) as board:
         yield silent if board is None else lambda done, every: board.show(what, done, every)
 

@@ -54,14 +54,7 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
 
 
 def find_setup(name: str) -> Setup:
-    """The set-up of that name.
-
-    Args:
-        name: One of `SETUPS`.
-
-    Raises:
-        SceneError: There is none of that name.
-    """
+    """The set-up of that name."""
     if not isinstance(name, str) or name not in SETUPS:
         raise SceneError(
             "no such scene",

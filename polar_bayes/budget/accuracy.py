@@ -128,16 +128,7 @@ def accuracy(
 
 
 class Row(NamedTuple):
-    """One trial, judged.
-
-    Args:
-        rung: Name of the method.
-        dial: What was turned.
-        apart: How far from the reference, NaN where the trial has no answer or no such parameter.
-        measured: What came of it; None where it has no answer.
-        problems: What the method objects to, or why it has no answer.
-        fresh: Whether times and memory are those of a process of its own.
-    """
+    """One trial, judged."""
 
     rung: str
     dial: str

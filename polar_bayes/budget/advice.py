@@ -25,17 +25,7 @@ TIMES = ("seconds_first", "seconds_again")
 
 
 def accuracy_of(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
-    """The group `accuracy` of a tree.
-
-    Args:
-        result: What `polar_bayes.accuracy` returns, or any tree or dataset that has such a group.
-
-    Returns:
-        The dataset.
-
-    Raises:
-        FitError: It has none.
-    """
+    """The group `accuracy` of a tree."""
     if isinstance(result, xr.Dataset):
         result = xr.DataTree(children={"accuracy": xr.DataTree(result)})
     # A study may stand in the tree of a fit, which has checks of its own.
@@ -96,17 +86,7 @@ def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
 
 
 def parameter_errors(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
-    """The larger error of mean and sd of every parameter, in reference sds.
-
-    Args:
-        result: What `polar_bayes.accuracy` returns.
-
-    Returns:
-        A row for each rung and dial, a column for each parameter; NaN where there is no answer.
-
-    Raises:
-        FitError: It holds no accuracy study.
-    """
+    """The larger error of mean and sd of every parameter, in reference sds."""
     found = accuracy_of(result)
     values = _larger(found, "mean_error", "sd_error")
     pairs = zip(found["rung"].to_numpy(), found["dial"].to_numpy(), strict=True)
@@ -116,18 +96,7 @@ def parameter_errors(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
 
 
 def pareto_front(seconds: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Which rows are such that no other is at least as fast and as good, and better in one.
-
-    Args:
-        seconds: (row,); NaN where there is no answer.
-        error: (row,), likewise.
-
-    Returns:
-        (row,), boolean.
-
-    Raises:
-        Nothing.
-    """
+    """Which rows are such that no other is at least as fast and as good, and better in one."""
     here = np.stack([seconds, error], axis=1)
     known = np.isfinite(here).all(axis=1)
     beaten = [
@@ -170,18 +139,7 @@ def accuracy_advice(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERAN
 
 
 def advised(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> str | None:
-    """The fastest rung as given that is good for every parameter.
-
-    Args:
-        result: What `polar_bayes.accuracy` returns.
-        tolerance: Largest error of a mean or sd, in posterior sds.
-
-    Returns:
-        Its name; None where there is none.
-
-    Raises:
-        FitError: It holds no accuracy study.
-    """
+    """The fastest rung as given that is good for every parameter."""
     table = accuracy_table(result)
     seconds = table[time_of(table)]
     good = (table["dial"] == AS_GIVEN) & (table["error"] <= tolerance) & seconds.notna()

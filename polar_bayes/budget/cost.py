@@ -18,15 +18,7 @@ CALLS = 3
 
 @dataclasses.dataclass(frozen=True)
 class Compiled:
-    """A compiled program and what it took to make it.
-
-    Args:
-        call: The program.
-        operations: Arithmetic operations and elementary functions of one call, as the compiler
-            counts them; NaN where it does not say.
-        compile_seconds: Tracing and compiling; next to nothing for a program that a compile cache
-            remembers.
-    """
+    """A compiled program and what it took to make it."""
 
     call: Callable[..., Any]
     operations: float
@@ -35,13 +27,7 @@ class Compiled:
 
 @dataclasses.dataclass(frozen=True)
 class Cost:
-    """What a program costs.
-
-    Args:
-        operations: As the compiler counts them.
-        compile_seconds: Tracing and compiling.
-        run_seconds: One call, results awaited.
-    """
+    """What a program costs."""
 
     operations: float
     compile_seconds: float
@@ -49,15 +35,7 @@ class Cost:
 
 
 def compile_and_count(function: Callable[..., Any], *arguments: Any) -> Compiled:
-    """Compile a function for arguments of these shapes.
-
-    Args:
-        function: A function of arrays.
-        arguments: Any of the layout in question.
-
-    Returns:
-        The program with its cost.
-    """
+    """Compile a function for arguments of these shapes."""
     begin = time.perf_counter()
     program = jax.jit(function).lower(*arguments).compile()
     seconds = time.perf_counter() - begin
@@ -67,17 +45,9 @@ def compile_and_count(function: Callable[..., Any], *arguments: Any) -> Compiled
 
 
 def run_seconds(calls: Sequence[Callable[[], Any]]) -> list[float]:
-    """Time of each call at its fastest, results awaited.
-
-    The calls take turns, so that a machine that slows down slows them all alike; the fastest
-    round is the one that other programs disturbed least.
-
-    Args:
-        calls: Functions without arguments, compiled already.
-
-    Returns:
-        Seconds of one call of each.
-    """
+    """Time of each call at its fastest, results awaited."""
+    # The calls take turns, so that a machine that slows down slows them all alike; the fastest
+    # round is the one that other programs disturbed least.
     rounds = [[_seconds(call) for call in calls] for _ in range(ROUNDS)]
     return [float(fastest) for fastest in np.min(rounds, axis=0)]
 

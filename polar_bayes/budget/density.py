@@ -26,16 +26,7 @@ Readings = Mapping[str, np.ndarray]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Density:
-    """The log posterior density of one scene, compiled.
-
-    Args:
-        scene: The optics.
-        program: The model with that scene.
-        data: The capture as arrays.
-        compiled: Potential (minus the log density) and noise-free readings of a vector.
-        labels: The name of each coordinate, such as `refractive_index[550]`.
-        sites: The parameter to which each coordinate belongs.
-    """
+    """The log posterior density of one scene, compiled."""
 
     scene: Scene
     program: Program
@@ -57,11 +48,9 @@ class Density:
         return self.compiled.call(jnp.asarray(z), self.data)
 
     def noise_sd(self, z: np.ndarray) -> Readings:
-        """Standard deviation of the noise of every reading.
-
-        Where a distribution states no finite variance: half the width of the central 68% of a
-        thousand draws, which is the same for normal noise.
-        """
+        """Standard deviation of the noise of every reading."""
+        # Where a distribution states no finite variance: half the width of the central 68% of a
+        # thousand draws, which is the same for normal noise.
         found = self._of_noise(_stated_sd, self.program.observed, z)
         unknown = tuple(name for name, sd in found.items() if not np.isfinite(sd).all())
         return found | (self._of_noise(_drawn_sd, unknown, z) if unknown else {})
@@ -82,15 +71,7 @@ class Density:
 
 
 def compile_density(request: Request, data: Observations) -> Density:
-    """Compile the log density of a request's scene.
-
-    Args:
-        request: Capture, scene, priors and links.
-        data: The capture as arrays.
-
-    Returns:
-        The density with its cost.
-    """
+    """Compile the log density of a request's scene."""
     program = compile_program(request.bind(request.scene), data)
 
     def evaluate(z: Array, data: Observations) -> tuple[Array, dict[str, Array]]:
@@ -125,16 +106,7 @@ def _drawn_sd(distribution: dist.Distribution) -> Array:
 def coordinates(
     program: Program, capture: xr.Dataset, data: Observations
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Label and parameter of every coordinate, as the tables of a fit name them.
-
-    Args:
-        program: The model.
-        capture: The validated capture.
-        data: The same as arrays.
-
-    Returns:
-        Labels, such as `refractive_index[550]`, and names of parameters.
-    """
+    """Label and parameter of every coordinate, as the tables of a fit name them."""
     labels, sites = [""] * program.size, [""] * program.size
     for name, positions in program.unravel(jnp.arange(float(program.size))).items():
         flat = np.ravel(positions).astype(int)

@@ -10,15 +10,7 @@ INTERVAL = (0.025, 0.975)
 
 
 class Distances(NamedTuple):
-    """Of every parameter, in standard deviations of the reference, each (parameter,).
-
-    Args:
-        mean_error: Difference of the means.
-        sd_error: Difference of the standard deviations.
-        low_error: Difference of the 2.5% ends of the interval.
-        high_error: Difference of the 97.5% ends.
-        wasserstein: Mean distance that one distribution must be moved to become the other.
-    """
+    """Of every parameter, in standard deviations of the reference, each (parameter,)."""
 
     mean_error: Float[np.ndarray, " parameter"]
     sd_error: Float[np.ndarray, " parameter"]
@@ -30,18 +22,7 @@ class Distances(NamedTuple):
 def distances(
     draws: Float[np.ndarray, "parameter draw"], reference: Float[np.ndarray, "parameter many"]
 ) -> Distances:
-    """Compare draws with those of a reference.
-
-    Args:
-        draws: Of some method.
-        reference: Of the same parameters in the same unit.
-
-    Returns:
-        The distances; infinite where a draw is no number.
-
-    Raises:
-        Nothing.
-    """
+    """Compare draws with those of a reference."""
     whole = np.isfinite(draws).all(axis=1)
     found = np.full((len(Distances._fields), len(draws)), np.inf)
     for at in np.flatnonzero(whole):

@@ -25,18 +25,7 @@ LAST_WORDS = 300
 
 
 def run_fresh(trial: Trial) -> Measured:
-    """Run a trial in a new process, with compiled programs of earlier ones out of reach.
-
-    Args:
-        trial: What is run. What it names by import is imported there, the rest is sent along.
-
-    Returns:
-        What came of it; imports are not part of its times.
-
-    Raises:
-        FitError: The method does not suit the capture, found nothing, or its process broke down;
-            other errors of the package as the trial raised them.
-    """
+    """Run a trial in a new process, with compiled programs of earlier ones out of reach."""
     with unfinished_folder(Path(tempfile.gettempdir())) as folder:
         given, made = folder / "trial", folder / "measured"
         given.write_bytes(cloudpickle.dumps(trial))

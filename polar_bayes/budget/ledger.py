@@ -42,19 +42,7 @@ def make_ledger(
     costs: Mapping[Scene, Cost],
     settings: Mapping[str, str | float | int],
 ) -> xr.Dataset:
-    """Put a ledger together.
-
-    Args:
-        full: The scene with everything on.
-        weighed: Its effects, in the order of the rows.
-        verdict: What the rule says of them.
-        wishes: What the user said of them.
-        costs: Of every scene that was weighed.
-        settings: Tolerance, seed and the like, as attributes.
-
-    Returns:
-        A dataset with dims effect and parameter that netCDF can hold.
-    """
+    """Put a ledger together."""
     whole, effects, changes = weighed.whole, tuple(weighed.changes), tuple(weighed.changes.values())
     saved = [(costs[full], costs[effect.apply(full)]) for effect in effects]
     labels = whole.peak.density.labels
@@ -156,14 +144,7 @@ def ledger_summary(ledger: xr.Dataset) -> dict[str, Any]:
 
 
 def ledger_rows(ledger: xr.Dataset) -> dict[str, tuple[str, ...]]:
-    """The cells of each effect's row as text: data, shift, sd, operations, time, verdict.
-
-    Args:
-        ledger: A ledger.
-
-    Returns:
-        Cells by effect.
-    """
+    """The cells of each effect's row as text: data, shift, sd, operations, time, verdict."""
     judged = ledger["judged"].to_numpy().astype(bool)
     rows: dict[str, tuple[str, ...]] = {}
     for index, name in enumerate(ledger["effect"].to_numpy()):

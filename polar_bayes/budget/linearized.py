@@ -41,14 +41,7 @@ NEW_WIDTH = 0.1
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Peak:
-    """The normal distribution that stands for a posterior.
-
-    Args:
-        density: The posterior.
-        z: Where its peak is, unconstrained, (size,).
-        covariance: Inverse Fisher information, (size, size); NaN where there is no peak.
-        found: False where the climb ended elsewhere than at a peak.
-    """
+    """The normal distribution that stands for a posterior."""
 
     density: Density
     z: np.ndarray
@@ -63,16 +56,7 @@ class Peak:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Change:
-    """What becomes of readings and posterior when one scene takes another's place.
-
-    Args:
-        largest_move: Largest change of a valid reading's prediction, in sds of its noise.
-        rms_move: Root mean square of the same over all valid readings.
-        shift: How far each coordinate moves, in posterior sds, (size,); NaN for those that the
-            other scene lacks.
-        sd_ratio: New posterior sd over old, (size,); NaN likewise.
-        found: False where the other scene's peak was not found: shift and ratio are then NaN.
-    """
+    """What becomes of readings and posterior when one scene takes another's place."""
 
     largest_move: float
     rms_move: float
@@ -87,19 +71,7 @@ class Change:
 
 
 def find_peak(density: Density, key: Array, progress: Progress) -> Peak:
-    """The heaviest peak of a posterior about which nothing is known yet.
-
-    Args:
-        density: The posterior.
-        key: Random key for the starts.
-        progress: Called with the name of the stage and the fraction of it that is done.
-
-    Returns:
-        The peak.
-
-    Raises:
-        FitError: No start reached one.
-    """
+    """The heaviest peak of a posterior about which nothing is known yet."""
     size = density.program.size
     starts = from_prior(density.program, key, STARTS, density.data)
     plain = _with_gradient(density, np.zeros(size), np.eye(size), FIRST_STEP)
@@ -108,17 +80,7 @@ def find_peak(density: Density, key: Array, progress: Progress) -> Peak:
 
 
 def compare(peak: Peak, noise_sd: Readings, other: Density) -> tuple[Change, Peak]:
-    """Put another scene in the place of one whose peak is known.
-
-    Args:
-        peak: The posterior of the scene that is there.
-        noise_sd: Noise of every reading at that peak.
-        other: The scene that takes its place.
-
-    Returns:
-        What changes, and the other's peak. Coordinates that only the other scene has start at
-        zero without constraints.
-    """
+    """Put another scene in the place of one whose peak is known."""
     here = {label: index for index, label in enumerate(peak.density.labels)}
     theirs = [index for index, label in enumerate(other.labels) if label in here]
     mine = [here[other.labels[index]] for index in theirs]
@@ -137,10 +99,8 @@ def compare(peak: Peak, noise_sd: Readings, other: Density) -> tuple[Change, Pea
 
 
 def _moves(peak: Peak, noise_sd: Readings, other: Density, start: np.ndarray) -> np.ndarray:
-    """Changes of all valid readings' predictions in units of their noise, in one row.
-
-    A sensor far beyond its full scale has no noise, and what it records does not move.
-    """
+    """Changes of all valid readings' predictions in units of their noise, in one row."""
+    # A sensor far beyond its full scale has no noise, and what it records does not move.
     before, after = peak.density.noise_free(peak.z), other.noise_free(start)
     valid = np.asarray(peak.density.data.valid)
     rows = []

@@ -70,20 +70,7 @@ class Reference:
 
 
 class Judge(NamedTuple):
-    """A reference that was run.
-
-    Args:
-        labels: Of the parameters.
-        draws: (parameter, chain, draw).
-        made_by: Name of the method.
-        mean_error: Monte Carlo standard error of the means, in standard deviations, (parameter,);
-            of the weights, too, where draws were chosen by weight.
-        sd_error: Of the standard deviations, likewise.
-        halves: Distances of the draws of one half of the chains from those of the other.
-        answer: What the method says of itself.
-        biases: Why it may be biased; empty where nothing says so.
-        noise: That its own error is too large; empty where it is not.
-    """
+    """A reference that was run."""
 
     labels: tuple[str, ...]
     draws: np.ndarray
@@ -107,21 +94,9 @@ class Judge(NamedTuple):
 
 
 def run_reference(settings: Reference, bench: Bench) -> Judge:
-    """Chains that go on until their own error is small enough.
-
-    Where they do not agree, or some of them missed a mode, tempered draws take over, where the
-    capture allows it. Where nothing is good enough, the best of it says so in its doubts.
-
-    Args:
-        settings: How small.
-        bench: The capture, in the precision of the surrounding scope, with a key of its own.
-
-    Returns:
-        The reference.
-
-    Raises:
-        FitError: Nothing can be drawn at all.
-    """
+    """Chains that go on until their own error is small enough."""
+    # Where they do not agree, or some of them missed a mode, tempered draws take over, where the
+    # capture allows it. Where nothing is good enough, the best of it says so in its doubts.
     tried = [_climb(settings, "NUTS", settings.chains, bench)]
     if tried[0].doubts:
         with contextlib.suppress(FitError):  # several patches or colors
@@ -130,18 +105,7 @@ def run_reference(settings: Reference, bench: Bench) -> Judge:
 
 
 def nearest(tried: Sequence[Judge]) -> Judge:
-    """The one that least can be said against: noise is told, and no reason to take a bias.
-
-    Args:
-        tried: At least one.
-
-    Returns:
-        Of those with the fewest signs of bias, the one with the smallest error; one whose error is
-        no number comes last of them.
-
-    Raises:
-        Nothing.
-    """
+    """The one that least can be said against: noise is told, and no reason to take a bias."""
     return min(tried, key=lambda judge: (len(judge.biases), not judge.error < np.inf, judge.error))
 
 

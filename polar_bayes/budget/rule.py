@@ -12,12 +12,7 @@ from polar_bayes.physics.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class Wishes:
-    """What the user decided.
-
-    Args:
-        keep: Effects that stay.
-        drop: Effects that go.
-    """
+    """What the user decided."""
 
     keep: tuple[Effect, ...] = ()
     drop: tuple[Effect, ...] = ()
@@ -26,11 +21,7 @@ class Wishes:
     def of(
         cls, effects: Sequence[Effect], keep: str | Iterable[str], drop: str | Iterable[str]
     ) -> "Wishes":
-        """The effects that words mean.
-
-        Raises:
-            SceneError: There is none of that name, or one is both to keep and to drop.
-        """
+        """The effects that words mean."""
         kept, dropped = (
             tuple(effect for word in words for effect in find_effects(word, effects, where))
             for where, words in (("keep", _words(keep)), ("drop", _words(drop)))
@@ -50,13 +41,7 @@ class Wishes:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Weighed:
-    """Each effect left out alone of the scene with everything on.
-
-    Args:
-        whole: The scene with everything on.
-        changes: What changes without each effect.
-        operations: Of the scene without each effect.
-    """
+    """Each effect left out alone of the scene with everything on."""
 
     whole: Reference
     changes: dict[Effect, Change]
@@ -76,15 +61,7 @@ class Weighed:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Verdict:
-    """What the rule comes to.
-
-    Args:
-        scene: What is left.
-        base: The scene with everything on but what the user drops.
-        combined: What changes in `base` when all that the rule drops is left out together.
-        kept: Whether the part of each effect is still there.
-        reasons: Why.
-    """
+    """What the rule comes to."""
 
     scene: Scene
     base: Reference
@@ -96,20 +73,7 @@ class Verdict:
 def weigh(
     scales: Scales, full: Scene, effects: Sequence[Effect], parameters: tuple[str, ...] | None
 ) -> Weighed:
-    """Leave out each effect alone.
-
-    Args:
-        scales: For the capture.
-        full: The scene with everything on.
-        effects: Its effects.
-        parameters: Names of the parameters that are judged; None for all.
-
-    Returns:
-        What that changes.
-
-    Raises:
-        FitError: No such parameter, or the posterior has no peak.
-    """
+    """Leave out each effect alone."""
     whole = scales.reference(full, parameters)
     _check_names(whole, parameters or ())
     changes, operations = {}, {}
@@ -124,21 +88,7 @@ def weigh(
 def decide(
     scales: Scales, full: Scene, weighed: Weighed, wishes: Wishes, tolerance: float
 ) -> Verdict:
-    """Leave out together whatever may go.
-
-    Args:
-        scales: For the capture.
-        full: The scene with everything on.
-        weighed: Each of its effects.
-        wishes: What the user decided.
-        tolerance: Largest change of a judged parameter that is allowed, posterior sd.
-
-    Returns:
-        The scene that is left, and why.
-
-    Raises:
-        FitError: Without what the user drops, the posterior has no peak.
-    """
+    """Leave out together whatever may go."""
     forced = [options[0] for options in weighed.by_place(wishes.drop).values()]
     base = weighed.whole
     if forced:

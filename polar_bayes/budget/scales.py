@@ -21,13 +21,7 @@ from polar_bayes.progress import Progress
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Reference:
-    """A scene that others are compared with.
-
-    Args:
-        peak: Its posterior.
-        noise_sd: Noise of every reading there.
-        names: Names or labels of the parameters that are judged; None for all.
-    """
+    """A scene that others are compared with."""
 
     peak: Peak
     noise_sd: Readings
@@ -51,10 +45,8 @@ class Reference:
         return dataclasses.replace(self, peak=compare(self.peak, self.noise_sd, other)[1])
 
     def size(self, change: Change) -> float:
-        """The largest change of a judged parameter; infinite where it is not known.
-
-        A parameter that the other scene lacks is not judged, unless the user named it.
-        """
+        """The largest change of a judged parameter; infinite where it is not known."""
+        # A parameter that the other scene lacks is not judged, unless the user named it.
         sizes = change.size[self.judged]
         lost = np.isnan(sizes)
         unknown = not change.found or lost.all() or (self.names is not None and lost.any())
@@ -82,13 +74,7 @@ class Reference:
 
 
 class Scales:
-    """Densities of scenes for one capture.
-
-    Args:
-        request: The capture, links and model.
-        priors: What the user gave in place of the usual ones.
-        progress: Called with the name of a stage and the fraction of it that is done.
-    """
+    """Densities of scenes for one capture."""
 
     def __init__(
         self, request: Request, priors: Mapping[str, dist.Distribution] | None, progress: Progress
@@ -114,15 +100,7 @@ class Scales:
         return table
 
     def reference(self, scene: Scene, parameters: tuple[str, ...] | None) -> Reference:
-        """A scene to compare with.
-
-        Args:
-            scene: The scene.
-            parameters: Names or labels of the parameters that are judged; None for all.
-
-        Raises:
-            FitError: Its posterior has no peak.
-        """
+        """A scene to compare with."""
         density = self.density(scene)
         peak = find_peak(density, jax.random.key(self._request.seed), self.progress)
         return Reference(peak, density.noise_sd(peak.z), parameters)

@@ -31,13 +31,7 @@ MEBIBYTE = 2**20
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
-    """What is run.
-
-    Args:
-        request: The capture with scene, model, priors, links and precision.
-        method: How it is fitted.
-        seed: Of the random numbers; the second run has the next one.
-    """
+    """What is run."""
 
     request: Request
     method: Method
@@ -46,17 +40,7 @@ class Trial:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Measured:
-    """What came of it.
-
-    Args:
-        labels: Of the parameters, the material first.
-        draws: (parameter, chain, draw).
-        answer: What the method says of itself, without the draws.
-        seconds_first: Until the parameters of all draws are there, compilation included.
-        seconds_again: The same once more, with another seed.
-        peak_memory: Most memory that the process has held so far, MiB; NaN where not known.
-        memory_before: The same before the trial began.
-    """
+    """What came of it."""
 
     labels: tuple[str, ...]
     draws: np.ndarray
@@ -68,17 +52,7 @@ class Measured:
 
 
 def run_trial(trial: Trial) -> Measured:
-    """Run a trial in this process.
-
-    Args:
-        trial: What is run.
-
-    Returns:
-        Draws and costs of the first run, and how long a second one took.
-
-    Raises:
-        FitError: The method does not suit the capture, or found nothing.
-    """
+    """Run a trial in this process."""
     before = _memory()
     with jax.enable_x64(trial.request.precision == "double"):
         begin = time.perf_counter()
@@ -95,18 +69,7 @@ def run_trial(trial: Trial) -> Measured:
 
 
 def bench_of(request: Request, key: Array) -> Bench:
-    """The capture of a request, ready to be fitted.
-
-    Args:
-        request: What is asked; its precision must be that of the surrounding scope.
-        key: Random key.
-
-    Returns:
-        The bench.
-
-    Raises:
-        Nothing.
-    """
+    """The capture of a request, ready to be fitted."""
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     if request.precision == "single":
         data = data.in_single_precision()

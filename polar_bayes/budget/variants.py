@@ -18,14 +18,7 @@ Place = tuple[str | int, ...]
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """One part of a scene, and one thing that may stand in its place.
-
-    Args:
-        name: What it is called; no two effects of a scene share a name.
-        place: Where the part sits.
-        part: The part.
-        replacement: What to put there; None to leave it out.
-    """
+    """One part of a scene, and one thing that may stand in its place."""
 
     name: str
     place: Place
@@ -43,19 +36,7 @@ class Effect:
 
 
 def effects_of(scene: Scene) -> tuple[Effect, ...]:
-    """Every effect of a scene, in the order of its fields.
-
-    Args:
-        scene: Any scene.
-
-    Returns:
-        One effect for each entry of each part's `simpler`. Where two lead to the same scene (a
-        stack of coats less one coat, and that coat left out of its stack) the inner one stands
-        for both, because it combines with others.
-
-    Raises:
-        SceneError: A part's replacement does not fit in its place.
-    """
+    """Every effect of a scene, in the order of its fields."""
     found: dict[Scene, tuple[Place, Part, Part | None]] = {}
     for place, part in parts_of(scene):
         for replacement in part.simpler():
@@ -72,20 +53,7 @@ def effects_of(scene: Scene) -> tuple[Effect, ...]:
 
 
 def simplify(scene: Scene, effects: Iterable[Effect]) -> Scene:
-    """The scene without some of its effects.
-
-    Args:
-        scene: The scene whose effects they are.
-        effects: Any of `effects_of(scene)`, at most one for each place. One that sits inside
-            another's part is left out of the replacement too, where that still has it.
-
-    Returns:
-        A plain scene; an instrument or a stack without anything left is None, and so is the
-        mixing where no body is left to mix.
-
-    Raises:
-        SceneError: A replacement does not fit in its place.
-    """
+    """The scene without some of its effects."""
     chosen = {effect.place: effect for effect in effects}
     parts = {
         field.name: _rebuilt(getattr(scene, field.name), (field.name,), chosen)
@@ -97,16 +65,7 @@ def simplify(scene: Scene, effects: Iterable[Effect]) -> Scene:
 
 
 def find_effects(word: str, effects: Iterable[Effect], where: str) -> tuple[Effect, ...]:
-    """The effects that a user means by one word.
-
-    Args:
-        word: An effect's name; or the name of a part's class, or a path, for all effects there.
-        effects: Those of the scene.
-        where: Which argument the word was given to, for the message.
-
-    Raises:
-        SceneError: There is none.
-    """
+    """The effects that a user means by one word."""
     effects = tuple(effects)
     named = tuple(effect for effect in effects if effect.name == word)
     meant = named or tuple(

@@ -11,13 +11,7 @@ from polar_bayes.calibration.uniformity import MOST_POINTS, NULLS, null_statisti
 
 
 class EcdfBand(NamedTuple):
-    """Empirical distributions of uniform samples, minus the uniform one.
-
-    Args:
-        at: Where, from 0 to 1, (point,).
-        lower: Lower edge at each point; a curve on the edge is inside.
-        upper: Upper edge.
-    """
+    """Empirical distributions of uniform samples, minus the uniform one."""
 
     at: Float[np.ndarray, " point"]
     lower: Float[np.ndarray, " point"]
@@ -25,21 +19,8 @@ class EcdfBand(NamedTuple):
 
 
 def ecdf_band(count: int, level: float) -> EcdfBand:
-    """The band that a curve leaves exactly where `uniformity` has a p-value below the level.
-
-    Args:
-        count: Size of the sample, at least 2.
-        level: How often a uniform sample leaves the band, from 1e-4 to 1.
-
-    Returns:
-        Edges at 0, 1 and the points at which `uniformity` looks.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Saeilynoja, Buerkner & Vehtari (2022), Stat. Comput. 32, 32.
-    """
+    """The band that a curve leaves exactly where `uniformity` has a p-value below the level."""
+    # Source: Saeilynoja, Buerkner & Vehtari (2022), Stat. Comput. 32, 32.
     table = two_sided(count, min(count, MOST_POINTS))
     # A p-value is (1 + null samples at least as surprising) / (1 + NULLS): below the level are
     # those that surprise more than the null sample of this rank.
@@ -57,20 +38,7 @@ def ecdf_band(count: int, level: float) -> EcdfBand:
 
 
 def histogram_band(count: int, bins: int, level: float = 0.05) -> tuple[float, float]:
-    """How high the bars of a uniform histogram are.
-
-    Args:
-        count: Size of the sample.
-        bins: Of equal width.
-        level: At most how often any bar leaves the band.
-
-    Returns:
-        Density of the lowest and of the highest bar inside: quantiles of the binomial distribution
-        of one bar, at the level over the number of bins (Bonferroni).
-
-    Raises:
-        Nothing.
-    """
+    """How high the bars of a uniform histogram are."""
     tail = level / (2 * bins)
     low, high = scipy.stats.binom.ppf([tail, 1.0 - tail], count, 1.0 / bins)
     return float(low) * bins / count, float(high) * bins / count

@@ -35,22 +35,7 @@ RANKED = 128
 
 
 class Block(NamedTuple):
-    """Some simulations and their fits, NaN where a fit has no answer; axis 0 is the simulation.
-
-    Args:
-        numbers: Of the simulations.
-        truth: By parameter, what was simulated.
-        pit: By parameter, where the truth stands.
-        crps: By parameter, ranked scores.
-        mean: By parameter.
-        sd: By parameter.
-        quantiles: By parameter, (simulation, level, ...).
-        fresh: By reading, where a fresh one stands in the prediction.
-        left_out: By reading, where one of the fitted ones stands in what the others predict.
-        left_out_k: By reading, Pareto k of leaving it out.
-        place: By reading, the number of its entry, in row-major order of its axes.
-        outcome: What became of each fit.
-    """
+    """Some simulations and their fits, NaN where a fit has no answer; axis 0 is the simulation."""
 
     numbers: np.ndarray
     truth: Arrays
@@ -68,16 +53,7 @@ class Block(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plan:
-    """What is done to every block of one calibration; it can be sent to another process.
-
-    Args:
-        request: What is fitted, checked.
-        told: What captures are simulated by, where it differs.
-        settings: How each is fitted.
-        readings: Whether readings are ranked too.
-        recipe_key: Of all that the programs of the fits depend on.
-        key: Of all that the blocks depend on.
-    """
+    """What is done to every block of one calibration; it can be sent to another process."""
 
     request: Request
     told: Request | None
@@ -148,20 +124,8 @@ class Plan:
 
 
 def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
-    """Simulate some captures and fit each; this is what a worker is sent.
-
-    What becomes of a simulation depends on its number alone, not on those beside it.
-
-    Args:
-        plan: What is done.
-        numbers: Of the simulations, at most `plan.block`.
-
-    Returns:
-        The block.
-
-    Raises:
-        Nothing: fits that fail are in its outcome.
-    """
+    """Simulate some captures and fit each; this is what a worker is sent."""
+    # What becomes of a simulation depends on its number alone, not on those beside it.
     seed, shared = plan.request.seed, plan.shared
     filled = np.resize(numbers, plan.block)  # so that all blocks run the same program
     wanted = np.arange(len(numbers))
@@ -204,36 +168,14 @@ def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
 
 
 def join(blocks: Iterable[Block], count: int) -> Block:
-    """The first simulations of a calibration as one block, in order.
-
-    Args:
-        blocks: That hold them, in any order; some may hold the same.
-        count: How many.
-
-    Returns:
-        The block.
-
-    Raises:
-        Nothing.
-    """
+    """The first simulations of a calibration as one block, in order."""
     whole = jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
     numbers, first = np.unique(whole.numbers, return_index=True)
     return jax.tree.map(lambda x: x[first[numbers < count]], whole)
 
 
 def cut(numbers: np.ndarray, size: int) -> list[np.ndarray]:
-    """Numbers of simulations in ascending order, a part for each block.
-
-    Args:
-        numbers: Those that are to be fitted.
-        size: Most simulations of a block.
-
-    Returns:
-        The parts: what is cut does not depend on how many there are in all.
-
-    Raises:
-        Nothing.
-    """
+    """Numbers of simulations in ascending order, a part for each block."""
     ends = np.flatnonzero(np.diff(numbers // size)) + 1
     return [part for part in np.split(numbers, ends) if part.size]
 

@@ -181,20 +181,7 @@ def _resolved(
 
 
 def planned(request: Request, told: Request | None, settings: Method, readings: bool) -> Plan:
-    """What is done to every block.
-
-    Args:
-        request: What is fitted, checked.
-        told: What captures are simulated by; None where it is the same.
-        settings: How each is fitted.
-        readings: Whether readings are ranked too.
-
-    Returns:
-        The plan.
-
-    Raises:
-        Nothing.
-    """
+    """What is done to every block."""
     limit = request.largest_view_zenith
     recipe_key = key_of(request, candidates_of(settings), limit)
     told_key = "" if told is None else key_of(told)

@@ -56,15 +56,7 @@ def is_calibration(tree: object) -> bool:
 
 
 def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
-    """Refuse what is no calibration, or does not hold together.
-
-    Args:
-        tree: Any object.
-        source: Its name in errors, for instance the file.
-
-    Raises:
-        FitError: It is none; or the group, variable or provenance that is wrong.
-    """
+    """Refuse what is no calibration, or does not hold together."""
     CALIBRATION.check(tree, source)
     levels = tree["marginals"].to_dataset()["quantile"].to_numpy().tolist()
     if missing := [level for level in LEVELS if levels.count(level) != 1]:

@@ -9,17 +9,7 @@ FALSE_ALARMS = 0.05
 
 
 def limit_of(table: pd.DataFrame) -> float:
-    """The p-value below which a row strays: the false-alarm rate over the number of rows.
-
-    Args:
-        table: With a row for each p-value.
-
-    Returns:
-        Bonferroni's limit.
-
-    Raises:
-        Nothing.
-    """
+    """The p-value below which a row strays: the false-alarm rate over the number of rows."""
     return FALSE_ALARMS / len(table)
 
 
@@ -40,18 +30,7 @@ def is_calibrated(table: pd.DataFrame) -> bool:
 
 
 def which_stray(table: pd.DataFrame, how: Callable[[pd.Series], str]) -> list[str]:
-    """A sentence for each row whose ranks stray.
-
-    Args:
-        table: With the columns `p_value` and `answered`.
-        how: The words for a row.
-
-    Returns:
-        The sentences, in the order of the rows.
-
-    Raises:
-        Nothing.
-    """
+    """A sentence for each row whose ranks stray."""
     limit, said = limit_of(table), []
     for label, row in table.iterrows():
         if not row["p_value"] >= limit:  # none at all strays too

@@ -34,18 +34,7 @@ BLOCK = 4
 
 
 def calls_for_chains(request: Request) -> bool:
-    """Whether the posteriors of a capture are out of reach of weighted draws.
-
-    Args:
-        request: What is to be fitted, checked.
-
-    Returns:
-        True with several patches, materials or wavelengths, and with a discrepancy: their
-        unknowns are so many that mixtures fitted to a crowd may be worth a few draws.
-
-    Raises:
-        Nothing.
-    """
+    """Whether the posteriors of a capture are out of reach of weighted draws."""
     read = [request.capture[name].sizes for name in READINGS if name in request.capture]
     several = any(dim != "view" and length > 1 for sizes in read for dim, length in sizes.items())
     return several or request.scene.has(Discrepancy)
@@ -59,29 +48,13 @@ def fit_each(
     seed: int,
     describe: Describe,
 ) -> Outcome:
-    """Fit every capture of a row as `polar_bayes.fit` does, one after another.
-
-    The draws of chains are correlated, and ranks want independent ones. So each chain is thinned
-    to every k-th draw, k the number of draws over their effective sample size (of the bulk, the
-    least of all parameters), rounded up. The verdict of `polar_bayes.verdict` becomes the status:
-    good, or not trusted where R-hat is above 1.01, an effective sample size below 400, a draw
-    diverged or is no number, the goals were not reached before `most_draws`, or the mode of a
-    normal approximation is not settled. Such fits are ranked all the same.
-
-    Args:
-        prepared: The model.
-        settings: As for `polar_bayes.fit`; chains of one fit run one after another.
-        captures: The readings.
-        numbers: Of the captures, which random numbers follow, (capture,).
-        seed: Of the random numbers.
-        describe: Called with the draws of each that has any.
-
-    Returns:
-        What became of each, in the order of the captures.
-
-    Raises:
-        Nothing: a fit without a single draw is not converged, and is not described.
-    """
+    """Fit every capture of a row as `polar_bayes.fit` does, one after another."""
+    # The draws of chains are correlated, and ranks want independent ones. So each chain is thinned
+    # to every k-th draw, k the number of draws over their effective sample size (of the bulk, the
+    # least of all parameters), rounded up. The verdict of `polar_bayes.verdict` becomes the status:
+    # good, or not trusted where R-hat is above 1.01, an effective sample size below 400, a draw
+    # diverged or is no number, the goals were not reached before `most_draws`, or the mode of a
+    # normal approximation is not settled. Such fits are ranked all the same.
     found, base = no_outcome(len(captures)), jax.random.fold_in(jax.random.key(seed), 3)
     with jax.enable_x64(True), TRACING:  # two threads that begin at once share what they make
         grounds = prepared.grounds

@@ -63,19 +63,7 @@ def reading_ranks(calibration: xr.DataTree) -> dict[str, np.ndarray]:
 
 
 def readings_verdict(calibration: xr.DataTree) -> list[str]:
-    """What a calibration says of readings, in sentences.
-
-    Args:
-        calibration: What `polar_bayes.calibrate` returns.
-
-    Returns:
-        First whether they pass a joint test of their own, then each that does not and how it
-        strays, then how far those left out can be trusted. Why they were not ranked, where they
-        should have been. Nothing where nobody asked.
-
-    Raises:
-        Nothing.
-    """
+    """What a calibration says of readings, in sentences."""
     if not holds_readings(calibration):
         why = provenance_of(calibration).get("readings_told", "")
         return [f"Readings were not ranked: {why}."] if why else []
@@ -98,17 +86,7 @@ def readings_verdict(calibration: xr.DataTree) -> list[str]:
 
 
 def how_predictions_stray(row: pd.Series) -> str:
-    """In which way the ranks of a reading stray.
-
-    Args:
-        row: Of `calibration_readings`.
-
-    Returns:
-        Words: a shift or stretch is named where it is 2.5 times what chance would do.
-
-    Raises:
-        Nothing.
-    """
+    """In which way the ranks of a reading stray."""
     count = row["answered"]
     if count < 2:
         return "fewer than two fits have an answer"

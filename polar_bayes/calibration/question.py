@@ -24,18 +24,7 @@ LIBRARIES = ("polar_bayes", "jax", "jaxlib", "numpyro", "numpy", "scipy")
 
 
 def question_of(plan: Plan) -> dict[str, str]:
-    """All that fixes the numbers of a calibration, but how many simulations there are.
-
-    Args:
-        plan: What is done.
-
-    Returns:
-        Texts by topic. Of a model of one's own it knows the code, what it encloses and what
-        handlers around it hold, but no global that it reads.
-
-    Raises:
-        Nothing.
-    """
+    """All that fixes the numbers of a calibration, but how many simulations there are."""
     told = _asked(plan.told) if plan.told is not None else {}
     return {
         "capture": digest(jax.tree.leaves(plan.data), plan.data.dims, tuple(plan.data.readings)),

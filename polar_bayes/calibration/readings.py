@@ -35,35 +35,17 @@ FEW = 4
 
 
 class Readings:
-    """Probability integral transforms of readings, filled in as fits come: NaN without an answer.
+    """Probability integral transforms of readings, filled in as fits come: NaN without an answer."""
 
-    A fresh reading of the same truth, and the posterior's predictions of it, are exchangeable
-    where model, prior and posterior are right. So are a reading that was fitted and what the
-    posterior without it predicts: draws of the whole posterior, each weighed by one over the
-    likelihood of that reading, the weights smoothed. The noise of all readings of a view may
-    follow its intensity, so without an intensity the whole view is left out.
-
-    Args:
-        program: The model that was fitted, made for single precision.
-        captures: The readings that were fitted.
-        again: Fresh ones of the same truths by name, each (simulation, ..., view).
-        numbers: Of the simulations, which random numbers follow.
-        seed: Of the random numbers.
-
-    Attributes:
-        fresh: Share of the predictions below the fresh reading, randomized within one draw. By
-            reading, (simulation,).
-        left_out: The same of the reading that was left out.
-        left_out_k: Pareto k of the weights without it; above 0.7 they say little.
-        place: Which entry was chosen, in row-major order of the axes of the readings; -1 where
-            none is valid.
-
-    Source:
-        Gelman et al. (2013), Bayesian Data Analysis, 3rd ed., section 6.3 (probability integral
-        transforms of readings, and of those left out); Vehtari, Gelman & Gabry (2017), Stat.
-        Comput. 27, 1413-1432 (leaving out by smoothed weights); Saeilynoja, Buerkner & Vehtari
-        (2022), Stat. Comput. 32, 32 (the test).
-    """
+    # A fresh reading of the same truth, and the posterior's predictions of it, are exchangeable
+    # where model, prior and posterior are right. So are a reading that was fitted and what the
+    # posterior without it predicts: draws of the whole posterior, each weighed by one over the
+    # likelihood of that reading, the weights smoothed. The noise of all readings of a view may
+    # follow its intensity, so without an intensity the whole view is left out.
+    # Source: Gelman et al. (2013), Bayesian Data Analysis, 3rd ed., section 6.3 (probability
+    # integral transforms of readings, and of those left out); Vehtari, Gelman & Gabry (2017), Stat.
+    # Comput. 27, 1413-1432 (leaving out by smoothed weights); Saeilynoja, Buerkner & Vehtari
+    # (2022), Stat. Comput. 32, 32 (the test).
 
     def __init__(
         self, program: Program, captures: Stack, again: Values, numbers: np.ndarray, seed: int
@@ -96,17 +78,7 @@ class Readings:
         )
 
     def describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        """Take down some fits.
-
-        Args:
-            at: Which, (fit,).
-            parameters: Their draws by name, each (fit, draw, ...); every latent site is among
-                them.
-            weights: Of the draws; they sum to one. (fit, draw).
-
-        Raises:
-            Nothing.
-        """
+        """Take down some fits."""
         if not at.size:
             return
         even = _resample(weights, self._first[at])
@@ -150,20 +122,7 @@ class Readings:
 def why_untold(
     program: Program, teller: Program, data: Observations, given: Mapping[str, tuple[int, ...]]
 ) -> str:
-    """Why readings of this model cannot be ranked.
-
-    Args:
-        program: What is fitted.
-        teller: What captures are simulated by.
-        data: The layout.
-        given: Names of what is known of each draw.
-
-    Returns:
-        A clause; empty where they can be.
-
-    Raises:
-        Nothing.
-    """
+    """Why readings of this model cannot be ranked."""
     missing = [name for name in program.supports if name not in given]
     if missing:
         return f"draws do not hold {', '.join(missing)}, without which the model predicts nothing"

@@ -25,21 +25,7 @@ def assemble(
     found: Block,
     about: Mapping[str, Any],
 ) -> xr.DataTree:
-    """Put a calibration into one tree.
-
-    Args:
-        program: The model that was fitted.
-        request: What was asked.
-        data: The layout.
-        found: All simulations and their fits, in order.
-        about: Whatever JSON can hold.
-
-    Returns:
-        The tree that `polar_bayes.calibrate` returns.
-
-    Raises:
-        Nothing.
-    """
+    """Put a calibration into one tree."""
     dims = dims_of(program)
     lengths = dict(data.dims)
     captured = request.capture

@@ -18,55 +18,23 @@ from polar_bayes.pixels.stack import Stack, together
 
 
 class Simulations(NamedTuple):
-    """Truths and what was recorded of them.
-
-    Args:
-        truth: Parameters by name, each (simulation, ...).
-        captures: The readings, in a row.
-    """
+    """Truths and what was recorded of them."""
 
     truth: Values
     captures: Stack
 
 
 def draw_captures(program: Program, data: Observations, count: int, key: Array) -> Simulations:
-    """Draw captures of one layout.
-
-    Directions, stated errors and masks are those of `data`. Where intensity is recorded, each
-    capture's own brightness sets its noise, and readings at full scale are saturated.
-
-    Args:
-        program: The model that tells the story.
-        data: A capture of the layout.
-        count: How many.
-        key: Random key; a simulation's own depends on its number, not on `count`.
-
-    Returns:
-        The simulations.
-
-    Raises:
-        Nothing.
-    """
+    """Draw captures of one layout."""
+    # Directions, stated errors and masks are those of `data`. Where intensity is recorded, each
+    # capture's own brightness sets its noise, and readings at full scale are saturated.
     return draw_numbered(program, data, np.arange(count), key)
 
 
 def draw_numbered(
     program: Program, data: Observations, numbers: np.ndarray, key: Array
 ) -> Simulations:
-    """Draw the captures of some numbers.
-
-    Args:
-        program: The model that tells the story.
-        data: A capture of the layout.
-        numbers: Of the simulations.
-        key: Random key; as many numbers as the last time run the same program, to the same bits.
-
-    Returns:
-        The simulations, in the order of their numbers.
-
-    Raises:
-        Nothing.
-    """
+    """Draw the captures of some numbers."""
     told = _drawing(program)(jnp.asarray(numbers, np.uint32), key, data)
     truth, parts = jax.tree.map(np.asarray, told)
     return Simulations(truth, _in_a_row(data, parts))
@@ -75,21 +43,7 @@ def draw_numbered(
 def draw_fresh(
     program: Program, data: Observations, drawn: Simulations, numbers: np.ndarray, key: Array
 ) -> Values:
-    """Read the same truths once more.
-
-    Args:
-        program: The model that told the story.
-        data: The capture of the layout.
-        drawn: What was recorded; its brightness sets the noise of the other readings.
-        numbers: Of the simulations.
-        key: The random key that they were drawn with.
-
-    Returns:
-        Fresh readings by name, each (simulation, ..., view).
-
-    Raises:
-        Nothing.
-    """
+    """Read the same truths once more."""
     captures = drawn.captures
     found = _reading_again(program)(
         np.asarray(numbers, np.uint32), key, data, captures.own, captures.shared

@@ -7,22 +7,10 @@ from polar_bayes.inference.program import Values
 
 
 class Standing:
-    """Probability integral transforms and scores, filled in as fits come: NaN without an answer.
+    """Probability integral transforms and scores, filled in as fits come: NaN without an answer."""
 
-    Args:
-        truth: By parameter, (simulation, ...).
-        numbers: Of the simulations, which the randomization follows.
-        seed: Of the randomization.
-
-    Attributes:
-        pit: Share of the posterior below the truth, randomized within one draw: uniform on (0, 1)
-            where the posterior is right. By parameter, (simulation, ...).
-        crps: Continuous ranked probability score, in the unit of the parameter; the same shape.
-
-    Source:
-        Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788; Gneiting & Raftery
-        (2007), JASA 102, 359-378, eq. 21.
-    """
+    # Source: Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788; Gneiting &
+    # Raftery (2007), JASA 102, 359-378, eq. 21.
 
     def __init__(self, truth: Values, numbers: np.ndarray, seed: int) -> None:
         self._truth = {name: np.asarray(truth[name], float) for name in sorted(truth)}
@@ -35,16 +23,7 @@ class Standing:
         self.crps = {name: np.full(x.shape, np.nan) for name, x in self._truth.items()}
 
     def describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        """Take down some fits.
-
-        Args:
-            at: Which, (fit,).
-            parameters: Their draws by name, each (fit, draw, ...).
-            weights: Of the draws; they sum to one. (fit, draw).
-
-        Raises:
-            Nothing.
-        """
+        """Take down some fits."""
         for name, truth in self._truth.items():
             draws = np.asarray(parameters[name], float)
             for own in np.ndindex(truth.shape[1:]):
@@ -60,21 +39,7 @@ def share_below(
     truth: Float[np.ndarray, " fit"],
     chance: Float[np.ndarray, " fit"],
 ) -> Float[np.ndarray, " fit"]:
-    """Share of each posterior below the truth, spread evenly over the gap in which it falls.
-
-    Args:
-        draws: Of one parameter.
-        weights: They sum to one in each fit.
-        truth: What was simulated.
-        chance: Uniform on (0, 1).
-
-    Returns:
-        (rank + chance) / (draws + 1) for even weights: exactly uniform where truth and draws are
-        exchangeable.
-
-    Raises:
-        Nothing.
-    """
+    """Share of each posterior below the truth, spread evenly over the gap in which it falls."""
     below = np.sum(weights * (draws < truth[:, None]), axis=-1)
     tied = np.sum(weights * (draws == truth[:, None]), axis=-1)
     count = draws.shape[-1]
@@ -86,19 +51,7 @@ def ranked_score(
     weights: Float[np.ndarray, "fit draw"],
     truth: Float[np.ndarray, " fit"],
 ) -> Float[np.ndarray, " fit"]:
-    """E|X - truth| - E|X - X'| / 2 of every fit.
-
-    Args:
-        draws: Of one parameter.
-        weights: They sum to one in each fit.
-        truth: What was simulated.
-
-    Returns:
-        The score in the unit of the parameter: small where the posterior is sharp and right.
-
-    Raises:
-        Nothing.
-    """
+    """E|X - truth| - E|X - X'| / 2 of every fit."""
     order = np.argsort(draws, axis=-1)
     ranked = np.take_along_axis(draws, order, axis=-1)
     share = np.take_along_axis(weights, order, axis=-1)

@@ -20,33 +20,17 @@ QUESTION, BLOCKS = "question.json", "*.npz"
 
 
 class Store:
-    """Blocks on the disk, each in a file that is there whole or not at all.
+    """Blocks on the disk, each in a file that is there whole or not at all."""
 
-    A file is moved to its place when it is on the disk, and its archive holds a checksum of each
-    array. What a crash left unfinished, or what cannot be read, counts as not there: its
-    simulations are fitted again, to the same bits.
-
-    Args:
-        folder: Where.
-        question: All that fixes the numbers, by topic.
-    """
+    # A file is moved to its place when it is on the disk, and its archive holds a checksum of each
+    # array. What a crash left unfinished, or what cannot be read, counts as not there: its
+    # simulations are fitted again, to the same bits.
 
     def __init__(self, folder: Path, question: Mapping[str, str]) -> None:
         self._folder, self._question = folder, dict(question)
 
     def begin(self, *, resume: bool) -> list[Block]:
-        """Make the folder, or find what is in it.
-
-        Args:
-            resume: Whether to go on with what is there.
-
-        Returns:
-            The blocks that are there.
-
-        Raises:
-            FitError: The folder is there already, or (to resume) what is in it was begun otherwise
-                or is no calibration, or nothing can be written.
-        """
+        """Make the folder, or find what is in it."""
         where, head = str(self._folder), self._folder / QUESTION
         if not resume and self._folder.exists():
             raise FitError(
@@ -67,14 +51,7 @@ class Store:
         return [block for block in found if block is not None]
 
     def add(self, block: Block) -> None:
-        """Keep a block.
-
-        Args:
-            block: What is finished.
-
-        Raises:
-            FitError: It cannot be written.
-        """
+        """Keep a block."""
         first, last = int(block.numbers.min()), int(block.numbers.max())
         with self._whole(f"{first:08d}-{last:08d}.npz") as unfinished:
             with unfinished.open("wb") as file:
@@ -122,17 +99,7 @@ class Store:
 
 
 def read_block(path: Path) -> Block | None:
-    """A block from a file.
-
-    Args:
-        path: That a store wrote.
-
-    Returns:
-        The block, or None where it cannot be read.
-
-    Raises:
-        Nothing.
-    """
+    """A block from a file."""
     try:
         # NumPy does not close a file that it opens and cannot read.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:

@@ -17,14 +17,7 @@ SEED = 20
 
 
 class Uniformity(NamedTuple):
-    """What the test says.
-
-    Args:
-        p_value: How often a uniform sample of this size strays as far.
-        mean: Of the sample; above a half the truth stands too high: the posterior is too low.
-        spread: Standard deviation over that of the uniform distribution; above one the posterior
-            is too narrow, below too wide.
-    """
+    """What the test says."""
 
     p_value: float
     mean: float
@@ -32,24 +25,12 @@ class Uniformity(NamedTuple):
 
 
 def uniformity(sample: Float[np.ndarray, " size"]) -> Uniformity:
-    """Test a sample against the uniform distribution.
-
-    The statistic is the largest surprise of the empirical distribution at any of many points, each
-    judged by its own binomial distribution: what simultaneous bands of ECDF plots are made of.
-    Its distribution is found by simulation, so the rate of false alarms at a level is that level.
-
-    Args:
-        sample: At least two numbers from 0 to 1.
-
-    Returns:
-        The p-value, and in which way the sample strays.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Saeilynoja, Buerkner & Vehtari (2022), Stat. Comput. 32, 32.
-    """
+    """Test a sample against the uniform distribution."""
+    # The statistic is the largest surprise of the empirical distribution at any of many points,
+    # each judged by its own binomial distribution: what simultaneous bands of ECDF plots are made
+    # of. Its distribution is found by simulation, so the rate of false alarms at a level is that
+    # level.
+    # Source: Saeilynoja, Buerkner & Vehtari (2022), Stat. Comput. 32, 32.
     observed = _surprise(sample[None])[0]
     null = null_statistics(len(sample))
     p_value = (1 + np.searchsorted(null, observed, side="right")) / (1 + NULLS)

@@ -89,18 +89,7 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
 
 
 def how_ranks_stray(row: pd.Series) -> str:
-    """In which way the ranks of a parameter stray.
-
-    Args:
-        row: Of `calibration_table`.
-
-    Returns:
-        Words: a shift or stretch is named where it is 2.5 times what chance would do, else tails
-        where the 95% intervals are 2 standard errors off.
-
-    Raises:
-        Nothing.
-    """
+    """In which way the ranks of a parameter stray."""
     count = row["answered"]
     if count < 2:
         return "fewer than two fits have an answer"
@@ -121,29 +110,16 @@ def how_ranks_stray(row: pd.Series) -> str:
 
 
 def _spread_at(mean: float) -> float:
-    """Spread of the ranks where posteriors are shifted and no more: it presses them together.
-
-    With normal posteriors ranks are Phi(z), z of variance one and mean sqrt(2) Phi^-1(mean); their
-    second moment is in Owen's T function (Owen 1980, Commun. Stat. B 9, 389-419).
-    """
+    """Spread of the ranks where posteriors are shifted and no more: it presses them together."""
+    # With normal posteriors ranks are Phi(z), z of variance one and mean sqrt(2) Phi^-1(mean);
+    # their second moment is in Owen's T function (Owen 1980, Commun. Stat. B 9, 389-419).
     height = scipy.stats.norm.ppf(np.clip(mean, 1e-6, 1.0 - 1e-6))
     second = scipy.stats.norm.cdf(height) - 2.0 * scipy.special.owens_t(height, 3.0**-0.5)
     return math.sqrt(12.0 * max(second - scipy.stats.norm.cdf(height) ** 2, 0.0))
 
 
 def calibration_scalars(calibration: xr.DataTree, group: str) -> list[Scalar]:
-    """Every scalar of `prior_sbc` or `truth`, with simulations in place of draws.
-
-    Args:
-        calibration: What `polar_bayes.calibrate` returns.
-        group: Name of the group.
-
-    Returns:
-        Material parameters first; `draws` is (1, simulation).
-
-    Raises:
-        FitError: It is no calibration.
-    """
+    """Every scalar of `prior_sbc` or `truth`, with simulations in place of draws."""
     check_calibration(calibration)
     dataset = calibration[group].to_dataset()
     return scalars(dataset.rename(simulation="draw").expand_dims("chain"))

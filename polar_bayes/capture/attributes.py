@@ -15,21 +15,9 @@ RESERVED = frozenset({"add_offset", "coordinates", "dtype", "missing_value", "sc
 
 
 def clean_attributes(attributes: Mapping[Any, Any], where: str) -> dict[str, str | int | float]:
-    """Attributes as plain text and numbers, so that a file gives back what was saved.
-
-    Numbers become Python numbers, truth values 0 or 1; bytes and arrays of numbers or text are
-    kept as text.
-
-    Args:
-        attributes: Any mapping, for instance `dataset.attrs`.
-        where: What carries them, for the error.
-
-    Returns:
-        A new dictionary in the same order.
-
-    Raises:
-        CaptureError: A name that netCDF cannot hold, or a value that is neither number nor text.
-    """
+    """Attributes as plain text and numbers, so that a file gives back what was saved."""
+    # Numbers become Python numbers, truth values 0 or 1; bytes and arrays of numbers or text are
+    # kept as text.
     return {
         _clean_name(name, where): _clean_value(value, f"{where}: attribute {name}")
         for name, value in attributes.items()

@@ -22,15 +22,7 @@ LARGEST_READING = 1e30
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Channel:
-    """What one channel read, sorted by angle.
-
-    Args:
-        name: "s" or "p".
-        angle: Angle of incidence. Shape (row,), degree, 0 <= angle < 90.
-        light: The reading; once scaled, light above the dark level. Shape (row,), any unit.
-        error: The part of its standard deviation that light does not change. Shape (row,), > 0.
-        places: Where each row stands, for errors.
-    """
+    """What one channel read, sorted by angle."""
 
     name: str
     angle: np.ndarray
@@ -40,37 +32,13 @@ class Channel:
 
 
 def channel_from_table(name: str, table: Table, angle: str, reading: str) -> Channel:
-    """A channel from two columns of a table; its errors are the resolution of the print.
-
-    Args:
-        name: "s" or "p".
-        table: The table.
-        angle: Column of angles in degrees.
-        reading: Column of readings.
-
-    Returns:
-        The channel, readings as they are.
-
-    Raises:
-        CaptureError: An angle outside 0..90 or given twice, or a reading too large.
-    """
+    """A channel from two columns of a table; its errors are the resolution of the print."""
     places = [f"{table.source}: line {line}" for line in table.lines]
     return _sorted(name, table.columns[angle], table.columns[reading], table.steps[reading], places)
 
 
 def channel_from_file(name: str, path: str | os.PathLike[str]) -> Channel:
-    """A channel from a table of two columns, angle and reading.
-
-    Args:
-        name: "s" or "p".
-        path: The table.
-
-    Returns:
-        The channel, readings as they are.
-
-    Raises:
-        CaptureError: As `read_table` and `channel_from_table`, or a number of columns not two.
-    """
+    """A channel from a table of two columns, angle and reading."""
     table = read_table(path)
     if len(table.names) != 2:
         raise CaptureError(
@@ -82,19 +50,7 @@ def channel_from_file(name: str, path: str | os.PathLike[str]) -> Channel:
 
 
 def channel_from_arrays(name: str, pair: Any) -> Channel:
-    """A channel from a pair of arrays; its resolution is the finest decimal among the readings.
-
-    Args:
-        name: "s" or "p".
-        pair: Angles in degrees and readings, each of shape (row,).
-
-    Returns:
-        The channel, readings as they are.
-
-    Raises:
-        CaptureError: Not a pair of equally long lists of finite numbers, or as
-            `channel_from_table`.
-    """
+    """A channel from a pair of arrays; its resolution is the finest decimal among the readings."""
     try:
         angle, reading = (np.asarray(part) for part in pair)
     except (TypeError, ValueError):
@@ -118,22 +74,8 @@ def channel_from_arrays(name: str, pair: Any) -> Channel:
 def scaled(
     channel: Channel, dark_level: float, incident: float | None, error: float | None
 ) -> Channel:
-    """The light above the dark level, over the incident light where that is known.
-
-    A reading below the dark level by at most three errors is kept as zero light.
-
-    Args:
-        channel: A channel with readings as they are.
-        dark_level: Reading without light.
-        incident: Reading of the incident light, or None.
-        error: Standard deviation without light, > 0; None keeps the resolution.
-
-    Returns:
-        The channel scaled, light >= 0.
-
-    Raises:
-        CaptureError: A reading far below the dark level or far above the incident level.
-    """
+    """The light above the dark level, over the incident light where that is known."""
+    # A reading below the dark level by at most three errors is kept as zero light.
     errors = channel.error if error is None else np.full_like(channel.error, error)
     light = channel.light - dark_level
     _refuse(
@@ -158,20 +100,7 @@ def scaled(
 def on_grid(
     channel: Channel, grid: np.ndarray, relative_error: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The channel at the angles of a grid, interpolated where it has no reading.
-
-    Args:
-        channel: A scaled channel.
-        grid: Angles, sorted, among them those of the channel. Shape (view,), degree.
-        relative_error: Standard deviation over reading, unit 1.
-
-    Returns:
-        Light, its standard deviation (both NaN outside the channel's range) and True where it is
-        interpolated. Each of shape (view,).
-
-    Raises:
-        Nothing.
-    """
+    """The channel at the angles of a grid, interpolated where it has no reading."""
     light, error = np.full((2, grid.size), np.nan)
     read = np.isin(grid, channel.angle)
     light[read], error[read] = channel.light, channel.error

@@ -43,17 +43,7 @@ class Interval:
 
 @dataclasses.dataclass(frozen=True)
 class Variable:
-    """One row of the contract.
-
-    Args:
-        name: Name of the variable in the capture.
-        kind: "geometry", "trust", "reading", "flag" or "label": decides its dims.
-        units: The unit, or None for any.
-        range: Numbers that it may take (a flag: 0 and 1).
-        meaning: Its `long_name`.
-        mend: What to do about a number outside the range.
-        needs: The variable without which it has no meaning.
-    """
+    """One row of the contract."""
 
     name: str
     kind: Literal["geometry", "trust", "reading", "flag", "label"]

@@ -73,15 +73,7 @@ class Detector:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Signal:
-    """Frames with dark and flat field taken out.
-
-    Args:
-        light: Shape (..., row, column), counts above dark.
-        variance: Of the light of one pixel, without what averaging does not reduce. Same shape.
-        saturated: True where the raw count stopped. Same shape.
-        full_scale: Light at which the least sensitive pixel stops, counts.
-        said: What was used, as attributes of the capture.
-    """
+    """Frames with dark and flat field taken out."""
 
     light: np.ndarray
     variance: np.ndarray
@@ -91,20 +83,7 @@ class Signal:
 
 
 def signal_of(frames: list[np.ndarray], level: float | None, detector: Detector) -> Signal:
-    """Light from raw frames.
-
-    Args:
-        frames: Raw counts, all of one shape (row, column).
-        level: Largest count of their type, or None where that says nothing.
-        detector: How counts become light.
-
-    Returns:
-        The signal, with a leading axis over frames.
-
-    Raises:
-        CaptureError: No saturation level, a dark or flat frame of another shape, or a flat frame
-            that is dark.
-    """
+    """Light from raw frames."""
     full = detector.saturation_level if detector.saturation_level is not None else level
     if full is None:
         raise CaptureError(
@@ -141,19 +120,7 @@ def signal_of(frames: list[np.ndarray], level: float | None, detector: Detector)
 
 
 def check_number(name: str, value: Any, allowed: Interval) -> float:
-    """A number given by the user.
-
-    Args:
-        name: What it is, for the error.
-        value: Anything.
-        allowed: The numbers that will do.
-
-    Returns:
-        The number.
-
-    Raises:
-        CaptureError: It is none, or lies outside.
-    """
+    """A number given by the user."""
     if isinstance(value, Real) and not isinstance(value, bool) and allowed.contains(value):
         return float(value)
     raise CaptureError(f"it is {value!r}", where=name, mend=f"give {allowed}")

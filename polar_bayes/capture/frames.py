@@ -24,20 +24,7 @@ LARGEST_COUNT = 1e9
 
 
 def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
-    """One frame of gray values.
-
-    Args:
-        frame: A PNG, TIFF or .npy file, or an array of shape (row, column).
-        where: What it is, for errors, such as "dark".
-
-    Returns:
-        The values as they are, shape (row, column), in counts; and the largest count that its type
-        can hold, where that is the sensor's: 255 for 8 bits. Wider types hold sensors of 10, 12,
-        14 or 16 bits alike, so for them it is None.
-
-    Raises:
-        CaptureError: The file cannot be read, or it holds no single frame of finite gray values.
-    """
+    """One frame of gray values."""
     values = _array(frame, where)
     if values.dtype.kind not in "uif" or values.ndim != 2 or values.size == 0:
         raise CaptureError(
@@ -57,19 +44,7 @@ def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
 
 
 def read_array(path: str | os.PathLike[str], where: str) -> np.ndarray:
-    """The array of a .npy file.
-
-    Args:
-        path: The file.
-        where: What it is, for errors.
-
-    Returns:
-        The array.
-
-    Raises:
-        CaptureError: The file is not there, holds something else, or is shorter or longer than its
-            header says.
-    """
+    """The array of a .npy file."""
     file = existing_file(path, where)
     mend = "save one array with numpy.save"
     try:

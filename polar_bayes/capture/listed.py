@@ -32,13 +32,7 @@ REQUIRED = tuple(row.name for row in CONTRACT if row.kind == "geometry")
 
 
 class _Lines(NamedTuple):
-    """What a table says.
-
-    Args:
-        values: Of each variable, (line,).
-        columns: Name of the column of each variable; constants have none.
-        numbers: Of the lines in the file.
-    """
+    """What a table says."""
 
     values: dict[str, np.ndarray]
     columns: dict[str, str]
@@ -222,10 +216,9 @@ def _is_flag(name: str) -> bool:
 
 
 def _views(values: dict[str, np.ndarray], column: np.ndarray) -> np.ndarray:
-    """Number of the view of each line, in the order of their first lines.
-
-    One for each set of directions, and one more for each time that a wavelength is repeated there.
-    """
+    """Number of the view of each line, in the order of their first lines."""
+    # One for each set of directions, and one more for each time that a wavelength is repeated
+    # there.
     numbers: dict[tuple, int] = {}
     seen: dict[tuple, int] = defaultdict(int)
     found = []

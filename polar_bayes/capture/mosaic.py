@@ -112,12 +112,10 @@ def from_mosaic(
 
 
 def _demosaiced(polanalyser: ModuleType, light: np.ndarray) -> np.ndarray:
-    """Light at each angle in every pixel, (angle, row, column).
-
-    The library works on whole numbers up to 65535 and cuts off what lies outside. Filling in is
-    linear, so the frame is shifted and stretched to just that range and back: dark pixels whose
-    noise lies below zero stay what they are.
-    """
+    """Light at each angle in every pixel, (angle, row, column)."""
+    # The library works on whole numbers up to 65535 and cuts off what lies outside. Filling in is
+    # linear, so the frame is shifted and stretched to just that range and back: dark pixels whose
+    # noise lies below zero stay what they are.
     low, high = float(light.min()), float(light.max())
     step = (high - low) / DEEPEST if high > low else 1.0
     whole = np.rint((light - low) / step).astype(np.uint16)

@@ -27,20 +27,7 @@ BLOCK = 2**20
 def read_netcdf[Data: (xr.Dataset, xr.DataTree)](
     kind: type[Data], file: Path, broken: PolarBayesError
 ) -> Data:
-    """Read a file whole, and verify its checksum where it has one.
-
-    Args:
-        kind: What to read: the root group alone, or the tree of all groups.
-        file: The path of a file that is there.
-        broken: What to raise where it cannot be read.
-
-    Returns:
-        The data in memory; the file is closed.
-
-    Raises:
-        CaptureError: The operating system does not allow to read it.
-        PolarBayesError: `broken`; or one of its type, where the file is not what was written.
-    """
+    """Read a file whole, and verify its checksum where it has one."""
     try:
         is_whole = _is_whole(file)
     except OSError as error:

@@ -35,13 +35,7 @@ DARKEST = 10.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Setting:
-    """What stood where in front of the camera, checked.
-
-    Args:
-        shape: The surface.
-        view: Where the camera stands.
-        light: Where the light stands, or the highlight that tells it; or it is all around.
-    """
+    """What stood where in front of the camera, checked."""
 
     shape: AbstractShape
     view: AbstractPlace
@@ -49,20 +43,7 @@ class Setting:
 
 
 def setting_of(shape: Any, view: Any, light: Any, frame: tuple[int, ...]) -> Setting:
-    """What stood in front of the camera, from what a user gave.
-
-    Args:
-        shape: See `polar_bayes.from_polarizer`; the other arguments too.
-        view: Where the camera stands.
-        light: Where the light stands.
-        frame: Rows and columns.
-
-    Returns:
-        The same, checked.
-
-    Raises:
-        CaptureError: One of them is nothing of the kind, or does not fit the frames.
-    """
+    """What stood in front of the camera, from what a user gave."""
     surface = as_shape(shape)
     surface.check(frame)
     return Setting(
@@ -82,24 +63,7 @@ def picture_capture(
     setting: Setting,
     attributes: dict[str, str | int | float],
 ) -> xr.Dataset:
-    """A capture from averaged readings behind a polarizer.
-
-    Args:
-        light: Averages at each angle, (angle, row, column) of the squares, counts.
-        variance: Of each, without what averaging does not reduce. Same shape.
-        saturated: True where a square holds a full pixel, (row, column).
-        signal: The frames that were averaged.
-        angles: Of the polarizer, degree, (angle,).
-        squares: What was averaged.
-        setting: What stood where.
-        attributes: Of the capture; what was used and masked is added.
-
-    Returns:
-        The validated capture.
-
-    Raises:
-        CaptureError: No reading is left, or the highlight lies where there is no surface.
-    """
+    """A capture from averaged readings behind a polarizer."""
     places, light_said = _directions(squares, setting)
     relative = float(signal.said["relative_error"])
     stokes = fit_stokes(light, variance + (relative * light) ** 2, angles)

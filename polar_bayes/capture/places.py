@@ -134,19 +134,7 @@ class Surroundings:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Directions:
-    """What a model must know of each piece of surface; all of one shape.
-
-    Args:
-        view_zenith: Degree; 0 where there is no surface.
-        view_azimuth: From the light's azimuth, degree.
-        light_zenith: Degree.
-        light_azimuth: Always 0.
-        cos_twice: Cosine of twice the angle from the camera's first axis to the s axis.
-        sin_twice: Sine of the same.
-        outside: True where there is no surface.
-        turned_away: True where the surface does not face the camera.
-        in_shadow: True where it does not face the light.
-    """
+    """What a model must know of each piece of surface; all of one shape."""
 
     view_zenith: np.ndarray
     view_azimuth: np.ndarray
@@ -160,19 +148,7 @@ class Directions:
 
 
 def directions(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> Directions:
-    """Zeniths, azimuths and the turn of axes from vectors in the camera's axes.
-
-    Args:
-        normals: Unit normals, NaN where there is no surface, (..., 3).
-        view: Unit vectors to the camera, (..., 3).
-        light: Unit vectors to the light, NaN where there is no surface, (..., 3).
-
-    Returns:
-        Angles of shape (...).
-
-    Raises:
-        Nothing.
-    """
+    """Zeniths, azimuths and the turn of axes from vectors in the camera's axes."""
     outside = ~np.isfinite(normals).all(axis=-1)
     n = np.where(outside[..., None], view, normals)
     light = np.where(np.isfinite(light), light, view)
@@ -211,34 +187,12 @@ def directions(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> Dire
 
 
 def mirrored(normals: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """The direction from which a mirror sends light to the viewer.
-
-    Args:
-        normals: Unit vectors (..., 3).
-        view: Unit vectors (..., 3).
-
-    Returns:
-        Unit vectors (..., 3); NaN where there is no surface.
-
-    Raises:
-        Nothing.
-    """
+    """The direction from which a mirror sends light to the viewer."""
     return 2.0 * _dot(normals, view)[..., None] * normals - view
 
 
 def as_place(place: Any, where: str) -> AbstractPlace:
-    """What a user gave for a place.
-
-    Args:
-        place: A `Direction`, a `Position`, or three numbers for a direction.
-        where: What stands there, for errors.
-
-    Returns:
-        The place.
-
-    Raises:
-        CaptureError: It is none of these.
-    """
+    """What a user gave for a place."""
     if isinstance(place, AbstractPlace):
         return place
     if isinstance(place, list | tuple | np.ndarray) and len(place) == 3:

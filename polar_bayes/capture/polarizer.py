@@ -105,18 +105,7 @@ def from_polarizer(
 
 
 def with_wavelength(capture: xr.Dataset, wavelength: float | None) -> xr.Dataset:
-    """The capture with its one color stated, where it is known.
-
-    Args:
-        capture: Without the coordinate.
-        wavelength: In nm, > 0, or None.
-
-    Returns:
-        The capture.
-
-    Raises:
-        CaptureError: It is no number above zero.
-    """
+    """The capture with its one color stated, where it is known."""
     if wavelength is None:
         return capture
     nanometers = check_number("wavelength", wavelength, POSITIVE)

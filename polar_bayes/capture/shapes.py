@@ -236,17 +236,7 @@ def fit_sphere(rim: Any) -> Sphere:
 
 
 def as_shape(shape: Any) -> AbstractShape:
-    """What a user gave for a surface, as a shape.
-
-    Args:
-        shape: A shape, a `Sphere` or several, normals (row, column, 3) or a .npy file of them.
-
-    Returns:
-        The shape.
-
-    Raises:
-        CaptureError: It is none of these.
-    """
+    """What a user gave for a surface, as a shape."""
     if isinstance(shape, AbstractShape):
         return shape
     if isinstance(shape, Sphere):

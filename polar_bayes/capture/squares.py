@@ -16,13 +16,7 @@ from polar_bayes.errors import CaptureError
 
 @dataclasses.dataclass(frozen=True)
 class Squares:
-    """Squares of pixels that are averaged, and those that are read as one material.
-
-    Args:
-        frame: Rows and columns of the frame.
-        bin: Width of a square that is averaged, pixels.
-        window: Width of a square of such squares.
-    """
+    """Squares of pixels that are averaged, and those that are read as one material."""
 
     frame: tuple[int, int]
     bin: int
@@ -67,19 +61,7 @@ class Squares:
 
 
 def squares_of(frame: tuple[int, ...], bin_: object, window: object) -> Squares:
-    """How a frame is cut.
-
-    Args:
-        frame: Rows and columns.
-        bin_: Width of the squares that are averaged, pixels.
-        window: Readings along one side of a pixel of the capture.
-
-    Returns:
-        The squares.
-
-    Raises:
-        CaptureError: A width is no whole number above zero, or the frame is smaller than a square.
-    """
+    """How a frame is cut."""
     for name, value in (("bin", bin_), ("window", window)):
         if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
             mend = "give a whole number of 1 or more"

@@ -34,19 +34,7 @@ LARGEST_CONDITION = 100.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StokesImage:
-    """Normalized Stokes parameters with their noise, each of shape (row, column).
-
-    Args:
-        intensity: Half of S0: what the polarizer lets pass of unpolarized light. Counts.
-        q: S1/S0, NaN where there is no light.
-        u: S2/S0.
-        intensity_variance: Of the intensity, counts squared.
-        q_variance: Of q.
-        u_variance: Of u.
-        covariance: Of q and u.
-        misfit: Squared distance of the readings from the fit over its variance, for each degree of
-            freedom; about 1 where the noise is as stated. None for three angles, which always fit.
-    """
+    """Normalized Stokes parameters with their noise, each of shape (row, column)."""
 
     intensity: np.ndarray
     q: np.ndarray
@@ -58,15 +46,7 @@ class StokesImage:
     misfit: np.ndarray | None
 
     def turned(self, cos: np.ndarray, sin: np.ndarray) -> "StokesImage":
-        """The same light in axes that are turned counterclockwise, as the camera sees it.
-
-        Args:
-            cos: Cosine of twice the angle, (row, column).
-            sin: Sine of the same.
-
-        Returns:
-            Stokes parameters in those axes.
-        """
+        """The same light in axes that are turned counterclockwise, as the camera sees it."""
         q_variance, u_variance, between = self.q_variance, self.u_variance, self.covariance
         mixed = 2.0 * cos * sin * between
         return dataclasses.replace(
@@ -85,20 +65,7 @@ class StokesImage:
 
 
 def fit_stokes(light: np.ndarray, variance: np.ndarray, angles: Any) -> StokesImage:
-    """Stokes parameters by least squares.
-
-    Args:
-        light: What passed the polarizer at each angle, (angle, row, column), counts.
-        variance: Of each reading; they are independent. Same shape.
-        angles: Of the polarizer's axis from the first axis of the image (to the right),
-            counterclockwise as the camera sees it, degree. Shape (angle,).
-
-    Returns:
-        Stokes parameters in the axes of the image, with their covariance.
-
-    Raises:
-        CaptureError: Fewer than three different angles, or angles too close to tell.
-    """
+    """Stokes parameters by least squares."""
     design = _design(check_angles(angles))
     solve = np.linalg.pinv(design)
     S = np.einsum("sa,ayx->syx", solve, light)
@@ -122,18 +89,7 @@ def fit_stokes(light: np.ndarray, variance: np.ndarray, angles: Any) -> StokesIm
 
 
 def unbiased_dop(image: StokesImage) -> tuple[np.ndarray, np.ndarray]:
-    """Degree of polarization with what noise alone adds to it taken off, and its error.
-
-    Args:
-        image: Stokes parameters with their noise.
-
-    Returns:
-        `(dop, dop_error)`, each (row, column); the module tells how. The error is that along the
-        direction of polarization.
-
-    Raises:
-        Nothing.
-    """
+    """Degree of polarization with what noise alone adds to it taken off, and its error."""
     p = np.hypot(image.q, image.u)
     with np.errstate(divide="ignore", invalid="ignore"):
         along_q = np.where(p > 0.0, image.q / p, 1.0)
@@ -148,17 +104,7 @@ def unbiased_dop(image: StokesImage) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_angles(angles: Any) -> np.ndarray:
-    """Angles of a polarizer that tell all three Stokes parameters.
-
-    Args:
-        angles: Degrees.
-
-    Returns:
-        The same as an array, (angle,).
-
-    Raises:
-        CaptureError: They are no list of numbers, fewer than three different ones, or too close.
-    """
+    """Angles of a polarizer that tell all three Stokes parameters."""
     try:
         degrees = np.asarray(angles, dtype=np.float64)
     except (TypeError, ValueError):

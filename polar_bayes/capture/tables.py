@@ -33,14 +33,7 @@ Row = tuple[int, list[str]]  # line of the file, cells
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Columns of numbers, with where they stood and how finely they were printed.
-
-    Args:
-        source: Path of the file, as given.
-        columns: Values of each column, by name, in the order asked for. Each of shape (row,).
-        steps: Value of the last printed digit of each number ("1.20" -> 0.01), like `columns`.
-        lines: Line of the file on which each row stands, counted from 1.
-    """
+    """Columns of numbers, with where they stood and how finely they were printed."""
 
     source: str
     columns: Mapping[str, np.ndarray]
@@ -54,22 +47,10 @@ class Table:
 
 
 def read_table(path: str | os.PathLike[str], columns: Sequence[str] | None = None) -> Table:
-    """A text table of numbers.
-
-    Semicolons, tabs, commas or blanks separate the cells; runs of tabs or of blanks separate once.
-    The first line may name the columns. From a # to the end of its line is comment. Where commas
-    do not separate they may be decimal commas, in the whole table or not at all.
-
-    Args:
-        path: A text file of at most 50 MB.
-        columns: Names of the columns to keep, in this order; None keeps all.
-
-    Returns:
-        The table; every number is finite.
-
-    Raises:
-        CaptureError: The file, line and column that are wrong.
-    """
+    """A text table of numbers."""
+    # Semicolons, tabs, commas or blanks separate the cells; runs of tabs or of blanks separate
+    # once. The first line may name the columns. From a # to the end of its line is comment. Where
+    # commas do not separate they may be decimal commas, in the whole table or not at all.
     source, names, body = _parts(path)
     if not body:
         raise CaptureError("it holds names but no rows", where=source, mend=EACH_READING)
@@ -95,17 +76,7 @@ def read_table(path: str | os.PathLike[str], columns: Sequence[str] | None = Non
 
 
 def column_names(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Names of the columns of a text table, as `read_table` reads it.
-
-    Args:
-        path: A text file of at most 50 MB.
-
-    Returns:
-        The names; without a header line column_1, column_2, ...
-
-    Raises:
-        CaptureError: There is no table.
-    """
+    """Names of the columns of a text table, as `read_table` reads it."""
     return tuple(_parts(path)[1])
 
 

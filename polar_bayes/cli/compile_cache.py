@@ -15,11 +15,9 @@ OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 def keep_compiled_programs() -> None:
-    """Keep compiled programs between runs; a second run of the same fit compiles nothing.
-
-    The folder that the user gives by JAX_COMPILATION_CACHE_DIR is used as it is. The own one is
-    not used where other users could write to it; one line on stderr says so.
-    """
+    """Keep compiled programs between runs; a second run of the same fit compiles nothing."""
+    # The folder that the user gives by JAX_COMPILATION_CACHE_DIR is used as it is. The own one is
+    # not used where other users could write to it; one line on stderr says so.
     if FOLDER not in os.environ:
         folder = platformdirs.user_cache_path("polar_bayes") / "compiled"
         doubt = _doubt(folder)

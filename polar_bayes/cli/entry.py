@@ -33,16 +33,7 @@ def console() -> NoReturn:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command.
-
-    Args:
-        arguments: Words after the program's name. By default those of the process, which then
-            belongs to the command: a signal ends it, compiled programs are kept for later runs,
-            and libraries log nothing.
-
-    Returns:
-        The exit status.
-    """
+    """Run one command."""
     if arguments is not None or threading.current_thread() is not threading.main_thread():
         return _run(arguments)
     return run_until_signal(_own_process)

@@ -68,10 +68,9 @@ class Input(click.ParamType):
 
 
 class Output(click.ParamType):
-    """The path of an output; it is checked when all inputs are known.
+    """The path of an output; it is checked when all inputs are known."""
 
-    A folder or store, of no `kind`, is checked further by what writes it.
-    """
+    # A folder or store, of no `kind`, is checked further by what writes it.
 
     name = "path"
 

@@ -40,20 +40,9 @@ DAMAGED = "Error reading persistent compilation cache entry"
 
 
 def run_until_signal(command: Callable[[], int]) -> int:
-    """Run a command in a thread of its own; a signal ends the process.
-
-    The first signal runs the cleanups and prints one line; the second ends the process at once.
-    Signals that the process was started to ignore (`nohup`) stay ignored.
-
-    Args:
-        command: Called once, in the context of the caller.
-
-    Returns:
-        What it returns.
-
-    Raises:
-        BaseException: What it raises.
-    """
+    """Run a command in a thread of its own; a signal ends the process."""
+    # The first signal runs the cleanups and prints one line; the second ends the process at once.
+    # Signals that the process was started to ignore (`nohup`) stay ignored.
     received: list[int] = []
 
     def receive(number: int, _: object) -> None:
@@ -116,11 +105,7 @@ def _stop(number: int) -> NoReturn:
 
 
 def end(status: int) -> NoReturn:
-    """End the process, without waiting for threads that compute what nobody needs any more.
-
-    Args:
-        status: The exit status.
-    """
+    """End the process, without waiting for threads that compute what nobody needs any more."""
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, signal.SIG_DFL)  # no traceback from here on

@@ -12,13 +12,7 @@ NARROWEST = 1e-6
 
 
 class Alone(NamedTuple):
-    """One member without its population, on the scale on which the population is normal.
-
-    Args:
-        mean: Where its own readings put it; NaN where they say nothing.
-        sd: The standard deviation of that; NaN where they say nothing.
-        leaning: Share of the population in the precision of its posterior, 0 to 1.
-    """
+    """One member without its population, on the scale on which the population is normal."""
 
     mean: float
     sd: float
@@ -26,29 +20,13 @@ class Alone(NamedTuple):
 
 
 def estimate_alone(value: np.ndarray, location: np.ndarray, spread: np.ndarray) -> Alone:
-    r"""Take a normal population out of the posterior draws of one of its members.
-
-    A likelihood $\exp(b x - p x^2 / 2)$ of the member makes its draws, given location $\mu$ and
-    spread $s$ of the same draw,
-
-    $$ x | \mu, s \sim Normal(m, v), \qquad v = \frac{1}{p + s^{-2}}, \qquad
-       m = v (b + \mu s^{-2}) $$
-
-    The log density of all draws is concave in (b, p): Newton's method finds its maximum. So the
-    estimate is exact, up to Monte Carlo error, for any posterior of location and spread.
-
-    Args:
-        value: Draws of the member on the population's scale, (draw,), finite.
-        location: Of the population, same shape and scale.
-        spread: Of the population, same shape, >= 0.
-
-    Returns:
-        Mean b / p and standard deviation p^(-1/2). The member says nothing where p lies within
-        two standard errors of zero, and where its draws do not move.
-
-    Raises:
-        Nothing.
-    """
+    """Take a normal population out of the posterior draws of one of its members."""
+    # A likelihood $\exp(b x - p x^2 / 2)$ of the member makes its draws, given location $\mu$ and
+    # spread $s$ of the same draw,
+    # $$ x | \mu, s \sim Normal(m, v), \qquad v = \frac{1}{p + s^{-2}}, \qquad m = v (b + \mu
+    # s^{-2}) $$
+    # The log density of all draws is concave in (b, p): Newton's method finds its maximum. So the
+    # estimate is exact, up to Monte Carlo error, for any posterior of location and spread.
     center, unit = float(value.mean()), float(value.std())
     if not unit > 0.0:
         return Alone(math.nan, math.nan, math.nan)

@@ -45,13 +45,7 @@ OTHER_MODES = {
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """Whether a fit may be used.
-
-    Args:
-        converged: False when anything is listed in `problems`.
-        problems: What makes the numbers unusable, each a sentence with its remedy.
-        cautions: What a reader of the numbers should know.
-    """
+    """Whether a fit may be used."""
 
     converged: bool
     problems: tuple[str, ...]
@@ -152,20 +146,9 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
 
 
 def laplace_k_hat(result: xr.DataTree) -> float:
-    """How far draws of Laplace or a guide are from the posterior, as Pareto k-hat of their weights.
-
-    $$ w = p(z | data) / q(z) $$
-
-    Args:
-        result: A fit whose `sample_stats` hold `log_weight` = log p - log q, up to a constant.
-
-    Returns:
-        k-hat: below 0.7 the approximation can be trusted; minus infinity when all weights are
-        equal; NaN where no weights are stored, or one is not a number.
-
-    Source:
-        Vehtari et al. (2024), JMLR 25(72).
-    """
+    """How far draws of Laplace or a guide are from the posterior, as Pareto k-hat of their weights."""
+    # $$ w = p(z | data) / q(z) $$
+    # Source: Vehtari et al. (2024), JMLR 25(72).
     stats = stats_of(result)
     if "log_weight" not in stats:
         return math.nan

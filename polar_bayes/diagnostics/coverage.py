@@ -85,17 +85,7 @@ def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
 
 
 def map_scalars(maps: xr.Dataset) -> list[Scalar]:
-    """The numbers that a map has in each pixel, labeled and in the order of a fit of one.
-
-    Args:
-        maps: Of `polar_bayes.fit_pixels`, or opened from a store.
-
-    Returns:
-        Scalars without draws: values stand in the maps.
-
-    Raises:
-        FitError: It holds no maps.
-    """
+    """The numbers that a map has in each pixel, labeled and in the order of a fit of one."""
     names = [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
     if not names or "status" not in maps:
         raise FitError("it holds no maps", where="maps", mend="give what fit_pixels returns")

@@ -22,19 +22,7 @@ WITHOUT = {"discrepancy": "the discrepancy term", "instrument": "any instrument 
 
 
 def compare_without(result: xr.DataTree, part: str) -> pd.DataFrame:
-    """The material's intervals with and without a part of the instrument, side by side.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-        part: A key of `WITHOUT`.
-
-    Returns:
-        One row per material parameter that both fits have; `width_ratio` is the width of the 95%
-        interval without the part over that with it. Empty where the tree holds no such fit.
-
-    Raises:
-        FitError: The tree holds no posterior.
-    """
+    """The material's intervals with and without a part of the instrument, side by side."""
     found = posterior_scalars(result)
     rows, labels = [], []
     plain = {}

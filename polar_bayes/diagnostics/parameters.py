@@ -22,15 +22,7 @@ OF_PROCESSES = ("_level", "_amplitude", "_length")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scalar:
-    """One number that a fit estimates.
-
-    Args:
-        label: Its name in ArviZ's style, such as `refractive_index[450]`.
-        name: The variable that it belongs to.
-        index: Where in that variable, by dim.
-        labels: The coordinate of each dim as text.
-        draws: Its draws, shape (chain, draw), in the unit of the variable.
-    """
+    """One number that a fit estimates."""
 
     label: str
     name: str
@@ -45,30 +37,13 @@ class Scalar:
 
 
 def is_hyperparameter(name: str, names: Collection[str]) -> bool:
-    """True for what describes a population, or a process over wavelength, of another parameter.
-
-    Args:
-        name: The variable.
-        names: All variables of the posterior: `x_spread` is a spread where `x` is beside it.
-
-    Returns:
-        False for parameters of the material, the instrument and the noise.
-    """
+    """True for what describes a population, or a process over wavelength, of another parameter."""
     owners = [name.removesuffix(end) for end in OF_POPULATIONS + OF_PROCESSES if name.endswith(end)]
     return any(owner in names for owner in owners)
 
 
 def scalars(group: xr.Dataset) -> list[Scalar]:
-    """Every scalar of a group of draws.
-
-    Args:
-        group: The dataset of `posterior` or `prior`, with dims chain and draw.
-
-    Returns:
-        Material parameters first, then those of populations and processes, then other single
-        numbers, then the entries of vectors. Equal labels (two readings at one wavelength) are
-        told apart by `#2`, `#3`.
-    """
+    """Every scalar of a group of draws."""
     names = set(map(str, group.data_vars))
     ordered = sorted(group.data_vars, key=lambda name: _rank(str(name), group[name], names))
     found = [scalar for name in ordered for scalar in _entries(str(name), group[name])]
@@ -81,11 +56,7 @@ def scalars(group: xr.Dataset) -> list[Scalar]:
 
 
 def posterior_scalars(result: xr.DataTree) -> list[Scalar]:
-    """Every scalar of the posterior of a result, which is checked first.
-
-    Raises:
-        FitError: It is no fit, or does not hold together.
-    """
+    """Every scalar of the posterior of a result, which is checked first."""
     check_fit(result)
     return scalars(result["posterior"].to_dataset())
 

@@ -54,16 +54,7 @@ MEMBER_COLUMNS = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Population:
-    """One pooled parameter, at one wavelength where it has several.
-
-    Args:
-        label: Such as `refractive_index` or `refractive_index[450]`.
-        location: Its location.
-        spread: Its spread.
-        members: The parameter of every member.
-        low: Least value that a member can have.
-        high: Largest value that a member can have.
-    """
+    """One pooled parameter, at one wavelength where it has several."""
 
     label: str
     location: Scalar
@@ -122,17 +113,7 @@ class Population:
 
 
 def populations(result: xr.DataTree) -> list[Population]:
-    """Every pooled parameter of a result, wavelength by wavelength.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-
-    Returns:
-        The populations; none where nothing is pooled.
-
-    Raises:
-        FitError: The tree holds no posterior.
-    """
+    """Every pooled parameter of a result, wavelength by wavelength."""
     found: dict[str, list[Scalar]] = {}
     for scalar in posterior_scalars(result):
         found.setdefault(scalar.name, []).append(scalar)
@@ -184,33 +165,16 @@ def population_summary(result: xr.DataTree) -> pd.DataFrame:
 
 
 def shrinkage(result: xr.DataTree) -> pd.DataFrame:
-    r"""How far the population pulls each member, and where its own readings alone would put it.
-
-    The estimate of a member alone is not fitted again: the population is taken out of the draws.
-    If the readings of a member say $x_m \sim Normal(a, 1/p)$ on the population's scale, its
-    posterior given the population is
-
-    $$ x_m | \mu, s \sim Normal\Big(\frac{p a + \mu / s^2}{p + 1 / s^2},
-       \frac{1}{p + 1 / s^2}\Big) $$
-
-    and $a$ and $p$ are those under which the draws are likeliest, so that the uncertainty of
-    location and spread is accounted for. This holds where what a member's readings say is about
-    normal on that scale, and the bounds of an index are far; elsewhere it is an approximation.
-    The other parameters of the member keep their priors.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-
-    Returns:
-        A row for each member with mean, q2.5 and q97.5 of its posterior; alone, alone_q2.5 and
-        alone_q97.5 without the population, NaN where the member's own readings say nothing (p
-        within two standard errors of zero); and leaning, the share of the population in the
-        precision of the posterior, from 0 (its own readings decide) to 1. Empty where nothing is
-        pooled and for a point fit.
-
-    Raises:
-        FitError: The tree holds no posterior.
-    """
+    """How far the population pulls each member, and where its own readings alone would put it."""
+    # The estimate of a member alone is not fitted again: the population is taken out of the draws.
+    # If the readings of a member say $x_m \sim Normal(a, 1/p)$ on the population's scale, its
+    # posterior given the population is
+    # $$ x_m | \mu, s \sim Normal\Big(\frac{p a + \mu / s^2}{p + 1 / s^2}, \frac{1}{p + 1 /
+    # s^2}\Big) $$
+    # and $a$ and $p$ are those under which the draws are likeliest, so that the uncertainty of
+    # location and spread is accounted for. This holds where what a member's readings say is about
+    # normal on that scale, and the bounds of an index are far; elsewhere it is an approximation.
+    # The other parameters of the member keep their priors.
     found = _drawn(result)
     rows, labels = [], []
     for each in found:

@@ -34,16 +34,7 @@ LARGEST_BAND = 500
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Loo:
-    """Leave-one-out cross-validation by smoothed importance sampling.
-
-    Args:
-        elpd: Expected log density of a new reading, summed over the readings, unit nat.
-        standard_error: Of `elpd`; NaN for a single reading.
-        p_loo: Effective number of parameters.
-        pareto_k: Of each reading; above 0.7 its own share cannot be trusted.
-        pit: Share of the prediction from all other readings that lies below each reading.
-        parts: Log density of each reading given all others, unit nat.
-    """
+    """Leave-one-out cross-validation by smoothed importance sampling."""
 
     elpd: float
     standard_error: float
@@ -60,17 +51,7 @@ class Loo:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Check:
-    """How one recorded variable compares with its prediction.
-
-    Args:
-        name: The variable: dop, q, u or intensity.
-        count: Readings that were compared.
-        residual_rms: Root mean square of reading minus noise-free prediction, averaged over the
-            draws; unit of the variable (for dop, q and u: 1).
-        pit: Share of the prediction below each reading; empty where there are too few draws.
-        coverage: Share of readings inside the central predictive interval, by its probability.
-        loo: Leave-one-out results, or None where they cannot be had.
-    """
+    """How one recorded variable compares with its prediction."""
 
     name: str
     count: int
@@ -82,14 +63,7 @@ class Check:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Band:
-    """Empirical distribution of PIT values minus the uniform, with a simultaneous band.
-
-    Args:
-        at: Where, unit 1, range [0, 1].
-        difference: Observed share below minus `at`.
-        lower: Lower edge of the band of uniform samples of this size.
-        upper: Its upper edge.
-    """
+    """Empirical distribution of PIT values minus the uniform, with a simultaneous band."""
 
     at: np.ndarray
     difference: np.ndarray
@@ -104,18 +78,7 @@ class Band:
 
 
 def predictive_checks(result: xr.DataTree) -> dict[str, Check]:
-    """Compare every recorded variable with its prediction.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-
-    Returns:
-        A check for each variable with at least one reading left. Without draws (a point fit)
-        only the residuals are there.
-
-    Raises:
-        FitError: The tree holds no posterior.
-    """
+    """Compare every recorded variable with its prediction."""
     check_fit(result)
     efficiency = _relative_efficiency(result)
     correction = _correction(result)
@@ -128,18 +91,8 @@ def predictive_checks(result: xr.DataTree) -> dict[str, Check]:
 
 
 def pit_band(pit: np.ndarray) -> Band | None:
-    """Where PIT values leave the uniform distribution, judged at all places at once.
-
-    Args:
-        pit: PIT values, shape (reading,), range [0, 1].
-
-    Returns:
-        The curve and the band that 95% of uniform samples stay inside, or None below two values.
-        The band is simulated with a fixed seed.
-
-    Source:
-        Saeilynoja et al. (2022), Statistics and Computing 32, 32.
-    """
+    """Where PIT values leave the uniform distribution, judged at all places at once."""
+    # Source: Saeilynoja et al. (2022), Statistics and Computing 32, 32.
     pit = pit[np.isfinite(pit)]
     if pit.size < 2:
         return None
@@ -196,15 +149,7 @@ def _select(result: xr.DataTree, name: str) -> _Part | None:
 
 
 def usable(result: xr.DataTree, name: str) -> np.ndarray:
-    """Which readings can be compared with a prediction: finite, valid and not saturated.
-
-    Args:
-        result: The tree.
-        name: A variable of `observed_data`.
-
-    Returns:
-        Booleans of that variable's shape.
-    """
+    """Which readings can be compared with a prediction: finite, valid and not saturated."""
     observed = result["observed_data"].to_dataset()[name]
     keep = np.isfinite(observed.to_numpy())
     constants = result["constant_data"].to_dataset() if "constant_data" in result.children else {}

@@ -38,29 +38,15 @@ COLUMNS = (
 
 
 def sensitivity(result: xr.DataTree) -> pd.DataFrame:
-    """How much of each answer came from the data, and how much from the prior.
-
-    `prior_inside` is the prior probability of the posterior's 95% interval: 0.95 when the data
-    said nothing, small when they did. Unlike a ratio of widths it is the same for a parameter and
-    its logarithm, and it does not mistake a posterior in the prior's tail for the prior. The
-    verdict is "determined" up to 0.5, "partly" up to 0.85, else "not determined". `width_left` is
-    the interval's width over that of the prior, `contraction` 1 - variance over prior variance.
-    The two sensitivities say how fast the posterior moves when the log priors (all together) or
-    the log likelihood are multiplied by a number near 1.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-
-    Returns:
-        One row per parameter, the material first, with the columns of `COLUMNS`; NaN where a
-        number cannot be had. Empty for a point fit, which has no posterior width.
-
-    Raises:
-        FitError: The tree holds no posterior.
-
-    Source:
-        Kallioinen et al. (2024), Statistics and Computing 34, 57 (power scaling).
-    """
+    """How much of each answer came from the data, and how much from the prior."""
+    # `prior_inside` is the prior probability of the posterior's 95% interval: 0.95 when the data
+    # said nothing, small when they did. Unlike a ratio of widths it is the same for a parameter and
+    # its logarithm, and it does not mistake a posterior in the prior's tail for the prior. The
+    # verdict is "determined" up to 0.5, "partly" up to 0.85, else "not determined". `width_left` is
+    # the interval's width over that of the prior, `contraction` 1 - variance over prior variance.
+    # The two sensitivities say how fast the posterior moves when the log priors (all together) or
+    # the log likelihood are multiplied by a number near 1.
+    # Source: Kallioinen et al. (2024), Statistics and Computing 34, 57 (power scaling).
     found = posterior_scalars(result)
     if method_of(result) == "point":
         return pd.DataFrame(columns=list(COLUMNS))

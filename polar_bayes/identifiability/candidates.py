@@ -22,14 +22,7 @@ STEP = 2.5
 
 
 class Views(NamedTuple):
-    """Measured and possible views in one capture.
-
-    Args:
-        capture: Those that were measured, then the candidates.
-        measured: How many were.
-        directions: Of the candidates, (view, 4), degree.
-        wavelengths: For each wavelength of the capture, True where candidates have it.
-    """
+    """Measured and possible views in one capture."""
 
     capture: xr.Dataset
     measured: int
@@ -38,17 +31,7 @@ class Views(NamedTuple):
 
 
 def directions_of(views: xr.Dataset) -> Directions:
-    """The four angles of every view, (view, 4); those of the first patch where each has its own.
-
-    Args:
-        views: A Dataset with the angles of a capture.
-
-    Returns:
-        View zenith and azimuth, light zenith and azimuth, degree.
-
-    Raises:
-        Nothing.
-    """
+    """The four angles of every view, (view, 4); those of the first patch where each has its own."""
     columns = []
     for name in ANGLES:
         angle = views[name]
@@ -58,21 +41,9 @@ def directions_of(views: xr.Dataset) -> Directions:
 
 
 def default_candidates(capture: xr.Dataset, limit: float) -> xr.Dataset:
-    """Views every 2.5 degrees in the azimuths and under the lights that the capture has.
-
-    Where the light stands at the mirrored zenith in every view, as on a goniometer, it does so in
-    the candidates.
-
-    Args:
-        capture: A validated capture.
-        limit: Largest view zenith, degree.
-
-    Returns:
-        The four angles by `view`.
-
-    Raises:
-        Nothing.
-    """
+    """Views every 2.5 degrees in the azimuths and under the lights that the capture has."""
+    # Where the light stands at the mirrored zenith in every view, as on a goniometer, it does so in
+    # the candidates.
     measured = directions_of(capture)
     zeniths = np.arange(STEP, min(limit, 87.5) + 1e-9, STEP)
     if np.allclose(measured[:, 0], measured[:, 2]) and np.ptp(measured[:, 0]) > 0.0:
@@ -87,18 +58,7 @@ def default_candidates(capture: xr.Dataset, limit: float) -> xr.Dataset:
 def links_of_new(
     question: Question, readings: Sequence[str] | Mapping[str, AbstractLink] | None
 ) -> dict[str, AbstractLink]:
-    """How the readings of new views scatter.
-
-    Args:
-        question: The model of the views that were measured.
-        readings: Variables that new views record, with links or without; None for the same.
-
-    Returns:
-        A link for each.
-
-    Raises:
-        FitError: No such reading, nothing says how it scatters, or one is made of others.
-    """
+    """How the readings of new views scatter."""
     request, observed = question.request, question.program.observed
     if readings is None:
         return {name: link for name, link in request.links.items() if name in observed}
@@ -149,21 +109,7 @@ def _link_of(request: Request, name: str, given: AbstractLink | None) -> Abstrac
 
 
 def join(capture: xr.Dataset, candidates: xr.Dataset, readings: Sequence[str]) -> Views:
-    """Put candidates behind the views of a capture.
-
-    Args:
-        capture: A validated capture.
-        candidates: Angles by `view`; the light's may be missing where the capture has one light.
-            With a coordinate `wavelength` (some of the capture's) only these are measured. Stated
-            errors of readings (`q_error`) count; without them those of the capture do.
-        readings: All variables of the model, those of new views included.
-
-    Returns:
-        Both in one, to be validated.
-
-    Raises:
-        FitError: An angle is missing, or a wavelength is not the capture's.
-    """
+    """Put candidates behind the views of a capture."""
     candidates = _with_light(capture, candidates)
     count, measured = candidates.sizes["view"], capture.sizes["view"]
     old = _with_room(capture, candidates, readings)

@@ -30,13 +30,7 @@ PEAKS = 3
 
 
 class Curve(NamedTuple):
-    """Profiles on one grid; NaN where no track arrived.
-
-    Args:
-        z: Values of the coordinate, (point,).
-        value: Profile of each kind, (kind, point).
-        at: All coordinates there, (kind, point, size).
-    """
+    """Profiles on one grid; NaN where no track arrived."""
 
     z: np.ndarray
     value: np.ndarray
@@ -47,18 +41,7 @@ Density = Callable[[np.ndarray, float], tuple[float, np.ndarray]]
 
 
 def compile_density(split: Parts, data: Observations) -> Density:
-    """Minus log likelihood and weighted log prior, with their gradient, as one program.
-
-    Args:
-        split: The log density of the coordinates in its two parts.
-        data: The capture.
-
-    Returns:
-        A function of an unconstrained vector and the weight of the prior.
-
-    Raises:
-        Nothing.
-    """
+    """Minus log likelihood and weighted log prior, with their gradient, as one program."""
 
     def loss(z: jax.Array, weight: jax.Array, data: Any) -> jax.Array:
         parts = split(z, data)
@@ -81,22 +64,7 @@ def draw_curve(
     follow: Follow,
     grid: np.ndarray,
 ) -> Curve:
-    """Follow both kinds from every mode to both ends of the grid, and keep the best.
-
-    Args:
-        question: The model on its data.
-        held: The coordinate that is moved.
-        modes: Where to start.
-        density: Judges where a climb ended.
-        follow: Climbs.
-        grid: Values of the coordinate, rising.
-
-    Returns:
-        The profiles.
-
-    Raises:
-        Nothing.
-    """
+    """Follow both kinds from every mode to both ends of the grid, and keep the best."""
     center = modes.z[0, held]
     below, above = grid[grid <= center][::-1], grid[grid > center]
     longest = max(len(below), len(above))
@@ -141,21 +109,7 @@ def widened(
     prior: np.ndarray,
     points: int,
 ) -> Curve:
-    """Profiles four sds to either side, or over almost all of the prior where they stay open.
-
-    Args:
-        draw: Gives the profiles on a grid.
-        modes: The first is the middle of the grid.
-        held: The coordinate that is moved.
-        prior: Its draws from the prior.
-        points: On the grid.
-
-    Returns:
-        The profiles.
-
-    Raises:
-        Nothing.
-    """
+    """Profiles four sds to either side, or over almost all of the prior where they stay open."""
     center = modes.z[0, held]
     sd = float(np.sqrt(modes.covariance[0][held, held]))
     low, high = center - REACH * sd, center + REACH * sd
@@ -186,19 +140,7 @@ def _is_open(value: np.ndarray, end: int) -> bool:
 
 
 def interval(theta: np.ndarray, value: np.ndarray) -> tuple[float, float, bool, bool]:
-    """Where a profile has fallen by less than 1.92.
-
-    Args:
-        theta: Values of the parameter, rising.
-        value: The profile, NaN where unknown.
-
-    Returns:
-        Both ends, and whether the profile is still higher at the first and last known value.
-        Between neighbors the ends are interpolated; beside a gap, the end is the value beyond it.
-
-    Raises:
-        Nothing.
-    """
+    """Where a profile has fallen by less than 1.92."""
     known = np.isfinite(value)
     if not known.any():
         return np.nan, np.nan, True, True

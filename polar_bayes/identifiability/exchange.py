@@ -15,13 +15,7 @@ Loss = Callable[[Float[np.ndarray, "draw option size size"]], Float[np.ndarray, 
 
 
 class Chosen(NamedTuple):
-    """A choice in the order in which each adds most to those before.
-
-    Args:
-        picks: Candidates.
-        losses: Before any, and after each.
-        exchanges: How many were made after the greedy choice.
-    """
+    """A choice in the order in which each adds most to those before."""
 
     picks: list[int]
     losses: list[float]
@@ -36,25 +30,8 @@ def choose(
     clashes: Bool[np.ndarray, "candidate candidate"],
     count: int,
 ) -> Chosen:
-    """Pick candidates that make a loss of the summed information small.
-
-    Args:
-        loss: Of the information of several options, averaged over draws.
-        base: What is known before, prior included.
-        each: What each candidate adds.
-        allowed: Those that can be picked.
-        clashes: Pairs that cannot be picked both.
-        count: How many.
-
-    Returns:
-        The choice: no exchange of one pick for one candidate lowers its loss.
-
-    Raises:
-        FitError: So many cannot be picked.
-
-    Source:
-        Fedorov (1972), Theory of Optimal Experiments, chapter 3: exchange.
-    """
+    """Pick candidates that make a loss of the summed information small."""
+    # Source: Fedorov (1972), Theory of Optimal Experiments, chapter 3: exchange.
 
     def best(picks: list[int]) -> tuple[int, float]:
         """The candidate that adds most to some picks."""

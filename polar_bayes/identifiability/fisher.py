@@ -23,13 +23,7 @@ from polar_bayes.observation.distributions import MeanConcentrationBeta
 
 
 class Seen(NamedTuple):
-    """What the readings of one variable see of the coordinates; 0 where they are not valid.
-
-    Args:
-        slope: J, (..., view, parameter, size), with the parameters of the reading's distribution.
-        information: I, (..., view, parameter, parameter).
-        concentration: Of Beta noise, (..., view), whose first parameter is its mean; None else.
-    """
+    """What the readings of one variable see of the coordinates; 0 where they are not valid."""
 
     slope: Array
     information: Array
@@ -37,19 +31,7 @@ class Seen(NamedTuple):
 
 
 def look(program: Program, z: Float[Array, " size"], data: Observations) -> dict[str, Seen]:
-    """Derivatives and information of every reading, with the optics told once.
-
-    Args:
-        program: The model.
-        z: Where.
-        data: Directions, masks and brightness count; the readings do not.
-
-    Returns:
-        By observed variable.
-
-    Raises:
-        FitError: A link gives a distribution of which nothing is known.
-    """
+    """Derivatives and information of every reading, with the optics told once."""
 
     def told(z: Array) -> tuple[dict[str, Array], dict[str, tuple]]:
         fixed = distributions(program, z, data)
@@ -72,34 +54,12 @@ def look(program: Program, z: Float[Array, " size"], data: Observations) -> dict
 def expected_information(
     program: Program, z: Float[Array, " size"], data: Observations
 ) -> Float[Array, "size size"]:
-    """Fisher information of a capture's layout about the unconstrained coordinates.
-
-    Args:
-        program: The model.
-        z: Where.
-        data: Directions, masks and brightness count; the readings do not.
-
-    Returns:
-        The matrix, without the prior.
-
-    Raises:
-        FitError: A link gives a distribution of which nothing is known.
-    """
+    """Fisher information of a capture's layout about the unconstrained coordinates."""
     return sum_information(look(program, z, data))
 
 
 def sum_information(seen: Mapping[str, Seen]) -> Float[Array, "size size"]:
-    """Fisher information of all readings about the unconstrained coordinates.
-
-    Args:
-        seen: What the readings see.
-
-    Returns:
-        The matrix, without the prior.
-
-    Raises:
-        Nothing.
-    """
+    """Fisher information of all readings about the unconstrained coordinates."""
     parts = [
         jnp.einsum("...ki,...kl,...lj->ij", each.slope, each.information, each.slope)
         for each in seen.values()
@@ -110,21 +70,7 @@ def sum_information(seen: Mapping[str, Seen]) -> Float[Array, "size size"]:
 def information_of_each(
     program: Program, z: Float[Array, " size"], data: Observations, kept: int
 ) -> dict[str, Float[Array, "reading size size"]]:
-    """The same for every variable and view, or every variable, wavelength and view.
-
-    Args:
-        program: The model.
-        z: Where.
-        data: As above.
-        kept: How many of the last axes of the readings are kept apart; the others are summed.
-
-    Returns:
-        For each observed variable a matrix for each entry of the kept axes, flattened in their
-        order.
-
-    Raises:
-        FitError: A link gives a distribution of which nothing is known.
-    """
+    """The same for every variable and view, or every variable, wavelength and view."""
     apart = int(np.prod(data.shape[len(data.shape) - kept :]))
 
     def of_each(slope: Array, each: Array) -> Array:
@@ -139,19 +85,7 @@ def information_of_each(
 def distributions(
     program: Program, z: Float[Array, " size"], data: Observations
 ) -> dict[str, dist.Distribution]:
-    """How the readings of every observed variable scatter at a point.
-
-    Args:
-        program: The model.
-        z: Where.
-        data: The capture.
-
-    Returns:
-        The distributions, by variable, inside their masks.
-
-    Raises:
-        Nothing.
-    """
+    """How the readings of every observed variable scatter at a point."""
     fixed = handlers.substitute(program.model, data=program.constrain(z))
     trace = handlers.trace(handlers.seed(fixed, jax.random.key(0))).get_trace(data)
     return {name: trace[name]["fn"] for name in program.observed}
@@ -160,40 +94,16 @@ def distributions(
 def prior_precision(
     program: Program, z: Float[Array, " size"], data: Observations
 ) -> Float[Array, "size size"]:
-    """Curvature of minus the log prior of the unconstrained coordinates.
-
-    Args:
-        program: The model.
-        z: Where.
-        data: Any capture of the layout.
-
-    Returns:
-        The matrix; see `sound_precision` where it has no inverse.
-
-    Raises:
-        Nothing.
-    """
+    """Curvature of minus the log prior of the unconstrained coordinates."""
     return jax.hessian(lambda z: program.prior_potential(z, data))(z)
 
 
 def sound_precision(
     curvature: Float[np.ndarray, "size size"], draws: Float[np.ndarray, "draw size"]
 ) -> Float[np.ndarray, "size size"]:
-    """The curvature of a prior, or the inverse covariance of its draws where it is no precision.
-
-    Far in the tail of a bounded prior, and in the funnel of a population, the curvature has a
-    direction in which the density bends the other way.
-
-    Args:
-        curvature: Of minus the log prior.
-        draws: From the prior, unconstrained.
-
-    Returns:
-        A positive definite matrix.
-
-    Raises:
-        Nothing.
-    """
+    """The curvature of a prior, or the inverse covariance of its draws where it is no precision."""
+    # Far in the tail of a bounded prior, and in the funnel of a population, the curvature has a
+    # direction in which the density bends the other way.
     try:
         np.linalg.cholesky(curvature)
         return 0.5 * (curvature + curvature.T)

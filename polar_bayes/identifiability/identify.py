@@ -37,16 +37,7 @@ from polar_bayes.progress import Progress, watched
 
 
 class Expected(NamedTuple):
-    """Information and covariance of the unconstrained coordinates.
-
-    Args:
-        data: Fisher information of the capture.
-        prior: Curvature of the prior.
-        paper: The paper's information of its degrees of polarization.
-        exact: The exact one of the same readings, noise known.
-        slopes: Derivatives of the parameters, flattened, by the coordinates.
-        values: The parameters there.
-    """
+    """Information and covariance of the unconstrained coordinates."""
 
     data: np.ndarray
     prior: np.ndarray

@@ -26,32 +26,15 @@ NODES = 400
 
 
 class Told(NamedTuple):
-    """A distribution's parameters, and what one reading tells of them.
-
-    Args:
-        parameters: Each (..., view).
-        information: (..., view, parameter, parameter).
-    """
+    """A distribution's parameters, and what one reading tells of them."""
 
     parameters: tuple[Float[Array, "..."], ...]
     information: Float[Array, "... parameter parameter"]
 
 
 def information(distribution: dist.Distribution) -> Told:
-    """Fisher information of one reading about the parameters of its distribution.
-
-    Args:
-        distribution: As a link gives it, in a mask or an expansion or not.
-
-    Returns:
-        Parameters and information, by view.
-
-    Raises:
-        FitError: Nothing is known of this distribution.
-
-    Source:
-        Lehmann & Casella (1998), Theory of Point Estimation, section 2.5.
-    """
+    """Fisher information of one reading about the parameters of its distribution."""
+    # Source: Lehmann & Casella (1998), Theory of Point Estimation, section 2.5.
     shape = distribution.batch_shape
     distribution = bare(distribution)
     for family, told in _FAMILIES.items():

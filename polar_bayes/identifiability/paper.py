@@ -21,42 +21,16 @@ from polar_bayes.observation.data import Observations
 def paper_information(
     program: Program, z: Float[Array, " size"], data: Observations
 ) -> tuple[Float[Array, "size size"], Float[Array, "size size"]]:
-    """The paper's sum over the readings with Beta noise, and the exact one about their means.
-
-    The noise counts as known in both: only the means move.
-
-    Args:
-        program: The model.
-        z: Where.
-        data: Directions, masks and brightness count; the readings do not.
-
-    Returns:
-        Both matrices; NaN where no reading has Beta noise.
-
-    Raises:
-        FitError: A link gives a distribution of which nothing is known.
-
-    Source:
-        The paper, on identifiability: the sum of kappa S S' over views.
-    """
+    """The paper's sum over the readings with Beta noise, and the exact one about their means."""
+    # The noise counts as known in both: only the means move.
+    # Source: The paper, on identifiability: the sum of kappa S S' over views.
     return sum_as_paper(look(program, z, data), program.size)
 
 
 def sum_as_paper(
     seen: Mapping[str, Seen], size: int
 ) -> tuple[Float[Array, "size size"], Float[Array, "size size"]]:
-    """The same from what the readings see.
-
-    Args:
-        seen: By observed variable.
-        size: How many coordinates there are.
-
-    Returns:
-        Both matrices.
-
-    Raises:
-        Nothing.
-    """
+    """The same from what the readings see."""
     paper: list[Array] = []
     exact: list[Array] = []
     for each in seen.values():
@@ -76,18 +50,6 @@ def sd_with(
     prior: Float[np.ndarray, "size size"],
     slopes: Float[np.ndarray, "parameter size"],
 ) -> Float[np.ndarray, " parameter"]:
-    """Standard deviations of parameters, expected from an information matrix and a prior.
-
-    Args:
-        information: About the coordinates; NaN gives NaN.
-        prior: Precision of the coordinates before the data.
-        slopes: Of the parameters by the coordinates.
-
-    Returns:
-        One for each parameter, in its unit.
-
-    Raises:
-        Nothing.
-    """
+    """Standard deviations of parameters, expected from an information matrix and a prior."""
     covariance = np.linalg.inv(information + prior)
     return np.sqrt(np.einsum("pi,ij,pj->p", slopes, covariance, slopes))

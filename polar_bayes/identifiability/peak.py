@@ -27,14 +27,7 @@ PRIOR_DRAWS = 500
 
 
 class Question(NamedTuple):
-    """A model and a capture, ready to be asked.
-
-    Args:
-        request: What the caller asked for.
-        data: The capture as arrays.
-        program: The model on that layout.
-        prior: Unconstrained draws from the prior, (draw, size).
-    """
+    """A model and a capture, ready to be asked."""
 
     request: Request
     data: Observations
@@ -51,23 +44,7 @@ def pose(
     largest_view_zenith: float | None,
     seed: int,
 ) -> Question:
-    """Check what a caller asked for and compile it; to be called in double precision.
-
-    Args:
-        capture: As for `polar_bayes.fit`; the other arguments too.
-        model: A name or a callable.
-        scene: A name, a `Scene` or None.
-        priors: Overrides.
-        links: One link, a mapping or None.
-        largest_view_zenith: Unit degree, or None.
-        seed: Of the draws.
-
-    Returns:
-        The model on these data.
-
-    Raises:
-        PolarBayesError: Something cannot be used; see `polar_bayes.fit`.
-    """
+    """Check what a caller asked for and compile it; to be called in double precision."""
     request = resolve(
         capture, model, "laplace", scene, priors, links, largest_view_zenith, seed, "double"
     )
@@ -80,19 +57,7 @@ def pose(
 def find_peaks(
     question: Question, progress: Progress | None, potential: ValueAndGradient | None = None
 ) -> Modes:
-    """The modes of the posterior, heaviest first.
-
-    Args:
-        question: The model on its data.
-        progress: Called with the name of a stage and the fraction of it that is done.
-        potential: Minus the log density and its gradient, where they are compiled already.
-
-    Returns:
-        The modes.
-
-    Raises:
-        FitError: No start reached a peak.
-    """
+    """The modes of the posterior, heaviest first."""
     potential = potential or CompiledPotential(question.program, question.data)
     return find_modes(potential, question.prior[:STARTS], progress or silent)
 
@@ -106,12 +71,7 @@ def flat_parameters(
 
 
 class Labels(NamedTuple):
-    """The scalar parameters as tables list them.
-
-    Args:
-        scalars: With their draws from the prior, the material first.
-        rows: Where each stands in `flat_parameters`.
-    """
+    """The scalar parameters as tables list them."""
 
     scalars: list[Scalar]
     rows: list[int]
@@ -128,17 +88,7 @@ class Labels(NamedTuple):
 
 
 def label_parameters(question: Question) -> Labels:
-    """Name every scalar parameter of a model, with its prior.
-
-    Args:
-        question: The model on its data.
-
-    Returns:
-        The labels.
-
-    Raises:
-        Nothing.
-    """
+    """Name every scalar parameter of a model, with its prior."""
     program, data = question.program, question.data
     told = compiled(jax.vmap(lambda z: program.parameters(z, data)))(question.prior)
     draws = {name: np.asarray(x)[None] for name, x in told.items()}

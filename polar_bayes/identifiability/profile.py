@@ -40,14 +40,7 @@ KINDS = ("posterior", "likelihood")
 
 
 class Place(NamedTuple):
-    """One scalar parameter among the coordinates.
-
-    Args:
-        label: Its name in tables.
-        site: The site that it belongs to.
-        entry: Its number in that site.
-        held: Its number among all coordinates.
-    """
+    """One scalar parameter among the coordinates."""
 
     label: str
     site: str

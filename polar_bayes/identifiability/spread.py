@@ -22,38 +22,14 @@ FOLD = 7
 
 
 def draws_at(modes: Modes, count: int, seed: int) -> Float[np.ndarray, "draw size"]:
-    """Draws of the normal approximation at the heaviest mode.
-
-    Args:
-        modes: The peaks.
-        count: How many draws.
-        seed: Of the draws.
-
-    Returns:
-        Unconstrained.
-
-    Raises:
-        Nothing.
-    """
+    """Draws of the normal approximation at the heaviest mode."""
     key = jax.random.fold_in(jax.random.key(seed), FOLD)
     noise = np.asarray(jax.random.normal(key, (count, modes.z.shape[1])))
     return modes.z[0] + noise @ np.linalg.cholesky(modes.covariance[0]).T
 
 
 def draws_of(question: Question, result: xr.DataTree, count: int) -> Float[np.ndarray, "draw size"]:
-    """Draws of a fit, evenly spaced, as unconstrained vectors.
-
-    Args:
-        question: The same model on the same layout.
-        result: What `polar_bayes.fit` returned.
-        count: How many draws.
-
-    Returns:
-        Unconstrained; fewer where the fit has fewer.
-
-    Raises:
-        FitError: It is no fit of this model and layout.
-    """
+    """Draws of a fit, evenly spaced, as unconstrained vectors."""
     check_fit(result, "next_views: result")
     program = question.program
     whole = program.constrain(jnp.zeros(program.size))
@@ -89,18 +65,7 @@ def draws_of(question: Question, result: xr.DataTree, count: int) -> Float[np.nd
 def unconstrain(
     program: Program, values: Mapping[str, Float[np.ndarray, "draw ..."]]
 ) -> Float[np.ndarray, "draw size"]:
-    """Draws of all latent sites as unconstrained vectors.
-
-    Args:
-        program: The model.
-        values: By site, in their supports.
-
-    Returns:
-        One vector for each draw.
-
-    Raises:
-        Nothing.
-    """
+    """Draws of all latent sites as unconstrained vectors."""
 
     def free(values: dict[str, Array]) -> Array:
         moved = {n: dist.biject_to(s).inv(values[n]) for n, s in program.supports.items()}
@@ -111,18 +76,7 @@ def unconstrain(
 
 
 def embed(program: Program, wide: Program) -> Int[np.ndarray, " size"]:
-    """Where the coordinates of a program stand in one with more readings.
-
-    Args:
-        program: Of the views that were measured.
-        wide: Of these and of candidates, perhaps with more variables.
-
-    Returns:
-        For each coordinate of the first its place in the second.
-
-    Raises:
-        FitError: A site has another shape there: every view has coordinates of its own.
-    """
+    """Where the coordinates of a program stand in one with more readings."""
     ours, theirs = (
         {n: np.asarray(x) for n, x in one.unravel(jnp.arange(float(one.size))).items()}
         for one in (program, wide)

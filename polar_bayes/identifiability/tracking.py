@@ -44,20 +44,7 @@ class Split(NamedTuple):
 def split_density(
     program: Program, known: Collection[str], z: Float[Array, " size"], data: Observations
 ) -> Split:
-    """The log posterior density of the coordinates in its two parts.
-
-    Args:
-        program: The model.
-        known: Sites whose prior belongs to the first part.
-        z: Where.
-        data: The capture.
-
-    Returns:
-        The parts; their sum is minus `Program.potential`, up to a constant.
-
-    Raises:
-        Nothing.
-    """
+    """The log posterior density of the coordinates in its two parts."""
     free = program.unravel(z)
     moves = {name: dist.biject_to(program.supports[name]) for name in free}
     latent = {name: move(free[name]) for name, move in moves.items()}
@@ -72,14 +59,7 @@ def split_density(
 
 
 class Slice(NamedTuple):
-    """How the other coordinates move when one does, by the normal approximation at a mode.
-
-    Args:
-        held: The coordinate that is moved.
-        slope: Of all coordinates by that one, (size,).
-        width: A root of the covariance of the others, given that one: (size, size - 1), or one
-            column of zeros where there is no other.
-    """
+    """How the other coordinates move when one does, by the normal approximation at a mode."""
 
     held: int
     slope: np.ndarray
@@ -87,18 +67,7 @@ class Slice(NamedTuple):
 
 
 def slice_at(covariance: Float[np.ndarray, "size size"], index: int) -> Slice:
-    """The conditional normal distribution of all coordinates but one.
-
-    Args:
-        covariance: Of the posterior at a mode.
-        index: The one that will be held.
-
-    Returns:
-        The slice.
-
-    Raises:
-        Nothing.
-    """
+    """The conditional normal distribution of all coordinates but one."""
     size = len(covariance)
     slope = covariance[:, index] / covariance[index, index]
     others = np.delete(np.arange(size), index)
@@ -114,17 +83,7 @@ Follow = Callable[[Array, Array, Array, Array, Observations], Array]
 
 
 def make_follow(split: Parts, index: int) -> Follow:
-    """Compile the way of all tracks along their targets.
-
-    Args:
-        split: The log density of the coordinates in its two parts.
-        index: The coordinate that is moved.
-
-    Returns:
-        A function of starts (track, size), targets (track, point), slope (size,), width
-        (size, size - 1) and the data. It gives the coordinates at every target for each of
-        `WEIGHTS`, (track, point, weight, size), whether they are a peak or not.
-    """
+    """Compile the way of all tracks along their targets."""
     solver = optx.BFGS(rtol=1e-6, atol=1e-5)
 
     def plain(y: Array, guess: Array, weight: Array, width: Array, data: Observations) -> Array:

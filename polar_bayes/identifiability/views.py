@@ -55,16 +55,7 @@ WIDTH = 2.0 * 1.959963984540054
 
 
 class Design(NamedTuple):
-    """All that a choice needs, averaged over draws of what the material may be.
-
-    Args:
-        base: Information before, prior included, (draw, size, size).
-        each: What each candidate adds, (draw, candidate, size, size).
-        slopes: Of the chosen parameters by the coordinates, (draw, parameter, size).
-        view: Which view each candidate belongs to.
-        wavelength: Which wavelength; -1 where it has all.
-        reading: Which variable; empty where it has all.
-    """
+    """All that a choice needs, averaged over draws of what the material may be."""
 
     base: np.ndarray
     each: np.ndarray

@@ -20,31 +20,14 @@ Starts = tuple[np.ndarray, np.ndarray]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lone:
-    """The model of one patch, compiled once for all patches of all captures.
-
-    Args:
-        program: The model on a capture of one patch.
-        groups: Which of its coordinates are the patch's own.
-    """
+    """The model of one patch, compiled once for all patches of all captures."""
 
     program: Program
     groups: Groups
 
 
 def find_lone(model: Model, groups: Groups, data: Observations) -> Lone | None:
-    """The model told for one patch, where it can be: not where a prior names every patch.
-
-    Args:
-        model: The model of the data alone.
-        groups: The patches of the whole capture.
-        data: The whole capture.
-
-    Returns:
-        None where the shapes of one patch do not fit the model.
-
-    Raises:
-        Nothing.
-    """
+    """The model told for one patch, where it can be: not where a prior names every patch."""
     first = group_of(data, 0)
     try:
         program = compile_program(model, first)
@@ -59,13 +42,7 @@ def find_lone(model: Model, groups: Groups, data: Observations) -> Lone | None:
 
 
 class Alone:
-    """The patches of one capture, each by itself.
-
-    Args:
-        lone: The model of one patch.
-        data: The whole capture.
-        threads: Patches that are climbed at once.
-    """
+    """The patches of one capture, each by itself."""
 
     def __init__(self, lone: Lone, data: Observations, threads: int = 2) -> None:
         self._program, self._groups = lone.program, lone.groups
@@ -95,20 +72,7 @@ class Alone:
         movable: np.ndarray,
         tell: Callable[[float], None],
     ) -> list[Modes]:
-        """The peaks of every patch over its own coordinates and the movable common ones.
-
-        Args:
-            starts: For each patch, where to climb from.
-            common: Where the common coordinates stand that do not move.
-            movable: True for those that do, (common,).
-            tell: Called with the fraction that is done.
-
-        Returns:
-            For each patch its distinct peaks: its own coordinates first, then the movable ones.
-
-        Raises:
-            FitError: A patch has no peak.
-        """
+        """The peaks of every patch over its own coordinates and the movable common ones."""
 
         def climb_one(patch: int) -> Modes:
             # A thread starts with the settings of the process, not with those of this fit.
@@ -128,17 +92,7 @@ class Alone:
     def expand(
         self, patch: int, local: np.ndarray, common: np.ndarray, spread: Iterable[float]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Gradient and second derivatives of the potential, by central differences.
-
-        Args:
-            patch: Which one.
-            local: Its coordinates, (local,).
-            common: The common ones, (common,).
-            spread: About one posterior standard deviation of each coordinate, (local,).
-
-        Returns:
-            Gradient (local,), Hessian (local, local) and mixed derivatives (local, common).
-        """
+        """Gradient and second derivatives of the potential, by central differences."""
         potential, z = self.potential(patch), self._join(local, common)
         mine = self._groups.local[0]
         # As in `modes.curvature`: truncation and rounding are then of one size.

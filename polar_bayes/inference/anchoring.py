@@ -33,16 +33,7 @@ WIDEST = 3.0
 
 
 class Peaks(NamedTuple):
-    """What is known of the patches, one by one.
-
-    Args:
-        common: Common coordinates: populations as typical under their priors, the rest as most
-            patches see them, (common,).
-        movable: True for the common coordinates of noise and instrument, (common,).
-        of_patch: The distinct peaks of each patch, given those common ones.
-        starts: Climbs made for each patch.
-        failures: Climbs, of all patches, that ended elsewhere than at a peak.
-    """
+    """What is known of the patches, one by one."""
 
     common: np.ndarray
     movable: np.ndarray
@@ -53,15 +44,7 @@ class Peaks(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Anchoring:
-    """The map with its anchors, compiled.
-
-    Args:
-        transport: The map.
-        given: Its anchors, and the capture.
-        potential: Minus the log density in the map's coordinates, with its gradient.
-        peaks: The peaks of the patches.
-        decrement: How far the anchors may be from the peak, in posterior standard deviations.
-    """
+    """The map with its anchors, compiled."""
 
     transport: Transport
     given: Anchored
@@ -70,15 +53,7 @@ class Anchoring:
     decrement: float
 
     def draw_starts(self, key: Array, chains: int) -> np.ndarray:
-        """Starting points in the map's coordinates: each patch at one of its peaks, by weight.
-
-        Args:
-            key: Random key.
-            chains: How many.
-
-        Returns:
-            (chains, size); a draw of infinite potential falls back on the anchor.
-        """
+        """Starting points in the map's coordinates: each patch at one of its peaks, by weight."""
         random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         groups, dtype = self.transport.groups, self.given.anchors.common.dtype
         starts = []
@@ -98,21 +73,7 @@ class Anchoring:
 def anchor(
     lone: Lone, transport: Transport, data: Observations, key: Array, tell: Progress
 ) -> Anchoring:
-    """Find the anchors.
-
-    Args:
-        lone: The model of one patch.
-        transport: The map of the whole capture.
-        data: The whole capture.
-        key: Random key.
-        tell: Called with the name of a stage and the fraction of it that is done.
-
-    Returns:
-        The map and what was found on the way.
-
-    Raises:
-        FitError: A patch has no peak.
-    """
+    """Find the anchors."""
     alone, groups, size = Alone(lone, data), transport.groups, transport.size
     surveyor = _Surveyor(alone, transport, data)
     peaks = _find_peaks(alone, transport, surveyor, data, key, tell)

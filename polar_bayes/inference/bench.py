@@ -18,16 +18,7 @@ from polar_bayes.progress import Progress
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Bench:
-    """A capture with the programs that fit it.
-
-    Args:
-        request: What was asked.
-        prepared: What is compiled for captures of this layout.
-        data: The capture.
-        key: Random key of the whole fit.
-        progress: Called with the name of a stage and the fraction of it that is done.
-        begun: When the fit was asked for, of `time.perf_counter`, s.
-    """
+    """A capture with the programs that fit it."""
 
     request: Request
     prepared: Prepared

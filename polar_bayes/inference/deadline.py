@@ -18,24 +18,10 @@ class OutOfTimeError(Exception):
 
 
 def run_until[T](deadline: float, progress: Progress, work: Callable[[Progress], T]) -> T:
-    """Do work in a thread of its own, and go on without it after the deadline.
-
-    Compilation and compiled programs cannot be interrupted from Python. An abandoned thread ends
-    when it next reports progress or wants to trace a model; it traces nothing after this function
-    has returned or raised, so that it never meets the caller in NumPyro's stack of handlers.
-
-    Args:
-        deadline: Of `time.perf_counter`, s; where it is infinite, no thread is made.
-        progress: Called in the thread of the caller, until the deadline.
-        work: Called with what reports its progress, in the precision of the caller.
-
-    Returns:
-        What the work returns.
-
-    Raises:
-        OutOfTimeError: It was not done in time; or the deadline had passed, and it did not begin.
-        Exception: What the work or `progress` raises.
-    """
+    """Do work in a thread of its own, and go on without it after the deadline."""
+    # Compilation and compiled programs cannot be interrupted from Python. An abandoned thread ends
+    # when it next reports progress or wants to trace a model; it traces nothing after this function
+    # has returned or raised, so that it never meets the caller in NumPyro's stack of handlers.
     if deadline == float("inf"):
         return work(progress)
     if time.perf_counter() >= deadline:

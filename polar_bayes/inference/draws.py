@@ -10,20 +10,7 @@ PIECE = 500
 
 
 def parameters_of(program: Program, z: np.ndarray, data: Observations) -> dict[str, np.ndarray]:
-    """What draws say of the parameters, and nothing of readings.
-
-    Args:
-        program: The model.
-        z: Unconstrained draws, (chain, draw, size).
-        data: The capture.
-
-    Returns:
-        By name, each (chain, draw, ...). Draws go in pieces of one length, so that chains of any
-        length are served by one compiled program.
-
-    Raises:
-        Nothing.
-    """
+    """What draws say of the parameters, and nothing of readings."""
     count = z.shape[1]
     pieces = []
     for begin in range(0, count, PIECE):

@@ -156,15 +156,7 @@ FIT = Schema(
 
 
 def check_fit(result: xr.DataTree, source: str = "result") -> None:
-    """Refuse what is no fit, or does not hold together.
-
-    Args:
-        result: Any object.
-        source: Its name in errors, for instance the file.
-
-    Raises:
-        FitError: It is no fit; or the group, variable or provenance that is wrong.
-    """
+    """Refuse what is no fit, or does not hold together."""
     FIT.check(result, source)
 
 
@@ -185,19 +177,7 @@ def load_result(path: str | os.PathLike[str]) -> xr.DataTree:
 
 
 def load_tree(path: str | os.PathLike[str], schema: Schema) -> xr.DataTree:
-    """A tree of one kind from a netCDF file.
-
-    Args:
-        path: A file that `save_result` wrote.
-        schema: Of the kind.
-
-    Returns:
-        The tree, in memory; the file is closed.
-
-    Raises:
-        CaptureError: The file is not there.
-        FitError: It was damaged, or is of another kind; the group and variable that is wrong.
-    """
+    """A tree of one kind from a netCDF file."""
     file = existing_file(path, schema.kind)
     mend = f"give the file that {schema.command} or save_result wrote"
     broken = FitError("it cannot be read as netCDF", where=str(file), mend=mend)

@@ -63,33 +63,7 @@ def fit(
     precision: str = "double",
     progress: Progress | None = None,
 ) -> xr.DataTree:
-    """Fit one capture.
-
-    Args:
-        capture: A Dataset of the capture schema; validated here.
-        model: A name in `MODELS` or a callable `model(data, scene, priors, links)`.
-        method: "nuts", "laplace", "point", or settings such as `Nuts(draws=2000)`; those of any
-            `polar_bayes.inference.method.AbstractMethod`, too.
-        scene: A name in `SETUPS` or a `Scene`; by default the set-up that the capture names in
-            its attribute `setup`, else "paper".
-        priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
-        links: One link for the polarization, or a mapping from variable to link.
-        largest_view_zenith: Views beyond it are set aside and counted. Unit degree.
-        seed: The same seed gives the same result on the same machine.
-        precision: "double" or "single".
-        progress: Called with the name of a stage and the fraction of it that is done.
-
-    Returns:
-        A DataTree with the groups posterior, sample_stats, log_likelihood, log_prior,
-        posterior_predictive, noise_free, prior, prior_predictive, observed_data and
-        constant_data, and effects for a scene of `polar_bayes.choose_effects`;
-        `polar_bayes.diagnostics.convergence.verdict` says whether it converged.
-
-    Raises:
-        CaptureError: The capture does not hold what a fit needs.
-        SceneError: No such scene.
-        FitError: A model, method, prior or link cannot be used, or the memory is too small.
-    """
+    """Fit one capture."""
     begun = time.perf_counter()
     request = resolve(
         capture, model, method, scene, priors, links, largest_view_zenith, seed, precision

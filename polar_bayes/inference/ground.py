@@ -37,14 +37,7 @@ Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 class Drawn(NamedTuple):
-    """What became of one posterior.
-
-    Args:
-        z: Unconstrained draws of the model, (chain, draw, size).
-        stats: Statistics, each (chain, draw).
-        problems: What makes them unusable.
-        goals_reached: Whether chains mixed before `most_draws`; None where there are no chains.
-    """
+    """What became of one posterior."""
 
     z: np.ndarray
     stats: dict[str, np.ndarray]
@@ -249,19 +242,7 @@ class PatchGrounds(AbstractGrounds):
 
 
 def make_grounds(model: Model, program: Program, data: Observations) -> AbstractGrounds:
-    """What searches for peaks, in the way that the layout of the capture calls for.
-
-    Args:
-        model: The model of the data alone.
-        program: The same on these data.
-        data: Any capture of the layout.
-
-    Returns:
-        The grounds; they are compiled as they are used.
-
-    Raises:
-        Nothing.
-    """
+    """What searches for peaks, in the way that the layout of the capture calls for."""
     groups = find_groups(program, data)
     lone = None if groups is None else find_lone(model, groups, data)
     if groups is None or lone is None:
@@ -271,12 +252,7 @@ def make_grounds(model: Model, program: Program, data: Observations) -> Abstract
 
 
 class CompiledPotential:
-    """Minus the log density with its gradient, compiled, for searches in NumPy; counts its calls.
-
-    Args:
-        program: The model.
-        data: The capture.
-    """
+    """Minus the log density with its gradient, compiled, for searches in NumPy; counts its calls."""
 
     def __init__(self, program: Program, data: Observations) -> None:
         self._program, self._data = program, data

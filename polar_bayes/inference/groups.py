@@ -19,13 +19,7 @@ SHARED_AXES = ("wavelength", "view")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Groups:
-    """Positions in the flat vector of a program.
-
-    Args:
-        axis: The leading axis of the capture, patch or material.
-        local: Coordinates of each group, (group, local), in the same order for all.
-        common: Coordinates that all groups share, (common,).
-    """
+    """Positions in the flat vector of a program."""
 
     axis: str
     local: np.ndarray
@@ -38,15 +32,7 @@ class Groups:
 
 
 def find_groups(program: Program, data: Observations) -> Groups | None:
-    """The groups of a capture with a leading axis.
-
-    Args:
-        program: The model on that capture.
-        data: The capture as arrays.
-
-    Returns:
-        The groups; None where there is no leading axis, or no coordinate of its own on it.
-    """
+    """The groups of a capture with a leading axis."""
     leading = [(name, length) for name, length in data.dims if name not in SHARED_AXES]
     if len(leading) != 1:
         return None
@@ -68,15 +54,7 @@ def find_groups(program: Program, data: Observations) -> Groups | None:
 
 
 def group_of(data: Observations, number: int) -> Observations:
-    """One group of a capture, as a capture with a leading axis of length 1.
-
-    Args:
-        data: The capture.
-        number: Which group, from 0.
-
-    Returns:
-        Arrays of the same layout.
-    """
+    """One group of a capture, as a capture with a leading axis of length 1."""
     length = data.dims[0][1]
 
     def cut(array: jax.Array) -> jax.Array:

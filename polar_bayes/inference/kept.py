@@ -20,11 +20,7 @@ INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib",
 
 
 class Kept[T]:
-    """The last few things that were made, by key; safe to ask from several threads.
-
-    Args:
-        most: How many are kept; the one that was asked for least recently goes first.
-    """
+    """The last few things that were made, by key; safe to ask from several threads."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -48,21 +44,7 @@ def key_of_story(
     links: Mapping[str, AbstractLink],
     *further: Any,
 ) -> str:
-    """A text that is the same for stories whose programs are the same.
-
-    Args:
-        model: The model, with any handlers around it.
-        scene: The optics; how it was chosen does not count.
-        priors: A distribution for every parameter.
-        links: For each recorded variable, how it scatters.
-        further: What else the programs depend on: the layout of the capture, the precision.
-
-    Returns:
-        The text; good for one process and those that it sends it to.
-
-    Raises:
-        Nothing: what has no key of its own gets another one each time, and is never shared.
-    """
+    """A text that is the same for stories whose programs are the same."""
     parts = [
         model,
         dataclasses.replace(scene),  # without its ledger
@@ -85,11 +67,9 @@ def layout_of(data: Observations) -> tuple[str, ...]:
 
 
 def last_edit() -> int:
-    """When a module that is not installed was edited last, in ns.
-
-    A model, link or part of the user's own that is edited and loaded again has the name that it
-    had before. What was compiled of the old one must not answer for it.
-    """
+    """When a module that is not installed was edited last, in ns."""
+    # A model, link or part of the user's own that is edited and loaded again has the name that it
+    # had before. What was compiled of the old one must not answer for it.
     edits = [0]
     for module in list(sys.modules.values()):
         file = getattr(module, "__file__", None)

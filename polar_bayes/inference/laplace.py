@@ -61,21 +61,7 @@ def sample(
     key: Array,
     settings: Laplace,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Draw from NumPyro's guide at the heaviest mode.
-
-    Args:
-        program: The model.
-        guide: Its guide, compiled.
-        data: The capture.
-        potential: Minus the log density and its gradient, already compiled.
-        modes: The peaks.
-        key: Random key.
-        settings: How many draws.
-
-    Returns:
-        Unconstrained draws (chain, draw, size), NaN where the guide has no width; and their
-        statistics: the log density `lp` and the `log_weight` of posterior over approximation.
-    """
+    """Draw from NumPyro's guide at the heaviest mode."""
     location, factor, order = guide(
         jnp.asarray(modes.z[0]), jnp.linalg.inv(jnp.asarray(modes.covariance[0])), data
     )
@@ -91,28 +77,16 @@ def sample(
 
 
 def compiled_guide(program: Program) -> Guide:
-    """NumPyro's guide around a mode, compiled for captures of the program's layout.
-
-    Args:
-        program: The model.
-
-    Returns:
-        See `Guide`.
-
-    Raises:
-        Nothing.
-    """
+    """NumPyro's guide around a mode, compiled for captures of the program's layout."""
     return TracedOnce(functools.partial(_guide, program))
 
 
 def _guide(
     program: Program, mode: Array, precision: Array, data: Observations
 ) -> tuple[Array, Array, Array]:
-    """Location and Cholesky factor of NumPyro's guide, and the order of its coordinates.
-
-    The guide strings sites together as the model declares them, the program by name. Inside one
-    compiled function the guide's search for a start of its own, which is not needed, drops out.
-    """
+    """Location and Cholesky factor of NumPyro's guide, and the order of its coordinates."""
+    # The guide strings sites together as the model declares them, the program by name. Inside one
+    # compiled function the guide's search for a start of its own, which is not needed, drops out.
     order = jnp.zeros(program.size, int)
     guide = AutoLaplaceApproximation(
         program.model, hessian_fn=lambda _, location: precision[order][:, order]

@@ -11,27 +11,7 @@ from polar_bayes.cards import Carded
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Answer:
-    """What a method says of one posterior.
-
-    Args:
-        kind: How the draws were made: "nuts", "laplace", "point", "importance", "tempered",
-            "variational", or a word of one's own. Verdict and report follow it: "nuts" is judged by
-            R-hat, "laplace" and "variational" by the statistic `log_weight`.
-        z: Unconstrained draws of the model, all worth the same, (chain, draw, size).
-        stats: Statistics of the draws, each (chain, draw).
-        problems: What makes them unusable.
-        weighted: The draws and weights that `z` was chosen from, (draw, size) and (draw,); None
-            where there are none.
-        r_hat: Largest of all coordinates; NaN where there are no chains.
-        k_hat: Pareto k-hat of the importance weights; NaN where there are none.
-        effective_draws: How many independent draws these are worth, the least of all coordinates.
-        gradients: Evaluations of the log density with its gradient; NaN where nobody counts.
-        densities: Evaluations of the log density alone, likewise.
-        said: What else belongs into the provenance; JSON must hold it.
-        beside: Settings that fit the comparisons beside this answer, where a method has chosen
-            another; None where they are its own.
-        deadline: Of `time.perf_counter`, s; comparisons that are not done by then are abandoned.
-    """
+    """What a method says of one posterior."""
 
     kind: str
     z: np.ndarray

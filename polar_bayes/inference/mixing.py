@@ -10,13 +10,7 @@ TAILS = (0.05, 0.95)
 
 
 class Mixing(NamedTuple):
-    """Of every coordinate.
-
-    Args:
-        bulk: Effective sample size of the center.
-        tail: Of the ends of the 90% interval.
-        r_hat: Rank-normalized, split.
-    """
+    """Of every coordinate."""
 
     bulk: Float[np.ndarray, " coordinate"]
     tail: Float[np.ndarray, " coordinate"]
@@ -24,20 +18,8 @@ class Mixing(NamedTuple):
 
 
 def measure(draws: Float[np.ndarray, "coordinate chain draw"]) -> Mixing:
-    """Effective sample sizes and R-hat, which monotone maps of a coordinate do not change.
-
-    Args:
-        draws: Of some chains of one length.
-
-    Returns:
-        The measures.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Vehtari et al. (2021), Bayesian Analysis 16(2).
-    """
+    """Effective sample sizes and R-hat, which monotone maps of a coordinate do not change."""
+    # Source: Vehtari et al. (2021), Bayesian Analysis 16(2).
     return Mixing(
         bulk=np.array([array_stats.ess(x, method="bulk") for x in draws]),
         tail=np.array([array_stats.ess(x, method="tail", prob=TAILS) for x in draws]),
@@ -48,20 +30,8 @@ def measure(draws: Float[np.ndarray, "coordinate chain draw"]) -> Mixing:
 def standard_errors(
     draws: Float[np.ndarray, "coordinate chain draw"],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Monte Carlo standard errors of mean and standard deviation, in standard deviations.
-
-    Args:
-        draws: Of some chains of one length.
-
-    Returns:
-        Of the means and of the standard deviations, each (coordinate,); NaN for what never moved.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Vehtari et al. (2021), Bayesian Analysis 16(2).
-    """
+    """Monte Carlo standard errors of mean and standard deviation, in standard deviations."""
+    # Source: Vehtari et al. (2021), Bayesian Analysis 16(2).
     sd = draws.reshape(len(draws), -1).std(axis=-1)
     with np.errstate(all="ignore"):
         return (

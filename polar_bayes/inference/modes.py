@@ -39,15 +39,7 @@ class Status(enum.IntEnum):
 
 
 class Climb(NamedTuple):
-    """The end of one climb.
-
-    Args:
-        z: Where it ended, unconstrained, (size,).
-        potential: Minus the log posterior density there, up to a constant.
-        decrement: Newton decrement: how far, in posterior sds, the true peak may still be.
-        covariance: Inverse Hessian, (size, size); NaN where it is not positive definite.
-        status: What became of it.
-    """
+    """The end of one climb."""
 
     z: np.ndarray
     potential: float
@@ -63,16 +55,7 @@ class Climb(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Modes:
-    """Distinct peaks, heaviest first.
-
-    Args:
-        z: (mode, size).
-        covariance: (mode, size, size).
-        weight: Share of the Laplace evidence, (mode,); sums to 1.
-        decrement: Newton decrement of each, (mode,).
-        starts: How many climbs were made.
-        failures: How many of them ended elsewhere than at a peak.
-    """
+    """Distinct peaks, heaviest first."""
 
     z: np.ndarray
     covariance: np.ndarray
@@ -109,10 +92,8 @@ _QUIET = _Quiet()
 
 @contextlib.contextmanager
 def quiet_line_search() -> Iterator[None]:
-    """Climbs judge their own ends, so SciPy's warning of a poor step says nothing more.
-
-    Fits on several threads may open it side by side.
-    """
+    """Climbs judge their own ends, so SciPy's warning of a poor step says nothing more."""
+    # Fits on several threads may open it side by side.
     _QUIET.begin()
     try:
         yield
@@ -121,15 +102,7 @@ def quiet_line_search() -> Iterator[None]:
 
 
 def climb(potential: ValueAndGradient, start: np.ndarray) -> Climb:
-    """Go downhill in the potential, then settle with Newton steps.
-
-    Args:
-        potential: Minus the log density and its gradient.
-        start: Unconstrained vector, (size,).
-
-    Returns:
-        The end, with its curvature and an honest status.
-    """
+    """Go downhill in the potential, then settle with Newton steps."""
 
     def guarded(z: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = potential(z)
@@ -161,20 +134,9 @@ def climb(potential: ValueAndGradient, start: np.ndarray) -> Climb:
 def curvature(
     potential: ValueAndGradient, z: np.ndarray, spread: np.ndarray, precision: np.dtype
 ) -> np.ndarray:
-    """Hessian by central differences of the gradient.
-
-    With a step of the fourth root of the rounding error, in units of the posterior's own width,
-    truncation and rounding both stay below 1e-7 of the curvature (double precision).
-
-    Args:
-        potential: Minus the log density and its gradient.
-        z: Where, (size,).
-        spread: About one posterior standard deviation in each coordinate, (size,).
-        precision: The floating type in which `potential` computes.
-
-    Returns:
-        (size, size), symmetric.
-    """
+    """Hessian by central differences of the gradient."""
+    # With a step of the fourth root of the rounding error, in units of the posterior's own width,
+    # truncation and rounding both stay below 1e-7 of the curvature (double precision).
     steps = np.clip(spread, 1e-6, 1.0) * np.finfo(precision).eps ** 0.25
     rows = []
     for index, step in enumerate(steps):
@@ -186,15 +148,7 @@ def curvature(
 
 
 def distinct(climbs: list[Climb]) -> Modes | None:
-    """Keep one climb per peak.
-
-    Args:
-        climbs: The ends of all climbs.
-
-    Returns:
-        The peaks by weight, or None when no climb came near one. Where none settled, those that
-        came within one posterior standard deviation stand in, and their decrement tells.
-    """
+    """Keep one climb per peak."""
     near = [end for end in climbs if end.decrement < 1.0]
     settled = [end for end in near if end.status is Status.OK]
     arrived = sorted(settled or near, key=lambda end: -end.log_evidence)

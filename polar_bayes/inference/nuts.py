@@ -102,18 +102,7 @@ class Step(NamedTuple):
 
 
 class Target(NamedTuple):
-    """What is sampled.
-
-    Args:
-        samplers: Of minus the log density of a vector, given data (any tree of arrays).
-        given: Those data.
-        potential: The density with its gradient, already compiled, for those data.
-        starts: Where each chain starts, (chain, size).
-        metric: Covariance, (size, size), to begin with; or variances, (size,), to stay with.
-        place: From vectors (chain, draw, size) to the model's unconstrained coordinates.
-        acceptance: What to aim at where the settings leave it open.
-        warmup: Draws spent on step size and metric where the settings leave them open.
-    """
+    """What is sampled."""
 
     samplers: "Samplers"
     given: Any
@@ -136,19 +125,7 @@ def sample(
     settings: Nuts,
     progress: Progress = lambda _: None,
 ) -> tuple[np.ndarray, dict[str, np.ndarray], bool]:
-    """Draw from the posterior.
-
-    Args:
-        target: Density, starts and metric.
-        key: Random key.
-        settings: Lengths and limits.
-        progress: Called with the fraction of all draws that is done.
-
-    Returns:
-        Unconstrained draws of the model (chain, draw, size); statistics, each (chain, draw), of
-        which `n_steps` and `warmup_steps` count gradients; and whether the goals for mixing were
-        reached before `most_draws`.
-    """
+    """Draw from the posterior."""
     sampler = _sampler(target, settings)
     warmup = sampler.fixed.warmup
     keys = jax.random.split(key, settings.chains)
@@ -192,15 +169,7 @@ def sample(
 
 
 def expect(target: Target, settings: Nuts) -> None:
-    """Begin to compile what `sample` will need, beside whatever follows.
-
-    Args:
-        target: Its shapes are what counts, and which potential, starts and metric it has is not.
-        settings: What to do.
-
-    Raises:
-        Nothing.
-    """
+    """Begin to compile what `sample` will need, beside whatever follows."""
     sampler = _sampler(target, settings)
     if not sampler.advance.is_begun:
         state = sampler.begin(target, jax.random.key(0), target.starts[0])
@@ -233,17 +202,7 @@ def _mixed(rounds: list[Step], settings: Nuts) -> bool:
 def draw_starts(
     potential: ValueAndGradient, modes: Modes, key: Array, chains: int
 ) -> Float[np.ndarray, "chains size"]:
-    """Starting points: Laplace draws at modes chosen by weight, kept only where finite.
-
-    Args:
-        potential: Minus the log density and its gradient.
-        modes: The peaks.
-        key: Random key.
-        chains: How many.
-
-    Returns:
-        Unconstrained vectors; a draw of infinite potential falls back on its mode.
-    """
+    """Starting points: Laplace draws at modes chosen by weight, kept only where finite."""
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     starts = []
     for mode in random.choice(len(modes.weight), size=chains, p=modes.weight):
@@ -263,11 +222,7 @@ class _Fixed(NamedTuple):
 
 
 class Samplers:
-    """The samplers of one density, each compiled once.
-
-    Args:
-        density: Minus the log density of a vector, given data (any tree of arrays).
-    """
+    """The samplers of one density, each compiled once."""
 
     def __init__(self, density: Callable[[Array, Any], Array]) -> None:
         self._density = density

@@ -38,15 +38,7 @@ class Point(Carded):
 
 
 class Estimate(NamedTuple):
-    """The best fit.
-
-    Args:
-        z: Unconstrained vector.
-        covariance: Of `z`, by the Gauss-Newton curvature and the residuals' own variance;
-            infinite variance in directions that the readings do not move with.
-        converged: True where the solver met its tolerance.
-        loss: Half the sum of squares, unit 1.
-    """
+    """The best fit."""
 
     z: Float[Array, " size"]
     covariance: Float[Array, "size size"]
@@ -55,16 +47,7 @@ class Estimate(NamedTuple):
 
 
 def estimate(program: Program, data: Observations, starts: Float[Array, "start size"]) -> Estimate:
-    """Fit by Levenberg-Marquardt from several starts.
-
-    Args:
-        program: The model; only its noise-free readings are used.
-        data: The capture.
-        starts: Unconstrained vectors.
-
-    Returns:
-        The end of lowest loss among those that converged (of all, if none did).
-    """
+    """Fit by Levenberg-Marquardt from several starts."""
 
     def residuals(z: Array, unit: Array) -> Array:
         parts = program.residuals(z, data)
@@ -113,15 +96,7 @@ def to_numpy(estimate: Estimate) -> Estimate:
 
 
 def standard_errors(program: Program, estimate: Estimate) -> dict[str, list[float | None]]:
-    """Standard errors of the parameters in their physical range, by the delta method.
-
-    Args:
-        program: The model.
-        estimate: The best fit.
-
-    Returns:
-        For each site a flat list; None where the readings do not determine the value.
-    """
+    """Standard errors of the parameters in their physical range, by the delta method."""
     free = np.isinf(np.diagonal(estimate.covariance))
     covariance = np.where(np.isinf(estimate.covariance), 0.0, estimate.covariance)
     errors = {}

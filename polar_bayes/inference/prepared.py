@@ -20,13 +20,7 @@ MOST_KEPT = 8
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Prepared:
-    """What fits of one model to captures of one layout have in common.
-
-    Args:
-        model: A NumPyro model of the data alone.
-        program: The same on captures of the layout.
-        layout: One of them, which stands for all.
-    """
+    """What fits of one model to captures of one layout have in common."""
 
     model: Model
     program: Program
@@ -48,19 +42,7 @@ _KEPT: Kept[Prepared] = Kept(MOST_KEPT)
 
 
 def prepare(request: Request, scene: Scene, data: Observations) -> Prepared:
-    """What fits the capture, and any other of its layout, kept from the last fit where it can be.
-
-    Args:
-        request: What is asked; its readings, seed and settings do not count.
-        scene: The optics.
-        data: The capture.
-
-    Returns:
-        The model, its program and what is compiled of both.
-
-    Raises:
-        Nothing.
-    """
+    """What fits the capture, and any other of its layout, kept from the last fit where it can be."""
     key = key_of_story(
         request.model, scene, request.priors, request.links, request.precision, layout_of(data)
     )

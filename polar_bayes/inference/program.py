@@ -42,21 +42,7 @@ class Draw(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Program:
-    """A model conditioned on data of one layout.
-
-    Args:
-        model: A NumPyro model of the data alone; scene, priors and links are already in it.
-        dims: For each site, the axes that its plates gave it.
-        plates: Length of every plate.
-        events: For each site, the shape of its own event.
-        supports: For each latent site, where its values live.
-        auxiliary: Latent sites that are coordinates, not parameters; see `is_auxiliary`.
-        derived: Deterministic sites, other than noise-free readings.
-        observed: The sites that the data fix.
-        fixed: Sites that the model itself fixes, as `numpyro.handlers.condition` does.
-        families: For each latent site, the name of its distribution.
-        size: Length of the flat vector.
-    """
+    """A model conditioned on data of one layout."""
 
     model: Model
     dims: Mapping[str, tuple[str, ...]]
@@ -159,10 +145,8 @@ class Program:
 
     @functools.cached_property
     def drawn_from_prior(self) -> Callable[[np.ndarray, int, Observations], Array]:
-        """Vectors drawn from the prior, one for each of the first keys, compiled.
-
-        The others are zero: how many are wanted is no part of what is compiled.
-        """
+        """Vectors drawn from the prior, one for each of the first keys, compiled."""
+        # The others are zero: how many are wanted is no part of what is compiled.
 
         def draw(keys: Array, count: int, data: Observations) -> Array:
             wrapped = jax.random.wrap_key_data(keys)
@@ -196,15 +180,7 @@ class Program:
 
 
 def compile_program(model: Model, data: Observations) -> Program:
-    """Walk the model once, without computing anything, and note its sites.
-
-    Args:
-        model: A NumPyro model of the data alone.
-        data: Any capture of the layout to be fitted.
-
-    Returns:
-        The program of that layout.
-    """
+    """Walk the model once, without computing anything, and note its sites."""
     sites: dict[str, dict] = {}
 
     def walk(data: Observations) -> None:

@@ -77,25 +77,7 @@ def resolve(
     seed: int,
     precision: str,
 ) -> Request:
-    """Check what the caller asked for, and fill in every default.
-
-    Args:
-        capture: See `polar_bayes.fit`; the other arguments too.
-        model: A name or a callable.
-        method: A name or settings.
-        scene: A name, a `Scene` or None.
-        priors: Overrides.
-        links: One link, a mapping or None.
-        largest_view_zenith: Unit degree, or None for the set-up's own.
-        seed: An integer.
-        precision: "double" or "single".
-
-    Returns:
-        The request, complete.
-
-    Raises:
-        PolarBayesError: Something cannot be used; see `polar_bayes.fit`.
-    """
+    """Check what the caller asked for, and fill in every default."""
     capture = validate(capture)
     if {"y", "x"} & set(map(str, capture.dims)):
         raise CaptureError(

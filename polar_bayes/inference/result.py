@@ -33,21 +33,7 @@ def assemble(
     beside: Mapping[str, xr.Dataset],
     provenance: Mapping[str, object],
 ) -> xr.DataTree:
-    """Put draws, data and provenance into one tree.
-
-    Args:
-        program: The model that was fitted.
-        capture: The validated capture.
-        data: The same as arrays, with the views that were set aside.
-        posterior: Arrays of shape (chain, draw, ...).
-        prior: The same from the prior.
-        sample_stats: Arrays of shape (chain, draw).
-        beside: Posteriors of other fits that stand beside this one, by group name.
-        provenance: Whatever JSON can hold.
-
-    Returns:
-        The tree of DESIGN section 4.
-    """
+    """Put draws, data and provenance into one tree."""
     groups: dict[str, dict[str, np.ndarray]] = {
         "posterior": _shaped(program, posterior.parameters),
         "sample_stats": {name: np.asarray(x) for name, x in sample_stats.items()},
@@ -81,17 +67,7 @@ def assemble(
 
 
 def provenance_of(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
-    """What a result says about how it was made.
-
-    Args:
-        result: A tree or maps, in memory or read back.
-
-    Returns:
-        The decoded root attribute, without what is null; empty where there is none.
-
-    Raises:
-        FitError: The attribute is no JSON mapping.
-    """
+    """What a result says about how it was made."""
     text = result.attrs.get(PROVENANCE, "{}")
     try:
         said = json.loads(text)
@@ -107,16 +83,7 @@ def provenance_of(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
 
 
 def bounds_of(provenance: Mapping[str, Any], name: str) -> tuple[float, float]:
-    """Where the prior of a parameter ends.
-
-    Args:
-        provenance: What a result says about how it was made.
-        name: The parameter.
-
-    Returns:
-        Least and largest value, infinite where the prior has no end; the physical range of the
-        parameter where the result names no such prior.
-    """
+    """Where the prior of a parameter ends."""
     limits = RANGES.get(name, (-math.inf, math.inf))
     said = (provenance.get("bounds") or {}).get(name)
     if said is None:
@@ -126,15 +93,7 @@ def bounds_of(provenance: Mapping[str, Any], name: str) -> tuple[float, float]:
 
 
 def posterior_of(program: Program, parameters: Mapping[str, Any]) -> xr.Dataset:
-    """A posterior group alone, for a fit that stands beside the main one.
-
-    Args:
-        program: The model that was fitted.
-        parameters: Draws of its parameters, (chain, draw, ...).
-
-    Returns:
-        A dataset like the group `posterior`.
-    """
+    """A posterior group alone, for a fit that stands beside the main one."""
     tree = from_dict({"posterior": _shaped(program, parameters)}, dims=dims_of(program))
     return tree["posterior"].to_dataset()
 

@@ -100,13 +100,7 @@ NUMBERS, FLAGS, TEXTS = "biuf", "biu", "OSUT"
 
 
 class Like(NamedTuple):
-    """That a group has variables in the shape of those of another group.
-
-    Args:
-        group: The other group.
-        endings: What is appended to a name there, and the dims that such a variable has besides.
-        needed: Whether it has them for every variable there.
-    """
+    """That a group has variables in the shape of those of another group."""
 
     group: str
     endings: Mapping[str, tuple[str, ...]]
@@ -115,23 +109,7 @@ class Like(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """What is read of a group.
-
-    Args:
-        dims: Dims that every variable has.
-        others: Whether it may have others.
-        never: Dims that none has.
-        needed: Whether the tree has the group.
-        tied: Whether it has the chains and draws of the posterior.
-        labeled: Whether the labels of its dims are those of the other groups.
-        kinds: Types of values, `NUMBERS` unless it is said otherwise by name.
-        variables: Variables that are there, and all their dims.
-        names: Patterns of the names that are read; None: all.
-        like: The shape of another group.
-        inside: By the name of a variable, the group whose variables all have its dims.
-        attributes: Of the group.
-        marks: Attributes of each variable.
-    """
+    """What is read of a group."""
 
     dims: tuple[str, ...] = ()
     others: bool = True
@@ -154,15 +132,7 @@ class Group:
 
 @dataclasses.dataclass(frozen=True)
 class Schema:
-    """What is read of a kind of tree.
-
-    Args:
-        kind: Its name, as in "it holds no <kind>".
-        made_by: The functions that return one.
-        command: The command that writes one to a file.
-        groups: By their name.
-        provenance: Of the root attribute, as JSON.
-    """
+    """What is read of a kind of tree."""
 
     kind: str
     made_by: str
@@ -180,15 +150,7 @@ class Schema:
         )
 
     def check(self, tree: xr.DataTree, source: str) -> None:
-        """Refuse a tree that does not hold what this kind holds.
-
-        Args:
-            tree: Any object.
-            source: Its name in errors, for instance the file.
-
-        Raises:
-            FitError: The first departure, with its group and variable.
-        """
+        """Refuse a tree that does not hold what this kind holds."""
         if not self.describes(tree):
             mend = f"give the tree that {self.made_by} returned"
             raise FitError(f"it holds no {self.kind}", where=source, mend=mend)

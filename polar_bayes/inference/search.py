@@ -15,17 +15,7 @@ KEYS = 500
 
 
 def from_prior(program: Program, key: Array, draws: int, data: Observations) -> np.ndarray:
-    """Unconstrained vectors drawn from the prior; other numbers of them compile nothing new.
-
-    Args:
-        program: The model.
-        key: Random key.
-        draws: How many.
-        data: A capture of the program's layout.
-
-    Returns:
-        Shape (draws, size).
-    """
+    """Unconstrained vectors drawn from the prior; other numbers of them compile nothing new."""
     # A key depends on its place alone, so a round number of them serves any number of draws.
     keys = np.asarray(jax.random.key_data(jax.random.split(key, KEYS * -(-draws // KEYS))))
     drawn = [
@@ -36,19 +26,7 @@ def from_prior(program: Program, key: Array, draws: int, data: Observations) -> 
 
 
 def find_modes(potential: ValueAndGradient, starts: np.ndarray, progress: Progress) -> Modes:
-    """Climb from every start and keep the distinct peaks.
-
-    Args:
-        potential: Minus the log density and its gradient.
-        starts: Unconstrained vectors, (start, size).
-        progress: Called with the name of the stage and the fraction of it that is done.
-
-    Returns:
-        The peaks, heaviest first.
-
-    Raises:
-        FitError: No start reached a peak.
-    """
+    """Climb from every start and keep the distinct peaks."""
     climbs = []
     with quiet_line_search():
         for number, start in enumerate(starts):

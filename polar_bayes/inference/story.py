@@ -18,13 +18,7 @@ from polar_bayes.priors import PriorTable, check_support
 
 
 class Story(NamedTuple):
-    """What was found.
-
-    Args:
-        priors: The priors that the model reads, in that order.
-        declared: Families of the parameters whose prior stands in the model itself.
-        fixed: Sites that the model, or a handler around it, holds at a value; and the values.
-    """
+    """What was found."""
 
     priors: tuple[str, ...]
     declared: dict[str, str]
@@ -38,22 +32,7 @@ def read_story(
     priors: PriorTable,
     links: Mapping[str, AbstractLink],
 ) -> Story:
-    """Tell the story once, with abstract arrays, and refuse what cannot be fitted.
-
-    Args:
-        model: A callable `model(data, scene, priors, links)`, with any handlers around it.
-        data: The capture as arrays.
-        scene: The optics.
-        priors: The table with the caller's replacements.
-        links: For each recorded variable, how it scatters.
-
-    Returns:
-        What the model reads, declares and fixes.
-
-    Raises:
-        FitError: A parameter has no prior; a site of the model allows values outside the physical
-            range of its parameter, is discrete, or draws a reading; or the model observes none.
-    """
+    """Tell the story once, with abstract arrays, and refuse what cannot be fitted."""
     sites: dict[str, dict] = {}
 
     def tell(data: Observations) -> None:

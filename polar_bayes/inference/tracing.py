@@ -57,26 +57,12 @@ TRACING = _Tracing()
 
 
 def compiled(function: Callable) -> Any:
-    """The function as `jax.jit` has it, compiled with as much effort as running it pays back.
-
-    Args:
-        function: Not called by another compiled function.
-
-    Returns:
-        The compiled function.
-
-    Raises:
-        Nothing.
-    """
+    """The function as `jax.jit` has it, compiled with as much effort as running it pays back."""
     return jax.jit(function, compiler_options=QUICK if jax.default_backend() == "cpu" else None)
 
 
 class TracedOnce:
-    """A function that is traced alone in the process, and compiled once, by its first call.
-
-    Args:
-        function: Always called with arrays of the same shapes and types.
-    """
+    """A function that is traced alone in the process, and compiled once, by its first call."""
 
     def __init__(self, function: Callable) -> None:
         self._function = compiled(function)
@@ -99,17 +85,7 @@ class TracedOnce:
             _BESIDE.submit(self._traced(*arguments).result)
 
     def program(self, *arguments: Any) -> Callable:
-        """The compiled program for arguments of these shapes and types.
-
-        Args:
-            arguments: Arrays, or anything of such shapes and types.
-
-        Returns:
-            The program.
-
-        Raises:
-            FitError: It needs more memory than there is.
-        """
+        """The compiled program for arguments of these shapes and types."""
         run = self._run
         if run is None or self._device != jax.config.jax_default_device:
             run = self._run = self._traced(*arguments).result()
@@ -125,11 +101,7 @@ class TracedOnce:
 
 
 class TracedByShape:
-    """The same for a function whose first argument comes in several shapes.
-
-    Args:
-        function: Its other arguments are always of the same shapes.
-    """
+    """The same for a function whose first argument comes in several shapes."""
 
     def __init__(self, function: Callable) -> None:
         self._function = function
@@ -177,14 +149,7 @@ def bytes_of(program: Any) -> int:
 
 
 def check_memory(needed: int) -> None:
-    """Refuse what cannot be held in memory, before anything is allocated.
-
-    Args:
-        needed: Bytes.
-
-    Raises:
-        FitError: There are fewer.
-    """
+    """Refuse what cannot be held in memory, before anything is allocated."""
     there = memory_limit()
     if there is not None and needed > there:
         raise FitError(

@@ -36,16 +36,7 @@ from polar_bayes.observation.data import Observations
 
 
 class Anchors(eqx.Module):
-    """Where the map is anchored: numbers, so that moving them compiles nothing.
-
-    Args:
-        common: Common parameters, unconstrained, (common,).
-        factor: L such that L v has the spread of the common parameters, (common, common).
-        local: Best fits of the groups, (group, local).
-        slope: Gradient of minus the log likelihood there, (group, local).
-        curvature: Its Hessian, positive semi-definite, (group, local, local).
-        coupling: Its mixed derivatives with the common parameters, (group, local, common).
-    """
+    """Where the map is anchored: numbers, so that moving them compiles nothing."""
 
     common: Float[Array, " common"]
     factor: Float[Array, "common common"]
@@ -64,12 +55,7 @@ class Anchored(eqx.Module):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Transport:
-    """The map for one program.
-
-    Args:
-        program: The model.
-        groups: Which coordinates belong to which patch.
-    """
+    """The map for one program."""
 
     program: Program
     groups: Groups
@@ -111,11 +97,9 @@ class Transport:
         local: Float[Array, "group local"],
         data: Observations,
     ) -> tuple[Float[Array, "group local"], Float[Array, "group local"]]:
-        """Slope and curvature of minus the log prior of the groups, given what is common.
-
-        The priors of a group's coordinates are taken as independent given what is common, which
-        concerns the ease of sampling only.
-        """
+        """Slope and curvature of minus the log prior of the groups, given what is common."""
+        # The priors of a group's coordinates are taken as independent given what is common, which
+        # concerns the ease of sampling only.
 
         def slope(local: Array) -> Array:
             return jax.grad(lambda x: self._prior(self._join(common, x), data))(local)

@@ -186,19 +186,7 @@ class Auto(AbstractMethod):
 
 
 class Step(NamedTuple):
-    """One method that was tried.
-
-    Args:
-        name: The method.
-        seconds: That it took, compilation included.
-        why: Why it was not taken; empty where it was.
-        error: By which methods that were not taken are compared, posterior sds.
-        monte_carlo: Largest expected error of a mean or sd, posterior sds.
-        taken: Whether it was good enough.
-        r_hat: Largest of all coordinates.
-        k_hat: Of the weights.
-        effective_draws: Of the worst coordinate.
-    """
+    """One method that was tried."""
 
     name: str
     seconds: float

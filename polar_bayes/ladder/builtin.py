@@ -25,18 +25,7 @@ POINT_DRAWS = 1000
 
 @functools.singledispatch
 def answer(method: Method, bench: Bench) -> Answer:
-    """What a method says of a capture.
-
-    Args:
-        method: Settings of any method.
-        bench: The capture.
-
-    Returns:
-        Draws, and how far they can be trusted.
-
-    Raises:
-        FitError: It is no method, does not suit the capture, or found nothing to draw from.
-    """
+    """What a method says of a capture."""
     raise FitError(
         f"a {type(method).__name__} is not a method",
         where="method",
@@ -89,10 +78,8 @@ def _(method: Laplace, bench: Bench) -> Answer:
 
 @answer.register
 def _(method: point.Point, bench: Bench) -> Answer:
-    """Draws of the normal distribution that the standard errors stand for.
-
-    What the readings do not determine has no standard error, and is drawn without any width.
-    """
+    """Draws of the normal distribution that the standard errors stand for."""
+    # What the readings do not determine has no standard error, and is drawn without any width.
     key_starts = jax.random.split(bench.key)[0]
     starts = from_prior(bench.program, key_starts, STARTS, bench.data)
     least_squares = bench.prepared.least_squares

@@ -18,22 +18,10 @@ FALSE_ALARMS = 0.01
 
 
 def expected_error(answer: Answer, program: Program, data: Observations) -> float:
-    r"""The largest error of a mean or a standard deviation that Monte Carlo noise can make.
-
-    In posterior standard deviations, over all parameters, exceeded in 1% of the fits: each of the
-    2P standard errors times the normal quantile of 0.5% / (2P) (Bonferroni). Bias is not seen here.
-
-    Args:
-        answer: Draws of chains, independent ones, or weighted ones and those chosen from them.
-        program: The model.
-        data: The capture.
-
-    Returns:
-        The error; infinite where a draw is not finite, or a parameter never moved.
-
-    Raises:
-        Nothing.
-    """
+    """The largest error of a mean or a standard deviation that Monte Carlo noise can make."""
+    # In posterior standard deviations, over all parameters, exceeded in 1% of the fits: each of the
+    # 2P standard errors times the normal quantile of 0.5% / (2P) (Bonferroni). Bias is not seen
+    # here.
     mean, sd = errors_of(answer, lambda z: scalars_of(program, z, data))
     errors = np.concatenate([mean, sd])
     if not np.isfinite(errors).all():
@@ -44,18 +32,7 @@ def expected_error(answer: Answer, program: Program, data: Observations) -> floa
 def errors_of(
     answer: Answer, describe: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Monte Carlo standard errors of means and standard deviations, in standard deviations.
-
-    Args:
-        answer: Draws of chains, independent ones, or weighted ones and those chosen from them.
-        describe: From unconstrained draws, (chain, draw, size), to numbers, (scalar, chain, draw).
-
-    Returns:
-        Of the means and of the standard deviations, each (scalar,); NaN for what never moved.
-
-    Raises:
-        Nothing.
-    """
+    """Monte Carlo standard errors of means and standard deviations, in standard deviations."""
     mean, sd = standard_errors(describe(answer.z))
     if answer.weighted is None:
         return mean, sd
@@ -71,18 +48,7 @@ def quantile(count: int) -> float:
 
 
 def draws_needed(tolerance: float, count: int) -> int:
-    """Independent draws after which the expected error is below a tolerance, parameters normal.
-
-    Args:
-        tolerance: Posterior standard deviations.
-        count: Parameters.
-
-    Returns:
-        How many.
-
-    Raises:
-        Nothing.
-    """
+    """Independent draws after which the expected error is below a tolerance, parameters normal."""
     return int(np.ceil((quantile(2 * count) / tolerance) ** 2))
 
 
@@ -102,11 +68,8 @@ def count_scalars(program: Program, data: Observations) -> int:
 
 
 def _of_weighted(draws: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard errors of self-normalized weighted draws, in their standard deviations.
-
-    Source:
-        Owen (2013), Monte Carlo theory, methods and examples, section 9.2: the delta method.
-    """
+    """Standard errors of self-normalized weighted draws, in their standard deviations."""
+    # Source: Owen (2013), Monte Carlo theory, methods and examples, section 9.2: the delta method.
     apart = draws - (draws @ weights)[:, None]
     variance = apart**2 @ weights
     with np.errstate(all="ignore"):

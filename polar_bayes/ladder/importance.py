@@ -99,10 +99,8 @@ def _drawn(proposal: Mixture, count: int, key: jax.Array) -> tuple[jax.Array, ja
 
 
 def _proposal(modes: Modes, dtype: np.dtype) -> Mixture:
-    """A component for each heavy mode; always as many, so that one program draws from all.
-
-    There are never more modes than climbs; a mode has several components where there are fewer.
-    """
+    """A component for each heavy mode; always as many, so that one program draws from all."""
+    # There are never more modes than climbs; a mode has several components where there are fewer.
     heavy = np.flatnonzero(modes.weight >= LEAST_SHARE)
     which = np.resize(heavy, max(STARTS, heavy.size))
     times = np.bincount(which, minlength=len(modes.weight))[which]

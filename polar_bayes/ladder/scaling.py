@@ -14,18 +14,7 @@ from polar_bayes.pixels.tempering import PixelTempering
 
 @functools.singledispatch
 def with_draws(method: Method, factor: float) -> Method | None:
-    """The same settings with so many times the draws.
-
-    Args:
-        method: Settings of any method; a dataclass with a field `draws` needs nothing more.
-        factor: Above 0.
-
-    Returns:
-        The settings; None where the method draws nothing.
-
-    Raises:
-        FitError: The method refuses so few.
-    """
+    """The same settings with so many times the draws."""
     draws = getattr(method, "draws", None)
     if not isinstance(draws, int):
         return None
@@ -55,18 +44,7 @@ def _(method: Tempered, factor: float) -> Method:
 
 
 def with_answer_draws(settings: PixelTempering, count: float) -> PixelTempering:
-    """The same settings with at least so many draws in an answer.
-
-    Args:
-        settings: Of tempered draws.
-        count: Draws of an answer, above 0; as many as the crowd has, at least.
-
-    Returns:
-        The settings; what the draws must be worth is as it was, or half of the draws if fewer.
-
-    Raises:
-        Nothing.
-    """
+    """The same settings with at least so many draws in an answer."""
     half = math.ceil(0.5 * max(count, settings.crowd))
     worth = min(settings.effective_draws, float(half))
     return dataclasses.replace(settings, draws=half, effective_draws=worth)
@@ -74,17 +52,7 @@ def with_answer_draws(settings: PixelTempering, count: float) -> PixelTempering:
 
 @functools.singledispatch
 def draws_of(method: Method) -> int | None:
-    """How many draws a method makes, at least.
-
-    Args:
-        method: Settings of any method.
-
-    Returns:
-        The number; None where the method draws nothing.
-
-    Raises:
-        Nothing.
-    """
+    """How many draws a method makes, at least."""
     draws = getattr(method, "draws", None)
     return draws if isinstance(draws, int) else None
 

@@ -10,18 +10,7 @@ HEAVY_MODE = 0.01
 
 
 def unvisited_weight(z: np.ndarray, bench: Bench) -> float:
-    """Weight of the heaviest mode to which some chain never came nearest.
-
-    Args:
-        z: Unconstrained draws, (chain, draw, size).
-        bench: The capture; of many patches nothing is known.
-
-    Returns:
-        The Laplace weight; 0 where every chain was at all of them.
-
-    Raises:
-        Nothing.
-    """
+    """Weight of the heaviest mode to which some chain never came nearest."""
     ground = bench.ground
     if not isinstance(ground, WholeGround):
         return 0.0

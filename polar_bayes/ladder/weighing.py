@@ -25,19 +25,7 @@ FEWEST, MOST = 50, 10_000
 
 
 def log_densities(program: Program, z: np.ndarray, data: Observations) -> np.ndarray:
-    """Log posterior density of many unconstrained vectors, up to a constant.
-
-    Args:
-        program: The model.
-        z: (draw, size).
-        data: The capture.
-
-    Returns:
-        (draw,); minus infinity where it is not a number.
-
-    Raises:
-        Nothing.
-    """
+    """Log posterior density of many unconstrained vectors, up to a constant."""
     look, count, parts = _looker(program), len(z), []
     for begin in range(0, count, PIECE):
         index = np.minimum(np.arange(begin, begin + PIECE), count - 1)
@@ -49,24 +37,9 @@ def log_densities(program: Program, z: np.ndarray, data: Observations) -> np.nda
 def choose(
     weights: Float[np.ndarray, " draw"], effective: float, random: np.random.Generator
 ) -> np.ndarray:
-    """Which draws stand for all, each as often as it weighs.
-
-    As many are chosen as the weighted ones are worth. More would look like more than is known.
-
-    Args:
-        weights: They sum to one.
-        effective: What they are worth.
-        random: Of the choice.
-
-    Returns:
-        Indices, (chain, draw), in random order.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Kitagawa (1996), J. Comput. Graph. Stat. 5(1), 1-25: systematic resampling.
-    """
+    """Which draws stand for all, each as often as it weighs."""
+    # As many are chosen as the weighted ones are worth. More would look like more than is known.
+    # Source: Kitagawa (1996), J. Comput. Graph. Stat. 5(1), 1-25: systematic resampling.
     each = int(np.clip(effective / CHAINS, FEWEST, MOST))
     places = (np.arange(CHAINS * each) + random.random()) / (CHAINS * each)
     index = np.searchsorted(np.cumsum(weights), places)
@@ -75,17 +48,7 @@ def choose(
 
 
 def most_worth(count: int) -> float:
-    """How many independent draws the chosen ones stand for at best, all weights being equal.
-
-    Args:
-        count: Weighted draws.
-
-    Returns:
-        The number; the errors of weighing and of choosing are both in it.
-
-    Raises:
-        Nothing.
-    """
+    """How many independent draws the chosen ones stand for at best, all weights being equal."""
     chosen = min(count, CHAINS * MOST)
     return count * chosen / (count + chosen) if count else 0.0
 

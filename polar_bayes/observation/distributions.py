@@ -218,11 +218,9 @@ def _tail_series(degrees_of_freedom: float) -> tuple[float, ...]:
 def _excess(
     mean: Float[Array, "..."], value: Float[Array, "..."], step: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """`step - mean log(value / mean)`, one half of the divergence, for `step = value - mean`.
-
-    The first-order terms cancel near the mean, hence the series; far from it the logarithm takes
-    the quotient itself, since `1 + step / mean` has lost its digits where that is nearly 0.
-    """
+    """`step - mean log(value / mean)`, one half of the divergence, for `step = value - mean`."""
+    # The first-order terms cancel near the mean, hence the series; far from it the logarithm takes
+    # the quotient itself, since `1 + step / mean` has lost its digits where that is nearly 0.
     # log(value / mean) = 2 artanh(slant), an odd series whose first term is known.
     slant = step / (value + mean)
     near = jnp.abs(slant) < 0.05
@@ -244,11 +242,9 @@ class _Remainder(NamedTuple):
 
 
 def _stirling_remainder(z: Float[Array, "..."]) -> _Remainder:
-    """`log gamma(z)` less Stirling's `(z - 1/2) log z - z + log(2 pi) / 2`, for z > 0.
-
-    Below 10 the recurrence of the gamma function moves the argument up by eight, so that only
-    logarithms are differentiated: polygamma functions take long to compile.
-    """
+    """`log gamma(z)` less Stirling's `(z - 1/2) log z - z + log(2 pi) / 2`, for z > 0."""
+    # Below 10 the recurrence of the gamma function moves the argument up by eight, so that only
+    # logarithms are differentiated: polygamma functions take long to compile.
     large = z > 10.0
     big = jnp.where(large, z, 10.0)
     small = jnp.where(large, 1.0, z)

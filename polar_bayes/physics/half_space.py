@@ -248,15 +248,12 @@ def _inverse(matrix: Array) -> Array:
 
 
 def _solve_h(a: Array, p: Array) -> _Moments:
-    r"""Chandrasekhar's H of both pairs, by a few rounds of iteration.
-
-    $$ H^{-1}(\mu) = C + \int_0^1 \frac{\mu'}{\mu+\mu'} M(\mu') d\mu', \qquad
-       M = \frac{w}{2} L H^T \sum f f^T, \qquad C = 1 - \int_0^1 M(\mu') d\mu' $$
-
-    Where L is scaled to 1, C^T C = 1 - w int sum f f^T is known: diag(1 - w, 1 - .7 w p) for pair 0
-    and twice 1 - .7 w p for pair 1. Only the rotation that C has besides comes from the last round,
-    and so a clear body needs no more rounds than a dark one.
-    """
+    """Chandrasekhar's H of both pairs, by a few rounds of iteration."""
+    # $$ H^{-1}(\mu) = C + \int_0^1 \frac{\mu'}{\mu+\mu'} M(\mu') d\mu', \qquad M = \frac{w}{2} L
+    # H^T \sum f f^T, \qquad C = 1 - \int_0^1 M(\mu') d\mu' $$
+    # Where L is scaled to 1, C^T C = 1 - w int sum f f^T is known: diag(1 - w, 1 - .7 w p) for pair
+    # 0 and twice 1 - .7 w p for pair 1. Only the rotation that C has besides comes from the last
+    # round, and so a clear body needs no more rounds than a dark one.
     w = 1.0 / (1.0 + a)
     g, h = jnp.sqrt(a * w), jnp.sqrt(1.0 - 0.7 * w * p)
     length = _stack((2, 2), g, h, h, h)[:, None]

@@ -193,10 +193,8 @@ class GGX(AbstractMicrofacet):
 
 
 def _quarter(slope: Array, width: Array) -> Array:
-    """Tangent of a quarter of the angle whose tangent is slope / width.
-
-    Nearly proportional to the angle, and a gradient costs a third of what arctan and tan take.
-    """
+    """Tangent of a quarter of the angle whose tangent is slope / width."""
+    # Nearly proportional to the angle, and a gradient costs a third of what arctan and tan take.
     half = slope / (width + jnp.sqrt(width**2 + slope**2))
     return half / (1.0 + jnp.sqrt(1.0 + half**2))
 

@@ -88,14 +88,12 @@ def _blend(fraction: Array, first: Array, second: Array) -> Array:
 
 
 def _share(fraction: Array, surface: Array, subsurface: Array) -> Array:
-    """Share of the body in the brightness, defined where all light vanishes.
-
-    Far from the mirror direction a smooth surface sends no light at all; at a fraction of 0 the
-    share is then 0/0, and its slope is the ratio of the two intensities. A trace of the other
-    part, eps^1.25, keeps value, gradient and Hessian finite; it moves the share by at most
-    trace/fraction or trace/(1 - fraction), whichever is more. A common factor does not change the
-    share, so intensities are scaled by a constant first.
-    """
+    """Share of the body in the brightness, defined where all light vanishes."""
+    # Far from the mirror direction a smooth surface sends no light at all; at a fraction of 0 the
+    # share is then 0/0, and its slope is the ratio of the two intensities. A trace of the other
+    # part, eps^1.25, keeps value, gradient and Hessian finite; it moves the share by at most
+    # trace/fraction or trace/(1 - fraction), whichever is more. A common factor does not change the
+    # share, so intensities are scaled by a constant first.
     trace = jnp.finfo(jnp.result_type(surface, subsurface)).eps ** 1.25
     # Darker than any reading: a black body on a surface far from its highlight is the surface's.
     surface = surface + jnp.finfo(jnp.result_type(surface, subsurface)).eps ** 2

@@ -257,10 +257,8 @@ class Scene(Carded):
     def _per_view(
         self, parameters: Mapping[str, ArrayLike], names: tuple[str, ...], geometry: Geometry
     ) -> dict[str, Array]:
-        """The parameters that the scene reads, in one precision, each with a trailing view axis.
-
-        A Python number takes the precision of the arrays beside it.
-        """
+        """The parameters that the scene reads, in one precision, each with a trailing view axis."""
+        # A Python number takes the precision of the arrays beside it.
         needed = [name for name in self.parameters if name in names]
         missing = [name for name in needed if name not in parameters]
         if missing:

@@ -25,12 +25,7 @@ FEWEST_EFFECTIVE = 100
 
 
 class Proposal(NamedTuple):
-    """Where the draws of every pixel are taken: `center + points @ half`.
-
-    Args:
-        center: Unconstrained vectors, (pixel, size).
-        half: Root of the squared scale; NaN where there is none. (pixel, size, size).
-    """
+    """Where the draws of every pixel are taken: `center + points @ half`."""
 
     center: Float[np.ndarray, "pixel size"]
     half: Float[np.ndarray, "pixel size size"]
@@ -45,19 +40,7 @@ class Proposal(NamedTuple):
 
 
 def heavy_points(count: int, size: int, seed: int) -> Points:
-    """Evenly spread points of a standard Student t distribution.
-
-    Args:
-        count: How many; a power of two is spread best.
-        size: Number of coordinates.
-        seed: Of the scrambling.
-
-    Returns:
-        The points, each beside its mirror image.
-
-    Raises:
-        Nothing.
-    """
+    """Evenly spread points of a standard Student t distribution."""
     share = even(-(-count // 2), size + 1, seed)
     chi_squared = 2.0 * scipy.special.gammaincinv(0.5 * DEGREES_OF_FREEDOM, share[:, :1])
     half = scipy.special.ndtri(share[:, 1:]) / np.sqrt(chi_squared / DEGREES_OF_FREEDOM)
@@ -69,22 +52,9 @@ def heavy_points(count: int, size: int, seed: int) -> Points:
 def learn(
     places: Float[np.ndarray, "pixel draw size"], weights: Float[np.ndarray, "pixel draw"]
 ) -> Proposal:
-    """Mean and covariance of weighted draws.
-
-    Args:
-        places: Unconstrained vectors.
-        weights: They sum to one in each pixel.
-
-    Returns:
-        The next proposal; NaN where the draws span no volume.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Cappe, Guillin, Marin & Robert (2004), J. Comput. Graph. Stat. 13(4), 907-929: population
-        Monte Carlo.
-    """
+    """Mean and covariance of weighted draws."""
+    # Source: Cappe, Guillin, Marin & Robert (2004), J. Comput. Graph. Stat. 13(4), 907-929:
+    # population Monte Carlo.
     center = np.einsum("pd,pds->ps", weights, places)
     apart = places - center[:, None]
     covariance = np.einsum("pd,pds,pdt->pst", weights, apart, apart)

@@ -26,11 +26,9 @@ def batches(count: int, size: int) -> Iterator[np.ndarray]:
 
 
 def batched(function: Callable, *, given: int = 0, side_by_side: int = CLIMBING) -> Callable:
-    """A function of one pixel, mapped over a batch, compiled.
-
-    Its first arguments, as many as `given`, are the same for all pixels; so is how many pixels of
-    the batch are wanted, which comes before the batch. The others fill it up, and cost nothing.
-    """
+    """A function of one pixel, mapped over a batch, compiled."""
+    # Its first arguments, as many as `given`, are the same for all pixels; so is how many pixels of
+    # the batch are wanted, which comes before the batch. The others fill it up, and cost nothing.
 
     def run(*arguments: Any) -> Any:
         common, (wanted, own, shared, *states) = arguments[:given], arguments[given:]

@@ -39,16 +39,7 @@ NUMBER = "pixel_number"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plan:
-    """What is done to every block of one image; it can be sent to another process.
-
-    Args:
-        request: The fit of one pixel, checked; its capture is that pixel.
-        settings: What is done for each pixel.
-        intensity_unit: What an intensity of 1 is, or None where the capture states its saturation
-            level.
-        own_directions: Angles, and `normal_confidence`, that each pixel has for itself.
-        key: Of all that the programs depend on: plans that share it share them, in each process.
-    """
+    """What is done to every block of one image; it can be sent to another process."""
 
     request: Request
     settings: PixelMethod
@@ -99,18 +90,7 @@ class Plan:
 
 
 def fit_block(block: xr.Dataset, plan: Plan) -> xr.Dataset:
-    """Fit every pixel of a block.
-
-    Args:
-        block: A capture with dims y and x, and `pixel_number`.
-        plan: What is done.
-
-    Returns:
-        The maps of the block.
-
-    Raises:
-        CaptureError: A value of the block is not what the contract of captures allows.
-    """
+    """Fit every pixel of a block."""
     engine = plan.engine
     numbers = block[NUMBER].transpose(*IMAGE).to_numpy()
     with jax.enable_x64(True):
@@ -132,17 +112,7 @@ def _masked(block: xr.Dataset, plan: Plan) -> xr.Dataset:
 
 
 def set_aside(capture: xr.Dataset) -> xr.Dataset:
-    """A capture whose missing readings are marked as such.
-
-    Args:
-        capture: Readings that are not numbers count as missing.
-
-    Returns:
-        The capture with `valid`.
-
-    Raises:
-        Nothing.
-    """
+    """A capture whose missing readings are marked as such."""
     valid = capture.get("valid", xr.DataArray(True)).astype(bool)
     for name in READINGS:
         if name in capture:
@@ -151,21 +121,7 @@ def set_aside(capture: xr.Dataset) -> xr.Dataset:
 
 
 def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, layout: Layout) -> xr.Dataset:
-    """The marginals of a block as labeled maps.
-
-    Args:
-        found: Of its pixels, row by row.
-        outcome: What became of them.
-        block: The readings.
-        layout: Own axes of every parameter.
-
-    Returns:
-        For each parameter `<name>` (the posterior mean), `<name>_sd` and `<name>_quantile`; and
-        what is known of each pixel's fit. Maps are in single precision.
-
-    Raises:
-        Nothing.
-    """
+    """The marginals of a block as labeled maps."""
     shape = tuple(block.sizes[dim] for dim in IMAGE)
     variables: dict[str, Any] = {}
     for name, (own, sizes) in layout.items():

@@ -27,16 +27,7 @@ Curvature = Callable[[Program, Array, Observations], Slopes]
 
 
 class Climber(NamedTuple):
-    """Where one pixel is.
-
-    Args:
-        z: Unconstrained vector.
-        slopes: The potential there.
-        damping: Of the next step, relative to the diagonal of the curvature.
-        decrement: Length of the last step, in posterior standard deviations.
-        steps: How many were tried.
-        settled: True where the decrement met its goal; then nothing changes any more.
-    """
+    """Where one pixel is."""
 
     z: Float[AnyArray, " size"]
     slopes: Slopes
@@ -47,16 +38,7 @@ class Climber(NamedTuple):
 
 
 class Peak(NamedTuple):
-    """A mode, and the normal distribution that fits there.
-
-    Args:
-        z: Unconstrained vector.
-        value: The potential, up to the constant of the model.
-        widths: Lower triangular; `z + widths.T @ e` with standard normal e are its draws. NaN
-            where the curvature is not positive definite.
-        decrement: Distance to the mode in posterior standard deviations before the last step.
-        condition: Condition number (1-norm) of the curvature.
-    """
+    """A mode, and the normal distribution that fits there."""
 
     z: Float[AnyArray, " size"]
     value: Float[AnyArray, ""]
@@ -66,17 +48,7 @@ class Peak(NamedTuple):
 
 
 def stand(z: Float[np.ndarray, "pixel size"]) -> Climber:
-    """Climbers at their starts; their first step looks around and stays where it is.
-
-    Args:
-        z: The starts, in the precision of the climb.
-
-    Returns:
-        A climber for each, not yet settled.
-
-    Raises:
-        Nothing.
-    """
+    """Climbers at their starts; their first step looks around and stays where it is."""
     count, size = z.shape
     far, unit = (
         np.full(count, np.inf, z.dtype),
@@ -95,24 +67,8 @@ def stand(z: Float[np.ndarray, "pixel size"]) -> Climber:
 def step(
     program: Program, curvature: Curvature, goal: float, climber: Climber, data: Observations
 ) -> Climber:
-    """One damped step, taken only where it leads down.
-
-    Args:
-        program: The model of one pixel.
-        curvature: `score` or `expand`.
-        goal: The decrement, in posterior standard deviations, at which it is settled.
-        climber: Where the pixel is.
-        data: The pixel's readings.
-
-    Returns:
-        The climber after the step.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Marquardt (1963), J. SIAM 11(2), 431-441.
-    """
+    """One damped step, taken only where it leads down."""
+    # Source: Marquardt (1963), J. SIAM 11(2), 431-441.
     value, gradient, bend = climber.slopes
     scale = jnp.maximum(jnp.abs(jnp.diagonal(bend)), jnp.finfo(value.dtype).tiny)
     half = inverse(cholesky(bend + climber.damping * jnp.diag(scale)))
@@ -143,18 +99,7 @@ def step(
 
 
 def crown(z: Float[Array, " size"], slopes: Slopes) -> Peak:
-    """The last step, with exact curvature, and what it leaves.
-
-    Args:
-        z: Next to a mode.
-        slopes: There, with exact curvature.
-
-    Returns:
-        The peak; its widths are those at `z`, so `decrement` says how far they can be off.
-
-    Raises:
-        Nothing.
-    """
+    """The last step, with exact curvature, and what it leaves."""
     value, gradient, bend = slopes
     half = inverse(cholesky(bend))
     whitened = half @ gradient

@@ -32,13 +32,7 @@ Coordinates = tuple[Float[Array, ""], ...]
 
 
 class Slopes(NamedTuple):
-    """The potential (minus the log posterior density) around a point.
-
-    Args:
-        value: The potential, up to a constant.
-        gradient: Its first derivatives.
-        curvature: Its second derivatives, or what scoring puts in their place.
-    """
+    """The potential (minus the log posterior density) around a point."""
 
     value: Float[AnyArray, ""]
     gradient: Float[AnyArray, " size"]
@@ -46,28 +40,12 @@ class Slopes(NamedTuple):
 
 
 def score(program: Program, z: Float[Array, " size"], data: Observations) -> Slopes:
-    r"""Value, gradient and the curvature of scoring.
-
-    $$ H = \sum_i J_i^T \, \frac{\partial^2 (-\log p_i)}{\partial\eta^2} \, J_i + H_{prior} $$
-
-    where $\eta_i(z)$ are the arguments of the distribution of reading i and $J_i$ their slopes.
-    What is left out is the curvature of $\eta$ itself, times residuals.
-
-    Args:
-        program: The model of one pixel.
-        z: Unconstrained vector, (size,).
-        data: The pixel's readings.
-
-    Returns:
-        The three, in the precision of `z`.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Schraudolph (2002), Neural Computation 14(7), 1723-1738: the generalized Gauss-Newton
-        matrix; with normal noise it is that of Gauss and Newton, and Fisher's.
-    """
+    """Value, gradient and the curvature of scoring."""
+    # $$ H = \sum_i J_i^T \, \frac{\partial^2 (-\log p_i)}{\partial\eta^2} \, J_i + H_{prior} $$
+    # where $\eta_i(z)$ are the arguments of the distribution of reading i and $J_i$ their slopes.
+    # What is left out is the curvature of $\eta$ itself, times residuals.
+    # Source: Schraudolph (2002), Neural Computation 14(7), 1723-1738: the generalized Gauss-Newton
+    # matrix; with normal noise it is that of Gauss and Newton, and Fisher's.
     coordinates = tuple(z)
     pixel = _Pixel(program, data)
     arguments, likelihoods = pixel.arguments(coordinates), pixel.likelihoods(coordinates)
@@ -94,28 +72,15 @@ def score(program: Program, z: Float[Array, " size"], data: Observations) -> Slo
 
 
 def expand(program: Program, z: Float[Array, " size"], data: Observations) -> Slopes:
-    """Value, gradient and exact second derivatives.
-
-    Args:
-        program: The model of one pixel.
-        z: Unconstrained vector, (size,).
-        data: The pixel's readings.
-
-    Returns:
-        The three, in the precision of `z`.
-
-    Raises:
-        Nothing.
-    """
+    """Value, gradient and exact second derivatives."""
     return Slopes(*_expand(_Pixel(program, data).potential, tuple(z)))
 
 
 class _Pixel:
-    """A program and its data as functions of coordinates, one number each.
+    """A program and its data as functions of coordinates, one number each."""
 
-    Each is traced once, however often it is differentiated: the model is walked by NumPyro, and
-    that is slow.
-    """
+    # Each is traced once, however often it is differentiated: the model is walked by NumPyro, and
+    # that is slow.
 
     def __init__(self, program: Program, data: Observations) -> None:
         self._program = program

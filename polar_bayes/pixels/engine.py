@@ -58,13 +58,7 @@ THERE = {"double": 1e-4, "single": 1e-2}
 
 
 class Settled(NamedTuple):
-    """Where a row of pixels arrived.
-
-    Args:
-        peak: The modes.
-        steps: How many steps each took.
-        converged: True where the decrement met its goal and the curvature is positive definite.
-    """
+    """Where a row of pixels arrived."""
 
     peak: Peak
     steps: np.ndarray
@@ -73,15 +67,7 @@ class Settled(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Engine:
-    """The model of one pixel, ready to be climbed by many.
-
-    Args:
-        program: In the precision of the answer.
-        rough: The same model in single precision, in which climbs begin.
-        candidates: Unconstrained vectors among which each pixel finds its start.
-        precision: "double" or "single".
-        programs: Those that depend on settings, by these; they go when the engine goes.
-    """
+    """The model of one pixel, ready to be climbed by many."""
 
     program: Program
     rough: Program
@@ -95,18 +81,7 @@ class Engine:
         return self
 
     def climb(self, pixels: Stack, rank: int = 0) -> Settled:
-        """From a candidate to the mode of every pixel.
-
-        Args:
-            pixels: Each with enough valid views.
-            rank: Which candidate: 0 is the best of them for a pixel, 1 the next.
-
-        Returns:
-            Where they arrived.
-
-        Raises:
-            Nothing.
-        """
+        """From a candidate to the mode of every pixel."""
         near = pixels.in_precision(np.float32)
         with jax.enable_x64(False):
             z = self._map(functools.partial(self._start, np.int32(rank)), near)
@@ -133,21 +108,7 @@ class Engine:
     def draw(
         self, pixels: Stack, proposal: Proposal, points: Points, *, weighted: bool
     ) -> tuple[Values, np.ndarray]:
-        """Draws of every pixel's proposal, and how the posterior weighs them.
-
-        Args:
-            pixels: The readings.
-            proposal: Centers and scales.
-            points: Draws of the standard distribution.
-            weighted: True for the ratios too.
-
-        Returns:
-            Draws of the parameters by name, each (pixel, draw, ...); and log of posterior over
-            proposal, (pixel, draw), up to a constant per pixel, or zeros.
-
-        Raises:
-            Nothing.
-        """
+        """Draws of every pixel's proposal, and how the posterior weighs them."""
         near = pixels.in_precision(np.float32)
         with jax.enable_x64(False):
             center, half = (np.float32(x) for x in proposal)
@@ -159,23 +120,7 @@ class Engine:
     def sample(
         self, pixels: Stack, z: AnyArray, half: AnyArray, settings: PixelNuts, keys: np.ndarray
     ) -> tuple[Values, np.ndarray, np.ndarray]:
-        """Chains in every pixel.
-
-        Args:
-            pixels: The readings.
-            z: Their modes, (pixel, size); or where chains begin, (pixel, chain, size), where the
-                settings have a start of their own.
-            half: Widths, which are the metric, (pixel, size, size).
-            settings: Lengths of the chains.
-            keys: One for each pixel.
-
-        Returns:
-            Draws of the parameters by name, each (pixel, draw, ...); and of the worst coordinate,
-            split R-hat and effective draws, each (pixel,).
-
-        Raises:
-            Nothing.
-        """
+        """Chains in every pixel."""
         with jax.enable_x64(self.precision == "double"):
             with TRACING:
                 several = self._kept(self._chains, settings)
@@ -188,20 +133,7 @@ class Engine:
     def temper(
         self, pixels: Stack, settings: PixelTempering, keys: np.ndarray, attempt: int
     ) -> Tempered:
-        """A crowd for every pixel that began as draws from its prior.
-
-        Args:
-            pixels: The readings.
-            settings: How many walks, and how long.
-            keys: One for each pixel.
-            attempt: Number of the crowd, which random numbers follow.
-
-        Returns:
-            The crowds, with a leading pixel axis; in the coordinates of each pixel's prior.
-
-        Raises:
-            Nothing.
-        """
+        """A crowd for every pixel that began as draws from its prior."""
         with jax.enable_x64(False):
             with TRACING:
                 crowded = functools.partial(
@@ -219,23 +151,7 @@ class Engine:
         keys: np.ndarray,
         number: int,
     ) -> Proposed:
-        """Draws of mixtures that are fitted to weighted draws.
-
-        Args:
-            pixels: The readings.
-            settings: How many components, and draws.
-            scores: Coordinates of each pixel.
-            u: Normal scores of the weighted draws, (pixel, draw, size).
-            weights: They sum to one in each pixel.
-            keys: One for each pixel.
-            number: Of the round, which random numbers follow.
-
-        Returns:
-            The mixtures, their draws, and the density of their scores there.
-
-        Raises:
-            Nothing.
-        """
+        """Draws of mixtures that are fitted to weighted draws."""
         with jax.enable_x64(False):
             with TRACING:
                 proposed = self._kept(self._proposed, settings)

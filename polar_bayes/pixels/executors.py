@@ -15,18 +15,7 @@ AHEAD = 2
 
 @contextlib.contextmanager
 def workers(scheduler: str | None) -> Iterator[tuple[Executor, int]]:
-    """Something that runs functions, and how many at a time.
-
-    Args:
-        scheduler: Address of a `dask.distributed` scheduler, such as tcp://10.0.0.1:8786; None for
-            threads of this process.
-
-    Yields:
-        An executor and its number of workers.
-
-    Raises:
-        FitError: The cluster cannot be reached, or the library for it is not installed.
-    """
+    """Something that runs functions, and how many at a time."""
     if scheduler is None:
         threads = os.cpu_count() or 1
         pool = ThreadPoolExecutor(threads)
@@ -60,20 +49,7 @@ def workers(scheduler: str | None) -> Iterator[tuple[Executor, int]]:
 def as_completed(
     executor: Executor, count: int, function: Callable, tasks: Iterable[tuple]
 ) -> Iterator[tuple[tuple, Any]]:
-    """Results as they come, with few tasks on their way at any time.
-
-    Args:
-        executor: Of `workers`.
-        count: How many tasks it runs at a time.
-        function: Called with each task's arguments.
-        tasks: Arguments.
-
-    Yields:
-        A task and its result.
-
-    Raises:
-        Exception: What the function raises; tasks that have not begun are then called off.
-    """
+    """Results as they come, with few tasks on their way at any time."""
     waiting, left = {}, iter(tasks)
     try:
         while True:

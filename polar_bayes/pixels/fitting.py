@@ -103,22 +103,7 @@ def fit_stack(
     seed: int,
     describe: Describe,
 ) -> Outcome:
-    """Fit every pixel of a row.
-
-    Args:
-        engine: The model of one pixel.
-        settings: What is done for each.
-        pixels: The readings.
-        numbers: Of the pixels in the whole image, which random numbers follow, (pixel,).
-        seed: Of the random numbers.
-        describe: Called with the draws of all that have an answer.
-
-    Returns:
-        What became of each, in the order of the pixels.
-
-    Raises:
-        Nothing: what fails is in `status`.
-    """
+    """Fit every pixel of a row."""
     row = Row(len(pixels), describe)
     row.status[pixels.views < FEWEST_VIEWS] = Status.TOO_FEW_VIEWS
     row.status[pixels.views == 0] = Status.MASKED
@@ -218,16 +203,7 @@ def _climb(engine: Engine, pixels: Stack) -> Settled:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Work:
-    """What is done to every piece of a row, from the cheapest answer to the dearest.
-
-    Args:
-        engine: The model of one pixel.
-        settings: What is asked for.
-        points: Of the normal approximations.
-        further: Of the proposals that are fitted to weighted draws.
-        keys: A random key for each pixel of the row.
-        turns: How each pixel of the row turns the points.
-    """
+    """What is done to every piece of a row, from the cheapest answer to the dearest."""
 
     engine: Engine
     settings: PixelLaplace

@@ -22,12 +22,7 @@ TAIL = 0.05
 
 
 class Points(NamedTuple):
-    """Draws of a standard distribution, the same for all pixels.
-
-    Args:
-        places: (draw, size).
-        log_density: Up to a constant, (draw,).
-    """
+    """Draws of a standard distribution, the same for all pixels."""
 
     places: Float[np.ndarray, "draw size"]
     log_density: Float[np.ndarray, " draw"]
@@ -50,21 +45,8 @@ def mirrored(points: Float[np.ndarray, "half size"]) -> Float[np.ndarray, "count
 
 
 def turns(keys: np.ndarray, size: int) -> Float[np.ndarray, "pixel size size"]:
-    """A random rotation or reflection for each pixel, all equally likely.
-
-    Args:
-        keys: Data of a random key for each pixel.
-        size: Number of coordinates.
-
-    Returns:
-        Orthogonal matrices.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Mezzadri (2007), Notices of the AMS 54(5), 592-604.
-    """
+    """A random rotation or reflection for each pixel, all equally likely."""
+    # Source: Mezzadri (2007), Notices of the AMS 54(5), 592-604.
     draw = jax.vmap(
         lambda key: jax.random.bits(jax.random.wrap_key_data(key), (size, size), np.uint32)
     )
@@ -75,37 +57,17 @@ def turns(keys: np.ndarray, size: int) -> Float[np.ndarray, "pixel size size"]:
 
 
 class Smoothed(NamedTuple):
-    """Weights of the draws of every pixel.
-
-    Args:
-        weights: They sum to one. (pixel, draw).
-        pareto_k: Shape of the tail of the raw weights. (pixel,).
-    """
+    """Weights of the draws of every pixel."""
 
     weights: Float[np.ndarray, "pixel draw"]
     pareto_k: Float[np.ndarray, " pixel"]
 
 
 def normal_points(count: int, size: int, seed: int) -> Points:
-    """Evenly spread standard normal points.
-
-    Their distances from the middle are quantiles of the chi distribution, one of each, so that over
-    all turns of the points every quantile in every direction is right.
-
-    Args:
-        count: How many; a power of two is spread best.
-        size: Number of coordinates.
-        seed: Of the scrambling.
-
-    Returns:
-        The points, with mean zero: each stands beside its mirror image.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Owen (1998), J. Complexity 14(4), 466-489: scrambled Sobol' points.
-    """
+    """Evenly spread standard normal points."""
+    # Their distances from the middle are quantiles of the chi distribution, one of each, so that
+    # over all turns of the points every quantile in every direction is right.
+    # Source: Owen (1998), J. Complexity 14(4), 466-489: scrambled Sobol' points.
     points = scipy.special.ndtri(even(-(-count // 2), size, seed))
     distance = np.linalg.norm(points, axis=-1)
     rank = np.argsort(np.argsort(distance))
@@ -116,23 +78,8 @@ def normal_points(count: int, size: int, seed: int) -> Points:
 
 
 def smooth(log_ratios: Float[np.ndarray, "pixel draw"]) -> Smoothed:
-    r"""Pareto-smoothed importance weights of many pixels at once.
-
-    Args:
-        log_ratios: log of posterior over approximation at each draw, up to a constant per pixel;
-            minus infinity where the posterior is zero.
-
-    Returns:
-        Weights and Pareto k. k is 0 where all ratios of the tail agree to rounding: the
-        approximation is exact there. It is infinite where the tail is none: most ratios are one, or
-        fewer are finite than it should hold. Weights are NaN where no ratio is finite.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72).
-    """
+    """Pareto-smoothed importance weights of many pixels at once."""
+    # Source: Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72).
     count = log_ratios.shape[-1]
     tail = int(3.0 * count**0.5) if count > 225 else count // 5
     known = np.isfinite(log_ratios)
@@ -159,11 +106,9 @@ def smooth(log_ratios: Float[np.ndarray, "pixel draw"]) -> Smoothed:
 
 
 def _fit_tail(excess: Float[np.ndarray, "pixel tail"]) -> tuple[np.ndarray, np.ndarray]:
-    """Shape and scale of generalized Pareto distributions, ascending excesses in every row.
-
-    Source:
-        Zhang & Stephens (2009), Technometrics 51(3), 316-325, with the prior of Vehtari et al.
-    """
+    """Shape and scale of generalized Pareto distributions, ascending excesses in every row."""
+    # Source: Zhang & Stephens (2009), Technometrics 51(3), 316-325, with the prior of Vehtari et
+    # al.
     count = excess.shape[-1]
     grid = 30 + int(count**0.5)
     quartile = excess[:, int(count / 4.0 + 0.5) - 1, None]
@@ -193,20 +138,7 @@ def summarize(
     weights: Float[np.ndarray, "pixel draw"],
     levels: tuple[float, ...],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean, standard deviation and quantiles of weighted draws.
-
-    Args:
-        draws: Of one parameter.
-        weights: They sum to one in each pixel.
-        levels: Between 0 and 1.
-
-    Returns:
-        Mean and standard deviation, (pixel,), and quantiles, (level, pixel), interpolated between
-        the middles of the weights.
-
-    Raises:
-        Nothing.
-    """
+    """Mean, standard deviation and quantiles of weighted draws."""
     mean = np.sum(weights * draws, axis=-1)
     sd = np.sqrt(np.sum(weights * (draws - mean[:, None]) ** 2, axis=-1))
     order = np.argsort(draws, axis=-1, kind="stable")
@@ -235,24 +167,10 @@ def effective_draws(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarra
 def effective_tails(
     draws: Float[np.ndarray, "pixel draw size"], weights: Float[np.ndarray, "pixel draw"]
 ) -> Float[np.ndarray, " pixel"]:
-    """How many draws of the posterior itself would tell its tails as well as the weighted ones do.
-
-    Args:
-        draws: Unconstrained vectors.
-        weights: They sum to one in each pixel.
-
-    Returns:
-        The least of all coordinates and both tails: p (1 - p) over the variance of the share of the
-        posterior beyond its own 5% and 95% quantile.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Vehtari, Gelman, Simpson, Carpenter & Buerkner (2021), Bayesian Anal. 16(2), section 4.3
-        (tail effective sample size); Owen (2013), Monte Carlo theory, methods and examples, eq. 9.8
-        (variance of weighted means).
-    """
+    """How many draws of the posterior itself would tell its tails as well as the weighted ones do."""
+    # Source: Vehtari, Gelman, Simpson, Carpenter & Buerkner (2021), Bayesian Anal. 16(2), section
+    # 4.3 (tail effective sample size); Owen (2013), Monte Carlo theory, methods and examples, eq.
+    # 9.8 (variance of weighted means).
     least = np.full(len(draws), np.inf)
     for coordinate in np.moveaxis(draws, -1, 0):
         order = np.argsort(coordinate, axis=-1)

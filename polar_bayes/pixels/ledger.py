@@ -18,23 +18,17 @@ REPEAT = "repeat the command as it was, or give another --out"
 
 
 class Entry(NamedTuple):
-    """A block that is done.
-
-    Args:
-        readings: SHA-256 of what was read of the capture.
-        chunks: SHA-256 of the chunk files as written.
-    """
+    """A block that is done."""
 
     readings: str
     chunks: str
 
 
 class Ledger:
-    """A file beside the store: a head with the fingerprint of the request, then a line per block.
+    """A file beside the store: a head with the fingerprint of the request, then a line per block."""
 
-    A line is added after the chunks of its block are on the disk. A line without an end was cut
-    off by a crash and counts as not there; any other line that fails its checksum is an error.
-    """
+    # A line is added after the chunks of its block are on the disk. A line without an end was cut
+    # off by a crash and counts as not there; any other line that fails its checksum is an error.
 
     def __init__(self, opened: BinaryIO, file: Path, request: str) -> None:
         self._opened, self._file, self._size = opened, file, 0
@@ -101,10 +95,8 @@ class Ledger:
 
 @contextlib.contextmanager
 def locked_ledger(file: Path, request: str, *, resume: bool) -> Iterator[Ledger]:
-    """The ledger of a map, locked: the lock ends with the block, or with the process.
-
-    A ledger that was made here and in which nothing was written is removed again.
-    """
+    """The ledger of a map, locked: the lock ends with the block, or with the process."""
+    # A ledger that was made here and in which nothing was written is removed again.
     opened, is_new = _open(file, resume=resume)
     try:
         _lock(opened, file)

@@ -23,14 +23,7 @@ MAKING = threading.RLock()
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Recipe:
-    """What programs are made from. Recipes of one key make the same, and share them.
-
-    Args:
-        request: What is asked of each capture.
-        observe: One that stands for all, in double precision.
-        candidates: Prior draws among which each capture finds its start.
-        key: Of all that the programs depend on; see `key_of`.
-    """
+    """What programs are made from. Recipes of one key make the same, and share them."""
 
     request: Request
     observe: Callable[[], Observations]
@@ -47,18 +40,7 @@ class Recipe:
 
 
 def key_of(request: Request, *further: Any) -> str:
-    """A text that is the same for requests whose programs are the same.
-
-    Args:
-        request: Its readings do not count, their layout does.
-        further: What else the programs depend on.
-
-    Returns:
-        The text; good for one process and those that it sends it to.
-
-    Raises:
-        Nothing.
-    """
+    """A text that is the same for requests whose programs are the same."""
     layout = [
         (name, v.dims, v.shape, str(v.dtype)) for name, v in request.capture.variables.items()
     ]
@@ -75,17 +57,7 @@ def key_of(request: Request, *further: Any) -> str:
 
 @functools.lru_cache(maxsize=4)
 def make_engine(recipe: Recipe) -> Engine:
-    """The programs of a recipe; they are traced at their first use.
-
-    Args:
-        recipe: What they are made from.
-
-    Returns:
-        The engine; the last few are kept.
-
-    Raises:
-        Nothing.
-    """
+    """The programs of a recipe; they are traced at their first use."""
     request, data = recipe.request, recipe.observe()
     given = {"double": data, "single": data.in_single_precision()}
 

@@ -115,10 +115,8 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
 
 
 def checked_status(maps: xr.Dataset) -> xr.DataArray:
-    """Statuses of maps, in memory; a pixel that is called good without numbers is not fitted.
-
-    A chunk that was lost from a store reads as not a number.
-    """
+    """Statuses of maps, in memory; a pixel that is called good without numbers is not fitted."""
+    # A chunk that was lost from a store reads as not a number.
     answers = [
         f"{name}{ending}"
         for name in maps.data_vars
@@ -146,25 +144,7 @@ def plan_map(
     seed: int,
     precision: str,
 ) -> Plan:
-    """Check what is asked of a map, on one of its pixels.
-
-    Args:
-        capture: See `fit_pixels`; the other arguments too.
-        model: A name or a callable.
-        method: Settings, or None for the defaults.
-        scene: A name, a `Scene` or None.
-        priors: Overrides.
-        links: One link, a mapping or None.
-        largest_view_zenith: Unit degree, or None for the set-up's own.
-        seed: An integer.
-        precision: "double" or "single".
-
-    Returns:
-        The plan, which holds for every block.
-
-    Raises:
-        PolarBayesError: Something cannot be used; see `fit_pixels`.
-    """
+    """Check what is asked of a map, on one of its pixels."""
     settings = PixelLaplace() if method is None else method
     if not isinstance(settings, PixelMethod):
         raise FitError(
@@ -210,18 +190,7 @@ def numbered_block(block: xr.Dataset, place: Mapping[str, slice], columns: int) 
 
 
 def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
-    """Maps of the image before any pixel is fitted: names, axes, types and attributes.
-
-    Args:
-        capture: The image.
-        plan: What is to be done.
-
-    Returns:
-        A dataset that takes no memory, in the chunks of the image.
-
-    Raises:
-        Nothing.
-    """
+    """Maps of the image before any pixel is fitted: names, axes, types and attributes."""
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
     nothing = no_outcome(1)
     nothing.status[:] = Status.NOT_FITTED
@@ -237,15 +206,7 @@ def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
 
 
 def cut(capture: xr.Dataset, pixels: int = BLOCK) -> Iterator[dict[str, slice]]:
-    """Places of blocks that cover an image, row by row.
-
-    Args:
-        capture: The image.
-        pixels: Most pixels of a block.
-
-    Yields:
-        Slices of y and x.
-    """
+    """Places of blocks that cover an image, row by row."""
     rows, columns = (capture.sizes[dim] for dim in IMAGE)
     wide = min(columns, pixels)
     high = max(1, pixels // wide)

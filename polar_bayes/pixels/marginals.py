@@ -11,17 +11,7 @@ LEVELS = (0.025, 0.1, 0.25, 0.5, 0.75, 0.9, 0.975)
 
 
 class Marginals:
-    """What a row of pixels has, filled in as answers come: NaN where a pixel has none.
-
-    Args:
-        count: How many pixels.
-        sizes: Own axes of every parameter.
-
-    Attributes:
-        mean: By parameter, (pixel, ...).
-        sd: By parameter, (pixel, ...).
-        quantiles: By parameter, (level, pixel, ...), at `LEVELS`.
-    """
+    """What a row of pixels has, filled in as answers come: NaN where a pixel has none."""
 
     def __init__(self, count: int, sizes: Mapping[str, tuple[int, ...]]) -> None:
         self.mean = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
@@ -31,16 +21,7 @@ class Marginals:
         }
 
     def describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        """Take down some pixels.
-
-        Args:
-            at: Which, (pixel,).
-            parameters: Their draws by name, each (pixel, draw, ...).
-            weights: Of the draws; they sum to one. (pixel, draw).
-
-        Raises:
-            Nothing.
-        """
+        """Take down some pixels."""
         for name, mean in self.mean.items():
             draws = np.asarray(parameters[name], float)
             for own in np.ndindex(mean.shape[1:]):

@@ -30,15 +30,7 @@ PRIOR_SCALE = 0.5
 
 
 class Mixture(NamedTuple):
-    """A mixture in coordinates in which all draws together have mean 0 and covariance 1.
-
-    Args:
-        center: Mean of all draws, (size,).
-        half: Lower root of their covariance, (size, size).
-        log_share: (component,).
-        mean: (component, size).
-        scale: Lower root of the squared scale of each component, (component, size, size).
-    """
+    """A mixture in coordinates in which all draws together have mean 0 and covariance 1."""
 
     center: Float[Array, " size"]
     half: Float[Array, "size size"]
@@ -48,15 +40,7 @@ class Mixture(NamedTuple):
 
 
 class Proposed(NamedTuple):
-    """Draws of a mixture for every pixel of a row.
-
-    Args:
-        mixture: It, with a leading pixel axis.
-        z: Its draws, in the coordinates in which it was fitted, (pixel, draw, size).
-        parameters: The same by name, each (pixel, draw, ...).
-        log_posterior: There, (pixel, draw), up to a constant per pixel; minus infinity where there
-            is none.
-    """
+    """Draws of a mixture for every pixel of a row."""
 
     mixture: Mixture
     z: AnyArray
@@ -67,26 +51,10 @@ class Proposed(NamedTuple):
 def fit_mixture(
     z: Float[Array, "draw size"], weights: Float[Array, " draw"], components: int, key: Array
 ) -> Mixture:
-    """Fit normal components by expectation and maximization.
-
-    Components shrink towards the whole as far as they have few draws.
-
-    Args:
-        z: Draws.
-        weights: They sum to one.
-        components: How many.
-        key: Random key: of the draws at which components begin.
-
-    Returns:
-        The mixture.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Cappe, Douc, Guillin, Marin & Robert (2008), Stat. Comput. 18, 447-459: adaptive importance
-        sampling by mixtures.
-    """
+    """Fit normal components by expectation and maximization."""
+    # Components shrink towards the whole as far as they have few draws.
+    # Source: Cappe, Douc, Guillin, Marin & Robert (2008), Stat. Comput. 18, 447-459: adaptive
+    # importance sampling by mixtures.
     size = z.shape[-1]
     center, half = spread(z, weights)
     x = (z - center) @ _inverse(half).T
@@ -121,19 +89,7 @@ def fit_mixture(
 
 
 def draw_mixture(mixture: Mixture, count: int, key: Array) -> Float[Array, "draw size"]:
-    """Draws of the mixture with tails of Student's t, each component's share evenly.
-
-    Args:
-        mixture: Of `fit_mixture`.
-        count: How many.
-        key: Random key.
-
-    Returns:
-        Unconstrained vectors.
-
-    Raises:
-        Nothing.
-    """
+    """Draws of the mixture with tails of Student's t, each component's share evenly."""
     components, size = mixture.mean.shape
     key_which, key_normal, key_tail = jax.random.split(key, 3)
     even = (jnp.arange(count) + jax.random.uniform(key_which)) / count
@@ -148,18 +104,7 @@ def draw_mixture(mixture: Mixture, count: int, key: Array) -> Float[Array, "draw
 
 
 def log_density(mixture: Mixture, z: Float[Array, "draw size"]) -> Float[Array, " draw"]:
-    """Log density of a mixture with tails of Student's t.
-
-    Args:
-        mixture: Of `fit_mixture`.
-        z: Unconstrained vectors.
-
-    Returns:
-        The log density, up to a constant that depends on the size alone.
-
-    Raises:
-        Nothing.
-    """
+    """Log density of a mixture with tails of Student's t."""
     freedom, size = DEGREES_OF_FREEDOM, z.shape[-1]
     x = (z - mixture.center) @ _inverse(mixture.half).T
     squares, log_volume = _whitened(x, mixture.mean, mixture.scale)

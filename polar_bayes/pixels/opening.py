@@ -218,19 +218,8 @@ def _range(part: slice | np.ndarray | int, length: int) -> str:
 
 
 def at_hand(maps: xr.Dataset) -> xr.Dataset:
-    """Maps whose values can be looked at again and again.
-
-    Those in chunks (Dask) would be fitted anew at each look: they are computed, once.
-
-    Args:
-        maps: Of `polar_bayes.fit_pixels`, or opened from a store.
-
-    Returns:
-        The maps: in memory, or in a store from which they are read when they are needed.
-
-    Raises:
-        FitError: They are in chunks, and too large for memory.
-    """
+    """Maps whose values can be looked at again and again."""
+    # Those in chunks (Dask) would be fitted anew at each look: they are computed, once.
     if not any(variable.chunks for variable in maps.variables.values()):
         return maps
     if maps.nbytes > MOST_BYTES:

@@ -39,16 +39,7 @@ Describe = Callable[[np.ndarray, Values, np.ndarray], None]
 
 
 class Outcome(NamedTuple):
-    """What became of a row of pixels: NaN where there is nothing to say.
-
-    Args:
-        pareto_k: (pixel,).
-        effective_draws: What the weighted draws are worth, (pixel,).
-        condition: Condition number of the curvature at the mode, (pixel,).
-        steps: Steps to the mode, (pixel,).
-        approach: Of `Approach`, (pixel,).
-        status: Of `Status`, (pixel,).
-    """
+    """What became of a row of pixels: NaN where there is nothing to say."""
 
     pareto_k: np.ndarray
     effective_draws: np.ndarray
@@ -71,14 +62,7 @@ def no_outcome(count: int) -> Outcome:
 
 
 class Approximation(NamedTuple):
-    """Normal approximations of a row of pixels, and their weighted draws.
-
-    Args:
-        settled: The modes.
-        parameters: Draws by name, each (pixel, draw, ...).
-        weights: (pixel, draw).
-        pareto_k: (pixel,).
-    """
+    """Normal approximations of a row of pixels, and their weighted draws."""
 
     settled: Settled
     parameters: Values
@@ -92,14 +76,7 @@ class Approximation(NamedTuple):
 
 
 class Weighted(NamedTuple):
-    """Weighted draws of a row of pixels.
-
-    Args:
-        z: Unconstrained vectors, (pixel, draw, size).
-        parameters: The same by name, each (pixel, draw, ...).
-        weights: (pixel, draw).
-        pareto_k: (pixel,).
-    """
+    """Weighted draws of a row of pixels."""
 
     z: np.ndarray
     parameters: Values

@@ -23,18 +23,7 @@ BATCH = 16
 
 
 def pool(first: Proposed, second: Proposed) -> Weighted:
-    """The draws of both, weighed by the posterior over the mean of both mixtures.
-
-    Args:
-        first: Of some pixels.
-        second: Of the same pixels; as many draws.
-
-    Returns:
-        Weighted draws, those of the first before those of the second.
-
-    Raises:
-        Nothing.
-    """
+    """The draws of both, weighed by the posterior over the mean of both mixtures."""
     z, parameters, log_posterior = jax.tree.map(
         lambda *x: np.concatenate(x, axis=1), first[1:], second[1:]
     )

@@ -21,22 +21,7 @@ def tempered_draws(
     at: np.ndarray,
     row: Row,
 ) -> Iterator[tuple[np.ndarray, Weighted]]:
-    """Weighted draws as answers come; what has none begins again from a new crowd.
-
-    Args:
-        engine: The model of one pixel.
-        settings: Numbers and lengths.
-        pixels: The readings.
-        keys: A random key for each pixel.
-        at: Numbers of those that are fitted.
-        row: Told of every answer.
-
-    Returns:
-        Numbers of some pixels, and their draws.
-
-    Raises:
-        Nothing: what fails is in `row.status`.
-    """
+    """Weighted draws as answers come; what has none begins again from a new crowd."""
     row.status[at] = Status.NOT_CONVERGED
     for attempt in range(settings.crowds):
         lost = at

@@ -67,25 +67,8 @@ def chains(
     half: Float[Array, "size size"],
     key: Array,
 ) -> Float[Array, "chain draw size"]:
-    """Chains in one pixel.
-
-    Args:
-        program: The model of one pixel.
-        settings: Lengths and goals.
-        data: The pixel's readings.
-        starts: Where each chain begins.
-        half: `half.T @ half` is the metric.
-        key: Random key.
-
-    Returns:
-        Unconstrained draws after the warm-up.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Hoffman & Gelman (2014), JMLR 15, 1593-1623.
-    """
+    """Chains in one pixel."""
+    # Source: Hoffman & Gelman (2014), JMLR 15, 1593-1623.
     begin, advance = infer.hmc.hmc(
         potential_fn_gen=lambda data: lambda z: program.potential(z, data), algo="NUTS"
     )
@@ -125,22 +108,7 @@ def around_mode(
     half: Float[Array, "size size"],
     key: Array,
 ) -> Float[Array, "chain size"]:
-    """Draws of the normal approximation, for chains to begin at.
-
-    Args:
-        program: The model of one pixel.
-        settings: How many chains.
-        data: The pixel's readings.
-        mode: Its highest density.
-        half: Widths there; `mode + half.T @ e` are draws.
-        key: Random key.
-
-    Returns:
-        Unconstrained vectors; the mode itself where a draw has no density.
-
-    Raises:
-        Nothing.
-    """
+    """Draws of the normal approximation, for chains to begin at."""
 
     def draw(key: Array) -> Array:
         noise = jax.random.normal(jax.random.split(key)[0], mode.shape, mode.dtype)

@@ -25,14 +25,10 @@ FLATTEST = 1e-4
 
 
 class Scores(NamedTuple):
-    """A map of each coordinate to its normal score and back.
+    """A map of each coordinate to its normal score and back."""
 
-    Any increasing map would do: what is drawn and weighed allows for its slope. This one is the
-    empirical one of draws from the prior, linear between few knots.
-
-    Args:
-        values: Of the coordinates where the scores are `KNOTS`, increasing, (size, knot).
-    """
+    # Any increasing map would do: what is drawn and weighed allows for its slope. This one is the
+    # empirical one of draws from the prior, linear between few knots.
 
     values: Float[Array, "size knot"]
 
@@ -60,20 +56,8 @@ class Scores(NamedTuple):
 
 
 def normal_scores(z: Float[Array, "draw size"]) -> Scores:
-    """The scores that make draws from a prior standard normal in every coordinate.
-
-    Args:
-        z: Unconstrained vectors drawn from the prior, at least a thousand.
-
-    Returns:
-        The map.
-
-    Raises:
-        Nothing.
-
-    Source:
-        van der Waerden (1952), Indag. Math. 14, 453-458: normal scores.
-    """
+    """The scores that make draws from a prior standard normal in every coordinate."""
+    # Source: van der Waerden (1952), Indag. Math. 14, 453-458: normal scores.
     values = _quantiles(z.T, ndtr(KNOTS.astype(float)))
     steps = jnp.diff(values)
     steps = jnp.maximum(steps, FLATTEST * jnp.mean(steps, axis=-1, keepdims=True))
@@ -82,12 +66,7 @@ def normal_scores(z: Float[Array, "draw size"]) -> Scores:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ScoredProgram:
-    """A program whose vectors are normal scores; densities are those of the scores.
-
-    Args:
-        program: Of unconstrained vectors.
-        scores: The map between both.
-    """
+    """A program whose vectors are normal scores; densities are those of the scores."""
 
     program: Program
     scores: Scores
@@ -108,18 +87,7 @@ class ScoredProgram:
 
 
 def place(scores: Scores, u: Float[np.ndarray, "pixel draw size"]) -> np.ndarray:
-    """Unconstrained vectors of many pixels, each with scores of its own.
-
-    Args:
-        scores: With a leading pixel axis.
-        u: Normal scores.
-
-    Returns:
-        The vectors, (pixel, draw, size).
-
-    Raises:
-        Nothing.
-    """
+    """Unconstrained vectors of many pixels, each with scores of its own."""
     at = np.clip(np.searchsorted(KNOTS, u) - 1, 0, len(KNOTS) - 2)
     values = np.asarray(scores.values)
     slopes = np.diff(values, axis=-1) / np.diff(KNOTS)
@@ -131,11 +99,9 @@ def place(scores: Scores, u: Float[np.ndarray, "pixel draw size"]) -> np.ndarray
 
 
 def _quantiles(x: Float[Array, "size draw"], shares: np.ndarray) -> Float[Array, "size share"]:
-    """As `jnp.quantile`, of numbers that are finite.
-
-    Whole numbers in the same order are sorted instead: XLA compares floating-point numbers at six
-    times the cost.
-    """
+    """As `jnp.quantile`, of numbers that are finite."""
+    # Whole numbers in the same order are sorted instead: XLA compares floating-point numbers at six
+    # times the cost.
     whole = jnp.int64 if x.dtype == jnp.float64 else jnp.int32
 
     def turned(bits: Array) -> Array:

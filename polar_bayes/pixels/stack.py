@@ -18,13 +18,7 @@ IMAGE = ("y", "x")
 
 @dataclasses.dataclass(frozen=True)
 class Stack:
-    """Readings of many pixels.
-
-    Args:
-        own: Arrays with a leading pixel axis.
-        shared: What all pixels have in common: directions of a distant camera, for example.
-        views: How many valid readings each pixel has, (pixel,).
-    """
+    """Readings of many pixels."""
 
     own: Observations
     shared: Observations
@@ -53,19 +47,7 @@ class Stack:
 
 
 def stack(image: Observations, own_directions: frozenset[str] = frozenset()) -> Stack:
-    """Put the pixels of an image, or of a block of it, in a row.
-
-    Args:
-        image: With leading axes y and x.
-        own_directions: Angles, and `normal_confidence`, that each pixel has for itself. A block
-            cannot tell: in a block of one row, what changes from row to row looks the same for all.
-
-    Returns:
-        The pixels, row by row. Masks and readings are each pixel's own.
-
-    Raises:
-        Nothing.
-    """
+    """Put the pixels of an image, or of a block of it, in a row."""
     rows, columns = image.shape[:2]
 
     def row(x: Array) -> np.ndarray:

@@ -122,13 +122,7 @@ class PixelTempering(Carded):
 
 
 class Crowd(NamedTuple):
-    """Draws on their way.
-
-    Args:
-        u: Normal scores, (draw, size).
-        log_prior: Their log prior density, (draw,).
-        log_likelihood: Log posterior minus log prior; minus infinity where there is none. (draw,).
-    """
+    """Draws on their way."""
 
     u: Float[Array, "draw size"]
     log_prior: Float[Array, " draw"]
@@ -136,15 +130,7 @@ class Crowd(NamedTuple):
 
 
 class Tempered(NamedTuple):
-    """A crowd that has arrived, or not.
-
-    Args:
-        u: Normal scores, (draw, size).
-        weights: They sum to one, (draw,).
-        scores: What the draws are scores of.
-        temperature: 1 where it arrived.
-        stages: Steps of temperature after which the crowd walked.
-    """
+    """A crowd that has arrived, or not."""
 
     u: Float[Array | np.ndarray, "draw size"]
     weights: Float[Array | np.ndarray, " draw"]
@@ -154,24 +140,9 @@ class Tempered(NamedTuple):
 
 
 def temper(program: Program, settings: PixelTempering, data: Observations, key: Array) -> Tempered:
-    """Draws that are spread about as the posterior is.
-
-    Args:
-        program: The model of one pixel.
-        settings: Numbers and lengths of the walks.
-        data: The pixel's readings.
-        key: Random key.
-
-    Returns:
-        The crowd, weighted. Its draws follow each other in walks: a start, no more.
-
-    Raises:
-        Nothing.
-
-    Source:
-        Dau & Chopin (2022), J. R. Stat. Soc. B 84(1), 114-148: waste-free sequential Monte Carlo;
-        Jasra, Stephens, Doucet & Tsagaris (2011), Scand. J. Stat. 38(1), 1-22: adaptive steps.
-    """
+    """Draws that are spread about as the posterior is."""
+    # Source: Dau & Chopin (2022), J. R. Stat. Soc. B 84(1), 114-148: waste-free sequential Monte
+    # Carlo; Jasra, Stephens, Doucet & Tsagaris (2011), Scand. J. Stat. 38(1), 1-22: adaptive steps.
     walks, count, size = settings.walks, settings.crowd, program.size
     key_start, key_crowd, key_stages = jax.random.split(key, 3)
     keys = jax.random.split(key_start, settings.looks * count)
@@ -230,18 +201,7 @@ def temper(program: Program, settings: PixelTempering, data: Observations, key: 
 def spread(
     z: Float[Array, "draw size"], weights: Float[Array, " draw"]
 ) -> tuple[Float[Array, " size"], Float[Array, "size size"]]:
-    """Mean of weighted draws, and the lower root of their covariance.
-
-    Args:
-        z: Draws.
-        weights: They sum to one.
-
-    Returns:
-        Both.
-
-    Raises:
-        Nothing.
-    """
+    """Mean of weighted draws, and the lower root of their covariance."""
     center = weights @ z
     apart = z - center
     sd = jnp.sqrt(weights @ apart**2)

@@ -10,17 +10,7 @@ from jaxtyping import Array, Float
 
 
 def cholesky(matrix: Float[Array | np.ndarray, "size size"]) -> Float[Array, "size size"]:
-    """Lower factor of a symmetric matrix.
-
-    Args:
-        matrix: Symmetric, any unit.
-
-    Returns:
-        The factor; NaN where the matrix is not positive definite, never a repaired one.
-
-    Raises:
-        Nothing.
-    """
+    """Lower factor of a symmetric matrix."""
     size = matrix.shape[0]
     rows: list[list[Array]] = []
     for i in range(size):
@@ -33,17 +23,7 @@ def cholesky(matrix: Float[Array | np.ndarray, "size size"]) -> Float[Array, "si
 
 
 def inverse(factor: Float[Array, "size size"]) -> Float[Array, "size size"]:
-    """Inverse of a lower factor, lower again.
-
-    Args:
-        factor: As `cholesky` returns it.
-
-    Returns:
-        The inverse; NaN where the factor is.
-
-    Raises:
-        Nothing.
-    """
+    """Inverse of a lower factor, lower again."""
     size = factor.shape[0]
     rows: list[list[Array]] = []
     for i in range(size):

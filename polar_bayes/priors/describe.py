@@ -10,17 +10,7 @@ from polar_bayes.priors.support import support_bounds
 
 
 def describe_prior(prior: dist.Distribution) -> str:
-    """A prior as text, for reports: `TruncatedNormal(loc=1.45, scale=0.15, low=1.2, high=2)`.
-
-    Args:
-        prior: Any NumPyro distribution.
-
-    Returns:
-        One line; ` x (4,)` at its end means that many independent copies.
-
-    Raises:
-        Nothing: what cannot be read out of a distribution is left out.
-    """
+    """A prior as text, for reports: `TruncatedNormal(loc=1.45, scale=0.15, low=1.2, high=2)`."""
     try:
         return _description(prior)
     except Exception:

@@ -22,11 +22,7 @@ TWO_LOG_TWO = 2.0 * math.log(2.0)
 
 
 class HalfNormal(dist.HalfNormal):
-    """The half-normal distribution, sampled in its normal score.
-
-    Args:
-        scale: Standard deviation of the normal distribution that is folded, a Python number > 0.
-    """
+    """The half-normal distribution, sampled in its normal score."""
 
     @property
     @override
@@ -35,11 +31,7 @@ class HalfNormal(dist.HalfNormal):
 
 
 class Scored(constraints.Constraint):
-    """Positive values, whose coordinate is the normal score under a half-normal distribution.
-
-    Args:
-        scale: Of that distribution.
-    """
+    """Positive values, whose coordinate is the normal score under a half-normal distribution."""
 
     lower_bound = 0.0
 
@@ -69,11 +61,7 @@ def _by_score(support: Scored) -> "FromScore":
 
 
 class FromScore(transforms.Transform):
-    """From a normal score to the value of that score.
-
-    Args:
-        scale: Of the half-normal distribution.
-    """
+    """From a normal score to the value of that score."""
 
     domain = constraints.real
     codomain = constraints.positive
@@ -102,20 +90,9 @@ class FromScore(transforms.Transform):
 
 @jax.custom_jvp
 def folded(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    r"""The half-normal quantile of a normal score: $\Phi^{-1}((1+\Phi(z))/2)$.
-
-    Each half is computed from the tail that is small there. Beyond the smallest number of its
-    precision the tail of the right half is that of its asymptote.
-
-    Args:
-        z: Normal scores, any real number.
-
-    Returns:
-        Positive numbers, in scales of the distribution.
-
-    Raises:
-        Nothing.
-    """
+    r"""The half-normal quantile of a normal score: $\Phi^{-1}((1+\Phi(z))/2)$."""
+    # Each half is computed from the tail that is small there. Beyond the smallest number of its
+    # precision the tail of the right half is that of its asymptote.
     tail = 0.5 * ndtr(-z)
     known = tail >= jnp.finfo(tail.dtype).tiny
     high = jnp.where(known, -ndtri(tail), jnp.sqrt(z**2 + TWO_LOG_TWO))
@@ -130,17 +107,7 @@ def _slope_of_folded(z: tuple, dz: tuple) -> tuple[Array, Array]:
 
 @jax.custom_jvp
 def unfolded(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    r"""The normal score of a half-normal value: $\Phi^{-1}(2\Phi(x) - 1)$.
-
-    Args:
-        x: Positive numbers, in scales of the distribution.
-
-    Returns:
-        Scores; minus infinity at zero, NaN below it.
-
-    Raises:
-        Nothing.
-    """
+    r"""The normal score of a half-normal value: $\Phi^{-1}(2\Phi(x) - 1)$."""
     half = 2.0**-0.5
     tail = erfc(half * x)
     known = tail >= jnp.finfo(tail.dtype).tiny

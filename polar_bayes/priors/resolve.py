@@ -16,16 +16,9 @@ from polar_bayes.priors.table import PRIORS, RANGES
 
 
 class PriorTable(Mapping[str, dist.Distribution]):
-    """The priors that a model may read: the table with a caller's replacements.
+    """The priors that a model may read: the table with a caller's replacements."""
 
-    It notes which names are read, so that a model need not list its parameters.
-
-    Args:
-        overrides: Priors that replace or extend the table.
-
-    Raises:
-        FitError: The overrides are no mapping.
-    """
+    # It notes which names are read, so that a model need not list its parameters.
 
     def __init__(self, overrides: Mapping[str, dist.Distribution] | None = None) -> None:
         if not isinstance(overrides, Mapping | None):
@@ -47,11 +40,7 @@ class PriorTable(Mapping[str, dist.Distribution]):
         return in_this_precision(self.row(name))
 
     def row(self, name: str) -> dist.Distribution:
-        """The prior as it was given.
-
-        Raises:
-            FitError: There is none of that name.
-        """
+        """The prior as it was given."""
         if name not in self._rows:
             raise FitError(
                 "this parameter has no prior",
@@ -71,11 +60,9 @@ class PriorTable(Mapping[str, dist.Distribution]):
 
 
 def in_this_precision(prior: dist.Distribution) -> dist.Distribution:
-    """A copy of a prior in the floating type of this fit.
-
-    Distributions keep what they have computed once, in the precision of that day; a copy made from
-    their arguments alone does not.
-    """
+    """A copy of a prior in the floating type of this fit."""
+    # Distributions keep what they have computed once, in the precision of that day; a copy made
+    # from their arguments alone does not.
 
     def convert(argument: object) -> object:
         if hasattr(argument, "dtype") and jnp.issubdtype(argument.dtype, jnp.floating):
@@ -88,20 +75,7 @@ def in_this_precision(prior: dist.Distribution) -> dist.Distribution:
 def resolve_priors(
     parameters: Iterable[str], overrides: Mapping[str, dist.Distribution] | None = None
 ) -> dict[str, dist.Distribution]:
-    """The prior of every parameter that a model reads.
-
-    Args:
-        parameters: Names that the model reads.
-        overrides: Priors that replace or extend the table.
-
-    Returns:
-        A distribution for each name, in the order given.
-
-    Raises:
-        FitError: An override is not a continuous NumPyro distribution of the right shape, names
-            no parameter of this model, or allows values outside the parameter's physical range;
-            or a parameter has no prior.
-    """
+    """The prior of every parameter that a model reads."""
     parameters = tuple(parameters)
     table = PriorTable(overrides)
     for name, prior in (overrides or {}).items():
@@ -110,16 +84,7 @@ def resolve_priors(
 
 
 def check_support(name: str, prior: dist.Distribution, where: str) -> None:
-    """Refuse a distribution that allows values outside the physical range of its parameter.
-
-    Args:
-        name: The parameter; one without a row in `RANGES` may take any value.
-        prior: Its distribution.
-        where: What the error points to.
-
-    Raises:
-        FitError: It allows what is not possible.
-    """
+    """Refuse a distribution that allows values outside the physical range of its parameter."""
     least, most = RANGES.get(name, (-math.inf, math.inf))
     try:
         low, high = support_bounds(prior)

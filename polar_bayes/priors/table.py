@@ -20,15 +20,10 @@ from polar_bayes.priors.half_normal import HalfNormal
 
 
 class Beta(dist.Beta):
-    """The Beta distribution, two Python numbers until it is used.
+    """The Beta distribution, two Python numbers until it is used."""
 
-    NumPyro's own turns them into an array at once, in the precision of that moment: a table of
-    priors would start the array library on import and stay in single precision for ever.
-
-    Args:
-        concentration1: Unit 1, range > 0.
-        concentration0: Unit 1, range > 0.
-    """
+    # NumPyro's own turns them into an array at once, in the precision of that moment: a table of
+    # priors would start the array library on import and stay in single precision for ever.
 
     def __init__(
         self,

@@ -119,13 +119,7 @@ def _measured(table: pd.DataFrame) -> list[str]:
 
 
 def front_panel(axes: Axes, found: xr.Dataset, time: str) -> None:
-    """One panel of `plot_accuracy`.
-
-    Args:
-        axes: Where to draw.
-        found: An accuracy study.
-        time: "seconds_first" or "seconds_again".
-    """
+    """One panel of `plot_accuracy`."""
     table, noise = accuracy_table(found), float(found.attrs["reference_error"])
     # Axes of logarithms have no place for a time of zero.
     known = table[np.isfinite(table["error"]) & np.isfinite(table[time]) & (table[time] > 0.0)]

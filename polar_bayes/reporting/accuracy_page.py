@@ -36,17 +36,7 @@ CAPTION = (
 
 
 def render_accuracy(result: xr.DataTree) -> str:
-    """The page as text.
-
-    Args:
-        result: What `polar_bayes.accuracy` returns, or one read back from a file.
-
-    Returns:
-        A whole HTML document; every text of the capture is escaped.
-
-    Raises:
-        FitError: It holds no accuracy study.
-    """
+    """The page as text."""
     about = provenance_of(result)
     content = {
         "kind": "Accuracy against time",
@@ -61,17 +51,7 @@ def render_accuracy(result: xr.DataTree) -> str:
 
 
 def accuracy_section(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
-    """What a page says of a study: advice, reference, figure and tables.
-
-    Args:
-        result: Any tree or dataset with a group `accuracy`.
-
-    Returns:
-        Content for a template.
-
-    Raises:
-        FitError: It has none.
-    """
+    """What a page says of a study: advice, reference, figure and tables."""
     found = accuracy_of(result)
     return {
         "advice": accuracy_advice(found),
@@ -96,17 +76,7 @@ def accuracy_picture(found: xr.Dataset) -> Picture:
 
 
 def reference_sentence(result: xr.DataTree | xr.Dataset) -> str:
-    """What the reference is, and how well it is known.
-
-    Args:
-        result: What `polar_bayes.accuracy` returns.
-
-    Returns:
-        A sentence, or two where something speaks against it.
-
-    Raises:
-        FitError: It holds no accuracy study.
-    """
+    """What the reference is, and how well it is known."""
     told = accuracy_of(result).attrs
     sentence = (
         f"The reference is {told['reference_draws']:,} draws of {told['reference']}, worth "

@@ -97,16 +97,7 @@ def plot_calibration(
 def ecdf_differences(
     parts: Sequence[Ranked], beside: Mapping[str, Mapping[str, Ranked]], method: str
 ) -> Figure:
-    """Share of the ranks below each rank, minus the uniform share.
-
-    Args:
-        parts: A panel for each.
-        beside: By method and label, the same of other calibrations.
-        method: What the calibration itself is called beside them.
-
-    Returns:
-        The figure.
-    """
+    """Share of the ranks below each rank, minus the uniform share."""
     figure, panels = _panels(len(parts), panel_height=1.85, header=0.6 if beside else 0.3)
     colors = colors_of(beside)
     for axes, part in zip(panels, parts, strict=True):
@@ -122,14 +113,7 @@ def ecdf_differences(
 
 @styled
 def rank_histograms(parts: Sequence[Part]) -> Figure:
-    """Histograms of the ranks.
-
-    Args:
-        parts: A panel for each.
-
-    Returns:
-        The figure.
-    """
+    """Histograms of the ranks."""
     figure, panels = _panels(len(parts), panel_height=1.5, header=0.3)
     for axes, part in zip(panels, parts, strict=True):
         histogram_panel(axes, part)
@@ -144,16 +128,7 @@ def rank_histograms(parts: Sequence[Part]) -> Figure:
 def interval_coverage(
     parts: Sequence[Part], beside: Mapping[str, Mapping[str, Part]], method: str
 ) -> Figure:
-    """How often 50, 80 and 95% intervals hold the truth.
-
-    Args:
-        parts: A line for each.
-        beside: By method and label, the same of other calibrations.
-        method: What the calibration itself is called beside them.
-
-    Returns:
-        The figure.
-    """
+    """How often 50, 80 and 95% intervals hold the truth."""
     colors = colors_of(beside)
     tall = 0.3 + 0.12 * len(beside)
     figure = Drawing(figsize=(8.2, tall * len(parts) + 1.0), layout="constrained")
@@ -172,14 +147,7 @@ def interval_coverage(
 
 @styled
 def estimates(parts: Sequence[Part]) -> Figure:
-    """Posterior means with 80% intervals against the truth.
-
-    Args:
-        parts: A panel for each.
-
-    Returns:
-        The figure.
-    """
+    """Posterior means with 80% intervals against the truth."""
     figure, panels = _panels(len(parts), panel_height=2.3, header=0.3)
     for axes, part in zip(panels, parts, strict=True):
         estimate_panel(axes, part)

@@ -47,18 +47,7 @@ SHAPES = (
 def render_calibration(
     calibration: xr.DataTree, beside: Mapping[str, xr.DataTree] | None = None
 ) -> str:
-    """The page of a calibration as text.
-
-    Args:
-        calibration: What `polar_bayes.calibrate` returns, or one read back from a file.
-        beside: Other calibrations of the same layout, by a name such as their method.
-
-    Returns:
-        A whole HTML document; every text of the capture and the names are escaped.
-
-    Raises:
-        FitError: One is no calibration, or of other parameters.
-    """
+    """The page of a calibration as text."""
     rivals = {one_line(str(name)): each for name, each in (beside or {}).items()}
     provenance = provenance_of(calibration)
     method = one_line(str(provenance.get("method", "this calibration")))

@@ -68,20 +68,7 @@ class Ranked(Protocol):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Part:
-    """What a calibration knows of one parameter.
-
-    Args:
-        label: Its name in ArviZ's style, such as `refractive_index[450]`.
-        title: In words.
-        pit: Rank of the truth in every fit, from 0 to 1; NaN where the fit failed. (simulation,).
-        truth: What was simulated, (simulation,).
-        mean: Posterior means, (simulation,).
-        low: Lower end of the 80% intervals, (simulation,).
-        high: Upper end.
-        row: Of `calibration_table`.
-        passes: Whether its ranks pass the joint test of all parameters.
-        level: Of that test for one parameter.
-    """
+    """What a calibration knows of one parameter."""
 
     label: str
     title: str
@@ -101,18 +88,7 @@ class Part:
 
 
 def parts_of(calibration: xr.DataTree, table: pd.DataFrame | None = None) -> dict[str, Part]:
-    """Every parameter of a calibration by its label.
-
-    Args:
-        calibration: What `polar_bayes.calibrate` returns, or one read back from a file.
-        table: Its `calibration_table`, where that is there already.
-
-    Returns:
-        The parts, material parameters first.
-
-    Raises:
-        FitError: It is no calibration.
-    """
+    """Every parameter of a calibration by its label."""
     table = calibration_table(calibration) if table is None else table
     truths = {each.label: each.draws[0] for each in calibration_scalars(calibration, "truth")}
     ranks, marginals = (calibration[name].to_dataset() for name in ("prior_sbc", "marginals"))
@@ -141,13 +117,7 @@ def parts_of(calibration: xr.DataTree, table: pd.DataFrame | None = None) -> dic
 def ecdf_panel(
     axes: Axes, part: Ranked, beside: Mapping[str, tuple[Ranked, str]] | None = None
 ) -> None:
-    """Share of the ranks below each rank, minus the uniform share, in its band.
-
-    Args:
-        axes: Where.
-        part: The parameter, or the reading.
-        beside: The same by other methods, each with its color.
-    """
+    """Share of the ranks below each rank, minus the uniform share, in its band."""
     if part.answered.size < 2:
         _too_few(axes)
         return
@@ -166,12 +136,7 @@ def ecdf_panel(
 
 
 def histogram_panel(axes: Axes, part: Part) -> None:
-    """Histogram of the ranks, and how high the bars of a uniform one are.
-
-    Args:
-        axes: Where.
-        part: The parameter.
-    """
+    """Histogram of the ranks, and how high the bars of a uniform one are."""
     count = part.answered.size
     if count < 2:
         _too_few(axes)
@@ -197,12 +162,7 @@ def histogram_panel(axes: Axes, part: Part) -> None:
 
 
 def estimate_panel(axes: Axes, part: Part) -> None:
-    """Posterior means and 80% intervals against the truth.
-
-    Args:
-        axes: Where.
-        part: The parameter.
-    """
+    """Posterior means and 80% intervals against the truth."""
     shown = np.unique(np.linspace(0, part.truth.size - 1, MOST_SHOWN).astype(int))
     truth, mean = part.truth[shown], part.mean[shown]
     low, high = part.low[shown], part.high[shown]
@@ -231,13 +191,7 @@ def estimate_panel(axes: Axes, part: Part) -> None:
 def coverage_rows(
     axes: Axes, rows: Sequence[Sequence[tuple[pd.Series, str]]], titles: Sequence[str]
 ) -> None:
-    """How often 50, 80 and 95% intervals hold the truth: a line for each parameter.
-
-    Args:
-        axes: Where.
-        rows: For each parameter, rows of `calibration_table` with a color for each method.
-        titles: Of the parameters.
-    """
+    """How often 50, 80 and 95% intervals hold the truth: a line for each parameter."""
     least = 0.4
     for percent in INTERVALS:
         axes.axvline(percent / 100.0, color=GRAY, lw=0.9, ls="--", zorder=1)

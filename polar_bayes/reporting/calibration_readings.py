@@ -31,16 +31,7 @@ CAPTION = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ReadingRanks:
-    """What a calibration knows of one reading.
-
-    Args:
-        label: As in `calibration_readings`.
-        title: In words.
-        answered: Ranks of the fits that have an answer.
-        row: Of `calibration_readings`.
-        passes: Whether its ranks pass the joint test of all readings.
-        level: Of that test for one of them.
-    """
+    """What a calibration knows of one reading."""
 
     label: str
     title: str
@@ -51,14 +42,7 @@ class ReadingRanks:
 
 
 def ranks_of_readings(calibration: xr.DataTree) -> list[ReadingRanks]:
-    """Every row of `calibration_readings` with its ranks.
-
-    Args:
-        calibration: One whose readings were ranked.
-
-    Returns:
-        The readings.
-    """
+    """Every row of `calibration_readings` with its ranks."""
     table, ranks = calibration_readings(calibration), reading_ranks(calibration)
     level = limit_of(table)
     return [
@@ -75,14 +59,7 @@ def ranks_of_readings(calibration: xr.DataTree) -> list[ReadingRanks]:
 
 
 def reading_rows(parts: list[ReadingRanks]) -> Table:
-    """Every reading: uniform ranks, and how far leaving it out can be trusted.
-
-    Args:
-        parts: Of `ranks_of_readings`.
-
-    Returns:
-        The table.
-    """
+    """Every reading: uniform ranks, and how far leaving it out can be trusted."""
     rows = []
     for part in parts:
         row = part.row

@@ -34,15 +34,7 @@ STATUSES = {
 
 
 def verdict_head(table: pd.DataFrame, readings: pd.DataFrame | None) -> tuple[str, bool]:
-    """The verdict in a few words, and whether all is well.
-
-    Args:
-        table: Of `calibration_table`.
-        readings: Of `calibration_readings`; None where they were not ranked.
-
-    Returns:
-        The headline, and False where ranks fail or too many fits have no answer.
-    """
+    """The verdict in a few words, and whether all is well."""
     passed = is_calibrated(table)
     answered = float((table["answered"] / (table["answered"] + table["failed"])).min())
     said = "Calibrated" if passed else "Not calibrated"
@@ -63,15 +55,7 @@ def verdict_words(said: Sequence[str]) -> list[str]:
 
 
 def interval_words(table: pd.DataFrame, parts: Mapping[str, Part]) -> list[str]:
-    """How often the 95% intervals of parameters that fail hold the truth, and cautions.
-
-    Args:
-        table: Of `calibration_table`.
-        parts: The parameters by label.
-
-    Returns:
-        Sentences; none where all is well.
-    """
+    """How often the 95% intervals of parameters that fail hold the truth, and cautions."""
     failing = [part for part in parts.values() if not part.passes]
     said = []
     if failing:
@@ -94,16 +78,7 @@ def interval_words(table: pd.DataFrame, parts: Mapping[str, Part]) -> list[str]:
 def calibration_rows(
     table: pd.DataFrame, parts: Mapping[str, Part], words: Mapping[str, str]
 ) -> Table:
-    """Every parameter: uniform ranks, coverage, width and score.
-
-    Args:
-        table: Of `calibration_table`.
-        parts: The parameters by label.
-        words: In which way the ranks of those that fail stray, by label.
-
-    Returns:
-        The table.
-    """
+    """Every parameter: uniform ranks, coverage, width and score."""
     rows = []
     for label, part in parts.items():
         row = table.loc[label]
@@ -125,15 +100,7 @@ def calibration_rows(
 
 
 def comparison_rows(compared: pd.DataFrame, parts: Mapping[str, Part]) -> Table:
-    """Every parameter by every method.
-
-    Args:
-        compared: Of `compare_calibrations`.
-        parts: The parameters of the first by label.
-
-    Returns:
-        The table.
-    """
+    """Every parameter by every method."""
     rows = []
     for (label, method), row in compared.iterrows():
         cells = [one_line(str(method)), chance(row["p_value"], bool(row["passes"])), row["ways"]]
@@ -150,15 +117,7 @@ def comparison_rows(compared: pd.DataFrame, parts: Mapping[str, Part]) -> Table:
 
 
 def fit_tables(calibration: xr.DataTree, parts: Mapping[str, Part]) -> list[tuple[str, Table]]:
-    """What became of the fits: by status and by approach.
-
-    Args:
-        calibration: The tree.
-        parts: The parameters by label.
-
-    Returns:
-        Tables, each with an id; those whose flags the tree does not hold are left out.
-    """
+    """What became of the fits: by status and by approach."""
     fits = calibration["fits"].to_dataset()
     answered = np.all([np.isfinite(part.pit) for part in parts.values()], axis=0)
     wanted = {
@@ -174,14 +133,7 @@ def fit_tables(calibration: xr.DataTree, parts: Mapping[str, Part]) -> list[tupl
 
 
 def fit_facts(calibration: xr.DataTree) -> list[Row]:
-    """What the fits are worth: effective draws, and how far they can be trusted.
-
-    Args:
-        calibration: The tree.
-
-    Returns:
-        Names and texts.
-    """
+    """What the fits are worth: effective draws, and how far they can be trusted."""
     fits = calibration["fits"].to_dataset()
     facts: dict[str, Any] = {}
     if "effective_draws" in fits:
@@ -203,14 +155,7 @@ def fit_facts(calibration: xr.DataTree) -> list[Row]:
 
 
 def calibration_groups(provenance: Mapping[str, Any]) -> list[tuple[str, list[Row]]]:
-    """How the calibration was made, in titled groups of name and text.
-
-    Args:
-        provenance: What the tree says about itself.
-
-    Returns:
-        The groups; a key that they do not know stands in the first.
-    """
+    """How the calibration was made, in titled groups of name and text."""
     titles = {
         "truth": "What captures were simulated by, where it differs from what is fitted",
         "priors": "Priors",

@@ -24,17 +24,7 @@ MOST_NAMED = 6
 
 
 def render_comparison(fits: Mapping[str, xr.DataTree]) -> str:
-    """The page of a comparison as text.
-
-    Args:
-        fits: Trees that `polar_bayes.fit` returned, by a name for each.
-
-    Returns:
-        A whole HTML document; every text of the captures and the names are escaped.
-
-    Raises:
-        FitError: They cannot be compared.
-    """
+    """The page of a comparison as text."""
     named = {one_line(str(name)): fit for name, fit in fits.items()}
     comparison = compare_fits(named)
     told = {name: provenance_of(fit) for name, fit in named.items()}

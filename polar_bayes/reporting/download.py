@@ -10,16 +10,7 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def csv_link(table: pd.DataFrame, first: str) -> str:
-    """A table as the address of a link.
-
-    Args:
-        table: A row for each index entry; numbers are written as they are.
-        first: What the index is called.
-
-    Returns:
-        A `data:` address of a UTF-8 CSV file. A text that a spreadsheet would run begins with an
-        apostrophe.
-    """
+    """A table as the address of a link."""
     safe = table.map(_inert)
     if isinstance(table.index, pd.MultiIndex):
         safe.index = pd.MultiIndex.from_tuples(

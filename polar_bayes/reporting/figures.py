@@ -49,15 +49,7 @@ MINUS = "\N{MINUS SIGN}"
 
 
 def drawable(result: xr.DataTree, *, material: bool = False) -> list[Scalar]:
-    """The parameters that figures show: single numbers that are finite and move.
-
-    Args:
-        result: The tree.
-        material: True for material parameters only.
-
-    Returns:
-        Those parameters, the material first; entries of vector sites are left out.
-    """
+    """The parameters that figures show: single numbers that are finite and move."""
     found = [
         scalar
         for scalar in posterior_scalars(result)

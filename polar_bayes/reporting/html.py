@@ -118,17 +118,7 @@ def _refuse(given: Mapping[str, object], fitting: bool, what: str) -> None:
 
 
 def render(result: xr.DataTree) -> str:
-    """The page as text.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-
-    Returns:
-        A whole HTML document; every text of the capture is escaped.
-
-    Raises:
-        FitError: The tree holds no posterior.
-    """
+    """The page as text."""
     found, table = posterior_scalars(result), summary(result)
     prior, checks = sensitivity(result), predictive_checks(result)
     method, provenance = method_of(result), provenance_of(result)

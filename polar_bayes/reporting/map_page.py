@@ -37,20 +37,7 @@ UNCHECKED = (
 def render_map(
     maps: xr.Dataset, truth: xr.Dataset | None = None, uncorrected: xr.Dataset | None = None
 ) -> str:
-    """The page of a map as text.
-
-    Args:
-        maps: Of `polar_bayes.fit_pixels`, or opened from a store.
-        truth: The simulated capture, where there is one.
-        uncorrected: Maps of the same image by `PixelLaplace(weighted=False)`.
-
-    Returns:
-        A whole HTML document; every text of the maps and the capture is escaped.
-
-    Raises:
-        CaptureError: `truth` does not fit the maps.
-        FitError: It holds no maps, or `uncorrected` does not fit them.
-    """
+    """The page of a map as text."""
     found = map_scalars(maps)
     if any(name not in maps for name in TRUST):
         raise FitError("it holds no maps", where="report", mend="give what fit_pixels returns")

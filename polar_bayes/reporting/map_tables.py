@@ -47,14 +47,7 @@ APPROACHES = {
 
 
 def count_cases(maps: xr.Dataset) -> pd.DataFrame:
-    """Pixels of a map by status (rows) and approach (columns), both in words.
-
-    Args:
-        maps: Of `polar_bayes.fit_pixels`, or opened from a store.
-
-    Returns:
-        Counts; block by block, so that a large map stays where it is.
-    """
+    """Pixels of a map by status (rows) and approach (columns), both in words."""
     rows, columns = (flag_words(maps[name]) for name in ("status", "approach"))
     counts = np.zeros((len(rows), len(columns)), int)
     for place in cut(maps, BLOCK):

@@ -22,14 +22,7 @@ MARK, HEAD = b'<meta name="generator" content="polar_bayes">', 1024
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A figure on the page.
-
-    Args:
-        source: The image itself, as a data URI.
-        alternative: What it shows, for readers who cannot see it.
-        caption: How to read it.
-        wide: True for many panels; small screens scroll it in its own box.
-    """
+    """A figure on the page."""
 
     source: str
     alternative: str
@@ -38,16 +31,7 @@ class Picture:
 
 
 def picture(figure: Figure, alternative: str, caption: str) -> Picture:
-    """A figure as a part of the page.
-
-    Args:
-        figure: Any.
-        alternative: What it shows, for readers who cannot see it.
-        caption: How to read it.
-
-    Returns:
-        The picture; the same figure gives the same bytes.
-    """
+    """A figure as a part of the page."""
     buffer = io.BytesIO()
     with matplotlib.rc_context(ALWAYS):
         # No date and a fixed salt: the same result gives the same page, byte for byte.
@@ -62,15 +46,7 @@ def picture(figure: Figure, alternative: str, caption: str) -> Picture:
 
 
 def fill(template: str, content: Mapping[str, Any]) -> str:
-    """A template with its content; every text is escaped.
-
-    Args:
-        template: Name of a file in `templates`.
-        content: All that it names.
-
-    Returns:
-        A whole HTML document.
-    """
+    """A template with its content; every text is escaped."""
     environment = Environment(
         loader=PackageLoader("polar_bayes.reporting"),
         autoescape=True,
@@ -85,20 +61,7 @@ def fill(template: str, content: Mapping[str, Any]) -> str:
 def write_page(
     folder: Path, page: str, others: Mapping[str, Callable[[Path], object]] | None = None
 ) -> Path:
-    """Write a page and the files that go with it; an older report in the folder is replaced.
-
-    Args:
-        folder: Made if it is not there.
-        page: The document.
-        others: By name of the file, what writes it.
-
-    Returns:
-        The path of the page.
-
-    Raises:
-        OutputError: The folder cannot be written, or holds a file of such a name that is no part
-            of a report.
-    """
+    """Write a page and the files that go with it; an older report in the folder is replaced."""
     with written(folder):
         folder.mkdir(parents=True, exist_ok=True)
     is_report = is_page(folder / PAGE)

@@ -26,14 +26,7 @@ def made_by(provenance: Mapping[str, Any], method: str) -> str:
 
 
 def swapped_sentence(provenance: Mapping[str, Any]) -> str:
-    """What the user replaced, in one sentence.
-
-    Args:
-        provenance: What the result says about itself.
-
-    Returns:
-        `Swapped by the user: the scene and the prior of roughness.`; empty where nothing is said.
-    """
+    """What the user replaced, in one sentence."""
     if "swapped" not in provenance:
         return ""
     swapped = [str(name) for name in provenance["swapped"]]

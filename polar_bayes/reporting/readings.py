@@ -39,19 +39,7 @@ WRAP = 3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Curve:
-    """One wavelength of one material: readings and predictions, each by view.
-
-    Args:
-        title: Which one, in words; empty when there is only one.
-        zenith: View zenith, unit degree.
-        azimuth: Angle between the planes of view and light, 0 to 180, 180 the mirror side.
-        light_zenith: Unit degree.
-        observed: Readings; NaN where masked.
-        fitted: False where a reading is masked or set aside.
-        saturated: True where the sensor stopped.
-        levels: Quantiles of the prediction at `LEVELS`, shape (level, view); NaN without draws.
-        center: Median of the noise-free prediction.
-    """
+    """One wavelength of one material: readings and predictions, each by view."""
 
     title: str
     zenith: np.ndarray
@@ -110,18 +98,7 @@ def _missing(result: xr.DataTree, name: str) -> str:
 
 
 def curves(result: xr.DataTree, name: str) -> list[Curve]:
-    """One recorded variable and its prediction, split by material and wavelength.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-        name: dop, q, u or intensity.
-
-    Returns:
-        A curve for every material, patch and wavelength, in order.
-
-    Raises:
-        FitError: The result has no such variable.
-    """
+    """One recorded variable and its prediction, split by material and wavelength."""
     if name not in variables(result):
         lacks = f", for it has no {_missing(result, name)}" if name in QUANTITIES else ""
         raise FitError(

@@ -202,17 +202,7 @@ def shape(band: Band) -> str:
 def overconfidence(
     compared: pd.DataFrame, found: Sequence[Scalar], posterior: xr.Dataset, what: str
 ) -> list[str]:
-    """What to make of a fit that leaves out a part of the instrument.
-
-    Args:
-        compared: The table of `compare_without`, not empty.
-        found: The scalars of the posterior.
-        posterior: The posterior.
-        what: What was left out, such as `the discrepancy term`.
-
-    Returns:
-        Sentences; they call it narrower only where it is.
-    """
+    """What to make of a fit that leaves out a part of the instrument."""
     gain = {
         s: 1.0 - compared.loc[s.label, "width_ratio"] for s in found if s.label in compared.index
     }

@@ -44,17 +44,7 @@ BEYOND = 0.05
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Spectrum:
-    """One parameter of one member over wavelength.
-
-    Args:
-        title: Which member, in words; empty where there is only one.
-        words: The parameter in words.
-        measured: Wavelengths with readings, unit nm, ascending.
-        levels: Quantiles of the parameter there at `LEVELS`, shape (level, wavelength).
-        true: The true values there, NaN where not known.
-        between: A fine row of wavelengths, unit nm; empty where nothing ties colors together.
-        band: Quantiles there at `LEVELS`, shape (level, between).
-    """
+    """One parameter of one member over wavelength."""
 
     title: str
     words: str
@@ -66,19 +56,7 @@ class Spectrum:
 
 
 def spectra(result: xr.DataTree) -> dict[str, list[Spectrum]]:
-    """What a fit says of each parameter over wavelength, of at most 12 members.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-
-    Returns:
-        A list with a spectrum for each member, by parameter; empty where no parameter was fitted
-        at two wavelengths, for a point fit, and where draws are not finite. Bands come from
-        `polar_bayes.predict_spectrum` with every draw or about 1000 of them.
-
-    Raises:
-        FitError: The tree holds no posterior.
-    """
+    """What a fit says of each parameter over wavelength, of at most 12 members."""
     found: dict[str, dict[tuple[str, ...], list[Scalar]]] = {}
     every = posterior_scalars(result)
     names = {scalar.name for scalar in every}

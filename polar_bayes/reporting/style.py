@@ -122,18 +122,7 @@ class Drawing(Figure):
 def grid(
     count: int, *, columns: int, width: float, panel_height: float, header: float = 0.0
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of equal panels in rows.
-
-    Args:
-        count: Panels; the last row may stay shorter.
-        columns: Panels in a full row.
-        width: Of the figure, unit inch.
-        panel_height: Of a row, unit inch.
-        header: Room above the first row, unit inch.
-
-    Returns:
-        The figure and its axes, row by row.
-    """
+    """A figure of equal panels in rows."""
     columns = max(1, min(columns, count))
     rows = max(1, math.ceil(count / columns))
     figure = Drawing(figsize=(width, rows * panel_height + header), layout="constrained")

@@ -49,14 +49,7 @@ class Row:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Table:
-    """A table of a page, and the numbers behind it.
-
-    Args:
-        caption: How to read it.
-        heads: A name for the first column and one for each cell.
-        rows: What is shown.
-        numbers: The same unrounded, a row for each row; None where the texts say it all.
-    """
+    """A table of a page, and the numbers behind it."""
 
     caption: str
     heads: tuple[str, ...]

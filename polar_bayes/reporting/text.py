@@ -7,15 +7,7 @@ DASH = "\N{EN DASH}"
 
 
 def numbers(values: Iterable[float], scale: float) -> list[str]:
-    """Numbers with as many decimals as show two digits of the scale (three if it begins with 1).
-
-    Args:
-        values: What to write; a dash where one is not finite.
-        scale: A standard deviation or width, unit of the values.
-
-    Returns:
-        A text for each value.
-    """
+    """Numbers with as many decimals as show two digits of the scale (three if it begins with 1)."""
     decimals = 3
     if math.isfinite(scale) and scale > 0.0:
         decimals = min(max(1 - math.floor(math.log10(scale / 2.0)), 0), 8)

@@ -65,14 +65,7 @@ PRESETS: Mapping[str, Material] = MappingProxyType(
 
 
 def find_preset(name: str) -> Material:
-    """The material of that name.
-
-    Args:
-        name: One of `PRESETS`.
-
-    Raises:
-        CaptureError: There is none of that name.
-    """
+    """The material of that name."""
     if not isinstance(name, str) or name not in PRESETS:
         raise CaptureError(
             "no such material", where=f"preset={name!r}", mend=f"give one of {', '.join(PRESETS)}"

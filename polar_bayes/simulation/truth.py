@@ -33,21 +33,7 @@ Value = float | np.ndarray
 def checked_parameters(
     scene: Scene, material: Material, wavelengths: np.ndarray, overrides: Mapping[str, Value]
 ) -> dict[str, np.ndarray]:
-    """A value for every parameter of the scene.
-
-    Args:
-        scene: The optics.
-        material: Where values come from unless they are replaced.
-        wavelengths: (wavelength,), unit nm; empty for a capture without color.
-        overrides: Values that replace those of the material and of `NEUTRAL`.
-
-    Returns:
-        By name, each (), (wavelength,) or (y, x); weights of a basis have its axis.
-
-    Raises:
-        CaptureError: A value is outside its range or has another shape.
-        SceneError: The scene has no such parameter, or one without a value.
-    """
+    """A value for every parameter of the scene."""
     unknown = set(overrides) - set(scene.parameters)
     if unknown:
         raise SceneError(
@@ -82,20 +68,7 @@ def checked_parameters(
 def checked_noise(
     links: Mapping[str, AbstractLink], usual: Mapping[str, float], overrides: Mapping[str, Value]
 ) -> dict[str, np.ndarray | None]:
-    """A value for every noise parameter of the links.
-
-    Args:
-        links: For each variable, how it scatters.
-        usual: Values of the parameters that a table knows.
-        overrides: Values that replace them.
-
-    Returns:
-        By name, each () or (y, x); None for an exposure that the brightness of the scene decides.
-
-    Raises:
-        CaptureError: A value is outside its range or has another shape.
-        FitError: No link reads such a parameter, or one has no value.
-    """
+    """A value for every noise parameter of the links."""
     parameters = noise_parameters(links)
     unknown = set(overrides) - set(parameters)
     if unknown:
@@ -126,18 +99,7 @@ def checked_noise(
 def image_of(
     parameters: Mapping[str, np.ndarray], noise: Mapping[str, np.ndarray | None]
 ) -> tuple[int, ...]:
-    """The image that parameters and noise span together.
-
-    Args:
-        parameters: Of `checked_parameters`.
-        noise: Of `checked_noise`.
-
-    Returns:
-        Rows and columns; nothing where no value is an image.
-
-    Raises:
-        CaptureError: Two images differ in shape.
-    """
+    """The image that parameters and noise span together."""
     named = [(f"parameters[{name!r}]", value) for name, value in parameters.items()]
     named += [(f"noise[{name!r}]", level) for name, level in noise.items() if level is not None]
     images = [(name, value.shape) for name, value in named if value.ndim == 2]

@@ -1,0 +1,224 @@
+"""Results that a change of the code must not change: the numbers of one fit of each kind.
+
+    python tests/test_golden.py            print what differs from tests/golden.json, and how far
+    python tests/test_golden.py --write    take the present numbers as the golden ones
+
+Optimized results agree to the tolerance of their optimizers. Sampled results depend on the order of
+additions through every draw, so they may differ by Monte Carlo error: the stored standard errors
+say how much. Numbers change only with a reason, which the commit that changes them states.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+
+import polar_bayes as pb
+
+STORED = Path(__file__).with_suffix("").with_name("golden.json")
+TIGHT, SAMPLED = 1e-5, 5.0
+"""Relative difference of optimized results; standard errors of sampled ones (1 in 10^6)."""
+
+
+def capture(views: int = 16, wavelengths: tuple[float, ...] = (), seed: int = 3):
+    protocol = pb.Protocol(views=views, wavelengths=wavelengths)
+    return pb.simulate("leaf", seed=seed, protocol=protocol)
+
+
+def image():
+    one = capture(12)
+    rows = [
+        pb.simulate("leaf", seed=s, protocol=pb.Protocol(views=12, wavelengths=()))
+        for s in range(6)
+    ]
+    whole = xr.concat(
+        rows, "pixel", data_vars="all", coords="minimal", compat="override", join="override"
+    )
+    index = {"y": ("pixel", [0, 0, 0, 1, 1, 1]), "x": ("pixel", [0, 1, 2, 0, 1, 2])}
+    found = whole.assign_coords(index).set_index(pixel=("y", "x")).unstack("pixel")
+    return found.transpose("y", "x", ...).assign_attrs(one.attrs)
+
+
+def numbers_of(result) -> dict[str, tuple[float, float]]:
+    """Mean and standard deviation of every parameter, each with its Monte Carlo standard error."""
+    found = {}
+    for name, row in pb.json_summary(result)["parameters"].items():
+        error = (row["sd"] or 0.0) / max(row.get("ess_bulk") or 400.0, 1.0) ** 0.5
+        found[f"{name} mean"] = (row["mean"], error)
+        if row["sd"] is not None:
+            found[f"{name} sd"] = (row["sd"], error)
+    return found
+
+
+def of_fit(**settings):
+    def run():
+        return numbers_of(pb.fit(capture(), seed=1, **settings))
+
+    return run
+
+
+def of_groups(model, wavelengths, material=False, **settings):
+    def run():
+        if material:
+            several = [capture(10, seed=s) for s in range(3)]
+            one = xr.concat(
+                several,
+                "material",
+                data_vars="all",
+                coords="minimal",
+                compat="override",
+                join="override",
+            )
+            one = one.assign_coords(material=["a", "b", "c"])
+        else:
+            one = capture(10, wavelengths)
+        return numbers_of(pb.fit(one, model=model, seed=1, **settings))
+
+    return run
+
+
+def map_of(**settings):
+    def run():
+        maps = pb.fit_pixels(image(), seed=1, **settings)
+        names = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
+        draws = 256.0
+        found = {}
+        for name in names:
+            mean = np.asarray(maps[f"{name}_mean"] if f"{name}_mean" in maps else maps[name])
+            sd = np.asarray(maps[f"{name}_sd"])
+            for at, value in enumerate(mean.ravel()[:3]):
+                found[f"{name} mean {at}"] = (float(value), float(sd.ravel()[at]) / draws**0.5)
+                found[f"{name} sd {at}"] = (
+                    float(sd.ravel()[at]),
+                    float(sd.ravel()[at]) / draws**0.5,
+                )
+        return found
+
+    return run
+
+
+def calibration():
+    tree = pb.calibrate(capture(8), simulations=40, method="laplace", seed=1, readings=False)
+    table = (
+        np.asarray(tree["prior_sbc"].ds.to_dataarray(), float).ravel()
+        if "prior_sbc" in tree
+        else []
+    )
+    return {f"rank {at}": (float(x), 0.0) for at, x in enumerate(np.asarray(table)[:40])}
+
+
+def identification():
+    found = pb.identify(capture(10), seed=1)
+    numbers = {}
+    for name, values in found.data_vars.items():
+        if values.dtype.kind == "f" and values.size <= 64:
+            for at, x in enumerate(np.asarray(values, float).ravel()):
+                if np.isfinite(x):
+                    numbers[f"{name} {at}"] = (float(x), 0.0)
+    return numbers
+
+
+def curve():
+    found = pb.profile(capture(10), "refractive_index", seed=1)
+    numbers = {}
+    for name, values in found.data_vars.items():
+        if values.dtype.kind == "f":
+            for at, x in enumerate(np.asarray(values, float).ravel()[:24]):
+                if np.isfinite(x):
+                    numbers[f"{name} {at}"] = (float(x), 0.0)
+    return numbers
+
+
+def views():
+    found = pb.next_views(capture(8), 2, seed=1)
+    numbers = {}
+    for name, values in found.data_vars.items():
+        if values.dtype.kind == "f" and values.size <= 64:
+            for at, x in enumerate(np.asarray(values, float).ravel()):
+                if np.isfinite(x):
+                    numbers[f"{name} {at}"] = (float(x), 0.0)
+    return numbers
+
+
+def effects():
+    chosen = pb.choose_effects(capture(10, (450.0, 650.0)), seed=1)
+    numbers = {}
+    for name in ("change", "shift", "information", "readings"):
+        if name in chosen.ledger:
+            for at, x in enumerate(np.asarray(chosen.ledger[name], float).ravel()):
+                if np.isfinite(x):
+                    numbers[f"{name} {at}"] = (float(x), 0.0)
+    kept = chosen.ledger["kept"] if "kept" in chosen.ledger else None
+    if kept is not None:
+        for at, x in enumerate(np.asarray(kept).ravel()):
+            numbers[f"kept {at}"] = (float(bool(x)), 0.0)
+    return numbers
+
+
+QUICK_NUTS = pb.Nuts(warmup=200, draws=500, most_draws=500, chains=2)
+CASES: dict[str, Callable] = {
+    "point": of_fit(method="point"),
+    "laplace": of_fit(method="laplace"),
+    "nuts": of_fit(method=QUICK_NUTS),
+    "importance": of_fit(method=pb.Importance()),
+    "tempered": of_fit(method="tempered"),
+    "auto": of_fit(method="auto"),
+    "normal guide": of_fit(method=pb.NormalGuide(steps=500)),
+    "hierarchical": of_groups("hierarchical", (), material=True, method=QUICK_NUTS),
+    "gp_spectral": of_groups("gp_spectral", (450.0, 550.0, 650.0), method=QUICK_NUTS),
+    "map laplace": map_of(),
+    "map tempered": map_of(method=pb.PixelTempering()),
+    "calibration": calibration,
+    "identify": identification,
+    "profile": curve,
+    "next views": views,
+    "effects": effects,
+}
+OPTIMIZED = {"point", "identify", "profile", "next views", "effects"}
+
+
+def differences(case: str, found: dict, stored: dict) -> list[str]:
+    """The numbers that differ by more than their tolerance."""
+    assert found.keys() == stored.keys()
+    wrong = []
+    for name, (value, error) in found.items():
+        was, error_then = stored[name]
+        limit = SAMPLED * np.hypot(error, error_then) if case not in OPTIMIZED else 0.0
+        limit = max(limit, TIGHT * max(abs(value), abs(was), 1e-3))
+        if not abs(value - was) <= limit:
+            wrong.append(f"{case}: {name}: {was:.8g} -> {value:.8g} (allowed {limit:.2g})")
+    return wrong
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("case", CASES)
+def test_results_are_as_before(case):
+    assert not differences(case, CASES[case](), json.loads(STORED.read_text())[case])
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    write = "--write" in sys.argv
+    names = [name for name in CASES if name in sys.argv] or list(CASES)
+    numbers = json.loads(STORED.read_text()) if STORED.is_file() else {}
+    for case in names:
+        found = json.loads(json.dumps(CASES[case]()))
+        if write:
+            numbers[case] = found
+            print(case, len(found), flush=True)
+        else:
+            far = max((abs(v - numbers[case][n][0]) for n, (v, _) in found.items()), default=0.0)
+            wrong = differences(case, found, numbers[case])
+            print(
+                f"{case:<14}{len(found):5d} numbers, largest difference {far:.3g}",
+                *wrong,
+                sep="\n  ",
+                flush=True,
+            )
+    if write:
+        STORED.write_text(json.dumps(numbers, indent=0) + "\n")
