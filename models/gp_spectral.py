@@ -13,11 +13,18 @@ import jax.numpy as jnp
 import numpyro
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
-from polar_bayes.models.axes import draw, draw_own, material_parameters, over_axes, unchanging
-from polar_bayes.models.population import check_members, check_pooled, draw_pooled
-from polar_bayes.models.readings import declare_readings
-from polar_bayes.models.spectra import (
+from polar_bayes.models.hierarchical import check_members, check_pooled, draw_pooled
+from polar_bayes.models.sites import (
+    declare_readings,
+    draw,
+    draw_own,
+    material_parameters,
+    over_axes,
+    unchanging,
+)
+from polar_bayes.models.spectral_process import (
     SPECTRA,
+    SpectralProcess,
     around,
     check_capture,
     check_processes,
@@ -25,13 +32,12 @@ from polar_bayes.models.spectra import (
     wavelengths_of,
     widening_of,
 )
-from polar_bayes.models.spectral_process import SpectralProcess
 
-from polar_bayes.cards import Carded
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import support_bounds
+from polar_bayes.repr_html import Carded
 
 OF_A_PATCH = ("wavelength", "view")
 

@@ -3,21 +3,217 @@
 What one patch cannot tell about its index, the others can: each index is drawn from a population
 whose mean and spread are inferred with it. A spread near zero pools completely, a large one not
 at all; the data decide.
+
+The population is normal on the natural scale of the parameter: log for what is positive, log odds
+for a share, the plain scale for an index, cut to its physical range. Its `location` is the median
+in the parameter's own unit (before the cut), its `spread` the standard deviation on that scale.
 """
 
+import abc
 import dataclasses
+import math
 from collections.abc import Mapping
+from typing import override
 
+import jax
+import jax.numpy as jnp
+import numpyro
+from jaxtyping import Array, Float
 from numpyro import distributions as dist
-from polar_bayes.models.axes import draw_own, material_parameters, unchanging
-from polar_bayes.models.population import check_members, check_pooled, draw_pooled
-from polar_bayes.models.readings import declare_readings
+from polar_bayes.models.sites import (
+    Bent,
+    declare_readings,
+    draw_own,
+    drop_view,
+    material_parameters,
+    over_axes,
+    unchanging,
+)
 
-from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
-from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
+from polar_bayes.priors import RANGES, support_bounds
+from polar_bayes.repr_html import Carded
+
+# --- Pooling: a parameter of many patches drawn from one population (the paper's section 2) -------
+
+
+@dataclasses.dataclass(frozen=True)
+class AbstractScale(abc.ABC):
+    """The scale on which a population is normal."""
+
+    @abc.abstractmethod
+    def population(self, location: Array, spread: Array) -> dist.Distribution:
+        """Where a member stands on this scale."""
+
+    @abc.abstractmethod
+    def value(self, place: Array) -> Array:
+        """The parameter of a member, in its own unit."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LogScale(AbstractScale):
+    """For positive parameters: roughness, absorption."""
+
+    @override
+    def population(self, location: Array, spread: Array) -> dist.Distribution:
+        return dist.Normal(jnp.log(location), spread)
+
+    @override
+    def value(self, place: Array) -> Array:
+        return jnp.exp(place)
+
+
+@dataclasses.dataclass(frozen=True)
+class LogitScale(AbstractScale):
+    """For shares: the subsurface fraction."""
+
+    @override
+    def population(self, location: Array, spread: Array) -> dist.Distribution:
+        return dist.Normal(jnp.log(location) - jnp.log1p(-location), spread)
+
+    @override
+    def value(self, place: Array) -> Array:
+        return jax.nn.sigmoid(place)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlainScale(AbstractScale):
+    """The parameter itself, which may take any value."""
+
+    @override
+    def population(self, location: Array, spread: Array) -> dist.Distribution:
+        return dist.Normal(location, spread)
+
+    @override
+    def value(self, place: Array) -> Array:
+        return place
+
+
+@dataclasses.dataclass(frozen=True)
+class CutScale(AbstractScale):
+    """The parameter itself between bounds, its population cut off there: the refractive index.
+
+    Args:
+        low: Lower bound, finite.
+        high: Upper bound, or inf.
+    """
+
+    low: float
+    high: float
+
+    @override
+    def population(self, location: Array, spread: Array) -> dist.Distribution:
+        high = None if math.isinf(self.high) else self.high
+        cut = dist.TruncatedNormal(location, spread, low=self.low, high=high)
+        return dist.TransformedDistribution(cut, Bent(self.low, self.high).inv)
+
+    @override
+    def value(self, place: Array) -> Array:
+        return Bent(self.low, self.high)(place)
+
+
+def natural_scale(name: str, location: dist.Distribution) -> AbstractScale:
+    """The scale of a parameter, by its physical range.
+
+    Args:
+        name: The parameter.
+        location: The prior of its population's location; its bounds cut an index.
+
+    Returns:
+        The scale.
+
+    Raises:
+        Nothing.
+    """
+    limits = RANGES.get(name, (-math.inf, math.inf))
+    if limits == (0.0, math.inf):
+        return LogScale()
+    if limits == (0.0, 1.0):
+        return LogitScale()
+    low, high = support_bounds(location)
+    return PlainScale() if math.isinf(low) else CutScale(low, high)
+
+
+def draw_pooled(
+    name: str,
+    data: Observations,
+    priors: Mapping[str, dist.Distribution],
+    *,
+    without: tuple[str, ...],
+) -> Float[Array, "..."]:
+    r"""Sample one parameter of every patch from a common population.
+
+    $$ g(x_m) \sim Normal(g(\text{location}), \text{spread}) $$
+
+    Over wavelengths, each has its own location; they share the spread.
+
+    Args:
+        name: The parameter.
+        data: The capture; its leading axes are what is pooled over.
+        priors: Priors of `<name>_location` and `<name>_spread`.
+        without: Axes over which the parameter does not change.
+
+    Returns:
+        The parameter, (patch[, wavelength]), in its own unit.
+
+    Raises:
+        FitError: A prior is missing.
+
+    Source:
+        The paper, section 2 (hierarchical extension).
+    """
+    leading = tuple(axis for axis, _ in data.dims if axis not in ("wavelength", "view"))
+    with over_axes(data, without=(*leading, *without)):
+        location = numpyro.sample(f"{name}_location", priors[f"{name}_location"])
+    spread = numpyro.sample(f"{name}_spread", priors[f"{name}_spread"])
+    scale = natural_scale(name, priors[f"{name}_location"])
+    with over_axes(data, without=without):
+        # The place on the scale is a coordinate; the parameter is what it stands for.
+        population = scale.population(location, spread)
+        place = numpyro.sample(f"{name}_base", population, infer={"auxiliary": True})
+        value = numpyro.deterministic(name, scale.value(place))
+    return drop_view(value, data)
+
+
+def check_pooled(pooled: object, *, where: str) -> None:
+    """Refuse a choice of pooled parameters that is no tuple of parameters of a material."""
+    if not isinstance(pooled, tuple) or not all(isinstance(name, str) for name in pooled):
+        raise FitError(
+            f"pooled={pooled!r} is no tuple of names",
+            where=where,
+            mend="write pooled=('refractive_index',), with the comma",
+        )
+    for name in pooled:
+        if name not in MATERIAL_PARAMETERS:
+            raise FitError(
+                f"{name!r} is no parameter of a material",
+                where=f"{where}: pooled",
+                mend=f"name any of {', '.join(MATERIAL_PARAMETERS)}",
+            )
+
+
+def check_members(pooled: tuple[str, ...], data: Observations, scene: Scene) -> None:
+    """Refuse to pool what the scene does not read, or a capture with a single member."""
+    possible = [name for name in MATERIAL_PARAMETERS if name in scene.parameters]
+    missing = [name for name in pooled if name not in possible]
+    if missing:
+        raise FitError(
+            f"the scene does not read {', '.join(missing)}",
+            where="pooled",
+            mend=f"pool any of {', '.join(possible)}",
+        )
+    if pooled and not any(axis not in ("wavelength", "view") for axis, _ in data.dims):
+        raise FitError(
+            "a population needs several members, and the capture has no axis patch or material",
+            where="model",
+            mend="give captures joined by polar_bayes.combine, or use model='per_material'",
+        )
+
+
+# --- Many patches, or many materials, that resemble each other: pooling (the paper's section 2) ---
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,8 +8,7 @@ turns them into what the instrument would record (eq. 1), the links say how read
 from collections.abc import Mapping
 
 from numpyro import distributions as dist
-from polar_bayes.models.axes import draw_own, material_parameters
-from polar_bayes.models.readings import declare_readings
+from polar_bayes.models.sites import declare_readings, draw_own, material_parameters
 
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink

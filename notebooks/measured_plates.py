@@ -21,7 +21,7 @@ import pandas as pd
 import xarray as xr
 
 import polar_bayes as pb
-from polar_bayes.diagnostics.discrepancy import compare_without
+from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.predictive import predictive_checks
 
 folder = Path(os.environ["POLAR_BAYES_DATA"])

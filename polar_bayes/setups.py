@@ -7,11 +7,10 @@ import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from polar_bayes.cards import Carded
 from polar_bayes.errors import SceneError
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
-from polar_bayes.physics.scene import Scene
-from polar_bayes.physics.scenes import SCENES
+from polar_bayes.physics.scene import SCENES, Scene
+from polar_bayes.repr_html import Carded
 
 
 @dataclasses.dataclass(frozen=True)

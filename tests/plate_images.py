@@ -10,10 +10,10 @@ from textbook import plate_q
 
 import polar_bayes as pb
 from polar_bayes.capture.schema import validate
-from polar_bayes.pixels.blocks import Plan, fit_block, set_aside
-from polar_bayes.pixels.fitting import PixelLaplace
-from polar_bayes.pixels.maps import blank, cut, number_pixels, plan_map
-from polar_bayes.pixels.stack import Stack, stack
+from polar_bayes.inference.batch_fit import PixelLaplace
+from polar_bayes.inference.batching import Stack, stack
+from polar_bayes.maps.blocks import Plan, fit_block, set_aside
+from polar_bayes.maps.fit_map import blank, cut, number_pixels, plan_map
 
 NOISE = 0.02
 # Away from Brewster's angle q stays so far from -1 that ordinary noise is never clipped.

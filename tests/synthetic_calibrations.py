@@ -6,8 +6,8 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from polar_bayes.pixels.marginals import LEVELS
-from polar_bayes.pixels.outcome import Approach, Status
+from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.psis import LEVELS
 
 CENTER, PRIOR_SD, NOISE = 0.5, 0.1, 0.05
 NAMES = ("roughness", "subsurface_fraction", "refractive_index")

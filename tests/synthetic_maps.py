@@ -5,8 +5,8 @@ import json
 import numpy as np
 import xarray as xr
 
-from polar_bayes.pixels.marginals import LEVELS
-from polar_bayes.pixels.outcome import Approach, Status
+from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.psis import LEVELS
 
 LEVELS_HERE = np.array(LEVELS)
 

@@ -6,7 +6,7 @@ import pytest
 from pages import EVIL, Page
 
 import polar_bayes as pb
-from polar_bayes.cards import Card, Carded, Grid
+from polar_bayes.repr_html import Card, Carded, Grid
 
 VALUES = {
     "scene": pb.SETUPS["goniometer"].scene,

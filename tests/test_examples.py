@@ -24,10 +24,10 @@ import xarray as xr
 from test_architecture import LAYERS
 
 import polar_bayes as pb
-from polar_bayes.capture.contract import CONTRACT
+from polar_bayes.capture.schema import CONTRACT
 from polar_bayes.cli import commands
-from polar_bayes.inference import fit as fitting
-from polar_bayes.inference.fit import fit
+from polar_bayes.inference import joint_fit as fitting
+from polar_bayes.inference.joint_fit import fit
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe

@@ -8,8 +8,7 @@ import pytest
 from numpyro import distributions as dist
 from numpyro.distributions import biject_to
 
-from polar_bayes.priors import PRIORS
-from polar_bayes.priors.half_normal import HalfNormal, folded, unfolded
+from polar_bayes.priors import PRIORS, HalfNormal, folded, unfolded
 
 SCALE = 0.01
 SCORES = (-37.0, -20.0, -9.0, -5.0, -1.0, -1e-3, 0.0, 1e-3, 1.0, 5.0, 9.0, 20.0, 36.0)

@@ -6,8 +6,7 @@ import pytest
 
 from polar_bayes.errors import SceneError
 from polar_bayes.observation.links import AbstractLink
-from polar_bayes.physics.scene import Scene
-from polar_bayes.physics.scenes import SCENES
+from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.setups import SETUPS, Setup, find_setup
 
 EVERY_SETUP = pytest.mark.parametrize("name", SETUPS)

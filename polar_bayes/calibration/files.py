@@ -5,9 +5,19 @@ import os
 import xarray as xr
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.files import OF_ALL, holds, load_tree
-from polar_bayes.inference.schema import ANY, EACH, FLAGS, TEXT, Group, Like, Schema
-from polar_bayes.pixels.marginals import LEVELS
+from polar_bayes.inference.files import (
+    ANY,
+    EACH,
+    FLAGS,
+    OF_ALL,
+    TEXT,
+    Group,
+    Like,
+    Schema,
+    holds,
+    load_tree,
+)
+from polar_bayes.inference.psis import LEVELS
 
 _SIMULATION = ("simulation",)
 _RANKS = Group(_SIMULATION, others=False)

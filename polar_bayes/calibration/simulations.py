@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from polar_bayes.inference.batching import Stack, together
+from polar_bayes.inference.compile import TracedByShape
 from polar_bayes.inference.program import Program, Values
-from polar_bayes.inference.tracing import TracedByShape
 from polar_bayes.observation.data import Observations
-from polar_bayes.pixels.stack import Stack, together
 
 
 class Simulations(NamedTuple):

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from polar_bayes.capture.contract import CONTRACT, SIGNALS, TRUTH, WAVELENGTH
-from polar_bayes.capture.schema import validate
+from polar_bayes.capture.schema import CONTRACT, SIGNALS, TRUTH, WAVELENGTH, validate
 from polar_bayes.errors import CaptureError
 
 DIMS = ("material", "patch")

@@ -11,12 +11,12 @@ from polar_bayes.cli.options import (
     CALIBRATION_METHOD,
     INPUT,
     MODEL,
+    NOT_CONVERGED,
     RESULT_FILE,
     RUNG,
     SCENE,
     command,
 )
-from polar_bayes.cli.printing import NOT_CONVERGED
 from polar_bayes.progress import stages
 
 

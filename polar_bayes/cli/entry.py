@@ -3,25 +3,217 @@
 Exit status: 0 done; 1 the input or the options are wrong, or something broke (one line: where,
 what, the hint); 2 the fit ran but its diagnostics fail, with the result still written; 128 + n
 stopped by signal n: 130 Ctrl-C, 143 terminated, 141 nobody reads the output.
+
+Python runs signal handlers between two bytecodes of the main thread, which may be inside compiled
+code for minutes. The command therefore runs in a thread of its own, and the main thread waits for
+its end or for a signal. Compiled code cannot be called off, so a signal ends the whole process as
+soon as the cleanups of `polar_bayes.interrupts` are done.
+
+A compiled program is native code that the next run loads, so whoever can write it can run it.
 """
 
+import contextlib
+import contextvars
+import logging
 import os
+import signal
+import stat
 import sys
 import threading
+import time
 import traceback
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
+import platformdirs
 
 from polar_bayes.cli.captures import COMMANDS as OF_CAPTURES
+from polar_bayes.cli.captures import IMPORT_COMMANDS as OF_IMPORTS
 from polar_bayes.cli.checks import COMMANDS as OF_CHECKS
-from polar_bayes.cli.compile_cache import keep_compiled_programs
 from polar_bayes.cli.fits import COMMANDS as OF_FITS
-from polar_bayes.cli.imports import COMMANDS as OF_IMPORTS
-from polar_bayes.cli.process import TRACEBACK, end, quiet_libraries, run_until_signal
 from polar_bayes.errors import PolarBayesError, one_line
+from polar_bayes.interrupts import clean_up
 from polar_bayes.paths import system_error
+
+# --- The process of a command: which signals end it, what libraries write to it, and how it ends
+
+
+TRACEBACK = "POLAR_BAYES_TRACEBACK"
+"""Environment variable: if it is set, tracebacks, warnings and logs of libraries are shown."""
+
+SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGHUP", "SIGINT", "SIGTERM") if hasattr(signal, name)
+)
+
+POLL, CLEAN_UP, LEAVE = 0.1, 3.0, 0.5
+"""Seconds: between two looks for a signal; for all cleanups; for threads that are still alive."""
+
+STACK = 16 * 2**20
+"""Bytes of the stack of the command's thread: by default macOS gives threads 0.5 MiB."""
+
+DAMAGED = "Error reading persistent compilation cache entry"
+
+
+def run_until_signal(command: Callable[[], int]) -> int:
+    """Run a command in a thread of its own; a signal ends the process."""
+    # The first signal runs the cleanups and prints one line; the second ends the process at once.
+    # Signals that the process was started to ignore (`nohup`) stay ignored.
+    received: list[int] = []
+
+    def receive(number: int, _: object) -> None:
+        if received:
+            os._exit(128 + number)
+        received.append(number)
+
+    outcome: Future[int] = Future()
+    with _handled_by(receive):
+        _start(contextvars.copy_context(), command, outcome)
+        while not wait([outcome], timeout=POLL).done:
+            if received:
+                _stop(received[0])
+    return outcome.result()
+
+
+@contextlib.contextmanager
+def _handled_by(receive: Callable[[int, Any], None]) -> Iterator[None]:
+    """Signal handlers while the block runs."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    handled = [number for number in SIGNALS if before[number] not in (signal.SIG_IGN, None)]
+    for number in handled:
+        signal.signal(number, receive)
+    try:
+        yield
+    finally:
+        for number in handled:
+            signal.signal(number, before[number])
+
+
+def _start(context: contextvars.Context, command: Callable[[], int], outcome: Future[int]) -> None:
+    """Start the thread of the command, whose end is that of `outcome`."""
+
+    def work() -> None:
+        try:
+            outcome.set_result(context.run(command))
+        except BaseException as error:
+            outcome.set_exception(error)
+
+    others = threading.stack_size(STACK)
+    try:
+        threading.Thread(target=work, name="polar-bayes command", daemon=True).start()
+    finally:
+        threading.stack_size(others)
+
+
+def _stop(number: int) -> NoReturn:
+    """Clean up and end the process; the main thread stays free for the next signal."""
+
+    def say() -> None:
+        text = ". ".join(["polar-bayes: stopped", *clean_up()])
+        with contextlib.suppress(OSError, ValueError):  # nobody reads any more
+            click.echo(text, err=True)
+            sys.stdout.flush()
+
+    cleaning = threading.Thread(target=say, daemon=True)
+    cleaning.start()
+    cleaning.join(CLEAN_UP)
+    os._exit(128 + number)
+
+
+def end(status: int) -> NoReturn:
+    """End the process, without waiting for threads that compute what nobody needs any more."""
+    for number in SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)  # no traceback from here on
+    threading.Thread(target=_leave, args=(status,), daemon=True).start()
+    sys.exit(status)
+
+
+def _leave(status: int) -> None:
+    """End the process if threads keep it from ending: Python joins those that are no daemons."""
+    time.sleep(LEAVE)
+    main = threading.main_thread()
+    if any(not each.daemon for each in threading.enumerate() if each is not main):
+        clean_up()
+        os._exit(status)
+
+
+def quiet_libraries() -> None:
+    """Keep what libraries log and warn from the user of the command line, who cannot act on it."""
+    if os.environ.get(TRACEBACK):
+        return
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA: slow compilation, other processors
+    logging.getLogger().addHandler(logging.NullHandler())  # else Python writes them to stderr
+    warnings.showwarning = _Warnings().show
+
+
+class _Warnings:
+    """One line about all damaged entries of the compilation cache; nothing about the rest."""
+
+    def __init__(self) -> None:
+        self._is_said = False
+
+    def show(self, message: Warning | str, *_: Any, **__: Any) -> None:
+        """Stands in for `warnings.showwarning`."""
+        if str(message).startswith(DAMAGED) and not self._is_said:
+            self._is_said = True
+            folder = os.environ.get("JAX_COMPILATION_CACHE_DIR", "JAX_COMPILATION_CACHE_DIR")
+            click.echo(
+                f"{folder}: compiled programs there are damaged and are compiled again; "
+                "delete the folder to have them kept",
+                err=True,
+            )
+
+
+# --- Where compiled programs are kept between runs: a folder that nobody else can write to --------
+
+
+FOLDER = "JAX_COMPILATION_CACHE_DIR"
+OTHERS = stat.S_IWGRP | stat.S_IWOTH
+
+
+def keep_compiled_programs() -> None:
+    """Keep compiled programs between runs; a second run of the same fit compiles nothing."""
+    # The folder that the user gives by JAX_COMPILATION_CACHE_DIR is used as it is. The own one is
+    # not used where other users could write to it; one line on stderr says so.
+    if FOLDER not in os.environ:
+        folder = platformdirs.user_cache_path("polar_bayes") / "compiled"
+        doubt = _doubt(folder)
+        if doubt:
+            hint = f"mend that, or set {FOLDER} to a folder of your own"
+            click.echo(f"{folder}: compiled programs are not kept: {doubt}; {hint}", err=True)
+            return
+        os.environ[FOLDER] = str(folder)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
+
+def _doubt(folder: Path) -> str:
+    """Why others could write to the folder, which is made if it is not there; empty if not."""
+    ours = (folder.parent, folder)
+    try:
+        folder.parent.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for each in ours:
+            each.mkdir(mode=0o700, exist_ok=True)
+        if os.name != "posix":
+            return ""
+        for each in (folder.parent.parent, *ours):
+            found = each.stat()
+            shared = each not in ours and found.st_mode & stat.S_ISVTX  # such as /tmp
+            if found.st_uid != os.getuid() and (each in ours or found.st_uid != 0):
+                return f"{each} belongs to another user"
+            if found.st_mode & OTHERS and not shared:
+                return f"other users can write to {each}"
+    except OSError as error:
+        return f"it cannot be used ({(error.strerror or str(error)).lower()})"
+    return ""
+
+
+# --- One program with many commands ---------------------------------------------------------------
+
 
 BROKEN_PIPE = 141
 """Exit status of a program whose output nobody reads: 128 + SIGPIPE."""

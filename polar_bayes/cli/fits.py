@@ -12,12 +12,14 @@ from polar_bayes.cli.options import (
     FOLDER,
     INPUT,
     MODEL,
+    NOT_CONVERGED,
     RESULT_FILE,
     SCENE,
     STORE,
     command,
+    print_table,
+    status,
 )
-from polar_bayes.cli.printing import NOT_CONVERGED, print_table, status
 from polar_bayes.paths import written
 from polar_bayes.progress import stages
 

@@ -8,12 +8,7 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
-from polar_bayes.diagnostics.parameters import (
-    SAMPLE_DIMS,
-    method_of,
-    posterior_scalars,
-    scalars,
-)
+from polar_bayes.diagnostics.parameters import SAMPLE_DIMS, method_of, posterior_scalars, scalars
 
 DETERMINED = 0.5
 """Prior probability inside the posterior's 95% interval; normal ones, a third as wide, have it."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from polar_bayes.cards import Carded
+from polar_bayes.repr_html import Carded
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class AbstractMethod(Carded, abc.ABC):
         """Draw from the posterior of one capture.
 
         Args:
-            bench: The capture, ready to be fitted; a `polar_bayes.inference.bench.Bench`.
+            bench: The capture, ready to be fitted; a `polar_bayes.inference.problem.Bench`.
 
         Returns:
             The draws, and how far they can be trusted.

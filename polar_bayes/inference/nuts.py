@@ -18,12 +18,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpyro import infer
 
-from polar_bayes.cards import Carded
 from polar_bayes.errors import FitError
-from polar_bayes.inference.kept import Kept
-from polar_bayes.inference.mixing import measure
-from polar_bayes.inference.modes import Modes, ValueAndGradient
-from polar_bayes.inference.tracing import TracedOnce
+from polar_bayes.inference.compile import Kept, TracedOnce
+from polar_bayes.inference.mcse import measure
+from polar_bayes.inference.optimize import Modes, ValueAndGradient
+from polar_bayes.repr_html import Carded
 
 Progress = Callable[[float], None]
 

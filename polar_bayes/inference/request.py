@@ -13,13 +13,11 @@ from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.kept import Kept, key_of_story, layout_of
-from polar_bayes.inference.laplace import Laplace
+from polar_bayes.inference.compile import TRACING, Kept, key_of_story, layout_of
+from polar_bayes.inference.laplace import Laplace, Point
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.nuts import Nuts
-from polar_bayes.inference.point import Point
-from polar_bayes.inference.story import Story, read_story
-from polar_bayes.inference.tracing import TRACING
+from polar_bayes.inference.program import Story, read_story
 from polar_bayes.models.gp_spectral import gp_spectral
 from polar_bayes.models.hierarchical import Hierarchical
 from polar_bayes.models.per_material import per_material

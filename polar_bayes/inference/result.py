@@ -16,7 +16,7 @@ from arviz_base import from_dict
 from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Draw, Program
 from polar_bayes.observation.data import Observations
-from polar_bayes.physics.notation import notation
+from polar_bayes.physics.part import notation
 from polar_bayes.priors import RANGES
 
 PROVENANCE = "polar_bayes"

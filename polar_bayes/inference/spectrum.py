@@ -11,14 +11,13 @@ import xarray as xr
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
+from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import bounds_of, provenance_of
-from polar_bayes.inference.tracing import compiled
 from polar_bayes.models.gp_spectral import GpSpectral
-from polar_bayes.models.spectra import SPECTRA, around, widening_of
-from polar_bayes.models.spectral_process import SpectralProcess
+from polar_bayes.models.spectral_process import SPECTRA, SpectralProcess, around, widening_of
 from polar_bayes.physics.dispersion import AbstractDispersion, Cauchy, Sellmeier
-from polar_bayes.physics.notation import notation
+from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
 
 BATCH = 64

@@ -1,4 +1,4 @@
-r"""Averages over the facets that a viewer sees: where to look, and how much each look counts.
+"""Averages over the facets that a viewer sees: where to look, and how much each look counts.
 
 In slope coordinates (x towards the viewer, y across) all borders are simple curves:
 
@@ -21,9 +21,8 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.microfacet import AbstractMicrofacet
+from polar_bayes.physics.microfacet import AbstractMicrofacet, SlopeEllipse
 from polar_bayes.physics.part import Part
-from polar_bayes.physics.slopes import SlopeEllipse
 
 # Facets steeper than this are not met by any distribution in use.
 STEEPEST = 1e6
@@ -291,3 +290,18 @@ def _crowded_gauss_legendre(nodes: int, crowding: float) -> tuple[np.ndarray, np
     node, weight = np.polynomial.legendre.leggauss(nodes)
     moved = node * (1.0 + 0.5 * crowding * (1.0 - node**2))
     return moved, weight * (1.0 + 0.5 * crowding * (1.0 - 3.0 * node**2))
+
+
+# --- Nodes and weights of integrals from 0 to 1 ---------------------------------------------------
+
+
+def unit_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Legendre nodes and weights on (0, 1)."""
+    node, weight = np.polynomial.legendre.leggauss(count)
+    return 0.5 * (node + 1.0), 0.5 * weight
+
+
+def squared_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same in the square root: denser at 0, where light meets an interface at grazing."""
+    node, weight = unit_rule(count)
+    return node**2, 2.0 * node * weight

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.physics.quadrature import squared_rule
+from polar_bayes.physics.facets import squared_rule
 
 # Cosines and weights for integrals over the hemisphere: 24 Gauss-Legendre nodes in the square root
 # of the cosine, because near n = 1 all reflection gathers at grazing. The error of Fe is 1e-15 from

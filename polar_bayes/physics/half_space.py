@@ -35,8 +35,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from polar_bayes.physics.facets import squared_rule, unit_rule
 from polar_bayes.physics.geometry import cos_degrees, sin_degrees
-from polar_bayes.physics.quadrature import squared_rule, unit_rule
 
 # Scattered light changes with the square root of absorption, whose slope at zero is infinite: less
 # absorption than this counts as this.

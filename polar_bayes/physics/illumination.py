@@ -11,15 +11,19 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.facets import Window, above_horizon, inside_disc
+from polar_bayes.physics.facets import Window, above_horizon, inside_disc, squared_rule, unit_rule
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
+from polar_bayes.physics.microfacet import SlopeEllipse
 from polar_bayes.physics.microsurface import Microsurface, gather
 from polar_bayes.physics.part import Part, check_part, like, parameters_of
-from polar_bayes.physics.polarization import LinearPolarization, let_in, mirror_light
-from polar_bayes.physics.quadrature import squared_rule, unit_rule
-from polar_bayes.physics.slopes import SlopeEllipse
 from polar_bayes.physics.stack import Stack
-from polar_bayes.physics.stokes import Light, in_turned_frame
+from polar_bayes.physics.stokes import (
+    Light,
+    LinearPolarization,
+    in_turned_frame,
+    let_in,
+    mirror_light,
+)
 
 # Directions in a disc, by angle from its center and by azimuth, when counting the light that
 # enters the body: exact to 1e-6 of it while the disc is above the horizon, and to .002 (half

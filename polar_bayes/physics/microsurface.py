@@ -13,9 +13,7 @@ from jaxtyping import Array
 from polar_bayes.physics.diattenuation import Diattenuation
 from polar_bayes.physics.facets import FacetQuadrature, Facets, Window, sample_facets
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_slopes, sin_degrees
-from polar_bayes.physics.microfacet import AbstractMicrofacet
-from polar_bayes.physics.shadowing import AbstractShadowing
-from polar_bayes.physics.slopes import SlopeEllipse
+from polar_bayes.physics.microfacet import AbstractMicrofacet, AbstractShadowing, SlopeEllipse
 from polar_bayes.physics.stokes import Light
 
 Border = Callable[[Array, Array], Window]

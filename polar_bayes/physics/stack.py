@@ -14,8 +14,8 @@ from jaxtyping import Array
 from polar_bayes.physics import boundary, fresnel
 from polar_bayes.physics.boundary import EVANESCENT, Film, Medium
 from polar_bayes.physics.diattenuation import Diattenuation
+from polar_bayes.physics.facets import squared_rule
 from polar_bayes.physics.part import like
-from polar_bayes.physics.quadrature import squared_rule
 
 # Squared sines of inner angles that reach a coat but not the air, crowded towards grazing.
 _FROM_END, TRAPPED_WEIGHT = squared_rule(24)

@@ -5,20 +5,99 @@ import dataclasses
 from collections.abc import Mapping
 from typing import override
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array
 
-from polar_bayes.physics.exit import AbstractExit, RoughExit, exit_through_plane
-from polar_bayes.physics.facets import FacetQuadrature
-from polar_bayes.physics.geometry import Geometry, mirror_facet
+from polar_bayes.physics.facets import FacetQuadrature, Facets, seen
+from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.illumination import AbstractIllumination, PointSource
-from polar_bayes.physics.microfacet import AbstractMicrofacet, Beckmann
-from polar_bayes.physics.microsurface import Microsurface
+from polar_bayes.physics.microfacet import (
+    AbstractMicrofacet,
+    AbstractShadowing,
+    AbstractSlopes,
+    Beckmann,
+    IsotropicSlopes,
+    SeparableShadowing,
+    SlopeEllipse,
+)
+from polar_bayes.physics.microsurface import Microsurface, gather
 from polar_bayes.physics.part import Part, check_part, parameters_of
-from polar_bayes.physics.polarization import mirror_light
-from polar_bayes.physics.shadowing import AbstractShadowing, SeparableShadowing
-from polar_bayes.physics.slopes import AbstractSlopes, IsotropicSlopes
 from polar_bayes.physics.stack import Stack
-from polar_bayes.physics.stokes import Light
+from polar_bayes.physics.stokes import Light, mirror_light
+
+# --- The way out: what a surface does to light that leaves the body -------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class AbstractExit(Part):
+    """How unpolarized light passes from the body to the viewer."""
+
+    @abc.abstractmethod
+    def light(
+        self, facets: Microsurface, ellipse: SlopeEllipse, stack: Stack, geometry: Geometry
+    ) -> Light:
+        """Transmittance towards the viewer, and the polarization that it gives.
+
+        Args:
+            facets: How they tilt, which are seen, and how many stand for all.
+            ellipse: Their slopes in the frame of each viewer. Broadcasts with (..., view).
+            stack: What one facet is made of. Broadcasts with (..., view).
+            geometry: Directions. Shape (..., view), degree.
+
+        Returns:
+            Light whose intensity is the transmittance. Shape (..., view).
+
+        Raises:
+            Nothing.
+        """
+
+
+@dataclasses.dataclass(frozen=True)
+class SmoothExit(AbstractExit):
+    """Through a plane, whatever the roughness."""
+
+    @override
+    def light(
+        self, facets: Microsurface, ellipse: SlopeEllipse, stack: Stack, geometry: Geometry
+    ) -> Light:
+        return exit_through_plane(stack, geometry)
+
+
+@dataclasses.dataclass(frozen=True)
+class RoughExit(AbstractExit):
+    r"""Through the facets that the viewer sees.
+
+    $$ E_0 = \sum_i w_i T_+, \qquad E_1 = -\sum_i w_i K \sin^2\theta_i \cos 2\psi_i $$
+    """
+
+    @override
+    def simpler(self) -> tuple[Part | None, ...]:
+        return (SmoothExit(),)
+
+    @override
+    def light(
+        self, facets: Microsurface, ellipse: SlopeEllipse, stack: Stack, geometry: Geometry
+    ) -> Light:
+        sample = facets.sample(ellipse, geometry, seen)
+        # A barrier keeps facets from being found anew for each of their readers; see `facets`.
+        sample = Facets(*jax.lax.optimization_barrier(tuple(sample)))
+        passing = stack.per_facet().transmission(sample.cos_incidence, sample.sin_squared)
+        area = jnp.sum(sample.weight, axis=-2)
+        light = gather(sample, sample.weight, passing)
+        light = light._replace(intensity=light.intensity / area)
+        return Light(*jax.lax.optimization_barrier(tuple(light)))
+
+
+def exit_through_plane(stack: Stack, geometry: Geometry) -> Light:
+    """Transmittance and polarization of a plane surface; the shapes of `AbstractExit.light`."""
+    cos_view, sin_view = cos_degrees(geometry.view_zenith), sin_degrees(geometry.view_zenith)
+    passing = stack.transmission(cos_view, sin_view**2)
+    q = passing.contrast * sin_view**2 / passing.mean
+    return Light(passing.mean, q, jnp.zeros_like(q))
+
+
+# --- The interface of a material: what it reflects, what it lets in, and what it lets out ---------
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,3 +310,24 @@ class Interface:
     def escape(self) -> Array:
         """Share of diffuse light in the body that is not turned back; see `Stack.escape`."""
         return self.stack.escape()
+
+
+# --- What the interface turns back into the body: light gets another chance to come out -----------
+
+
+@dataclasses.dataclass(frozen=True)
+class InternalReflection(Part):
+    r"""Diffuse light under the interface is turned back and scattered again.
+
+    $$ 1 + A F_i + (A F_i)^2 + \dots = \frac{1}{1 - A F_i} $$
+
+    for a body of albedo A. Where a body's `internal_reflection` is None, F_i = 0.
+    """
+
+    @override
+    def simpler(self) -> tuple[Part | None, ...]:
+        return (None,)
+
+    def escape(self, interface: Interface) -> Array:
+        """Share of diffuse light that leaves, 1 - F_i. Broadcasts with (..., view), in (0, 1]."""
+        return interface.escape()

@@ -9,26 +9,22 @@ from typing import Any
 
 import xarray as xr
 
-from polar_bayes.budget.accuracy_files import is_accuracy
-from polar_bayes.budget.advice import accuracy_advice, accuracy_of
+from polar_bayes.benchmark.accuracy import is_accuracy
+from polar_bayes.benchmark.advice import accuracy_advice, accuracy_of
 from polar_bayes.calibration.files import is_calibration
-from polar_bayes.calibration.verdict import (
-    calibration_table,
-    calibration_verdict,
-    how_ranks_stray,
-)
-from polar_bayes.cards import Card, Grid
+from polar_bayes.calibration.verdict import calibration_table, calibration_verdict, how_ranks_stray
 from polar_bayes.diagnostics.convergence import judge, summary
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.diagnostics.parameters import method_of, posterior_scalars
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import one_line
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.reporting import calibration_tables, map_tables, sentences, tables
-from polar_bayes.reporting.accuracy_page import reference_sentence, study_table
-from polar_bayes.reporting.calibration_panels import parts_of
-from polar_bayes.reporting.provenance import swapped_sentence
-from polar_bayes.reporting.tables import Table
+from polar_bayes.reporting import calibration_page, tables, text
+from polar_bayes.reporting import maps as map_tables
+from polar_bayes.reporting.accuracy import reference_sentence, study_table
+from polar_bayes.reporting.plots_calibration import parts_of
+from polar_bayes.reporting.tables import Table, swapped_sentence
+from polar_bayes.repr_html import Card, Grid
 
 MOST_ROWS = 40
 
@@ -58,9 +54,9 @@ def _of_fit(result: xr.DataTree) -> Card:
     method, provenance = method_of(result), provenance_of(result)
     judged, prior = judge(result, table), sensitivity(result)
     posterior = result["posterior"].to_dataset()
-    determined = sentences.determined(found, prior, posterior) if judged.converged else []
+    determined = text.determined(found, prior, posterior) if judged.converged else []
     said = [
-        sentences.headline(method, judged.converged, judged.cautions),
+        text.headline(method, judged.converged, judged.cautions),
         *judged.problems,
         *determined,
         *(f"Caution: {caution}" for caution in judged.cautions),
@@ -86,9 +82,9 @@ def _of_calibration(calibration: xr.DataTree) -> Card:
     table = calibration_table(calibration)
     parts = parts_of(calibration, table)
     words = {label: how_ranks_stray(part.row) for label, part in parts.items() if not part.passes}
-    _, is_good = calibration_tables.verdict_head(table, None)
+    _, is_good = calibration_page.verdict_head(table, None)
     said = calibration_verdict(calibration)
-    rows = calibration_tables.calibration_rows(table, parts, words)
+    rows = calibration_page.calibration_rows(table, parts, words)
     return _card(_name(provenance_of(calibration), "calibration"), said, rows, is_good)
 
 

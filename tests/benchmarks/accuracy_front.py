@@ -22,7 +22,7 @@ from accuracy_scenes import CASES, Case
 from matplotlib.figure import Figure
 
 import polar_bayes as pb
-from polar_bayes.budget.advice import accuracy_of, advised
+from polar_bayes.benchmark.advice import accuracy_of, advised
 from polar_bayes.reporting.accuracy import front_panel
 from polar_bayes.reporting.style import styled
 

@@ -19,13 +19,12 @@ import scipy.stats
 from accuracy_scenes import CASES, Case
 
 import polar_bayes as pb
-from polar_bayes.budget.distances import distances
-from polar_bayes.budget.reference import run_reference
-from polar_bayes.budget.trial import bench_of, labeled
+from polar_bayes.benchmark.reference import distances, run_reference
+from polar_bayes.benchmark.run import bench_of, labeled
 from polar_bayes.calibration.simulations import draw_numbered
-from polar_bayes.inference.bench import Bench
+from polar_bayes.inference.problem import Bench
 from polar_bayes.inference.request import resolve
-from polar_bayes.ladder.builtin import answer
+from polar_bayes.inference.run_method import answer
 
 LAYOUTS = ("smooth glass, 6 views", "leaf, 40 views")
 REFERENCE = pb.Reference(error=0.02)

@@ -5,7 +5,7 @@
 The per-material model of one color, 40 views, NUTS with the default settings, each level of
 optimization in a process of its own without a cache of compiled programs: seconds of the first
 `pb.fit` and the least of three further ones, of other readings. "all" is what XLA does unasked;
-`polar_bayes.inference.tracing.QUICK` is what fits ask for.
+`polar_bayes.inference.compile.QUICK` is what fits ask for.
 """
 
 import os
@@ -18,7 +18,7 @@ import jax
 from one_material import SCENE
 
 import polar_bayes as pb
-from polar_bayes.inference import tracing
+from polar_bayes.inference import compile
 
 PROTOCOL = pb.Protocol(views=40, wavelengths=())
 LEVELS = ("all", "2", "1", "0")
@@ -26,7 +26,7 @@ LEVELS = ("all", "2", "1", "0")
 
 def one(level: str) -> None:
     """A first fit and three more, in this process."""
-    tracing.QUICK = None if level == "all" else {"xla_backend_optimization_level": int(level)}
+    compile.QUICK = None if level == "all" else {"xla_backend_optimization_level": int(level)}
     took = []
     for seed in range(4):
         capture = pb.simulate("leaf", seed=seed, protocol=PROTOCOL)
@@ -37,7 +37,7 @@ def one(level: str) -> None:
 
 
 def main() -> None:
-    print(f"{platform.machine()}, {os.cpu_count()} cores; fits ask for {tracing.QUICK}")
+    print(f"{platform.machine()}, {os.cpu_count()} cores; fits ask for {compile.QUICK}")
     print(f"{'level':<8}{'first s':>8}{'next s':>8}", flush=True)
     quiet = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
     for level in LEVELS:

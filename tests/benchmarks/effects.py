@@ -16,9 +16,9 @@ import numpy as np
 import xarray as xr
 
 import polar_bayes as pb
-from polar_bayes.budget.ledger import ledger_table
+from polar_bayes.effects.choose import ledger_table
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.physics.scenes import FULL_SCENES, MANY_FACETS
+from polar_bayes.physics.scene import FULL_SCENES, MANY_FACETS
 from tests.benchmarks.effect_costs import gradients
 
 METHOD = pb.Nuts(draws=1000, most_draws=4000, effective_draws=1500)

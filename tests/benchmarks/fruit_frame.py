@@ -15,7 +15,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 import polar_bayes as pb
-from polar_bayes.capture.frames import read_frame
+from polar_bayes.importers.detector import read_frame
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from fruit import APPLE, ORANGE, SPOTS, mean_stokes, regions

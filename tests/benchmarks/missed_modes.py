@@ -17,8 +17,8 @@ import numpy as np
 from one_material import SCENE, layout
 
 import polar_bayes as pb
-from polar_bayes.calibration.block import Plan, fit_block
 from polar_bayes.calibration.calibrate import planned
+from polar_bayes.calibration.runner import Plan, fit_block
 from polar_bayes.inference.request import resolve
 
 LARGE = pb.PixelTempering(walks=4096, draws=16384)

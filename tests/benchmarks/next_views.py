@@ -26,21 +26,15 @@ from one_material import SCENE
 
 import polar_bayes as pb
 from polar_bayes.calibration.simulations import draw_captures
-from polar_bayes.identifiability.exchange import Chosen, choose
-from polar_bayes.identifiability.fisher import (
-    information_of_each,
-    prior_precision,
-    sound_precision,
-)
-from polar_bayes.identifiability.peak import flat_parameters
-from polar_bayes.identifiability.spread import unconstrain
+from polar_bayes.design.candidates import Chosen, choose
+from polar_bayes.design.fisher import information_of_each, prior_precision, sound_precision
+from polar_bayes.design.setup import flat_parameters, unconstrain
+from polar_bayes.inference.batch_fit import PixelLaplace, fit_stack
+from polar_bayes.inference.batch_programs import Engine, Recipe, key_of, make_engine
+from polar_bayes.inference.batching import Stack
+from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.search import from_prior
 from polar_bayes.observation.data import observe
-from polar_bayes.pixels.engine import Engine
-from polar_bayes.pixels.fitting import PixelLaplace, fit_stack
-from polar_bayes.pixels.making import Recipe, key_of, make_engine
-from polar_bayes.pixels.stack import Stack
 
 NAMES = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
 MEASURED = (15.0, 30.0, 45.0, 60.0)

@@ -25,8 +25,7 @@ from paper_study import (
 from scipy.stats import binomtest, norm
 
 import polar_bayes as pb
-from polar_bayes.calibration.bands import ecdf_band
-from polar_bayes.calibration.joint import FALSE_ALARMS
+from polar_bayes.calibration.scores import FALSE_ALARMS, ecdf_band
 from polar_bayes.reporting.style import (
     BLUE,
     GRAY,

@@ -27,12 +27,12 @@ from paper_study import (
 
 import polar_bayes as pb
 from polar_bayes.calibration.simulations import Simulations, draw_captures
-from polar_bayes.inference.point import Estimate, estimate
+from polar_bayes.inference.batching import together
+from polar_bayes.inference.laplace import Estimate, estimate
+from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.search import from_prior
 from polar_bayes.observation.data import observe
-from polar_bayes.pixels.stack import together
 
 USUAL = ("laplace", "importance", "tempered", "nuts")
 NORMAL_95 = 1.959964

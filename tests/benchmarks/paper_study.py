@@ -17,12 +17,11 @@ import xarray as xr
 from jaxtyping import Array
 from numpyro import distributions as dist
 from one_material import SCENE
-from polar_bayes.models.axes import draw_own, material_parameters
-from polar_bayes.models.readings import declare_readings
+from polar_bayes.models.sites import declare_readings, draw_own, material_parameters
 
 import polar_bayes as pb
 from polar_bayes.observation.data import Observations
-from polar_bayes.simulation.simulate import BRIGHT_LEVEL, BRIGHT_QUANTILE, NOISE
+from polar_bayes.simulate import BRIGHT_LEVEL, BRIGHT_QUANTILE, NOISE
 
 CLASSES = tuple(pb.PRESETS)
 NAMES = ("roughness", "subsurface_fraction", "absorption", "refractive_index")

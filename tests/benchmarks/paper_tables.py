@@ -30,9 +30,8 @@ from paper_study import (
 )
 
 import polar_bayes as pb
-from polar_bayes.identifiability.fisher import expected_information
-from polar_bayes.identifiability.paper import paper_information
-from polar_bayes.identifiability.spread import unconstrain
+from polar_bayes.design.fisher import expected_information, paper_information
+from polar_bayes.design.setup import unconstrain
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations, observe

@@ -42,13 +42,12 @@ from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
 from polar_bayes.capture.schema import validate
+from polar_bayes.inference.batch_programs import Engine
+from polar_bayes.inference.batching import CLIMBING, Stack, stack, together
+from polar_bayes.inference.levenberg_marquardt import expand, score
+from polar_bayes.maps.blocks import set_aside
+from polar_bayes.maps.fit_map import plan_map
 from polar_bayes.observation.data import Observations
-from polar_bayes.pixels.batching import CLIMBING
-from polar_bayes.pixels.blocks import set_aside
-from polar_bayes.pixels.derivatives import expand, score
-from polar_bayes.pixels.engine import Engine
-from polar_bayes.pixels.maps import plan_map
-from polar_bayes.pixels.stack import Stack, stack, together
 
 NOISE, VIEWS, STEPS = 0.01, 40, 25
 RANGES = {

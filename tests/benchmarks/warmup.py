@@ -31,7 +31,7 @@ from accuracy_scenes import CASES
 from plates import GONIOMETER, GONIOMETER_VIEWS, LINKS, PLATE, plate_capture, plates
 
 import polar_bayes as pb
-from polar_bayes.inference.mixing import measure, standard_errors
+from polar_bayes.inference.mcse import measure, standard_errors
 from polar_bayes.inference.result import provenance_of
 
 TWO, FOUR = (1.45, 1.55), (1.45, 1.5, 1.55, 1.6)

@@ -12,20 +12,17 @@ import xarray as xr
 from toy_models import capture, line, of_line, squared
 
 import polar_bayes as pb
-from polar_bayes.budget import dials, fresh
-from polar_bayes.budget.accuracy import AS_GIVEN
-from polar_bayes.budget.dials import AbstractDial
-from polar_bayes.budget.fresh import run_fresh
-from polar_bayes.budget.reference import Judge, nearest, run_reference
-from polar_bayes.budget.trial import Trial, bench_of
-from polar_bayes.budget.variants import parts_of
-from polar_bayes.inference.bench import Bench
+from polar_bayes.benchmark import run
+from polar_bayes.benchmark.accuracy import AS_GIVEN
+from polar_bayes.benchmark.reference import Judge, nearest, run_reference
+from polar_bayes.benchmark.run import AbstractDial, Trial, bench_of, run_fresh
+from polar_bayes.effects.variants import parts_of
+from polar_bayes.inference.mcse import errors_of, standard_errors
 from polar_bayes.inference.method import AbstractMethod, Answer
-from polar_bayes.inference.mixing import standard_errors
+from polar_bayes.inference.problem import Bench
 from polar_bayes.inference.request import resolve
-from polar_bayes.ladder.expected import errors_of
-from polar_bayes.ladder.scaling import draws_of
-from polar_bayes.ladder.weighing import choose
+from polar_bayes.inference.resampling import choose
+from polar_bayes.inference.run_method import draws_of
 
 LINKS = {"q": pb.StokesLink()}
 ROUGHLY = pb.Reference(error=0.05, longer=0)
@@ -134,7 +131,7 @@ def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
         tries.append(arguments)
         raise pb.FitError("no peak", where="choose_effects", mend="nothing")
 
-    monkeypatch.setattr(dials, "choose_effects", refuse)
+    monkeypatch.setattr(run, "choose_effects", refuse)
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
     for method in (pb.Laplace(), pb.Nuts()):
         with pytest.raises(pb.FitError, match="no peak"):
@@ -280,7 +277,7 @@ def test_settings_out_of_range_are_refused():
 
 def test_a_process_of_its_own_finds_no_compiled_programs(monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/somewhere")
-    told = fresh._environment()
+    told = run._environment()
     assert "JAX_COMPILATION_CACHE_DIR" not in told
     assert told["JAX_ENABLE_COMPILATION_CACHE"] == "false"
 

@@ -5,7 +5,7 @@ import pytest
 from synthetic_accuracy import ROWS, make_accuracy
 
 import polar_bayes as pb
-from polar_bayes.budget.advice import parameter_errors, pareto_front
+from polar_bayes.benchmark.advice import parameter_errors, pareto_front
 
 
 def test_the_table_has_the_worst_parameter_of_every_row():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import polar_bayes as pb
-from polar_bayes.budget.cost import compile_and_count, run_seconds
-from polar_bayes.budget.variants import effects_of, simplify
+from polar_bayes.effects.compare_scenes import compile_and_count, run_seconds
+from polar_bayes.effects.variants import effects_of, simplify
 from polar_bayes.physics import fresnel
 from polar_bayes.physics.boundary import Medium, medium, relative_reflection, transmission
 from polar_bayes.physics.geometry import cos_degrees, mirror_facet, sin_degrees

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from polar_bayes.budget.distances import distances
+from polar_bayes.benchmark.reference import distances
 
 SHARE = (np.arange(20000) + 0.5) / 20000
 STANDARD = stats.norm.ppf(SHARE)

@@ -11,9 +11,9 @@ from plates import LINKS, plate_capture
 from synthetic_results import make_result
 
 import polar_bayes as pb
-from polar_bayes.budget.ledger import ledger_rows, ledger_sentence, ledger_table
+from polar_bayes.effects.choose import ledger_rows, ledger_sentence, ledger_table
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.reporting.html import render
+from polar_bayes.reporting.report import render
 
 MATERIAL = ("body", "slope")
 TINY = pb.Laplace(chains=2, draws=50)

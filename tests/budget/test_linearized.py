@@ -8,9 +8,8 @@ from budget import linear
 from plates import LINKS, plate_capture
 
 import polar_bayes as pb
-from polar_bayes.budget.density import compile_density, coordinates
-from polar_bayes.budget.linearized import compare, find_peak
-from polar_bayes.inference.modes import climb
+from polar_bayes.effects.compare_scenes import compare, compile_density, coordinates, find_peak
+from polar_bayes.inference.optimize import climb
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from polar_bayes.calibration.bands import ecdf_band, histogram_band
-from polar_bayes.calibration.uniformity import MOST_POINTS, uniformity
+from polar_bayes.calibration.scores import MOST_POINTS, ecdf_band, histogram_band, uniformity
 
 
 @pytest.mark.parametrize("count", [20, 300, 700])

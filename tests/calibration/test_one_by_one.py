@@ -13,16 +13,16 @@ from plates import LINKS, PLATE, plate_capture, plates
 from spectral_plates import spectral_plate
 
 import polar_bayes as pb
-from polar_bayes.calibration import one_by_one
-from polar_bayes.calibration.block import Method
+from polar_bayes.calibration import runner
 from polar_bayes.calibration.calibrate import METHODS, _settings
+from polar_bayes.calibration.runner import Method
 from polar_bayes.errors import FitError
-from polar_bayes.inference import anchoring
-from polar_bayes.inference.draws import PIECE, parameters_of
-from polar_bayes.inference.prepared import prepare
+from polar_bayes.inference import hierarchical_reparam
+from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.problem import prepare
+from polar_bayes.inference.program import PIECE, parameters_of
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
-from polar_bayes.pixels.outcome import Approach, Status
 
 COUNT, PATCHES, VIEWS, NOISE = 80, 3, 4, 0.5
 SHORT = pb.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
@@ -54,8 +54,8 @@ ASKED: dict[str, Any] = {"scene": PLATE, "links": LINKS, "readings": False}
 @pytest.fixture(scope="module", autouse=True)
 def one_start_finds_the_one_peak() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(anchoring, "FEWEST_STARTS", 1)
-        patch.setattr(anchoring, "MOST_STARTS", 1)
+        patch.setattr(hierarchical_reparam, "FEWEST_STARTS", 1)
+        patch.setattr(hierarchical_reparam, "MOST_STARTS", 1)
         yield
 
 
@@ -118,7 +118,7 @@ def test_fits_without_draws_are_counted(
     capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever a fit raises for want of a peak: it is not left out, and has no rank."""
-    inner = one_by_one.Prepared.grounds.func
+    inner = runner.Prepared.grounds.func
     refused = []
 
     class Refusing:
@@ -131,9 +131,7 @@ def test_fits_without_draws_are_counted(
                 raise FitError("no start reached a peak", where="fit", mend="look at it")
             return self._grounds.find(data, key, progress)
 
-    monkeypatch.setattr(
-        one_by_one.Prepared, "grounds", property(lambda self: Refusing(inner(self)))
-    )
+    monkeypatch.setattr(runner.Prepared, "grounds", property(lambda self: Refusing(inner(self))))
     laplace = pb.Laplace(draws=50, chains=1)
     found = pb.calibrate(capture, simulations=24, model=population, method=laplace, **ASKED)
     lost = found["fits"]["status"].to_numpy() == Status.NOT_CONVERGED
@@ -167,7 +165,7 @@ def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
     data = observe(request.capture)
     prepared = prepare(request, PLATE, data)
     settings = pb.Laplace(draws=4000, chains=1)
-    told = one_by_one._fit(prepared.grounds, prepared.program, settings, data, jax.random.key(1))
+    told = runner._fit(prepared.grounds, prepared.program, settings, data, jax.random.key(1))
     assert told is not None
     _, parameters = told
     q = np.asarray(data.readings["q"])
@@ -194,7 +192,7 @@ def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None
 def test_draws_are_thinned_by_what_they_are_worth() -> None:
     draws = {"x": np.arange(200.0).reshape(2, 100), "y": np.zeros((2, 100, 3))}
     draws["x"][0, 40] = np.nan
-    few = one_by_one._thin(draws, effective=21.0)  # every tenth: 200 / 21, rounded up
+    few = runner._thin(draws, effective=21.0)  # every tenth: 200 / 21, rounded up
     assert few["x"].tolist() == [x for x in range(0, 200, 10) if x != 40]
     assert few["y"].shape == (19, 3)
-    assert len(one_by_one._thin(draws, effective=500.0)["x"]) == 199
+    assert len(runner._thin(draws, effective=500.0)["x"]) == 199

@@ -11,7 +11,7 @@ from scipy import stats
 from synthetic_calibrations import make_calibration
 
 import polar_bayes as pb
-from polar_bayes.calibration.readings import DRAWS, Readings, _choose, _resample, why_untold
+from polar_bayes.calibration.predictive import DRAWS, Readings, _choose, _resample, why_untold
 from polar_bayes.calibration.simulations import draw_captures, draw_fresh
 from polar_bayes.inference.program import compile_program
 from polar_bayes.observation.data import observe

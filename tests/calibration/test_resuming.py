@@ -20,8 +20,8 @@ from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
 from polar_bayes import interrupts
-from polar_bayes.calibration import block as module
-from polar_bayes.calibration.question import digest
+from polar_bayes.calibration import runner as module
+from polar_bayes.calibration.store import digest
 
 ASKED = {
     "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
@@ -197,7 +197,7 @@ import numpy as np
 import numpyro.distributions as dist
 from plates import plate_capture
 from polar_bayes.calibration.calibrate import METHODS, planned, _resolved
-from polar_bayes.calibration.question import question_of
+from polar_bayes.calibration.store import question_of
 from test_resuming import ASKED
 capture = plate_capture(np.array([30.0, 42.0, 68.0, 80.0]), 0.03, seed=0)
 priors = {"refractive_index": dist.TruncatedNormal(1.5, 0.1, low=1.2)}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from polar_bayes.calibration.standing import Standing, ranked_score, share_below
+from polar_bayes.calibration.scores import Standing, ranked_score, share_below
 
 
 def even(fits: int, draws: int) -> np.ndarray:

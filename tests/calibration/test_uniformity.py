@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from polar_bayes.calibration.uniformity import uniformity
+from polar_bayes.calibration.scores import uniformity
 
 
 @pytest.mark.parametrize("count", [50, 300, 1000])

@@ -5,11 +5,10 @@ import pytest
 import xarray as xr
 
 from polar_bayes.capture.combine import combine
-from polar_bayes.capture.contract import CONTRACT
 from polar_bayes.capture.files import load_capture, save_capture
-from polar_bayes.capture.goniometer import from_goniometer
-from polar_bayes.capture.schema import count, validate
+from polar_bayes.capture.schema import CONTRACT, count, validate
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers.goniometer import from_goniometer
 from polar_bayes.observation.data import observe
 
 

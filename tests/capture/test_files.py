@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from polar_bayes.capture.contract import LEADING
 from polar_bayes.capture.files import load_capture, save_capture
-from polar_bayes.capture.schema import validate
+from polar_bayes.capture.schema import LEADING, validate
 from polar_bayes.errors import CaptureError, OutputError
 
 

@@ -18,13 +18,12 @@ from mutations import (
     table_text,
 )
 
-from polar_bayes.capture.contract import LEADING
 from polar_bayes.capture.files import load_capture, save_capture
-from polar_bayes.capture.frames import read_array, read_frame
-from polar_bayes.capture.goniometer import from_goniometer
-from polar_bayes.capture.schema import validate
-from polar_bayes.capture.tables import read_table
+from polar_bayes.capture.schema import LEADING, validate
+from polar_bayes.capture.table_reader import read_table
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers.detector import read_array, read_frame
+from polar_bayes.importers.goniometer import from_goniometer
 
 
 def outcome(function, *arguments, **options):

@@ -7,9 +7,9 @@ import pytest
 import xarray as xr
 
 from polar_bayes.capture.files import load_capture, save_capture
-from polar_bayes.capture.goniometer import from_goniometer
 from polar_bayes.capture.schema import count, validate
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers.goniometer import from_goniometer
 
 ANGLES = np.arange(20.0, 81.0, 5.0)
 GLASS = 1.5

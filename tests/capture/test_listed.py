@@ -8,8 +8,8 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polar_bayes.capture.listed import from_table
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers.table import from_table
 
 ANGLES = {"view_azimuth": 180.0, "light_zenith": 45.0, "light_azimuth": 0.0}
 PLAIN = "view_zenith,dop,intensity\n10,0.02,812\n20,0.04,790\n# a cloud\n30,0.09,755\n"

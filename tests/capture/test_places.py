@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import polar_bayes as pb
-from polar_bayes.capture.places import directions, mirrored
-from polar_bayes.capture.shapes import NormalMap, as_shape, fit_sphere
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers.camera_geometry import directions, mirrored
+from polar_bayes.importers.normals import NormalMap, as_shape, fit_sphere
 
 COMPONENT = st.floats(-1.0, 1.0)
 VECTOR = st.tuples(COMPONENT, COMPONENT, st.floats(0.05, 1.0))

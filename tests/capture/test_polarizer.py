@@ -9,9 +9,9 @@ from pictures import BALL, FULL, LAMP, SCENE, TRUTH, ball_normals, frames
 from PIL import Image
 
 import polar_bayes as pb
-from polar_bayes.capture.polarizer import from_polarizer
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers.images import from_polarizer
 
 QUIET = pb.Detector(saturation_level=FULL, gain=1e-6, read_noise=0.0, relative_error=0.0)
 FOUR = (0.0, 45.0, 90.0, 135.0)

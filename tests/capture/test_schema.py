@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from polar_bayes.capture.contract import CONTRACT, LEADING, Interval
-from polar_bayes.capture.schema import count, validate
+from polar_bayes.capture.schema import CONTRACT, LEADING, Interval, count, validate
 from polar_bayes.errors import CaptureError
 
 

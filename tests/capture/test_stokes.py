@@ -5,8 +5,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from polar_bayes.capture.stokes import StokesImage, check_angles, fit_stokes, unbiased_dop
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers.stokes import StokesImage, check_angles, fit_stokes, unbiased_dop
 
 ANGLES = st.lists(st.floats(-180.0, 180.0), min_size=3, max_size=8)
 SIGNED = st.floats(-0.7, 0.7)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from polar_bayes.cli.compile_cache import FOLDER, keep_compiled_programs
+from polar_bayes.cli.entry import FOLDER, keep_compiled_programs
 
 NAMES = (
     FOLDER,

@@ -18,8 +18,8 @@ from plate_images import plate_image
 
 import polar_bayes as pb
 from polar_bayes import interrupts
-from polar_bayes.budget import fresh
-from polar_bayes.cli.process import SIGNALS, run_until_signal
+from polar_bayes.benchmark import run
+from polar_bayes.cli.entry import SIGNALS, run_until_signal
 from polar_bayes.paths import unfinished_folder
 
 LIMIT = 5.0
@@ -276,9 +276,9 @@ def test_an_interrupt_ends_the_process_of_a_trial(
         time.sleep(0.2)
         interrupts.clean_up()
 
-    monkeypatch.setattr(fresh.subprocess, "Popen", Sleeping)
-    monkeypatch.setattr(fresh.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(run.subprocess, "Popen", Sleeping)
+    monkeypatch.setattr(run.tempfile, "tempdir", str(tmp_path))
     threading.Thread(target=interrupt).start()
     with pytest.raises(pb.FitError, match="its process ended with -9"):
-        fresh.run_fresh(None)
+        run.run_fresh(None)
     assert not list(tmp_path.iterdir())

@@ -9,8 +9,8 @@ from plate_images import plate_image
 from synthetic_maps import make_maps
 
 from polar_bayes.cli import main
-from polar_bayes.pixels import store
-from polar_bayes.pixels.maps import blank
+from polar_bayes.maps import store
+from polar_bayes.maps.fit_map import blank
 
 
 @pytest.fixture

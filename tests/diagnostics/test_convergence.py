@@ -10,12 +10,7 @@ import xarray as xr
 from scipy import stats
 from synthetic_results import edit_provenance, make_result, replace
 
-from polar_bayes.diagnostics.convergence import (
-    json_summary,
-    laplace_k_hat,
-    summary,
-    verdict,
-)
+from polar_bayes.diagnostics.convergence import json_summary, laplace_k_hat, summary, verdict
 from polar_bayes.diagnostics.parameters import method_of
 from polar_bayes.errors import FitError
 

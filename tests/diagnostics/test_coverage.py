@@ -11,8 +11,8 @@ from synthetic_maps import make_maps
 
 import polar_bayes as pb
 from polar_bayes.diagnostics import coverage
-from polar_bayes.pixels import opening
-from polar_bayes.pixels.outcome import Status
+from polar_bayes.inference.batch_result import Status
+from polar_bayes.maps import lazy as opening
 
 HALF = np.full((40, 50), 0.5)
 SPREAD = ((np.arange(2000) + 0.5) / 2000).reshape(40, 50)

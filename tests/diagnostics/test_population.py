@@ -10,10 +10,10 @@ import scipy.stats
 import xarray as xr
 from synthetic_results import make_result, pool
 
-from polar_bayes.diagnostics.alone import estimate_alone
 from polar_bayes.diagnostics.population import (
     MEMBER_COLUMNS,
     SUMMARY_COLUMNS,
+    estimate_alone,
     population_summary,
     populations,
     shrinkage,

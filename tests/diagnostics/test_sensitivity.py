@@ -7,7 +7,7 @@ import xarray as xr
 from scipy import stats
 from synthetic_results import PRIOR, make_result, replace
 
-from polar_bayes.diagnostics.discrepancy import compare_without
+from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.sensitivity import sensitivity
 
 

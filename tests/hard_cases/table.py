@@ -14,14 +14,13 @@ import mpmath as mp
 import numpy as np
 
 from polar_bayes.observation.distributions import MeanConcentrationBeta
-from polar_bayes.observation.noise import ScaleSchedule
+from polar_bayes.observation.links import ScaleSchedule
 from polar_bayes.physics import fresnel
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.microfacet import Beckmann
 from polar_bayes.physics.mixing import StokesMixing
-from polar_bayes.physics.polarization import mirror_light
 from polar_bayes.physics.stack import Layer, Stack
-from polar_bayes.physics.stokes import Light, degree_of_linear_polarization
+from polar_bayes.physics.stokes import Light, degree_of_linear_polarization, mirror_light
 
 mp.mp.dps = 50
 

@@ -15,19 +15,21 @@ from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.illumination import PointSource
-from polar_bayes.physics.instrument import STEEPEST_ZENITH, BeamOverlap
-from polar_bayes.physics.microfacet import GGX, Beckmann
+from polar_bayes.physics.instrument import STEEPEST_ZENITH, BeamOverlap, lean
+from polar_bayes.physics.microfacet import (
+    GGX,
+    AnisotropicSlopes,
+    Beckmann,
+    HeightCorrelatedShadowing,
+    SeparableShadowing,
+)
 from polar_bayes.physics.microsurface import Microsurface
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
-from polar_bayes.physics.polarization import LinearPolarization
 from polar_bayes.physics.scene import Scene
-from polar_bayes.physics.shadowing import HeightCorrelatedShadowing, SeparableShadowing
-from polar_bayes.physics.slopes import AnisotropicSlopes
 from polar_bayes.physics.stack import Layer, Stack
-from polar_bayes.physics.stokes import Light
+from polar_bayes.physics.stokes import Light, LinearPolarization
 from polar_bayes.physics.subsurface import Lambertian, body_loss, half_space_loss
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
-from polar_bayes.physics.tilt import lean
 
 BOUND = {np.float64: 1e-10, np.float32: 1e-4}
 PRECISIONS = pytest.mark.parametrize("dtype", [np.float64, np.float32])

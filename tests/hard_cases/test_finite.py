@@ -21,23 +21,27 @@ from jaxtyping import Array
 
 from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
-from polar_bayes.physics.exit import SmoothExit
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
-from polar_bayes.physics.instrument import Analyzer, BeamOverlap, Instrument, Saturation
-from polar_bayes.physics.internal_reflection import InternalReflection
-from polar_bayes.physics.microfacet import GGX, Beckmann
+from polar_bayes.physics.instrument import (
+    Analyzer,
+    BeamOverlap,
+    Instrument,
+    Saturation,
+    TiltedNormal,
+)
+from polar_bayes.physics.microfacet import (
+    GGX,
+    AnisotropicSlopes,
+    Beckmann,
+    HeightCorrelatedShadowing,
+)
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
-from polar_bayes.physics.polarization import LinearPolarization
-from polar_bayes.physics.scene import Scene
-from polar_bayes.physics.scenes import SCENES
-from polar_bayes.physics.shadowing import HeightCorrelatedShadowing
-from polar_bayes.physics.slopes import AnisotropicSlopes
-from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
-from polar_bayes.physics.surface import RoughSurface, SmoothSurface
-from polar_bayes.physics.tilt import TiltedNormal
-from polar_bayes.physics.turbid import TurbidMedium
+from polar_bayes.physics.scene import SCENES, Scene
+from polar_bayes.physics.stokes import LinearPolarization
+from polar_bayes.physics.subsurface import Depolarizer, Lambertian, TurbidMedium, Unpolarized
+from polar_bayes.physics.surface import InternalReflection, RoughSurface, SmoothExit, SmoothSurface
 
 READINGS = ("dop", "q", "u", "intensity")
 

@@ -15,12 +15,13 @@ from synthetic_observations import make_observations
 
 from polar_bayes.observation.links import (
     BetaLink,
+    ConcentrationSchedule,
     LogitNormalLink,
     NormalLink,
+    ScaleSchedule,
     StokesLink,
     StudentTLink,
 )
-from polar_bayes.observation.noise import ConcentrationSchedule, ScaleSchedule
 
 ZENITHS = (0.0, 60.0, 89.999)
 BRIGHTNESS = (0.0, 1e-12, 0.5, 1.0)

@@ -11,7 +11,7 @@ from scipy.special import polygamma
 from textbook import plate_q
 
 import polar_bayes as pb
-from polar_bayes.identifiability.fisher import sound_precision
+from polar_bayes.design.fisher import sound_precision
 
 ASKED = {
     "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),

@@ -7,7 +7,7 @@ import pytest
 from numpyro import distributions as dist
 
 import polar_bayes as pb
-from polar_bayes.identifiability.information import information
+from polar_bayes.design.fisher import information
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
 
 READINGS = 200_000

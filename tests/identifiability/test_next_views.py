@@ -23,7 +23,7 @@ from polar_bayes.models.per_material import per_material
 from synthetic_results import make_result
 
 import polar_bayes as pb
-from polar_bayes.identifiability.exchange import choose
+from polar_bayes.design.candidates import choose
 
 START = np.array([40.0, 50.0])
 GRID = np.linspace(10.0, 80.0, 8)

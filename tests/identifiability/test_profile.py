@@ -7,9 +7,8 @@ import xarray as xr
 from identifiability.lines import ASKED, NOISE, PRIOR, line, line_capture, precision_of, rows_of
 
 import polar_bayes as pb
-from polar_bayes.identifiability.curve import interval
-from polar_bayes.identifiability.peak import pose
-from polar_bayes.identifiability.tracking import FAINT, split_density
+from polar_bayes.design.profile_curve import FAINT, interval, split_density
+from polar_bayes.design.setup import pose
 
 ZENITHS = np.array([20.0, 40.0, 60.0, 70.0])
 

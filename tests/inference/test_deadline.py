@@ -9,8 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from polar_bayes.inference.deadline import OutOfTimeError, run_until
-from polar_bayes.inference.tracing import TRACING, AbandonedError, TracedOnce
+from polar_bayes.inference.compile import (
+    TRACING,
+    AbandonedError,
+    OutOfTimeError,
+    TracedOnce,
+    run_until,
+)
 from polar_bayes.progress import Progress, silent
 
 LONG = 60.0

@@ -16,7 +16,7 @@ from synthetic_results import edit_provenance, make_result, pool, replace
 from tree_mutations import ODD_ATTRIBUTES, mutate, pick
 
 import polar_bayes as pb
-from polar_bayes.diagnostics.discrepancy import compare_without
+from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.inference.result import GEOMETRY, assemble, posterior_of

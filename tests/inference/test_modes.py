@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from polar_bayes.inference.modes import Status, climb, curvature, distinct
+from polar_bayes.inference.optimize import Status, climb, curvature, distinct
 
 SPREAD = np.array([[0.5, 0.2], [0.2, 0.3]])
 

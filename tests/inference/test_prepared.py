@@ -22,14 +22,14 @@ from polar_bayes.models.per_material import per_material
 from spectral_plates import spectral_plate
 
 import polar_bayes as pb
-from polar_bayes.budget.effects import ChosenScene
-from polar_bayes.inference import anchoring, ground, request, search
-from polar_bayes.inference import fit as fitting
-from polar_bayes.inference.kept import Kept, key_of_story, last_edit
-from polar_bayes.inference.modes import quiet_line_search
-from polar_bayes.inference.prepared import prepare
+from polar_bayes.effects.choose import ChosenScene
+from polar_bayes.inference import hierarchical_reparam, initialization, optimize, request
+from polar_bayes.inference import joint_fit as fitting
+from polar_bayes.inference.compile import Kept, key_of_story, last_edit
+from polar_bayes.inference.optimize import quiet_line_search
+from polar_bayes.inference.problem import prepare
+from polar_bayes.inference.program import Story, read_story
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.story import Story, read_story
 from polar_bayes.observation.data import observe
 
 # The goals let chains of other readings stop at another length.
@@ -53,9 +53,9 @@ def colors(seed: int) -> xr.Dataset:
 
 @pytest.fixture(autouse=True)
 def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(ground, "STARTS", 2)
-    monkeypatch.setattr(anchoring, "MOST_STARTS", 4)
-    monkeypatch.setattr(anchoring, "TYPICAL_DRAWS", 20)
+    monkeypatch.setattr(initialization, "STARTS", 2)
+    monkeypatch.setattr(hierarchical_reparam, "MOST_STARTS", 4)
+    monkeypatch.setattr(hierarchical_reparam, "TYPICAL_DRAWS", 20)
     monkeypatch.setattr(fitting, "PRIOR_DRAWS", 20)
     monkeypatch.setattr(fitting, "BLOCK", 50)
     jax.config.update("jax_disable_most_optimizations", True)
@@ -124,15 +124,15 @@ def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
 def test_any_number_of_prior_draws_is_served_by_one_program(
     compiled: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(search, "KEYS", 8)
+    monkeypatch.setattr(optimize, "KEYS", 8)
     with jax.enable_x64(True):
         data = observe(one(1))
         program = prepared(one(1)).program
-        few = search.from_prior(program, jax.random.key(5), 3, data)
+        few = optimize.from_prior(program, jax.random.key(5), 3, data)
         compiled.clear()
-        more = search.from_prior(program, jax.random.key(5), 7, data)
+        more = optimize.from_prior(program, jax.random.key(5), 7, data)
         assert compiled == []
-        many = search.from_prior(program, jax.random.key(5), 20, data)
+        many = optimize.from_prior(program, jax.random.key(5), 20, data)
         assert "jit(draw)" not in compiled
         alone = program.from_prior(jax.random.split(jax.random.key(5), 20)[19], data)
     assert few.shape == (3, program.size)

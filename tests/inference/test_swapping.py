@@ -12,7 +12,7 @@ from numpyro.infer.reparam import LocScaleReparam
 from plates import LINKS, PLATE, plate_capture
 from polar_bayes.models.hierarchical import Hierarchical
 from polar_bayes.models.per_material import per_material
-from polar_bayes.models.readings import declare_readings
+from polar_bayes.models.sites import declare_readings
 
 import polar_bayes as pb
 from polar_bayes.inference.result import provenance_of

@@ -15,10 +15,9 @@ from plates import plate_capture
 from toy_models import line
 
 import polar_bayes as pb
-from polar_bayes.inference import fit as fitting
-from polar_bayes.inference import tracing
-from polar_bayes.inference.kept import Kept
-from polar_bayes.inference.tracing import TracedByShape, TracedOnce, bytes_of
+from polar_bayes.inference import compile
+from polar_bayes.inference import joint_fit as fitting
+from polar_bayes.inference.compile import Kept, TracedByShape, TracedOnce, bytes_of
 
 
 @pytest.fixture
@@ -64,7 +63,7 @@ def test_the_sampler_is_compiled_beside_the_search_and_once(
     programs: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The program that is begun before any state of a chain is known is the one that runs."""
-    monkeypatch.setattr("polar_bayes.inference.prepared._KEPT", Kept(1))
+    monkeypatch.setattr("polar_bayes.inference.problem._KEPT", Kept(1))
     plastic = pb.simulate("plastic", seed=0, protocol=pb.Protocol(views=9, wavelengths=()))
     scene = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
     pb.fit(plastic, scene=scene, method=pb.Nuts(draws=50, most_draws=50))
@@ -206,7 +205,7 @@ def test_a_program_that_the_memory_cannot_hold_is_refused_and_not_run(
     for _ in range(2):  # nor later
         with pytest.raises(pb.FitError, match=said):
             run(jnp.ones(3))
-    monkeypatch.setattr(tracing, "memory_limit", lambda: None)  # where nobody knows, nobody refuses
+    monkeypatch.setattr(compile, "memory_limit", lambda: None)  # where nobody knows, nobody refuses
     assert TracedOnce(lambda x: x + 1.0)(jnp.ones(3))[0] == 2.0
 
 
@@ -218,7 +217,7 @@ def test_a_fit_is_refused_in_one_line_where_memory_is_short(
     views = np.linspace(20.0, 70.0, 9)  # a layout of its own: no other test has its programs
     readings = plate_capture(views, 0.05, seed=0)
     said = r"memory: this fit would need .*; average neighboring"
-    monkeypatch.setattr(tracing, "memory_limit", lambda: 1000)
+    monkeypatch.setattr(compile, "memory_limit", lambda: 1000)
     with pytest.raises(pb.FitError, match=said):  # what is described of draws would not fit
         pb.fit(readings, method=method, **asked)
     monkeypatch.setattr(fitting, "_check_room", lambda *_: None)
@@ -229,11 +228,11 @@ def test_a_fit_is_refused_in_one_line_where_memory_is_short(
 def test_the_limit_is_that_of_the_container_where_it_is_lower(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    machine = tracing.memory_limit()
+    machine = compile.memory_limit()
     assert machine is not None
     assert machine > 1e8
     limit = tmp_path / "memory.max"
-    monkeypatch.setattr(tracing, "CONTAINER_LIMITS", (str(limit),))
+    monkeypatch.setattr(compile, "CONTAINER_LIMITS", (str(limit),))
     for text, found in (("max\n", None), ("1000000\n", 1_000_000)):
         limit.write_text(text)
-        assert tracing.memory_limit() == (found or machine)
+        assert compile.memory_limit() == (found or machine)

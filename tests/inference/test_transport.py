@@ -10,10 +10,10 @@ from numpyro import distributions as dist
 from scipy import stats
 
 import polar_bayes as pb
-from polar_bayes.inference.groups import find_groups, group_of
+from polar_bayes.inference.group_model import find_groups, group_of
+from polar_bayes.inference.hierarchical_reparam import Anchored, Anchors, Transport
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.transport import Anchored, Anchors, Transport
 from polar_bayes.observation.data import observe
 
 MEMBERS, VIEWS, NOISE = 5, 3, 0.4

@@ -16,10 +16,10 @@ from plates import plate_capture
 from toy_models import capture, funnel, line, of_line
 
 import polar_bayes as pb
-from polar_bayes.budget.trial import bench_of
-from polar_bayes.inference import fit as fitting
-from polar_bayes.inference.bench import Bench
+from polar_bayes.benchmark.run import bench_of
+from polar_bayes.inference import joint_fit as fitting
 from polar_bayes.inference.method import AbstractMethod, Answer
+from polar_bayes.inference.problem import Bench
 from polar_bayes.inference.request import resolve
 
 LINKS = {"q": pb.StokesLink()}

@@ -9,16 +9,14 @@ import pytest
 from toy_models import capture, funnel, line, of_line, squared
 
 import polar_bayes as pb
-from polar_bayes.budget.trial import bench_of, labeled
+from polar_bayes.benchmark.run import bench_of, labeled
 from polar_bayes.errors import FitError
-from polar_bayes.inference.modes import Modes
+from polar_bayes.inference.auto import unvisited_weight
+from polar_bayes.inference.mcse import draws_needed, expected_error, quantile
+from polar_bayes.inference.optimize import Modes
 from polar_bayes.inference.request import resolve
-from polar_bayes.ladder.builtin import answer
-from polar_bayes.ladder.expected import draws_needed, expected_error, quantile
-from polar_bayes.ladder.importance import _proposal
-from polar_bayes.ladder.scaling import draws_of, with_answer_draws, with_draws
-from polar_bayes.ladder.tempered import _engine
-from polar_bayes.ladder.visiting import unvisited_weight
+from polar_bayes.inference.run_method import answer, draws_of, with_answer_draws, with_draws
+from polar_bayes.inference.weighted import _engine, _proposal
 
 SMALL = {
     "point": pb.Point(starts=2),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polar_bayes.ladder.weighing import CHAINS, FEWEST, MOST, choose, most_worth
+from polar_bayes.inference.resampling import CHAINS, FEWEST, MOST, choose, most_worth
 
 
 def test_each_draw_is_chosen_as_often_as_it_weighs():

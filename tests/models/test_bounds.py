@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from polar_bayes.models.bounds import Bent
+from polar_bayes.models.sites import Bent
 
 LOW, HIGH = 1.2, 2.0
 INTERVALS = {"both": (LOW, HIGH), "one": (1.0, np.inf)}

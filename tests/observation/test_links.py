@@ -24,14 +24,12 @@ from polar_bayes.observation.links import (
     StudentTLink,
     noise_parameters,
 )
-from polar_bayes.observation.noise import ConcentrationSchedule, ScaleSchedule  # noqa: F401 (eval)
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.subsurface import Unpolarized
 from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.priors import PRIORS, RANGES, resolve_priors
-from polar_bayes.simulation.protocol import Protocol
-from polar_bayes.simulation.simulate import NOISE, simulate
+from polar_bayes.simulate import NOISE, Protocol, simulate
 
 LINKS = [
     ("dop", BetaLink()),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from polar_bayes.errors import FitError
-from polar_bayes.observation.noise import SMOOTHING, ConcentrationSchedule, ScaleSchedule
+from polar_bayes.observation.links import SMOOTHING, ConcentrationSchedule, ScaleSchedule
 
 BRIGHTNESS = np.array([0.0, 0.2, 0.7, 1.0])
 COSINES = np.cos(np.deg2rad([0.0, 30.0, 60.0, 85.0]))

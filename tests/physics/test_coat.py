@@ -9,12 +9,11 @@ from scipy.integrate import quad
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import AbstractCoat, ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.internal_reflection import InternalReflection
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Layer, Stack
 from polar_bayes.physics.subsurface import Lambertian
-from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+from polar_bayes.physics.surface import InternalReflection, RoughSurface, SmoothSurface
 
 stokes_of = jax.jit(Scene.stokes, static_argnums=0)
 

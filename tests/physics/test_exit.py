@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from polar_bayes.physics import fresnel
-from polar_bayes.physics.exit import RoughExit, SmoothExit
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
+from polar_bayes.physics.microfacet import AnisotropicSlopes
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
-from polar_bayes.physics.slopes import AnisotropicSlopes
 from polar_bayes.physics.stack import Layer, Stack
 from polar_bayes.physics.subsurface import Lambertian
-from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+from polar_bayes.physics.surface import RoughExit, RoughSurface, SmoothExit, SmoothSurface
 
 ZENITHS = jnp.array([0.0, 30.0, 60.0, 80.0])
 VIEWS = Geometry(ZENITHS, jnp.full(4, 20.0), ZENITHS, jnp.full(4, 200.0))

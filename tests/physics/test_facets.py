@@ -9,8 +9,7 @@ from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature, sample_facets, seen
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.illumination import UniformSky
-from polar_bayes.physics.microfacet import GGX, Beckmann
-from polar_bayes.physics.slopes import SlopeEllipse
+from polar_bayes.physics.microfacet import GGX, Beckmann, SlopeEllipse
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.surface import RoughSurface
 

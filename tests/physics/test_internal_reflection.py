@@ -7,7 +7,6 @@ import pytest
 from polar_bayes.physics import fresnel
 from polar_bayes.physics.coat import ClearCoat
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.internal_reflection import InternalReflection
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Stack
@@ -18,7 +17,7 @@ from polar_bayes.physics.subsurface import (
     Unpolarized,
     half_space_loss,
 )
-from polar_bayes.physics.surface import Interface, SmoothSurface
+from polar_bayes.physics.surface import Interface, InternalReflection, SmoothSurface
 
 VIEWS = Geometry.from_degrees(
     view_zenith=[0.0, 40.0, 80.0], view_azimuth=180.0, light_zenith=30.0, light_azimuth=0.0

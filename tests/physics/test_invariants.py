@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from polar_bayes.physics.coat import AbstractCoat, ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
-from polar_bayes.physics.exit import SmoothExit
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
 from polar_bayes.physics.instrument import (
@@ -26,19 +25,20 @@ from polar_bayes.physics.instrument import (
     Leakage,
     Saturation,
 )
-from polar_bayes.physics.internal_reflection import InternalReflection
-from polar_bayes.physics.microfacet import GGX, AbstractMicrofacet, Beckmann
-from polar_bayes.physics.mixing import DopMixing, StokesMixing
-from polar_bayes.physics.polarization import LinearPolarization
-from polar_bayes.physics.scene import Scene
-from polar_bayes.physics.shadowing import (
+from polar_bayes.physics.microfacet import (
+    GGX,
+    AbstractMicrofacet,
+    AnisotropicSlopes,
+    Beckmann,
     HeightCorrelatedShadowing,
     NoShadowing,
     SeparableShadowing,
 )
-from polar_bayes.physics.slopes import AnisotropicSlopes
+from polar_bayes.physics.mixing import DopMixing, StokesMixing
+from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
-from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+from polar_bayes.physics.surface import InternalReflection, RoughSurface, SmoothExit, SmoothSurface
 
 BEAM = PointSource(LinearPolarization("light_degree", "light_angle"))
 GROOVED = AnisotropicSlopes("roughness_azimuth")

@@ -8,10 +8,14 @@ import vector_optics as twin
 
 from polar_bayes.physics.facets import FacetQuadrature, seen
 from polar_bayes.physics.geometry import Geometry, mirror_facet
-from polar_bayes.physics.microfacet import GGX, Beckmann
+from polar_bayes.physics.microfacet import (
+    GGX,
+    AnisotropicSlopes,
+    Beckmann,
+    IsotropicSlopes,
+    SeparableShadowing,
+)
 from polar_bayes.physics.microsurface import Microsurface
-from polar_bayes.physics.shadowing import SeparableShadowing
-from polar_bayes.physics.slopes import AnisotropicSlopes, IsotropicSlopes
 
 DISTRIBUTIONS = {"Beckmann": Beckmann(), "GGX": GGX()}
 named = pytest.mark.parametrize("name", DISTRIBUTIONS)

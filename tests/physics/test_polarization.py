@@ -12,10 +12,9 @@ from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat, ThinFilm
 from polar_bayes.physics.geometry import Geometry, cos_degrees
 from polar_bayes.physics.illumination import PointSource, UniformSky
-from polar_bayes.physics.polarization import LinearPolarization
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Stack
-from polar_bayes.physics.stokes import to_stokes
+from polar_bayes.physics.stokes import LinearPolarization, to_stokes
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
 RUN = settings(deadline=None, max_examples=100, derandomize=True)

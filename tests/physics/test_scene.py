@@ -22,12 +22,10 @@ from polar_bayes.physics.instrument import (
     DolpGain,
     Instrument,
 )
-from polar_bayes.physics.microfacet import GGX
+from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
-from polar_bayes.physics.polarization import LinearPolarization
-from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
-from polar_bayes.physics.scenes import SCENES
-from polar_bayes.physics.slopes import AnisotropicSlopes
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS, SCENES, Scene
+from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 

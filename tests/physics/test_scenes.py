@@ -9,7 +9,7 @@ import pytest
 
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.scenes import SCENES
+from polar_bayes.physics.scene import SCENES
 
 ZENITHS = np.linspace(2.0, 85.0, 43)
 

@@ -7,14 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.microfacet import GGX, Beckmann
-from polar_bayes.physics.scene import Scene
-from polar_bayes.physics.shadowing import (
+from polar_bayes.physics.microfacet import (
+    GGX,
     AbstractShadowing,
+    Beckmann,
     HeightCorrelatedShadowing,
     NoShadowing,
     SeparableShadowing,
 )
+from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.surface import RoughSurface
 
 RUN = settings(deadline=None, max_examples=80, derandomize=True)

@@ -12,11 +12,15 @@ from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
-from polar_bayes.physics.microfacet import GGX, Beckmann
+from polar_bayes.physics.microfacet import (
+    GGX,
+    AnisotropicSlopes,
+    Beckmann,
+    HeightCorrelatedShadowing,
+    IsotropicSlopes,
+)
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
-from polar_bayes.physics.shadowing import HeightCorrelatedShadowing
-from polar_bayes.physics.slopes import AnisotropicSlopes, IsotropicSlopes
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.subsurface import Lambertian
 from polar_bayes.physics.surface import RoughSurface

@@ -11,23 +11,25 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from polar_bayes.budget.variants import effects_of
+from polar_bayes.effects.variants import effects_of
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.exit import SmoothExit
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import PointSource, UniformSky
-from polar_bayes.physics.instrument import AngleZero, BeamOverlap, DolpGain, Instrument
-from polar_bayes.physics.microfacet import GGX, Beckmann
+from polar_bayes.physics.instrument import (
+    AngleZero,
+    BeamOverlap,
+    DolpGain,
+    Instrument,
+    TiltedNormal,
+    lean,
+)
+from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes, Beckmann
 from polar_bayes.physics.mixing import StokesMixing
-from polar_bayes.physics.polarization import LinearPolarization
-from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
-from polar_bayes.physics.scenes import SCENES
-from polar_bayes.physics.slopes import AnisotropicSlopes
-from polar_bayes.physics.subsurface import Lambertian
-from polar_bayes.physics.surface import RoughSurface, SmoothSurface
-from polar_bayes.physics.tilt import TiltedNormal, lean
-from polar_bayes.physics.turbid import TurbidMedium
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS, SCENES, Scene
+from polar_bayes.physics.stokes import LinearPolarization
+from polar_bayes.physics.subsurface import Lambertian, TurbidMedium
+from polar_bayes.physics.surface import RoughSurface, SmoothExit, SmoothSurface
 
 RUN = settings(deadline=None, max_examples=60, derandomize=True)
 direction = st.tuples(st.floats(0.0, 75.0), st.floats(-360.0, 360.0))

@@ -12,11 +12,10 @@ from polar_bayes.errors import SceneError
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
 from polar_bayes.physics.mixing import StokesMixing
-from polar_bayes.physics.polarization import LinearPolarization
 from polar_bayes.physics.scene import Scene
-from polar_bayes.physics.subsurface import Depolarizer
+from polar_bayes.physics.stokes import LinearPolarization
+from polar_bayes.physics.subsurface import Depolarizer, TurbidMedium
 from polar_bayes.physics.surface import AbstractSurface, RoughSurface, SmoothSurface
-from polar_bayes.physics.turbid import TurbidMedium
 
 BODY = {"subsurface_fraction": 1.0, "absorption": 0.3, "refractive_index": 1.5, "roughness": 0.2}
 VIEWS = Geometry.from_degrees(

@@ -5,10 +5,10 @@ import pytest
 from plate_images import NAMES, VIEWS, mapped, on_a_grid, planned, plate_image
 from scipy import stats
 
-from polar_bayes.pixels.adapting import DEGREES_OF_FREEDOM, Proposal, heavy_points, learn
-from polar_bayes.pixels.fitting import PixelLaplace
-from polar_bayes.pixels.importance import Points, normal_points
-from polar_bayes.pixels.outcome import Approach, Status
+from polar_bayes.inference.batch_fit import PixelLaplace
+from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.proposals import DEGREES_OF_FREEDOM, Proposal, heavy_points, learn
+from polar_bayes.inference.psis import Points, normal_points
 
 WEAK = plate_image(3, 8, noise=0.15, views=VIEWS[[1, 4]], seed=7)
 

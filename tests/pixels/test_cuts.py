@@ -8,12 +8,12 @@ import pytest
 import xarray as xr
 from plate_images import ASKED, NAMES, mapped, planned, plate_image
 
-from polar_bayes.pixels import maps as verb
-from polar_bayes.pixels.blocks import Plan, fit_block
-from polar_bayes.pixels.fitting import PixelLaplace
-from polar_bayes.pixels.maps import fit_pixels, number_pixels
-from polar_bayes.pixels.outcome import Approach, Status
-from polar_bayes.pixels.sampling import PixelNuts
+from polar_bayes.inference.batch_fit import PixelLaplace
+from polar_bayes.inference.batch_nuts import PixelNuts
+from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.maps import fit_map as verb
+from polar_bayes.maps.blocks import Plan, fit_block
+from polar_bayes.maps.fit_map import fit_pixels, number_pixels
 
 # Chains too short to be believed are as good as any to compare bits.
 SHORT = PixelLaplace(

@@ -15,10 +15,10 @@ from plates import PLATE
 from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
+from polar_bayes.inference.levenberg_marquardt import expand, score
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations, observe
-from polar_bayes.pixels.derivatives import expand, score
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 

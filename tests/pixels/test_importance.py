@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from polar_bayes.pixels.importance import effective_draws, normal_points, smooth, summarize, turns
+from polar_bayes.inference.psis import effective_draws, normal_points, smooth, summarize, turns
 
 
 def theirs(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

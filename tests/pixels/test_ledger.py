@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 import polar_bayes as pb
-from polar_bayes.pixels.ledger import Entry, locked_ledger
+from polar_bayes.maps.store import Entry, locked_ledger
 
 REQUEST = "ab" * 32
 ENTRIES = {f"y={row}:{row + 2} x=0:20": Entry(f"{row:064x}", "cd" * 32) for row in range(0, 6, 2)}
 
 HOLDER = """
 import pathlib, sys, time
-from polar_bayes.pixels.ledger import locked_ledger
+from polar_bayes.maps.store import locked_ledger
 with locked_ledger(pathlib.Path(sys.argv[1]), "0", resume=True):
     print("locked", flush=True)
     time.sleep(600)

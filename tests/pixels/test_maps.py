@@ -16,15 +16,15 @@ from polar_bayes.models.per_material import per_material
 from scipy import optimize, stats
 
 import polar_bayes as pb
+from polar_bayes.inference.batch_fit import PixelLaplace
+from polar_bayes.inference.batch_nuts import PixelNuts
+from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.batching import Stack
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.maps.blocks import Plan
+from polar_bayes.maps.fit_map import fit_pixels
 from polar_bayes.physics.facets import FacetQuadrature
-from polar_bayes.pixels.blocks import Plan
-from polar_bayes.pixels.fitting import PixelLaplace
-from polar_bayes.pixels.maps import fit_pixels
-from polar_bayes.pixels.outcome import Approach, Status
-from polar_bayes.pixels.sampling import PixelNuts
-from polar_bayes.pixels.stack import Stack
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 

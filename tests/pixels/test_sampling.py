@@ -6,11 +6,11 @@ import pytest
 from arviz_stats.base import array_stats
 from plate_images import NAMES, VIEWS, on_a_grid, planned, plate_image, stacked
 
-from polar_bayes.pixels.climbing import Peak
-from polar_bayes.pixels.engine import Engine, Settled
-from polar_bayes.pixels.fitting import _keys
-from polar_bayes.pixels.sampling import PixelNuts
-from polar_bayes.pixels.stack import Stack
+from polar_bayes.inference.batch_fit import _keys
+from polar_bayes.inference.batch_nuts import PixelNuts
+from polar_bayes.inference.batch_programs import Engine, Settled
+from polar_bayes.inference.batching import Stack
+from polar_bayes.inference.levenberg_marquardt import Peak
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 

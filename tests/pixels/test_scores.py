@@ -8,7 +8,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polar_bayes.pixels.scores import FLATTEST, KNOTS, Scores, normal_scores, place
+from polar_bayes.inference.smc import FLATTEST, KNOTS, Scores, normal_scores, place
 
 RANDOM = np.random.default_rng(0)
 DRAWS = np.stack(

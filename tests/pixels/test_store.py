@@ -15,12 +15,12 @@ import xarray as xr
 from plate_images import ASKED, plate_image
 
 import polar_bayes as pb
+from polar_bayes.inference.batch_programs import make_engine
 from polar_bayes.interrupts import clean_up
-from polar_bayes.pixels import opening
-from polar_bayes.pixels import store as module
-from polar_bayes.pixels.executors import workers
-from polar_bayes.pixels.making import make_engine
-from polar_bayes.reporting.map_page import render_map
+from polar_bayes.maps import lazy
+from polar_bayes.maps import store as module
+from polar_bayes.maps.blocks import workers
+from polar_bayes.reporting.maps import render_map
 
 METHOD = pb.PixelLaplace(draws=64, sampler=None)
 ROWS = 2  # of a block of 40 pixels in an image 20 wide
@@ -341,7 +341,7 @@ def test_a_netcdf_file_is_read_once(
         loaded.append(path)
         return pb.load_capture(path)
 
-    monkeypatch.setattr(opening, "load_capture", load)
+    monkeypatch.setattr(lazy, "load_capture", load)
     found = mapped(tmp_path / "plates.nc", tmp_path / "map.zarr")
     xr.testing.assert_equal(found.load(), pb.open_map(finished).load())
     assert loaded == [tmp_path / "plates.nc"]

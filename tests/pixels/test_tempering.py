@@ -15,23 +15,22 @@ from plate_images import VIEWS, on_a_grid, planned, plate_image, stacked
 from plates import plate_capture
 
 import polar_bayes as pb
+from polar_bayes.inference.batch_fit import fit_stack, pool
+from polar_bayes.inference.batch_nuts import PixelNuts
+from polar_bayes.inference.batch_programs import Engine
+from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.batching import Stack
 from polar_bayes.inference.program import Program, compile_program
-from polar_bayes.observation.data import Observations, observe
-from polar_bayes.pixels.engine import Engine
-from polar_bayes.pixels.fitting import fit_stack
-from polar_bayes.pixels.importance import effective_draws, effective_tails, smooth
-from polar_bayes.pixels.mixtures import (
+from polar_bayes.inference.proposals import (
     DEGREES_OF_FREEDOM,
     Proposed,
     draw_mixture,
     fit_mixture,
     log_density,
 )
-from polar_bayes.pixels.outcome import Approach, Status
-from polar_bayes.pixels.pooling import pool
-from polar_bayes.pixels.sampling import PixelNuts
-from polar_bayes.pixels.stack import Stack
-from polar_bayes.pixels.tempering import PixelTempering, spread, temper
+from polar_bayes.inference.psis import effective_draws, effective_tails, smooth
+from polar_bayes.inference.smc import PixelTempering, spread, temper
+from polar_bayes.observation.data import Observations, observe
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polar_bayes.pixels.triangles import cholesky, inverse
+from polar_bayes.inference.levenberg_marquardt import cholesky, inverse
 
 SIZES = range(1, 8)
 FACTOR, INVERSE = jax.jit(jax.vmap(cholesky)), jax.jit(jax.vmap(inverse))

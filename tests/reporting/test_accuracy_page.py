@@ -9,8 +9,8 @@ from synthetic_accuracy import ROWS, make_accuracy
 from synthetic_results import make_result
 
 import polar_bayes as pb
-from polar_bayes.reporting.accuracy_page import reference_sentence, render_accuracy
-from polar_bayes.reporting.html import render
+from polar_bayes.reporting.accuracy import reference_sentence, render_accuracy
+from polar_bayes.reporting.report import render
 
 
 @pytest.fixture(scope="module")

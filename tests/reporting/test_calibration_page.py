@@ -13,7 +13,7 @@ from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.reporting.calibration_page import render_calibration
-from polar_bayes.reporting.calibration_panels import parts_of
+from polar_bayes.reporting.plots_calibration import parts_of
 
 FAILED = (3, 50, 77)
 

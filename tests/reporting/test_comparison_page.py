@@ -10,7 +10,7 @@ from synthetic_results import edit_provenance, make_result, replace
 import polar_bayes as pb
 from polar_bayes.cli import main
 from polar_bayes.errors import FitError
-from polar_bayes.reporting.comparison_page import render_comparison
+from polar_bayes.reporting.comparison import render_comparison
 
 SMALL = {"wavelengths": (), "views": 16, "draws": 150, "variables": ("dop",)}
 

@@ -13,7 +13,7 @@ from synthetic_maps import make_maps
 from synthetic_results import make_result, pool
 
 import polar_bayes as pb
-from polar_bayes.reporting.download import csv_link
+from polar_bayes.reporting.page import csv_link
 
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 

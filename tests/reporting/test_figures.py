@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from synthetic_results import edit_provenance, make_result, replace
 
 from polar_bayes.errors import FitError
-from polar_bayes.reporting import figures
-from polar_bayes.reporting.readings import curves, plot_readings, plot_residuals
+from polar_bayes.reporting import plots_fit
+from polar_bayes.reporting.plots_observations import curves, plot_readings, plot_residuals
 
 CASES = {
     "three wavelengths, four azimuths": {"azimuths": (180.0, 150.0, 120.0, 60.0)},
@@ -44,7 +44,13 @@ def test_readings_of_every_layout(case: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "draw", [figures.plot_pairs, figures.plot_ranks, figures.plot_prior_posterior, figures.plot_pit]
+    "draw",
+    [
+        plots_fit.plot_pairs,
+        plots_fit.plot_ranks,
+        plots_fit.plot_prior_posterior,
+        plots_fit.plot_pit,
+    ],
 )
 @pytest.mark.parametrize(
     "case",
@@ -65,7 +71,7 @@ def test_nothing_global_changes() -> None:
     before = dict(matplotlib.rcParams)
     result = result_of("one wavelength")
     plot_readings(result, "dop")
-    figures.plot_pairs(result)
+    plots_fit.plot_pairs(result)
     with pytest.raises(FitError):
         plot_readings(result, "u")
     assert dict(matplotlib.rcParams) == before
@@ -111,10 +117,10 @@ def test_a_point_fit_has_a_curve_and_no_bands() -> None:
 @pytest.mark.parametrize(
     ("draw", "needed"),
     [
-        (figures.plot_pairs, "two material parameters with draws"),
-        (figures.plot_ranks, "two chains"),
-        (figures.plot_prior_posterior, "draws of the prior"),
-        (figures.plot_pit, "two readings and 100 draws"),
+        (plots_fit.plot_pairs, "two material parameters with draws"),
+        (plots_fit.plot_ranks, "two chains"),
+        (plots_fit.plot_prior_posterior, "draws of the prior"),
+        (plots_fit.plot_pit, "two readings and 100 draws"),
     ],
 )
 def test_nothing_to_draw_is_an_error_of_one_line(draw, needed: str) -> None:
@@ -126,16 +132,16 @@ def test_parameters_that_do_not_move_are_left_out() -> None:
     result = make_result(draws=100, discrepancy=True)
     result = replace(result, "posterior", "roughness", np.full((4, 100), 0.2))
     result = replace(result, "posterior", "subsurface_fraction", np.full((4, 100), np.nan))
-    names = [scalar.name for scalar in figures.drawable(result)]
+    names = [scalar.name for scalar in plots_fit.drawable(result)]
     assert "roughness" not in names
     assert "subsurface_fraction" not in names
     assert "discrepancy_weights" not in names
-    assert clipped(figures.plot_pairs(result)) == []
+    assert clipped(plots_fit.plot_pairs(result)) == []
 
 
 def test_figures_need_no_provenance() -> None:
     result = edit_provenance(make_result(draws=100, wavelengths=()))
     result.attrs.clear()
-    for draw in (figures.plot_pairs, figures.plot_ranks, figures.plot_pit):
+    for draw in (plots_fit.plot_pairs, plots_fit.plot_ranks, plots_fit.plot_pit):
         assert isinstance(draw(result), Figure)
     assert isinstance(plot_readings(result, "dop"), Figure)

@@ -9,14 +9,13 @@ import xarray as xr
 from pages import EVIL, Page
 from synthetic_results import edit_provenance, make_result, replace
 
+from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.convergence import summary
-from polar_bayes.diagnostics.discrepancy import compare_without
 from polar_bayes.diagnostics.parameters import posterior_scalars
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.files import load_result
-from polar_bayes.reporting.html import render, report
-from polar_bayes.reporting.sentences import overconfidence
-from polar_bayes.reporting.text import interval, numbers, percent, spoken
+from polar_bayes.reporting.report import render, report
+from polar_bayes.reporting.text import interval, numbers, overconfidence, percent, spoken
 
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 

@@ -11,9 +11,9 @@ from synthetic_maps import make_maps
 from synthetic_results import make_result
 
 import polar_bayes as pb
-from polar_bayes.pixels.outcome import Approach, Status
-from polar_bayes.reporting import map_tables
-from polar_bayes.reporting.map_page import render_map
+from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.reporting import maps as map_tables
+from polar_bayes.reporting.maps import render_map
 
 EVIL = "<script>alert(1)</script>"
 SHAPE = (10, 20)

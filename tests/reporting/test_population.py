@@ -8,10 +8,11 @@ from synthetic_results import edit_provenance, make_result, pool
 
 from polar_bayes.diagnostics.population import population_summary, populations, shrinkage
 from polar_bayes.errors import FitError
-from polar_bayes.reporting import sentences, tables
-from polar_bayes.reporting.html import render
-from polar_bayes.reporting.population import MOST_MEMBERS, plot_shrinkage
-from polar_bayes.reporting.provenance import provenance_groups, swapped_sentence
+from polar_bayes.reporting import tables
+from polar_bayes.reporting import text as sentences
+from polar_bayes.reporting.plots_fit import MOST_MEMBERS, plot_shrinkage
+from polar_bayes.reporting.report import render
+from polar_bayes.reporting.tables import provenance_groups, swapped_sentence
 
 EVIL = '<script>alert(1)</script>"><img src=x onerror=alert(2)>'
 

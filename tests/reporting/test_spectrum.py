@@ -8,9 +8,9 @@ from synthetic_results import edit_provenance, make_result, replace
 
 import polar_bayes as pb
 from polar_bayes.errors import FitError
-from polar_bayes.reporting import spectrum as module
-from polar_bayes.reporting.html import render
-from polar_bayes.reporting.spectrum import LEVELS, plot_spectrum, spectra
+from polar_bayes.reporting import plots_spectrum as module
+from polar_bayes.reporting.plots_spectrum import LEVELS, plot_spectrum, spectra
+from polar_bayes.reporting.report import render
 
 SMALL = {"views": 6, "draws": 60, "variables": ("dop",)}
 

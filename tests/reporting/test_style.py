@@ -15,7 +15,7 @@ from synthetic_maps import make_maps
 from synthetic_results import make_result, pool
 
 import polar_bayes as pb
-from polar_bayes.reporting.html import report
+from polar_bayes.reporting.report import report
 
 DRAWN = {
     "plot_accuracy": lambda: pb.plot_accuracy(make_accuracy()),

@@ -7,12 +7,11 @@ import numpy as np
 from posterior import AbstractPeer, Round
 
 import polar_bayes as pb
+from polar_bayes.inference.batch_fit import fit_stack
+from polar_bayes.inference.batch_programs import Engine, Recipe, make_engine
+from polar_bayes.inference.batching import Stack, stack
 from polar_bayes.inference.program import Values
 from polar_bayes.observation.data import observe
-from polar_bayes.pixels.engine import Engine
-from polar_bayes.pixels.fitting import fit_stack
-from polar_bayes.pixels.making import Recipe, make_engine
-from polar_bayes.pixels.stack import Stack, stack
 
 SETTINGS = pb.PixelTempering(effective_draws=400.0)
 CANDIDATES = 32

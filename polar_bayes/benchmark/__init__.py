@@ -1,0 +1,1 @@
+"""Accuracy against time: every method and setting on one capture."""

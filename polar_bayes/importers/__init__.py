@@ -1,0 +1,1 @@
+"""Captures from instruments: tables, goniometers and cameras."""

@@ -1,0 +1,222 @@
+r"""Where camera and light stand, and what a model must know of it for each piece of surface.
+
+Stokes parameters of a camera count from its own axes: from x (to the right) counterclockwise as
+the camera sees it. Models count from the s axis of each piece of surface,
+$e_s = (n \times v)/|n \times v|$ (docs/conventions.md), towards $v \times e_s$. The two are turned
+by $\psi = atan2(e_s \cdot b, e_s \cdot a)$, where a and b are the camera's axes carried to the
+direction of view v: a lens bends each ray in the plane of ray and axis, so
+
+$$ a = x - \frac{v_x}{1 + v_z} (z + v), \qquad b = v \times a $$
+"""
+
+import abc
+import dataclasses
+from typing import Any, override
+
+import numpy as np
+
+from polar_bayes.capture.schema import Interval
+from polar_bayes.errors import CaptureError
+from polar_bayes.importers.detector import check_number
+
+ON_NORMAL = 1e-6
+"""Sine of the zenith below which a direction is that of the normal itself."""
+
+EDGE_ON = 1e-9
+"""Cosine below which a surface no longer faces something; its zenith stays below 90 degrees."""
+
+COMPONENT = Interval(-1e9, 1e9)
+Z = np.array([0.0, 0.0, 1.0])
+
+
+class AbstractPlace(abc.ABC):
+    """Where something stands, as a surface sees it."""
+
+    @abc.abstractmethod
+    def towards(self, points: np.ndarray) -> np.ndarray:
+        """Unit vectors from points of the surface to it.
+
+        Args:
+            points: In the camera's axes, pixels from the center of the frame, (..., 3).
+
+        Returns:
+            Shape (..., 3).
+        """
+
+
+@dataclasses.dataclass(frozen=True)
+class Direction(AbstractPlace):
+    """Something far away: the same direction from everywhere.
+
+    Args:
+        x: To the right, in any unit.
+        y: Up.
+        z: From the scene to the camera.
+
+    Raises:
+        CaptureError: A component is no number, or all are zero.
+    """
+
+    x: float
+    y: float
+    z: float
+
+    def __post_init__(self) -> None:
+        if _check(self) == 0.0:
+            mend = "give a vector that is not zero"
+            raise CaptureError("it points nowhere", where=repr(self), mend=mend)
+
+    @override
+    def towards(self, points: np.ndarray) -> np.ndarray:
+        vector = np.array([self.x, self.y, self.z], float)
+        return np.broadcast_to(vector / np.linalg.norm(vector), points.shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class Position(AbstractPlace):
+    """Something near: a place in pixels of the frame, from its center, where z = 0 is the surface.
+
+    A camera of focal length f pixels stands at (0, 0, f).
+
+    Args:
+        x: To the right.
+        y: Up.
+        z: From the surface to the camera, > 0.
+
+    Raises:
+        CaptureError: A coordinate is no number, or z is not above the surface.
+    """
+
+    x: float
+    y: float
+    z: float
+
+    def __post_init__(self) -> None:
+        _check(self)
+        if not self.z > 0.0:
+            mend = "give z above 0, in pixels of the frame"
+            raise CaptureError("it stands behind the surface", where=repr(self), mend=mend)
+
+    @override
+    def towards(self, points: np.ndarray) -> np.ndarray:
+        vector = np.array([self.x, self.y, self.z], float) - points
+        return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Highlight:
+    """Light from far away, told by where the surface mirrors it.
+
+    Args:
+        row: Of the middle of the highlight, pixels.
+        column: Of the same.
+
+    Raises:
+        CaptureError: A coordinate is no number.
+    """
+
+    row: float
+    column: float
+
+    def __post_init__(self) -> None:
+        for name in ("row", "column"):
+            check_number(f"Highlight: {name}", getattr(self, name), Interval(0.0, 1e6))
+
+
+@dataclasses.dataclass(frozen=True)
+class Surroundings:
+    """Light from everywhere: each piece of surface mirrors what stands opposite to the camera.
+
+    So for smooth surfaces in a room, where no lamp need be known: the light's direction is the
+    mirror direction of each piece, in its plane of incidence.
+    """
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Directions:
+    """What a model must know of each piece of surface; all of one shape."""
+
+    view_zenith: np.ndarray
+    view_azimuth: np.ndarray
+    light_zenith: np.ndarray
+    light_azimuth: np.ndarray
+    cos_twice: np.ndarray
+    sin_twice: np.ndarray
+    outside: np.ndarray
+    turned_away: np.ndarray
+    in_shadow: np.ndarray
+
+
+def directions(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> Directions:
+    """Zeniths, azimuths and the turn of axes from vectors in the camera's axes."""
+    outside = ~np.isfinite(normals).all(axis=-1)
+    n = np.where(outside[..., None], view, normals)
+    light = np.where(np.isfinite(light), light, view)
+    cos_view, cos_light = _dot(n, view), _dot(n, light)
+    turned_away = ~outside & (cos_view <= EDGE_ON)
+    in_shadow = ~outside & ~turned_away & (cos_light <= EDGE_ON)
+    seen = ~(outside | turned_away | in_shadow)
+    across_view, across_light = np.cross(n, view), np.cross(n, light)
+    sin_view = np.linalg.norm(across_view, axis=-1)
+    sin_light = np.linalg.norm(across_light, axis=-1)
+    upright, from_above = sin_view < ON_NORMAL, sin_light < ON_NORMAL
+    # On the normal the frame is the light's, as if the viewer stood opposite to it; where both
+    # stand there, any frame will do.
+    fallback = np.where(from_above[..., None], _first_axis(view), -across_light)
+    s_axis = np.where(upright[..., None], fallback, across_view)
+    s_axis = s_axis / np.linalg.norm(s_axis, axis=-1, keepdims=True)
+    first = _first_axis(view)
+    cos, sin = _dot(s_axis, first), _dot(s_axis, np.cross(view, first))
+    length = np.hypot(cos, sin)
+    cos, sin = cos / length, sin / length
+    # n x l and n x v turn around n as l and v themselves do.
+    around = _dot(n, np.cross(across_light, across_view))
+    azimuth = np.arctan2(around, _dot(across_light, across_view))
+    azimuth = np.where(upright | from_above, np.pi, azimuth)
+    return Directions(
+        view_zenith=np.where(seen & ~upright, _zenith(sin_view, cos_view), 0.0),
+        view_azimuth=np.where(seen, np.rad2deg(azimuth), 180.0),
+        light_zenith=np.where(seen, _zenith(sin_light, cos_light), 0.0),
+        light_azimuth=np.zeros_like(cos_view),
+        cos_twice=cos**2 - sin**2,
+        sin_twice=2.0 * cos * sin,
+        outside=outside,
+        turned_away=turned_away,
+        in_shadow=in_shadow,
+    )
+
+
+def mirrored(normals: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """The direction from which a mirror sends light to the viewer."""
+    return 2.0 * _dot(normals, view)[..., None] * normals - view
+
+
+def as_place(place: Any, where: str) -> AbstractPlace:
+    """What a user gave for a place."""
+    if isinstance(place, AbstractPlace):
+        return place
+    if isinstance(place, list | tuple | np.ndarray) and len(place) == 3:
+        return Direction(*place)
+    mend = "give Direction(x, y, z) or Position(x, y, z)"
+    raise CaptureError(f"{place!r} is no place", where=where, mend=mend)
+
+
+def _first_axis(view: np.ndarray) -> np.ndarray:
+    """The camera's x axis, carried to a direction of view."""
+    x = np.array([1.0, 0.0, 0.0])
+    return x - (view[..., :1] / (1.0 + view[..., 2:])) * (Z + view)
+
+
+def _zenith(sine: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    return np.rad2deg(np.arctan2(sine, cosine))
+
+
+def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return np.sum(first * second, axis=-1)
+
+
+def _check(place: Direction | Position) -> float:
+    """The largest component; each must be a number."""
+    name = type(place).__name__
+    parts = [check_number(f"{name}: {k}", getattr(place, k), COMPONENT) for k in ("x", "y", "z")]
+    return max(map(abs, parts))

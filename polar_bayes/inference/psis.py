@@ -1,0 +1,217 @@
+"""What a normal approximation is worth: its draws, weighed by the true posterior.
+
+The weights say how far the approximation can be trusted (Pareto k) and, where it can, correct
+it. All pixels share one set of standard normal points, turned another way in each: what few points
+get wrong of a quantile would otherwise be wrong alike in all of them.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import scipy.special
+from jaxtyping import Float
+from scipy.stats import qmc
+
+from polar_bayes.inference.program import Values
+
+LARGEST_TRUSTED = 0.7
+"""Pareto k above which weighted draws say little, however many there are."""
+
+
+TAIL = 0.05
+"""Share of the posterior at either end whose Monte Carlo error counts as that of the tails."""
+
+
+class Points(NamedTuple):
+    """Draws of a standard distribution, the same for all pixels."""
+
+    places: Float[np.ndarray, "draw size"]
+    log_density: Float[np.ndarray, " draw"]
+
+    def split(self, count: int) -> list["Points"]:
+        """The same in parts of one size."""
+        parts = (np.split(array, count) for array in self)
+        return [Points(*part) for part in zip(*parts, strict=True)]
+
+
+def even(count: int, size: int, seed: int) -> Float[np.ndarray, "count size"]:
+    """Scrambled Sobol' points, clear of both ends of (0, 1)."""
+    points = qmc.Sobol(size, rng=np.random.default_rng(seed)).random(count)
+    return np.clip(points, 1e-12, 1.0 - 1e-12)
+
+
+def mirrored(points: Float[np.ndarray, "half size"]) -> Float[np.ndarray, "count size"]:
+    """Each point beside its mirror image."""
+    return np.stack([points, -points], axis=1).reshape(-1, points.shape[1])
+
+
+def turns(keys: np.ndarray, size: int) -> Float[np.ndarray, "pixel size size"]:
+    """A random rotation or reflection for each pixel, all equally likely."""
+    # Source: Mezzadri (2007), Notices of the AMS 54(5), 592-604.
+    draw = jax.vmap(
+        lambda key: jax.random.bits(jax.random.wrap_key_data(key), (size, size), np.uint32)
+    )
+    # Whole numbers are the same however a program was compiled, and for however many pixels.
+    share = (np.asarray(draw(keys)) + 0.5) / 2.0**32
+    q, r = np.linalg.qr(scipy.special.ndtri(share))
+    return q * np.sign(np.einsum("pii->pi", r))[:, None, :]
+
+
+class Smoothed(NamedTuple):
+    """Weights of the draws of every pixel."""
+
+    weights: Float[np.ndarray, "pixel draw"]
+    pareto_k: Float[np.ndarray, " pixel"]
+
+
+def normal_points(count: int, size: int, seed: int) -> Points:
+    """Evenly spread standard normal points."""
+    # Their distances from the middle are quantiles of the chi distribution, one of each, so that
+    # over all turns of the points every quantile in every direction is right.
+    # Source: Owen (1998), J. Complexity 14(4), 466-489: scrambled Sobol' points.
+    points = scipy.special.ndtri(even(-(-count // 2), size, seed))
+    distance = np.linalg.norm(points, axis=-1)
+    rank = np.argsort(np.argsort(distance))
+    share = (rank + 0.5) / len(points)
+    points *= (np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * size, share)) / distance)[:, None]
+    places = mirrored(points)[:count]
+    return Points(places, -0.5 * np.sum(places**2, axis=-1))
+
+
+def smooth(log_ratios: Float[np.ndarray, "pixel draw"]) -> Smoothed:
+    """Pareto-smoothed importance weights of many pixels at once."""
+    # Source: Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72).
+    count = log_ratios.shape[-1]
+    tail = int(3.0 * count**0.5) if count > 225 else count // 5
+    known = np.isfinite(log_ratios)
+    usable = known.any(axis=-1)
+    largest = np.max(log_ratios, axis=-1, where=known, initial=-np.inf, keepdims=True)
+    ratios = np.where(known, log_ratios - np.where(np.isfinite(largest), largest, 0.0), -np.inf)
+    order = np.argsort(ratios, axis=-1, kind="stable")
+    ranked = np.exp(np.take_along_axis(ratios, order, axis=-1).astype(float))
+    cutoff = ranked[:, -tail - 1, None]
+    excess = ranked[:, -tail:] - cutoff
+    flat = excess[:, -1] <= count * np.finfo(log_ratios.dtype).eps
+    shape, scale = _fit_tail(np.where(flat[:, None], np.linspace(0.5, 1.0, tail), excess))
+    shape = np.where(ranked[:, -tail] > 0.0, shape, np.nan)  # too few draws are possible at all
+    steps = (np.arange(tail) + 0.5) / tail
+    with np.errstate(all="ignore"):
+        smoothed = cutoff + _quantiles(steps, shape[:, None], scale[:, None])
+    smooth_enough = (~flat & np.isfinite(shape))[:, None]
+    ranked[:, -tail:] = np.where(smooth_enough, np.minimum(smoothed, 1.0), ranked[:, -tail:])
+    weights = np.empty_like(ranked)
+    np.put_along_axis(weights, order, ranked, axis=-1)
+    weights /= np.where(usable, weights.sum(axis=-1), np.nan)[:, None]
+    pareto_k = np.where(flat, 0.0, np.where(np.isfinite(shape), shape, np.inf))
+    return Smoothed(weights, np.where(usable, pareto_k, np.inf))
+
+
+def _fit_tail(excess: Float[np.ndarray, "pixel tail"]) -> tuple[np.ndarray, np.ndarray]:
+    """Shape and scale of generalized Pareto distributions, ascending excesses in every row."""
+    # Source: Zhang & Stephens (2009), Technometrics 51(3), 316-325, with the prior of Vehtari et
+    # al.
+    count = excess.shape[-1]
+    grid = 30 + int(count**0.5)
+    quartile = excess[:, int(count / 4.0 + 0.5) - 1, None]
+    with np.errstate(all="ignore"):
+        b = 1.0 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))
+        b = b / (3.0 * quartile) + 1.0 / excess[:, -1:]
+        k = np.mean(np.log1p(-b[:, :, None] * excess[:, None, :]), axis=-1)
+        fit = count * (np.log(-b / k) - k - 1.0)
+        weights = scipy.special.softmax(fit, axis=-1)
+        weights = np.where(weights >= 10.0 * np.finfo(float).eps, weights, 0.0)
+        b = np.sum(b * weights, axis=-1) / np.sum(weights, axis=-1)
+        k = np.mean(np.log1p(-b[:, None] * excess), axis=-1)
+        scale = -k / b
+        shape = (count * k + 10.0 * 0.5) / (count + 10.0)
+    lumped = quartile[:, 0] <= excess[:, 0]  # nothing like a tail
+    return np.where(lumped, np.nan, shape), scale
+
+
+def _quantiles(steps: np.ndarray, shape: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Of a generalized Pareto distribution."""
+    spread = np.where(shape == 0.0, -np.log1p(-steps), np.expm1(-shape * np.log1p(-steps)) / shape)
+    return scale * spread
+
+
+def summarize(
+    draws: Float[np.ndarray, "pixel draw"],
+    weights: Float[np.ndarray, "pixel draw"],
+    levels: tuple[float, ...],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean, standard deviation and quantiles of weighted draws."""
+    mean = np.sum(weights * draws, axis=-1)
+    sd = np.sqrt(np.sum(weights * (draws - mean[:, None]) ** 2, axis=-1))
+    order = np.argsort(draws, axis=-1, kind="stable")
+    ranked = np.take_along_axis(draws, order, axis=-1)
+    share = np.take_along_axis(weights, order, axis=-1)
+    below = np.cumsum(share, axis=-1) - 0.5 * share
+    return mean, sd, np.stack([_interpolate(level, below, ranked) for level in levels])
+
+
+def _interpolate(level: float, below: np.ndarray, ranked: np.ndarray) -> np.ndarray:
+    """One quantile of every row."""
+    last = ranked.shape[-1] - 1
+    right = np.clip(np.sum(below < level, axis=-1), 1, last)[:, None]
+    x0, x1 = (np.take_along_axis(ranked, at, axis=-1)[:, 0] for at in (right - 1, right))
+    p0, p1 = (np.take_along_axis(below, at, axis=-1)[:, 0] for at in (right - 1, right))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = np.clip((level - p0) / (p1 - p0), 0.0, 1.0)
+    return x0 + np.where(p1 > p0, between, 0.0) * (x1 - x0)
+
+
+def effective_draws(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarray, " pixel"]:
+    """How many draws of the posterior itself the weighted ones are worth (Kish)."""
+    return 1.0 / np.sum(weights**2, axis=-1)
+
+
+def effective_tails(
+    draws: Float[np.ndarray, "pixel draw size"], weights: Float[np.ndarray, "pixel draw"]
+) -> Float[np.ndarray, " pixel"]:
+    """How many draws of the posterior itself would tell its tails as well as the weighted ones do."""
+    # Source: Vehtari, Gelman, Simpson, Carpenter & Buerkner (2021), Bayesian Anal. 16(2), section
+    # 4.3 (tail effective sample size); Owen (2013), Monte Carlo theory, methods and examples, eq.
+    # 9.8 (variance of weighted means).
+    least = np.full(len(draws), np.inf)
+    for coordinate in np.moveaxis(draws, -1, 0):
+        order = np.argsort(coordinate, axis=-1)
+        rising = np.take_along_axis(weights, order, axis=-1)
+        for share in (rising, rising[:, ::-1]):
+            within, squares = np.cumsum(share, axis=-1), np.cumsum(share**2, axis=-1)
+            at = np.argmax(within >= TAIL, axis=-1)[:, None]
+            p, inside = (np.take_along_axis(x, at, axis=-1)[:, 0] for x in (within, squares))
+            outside = squares[:, -1] - inside
+            variance = inside * (1.0 - p) ** 2 + outside * p**2
+            with np.errstate(invalid="ignore"):  # weights may be no numbers
+                # One draw that is all there is: p is 1 and the variance 0, and it is worth itself.
+                told = np.where(p < 1.0, p * (1.0 - p) / np.where(p < 1.0, variance, 1.0), 1.0)
+                least = np.fmin(least, told)
+    return least
+
+
+# --- Means, standard deviations and quantiles of a row of pixels: what maps show ------------------
+
+
+LEVELS = (0.025, 0.1, 0.25, 0.5, 0.75, 0.9, 0.975)
+
+
+class Marginals:
+    """What a row of pixels has, filled in as answers come: NaN where a pixel has none."""
+
+    def __init__(self, count: int, sizes: Mapping[str, tuple[int, ...]]) -> None:
+        self.mean = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
+        self.sd = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
+        self.quantiles = {
+            name: np.full((len(LEVELS), count, *own), np.nan) for name, own in sizes.items()
+        }
+
+    def describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
+        """Take down some pixels."""
+        for name, mean in self.mean.items():
+            draws = np.asarray(parameters[name], float)
+            for own in np.ndindex(mean.shape[1:]):
+                found = summarize(draws[(..., *own)], weights, LEVELS)
+                mean[(at, *own)], self.sd[name][(at, *own)] = found[:2]
+                self.quantiles[name][(slice(None), at, *own)] = found[2]

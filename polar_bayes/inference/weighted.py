@@ -1,0 +1,267 @@
+"""The normal approximations of all modes together, their draws weighed by the posterior."""
+
+import collections
+import dataclasses
+import functools
+from typing import Any, override
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.batch_fit import tempered_draws
+from polar_bayes.inference.batch_programs import Engine
+from polar_bayes.inference.batch_result import Row, Status, Weighted
+from polar_bayes.inference.batching import Stack
+from polar_bayes.inference.compile import TRACING, Kept
+from polar_bayes.inference.initialization import STARTS, WholeGround
+from polar_bayes.inference.method import AbstractMethod, Answer
+from polar_bayes.inference.optimize import Modes
+from polar_bayes.inference.problem import Bench, Prepared
+from polar_bayes.inference.program import Program, compile_program
+from polar_bayes.inference.proposals import Mixture, draw_mixture, log_density
+from polar_bayes.inference.psis import LARGEST_TRUSTED, effective_draws, smooth
+from polar_bayes.inference.resampling import choose, generator, log_densities
+from polar_bayes.inference.smc import PixelTempering
+from polar_bayes.observation.data import Observations
+from polar_bayes.progress import Progress, silent
+
+LEAST_SHARE = 1e-3
+"""Of the Laplace evidence: lighter modes get no draws."""
+
+SIDE_BY_SIDE = 1024
+"""Draws whose density is computed together: that of all modes at once would fill the memory."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Importance(AbstractMethod):
+    """Laplace with importance correction.
+
+    Draws come from a mixture of Student t distributions with 8 degrees of freedom, one at each
+    mode that holds 0.1% of the Laplace evidence or more, as heavy as its evidence. Weighing them
+    by the posterior corrects what the normal approximation gets wrong, as far as the mixture
+    reaches; Pareto k-hat says how far.
+
+    Args:
+        draws: Of the mixture, at least 256.
+
+    Raises:
+        FitError: Fewer draws.
+    """
+
+    draws: int = 4096
+
+    def __post_init__(self) -> None:
+        if self.draws < 256:
+            raise FitError(f"draws is {self.draws}", where="Importance", mend="give at least 256")
+
+    @override
+    def draw(self, bench: Bench) -> Answer:
+        ground = bench.ground
+        if not isinstance(ground, WholeGround):
+            raise FitError(
+                "the weights of many patches together say nothing",
+                where="Importance",
+                mend="use method='nuts'",
+            )
+        proposal = _proposal(ground.modes, bench.dtype)
+        key_draw, key_choice = jax.random.split(bench.key_of_draws)
+        places, proposed = (np.asarray(x) for x in _drawn(proposal, self.draws, key_draw))
+        ratios = log_densities(bench.program, places, bench.data) - proposed
+        weights, k_hat = (x[0] for x in smooth(ratios[None]))
+        worth = float(effective_draws(weights[None])[0])
+        said = {"modes": ground.said}
+        evaluations = {"gradients": float(ground.said["gradients"]), "densities": float(self.draws)}
+        if not np.isfinite(weights).all():
+            raise FitError(
+                "the posterior density is zero at every draw",
+                where="Importance",
+                mend="use method='nuts'",
+            )
+        index = choose(weights, worth, generator(key_choice))
+        problems = []
+        if not k_hat <= LARGEST_TRUSTED:
+            problems.append(
+                f"Pareto k-hat of the weights is {k_hat:.2f} (at most {LARGEST_TRUSTED}): they do "
+                "not reach all of the posterior, so use method='nuts'"
+            )
+        return Answer(
+            kind="importance",
+            z=places[index],
+            stats={"lp": (ratios + proposed)[index]},
+            problems=problems,
+            weighted=(places, weights),
+            k_hat=float(k_hat),
+            effective_draws=worth,
+            said=said,
+            **evaluations,
+        )
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _drawn(proposal: Mixture, count: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    places = draw_mixture(proposal, count, key)
+    densities = jax.lax.map(
+        lambda z: log_density(proposal, z[None])[0], places, batch_size=min(SIDE_BY_SIDE, count)
+    )
+    return places, densities
+
+
+def _proposal(modes: Modes, dtype: np.dtype) -> Mixture:
+    """A component for each heavy mode; always as many, so that one program draws from all."""
+    # There are never more modes than climbs; a mode has several components where there are fewer.
+    heavy = np.flatnonzero(modes.weight >= LEAST_SHARE)
+    which = np.resize(heavy, max(STARTS, heavy.size))
+    times = np.bincount(which, minlength=len(modes.weight))[which]
+    share = modes.weight[which] / times
+    size = modes.z.shape[1]
+    return Mixture(
+        center=jnp.zeros(size, dtype),
+        half=jnp.eye(size, dtype=dtype),
+        log_share=jnp.asarray(np.log(share / share.sum()), dtype),
+        mean=jnp.asarray(modes.z[which], dtype),
+        scale=jnp.asarray(np.linalg.cholesky(modes.covariance[which]), dtype),
+    )
+
+
+# --- Draws led from the prior to the posterior, by what calibrations are made with ----------------
+
+
+MOST_KEPT = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Tempered(AbstractMethod):
+    """Tempered draws of one material in one color, corrected by weights.
+
+    A crowd that begins as draws from the prior sees all modes before any of them is narrow, and
+    nothing is differentiated.
+
+    Args:
+        settings: Of the crowd, and of the mixtures that are fitted to it; one fit alone has time
+            for more draws than each of thousands.
+
+    Raises:
+        FitError: A setting is outside its range.
+    """
+
+    settings: PixelTempering = dataclasses.field(
+        default_factory=functools.partial(PixelTempering, draws=4096)
+    )
+
+    @override
+    def draw(self, bench: Bench) -> Answer:
+        if any(name != "view" and length > 1 for name, length in bench.data.dims):
+            raise FitError(
+                "draws are tempered of one material in one color only",
+                where="Tempered",
+                mend="use method='nuts'",
+            )
+        row = Row(1, lambda at, parameters, weights: None)
+        keys = np.asarray(jax.random.key_data(bench.key_of_draws))[None]
+        engine = _engine(bench)
+        found: Weighted | None = None
+        pixels = _alone(bench.data)
+        at = np.zeros(1, int)
+        for _, answer in tempered_draws(engine, self.settings, pixels, keys, at, row):
+            found = answer
+        bench.progress("tempering", 1.0)
+        if found is None:
+            raise FitError(
+                "the crowd did not arrive at the posterior", where="Tempered", mend="use 'nuts'"
+            )
+        return self._answer(bench, found, row, engine)
+
+    def _answer(self, bench: Bench, found: Weighted, row: Row, engine: "_Counting") -> Answer:
+        z, weights = found.z[0].astype(float), found.weights[0].astype(float)
+        weights = weights / weights.sum()
+        worth, k_hat = float(found.worth[0]), float(found.pareto_k[0])
+        index = choose(weights, worth, generator(bench.key_of_draws))
+        problems = []
+        if row.status[0] != Status.GOOD:
+            problems.append(
+                f"the weighted draws are worth {worth:.0f} independent ones (at least "
+                f"{self.settings.effective_draws:.0f}), with a Pareto k-hat of {k_hat:.2f} (at "
+                f"most {LARGEST_TRUSTED}): use method='nuts'"
+            )
+        walks, length = self.settings.walks, self.settings.length
+        steps = int(row.outcome.steps[0]) * walks * (length - 1)
+        drawn = engine.counts["rounds"] * self.settings.draws
+        looked = engine.counts["crowds"] * self.settings.looks * self.settings.crowd
+        densities = looked + steps + drawn
+        return Answer(
+            kind="tempered",
+            z=z[index],
+            stats={"log_weight": np.log(np.maximum(weights, 1e-300))[index]},
+            problems=problems,
+            weighted=(z, weights),
+            k_hat=k_hat,
+            effective_draws=worth,
+            gradients=0.0,
+            densities=float(densities),
+            said={"stages": int(row.outcome.steps[0]), "rounds": engine.counts["rounds"]},
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Counting(Engine):
+    """The programs of a layout, and how often one fit runs them; made for each fit."""
+
+    counts: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+    progress: Progress = silent
+
+    @override
+    def temper(self, pixels: Stack, settings: PixelTempering, *others: Any) -> Any:
+        self._count("crowds", settings)
+        return super().temper(pixels, settings, *others)
+
+    @override
+    def propose(self, pixels: Stack, settings: PixelTempering, *others: Any) -> Any:
+        self._count("rounds", settings)
+        return super().propose(pixels, settings, *others)
+
+    def _count(self, what: str, settings: PixelTempering) -> None:
+        """Of every attempt, one crowd and some rounds; what is abandoned ends here."""
+        every = settings.crowds * (settings.rounds + 1)
+        self.progress("tempering", self.counts.total() / every)
+        self.counts[what] += 1
+
+
+_ENGINES: Kept[tuple[Prepared, Engine]] = Kept(MOST_KEPT)
+"""With what they were made for, so that its identity is not given to another."""
+
+
+def _engine(bench: Bench) -> _Counting:
+    """The programs of the bench's layout, kept from fit to fit, and counts that begin at zero."""
+    _, kept = _ENGINES.of(id(bench.prepared), functools.partial(_make, bench))
+    return _Counting(
+        kept.program,
+        kept.rough,
+        kept.candidates,
+        kept.precision,
+        kept.programs,
+        progress=bench.progress,
+    )
+
+
+def _make(bench: Bench) -> tuple[Prepared, Engine]:
+    candidates = np.zeros((1, bench.program.size))  # nothing climbs here
+    rough = _rough(bench)
+    with TRACING:
+        return bench.prepared, Engine(bench.program, rough, candidates, bench.request.precision)
+
+
+def _rough(bench: Bench) -> Program:
+    """The same model in single precision."""
+    if bench.request.precision == "single":
+        return bench.program
+    single = dataclasses.replace(bench.request, precision="single")
+    with jax.enable_x64(False), TRACING:
+        return compile_program(single.bind(single.scene), bench.data.in_single_precision())
+
+
+def _alone(data: Observations) -> Stack:
+    """One capture as a row of one pixel, which shares nothing with others."""
+    own = jax.tree.map(lambda x: np.asarray(x)[None], data)
+    return Stack(own, jax.tree.map(lambda _: None, data), np.array([int(np.sum(data.valid))]))

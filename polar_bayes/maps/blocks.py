@@ -1,0 +1,224 @@
+"""One block of an image: readings in, maps out, in any process."""
+
+import contextlib
+import dataclasses
+import functools
+import importlib
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, ThreadPoolExecutor, wait
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+
+from polar_bayes.capture.schema import validate
+from polar_bayes.errors import FitError
+from polar_bayes.inference.batch_fit import PixelMethod, candidates_of, fit_stack
+from polar_bayes.inference.batch_programs import MAKING, Engine, Recipe, make_engine
+from polar_bayes.inference.batch_result import Approach, Outcome, Status, no_outcome
+from polar_bayes.inference.batching import IMAGE, stack
+from polar_bayes.inference.compile import TRACING
+from polar_bayes.inference.psis import LEVELS, Marginals
+from polar_bayes.inference.request import Request
+from polar_bayes.inference.result import dims_of
+from polar_bayes.observation.data import READINGS, Observations, observe
+from polar_bayes.physics.part import notation
+
+Layout = dict[str, tuple[tuple[str, ...], tuple[int, ...]]]
+"""By parameter: names and lengths of the axes that it has in one pixel."""
+
+DIAGNOSTICS = {
+    "pareto_k": "Pareto k of the importance weights",
+    "effective_draws": "independent draws that the weighted ones are worth",
+    "condition": "condition number of the curvature at the mode",
+    "steps": "steps to the mode",
+    "approach": "how the numbers were found",
+    "status": "what became of the pixel",
+}
+
+NUMBER = "pixel_number"
+"""Variable of a block: where its pixels stand in the whole image, row by row."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plan:
+    """What is done to every block of one image; it can be sent to another process."""
+
+    request: Request
+    settings: PixelMethod
+    intensity_unit: float | None
+    own_directions: frozenset[str]
+    key: str
+
+    def observe(self, capture: xr.Dataset) -> Any:
+        """A block, or one pixel, as arrays."""
+        return observe(
+            capture,
+            largest_view_zenith=self.request.largest_view_zenith,
+            intensity_unit=self.intensity_unit,
+        )
+
+    @property
+    def engine(self) -> Engine:
+        """The compiled programs, made at first use in each process."""
+        observe = functools.partial(self.pixel, "double")
+        with MAKING:
+            return make_engine(
+                Recipe(self.request, observe, candidates_of(self.settings), self.key)
+            )
+
+    @property
+    def layout(self) -> Layout:
+        """Own axes of every parameter that a map shows."""
+        return _layout_of(self)
+
+    def pixel(self, precision: str) -> Observations:
+        """The pixel that stands for all, as arrays."""
+        with jax.enable_x64(True):
+            data = self.observe(self.request.capture)
+        return data if precision == "double" else data.in_single_precision()
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, ...]]:
+        """Lengths of the own axes of every parameter."""
+        return {name: own for name, (_, own) in self.layout.items()}
+
+    def __eq__(self, other: object) -> bool:
+        """The same programs, not the same readings."""
+        return isinstance(other, Plan) and self.key == other.key
+
+    def __hash__(self) -> int:
+        """Of the key."""
+        return hash(self.key)
+
+
+def fit_block(block: xr.Dataset, plan: Plan) -> xr.Dataset:
+    """Fit every pixel of a block."""
+    engine = plan.engine
+    numbers = block[NUMBER].transpose(*IMAGE).to_numpy()
+    with jax.enable_x64(True):
+        readings = set_aside(block.drop_vars(NUMBER))
+        if not readings["valid"].any():  # a corner of a picture; as a capture it would be refused
+            return _masked(block, plan)
+        pixels = stack(plan.observe(validate(readings)), plan.own_directions)
+    found, seed = Marginals(len(pixels), plan.sizes), plan.request.seed
+    outcome = fit_stack(engine, plan.settings, pixels, numbers.ravel(), seed, found.describe)
+    return maps_of(found, outcome, block, plan.layout)
+
+
+def _masked(block: xr.Dataset, plan: Plan) -> xr.Dataset:
+    """The maps of a block in which nothing was read."""
+    count = block.sizes["y"] * block.sizes["x"]
+    outcome = no_outcome(count)
+    outcome.status[:] = Status.MASKED
+    return maps_of(Marginals(count, plan.sizes), outcome, block, plan.layout)
+
+
+def set_aside(capture: xr.Dataset) -> xr.Dataset:
+    """A capture whose missing readings are marked as such."""
+    valid = capture.get("valid", xr.DataArray(True)).astype(bool)
+    for name in READINGS:
+        if name in capture:
+            valid = valid & capture[name].notnull()
+    return capture.assign(valid=valid)
+
+
+def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, layout: Layout) -> xr.Dataset:
+    """The marginals of a block as labeled maps."""
+    shape = tuple(block.sizes[dim] for dim in IMAGE)
+    variables: dict[str, Any] = {}
+    for name, (own, sizes) in layout.items():
+        symbol, meaning, unit = notation(name)
+        for ending, words, values, first in (
+            ("", "mean of", found.mean[name], ()),
+            ("_sd", "standard deviation of", found.sd[name], ()),
+            ("_quantile", "quantiles of", found.quantiles[name], ("quantile",)),
+        ):
+            whole = values.reshape(*values.shape[: len(first)], *shape, *sizes)
+            said = {"units": unit, "long_name": f"{words} {meaning}", "symbol": symbol}
+            variables[f"{name}{ending}"] = ((*first, *IMAGE, *own), np.float32(whole), said)
+    for name, meaning in DIAGNOSTICS.items():
+        said = {"units": "1", "long_name": meaning}
+        variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), said)
+    for name, names in (("approach", Approach), ("status", Status)):
+        flags: dict[str, Any] = {
+            "long_name": DIAGNOSTICS[name],
+            "flag_values": [int(each) for each in names],
+            "flag_meanings": " ".join(each.name.lower() for each in names),
+        }
+        variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), flags)
+    coords = {dim: block.coords[dim] for dim in (*IMAGE, "wavelength") if dim in block.coords}
+    return xr.Dataset(variables, coords={**coords, "quantile": list(LEVELS)})
+
+
+@functools.lru_cache(maxsize=4)
+def _layout_of(plan: Plan) -> Layout:
+    engine, pixel = plan.engine, plan.pixel(plan.request.precision)
+    program = engine.program
+    with jax.enable_x64(engine.precision == "double"), TRACING:
+        shapes = jax.eval_shape(program.parameters, np.zeros(program.size, engine.dtype), pixel)
+    dims = dims_of(program)
+    return {name: (tuple(dims[name]), x.shape) for name, x in shapes.items()}
+
+
+# --- Who fits the blocks: threads of this process, or the workers of a cluster --------------------
+
+
+AHEAD = 2
+"""Blocks that wait for each that is being fitted: none idles, and memory stays small."""
+
+
+@contextlib.contextmanager
+def workers(scheduler: str | None) -> Iterator[tuple[Executor, int]]:
+    """Something that runs functions, and how many at a time."""
+    if scheduler is None:
+        threads = os.cpu_count() or 1
+        pool = ThreadPoolExecutor(threads)
+        try:
+            yield pool, threads
+        except BaseException:  # an interrupt must not wait for blocks that take minutes
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        pool.shutdown()
+        return
+    try:
+        distributed = importlib.import_module("distributed")
+    except ImportError as error:
+        raise FitError(
+            "the library for clusters is not installed",
+            where=f"scheduler={scheduler}",
+            mend="pip install 'polar_bayes[cluster]', or leave the scheduler out",
+        ) from error
+    try:
+        client = distributed.Client(scheduler, timeout="5s")
+    except (OSError, ValueError) as error:
+        raise FitError(
+            "no scheduler answers there",
+            where=f"scheduler={scheduler}",
+            mend="give the address that `dask scheduler` prints, such as tcp://10.0.0.1:8786",
+        ) from error
+    with client:
+        yield client.get_executor(), max(1, len(client.scheduler_info()["workers"]))
+
+
+def as_completed(
+    executor: Executor, count: int, function: Callable, tasks: Iterable[tuple]
+) -> Iterator[tuple[tuple, Any]]:
+    """Results as they come, with few tasks on their way at any time."""
+    waiting, left = {}, iter(tasks)
+    try:
+        while True:
+            for task in left:
+                waiting[executor.submit(function, *task)] = task
+                if len(waiting) >= AHEAD * count:
+                    break
+            if not waiting:
+                return
+            done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield waiting.pop(future), future.result()
+    finally:
+        for future in waiting:
+            future.cancel()

@@ -1,0 +1,296 @@
+"""An image in, maps out: the public verb of this room."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping
+
+import numpy as np
+import xarray as xr
+from numpyro import distributions as dist
+
+from polar_bayes.errors import CaptureError, FitError
+from polar_bayes.inference.batch_fit import FEWEST_VIEWS, PixelLaplace, PixelMethod
+from polar_bayes.inference.batch_programs import key_of
+from polar_bayes.inference.batch_result import Status, no_outcome
+from polar_bayes.inference.batching import IMAGE
+from polar_bayes.inference.psis import Marginals
+from polar_bayes.inference.request import resolve
+from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.maps.blocks import (
+    NUMBER,
+    Plan,
+    as_completed,
+    fit_block,
+    maps_of,
+    set_aside,
+    workers,
+)
+from polar_bayes.observation.data import ANGLES
+from polar_bayes.observation.links import AbstractLink
+from polar_bayes.physics.scene import Scene
+from polar_bayes.priors import describe_prior
+from polar_bayes.progress import Counter, counted
+
+BLOCK = 4096
+"""Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
+
+CHUNK = 65536
+"""Pixels that are looked at together: a chunk of a store."""
+
+
+@counted("pixels")
+def fit_pixels(
+    capture: xr.Dataset,
+    *,
+    model: str | Callable = "per_material",
+    method: PixelMethod | None = None,
+    scene: str | Scene | None = None,
+    priors: Mapping[str, dist.Distribution] | None = None,
+    links: AbstractLink | Mapping[str, AbstractLink] | None = None,
+    largest_view_zenith: float | None = None,
+    seed: int = 0,
+    precision: str = "double",
+    progress: Counter | None = None,
+) -> xr.Dataset:
+    """Fit every pixel of an image by itself.
+
+    Each pixel is the fit that `polar_bayes.fit` makes of it, by the normal approximation at its
+    mode unless `method` says otherwise: the same model, priors and links. Noise parameters are
+    each pixel's own unless the model holds them (`numpyro.handlers.condition`). A map has the
+    marginals of each pixel and nothing joint: to ask for the mean of a region, fit the region.
+
+    Args:
+        capture: A capture with dims y and x. In chunks (Dask), it is read block by block, and the
+            maps come in the same chunks, computed when they are asked for.
+        model: See `polar_bayes.fit`; the other arguments too.
+        method: What is done in each pixel; by default `PixelLaplace()`. `PixelTempering()` sees
+            all modes of a pixel, at many times the cost; `PixelNuts()` runs chains in each.
+        scene: A name in `SETUPS` or a `Scene`.
+        priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
+        links: One link for the polarization, or a mapping from variable to link.
+        largest_view_zenith: Views beyond it are set aside. Unit degree.
+        seed: The same seed gives the same maps, however the image is cut.
+        precision: "double" or "single".
+        progress: Called with the pixels that are done, and all.
+
+    Returns:
+        For each parameter its mean `<name>`, `<name>_sd` and `<name>_quantile`, each (y, x, ...);
+        `pareto_k`, `effective_draws`, `condition`, `steps`, `approach` (how the numbers were
+        found) and `status` (what became of the pixel). NaN where a pixel has no answer; the
+        attribute `polar_bayes` says how the maps were made.
+
+    Raises:
+        CaptureError: The capture is no image, or does not hold what a fit needs.
+        SceneError: No such scene.
+        FitError: A model, prior, link or setting cannot be used.
+    """
+    plan = plan_map(
+        capture, model, method, scene, priors, links, largest_view_zenith, seed, precision
+    )
+    if capture.chunks:
+        numbered = number_pixels(capture)
+        maps = xr.map_blocks(fit_block, numbered, args=[plan], template=blank(capture, plan))
+    else:
+        maps = _at_once(capture, plan, progress)
+    maps["status"].encoding["fill_value"] = int(Status.NOT_FITTED)  # of chunks in a Zarr store
+    return maps
+
+
+def count_pixels(maps: xr.Dataset) -> dict[str, int]:
+    """What became of the pixels of a map.
+
+    Args:
+        maps: Of `fit_pixels`, or opened from a store.
+
+    Returns:
+        How many are good, masked, with too few views, not converged, not trusted and not fitted:
+        those whose chunk is lost, or whose numbers are not finite though they are called good.
+
+    Raises:
+        FitError: It holds no `status`.
+    """
+    if "status" not in maps:
+        raise FitError(
+            "it holds no maps", where="count_pixels", mend="give what fit_pixels returns"
+        )
+    counts = dict.fromkeys(Status, 0)
+    for place in cut(maps, CHUNK):
+        found = checked_status(maps.isel(place)).to_numpy()
+        for each in Status:
+            counts[each] += int(np.sum(found == each))
+    return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
+
+
+def checked_status(maps: xr.Dataset) -> xr.DataArray:
+    """Statuses of maps, in memory; a pixel that is called good without numbers is not fitted."""
+    # A chunk that was lost from a store reads as not a number.
+    answers = [
+        f"{name}{ending}"
+        for name in maps.data_vars
+        if f"{name}_quantile" in maps
+        for ending in ("", "_sd", "_quantile")
+        if f"{name}{ending}" in maps
+    ]
+    here = maps[["status", *answers]].load()
+    is_known = xr.ones_like(here["status"], dtype=bool)
+    for name in answers:
+        is_finite = abs(here[name]) < np.inf
+        is_known &= is_finite.all([dim for dim in is_finite.dims if dim not in IMAGE])
+    is_hole = (here["status"] == Status.GOOD) & ~is_known
+    return here["status"].where(~is_hole, Status.NOT_FITTED).astype(here["status"].dtype)
+
+
+def plan_map(
+    capture: xr.Dataset,
+    model: str | Callable,
+    method: PixelMethod | None,
+    scene: str | Scene | None,
+    priors: Mapping[str, dist.Distribution] | None,
+    links: AbstractLink | Mapping[str, AbstractLink] | None,
+    largest_view_zenith: float | None,
+    seed: int,
+    precision: str,
+) -> Plan:
+    """Check what is asked of a map, on one of its pixels."""
+    settings = PixelLaplace() if method is None else method
+    if not isinstance(settings, PixelMethod):
+        raise FitError(
+            f"{method!r} is no way to fit pixels",
+            where="fit_pixels: method",
+            mend="give settings such as PixelLaplace(draws=512) or PixelTempering()",
+        )
+    missing = [dim for dim in IMAGE if dim not in capture.dims]
+    if missing:
+        raise CaptureError(
+            f"it has no axis {' or '.join(missing)}",
+            where=str(capture.attrs.get("name", "capture")),
+            mend="give an image with dims y and x, or use polar_bayes.fit",
+        )
+    pixel, limit = _fullest_pixel(capture), largest_view_zenith
+    request = resolve(pixel, model, "laplace", scene, priors, links, limit, seed, precision)
+    own = frozenset(
+        name
+        for name in (*ANGLES, "normal_confidence")
+        if name in capture and set(IMAGE) & set(capture[name].dims)
+    )
+    unit = _intensity_unit(capture)
+    return Plan(request, settings, unit, own, key_of(request, settings, sorted(own), unit is None))
+
+
+def number_pixels(capture: xr.Dataset) -> xr.Dataset:
+    """An image whose pixels know where they stand, row by row, in chunks like its own."""
+    rows, columns = (capture.sizes[dim] for dim in IMAGE)
+    along = [
+        xr.Variable((dim,), np.arange(n)) for dim, n in zip(IMAGE, (rows, columns), strict=True)
+    ]
+    if capture.chunks:
+        along = [
+            each.chunk({dim: capture.chunks[dim]}) for dim, each in zip(IMAGE, along, strict=True)
+        ]
+    return capture.assign({NUMBER: along[0] * columns + along[1]})
+
+
+def numbered_block(block: xr.Dataset, place: Mapping[str, slice], columns: int) -> xr.Dataset:
+    """A block of an image so many columns wide, whose pixels know where they stand in the whole."""
+    y, x = (xr.Variable((d,), np.arange(place[d].start, place[d].stop)) for d in IMAGE)
+    return block.assign({NUMBER: y * columns + x})
+
+
+def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
+    """Maps of the image before any pixel is fitted: names, axes, types and attributes."""
+    corner = capture.isel({dim: slice(1) for dim in IMAGE})
+    nothing = no_outcome(1)
+    nothing.status[:] = Status.NOT_FITTED
+    tiny = maps_of(Marginals(1, plan.sizes), nothing, corner, plan.layout)
+    one = tiny.isel({dim: 0 for dim in IMAGE}, drop=True)
+    whole = one.expand_dims({dim: capture.sizes[dim] for dim in IMAGE})
+    whole = whole.assign_coords({dim: capture[dim] for dim in IMAGE if dim in capture.coords})
+    whole = xr.Dataset(
+        {n: v.transpose(*tiny[n].dims) for n, v in whole.items()}, attrs={PROVENANCE: said_of(plan)}
+    )
+    chunks = {dim: capture.chunks[dim] for dim in IMAGE if dim in capture.chunks}
+    return whole.chunk(chunks) if chunks else whole
+
+
+def cut(capture: xr.Dataset, pixels: int = BLOCK) -> Iterator[dict[str, slice]]:
+    """Places of blocks that cover an image, row by row."""
+    rows, columns = (capture.sizes[dim] for dim in IMAGE)
+    wide = min(columns, pixels)
+    high = max(1, pixels // wide)
+    for y in range(0, rows, high):
+        for x in range(0, columns, wide):
+            yield {"y": slice(y, min(y + high, rows)), "x": slice(x, min(x + wide, columns))}
+
+
+def _at_once(capture: xr.Dataset, plan: Plan, progress: Counter | None) -> xr.Dataset:
+    """Blocks on threads, put together in memory."""
+    maps = blank(capture, plan).copy(deep=True)
+    every, done = capture.sizes["y"] * capture.sizes["x"], 0
+    with workers(None) as (pool, count):
+        tasks = ((place,) for place in cut(capture))
+
+        def fit(place: dict[str, slice]) -> xr.Dataset:
+            block = numbered_block(capture.isel(place), place, capture.sizes["x"])
+            return fit_block(block, plan)
+
+        blocks = as_completed(pool, count, fit, tasks)
+        for (place,), block in blocks:
+            for name, values in block.items():
+                maps[name][place] = values
+            done += block.sizes["y"] * block.sizes["x"]
+            if progress is not None:
+                progress(done, every)
+    return maps
+
+
+def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
+    """The first pixel that has as many valid views as any in its rows; read row by row."""
+    rows = capture.sizes["y"]
+    best, most = None, 0
+    for y in range(rows):
+        row = set_aside(capture.isel(y=y).load())
+        views = row["valid"].any([d for d in row["valid"].dims if d not in ("x", "view")])
+        counts = views.sum("view")
+        found, x = int(counts.max()), int(counts.argmax("x")) if "x" in counts.dims else 0
+        if found > most:
+            best, most = row.isel(x=x), found
+        if most == capture.sizes["view"]:
+            break
+    if best is None or most < FEWEST_VIEWS:
+        raise CaptureError(
+            f"no pixel has {FEWEST_VIEWS} valid views",
+            where=str(capture.attrs.get("name", "capture")),
+            mend="check `valid` and the readings: NaN counts as missing",
+        )
+    return best
+
+
+def _intensity_unit(capture: xr.Dataset) -> float | None:
+    """The largest intensity of the whole image, where it states no saturation level."""
+    if "intensity" not in capture or "saturation_level" in capture["intensity"].attrs:
+        return None
+    readings = set_aside(capture)
+    largest = float(readings["intensity"].where(readings["valid"]).max())
+    return largest if largest > 0.0 else 1.0
+
+
+def said_of(plan: Plan) -> str:
+    """How maps are made, as JSON."""
+    request = plan.request
+    about = {
+        "method": "pixels",
+        "fitted_by": type(plan.settings).__name__,
+        "settings": dataclasses.asdict(plan.settings),
+        "model": request.model_name,
+        "scene": request.scene_name,
+        "scene_parts": repr(request.scene),
+        "priors": {name: describe_prior(prior) for name, prior in request.priors.items()},
+        "fixed": request.fixed,
+        "links": {name: repr(link) for name, link in request.links.items()},
+        "swapped": list(request.swapped),
+        "largest_view_zenith": request.largest_view_zenith,
+        "seed": request.seed,
+        "precision": request.precision,
+        "intensity_unit": plan.intensity_unit,
+    }
+    return json.dumps(about, sort_keys=True)

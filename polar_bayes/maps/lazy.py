@@ -1,0 +1,231 @@
+"""Images and maps in files, opened lazily; every broken part of one is an error of one line."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+import zarr
+from xarray.backends import BackendArray
+from xarray.core import indexing
+
+from polar_bayes.capture.files import load_capture
+from polar_bayes.errors import CaptureError, FitError, PolarBayesError
+from polar_bayes.inference.batching import IMAGE
+from polar_bayes.inference.psis import LEVELS
+from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.observation.data import READINGS
+from polar_bayes.paths import as_path
+
+MOST_BYTES = 2**31
+"""Maps in chunks (Dask) that are computed at once, into memory."""
+
+REQUEST = "request_sha256"
+"""Root attribute of a map from its first moment: the fingerprint of what was asked."""
+
+FINISHED = "capture_sha256"
+"""Root attribute that is written last: a map that holds it is finished. Digest of the readings."""
+
+COPY = "copy the store again, or make the map again"
+
+LEDGER = ".progress"
+"""Ending of the ledger beside an unfinished map."""
+
+
+def open_capture(path: str | os.PathLike[str]) -> xr.Dataset:
+    """A capture from a file, its values read when they are needed where it is a Zarr store.
+
+    Args:
+        path: A netCDF file, or the folder of a Zarr store (its name ends in .zarr).
+
+    Returns:
+        The capture; that of a Zarr store is not validated.
+
+    Raises:
+        CaptureError: It cannot be read; with a Zarr store also later, when values are read.
+    """
+    return open_image(as_path(path, "capture"))
+
+
+def open_image(path: Path) -> xr.Dataset:
+    """A capture from a file; of a Zarr store it is validated block by block, later."""
+    if path.suffix != ".zarr":
+        return load_capture(path)
+    if not path.is_dir():
+        raise CaptureError("there is no such store", where=str(path), mend="check the path")
+    image = _open_store(path, CaptureError, "write it again with to_zarr", decode_times=False)
+    for name, variable in image.variables.items():
+        if variable.dtype.kind not in "biufUOT":
+            raise CaptureError(
+                f"it holds {variable.dtype.name}, neither numbers nor flags",
+                where=f"{path}: {name}",
+                mend="write it again with to_zarr",
+            )
+    image.attrs.setdefault("name", path.stem)
+    return image
+
+
+def check_whole(path: Path) -> None:
+    """Refuse a store with holes, which would read as missing readings; once for the whole map."""
+    for name in READINGS:
+        if path.suffix != ".zarr" or not (path / name).is_dir():
+            continue
+        missing, chunks = _missing(path / name, CaptureError)
+        if missing:
+            raise CaptureError(
+                f"{missing} of {chunks} chunks are missing",
+                where=f"{path}: {name}",
+                mend="copy the store again, or write it again with to_zarr",
+            )
+
+
+def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
+    """The maps of a Zarr store, their values read when they are needed.
+
+    Args:
+        path: What `polar_bayes.map_file` or `polar-bayes map` wrote.
+
+    Returns:
+        The maps. Where a chunk is lost, pixels are not fitted (`polar_bayes.count_pixels`).
+
+    Raises:
+        CaptureError: It is no path.
+        FitError: There is no such store, it is not finished, or it holds no maps; later, when
+            values are read: a chunk is damaged.
+    """
+    store = as_path(path, "map")
+    where = str(store)
+    if not store.is_dir():
+        raise FitError("there is no such store", where=where, mend="check the path")
+    maps = _open_store(store, FitError, "make the map again")
+    if PROVENANCE not in maps.attrs or "status" not in maps:
+        raise FitError("it holds no maps", where=where, mend="give what `polar-bayes map` wrote")
+    if REQUEST in maps.attrs and FINISHED not in maps.attrs:
+        mend = "wait, or go on with `polar-bayes map --resume`"
+        raise FitError("it is not finished", where=where, mend=mend)
+    _check_maps(maps, store)
+    return maps
+
+
+def _check_maps(maps: xr.Dataset, store: Path) -> None:
+    """Refuse metadata that no map has, before anything trips over them."""
+    if not _has_provenance(maps):
+        raise FitError("its provenance cannot be read", where=str(store), mend=COPY)
+    if "quantile" in maps.dims and not np.array_equal(maps["quantile"], LEVELS):
+        raise FitError("its levels are not those of a map", where=f"{store}: quantile", mend=COPY)
+    for name, variable in maps.variables.items():
+        where, is_flag = f"{store}: {name}", name in ("status", "approach")
+        if variable.dtype.kind not in ("iu" if is_flag else "iufUOT"):
+            what = f"it holds {variable.dtype.name}, which no map does"
+            raise FitError(what, where=where, mend=COPY)
+        mean = str(name).removesuffix("_sd").removesuffix("_quantile")
+        own = set(maps[mean].dims) if mean in maps else set(IMAGE)
+        if name in maps.data_vars and not set(IMAGE) <= set(variable.dims) - {"quantile"} == own:
+            raise FitError("its axes are not those of a map", where=where, mend=COPY)
+        if is_flag and not _has_meanings(variable):
+            raise FitError("its flags have no meanings", where=where, mend=COPY)
+        is_ours = REQUEST in maps.attrs  # to_zarr of a user leaves out chunks of zeros
+        if is_ours and name in maps.coords and _missing(store / str(name), FitError)[0]:
+            raise FitError("its values are missing", where=where, mend=COPY)
+
+
+def _has_provenance(maps: xr.Dataset) -> bool:
+    try:
+        return isinstance(json.loads(maps.attrs[PROVENANCE]), dict)
+    except (TypeError, ValueError):
+        return False
+
+
+def _has_meanings(flags: xr.Variable) -> bool:
+    """Whether every value of a flag has a word."""
+    words = str(flags.attrs.get("flag_meanings", "")).split()
+    values = flags.attrs.get("flag_values", list(range(len(words))))
+    listed = list(values) if isinstance(values, list | tuple | np.ndarray) else [values]
+    are_whole = all(isinstance(value, int | np.integer) for value in listed)
+    return 0 < len(words) == len(listed) and are_whole
+
+
+def _missing(array: Path, error: type[PolarBayesError]) -> tuple[int, int]:
+    """Chunks of an array that are not there, and all."""
+    try:
+        opened = zarr.open_array(array, mode="r")
+        return opened.nchunks - opened.nchunks_initialized, opened.nchunks
+    except Exception as cause:  # the libraries below raise nearly every type for a broken store
+        raise error(
+            "it cannot be read as Zarr",
+            where=f"{array.parent}: {array.name}",
+            mend="copy the store again, or write it again",
+        ) from cause
+
+
+def _open_store(path: Path, error: type[PolarBayesError], mend: str, **options: Any) -> xr.Dataset:
+    """A Zarr store, lazily; each of its variables knows how to say that it is broken."""
+    where = str(path)
+    try:
+        opened = xr.open_dataset(path, engine="zarr", consolidated=False, cache=False, **options)
+    except Exception as cause:  # the libraries below raise nearly every type for a broken store
+        raise error("it cannot be read as Zarr", where=where, mend=mend) from cause
+    guarded = {
+        name: xr.Variable(
+            variable.dims,
+            indexing.LazilyIndexedArray(_Guarded(variable, f"{where}: {name}", error, mend)),
+            variable.attrs,
+            variable.encoding,
+            fastpath=True,
+        )
+        for name, variable in opened.variables.items()
+        if name not in opened.xindexes
+    }
+    coords = {name: guarded.pop(name) for name in list(guarded) if name in opened.coords}
+    found = opened.assign(guarded).assign_coords(coords)
+    found.encoding = opened.encoding
+    return found
+
+
+class _Guarded(BackendArray):
+    """A variable of a store; a chunk that cannot be read is an error with its place."""
+
+    def __init__(
+        self, variable: xr.Variable, where: str, error: type[PolarBayesError], mend: str
+    ) -> None:
+        self.shape, self.dtype = variable.shape, variable.dtype
+        self._variable, self._where, self._error, self._mend = variable, where, error, mend
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
+        return indexing.explicit_indexing_adapter(
+            key, self.shape, indexing.IndexingSupport.OUTER, self._read
+        )
+
+    def _read(self, key: tuple) -> np.ndarray:
+        try:
+            return self._variable[key].to_numpy()
+        except Exception as cause:  # codecs raise nearly every type for a broken chunk
+            parts = zip(self._variable.dims, key, self.shape, strict=True)
+            ranges = [f"{dim}={_range(part, n)}" for dim, part, n in parts if dim in IMAGE]
+            place = f"[{', '.join(ranges)}]" if ranges else ""
+            raise self._error(
+                f"it cannot be read ({cause})", where=f"{self._where}{place}", mend=self._mend
+            ) from cause
+
+
+def _range(part: slice | np.ndarray | int, length: int) -> str:
+    """Where along an axis values were asked for."""
+    if isinstance(part, slice):
+        return "{}:{}".format(*part.indices(length))
+    return str(part) if np.ndim(part) == 0 else f"{np.min(part)}:{np.max(part) + 1}"
+
+
+def at_hand(maps: xr.Dataset) -> xr.Dataset:
+    """Maps whose values can be looked at again and again."""
+    # Those in chunks (Dask) would be fitted anew at each look: they are computed, once.
+    if not any(variable.chunks for variable in maps.variables.values()):
+        return maps
+    if maps.nbytes > MOST_BYTES:
+        raise FitError(
+            f"these maps are in chunks and take {maps.nbytes / 2**30:.0f} GB",
+            where="maps",
+            mend="write them with to_zarr, if they are not yet, and open them with open_map",
+        )
+    return maps.compute()

@@ -1,0 +1,550 @@
+"""Maps of images that do not fit into memory: block by block from file to file, resumable.
+
+A map is a Zarr store that appears whole, without values, under a fingerprint of what was asked
+(`opening.REQUEST`). Each block is on the disk before its line is in the ledger beside the store
+(`ledger.py`). The attribute `opening.FINISHED` is written last. Nothing is written to a store that
+does not hold the fingerprint, and nothing is removed but the ledger and folders of our own.
+"""
+
+import contextlib
+import hashlib
+import inspect
+import json
+import math
+import os
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import portalocker
+import xarray as xr
+from zarr.codecs import Crc32cCodec, ZstdCodec
+
+from polar_bayes.capture.schema import CONTRACT, LABELS, WAVELENGTH
+from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError
+from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.batching import IMAGE
+from polar_bayes.interrupts import on_interrupt, resume_hint
+from polar_bayes.maps.blocks import Plan, as_completed, fit_block, workers
+from polar_bayes.maps.fit_map import blank, cut, fit_pixels, numbered_block, plan_map, said_of
+from polar_bayes.maps.lazy import FINISHED, LEDGER, REQUEST, check_whole, open_image, open_map
+from polar_bayes.paths import (
+    as_path,
+    is_same_place,
+    move_into_place,
+    output_error,
+    sync,
+    unfinished_folder,
+)
+from polar_bayes.progress import Counter, counted
+
+# --- The ledger of an unfinished map: which blocks are on the disk, and of which readings ---------
+
+
+MAGIC = b"polar_bayes map "
+BEGUN_OTHERWISE = "it was begun with another capture or other settings"
+REPEAT = "repeat the command as it was, or give another --out"
+
+
+class Entry(NamedTuple):
+    """A block that is done."""
+
+    readings: str
+    chunks: str
+
+
+class Ledger:
+    """A file beside the store: a head with the fingerprint of the request, then a line per block."""
+
+    # A line is added after the chunks of its block are on the disk. A line without an end was cut
+    # off by a crash and counts as not there; any other line that fails its checksum is an error.
+
+    def __init__(self, opened: BinaryIO, file: Path, request: str) -> None:
+        self._opened, self._file, self._size = opened, file, 0
+        self._head = MAGIC + request.encode() + b"\n"
+        self.entries: dict[str, Entry] = {}
+
+    def read(self) -> None:
+        """Read what is there; a file that holds anything else is refused and left as it is."""
+        where = str(self._file)
+        content = self._opened.read()
+        if self._head.startswith(content):  # empty, or cut off within the head
+            return
+        if not content.startswith(MAGIC):
+            mend = "move that file away, or give another --out"
+            raise OutputError("it is not the ledger of a map", where=where, mend=mend)
+        if not content.startswith(self._head):
+            raise FitError(BEGUN_OTHERWISE, where=where, mend=REPEAT)
+        *lines, rest = content[len(self._head) :].split(b"\n")
+        self._size = len(content) - len(rest)
+        for number, line in enumerate(lines, 2):
+            body, _, checksum = line.rpartition(b" ")
+            fields = body.rsplit(b" ", 2)
+            if len(fields) != 3 or checksum != _checksum(body):
+                raise OutputError(
+                    f"line {number} is damaged",
+                    where=where,
+                    mend="remove that file to fit all blocks again, or give another --out",
+                )
+            label, readings, chunks = (field.decode("ascii") for field in fields)
+            self.entries[label] = Entry(readings, chunks)
+
+    def begin(self) -> None:
+        """Cut off what a crash left of a line; write the head where there is none."""
+        self._opened.truncate(self._size)
+        if self._size == 0:
+            self._append(self._head)
+            sync(self._file.parent)
+
+    def add(self, label: str, entry: Entry) -> None:
+        """A block is on the disk."""
+        if not self._is_in_place():
+            raise taken_over(_store_of(self._file))
+        self._append(_line(label, entry))
+        self.entries[label] = entry
+
+    def end(self) -> None:
+        """Nothing is left to do."""
+        if self._is_in_place():
+            self._file.unlink()
+            sync(self._file.parent)
+
+    def _append(self, text: bytes) -> None:
+        self._opened.seek(0, os.SEEK_END)
+        while text:  # an unbuffered file may take less than it is given
+            text = text[self._opened.write(text) :]
+        os.fsync(self._opened.fileno())
+
+    def _is_in_place(self) -> bool:
+        try:
+            return os.path.samestat(os.fstat(self._opened.fileno()), os.stat(self._file))
+        except FileNotFoundError:
+            return False
+
+
+@contextlib.contextmanager
+def locked_ledger(file: Path, request: str, *, resume: bool) -> Iterator[Ledger]:
+    """The ledger of a map, locked: the lock ends with the block, or with the process."""
+    # A ledger that was made here and in which nothing was written is removed again.
+    opened, is_new = _open(file, resume=resume)
+    try:
+        _lock(opened, file)
+        ledger = Ledger(opened, file, request)
+        if not ledger._is_in_place():
+            raise taken_over(_store_of(file))
+        yield ledger
+    except BaseException:
+        if is_new and os.fstat(opened.fileno()).st_size == 0:
+            file.unlink(missing_ok=True)
+        raise
+    finally:
+        opened.close()
+
+
+def _open(file: Path, *, resume: bool) -> tuple[BinaryIO, bool]:
+    """The file, and whether it was made here."""
+    try:
+        with contextlib.suppress(FileExistsError):
+            return file.open("x+b", buffering=0), True
+        if not resume:
+            mend = "give another --out, or --resume"
+            raise OutputError("it is there already", where=str(file), mend=mend)
+        if file.is_file():
+            return file.open("r+b", buffering=0), False
+    except OSError as error:
+        raise output_error(error, file) from error
+    mend = "move it away, or give another --out"
+    raise OutputError("it is not the ledger of a map", where=str(file), mend=mend)
+
+
+def _lock(opened: BinaryIO, file: Path) -> None:
+    try:
+        portalocker.lock(
+            opened, portalocker.LockFlags.EXCLUSIVE | portalocker.LockFlags.NON_BLOCKING
+        )
+    except portalocker.AlreadyLocked as error:
+        mend = "wait until it has finished, or give another --out"
+        raise OutputError(
+            "another process is writing it", where=str(_store_of(file)), mend=mend
+        ) from error
+    except portalocker.LockException as error:
+        raise OutputError(
+            f"it cannot be locked ({error})",
+            where=str(file),
+            mend="give an --out on a file system that has locks",
+        ) from error
+
+
+def taken_over(store: Path) -> OutputError:
+    """The error of a process that finds the store or its ledger no longer there."""
+    return OutputError(
+        "another process has finished, moved or removed it",
+        where=str(store),
+        mend="let one process at a time write it, and repeat the command with --resume",
+    )
+
+
+def _store_of(file: Path) -> Path:
+    return file.with_suffix("")
+
+
+def _line(label: str, entry: Entry) -> bytes:
+    body = f"{label} {entry.readings} {entry.chunks}".encode()
+    return body + b" " + _checksum(body) + b"\n"
+
+
+def _checksum(body: bytes) -> bytes:
+    return f"{zlib.crc32(body):08x}".encode()
+
+
+# --- Maps of images that do not fit into memory: block by block from file to file, resumable ------
+
+
+BLOCK = 65536
+"""Most pixels of a block, and of a chunk on the disk: few files, little memory."""
+
+PARTS, LEAST = 4, 1024
+"""Blocks of a smaller image, so that every core has work; but none has fewer pixels."""
+
+READ = frozenset((*(row.name for row in CONTRACT), WAVELENGTH.name, *LABELS))
+"""What a fit reads of a capture; known truths and variables of the user's own are not among it."""
+
+METADATA = "zarr.json"
+
+Place = dict[str, slice]
+
+DEFAULTS: dict[str, Any] = {
+    name: parameter.default
+    for name, parameter in inspect.signature(fit_pixels).parameters.items()
+    if name not in ("capture", "progress")
+}
+
+
+@counted("pixels")
+def map_file(
+    capture: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    scheduler: str | None = None,
+    resume: bool = False,
+    progress: Counter | None = None,
+    **asked: Any,
+) -> xr.Dataset:
+    """Fit every pixel of an image in a file, and write the maps to another.
+
+    Blocks are read, fitted and written one by one, so memory does not grow with the image. What is
+    written does not depend on the order of the blocks or on how often the work was broken off, as
+    long as the compiler makes the same programs in every process (see the limits in docs/maps.md).
+
+    Args:
+        capture: A capture with dims y and x, netCDF (read whole) or Zarr (read block by block).
+        out: The folder of a Zarr store to write.
+        scheduler: Address of a `dask.distributed` scheduler whose workers can read `capture`; by
+            default threads of this process.
+        resume: Go on with a map that was broken off; what is done stays. Blocks whose files are
+            missing or altered are fitted again. A finished map of the same capture is returned.
+        progress: Called with the pixels that are done, and all.
+        asked: Arguments of `polar_bayes.fit_pixels`.
+
+    Returns:
+        The maps, opened lazily.
+
+    Raises:
+        CaptureError: The capture cannot be read, or is not what a fit needs.
+        FitError: Something asked for cannot be used; or, to resume, the map was begun otherwise or
+            the capture has changed since.
+        OutputError: The store cannot be written, is there already, is (to resume) no map of ours or
+            not as it was written, or another process is writing it.
+    """
+    source, store = as_path(capture, "capture"), as_path(out, "out")
+    check_apart(source, store)
+    image = open_image(source)
+    check_whole(source)
+    with _in_capture(source):
+        plan = plan_map(image, **(DEFAULTS | asked))
+    target = _MapStore(store, image, plan)
+    file = store.with_name(f"{store.name}{LEDGER}")
+    with locked_ledger(file, target.request, resume=resume) as ledger:
+        is_finished = target.is_finished(resume=resume)
+        with _written(store):
+            ledger.read()
+        if is_finished:
+            target.check_finished()
+        else:
+            target.check_readings(ledger)
+            target.begin(ledger)
+            with on_interrupt(lambda: resume_hint(store)):
+                target.run(ledger, source, scheduler, progress)
+            target.finish(ledger)
+        with _written(store):
+            ledger.end()
+    return open_map(store)
+
+
+def check_apart(source: Path, store: Path) -> None:
+    """Refuse a store that is the source, or in it, or around it; or that has nowhere to stand."""
+    where, mend = str(store), "give another --out"
+    with _written(store):
+        one, other = source.resolve(), store.resolve()
+        is_nested = other.is_relative_to(one) or one.is_relative_to(other)
+        if is_nested or is_same_place(source, store):
+            what = "it is the capture, inside it, or around it"
+            raise OutputError(what, where=where, mend=mend)
+        if not store.parent.is_dir():
+            raise OutputError("its folder is not there", where=where, mend="make the folder first")
+
+
+def fit_file_block(
+    source: Path, place: Place, plan: Plan, opened: xr.Dataset | None = None
+) -> tuple[xr.Dataset, str]:
+    """Fit one block of a capture, which a worker opens: its maps, and a digest of its readings."""
+    image = open_image(source) if opened is None else opened
+    block = _read(image, place)
+    with _in_capture(source, place):
+        return fit_block(numbered_block(block, place, image.sizes["x"]), plan), _digest(block)
+
+
+@contextlib.contextmanager
+def _in_capture(source: Path, place: Place | None = None) -> Iterator[None]:
+    """What is wrong with a capture, with its name and the block."""
+    where = str(source) if place is None else f"{source}: block {_label(place)}"
+    try:
+        yield
+    except CaptureError as error:
+        if error.where.startswith(str(source)):
+            raise
+        raise CaptureError(error.what, where=f"{where}: {error.where}", mend=error.mend) from error
+
+
+def _read(image: xr.Dataset, place: Place) -> xr.Dataset:
+    """A block of a capture in memory: what a fit reads of it."""
+    return image[[name for name in image.data_vars if name in READ]].isel(place).load()
+
+
+def _digest(block: xr.Dataset) -> str:
+    """SHA-256 of names, axes, types and values."""
+    found = hashlib.sha256()
+    for name in sorted(READ & set(block.variables)):
+        variable = block.variables[name]
+        values = variable.to_numpy()
+        head = [name, variable.dims, values.shape, values.dtype.str]
+        found.update(json.dumps(head).encode())
+        is_plain = values.dtype.kind in "biuf"
+        found.update(values.tobytes() if is_plain else json.dumps(values.tolist()).encode())
+    return found.hexdigest()
+
+
+class _MapStore:
+    """One map that is being made: its request, its blocks, and the files of its store."""
+
+    def __init__(self, store: Path, image: xr.Dataset, plan: Plan) -> None:
+        self._store, self._image, self._plan = store, image, plan
+        self._maps = blank(image, plan)
+        self._places = list(cut(image, _block(image)))
+        self._chunks = {dim: part.stop for dim, part in self._places[0].items()}
+        pixel = plan.request.capture.drop_attrs(deep=False)
+        read = pixel[sorted(READ & set(pixel.data_vars))].to_dict()
+        asked = [said_of(plan), dict(image.sizes), self._chunks, read]
+        text = json.dumps(asked, sort_keys=True, default=str)
+        self.request = hashlib.sha256(text.encode()).hexdigest()
+
+    def is_finished(self, *, resume: bool) -> bool:
+        """Whether the store is a finished map; one that is not of this request is refused."""
+        where = str(self._store)
+        if not os.path.lexists(self._store):
+            return False
+        if not resume:
+            mend = "give another --out, or --resume"
+            raise OutputError("it is there already", where=where, mend=mend)
+        attributes = _metadata(self._store)["attributes"]
+        if REQUEST not in attributes:
+            mend = "give another --out"
+            raise OutputError("it is not a map that can be resumed", where=where, mend=mend)
+        if attributes[REQUEST] != self.request:
+            raise FitError(BEGUN_OTHERWISE, where=where, mend=REPEAT)
+        return FINISHED in attributes
+
+    def check_finished(self) -> None:
+        """Refuse a finished map of readings that have changed, or that has lost chunks."""
+        where, mend = str(self._store), "give another --out"
+        readings = [_digest(_read(self._image, place)) for place in self._places]
+        if _metadata(self._store)["attributes"][FINISHED] != self._combined(readings):
+            raise FitError("the capture has changed since it was made", where=where, mend=mend)
+        files = [file for place in self._places for file in self._files(place)]
+        if missing := sum(not file.is_file() for file in files):
+            what = f"{missing} of {len(files)} chunks are missing"
+            raise OutputError(what, where=where, mend="copy the store again, or give another --out")
+
+    def check_readings(self, ledger: Ledger) -> None:
+        """Refuse to go on where the readings of a block that is done have changed."""
+        for place in self._places:
+            label = _label(place)
+            if label not in ledger.entries:
+                continue
+            if _digest(_read(self._image, place)) != ledger.entries[label].readings:
+                raise FitError(
+                    f"the capture has changed since block {label} was fitted",
+                    where=str(self._store),
+                    mend="give another --out",
+                )
+
+    def begin(self, ledger: Ledger) -> None:
+        """Put the store without values in its place, or see that it is as it was put there."""
+        with _written(self._store), unfinished_folder(self._store.parent) as folder:
+            empty = folder / self._store.name
+            self._write_blank(empty)
+            files = sorted(path.relative_to(empty) for path in empty.rglob("*") if path.is_file())
+            if self._store.exists():
+                for file in files:
+                    self._check_same(empty, file)
+                ledger.begin()
+                return
+            for path in (*empty.rglob("*"), empty):
+                sync(path)
+            ledger.begin()
+            empty.rename(self._store)
+            sync(self._store.parent)
+
+    def _write_blank(self, path: Path) -> None:
+        """The store with names, axes and attributes; what is not written reads as not fitted."""
+        compressors = (ZstdCodec(), Crc32cCodec())
+        encoding: dict = {str(name): {"compressors": compressors} for name in self._maps.variables}
+        encoding["status"]["fill_value"] = int(Status.NOT_FITTED)
+        self._maps.chunk(self._chunks).assign_attrs({REQUEST: self.request}).to_zarr(
+            path,
+            mode="w-",
+            encoding=encoding,
+            compute=False,
+            consolidated=False,
+            zarr_format=3,
+            write_empty_chunks=True,
+        )
+
+    def _check_same(self, empty: Path, file: Path) -> None:
+        """Refuse a store whose metadata or axes are not those that were written."""
+        found = self._store / file
+        if not found.is_file() or found.read_bytes() != (empty / file).read_bytes():
+            raise OutputError(
+                "it is missing, or not as it was written",
+                where=f"{self._store}: {file}",
+                mend="give another --out",
+            )
+
+    def run(
+        self, ledger: Ledger, source: Path, scheduler: str | None, progress: Counter | None
+    ) -> None:
+        """Fit and write every block that is not on the disk as the ledger says."""
+        places = [place for place in self._places if not self._is_done(ledger, place)]
+        every = sum(map(_size, self._places))
+        done = every - sum(map(_size, places))
+        with workers(scheduler) as (executor, count):
+            opened = self._image if scheduler is None else None  # a cluster opens it for itself
+            tasks = ((source, place, self._plan, opened) for place in places)
+            for (_, place, *_), (block, readings) in as_completed(
+                executor, count, fit_file_block, tasks
+            ):
+                with _written(self._store):
+                    self._write(block, place)
+                    entry = Entry(readings, _contents(self._files(place)))
+                    ledger.add(_label(place), entry)
+                done += _size(place)
+                if progress is not None:
+                    progress(done, every)
+
+    def _is_done(self, ledger: Ledger, place: Place) -> bool:
+        entry = ledger.entries.get(_label(place))
+        files = self._files(place)
+        if entry is None or not all(file.is_file() for file in files):
+            return False
+        with _written(self._store):
+            return _contents(files) == entry.chunks
+
+    def _write(self, block: xr.Dataset, place: Place) -> None:
+        """Write a block and wait until it is on the disk."""
+        values = block.drop_vars(list(block.coords))
+        region = {dim: part for dim, part in place.items()}
+        values.to_zarr(self._store, region=region, consolidated=False, write_empty_chunks=True)
+        files = self._files(place)
+        folders = {
+            folder
+            for file in files
+            for folder in file.parents
+            if folder.is_relative_to(self._store)
+        }
+        for path in (*files, *sorted(folders)):
+            sync(path)
+
+    def _files(self, place: Place) -> list[Path]:
+        """Chunk files of a block: one of each array, as the default names of Zarr have it."""
+        found = []
+        for name, variable in self._maps.data_vars.items():
+            at = [place[d].start // self._chunks[d] if d in IMAGE else 0 for d in variable.dims]
+            found.append(self._store.joinpath(str(name), "c", *map(str, at)))
+        return found
+
+    def finish(self, ledger: Ledger) -> None:
+        """Say in the store itself that it is finished, and of which readings."""
+        readings = [ledger.entries[_label(place)].readings for place in self._places]
+        with _written(self._store), unfinished_folder(self._store.parent) as folder:
+            metadata = _metadata(self._store)
+            if metadata["attributes"].get(REQUEST) != self.request:
+                raise taken_over(self._store)
+            metadata["attributes"][FINISHED] = self._combined(readings)
+            unfinished = folder / METADATA
+            unfinished.write_text(json.dumps(metadata, indent=2))
+            move_into_place(unfinished, self._store / METADATA)
+
+    def _combined(self, readings: Iterable[str]) -> str:
+        """Digest of the readings of all blocks."""
+        labels = map(_label, self._places)
+        text = "\n".join(f"{label} {one}" for label, one in zip(labels, readings, strict=True))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _contents(files: Iterable[Path]) -> str:
+    """SHA-256 of files, one after the other."""
+    found = hashlib.sha256()
+    for file in files:
+        found.update(hashlib.sha256(file.read_bytes()).digest())
+    return found.hexdigest()
+
+
+def _metadata(store: Path) -> dict[str, Any]:
+    """Metadata of a store, without attributes where there are none that can be read."""
+    try:
+        found = json.loads((store / METADATA).read_text())
+    except (OSError, ValueError):
+        found = None
+    found = found if isinstance(found, dict) else {}
+    is_known = isinstance(found.get("attributes"), dict)
+    return found if is_known else {**found, "attributes": {}}
+
+
+def _label(place: Place) -> str:
+    return " ".join(f"{dim}={part.start}:{part.stop}" for dim, part in place.items())
+
+
+def _size(place: Place) -> int:
+    return math.prod(part.stop - part.start for part in place.values())
+
+
+def _block(image: xr.Dataset) -> int:
+    """Most pixels of a block; it follows from the image alone, so that work can be resumed."""
+    return min(BLOCK, max(LEAST, image.sizes["y"] * image.sizes["x"] // PARTS))
+
+
+@contextlib.contextmanager
+def _written(store: Path) -> Iterator[None]:
+    """What the system or the libraries below say of a store that cannot be written, as one line."""
+    try:
+        yield
+    except PolarBayesError:
+        raise
+    except Exception as error:  # Zarr raises nearly every type for a store that is not as it was
+        reason = (getattr(error, "strerror", None) or "").lower() or str(error)
+        raise OutputError(
+            f"it could not be written ({reason or type(error).__name__})",
+            where=str(store),
+            mend="make room or give another --out; --resume goes on where it stopped",
+        ) from error

@@ -1,0 +1,526 @@
+r"""The ends of a prior.
+
+NumPyro samples the log of a positive value. Where zero is as likely as anything, that log has a
+tail without end to the left, in which chains walk for long. The normal score has none:
+
+$$ z = \Phi^{-1}\big(2 \Phi(v/\sigma) - 1\big) $$
+
+under which the prior is standard normal.
+
+The table is written once and read by every model. A caller replaces any row with any NumPyro
+distribution of the right support: `priors={"refractive_index": dist.Normal(1.5, 0.02)}` is
+refused (an index below 1 is possible under it), `dist.TruncatedNormal(1.5, 0.02, low=1.0)` is
+not. Distributions are made of Python numbers, so that importing this file creates no array and
+the fit chooses the precision.
+"""
+
+import difflib
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import override
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import erf, erfc, erfinv, ndtr, ndtri
+from jaxtyping import Array, ArrayLike, Float
+from numpyro import distributions as dist
+from numpyro.distributions import constraints, transforms
+
+from polar_bayes.errors import FitError
+from polar_bayes.physics.part import notation
+from polar_bayes.repr_html import Card, Grid
+
+
+def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
+    """Smallest and largest value that a prior allows, infinite where it has no bound."""
+    support = prior.support
+    while isinstance(support, constraints.independent):
+        support = support.base_constraint
+    low = getattr(support, "lower_bound", -math.inf)
+    high = getattr(support, "upper_bound", math.inf)
+    return float(np.min(low)), float(np.max(high))
+
+
+# --- The half-normal prior of what readings seldom tell from zero ---------------------------------
+
+
+TWO_LOG_TWO = 2.0 * math.log(2.0)
+
+
+class HalfNormal(dist.HalfNormal):
+    """The half-normal distribution, sampled in its normal score."""
+
+    @property
+    @override
+    def support(self) -> constraints.Constraint:
+        return Scored(self.scale)
+
+
+class Scored(constraints.Constraint):
+    """Positive values, whose coordinate is the normal score under a half-normal distribution."""
+
+    lower_bound = 0.0
+
+    def __init__(self, scale: float) -> None:
+        self.scale = scale
+
+    @override
+    def __call__(self, x: ArrayLike) -> Array:
+        return jnp.greater(x, 0.0)
+
+    @override
+    def feasible_like(self, prototype: Array) -> Array:
+        return jnp.broadcast_to(self.scale, jnp.shape(prototype))
+
+    def eq(self, other: object, static: bool = False) -> bool:
+        """Whether it is the same, as NumPyro asks."""
+        return isinstance(other, Scored) and other.scale == self.scale
+
+    def tree_flatten(self) -> tuple:
+        """As NumPyro has it."""
+        return (self.scale,), (("scale",), {})
+
+
+@dist.biject_to.register(Scored)
+def _by_score(support: Scored) -> "FromScore":
+    return FromScore(support.scale)
+
+
+class FromScore(transforms.Transform):
+    """From a normal score to the value of that score."""
+
+    domain = constraints.real
+    codomain = constraints.positive
+
+    def __init__(self, scale: float) -> None:
+        self.scale = scale
+
+    def __call__(self, x: Array) -> Array:
+        """The value of a score."""
+        return self.scale * folded(jnp.asarray(x))
+
+    @override
+    def _inverse(self, y: Array) -> Array:
+        return unfolded(jnp.asarray(y) / self.scale)
+
+    @override
+    def log_abs_det_jacobian(
+        self, x: Array, y: Array, intermediates: object | None = None
+    ) -> Array:
+        return jnp.log(0.5 * self.scale) + 0.5 * ((y / self.scale) ** 2 - x**2)
+
+    def tree_flatten(self) -> tuple:
+        """As NumPyro has it."""
+        return (self.scale,), (("scale",), {})
+
+
+@jax.custom_jvp
+def folded(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    r"""The half-normal quantile of a normal score: $\Phi^{-1}((1+\Phi(z))/2)$."""
+    # Each half is computed from the tail that is small there. Beyond the smallest number of its
+    # precision the tail of the right half is that of its asymptote.
+    tail = 0.5 * ndtr(-z)
+    known = tail >= jnp.finfo(tail.dtype).tiny
+    high = jnp.where(known, -ndtri(tail), jnp.sqrt(z**2 + TWO_LOG_TWO))
+    return jnp.where(z < 0.0, 2.0**0.5 * erfinv(ndtr(z)), high)
+
+
+@folded.defjvp
+def _slope_of_folded(z: tuple, dz: tuple) -> tuple[Array, Array]:
+    x = folded(*z)
+    return x, 0.5 * jnp.exp(0.5 * (x**2 - z[0] ** 2)) * dz[0]
+
+
+@jax.custom_jvp
+def unfolded(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    r"""The normal score of a half-normal value: $\Phi^{-1}(2\Phi(x) - 1)$."""
+    half = 2.0**-0.5
+    tail = erfc(half * x)
+    known = tail >= jnp.finfo(tail.dtype).tiny
+    high = jnp.where(known, -ndtri(tail), jnp.sqrt(x**2 - TWO_LOG_TWO))
+    return jnp.where(x < 0.5, ndtri(erf(half * x)), high)
+
+
+@unfolded.defjvp
+def _slope_of_unfolded(x: tuple, dx: tuple) -> tuple[Array, Array]:
+    z = unfolded(*x)
+    return z, 2.0 * jnp.exp(0.5 * (z**2 - x[0] ** 2)) * dx[0]
+
+
+# --- A prior in words, for reports ----------------------------------------------------------------
+
+
+def describe_prior(prior: dist.Distribution) -> str:
+    """A prior as text, for reports: `TruncatedNormal(loc=1.45, scale=0.15, low=1.2, high=2)`."""
+    try:
+        return _description(prior)
+    except Exception:
+        # A report must not fail because a distribution of the user's own describes itself badly.
+        return type(prior).__name__
+
+
+def _description(prior: dist.Distribution) -> str:
+    shape = (*prior.batch_shape, *prior.event_shape)
+    while isinstance(
+        prior, dist.Independent | dist.ExpandedDistribution | dist.distribution.MaskedDistribution
+    ):
+        prior = prior.base_dist
+    copies = f" x {shape}" if shape != (*prior.batch_shape, *prior.event_shape) else ""
+    return f"{_name(prior)}({', '.join(_arguments(prior))}){copies}"
+
+
+def _name(prior: dist.Distribution) -> str:
+    if _is_truncated(prior):
+        return f"Truncated{type(prior.base_dist).__name__}"
+    if isinstance(prior, dist.MixtureSameFamily | dist.MixtureGeneral):
+        return "Mixture"
+    return type(prior).__name__
+
+
+def _arguments(prior: dist.Distribution) -> list[str]:
+    """What stands between the parentheses."""
+    if _is_truncated(prior):
+        bounds = zip(("low", "high"), support_bounds(prior), strict=True)
+        said = [f"{key}={bound:g}" for key, bound in bounds if math.isfinite(bound)]
+        return _arguments(prior.base_dist) + said
+    if isinstance(prior, dist.MixtureSameFamily | dist.MixtureGeneral):
+        same = isinstance(prior, dist.MixtureSameFamily)
+        parts = [prior.component_distribution] if same else prior.component_distributions
+        return [
+            f"weights={_text(np.asarray(prior.mixing_distribution.probs))}",
+            *map(_description, parts),
+        ]
+    if isinstance(prior, dist.TransformedDistribution) and not prior.arg_constraints:
+        steps = (f"{type(step).__name__}({_fields(vars(step))})" for step in prior.transforms)
+        return [_description(prior.base_dist), *steps]
+    return [_fields({key: getattr(prior, key, None) for key in prior.arg_constraints})]
+
+
+def _fields(values: Mapping[str, object]) -> str:
+    """What of these is numbers, as `loc=1, scale=2`."""
+    numbers = {
+        key: np.asarray(value)
+        for key, value in values.items()
+        if not key.startswith("_") and np.asarray(value).dtype.kind in "iuf"
+    }
+    return ", ".join(f"{key}={_text(number)}" for key, number in numbers.items())
+
+
+def _is_truncated(prior: dist.Distribution) -> bool:
+    return isinstance(
+        prior,
+        dist.LeftTruncatedDistribution
+        | dist.RightTruncatedDistribution
+        | dist.TwoSidedTruncatedDistribution,
+    )
+
+
+def _text(numbers: np.ndarray) -> str:
+    """A number in six digits, a short list in brackets, a longer one by its shape."""
+    if numbers.size == 1:
+        return f"{numbers.item():g}"
+    if numbers.ndim == 1 and numbers.size <= 8:
+        return f"[{', '.join(f'{number:g}' for number in numbers)}]"
+    return f"<array {numbers.shape}>"
+
+
+# --- What is believed before any data: one NumPyro distribution for every named parameter ---------
+
+
+class Beta(dist.Beta):
+    """The Beta distribution, two Python numbers until it is used."""
+
+    # NumPyro's own turns them into an array at once, in the precision of that moment: a table of
+    # priors would start the array library on import and stay in single precision for ever.
+
+    def __init__(
+        self,
+        concentration1: float,
+        concentration0: float,
+        *,
+        validate_args: bool | None = None,
+    ) -> None:
+        self.concentration1, self.concentration0 = concentration1, concentration0
+        dist.Distribution.__init__(self, validate_args=validate_args)
+
+    @override
+    def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
+        return dist.Beta(self.concentration1, self.concentration0).sample(key, sample_shape)
+
+    @override
+    def log_prob(self, value: Array) -> Array:
+        return dist.Beta(self.concentration1, self.concentration0).log_prob(value)
+
+
+class Priors(dict[str, dist.Distribution]):
+    """A dictionary of priors that a notebook shows with their numbers."""
+
+    def _repr_html_(self) -> str:
+        rows = tuple((n, notation(n).meaning, describe_prior(x)) for n, x in self.items())
+        return Card("Priors", (), (Grid(("parameter", "meaning", "prior"), rows),))._repr_html_()
+
+
+_ROWS: dict[str, dist.Distribution] = {
+    # The material: the paper, section 2.
+    "roughness": dist.HalfNormal(0.2),
+    "subsurface_fraction": Beta(2.0, 2.0),
+    "absorption": dist.LogNormal(-1.0, 0.5),
+    "refractive_index": dist.TruncatedNormal(1.45, 0.15, low=1.2, high=2.0),
+    # The material, in scenes with more parts: a second roughness, a body's own color, a law of
+    # dispersion (for lengths in micrometers), a coat, a film (nm).
+    "roughness_across": dist.HalfNormal(0.2),
+    "roughness_azimuth": dist.Normal(0.0, 45.0),
+    "albedo": Beta(2.0, 2.0),
+    "polarized_fraction": Beta(2.0, 2.0),
+    "cauchy_a": dist.TruncatedNormal(1.44, 0.15, low=1.2, high=2.0),
+    "cauchy_b": dist.LogNormal(math.log(0.005), 0.5),
+    "sellmeier_strength": dist.TruncatedNormal(1.05, 0.4, low=0.4, high=3.0),
+    "sellmeier_resonance": dist.TruncatedNormal(0.011, 0.004, low=0.0, high=0.03),
+    "coat_refractive_index": dist.TruncatedNormal(1.5, 0.05, low=1.2, high=2.0),
+    "coat_absorbance": dist.HalfNormal(0.2),
+    "film_refractive_index": dist.TruncatedNormal(1.45, 0.1, low=1.2, high=2.0),
+    "film_thickness": dist.LogNormal(math.log(200.0), 0.7),
+    # How far the normal leans from the stated one: that of a sample laid down by eye.
+    "normal_tilt_x": dist.Normal(0.0, 2.0),
+    "normal_tilt_y": dist.Normal(0.0, 2.0),
+    # Populations of materials or patches (models/hierarchical.py): the paper, section 2, for the
+    # index; for the others the location is believed as one material is, and two members may well
+    # differ by half a unit of log or log odds.
+    "roughness_location": dist.HalfNormal(0.2),
+    "roughness_spread": dist.HalfNormal(0.5),
+    "subsurface_fraction_location": Beta(2.0, 2.0),
+    "subsurface_fraction_spread": dist.HalfNormal(0.5),
+    "absorption_location": dist.LogNormal(-1.0, 0.5),
+    "absorption_spread": dist.HalfNormal(0.5),
+    "refractive_index_location": dist.TruncatedNormal(1.45, 0.2, low=1.2, high=2.0),
+    "refractive_index_spread": dist.HalfNormal(0.1),
+    # Spectra (models/gp_spectral.py). The level is believed as one color is. Of 58 measured
+    # dielectrics, n(450 nm) - n(650 nm) is .011 in the median, and .006 to .029 for nine in ten;
+    # amplitudes of .02 to .03 and lengths of 300 to 400 nm explain them best. The presets' log a
+    # varies by 0 to 1 over the visible, in bands of pigments some tens of nm wide.
+    "refractive_index_level": dist.TruncatedNormal(1.45, 0.15, low=1.2, high=2.0),
+    "refractive_index_level_location": dist.TruncatedNormal(1.45, 0.2, low=1.2, high=2.0),
+    "refractive_index_level_spread": dist.HalfNormal(0.1),
+    "refractive_index_amplitude": dist.LogNormal(math.log(0.02), 0.7),
+    "refractive_index_length": dist.LogNormal(math.log(300.0), 0.5),
+    "absorption_level": dist.LogNormal(-1.0, 0.5),
+    "absorption_level_location": dist.LogNormal(-1.0, 0.5),
+    "absorption_level_spread": dist.HalfNormal(0.5),
+    "absorption_amplitude": dist.LogNormal(math.log(0.5), 0.5),
+    "absorption_length": dist.LogNormal(math.log(60.0), 0.5),
+    # The instrument: what a careful set-up leaves unknown.
+    "dolp_gain": Beta(10.0, 1.5),
+    "channel_gain_ratio": dist.LogNormal(0.0, 0.1),
+    "leakage": HalfNormal(0.01),
+    "dark_level": dist.Normal(0.0, 0.001),
+    "angle_zero": dist.Normal(0.0, 0.75),
+    "beam_overlap_zenith": dist.TruncatedNormal(80.0, 5.0, low=45.0, high=89.0),
+    # No set-up is free of smooth errors of some percent: a prior that allows none would let a
+    # few lucky readings claim an accuracy that no goniometer has.
+    "discrepancy_amplitude": dist.LogNormal(math.log(0.08), 0.5),
+    "discrepancy_weights": dist.Normal(0.0, 1.0).expand([4]).to_event(1),
+    # The noise: scales that the data themselves determine. None may reach zero: where the scene
+    # can match a few readings exactly, a scale of zero would have infinite posterior density.
+    "concentration_scale": dist.LogNormal(math.log(200.0), 1.0),
+    "logit_scale": dist.LogNormal(math.log(0.15), 1.0),
+    "normal_scale": dist.LogNormal(math.log(0.03), 1.0),
+    "stokes_scale": dist.LogNormal(math.log(0.01), 1.0),
+    "stokes_error_factor": dist.LogNormal(math.log(1.5), 0.7),
+    "exposure": dist.LogNormal(0.0, 3.0),
+    "intensity_scale": dist.LogNormal(math.log(0.02), 1.0),
+}
+
+PRIORS = Priors(_ROWS)
+"""What is believed before any data, by the name of the parameter."""
+
+RANGES: dict[str, tuple[float, float]] = {
+    "roughness": (0.0, math.inf),
+    "subsurface_fraction": (0.0, 1.0),
+    "absorption": (0.0, math.inf),
+    "refractive_index": (1.0, math.inf),
+    "roughness_across": (0.0, math.inf),
+    "albedo": (0.0, 1.0),
+    "polarized_fraction": (0.0, 1.0),
+    "cauchy_a": (1.0, math.inf),
+    "cauchy_b": (0.0, math.inf),
+    "sellmeier_strength": (0.0, math.inf),
+    "sellmeier_resonance": (0.0, 0.1),
+    "coat_refractive_index": (1.0, math.inf),
+    "coat_absorbance": (0.0, math.inf),
+    "film_refractive_index": (1.0, math.inf),
+    "film_thickness": (0.0, math.inf),
+    "roughness_location": (0.0, math.inf),
+    "roughness_spread": (0.0, math.inf),
+    "subsurface_fraction_location": (0.0, 1.0),
+    "subsurface_fraction_spread": (0.0, math.inf),
+    "absorption_location": (0.0, math.inf),
+    "absorption_spread": (0.0, math.inf),
+    "refractive_index_location": (1.0, math.inf),
+    "refractive_index_spread": (0.0, math.inf),
+    "refractive_index_level": (1.0, math.inf),
+    "refractive_index_level_location": (1.0, math.inf),
+    "refractive_index_level_spread": (0.0, math.inf),
+    "refractive_index_amplitude": (0.0, math.inf),
+    "refractive_index_length": (0.0, math.inf),
+    "absorption_level": (0.0, math.inf),
+    "absorption_level_location": (0.0, math.inf),
+    "absorption_level_spread": (0.0, math.inf),
+    "absorption_amplitude": (0.0, math.inf),
+    "absorption_length": (0.0, math.inf),
+    "dolp_gain": (0.0, 1.0),
+    "beam_overlap_zenith": (0.0, 90.0),
+    "channel_gain_ratio": (0.0, math.inf),
+    "leakage": (0.0, math.inf),
+    "discrepancy_amplitude": (0.0, math.inf),
+    "concentration_scale": (0.0, math.inf),
+    "logit_scale": (0.0, math.inf),
+    "normal_scale": (0.0, math.inf),
+    "stokes_scale": (0.0, math.inf),
+    "stokes_error_factor": (0.0, math.inf),
+    "exposure": (0.0, math.inf),
+    "intensity_scale": (0.0, math.inf),
+}
+"""Physical range of a parameter; one that is not listed may take any real value."""
+
+
+# --- Which prior each parameter of a model gets, and which ones are refused -----------------------
+
+
+class PriorTable(Mapping[str, dist.Distribution]):
+    """The priors that a model may read: the table with a caller's replacements."""
+
+    # It notes which names are read, so that a model need not list its parameters.
+
+    def __init__(self, overrides: Mapping[str, dist.Distribution] | None = None) -> None:
+        if not isinstance(overrides, Mapping | None):
+            raise FitError(
+                f"a {type(overrides).__name__} does not name what it replaces",
+                where="priors",
+                mend="give a mapping such as {'roughness': HalfNormal(0.1)}",
+            )
+        self._rows = {**PRIORS, **(overrides or {})}
+        self._read: dict[str, None] = {}
+
+    @property
+    def read(self) -> tuple[str, ...]:
+        """The names that were read so far, in that order."""
+        return tuple(self._read)
+
+    @override
+    def __getitem__(self, name: str) -> dist.Distribution:
+        return in_this_precision(self.row(name))
+
+    def row(self, name: str) -> dist.Distribution:
+        """The prior as it was given."""
+        if name not in self._rows:
+            raise FitError(
+                "this parameter has no prior",
+                where=f"priors[{name!r}]",
+                mend=f"give one: priors={{{name!r}: <a NumPyro distribution>}}",
+            )
+        self._read[name] = None
+        return self._rows[name]
+
+    @override
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    @override
+    def __len__(self) -> int:
+        return len(self._rows)
+
+
+def in_this_precision(prior: dist.Distribution) -> dist.Distribution:
+    """A copy of a prior in the floating type of this fit."""
+    # Distributions keep what they have computed once, in the precision of that day; a copy made
+    # from their arguments alone does not.
+
+    def convert(argument: object) -> object:
+        if hasattr(argument, "dtype") and jnp.issubdtype(argument.dtype, jnp.floating):
+            return jnp.asarray(np.asarray(argument).astype(jnp.result_type(float)))
+        return argument
+
+    return jax.tree.map(convert, prior)
+
+
+def resolve_priors(
+    parameters: Iterable[str], overrides: Mapping[str, dist.Distribution] | None = None
+) -> dict[str, dist.Distribution]:
+    """The prior of every parameter that a model reads."""
+    parameters = tuple(parameters)
+    table = PriorTable(overrides)
+    for name, prior in (overrides or {}).items():
+        _check_override(str(name), prior, parameters)
+    return {name: table.row(name) for name in parameters}
+
+
+def check_support(name: str, prior: dist.Distribution, where: str) -> None:
+    """Refuse a distribution that allows values outside the physical range of its parameter."""
+    least, most = RANGES.get(name, (-math.inf, math.inf))
+    try:
+        low, high = support_bounds(prior)
+    except jax.errors.ConcretizationTypeError:
+        return  # bounds that depend on other parameters are known only when it runs
+    if low < least or high > most:
+        raise FitError(
+            f"{type(prior).__name__} allows values outside {least:g} to {most:g}",
+            where=where,
+            mend=_in_range(least, most),
+        )
+
+
+def _in_range(least: float, most: float) -> str:
+    """What to give instead, in words."""
+    if (least, most) == (0.0, 1.0):
+        return "give a Beta distribution, or a truncated one"
+    if least == 0.0 and math.isinf(most):
+        return "give a HalfNormal or LogNormal distribution"
+    bound = f"low={least:g}" if math.isinf(most) else f"low={least:g}, high={most:g}"
+    return f"truncate it, for example TruncatedNormal(..., {bound})"
+
+
+def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> None:
+    where = f"priors[{name!r}]"
+    if name not in parameters:
+        near = difflib.get_close_matches(name, parameters, n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise FitError(
+            "no such parameter in this model",
+            where=where,
+            mend=f"{hint}the parameters are {', '.join(parameters)}",
+        )
+    if not isinstance(prior, dist.Distribution):
+        raise FitError(
+            f"a {type(prior).__name__} is not a NumPyro distribution",
+            where=where,
+            mend="give an object such as numpyro.distributions.Normal(0.0, 1.0)",
+        )
+    _check_shape(name, prior, where)
+    check_support(name, prior, where)
+
+
+def _check_shape(name: str, prior: dist.Distribution, where: str) -> None:
+    """Refuse what would be repeated over the wrong axes, or cannot be differentiated."""
+    if prior.support.is_discrete:
+        raise FitError(
+            f"{type(prior).__name__} is discrete, and samplers follow gradients",
+            where=where,
+            mend="give a continuous distribution",
+        )
+    usual = PRIORS.get(name)
+    if usual is None:
+        return  # a parameter of the user's own has the shape that its reader expects
+    if len(prior.event_shape) != len(usual.event_shape):
+        to_event = "one number" if not usual.event_shape else "a vector: use .expand([n])"
+        raise FitError(
+            f"one draw of it has shape {tuple(prior.event_shape)}",
+            where=where,
+            mend=f"give a distribution of {to_event}{'.to_event(1)' if usual.event_shape else ''}",
+        )
+    if prior.batch_shape and prior.batch_shape[-1] != 1:
+        raise FitError(
+            f"it is {prior.batch_shape[-1]} distributions side by side",
+            where=where,
+            mend="give one, or one per wavelength in shape (wavelength, 1): views share it",
+        )

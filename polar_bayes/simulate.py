@@ -1,0 +1,520 @@
+"""Materials to simulate: plausible values, not measurements.
+
+Refractive indices at 450, 550 and 650 nm follow published dispersion (water, BK7 glass and PMMA
+to 0.002); a leaf absorbs blue and red and leaves green, a ripe fruit leaves red.
+
+A value is one number, one for each wavelength, or an image (y, x): its rank says which.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+
+from polar_bayes.capture.schema import validate
+from polar_bayes.errors import CaptureError, FitError, SceneError
+from polar_bayes.observation.data import Observations
+from polar_bayes.observation.links import AbstractLink, noise_parameters
+from polar_bayes.physics.geometry import Geometry
+from polar_bayes.physics.part import notation
+from polar_bayes.physics.scene import Scene
+from polar_bayes.priors import RANGES
+from polar_bayes.setups import SETUPS, Setup, find_setup
+
+REFERENCE_WAVELENGTHS = (450.0, 550.0, 650.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Material:
+    """The truth about one material.
+
+    Args:
+        roughness: Microfacet roughness, unit 1.
+        subsurface_fraction: Share of the subsurface, unit 1, range [0, 1].
+        absorption: Absorption relative to scattering at the reference wavelengths, unit 1.
+        refractive_index: At the reference wavelengths, unit 1.
+    """
+
+    roughness: float
+    subsurface_fraction: float
+    absorption: tuple[float, float, float]
+    refractive_index: tuple[float, float, float]
+
+    def at(self, wavelengths: np.ndarray) -> dict[str, np.ndarray]:
+        """The parameters at any wavelengths, interpolated; the ends continue unchanged.
+
+        Args:
+            wavelengths: (wavelength,), unit nm.
+
+        Returns:
+            Scalars for what color does not change, (wavelength,) for the rest.
+        """
+
+        def spectral(values: tuple[float, ...]) -> np.ndarray:
+            return np.interp(wavelengths, REFERENCE_WAVELENGTHS, values)
+
+        return {
+            "roughness": np.asarray(self.roughness),
+            "subsurface_fraction": np.asarray(self.subsurface_fraction),
+            "absorption": spectral(self.absorption),
+            "refractive_index": spectral(self.refractive_index),
+        }
+
+
+PRESETS: Mapping[str, Material] = MappingProxyType(
+    {
+        "leaf": Material(0.20, 0.45, (1.20, 0.25, 0.90), (1.448, 1.440, 1.435)),
+        "fruit": Material(0.12, 0.40, (1.00, 0.60, 0.15), (1.418, 1.410, 1.405)),
+        "plastic": Material(0.10, 0.30, (0.30, 0.30, 0.30), (1.501, 1.494, 1.490)),
+        "coating": Material(0.06, 0.20, (0.60, 0.50, 0.45), (1.524, 1.515, 1.510)),
+        "glass": Material(0.03, 0.05, (0.20, 0.20, 0.20), (1.525, 1.519, 1.515)),
+        "water": Material(0.05, 0.15, (0.15, 0.20, 0.60), (1.338, 1.334, 1.331)),
+    }
+)
+
+
+def find_preset(name: str) -> Material:
+    """The material of that name."""
+    if not isinstance(name, str) or name not in PRESETS:
+        raise CaptureError(
+            "no such material", where=f"preset={name!r}", mend=f"give one of {', '.join(PRESETS)}"
+        )
+    return PRESETS[name]
+
+
+# --- Where to look from: the paper's protocol of about 40 views -----------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """Views on rings of azimuth, with the light fixed.
+
+    Args:
+        views: How many, at least 2.
+        largest_view_zenith: Unit degree, range (0, 90).
+        azimuths: View azimuths; 180 is the mirror side of a light at azimuth 0. Unit degree.
+        light_zenith: Unit degree, range [0, 90).
+        wavelengths: Unit nm; empty for a capture without color.
+
+    Raises:
+        CaptureError: A value is outside its range.
+    """
+
+    views: int = 40
+    largest_view_zenith: float = 85.0
+    azimuths: tuple[float, ...] = (180.0, 150.0, 120.0, 60.0)
+    light_zenith: float = 45.0
+    wavelengths: tuple[float, ...] = (450.0, 550.0, 650.0)
+
+    def __post_init__(self) -> None:
+        checks = {
+            "views": (
+                isinstance(self.views, int) and 2 <= self.views <= 100_000,
+                "give a whole number from 2 to 100000",
+            ),
+            "largest_view_zenith": (
+                0.0 < self.largest_view_zenith < 90.0,
+                "give degrees above 0 and below 90",
+            ),
+            "light_zenith": (0.0 <= self.light_zenith < 90.0, "give degrees from 0 to below 90"),
+            "azimuths": (
+                len(self.azimuths) > 0 and all(abs(a) <= 360.0 for a in self.azimuths),
+                "give at least one, each from -360 to 360 degrees",
+            ),
+            "wavelengths": (
+                all(0.0 < w < 1e6 for w in self.wavelengths),
+                "give nanometers above zero",
+            ),
+        }
+        for name, (holds, mend) in checks.items():
+            if not holds:
+                raise CaptureError(f"{name} is {getattr(self, name)}", where="Protocol", mend=mend)
+
+    def angles(self) -> dict[str, np.ndarray]:
+        """Directions of every view.
+
+        Returns:
+            view_zenith, view_azimuth, light_zenith and light_azimuth, each (view,), in degree.
+            The zeniths step evenly from near the normal to the largest, the azimuths in turn, so
+            that every azimuth sees the whole range.
+        """
+        steps = np.arange(1, self.views + 1) / self.views
+        azimuths = np.resize(np.asarray(self.azimuths, float), self.views)
+        return {
+            "view_zenith": steps * self.largest_view_zenith,
+            "view_azimuth": azimuths,
+            "light_zenith": np.full(self.views, self.light_zenith),
+            "light_azimuth": np.zeros(self.views),
+        }
+
+
+# --- What a simulated capture is drawn from: parameters and noise, checked, and the image they spa
+
+
+NEUTRAL: Mapping[str, np.ndarray] = {
+    "dolp_gain": np.asarray(1.0),
+    "channel_gain_ratio": np.asarray(1.0),
+    "leakage": np.asarray(0.0),
+    "dark_level": np.asarray(0.0),
+    "angle_zero": np.asarray(0.0),
+    "beam_overlap_zenith": np.asarray(90.0),
+    "discrepancy_amplitude": np.asarray(0.0),
+    "discrepancy_weights": np.zeros(4),
+    "normal_tilt_x": np.asarray(0.0),
+    "normal_tilt_y": np.asarray(0.0),
+}
+"""A perfect instrument and a level sample, by the names of the terms' parameters."""
+
+Value = float | np.ndarray
+
+
+def checked_parameters(
+    scene: Scene, material: Material, wavelengths: np.ndarray, overrides: Mapping[str, Value]
+) -> dict[str, np.ndarray]:
+    """A value for every parameter of the scene."""
+    unknown = set(overrides) - set(scene.parameters)
+    if unknown:
+        raise SceneError(
+            f"the scene has no parameter {', '.join(sorted(unknown))}",
+            where="simulate: parameters",
+            mend=f"give any of {', '.join(scene.parameters)}",
+        )
+    known = material.at(wavelengths if wavelengths.size else np.asarray(550.0))
+    given = {name: _numbers(_parameter(name), value) for name, value in overrides.items()}
+    available = {**NEUTRAL, **known, **given}
+    missing = [name for name in scene.parameters if name not in available]
+    if missing:
+        raise SceneError(
+            f"no value for {', '.join(missing)}",
+            where="simulate: parameters",
+            mend=f"give parameters={{{missing[0]!r}: <a number>}}",
+        )
+    truth = {name: available[name] for name in scene.parameters}
+    for name, value in truth.items():
+        where = _parameter(name)
+        _check_range(where, name, value)
+        if is_vector(name):
+            _check_shape(where, value, value.ndim <= 1, "give one number for each function")
+            continue
+        color = wavelengths.size > 0 and value.shape == wavelengths.shape
+        each = f", or one per wavelength ({wavelengths.size})" if wavelengths.size else ""
+        mend = f"give one number{each}, or an image (y, x)"
+        _check_shape(where, value, color or _is_number_or_image(value), mend)
+    return truth
+
+
+def checked_noise(
+    links: Mapping[str, AbstractLink], usual: Mapping[str, float], overrides: Mapping[str, Value]
+) -> dict[str, np.ndarray | None]:
+    """A value for every noise parameter of the links."""
+    parameters = noise_parameters(links)
+    unknown = set(overrides) - set(parameters)
+    if unknown:
+        raise FitError(
+            f"no link reads {', '.join(sorted(unknown))}",
+            where="simulate: noise",
+            mend=f"give any of {', '.join(parameters)}",
+        )
+    given: dict[str, Value | None] = {"exposure": None, **usual, **overrides}
+    levels: dict[str, np.ndarray | None] = {}
+    for name in parameters:
+        where = f"simulate: noise[{name!r}]"
+        if name not in given:
+            raise FitError(
+                "it has no value", where=where, mend=f"give noise={{{name!r}: <number>}}"
+            )
+        value = given[name]
+        if value is None:
+            levels[name] = None
+            continue
+        level = levels[name] = _numbers(where, value)
+        _check_range(where, name, level, above=True)
+        mend = "give one number, or an image (y, x)"
+        _check_shape(where, level, _is_number_or_image(level), mend)
+    return levels
+
+
+def image_of(
+    parameters: Mapping[str, np.ndarray], noise: Mapping[str, np.ndarray | None]
+) -> tuple[int, ...]:
+    """The image that parameters and noise span together."""
+    named = [(f"parameters[{name!r}]", value) for name, value in parameters.items()]
+    named += [(f"noise[{name!r}]", level) for name, level in noise.items() if level is not None]
+    images = [(name, value.shape) for name, value in named if value.ndim == 2]
+    for name, shape in images[1:]:
+        first, expected = images[0]
+        if shape != expected:
+            raise CaptureError(
+                f"its shape is {shape} and that of {first} is {expected}",
+                where=f"simulate: {name}",
+                mend="give images (y, x) of one shape",
+            )
+    return images[0][1] if images else ()
+
+
+def is_vector(name: str) -> bool:
+    """True of a parameter that has an axis of its own, for which a capture has no dim."""
+    return np.ndim(NEUTRAL.get(name, 0.0)) > 0
+
+
+def _parameter(name: str) -> str:
+    return f"simulate: parameters[{name!r}]"
+
+
+def _numbers(where: str, value: Value) -> np.ndarray:
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise CaptureError(
+            "it is no array of numbers",
+            where=where,
+            mend="give a number, or rows of numbers that are equally long",
+        ) from None
+
+
+def _is_number_or_image(value: np.ndarray) -> bool:
+    return value.ndim == 0 or (value.ndim == 2 and value.size > 0)
+
+
+def _check_shape(where: str, value: np.ndarray, fits: bool, mend: str) -> None:
+    if not fits:
+        raise CaptureError(f"its shape is {value.shape}", where=where, mend=mend)
+
+
+def _check_range(where: str, name: str, value: np.ndarray, *, above: bool = False) -> None:
+    """Refuse what is outside the physical range; with `above`, its lower end as well."""
+    low, high = RANGES.get(name, (-np.inf, np.inf))
+    inside = np.isfinite(value) & ((value > low) if above else (value >= low)) & (value <= high)
+    if not inside.all():
+        sign = "<" if above else "<="
+        raise CaptureError(
+            f"{value[~inside].flat[0]:g} is outside {low:g} {sign} value <= {high:g}",
+            where=where,
+            mend="give a finite number in that range",
+        )
+
+
+# --- Captures of known truth: the forward story of a model, told without data ---------------------
+
+
+NOISE: Mapping[str, float] = {
+    "concentration_scale": 300.0,
+    "logit_scale": 0.15,
+    "normal_scale": 0.02,
+    "stokes_scale": 0.01,
+    "stokes_error_factor": 1.0,
+    "intensity_scale": 0.01,
+}
+"""Noise of a careful laboratory capture, by the names of the links' parameters."""
+
+IMAGE = ("y", "x")
+
+STATED_ERROR = 0.01
+"""Standard error that the instrument states of every reading, for the links that read it."""
+
+FULL_SCALE = 1.0
+BRIGHT_QUANTILE = 0.9
+BRIGHT_LEVEL = 0.6
+"""Exposure puts the 90% brightest view at 60% of full scale; a specular lobe may saturate."""
+
+
+def simulate(
+    preset: str | Material = "leaf",
+    *,
+    scene: str | Scene = "paper",
+    links: Mapping[str, AbstractLink] | None = None,
+    protocol: Protocol | None = None,
+    parameters: Mapping[str, float | np.ndarray] | None = None,
+    noise: Mapping[str, float | np.ndarray] | None = None,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Draw a capture of a known material, or an image of many.
+
+    It is an image as soon as one value has shape (y, x): every pixel is then seen from the same
+    directions and draws noise of its own. All are predicted at once, which takes about 1 kB for
+    each reading of a smooth scene and 2 kB of the paper's: 100,000 pixels at 12 views are 1 to 2
+    GB. Larger ones are drawn some rows at a time, with a stated exposure and a seed for each part.
+
+    Args:
+        preset: A name in `PRESETS` or a `Material`.
+        scene: A name in `SETUPS` or a `Scene`.
+        links: How each variable scatters; by default those of the scene's set-up.
+        protocol: Where to look from; the paper's by default.
+        parameters: Values that replace the preset's, and those of instrument terms (which are
+            otherwise 0 for offsets and 1 for gains); shape (), (wavelength,) or (y, x).
+        noise: Values that replace those of `NOISE`; shape () or (y, x). `exposure` is otherwise
+            one number, chosen so that the brighter views come to 60% of full scale.
+        seed: The same seed gives the same capture.
+
+    Returns:
+        A validated capture with dims ([y, x,] view[, wavelength]). The truth rides along as
+        `true_<parameter>`, with dims (y, x) where it is an image; readings at full scale are
+        flagged `saturated`. Links that read stated errors find them as `<reading>_error`.
+
+    Raises:
+        CaptureError: No such preset, a seed, parameter or noise outside its range, or shapes that
+            are not told above or do not agree.
+        SceneError: No such scene, or a parameter that it does not have.
+        FitError: A link that does not describe its variable, or noise that no link reads.
+
+    Example:
+        Two glasses under uneven light. A shadow is a low exposure: polarization is noisier
+        there, where the link says so. A highlight is a high one: it saturates.
+
+        >>> index = np.array([[1.5, 1.5, 1.7, 1.7], [1.5, 1.5, 1.7, 1.7]])
+        >>> light = np.array([[0.5, 10.0, 10.0, 10.0], [10.0, 10.0, 10.0, 500.0]])
+        >>> image = pb.simulate(
+        ...     "glass",
+        ...     scene=pb.Scene(pb.SmoothSurface()),
+        ...     protocol=pb.Protocol(views=5, wavelengths=()),
+        ...     parameters={"refractive_index": index},
+        ...     noise={"exposure": light},
+        ... )
+    """
+    protocol = protocol or Protocol()
+    setup = Setup(scene, SETUPS["paper"].links) if isinstance(scene, Scene) else find_setup(scene)
+    links = _checked_links(setup.links if links is None else links)
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**32:
+        raise CaptureError(
+            f"seed is {seed!r}", where="simulate", mend="give an integer from 0 to 2**32 - 1"
+        )
+    material = preset if isinstance(preset, Material) else find_preset(preset)
+    wavelengths = np.asarray(protocol.wavelengths, float)
+    truth = checked_parameters(setup.scene, material, wavelengths, parameters or {})
+    levels = checked_noise(links, NOISE, noise or {})
+    image = image_of(truth, levels)
+    with jax.enable_x64(True):
+        recorded = _record(setup.scene, links, _blank(protocol, links, image), truth, levels, seed)
+    name = preset if isinstance(preset, str) else "simulated"
+    attributes: dict[str, str | int] = {"name": name, "seed": seed}
+    if isinstance(scene, str):  # a fit then takes the same set-up unless told otherwise
+        attributes["setup"] = scene
+    return _label(recorded, protocol, IMAGE if image else (), truth, attributes)
+
+
+def _checked_links(links: Mapping[str, AbstractLink]) -> dict[str, AbstractLink]:
+    if not isinstance(links, Mapping) or not links:
+        raise FitError(
+            "that is no set of links",
+            where="simulate: links",
+            mend="give a mapping such as {'dop': BetaLink()}",
+        )
+    for name, link in links.items():
+        if not isinstance(link, AbstractLink) or name not in link.observables:
+            raise FitError(
+                f"{link!r} does not describe {name}",
+                where=f"simulate: links[{name!r}]",
+                mend="give a link that names it in `observables`, such as {'dop': BetaLink()}",
+            )
+    return dict(links)
+
+
+def _record(
+    scene: Scene,
+    links: Mapping[str, AbstractLink],
+    blank: Observations,
+    truth: Mapping[str, np.ndarray],
+    noise: Mapping[str, np.ndarray | None],
+    seed: int,
+) -> dict[str, np.ndarray]:
+    """Readings with the dims of `blank`: intensity first, since noise depends on it."""
+    key_intensity, key_rest = jax.random.split(jax.random.key(seed))
+    axes = len(blank.shape)
+    parameters = {name: jnp.asarray(_in_front(x, axes - 1)) for name, x in truth.items()}
+    prediction = scene.predict(parameters, blank.geometry)
+    prediction = {n: jnp.broadcast_to(x, blank.shape) for n, x in prediction.items()}
+    exposure = BRIGHT_LEVEL / jnp.quantile(prediction["intensity"], BRIGHT_QUANTILE)
+    levels = {
+        name: exposure if level is None else jnp.asarray(_in_front(level, axes))
+        for name, level in noise.items()
+    }
+    recorded: dict[str, Array] = {}
+    data = blank
+    if "intensity" in links:
+        link = links["intensity"]
+        intensity = link.distribution("intensity", prediction, blank, levels).sample(key_intensity)
+        intensity = jnp.clip(intensity, 0.0, FULL_SCALE)
+        recorded["intensity"] = intensity
+        recorded["saturated"] = intensity >= FULL_SCALE
+        data = _with_intensity(blank, intensity, recorded["saturated"])
+    for name, key in zip(links, jax.random.split(key_rest, len(links)), strict=True):
+        if name != "intensity":
+            recorded[name] = links[name].distribution(name, prediction, data, levels).sample(key)
+    recorded |= _possible(recorded)
+    for name in (name for name, link in links.items() if link.reads_errors):
+        recorded[f"{name}_error"] = blank.errors[name]
+    return {name: np.asarray(value) for name, value in recorded.items()}
+
+
+def _in_front(value: np.ndarray, axes: int) -> np.ndarray:
+    """An image with axes of length 1 behind it, so many in all; other values as they are."""
+    return value.reshape(value.shape + (1,) * (axes - 2)) if value.ndim == 2 else value
+
+
+def _possible(recorded: Mapping[str, Array]) -> dict[str, Array]:
+    """The polarization as an instrument reports it: noise carries it no further than fully."""
+    stokes = {name: recorded[name] for name in ("q", "u") if name in recorded}
+    length = jnp.sqrt(sum(value**2 for value in stokes.values()))
+    possible = {name: value / jnp.maximum(length, 1.0) for name, value in stokes.items()}
+    if "dop" in recorded:
+        possible["dop"] = jnp.clip(recorded["dop"], 0.0, 1.0)
+    return possible
+
+
+def _blank(
+    protocol: Protocol, links: Mapping[str, AbstractLink], image: tuple[int, ...]
+) -> Observations:
+    """The layout of the capture before anything was recorded."""
+    dims: tuple[tuple[str, int], ...] = (("view", protocol.views),)
+    if protocol.wavelengths:
+        dims = (("wavelength", len(protocol.wavelengths)), *dims)
+    if image:
+        dims = (*zip(IMAGE, image, strict=True), *dims)
+    shape = tuple(length for _, length in dims)
+    angles = {name: jnp.asarray(angle) for name, angle in protocol.angles().items()}
+    colors = jnp.asarray(protocol.wavelengths)[:, None] if protocol.wavelengths else None
+    return Observations(
+        geometry=Geometry.from_degrees(**angles, wavelength=colors),
+        readings={},
+        errors={name: jnp.full(shape, STATED_ERROR) for name in links},
+        brightness=jnp.ones(shape),
+        full_scale=jnp.asarray(FULL_SCALE),
+        intensity_unit=jnp.asarray(1.0),
+        valid=jnp.ones(shape, bool),
+        saturated=jnp.zeros(shape, bool),
+        dims=dims,
+    )
+
+
+def _with_intensity(data: Observations, intensity: Array, saturated: Array) -> Observations:
+    brightness = jnp.clip(intensity / FULL_SCALE, 0.0, 1.0)
+    return dataclasses.replace(data, brightness=brightness, saturated=saturated)
+
+
+def _label(
+    recorded: Mapping[str, np.ndarray],
+    protocol: Protocol,
+    leading: tuple[str, ...],
+    truth: Mapping[str, np.ndarray],
+    attributes: Mapping[str, str | int],
+) -> xr.Dataset:
+    dims = (*leading, *(("wavelength",) if protocol.wavelengths else ()), "view")
+    capture = xr.Dataset(
+        {name: ("view", angle) for name, angle in protocol.angles().items()}, attrs=attributes
+    )
+    for name, value in recorded.items():
+        capture[name] = (dims, value)
+    for name, value in truth.items():
+        if not is_vector(name):
+            units = {"units": notation(name).unit}
+            capture[f"true_{name}"] = (((), ("wavelength",), IMAGE)[value.ndim], value, units)
+    if protocol.wavelengths:
+        capture = capture.assign_coords(wavelength=np.asarray(protocol.wavelengths, float))
+    if "intensity" in capture:
+        capture["intensity"].attrs["saturation_level"] = FULL_SCALE
+    return validate(capture, source="simulate")

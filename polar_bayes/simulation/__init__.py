@@ -1,1 +1,0 @@
-"""Captures of known truth, drawn from the same scene and links that a fit uses."""
