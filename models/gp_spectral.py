@@ -37,13 +37,13 @@ from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import support_bounds
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 OF_A_PATCH = ("wavelength", "view")
 
 
 @dataclasses.dataclass(frozen=True)
-class GpSpectral(Carded):
+class GpSpectral(HTMLRepr):
     """Spectra of one material, or of many patches, as Gaussian processes over wavelength.
 
     Args:

@@ -35,7 +35,7 @@ from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.priors import RANGES, support_bounds
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 # --- Pooling: a parameter of many patches drawn from one population (the paper's section 2) -------
 
@@ -184,14 +184,14 @@ def check_pooled(pooled: object, *, where: str) -> None:
         raise FitError(
             f"pooled={pooled!r} is no tuple of names",
             where=where,
-            mend="write pooled=('refractive_index',), with the comma",
+            hint="write pooled=('refractive_index',), with the comma",
         )
     for name in pooled:
         if name not in MATERIAL_PARAMETERS:
             raise FitError(
                 f"{name!r} is no parameter of a material",
                 where=f"{where}: pooled",
-                mend=f"name any of {', '.join(MATERIAL_PARAMETERS)}",
+                hint=f"name any of {', '.join(MATERIAL_PARAMETERS)}",
             )
 
 
@@ -203,13 +203,13 @@ def check_members(pooled: tuple[str, ...], data: Observations, scene: Scene) -> 
         raise FitError(
             f"the scene does not read {', '.join(missing)}",
             where="pooled",
-            mend=f"pool any of {', '.join(possible)}",
+            hint=f"pool any of {', '.join(possible)}",
         )
     if pooled and not any(axis not in ("wavelength", "view") for axis, _ in data.dims):
         raise FitError(
             "a population needs several members, and the capture has no axis patch or material",
             where="model",
-            mend="give captures joined by polar_bayes.combine, or use model='per_material'",
+            hint="give captures joined by polar_bayes.combine, or use model='per_material'",
         )
 
 
@@ -217,7 +217,7 @@ def check_members(pooled: tuple[str, ...], data: Observations, scene: Scene) -> 
 
 
 @dataclasses.dataclass(frozen=True)
-class Hierarchical(Carded):
+class Hierarchical(HTMLRepr):
     """Parameters of all patches drawn from common populations.
 
     Args:
@@ -235,7 +235,7 @@ class Hierarchical(Carded):
             raise FitError(
                 "nothing is pooled",
                 where="Hierarchical",
-                mend="name a parameter, or use model='per_material'",
+                hint="name a parameter, or use model='per_material'",
             )
 
     def __call__(

@@ -14,7 +14,7 @@ from tinygp import kernels
 from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
 from polar_bayes.physics.scene import Scene
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 KERNELS = ("Exp", "ExpSquared", "Matern32", "Matern52")
 """The decaying kernels of tinygp that a length says all of."""
@@ -27,7 +27,7 @@ NUGGET_OF_REMAINDER = 1e-8
 
 
 @dataclasses.dataclass(frozen=True)
-class SpectralProcess(Carded):
+class SpectralProcess(HTMLRepr):
     r"""A Gaussian process over wavelength, of unit amplitude.
 
     $$ f(\lambda) = k(\lambda, U)\, V L^{-T} w, \qquad L L^T = V^T [k(U, U) + \nu I] V, \qquad
@@ -70,19 +70,19 @@ class SpectralProcess(Carded):
             raise FitError(
                 f"there is no stationary kernel {self.kernel!r}",
                 where="SpectralProcess: kernel",
-                mend=f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length",
+                hint=f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length",
             )
         if not isinstance(self.kernel, str) and not callable(self.kernel):
             raise FitError(
                 f"a {type(self.kernel).__name__} is no kernel",
                 where="SpectralProcess: kernel",
-                mend=f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length",
+                hint=f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length",
             )
         if not isinstance(self.knots, int) or isinstance(self.knots, bool) or self.knots < 2:
             raise FitError(
                 f"knots={self.knots!r} cannot span wavelengths",
                 where="SpectralProcess",
-                mend="give a whole number from 2 on; 20 is the default",
+                hint="give a whole number from 2 on; 20 is the default",
             )
 
     @property
@@ -275,7 +275,7 @@ def check_spectra(coupled: object) -> None:
         raise FitError(
             f"coupled={coupled!r} names no spectra",
             where="GpSpectral",
-            mend=f"give a tuple of one or both of {', '.join(SPECTRA)}",
+            hint=f"give a tuple of one or both of {', '.join(SPECTRA)}",
         )
 
 
@@ -286,7 +286,7 @@ def check_processes(coupled: tuple[str, ...], process: object) -> None:
         raise FitError(
             f"process={process!r} does not say what {' and '.join(coupled)} follow",
             where="GpSpectral",
-            mend="give one SpectralProcess(), or a tuple with one for each",
+            hint="give one SpectralProcess(), or a tuple with one for each",
         )
 
 
@@ -296,11 +296,11 @@ def check_capture(coupled: tuple[str, ...], data: Observations, scene: Scene) ->
         raise FitError(
             "the capture has no axis wavelength to couple",
             where="gp_spectral",
-            mend="fit it with model='per_material', or give it the axis and a coordinate in nm",
+            hint="fit it with model='per_material', or give it the axis and a coordinate in nm",
         )
     if scene.dispersion is None and not set(coupled) & set(scene.parameters):
         raise FitError(
             f"the scene reads no {' and no '.join(coupled)}",
             where="gp_spectral",
-            mend=f"couple one of {', '.join(n for n in SPECTRA if n in scene.parameters)}",
+            hint=f"couple one of {', '.join(n for n in SPECTRA if n in scene.parameters)}",
         )

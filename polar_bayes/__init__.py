@@ -150,7 +150,7 @@ def __getattr__(name: str) -> Any:
     """Load a public name from its home (PEP 562)."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'polar_bayes' has no attribute {name!r}")
-    _wake_numpyro()
+    _force_numpyro_import()
     with _random_state_of_the_caller():
         value = getattr(importlib.import_module(f"polar_bayes.{_MODULE_OF[name]}"), name)
     globals()[name] = value
@@ -171,7 +171,7 @@ def _random_state_of_the_caller() -> Iterator[None]:
             numpy_random.set_state(numpy_state)
 
 
-def _wake_numpyro() -> None:
+def _force_numpyro_import() -> None:
     """Load NumPyro for real where ArviZ was imported first.
 
     ArviZ leaves a lazy stand-in for it; `import numpyro.infer` on a stand-in runs NumPyro twice,
@@ -186,4 +186,4 @@ def __dir__() -> list[str]:
     return __all__
 
 
-_wake_numpyro()
+_force_numpyro_import()

@@ -14,14 +14,14 @@ class PolarBayesError(ValueError):
         mend: What to do about it, as an imperative clause.
     """
 
-    def __init__(self, what: str, *, where: str, mend: str) -> None:
-        self.what, self.where, self.mend = (one_line(text) for text in (what, where, mend))
-        super().__init__(f"{self.where}: {self.what}; {self.mend}")
+    def __init__(self, what: str, *, where: str, hint: str) -> None:
+        self.what, self.where, self.hint = (one_line(text) for text in (what, where, hint))
+        super().__init__(f"{self.where}: {self.what}; {self.hint}")
 
     @override
     def __reduce__(self) -> tuple[Callable[[], "PolarBayesError"], tuple[()]]:
         # Exceptions are unpickled from `args`, which know no keywords.
-        return functools.partial(type(self), self.what, where=self.where, mend=self.mend), ()
+        return functools.partial(type(self), self.what, where=self.where, hint=self.hint), ()
 
 
 class CaptureError(PolarBayesError):

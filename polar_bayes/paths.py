@@ -30,7 +30,7 @@ def as_path(path: PathLike, what: str, error: type[PolarBayesError] = CaptureErr
     except TypeError:
         text = None
     if not isinstance(text, str) or not text or "\0" in text:
-        raise error(f"{path!r} is not a path", where=what, mend="give the path of a file")
+        raise error(f"{path!r} is not a path", where=what, hint="give the path of a file")
     return Path(text)
 
 
@@ -39,12 +39,12 @@ def existing_file(path: PathLike, what: str) -> Path:
     file = as_path(path, what)
     try:
         if not file.exists():
-            raise CaptureError("there is no such file", where=str(file), mend="check the path")
+            raise CaptureError("there is no such file", where=str(file), hint="check the path")
         if not file.is_file():
-            mend = "give the path of a file"
-            raise CaptureError("it is a folder or device", where=str(file), mend=mend)
+            hint = "give the path of a file"
+            raise CaptureError("it is a folder or device", where=str(file), hint=hint)
         if file.stat().st_size == 0:
-            raise CaptureError("the file is empty", where=str(file), mend="write it again")
+            raise CaptureError("the file is empty", where=str(file), hint="write it again")
     except OSError as error:
         raise system_error(error, file) from error
     return file
@@ -53,7 +53,7 @@ def existing_file(path: PathLike, what: str) -> Path:
 def system_error(error: OSError, path: Path) -> CaptureError:
     """What the operating system said of an input, as one line."""
     reason = (error.strerror or str(error)).lower()
-    return CaptureError(reason, where=str(path), mend="check the path, its rights and the disk")
+    return CaptureError(reason, where=str(path), hint="check the path, its rights and the disk")
 
 
 def check_output(
@@ -66,16 +66,16 @@ def check_output(
         file = given.resolve(strict=False)
         refuse_inputs(given, inputs)
         if file.is_dir():
-            raise OutputError("it is a folder", where=where, mend="give the path of a file")
+            raise OutputError("it is a folder", where=where, hint="give the path of a file")
         if file.exists() and not file.is_file():
-            raise OutputError("it is no regular file", where=where, mend="give the path of a file")
+            raise OutputError("it is no regular file", where=where, hint="give the path of a file")
         if not file.parent.is_dir():
-            raise OutputError("its folder is not there", where=where, mend="make the folder first")
+            raise OutputError("its folder is not there", where=where, hint="make the folder first")
         if file.exists() and file.stat().st_size and not replaces(file):
             raise OutputError(
                 "the file there holds something else",
                 where=where,
-                mend="give another path, or remove it first",
+                hint="give another path, or remove it first",
             )
         with tempfile.TemporaryFile(dir=file.parent):
             pass
@@ -92,7 +92,7 @@ def refuse_inputs(path: Path, inputs: Iterable[PathLike]) -> None:
             raise OutputError(
                 f"it {'lies inside' if inside else 'is'} one of the inputs",
                 where=str(path),
-                mend="give another path to write",
+                hint="give another path to write",
             )
 
 
@@ -110,13 +110,13 @@ def output_error(error: Exception, path: Path) -> OutputError:
     return OutputError(
         f"it could not be written ({reason.lower()})",
         where=str(path),
-        mend="check the path, its rights and the room on the disk",
+        hint="check the path, its rights and the room on the disk",
     )
 
 
 @contextlib.contextmanager
 def replacing(path: PathLike, replaces: Callable[[Path], bool]) -> Iterator[Path]:
-    """A path to write to, whose file takes the place of `path` when the block ends without error."""
+    """A path to write to; its file replaces `path` when the block ends without error."""
     file = check_output(path, replaces)
     with written(file), unfinished_folder(file.parent) as folder:
         yield folder / file.name

@@ -397,7 +397,7 @@ class PriorTable(Mapping[str, dist.Distribution]):
             raise FitError(
                 f"a {type(overrides).__name__} does not name what it replaces",
                 where="priors",
-                mend="give a mapping such as {'roughness': HalfNormal(0.1)}",
+                hint="give a mapping such as {'roughness': HalfNormal(0.1)}",
             )
         self._rows = {**PRIORS, **(overrides or {})}
         self._read: dict[str, None] = {}
@@ -417,7 +417,7 @@ class PriorTable(Mapping[str, dist.Distribution]):
             raise FitError(
                 "this parameter has no prior",
                 where=f"priors[{name!r}]",
-                mend=f"give one: priors={{{name!r}: <a NumPyro distribution>}}",
+                hint=f"give one: priors={{{name!r}: <a NumPyro distribution>}}",
             )
         self._read[name] = None
         return self._rows[name]
@@ -466,7 +466,7 @@ def check_support(name: str, prior: dist.Distribution, where: str) -> None:
         raise FitError(
             f"{type(prior).__name__} allows values outside {least:g} to {most:g}",
             where=where,
-            mend=_in_range(least, most),
+            hint=_in_range(least, most),
         )
 
 
@@ -488,13 +488,13 @@ def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> No
         raise FitError(
             "no such parameter in this model",
             where=where,
-            mend=f"{hint}the parameters are {', '.join(parameters)}",
+            hint=f"{hint}the parameters are {', '.join(parameters)}",
         )
     if not isinstance(prior, dist.Distribution):
         raise FitError(
             f"a {type(prior).__name__} is not a NumPyro distribution",
             where=where,
-            mend="give an object such as numpyro.distributions.Normal(0.0, 1.0)",
+            hint="give an object such as numpyro.distributions.Normal(0.0, 1.0)",
         )
     _check_shape(name, prior, where)
     check_support(name, prior, where)
@@ -506,7 +506,7 @@ def _check_shape(name: str, prior: dist.Distribution, where: str) -> None:
         raise FitError(
             f"{type(prior).__name__} is discrete, and samplers follow gradients",
             where=where,
-            mend="give a continuous distribution",
+            hint="give a continuous distribution",
         )
     usual = PRIORS.get(name)
     if usual is None:
@@ -516,11 +516,11 @@ def _check_shape(name: str, prior: dist.Distribution, where: str) -> None:
         raise FitError(
             f"one draw of it has shape {tuple(prior.event_shape)}",
             where=where,
-            mend=f"give a distribution of {to_event}{'.to_event(1)' if usual.event_shape else ''}",
+            hint=f"give a distribution of {to_event}{'.to_event(1)' if usual.event_shape else ''}",
         )
     if prior.batch_shape and prior.batch_shape[-1] != 1:
         raise FitError(
             f"it is {prior.batch_shape[-1]} distributions side by side",
             where=where,
-            mend="give one, or one per wavelength in shape (wavelength, 1): views share it",
+            hint="give one, or one per wavelength in shape (wavelength, 1): views share it",
         )

@@ -51,16 +51,16 @@ class _Board(Protocol):
         """Nothing is left."""
 
 
-def silent(stage: object, done: object) -> None:
+def no_progress(stage: object, done: object) -> None:
     """No progress to show."""
 
 
-def watched[**P, R](run: Callable[P, R]) -> Callable[P, R]:
+def with_progress[**P, R](run: Callable[P, R]) -> Callable[P, R]:
     """Give a function's `progress`, where it is left out, bars for its stages."""
     return _shows(run, stages)
 
 
-def counted[**P, R](what: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def with_counter[**P, R](what: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Give a function's `progress`, where it is left out, a bar that counts."""
     return lambda run: _shows(run, lambda: counts(what))
 
@@ -81,14 +81,14 @@ def _shows[**P, R](run: Callable[P, R], bars: Callable[[], Any]) -> Callable[P, 
 def stages() -> Iterator[Progress]:
     """A bar for each stage, where somebody watches."""
     with _board("") as board:
-        yield silent if board is None else lambda stage, share: board.show(stage, share, 1.0)
+        yield no_progress if board is None else lambda stage, share: board.show(stage, share, 1.0)
 
 
 @contextmanager
 def counts(what: str) -> Iterator[Counter]:
     """One bar that counts, with the time that is left, where somebody watches."""
     with _board(what) as board:
-        yield silent if board is None else lambda done, every: board.show(what, done, every)
+        yield no_progress if board is None else lambda done, every: board.show(what, done, every)
 
 
 @contextmanager

@@ -92,7 +92,7 @@ class Card:
         )
 
 
-class Carded:
+class HTMLRepr:
     """A frozen value that a notebook shows as a card: its fields, and theirs."""
 
     def _repr_html_(self) -> str:

@@ -10,11 +10,11 @@ from types import MappingProxyType
 from polar_bayes.errors import SceneError
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
 from polar_bayes.physics.scene import SCENES, Scene
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 
 @dataclasses.dataclass(frozen=True)
-class Setup(Carded):
+class Setup(HTMLRepr):
     """One way to measure.
 
     Args:
@@ -58,6 +58,6 @@ def find_setup(name: str) -> Setup:
         raise SceneError(
             "no such scene",
             where=f"scene={name!r}",
-            mend=f"give one of {', '.join(SETUPS)}, or a polar_bayes.Scene",
+            hint=f"give one of {', '.join(SETUPS)}, or a polar_bayes.Scene",
         )
     return SETUPS[name]

@@ -82,7 +82,7 @@ def find_preset(name: str) -> Material:
     """The material of that name."""
     if not isinstance(name, str) or name not in PRESETS:
         raise CaptureError(
-            "no such material", where=f"preset={name!r}", mend=f"give one of {', '.join(PRESETS)}"
+            "no such material", where=f"preset={name!r}", hint=f"give one of {', '.join(PRESETS)}"
         )
     return PRESETS[name]
 
@@ -131,9 +131,9 @@ class Protocol:
                 "give nanometers above zero",
             ),
         }
-        for name, (holds, mend) in checks.items():
+        for name, (holds, hint) in checks.items():
             if not holds:
-                raise CaptureError(f"{name} is {getattr(self, name)}", where="Protocol", mend=mend)
+                raise CaptureError(f"{name} is {getattr(self, name)}", where="Protocol", hint=hint)
 
     def angles(self) -> dict[str, np.ndarray]:
         """Directions of every view.
@@ -182,7 +182,7 @@ def checked_parameters(
         raise SceneError(
             f"the scene has no parameter {', '.join(sorted(unknown))}",
             where="simulate: parameters",
-            mend=f"give any of {', '.join(scene.parameters)}",
+            hint=f"give any of {', '.join(scene.parameters)}",
         )
     known = material.at(wavelengths if wavelengths.size else np.asarray(550.0))
     given = {name: _numbers(_parameter(name), value) for name, value in overrides.items()}
@@ -192,7 +192,7 @@ def checked_parameters(
         raise SceneError(
             f"no value for {', '.join(missing)}",
             where="simulate: parameters",
-            mend=f"give parameters={{{missing[0]!r}: <a number>}}",
+            hint=f"give parameters={{{missing[0]!r}: <a number>}}",
         )
     truth = {name: available[name] for name in scene.parameters}
     for name, value in truth.items():
@@ -203,8 +203,8 @@ def checked_parameters(
             continue
         color = wavelengths.size > 0 and value.shape == wavelengths.shape
         each = f", or one per wavelength ({wavelengths.size})" if wavelengths.size else ""
-        mend = f"give one number{each}, or an image (y, x)"
-        _check_shape(where, value, color or _is_number_or_image(value), mend)
+        hint = f"give one number{each}, or an image (y, x)"
+        _check_shape(where, value, color or _is_number_or_image(value), hint)
     return truth
 
 
@@ -218,7 +218,7 @@ def checked_noise(
         raise FitError(
             f"no link reads {', '.join(sorted(unknown))}",
             where="simulate: noise",
-            mend=f"give any of {', '.join(parameters)}",
+            hint=f"give any of {', '.join(parameters)}",
         )
     given: dict[str, Value | None] = {"exposure": None, **usual, **overrides}
     levels: dict[str, np.ndarray | None] = {}
@@ -226,7 +226,7 @@ def checked_noise(
         where = f"simulate: noise[{name!r}]"
         if name not in given:
             raise FitError(
-                "it has no value", where=where, mend=f"give noise={{{name!r}: <number>}}"
+                "it has no value", where=where, hint=f"give noise={{{name!r}: <number>}}"
             )
         value = given[name]
         if value is None:
@@ -234,8 +234,8 @@ def checked_noise(
             continue
         level = levels[name] = _numbers(where, value)
         _check_range(where, name, level, above=True)
-        mend = "give one number, or an image (y, x)"
-        _check_shape(where, level, _is_number_or_image(level), mend)
+        hint = "give one number, or an image (y, x)"
+        _check_shape(where, level, _is_number_or_image(level), hint)
     return levels
 
 
@@ -252,7 +252,7 @@ def image_of(
             raise CaptureError(
                 f"its shape is {shape} and that of {first} is {expected}",
                 where=f"simulate: {name}",
-                mend="give images (y, x) of one shape",
+                hint="give images (y, x) of one shape",
             )
     return images[0][1] if images else ()
 
@@ -273,7 +273,7 @@ def _numbers(where: str, value: Value) -> np.ndarray:
         raise CaptureError(
             "it is no array of numbers",
             where=where,
-            mend="give a number, or rows of numbers that are equally long",
+            hint="give a number, or rows of numbers that are equally long",
         ) from None
 
 
@@ -281,9 +281,9 @@ def _is_number_or_image(value: np.ndarray) -> bool:
     return value.ndim == 0 or (value.ndim == 2 and value.size > 0)
 
 
-def _check_shape(where: str, value: np.ndarray, fits: bool, mend: str) -> None:
+def _check_shape(where: str, value: np.ndarray, fits: bool, hint: str) -> None:
     if not fits:
-        raise CaptureError(f"its shape is {value.shape}", where=where, mend=mend)
+        raise CaptureError(f"its shape is {value.shape}", where=where, hint=hint)
 
 
 def _check_range(where: str, name: str, value: np.ndarray, *, above: bool = False) -> None:
@@ -295,7 +295,7 @@ def _check_range(where: str, name: str, value: np.ndarray, *, above: bool = Fals
         raise CaptureError(
             f"{value[~inside].flat[0]:g} is outside {low:g} {sign} value <= {high:g}",
             where=where,
-            mend="give a finite number in that range",
+            hint="give a finite number in that range",
         )
 
 
@@ -381,7 +381,7 @@ def simulate(
     links = _checked_links(setup.links if links is None else links)
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**32:
         raise CaptureError(
-            f"seed is {seed!r}", where="simulate", mend="give an integer from 0 to 2**32 - 1"
+            f"seed is {seed!r}", where="simulate", hint="give an integer from 0 to 2**32 - 1"
         )
     material = preset if isinstance(preset, Material) else find_preset(preset)
     wavelengths = np.asarray(protocol.wavelengths, float)
@@ -402,14 +402,14 @@ def _checked_links(links: Mapping[str, AbstractLink]) -> dict[str, AbstractLink]
         raise FitError(
             "that is no set of links",
             where="simulate: links",
-            mend="give a mapping such as {'dop': BetaLink()}",
+            hint="give a mapping such as {'dop': BetaLink()}",
         )
     for name, link in links.items():
         if not isinstance(link, AbstractLink) or name not in link.observables:
             raise FitError(
                 f"{link!r} does not describe {name}",
                 where=f"simulate: links[{name!r}]",
-                mend="give a link that names it in `observables`, such as {'dop': BetaLink()}",
+                hint="give a link that names it in `observables`, such as {'dop': BetaLink()}",
             )
     return dict(links)
 

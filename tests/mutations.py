@@ -150,8 +150,8 @@ def assert_inside_contract(capture):
         assert isinstance(variable.attrs["long_name"], str)
         assert all(type(value) in (str, int, float) for value in variable.attrs.values())
     assert all(type(value) in (str, int, float) for value in capture.attrs.values())
-    counted = count(capture)
-    assert 0 <= counted["masked"] < counted["views"]
+    with_counter = count(capture)
+    assert 0 <= with_counter["masked"] < with_counter["views"]
 
 
 # --- damaged tables ---------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import pytest
 from pages import EVIL, Page
 
 import polar_bayes as pb
-from polar_bayes.repr_html import Card, Carded, Grid
+from polar_bayes.repr_html import Card, Grid, HTMLRepr
 
 VALUES = {
     "scene": pb.SETUPS["goniometer"].scene,
@@ -64,7 +64,7 @@ def test_text_stays_what_one_would_write() -> None:
 
 def test_names_are_text_and_nothing_else() -> None:
     @dataclasses.dataclass(frozen=True)
-    class Odd(Carded):
+    class Odd(HTMLRepr):
         """A <b>part</b> of one's own."""
 
         label: str = EVIL

@@ -9,8 +9,8 @@ from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesEr
 
 @pytest.mark.parametrize("kind", [PolarBayesError, CaptureError, FitError, OutputError, SceneError])
 def test_an_error_arrives_as_it_was_sent(kind):
-    sent = kind("it is\ntorn", where="view 3", mend="measure it again")
+    sent = kind("it is\ntorn", where="view 3", hint="measure it again")
     came = pickle.loads(pickle.dumps(sent))
     assert type(came) is kind
     assert str(came) == str(sent) == "view 3: it is\\ntorn; measure it again"
-    assert (came.what, came.where, came.mend) == (sent.what, sent.where, sent.mend)
+    assert (came.what, came.where, came.hint) == (sent.what, sent.where, sent.hint)

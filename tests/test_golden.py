@@ -135,7 +135,7 @@ def curve():
 
 
 def views():
-    found = pb.next_views(capture(8), 2, seed=1)
+    found = pb.next_views(capture(8), seed=1)
     numbers = {}
     for name, values in found.data_vars.items():
         if values.dtype.kind == "f" and values.size <= 64:
@@ -210,6 +210,7 @@ if __name__ == "__main__":
         found = json.loads(json.dumps(CASES[case]()))
         if write:
             numbers[case] = found
+            STORED.write_text(json.dumps(numbers, indent=0) + "\n")
             print(case, len(found), flush=True)
         else:
             far = max((abs(v - numbers[case][n][0]) for n, (v, _) in found.items()), default=0.0)
@@ -220,5 +221,3 @@ if __name__ == "__main__":
                 sep="\n  ",
                 flush=True,
             )
-    if write:
-        STORED.write_text(json.dumps(numbers, indent=0) + "\n")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-FUZZ = Path(__file__).parent / "benchmarks" / "fuzz.py"
+FUZZ = Path(__file__).parents[1] / "benchmarks" / "fuzz.py"
 
 
 @pytest.mark.thorough

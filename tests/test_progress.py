@@ -8,17 +8,17 @@ import types
 import pytest
 
 from polar_bayes import interrupts, progress
-from polar_bayes.progress import counted, counts, stages, watched
+from polar_bayes.progress import counts, stages, with_counter, with_progress
 
 
-@watched
+@with_progress
 def two_steps(*, progress=None) -> list[str]:
     progress("climbing", 0.5)
     progress("climbing", 1.0)
     return ["done"]
 
 
-@counted("pixels")
+@with_counter("pixels")
 def two_pixels(*, progress=None) -> None:
     progress(1, 2)
     progress(2, 2)
@@ -117,7 +117,7 @@ def test_what_a_run_calls_adds_no_bars_of_its_own(notebook) -> None:
 
 
 def test_bars_go_where_a_run_breaks_off(notebook) -> None:
-    @watched
+    @with_progress
     def breaks(*, progress=None) -> None:
         progress("climbing", 0.5)
         raise KeyError

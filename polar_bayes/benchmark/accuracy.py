@@ -18,7 +18,7 @@ from polar_bayes.benchmark.run import (
     AbstractDial,
     Measured,
     Trial,
-    bench_of,
+    problem_of,
     run_fresh,
     run_trial,
 )
@@ -29,7 +29,7 @@ from polar_bayes.inference.request import Method, Request, resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.progress import Progress, silent, watched
+from polar_bayes.progress import Progress, no_progress, with_progress
 
 AS_GIVEN = "as given"
 FOLD = 7
@@ -59,7 +59,7 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
 }
 
 
-@watched
+@with_progress
 def accuracy(
     capture: xr.Dataset,
     *,
@@ -107,12 +107,12 @@ def accuracy(
     request = resolve(
         capture, model, "nuts", scene, priors, links, largest_view_zenith, seed, "double"
     )
-    show = progress or silent
+    show = progress or no_progress
     trials = _trials(request, LADDER if rungs is None else rungs, tuple(dials))
     show("reference", 0.0)
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), FOLD)  # no random number of any trial
-        judge = run_reference(reference or Reference(), bench_of(request, key))
+        judge = run_reference(reference or Reference(), problem_of(request, key))
     show("reference", 1.0)
     rows = []
     for number, ((rung, dial), trial) in enumerate(trials.items()):
@@ -179,7 +179,7 @@ def _trials(
     """What is run, or why it cannot be, by rung and dial; all rungs as given come first."""
     if not isinstance(rungs, Mapping) or not rungs:
         raise FitError(
-            "there is no rung", where="accuracy: rungs", mend="give methods by name, as in LADDER"
+            "there is no rung", where="accuracy: rungs", hint="give methods by name, as in LADDER"
         )
     trials: dict[tuple[str, str], Trial | PolarBayesError] = {}
     for name, method in rungs.items():
@@ -187,7 +187,7 @@ def _trials(
             raise FitError(
                 f"a {type(method).__name__} is not a method",
                 where=f"accuracy: rungs[{name!r}]",
-                mend="give settings such as polar_bayes.Nuts()",
+                hint="give settings such as polar_bayes.Nuts()",
             )
         trials[str(name), AS_GIVEN] = Trial(request, method, request.seed)
     for dial in dials:

@@ -38,7 +38,7 @@ def accuracy_of(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
         raise FitError(
             "two rows have one name",
             where="accuracy",
-            mend="give what polar_bayes.accuracy returned",
+            hint="give what polar_bayes.accuracy returned",
         )
     return found
 
@@ -126,7 +126,7 @@ def accuracy_advice(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERAN
     """
     if not tolerance > 0.0:
         raise FitError(
-            f"tolerance is {tolerance}", where="accuracy_advice", mend="give a number above 0"
+            f"tolerance is {tolerance}", where="accuracy_advice", hint="give a number above 0"
         )
     found = accuracy_of(result)
     every, errors = accuracy_table(found), parameter_errors(found)

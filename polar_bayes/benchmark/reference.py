@@ -12,11 +12,11 @@ from jaxtyping import Float
 from polar_bayes.benchmark.run import labeled
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT
 from polar_bayes.errors import FitError
-from polar_bayes.inference.auto import unvisited_weight
+from polar_bayes.inference.auto import missed_mode_weight
 from polar_bayes.inference.mcse import errors_of
-from polar_bayes.inference.method import Answer
+from polar_bayes.inference.method import PosteriorDraws
 from polar_bayes.inference.nuts import Nuts
-from polar_bayes.inference.problem import Bench
+from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.request import Method
 from polar_bayes.inference.run_method import answer, with_answer_draws, with_draws
 from polar_bayes.inference.smc import PixelTempering
@@ -78,7 +78,7 @@ class Reference:
             raise FitError(
                 f"error is {self.error} and longer {self.longer}",
                 where="Reference",
-                mend="give an error above 0, such as 0.02, and longer from 0",
+                hint="give an error above 0, such as 0.02, and longer from 0",
             )
 
     @property
@@ -112,7 +112,7 @@ class Judge(NamedTuple):
     mean_error: np.ndarray
     sd_error: np.ndarray
     halves: Distances
-    answer: Answer
+    answer: PosteriorDraws
     biases: tuple[str, ...]
     noise: str = ""
 
@@ -127,14 +127,14 @@ class Judge(NamedTuple):
         return float(max(self.mean_error.max(), self.sd_error.max()))
 
 
-def run_reference(settings: Reference, bench: Bench) -> Judge:
+def run_reference(settings: Reference, problem: Problem) -> Judge:
     """Chains that go on until their own error is small enough."""
     # Where they do not agree, or some of them missed a mode, tempered draws take over, where the
     # capture allows it. Where nothing is good enough, the best of it says so in its doubts.
-    tried = [_climb(settings, "NUTS", settings.chains, bench)]
+    tried = [_climb(settings, "NUTS", settings.chains, problem)]
     if tried[0].doubts:
         with contextlib.suppress(FitError):  # several patches or colors
-            tried.append(_climb(settings, "tempered draws", settings.tempered, bench))
+            tried.append(_climb(settings, "tempered draws", settings.tempered, problem))
     return nearest(tried)
 
 
@@ -143,27 +143,27 @@ def nearest(tried: Sequence[Judge]) -> Judge:
     return min(tried, key=lambda judge: (len(judge.biases), not judge.error < np.inf, judge.error))
 
 
-def _climb(settings: Reference, name: str, method: Method, bench: Bench) -> Judge:
-    judge = _judge(settings, name, method, bench)
+def _climb(settings: Reference, name: str, method: Method, problem: Problem) -> Judge:
+    judge = _judge(settings, name, method, problem)
     for _ in range(settings.longer):
         longer = with_draws(method, 4.0)
         if judge.error <= settings.error or longer is None:
             break
         method = longer
-        judge = _judge(settings, name, method, bench)
+        judge = _judge(settings, name, method, problem)
     return judge
 
 
-def _judge(settings: Reference, name: str, method: Method, bench: Bench) -> Judge:
-    found = answer(method, bench)
-    labels, draws = labeled(bench.program, found.z, bench.data)
-    mean_error, sd_error = errors_of(found, lambda z: labeled(bench.program, z, bench.data)[1])
+def _judge(settings: Reference, name: str, method: Method, problem: Problem) -> Judge:
+    found = answer(method, problem)
+    labels, draws = labeled(problem.program, found.z, problem.data)
+    mean_error, sd_error = errors_of(found, lambda z: labeled(problem.program, z, problem.data)[1])
     half = draws.shape[1] // 2
     one, other = (part.reshape(len(draws), -1) for part in (draws[:, :half], draws[:, half:]))
     biases = list(found.problems)
     if found.r_hat > LARGEST_R_HAT:
         biases.append(f"its R-hat is {found.r_hat:.3f}")
-    if isinstance(method, Nuts) and (weight := unvisited_weight(found.z, bench)) > 0.0:
+    if isinstance(method, Nuts) and (weight := missed_mode_weight(found.z, problem)) > 0.0:
         biases.append(f"a mode of weight {weight:.2g} was not visited by every chain")
     judge = Judge(
         labels, draws, name, mean_error, sd_error, distances(one, other), found, tuple(biases)

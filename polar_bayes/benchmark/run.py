@@ -28,9 +28,9 @@ from polar_bayes.diagnostics.parameters import scalars
 from polar_bayes.effects.choose import choose_effects
 from polar_bayes.effects.variants import Effect, parts_of, simplify
 from polar_bayes.errors import FitError, PolarBayesError
-from polar_bayes.inference.compile import Kept
-from polar_bayes.inference.method import Answer
-from polar_bayes.inference.problem import Bench, prepare
+from polar_bayes.inference.compile import LRUCache
+from polar_bayes.inference.method import PosteriorDraws
+from polar_bayes.inference.problem import Problem, compile_model
 from polar_bayes.inference.program import Program, parameters_of
 from polar_bayes.inference.request import Method, Request
 from polar_bayes.inference.result import posterior_of
@@ -40,7 +40,7 @@ from polar_bayes.observation.data import Observations, observe
 from polar_bayes.paths import unfinished_folder
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.scene import Scene
-from polar_bayes.progress import silent
+from polar_bayes.progress import no_progress
 
 try:
     import resource
@@ -65,7 +65,7 @@ class Measured:
 
     labels: tuple[str, ...]
     draws: np.ndarray
-    answer: Answer
+    answer: PosteriorDraws
     seconds_first: float
     seconds_again: float
     peak_memory: float
@@ -89,13 +89,13 @@ def run_trial(trial: Trial) -> Measured:
     return Measured(labels, draws, bare, first, seconds, peak, before)
 
 
-def bench_of(request: Request, key: Array) -> Bench:
+def problem_of(request: Request, key: Array) -> Problem:
     """The capture of a request, ready to be fitted."""
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     if request.precision == "single":
         data = data.in_single_precision()
-    prepared = prepare(request, request.scene, data)
-    return Bench(request, prepared, data, key, silent)
+    compiled_model = compile_model(request, request.scene, data)
+    return Problem(request, compiled_model, data, key, no_progress)
 
 
 def labeled(
@@ -107,9 +107,9 @@ def labeled(
     return tuple(each.label for each in found), np.stack([each.draws for each in found])
 
 
-def _run(trial: Trial, seed: int) -> tuple[Answer, Program, Observations]:
-    bench = bench_of(trial.request, jax.random.key(seed))
-    return answer(trial.method, bench), bench.program, bench.data
+def _run(trial: Trial, seed: int) -> tuple[PosteriorDraws, Program, Observations]:
+    problem = problem_of(trial.request, jax.random.key(seed))
+    return answer(trial.method, problem), problem.program, problem.data
 
 
 def _memory() -> float:
@@ -144,7 +144,7 @@ def run_fresh(trial: Trial) -> Measured:
             raise FitError(
                 f"its process ended with {process.returncode}: {said[-LAST_WORDS:].strip()}",
                 where="accuracy",
-                mend="try the same method with polar_bayes.fit, or a smaller capture",
+                hint="try the same method with polar_bayes.fit, or a smaller capture",
             )
         # Written by the process that this one has just started.
         found = pickle.loads(made.read_bytes())
@@ -167,10 +167,6 @@ def _work(given: Path, made: Path) -> None:
     except PolarBayesError as error:
         found = error
     made.write_bytes(cloudpickle.dumps(found))
-
-
-if __name__ == "__main__":
-    _work(*map(Path, sys.argv[1:]))
 
 
 # --- What may be turned beside the method: facets, effects, precision, number of draws ------------
@@ -223,7 +219,7 @@ class DrawsDial(AbstractDial):
     def __post_init__(self) -> None:
         if not self.factor > 0.0:
             raise FitError(
-                f"factor is {self.factor}", where="DrawsDial", mend="give a number above 0"
+                f"factor is {self.factor}", where="DrawsDial", hint="give a number above 0"
             )
 
     @property
@@ -277,7 +273,7 @@ class FacetsDial(AbstractDial):
     def __post_init__(self) -> None:
         if not self.factor > 0.0:
             raise FitError(
-                f"factor is {self.factor}", where="FacetsDial", mend="give a number above 0"
+                f"factor is {self.factor}", where="FacetsDial", hint="give a number above 0"
             )
 
     @property
@@ -339,7 +335,7 @@ DIALS: tuple[AbstractDial, ...] = (
 PRIOR = "prior of "
 """How a request says that a prior is the user's own."""
 
-_CHOSEN: Kept[tuple[Request, Scene | PolarBayesError]] = Kept(2)
+_CHOSEN: LRUCache[tuple[Request, Scene | PolarBayesError]] = LRUCache(2)
 """Choices take minutes, and every rung asks; each stands beside the request that it is of. One that
 failed would fail again."""
 
@@ -369,3 +365,7 @@ def _with_scene(request: Request, scene: Scene) -> Request:
 
 def _times(what: str, factor: float) -> str:
     return f"{what} x {factor:g}" if factor >= 1.0 else f"{what} / {1.0 / factor:g}"
+
+
+if __name__ == "__main__":
+    _work(*map(Path, sys.argv[1:]))

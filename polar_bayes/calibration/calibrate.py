@@ -16,12 +16,12 @@ from polar_bayes.calibration.runner import (
     Block,
     Method,
     Plan,
-    calls_for_chains,
     cut,
     fit_block,
     join,
+    needs_mcmc,
 )
-from polar_bayes.calibration.store import Store, question_of
+from polar_bayes.calibration.store import Store, fingerprint_of
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_fit import PixelLaplace, candidates_of
 from polar_bayes.inference.batch_nuts import PixelNuts
@@ -41,7 +41,7 @@ from polar_bayes.paths import as_path
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior
-from polar_bayes.progress import Counter, counted, silent
+from polar_bayes.progress import Counter, no_progress, with_counter
 
 # --- A finished calibration as a tree: labels come back here --------------------------------------
 
@@ -142,7 +142,7 @@ METHODS: dict[str, Method] = {
 FEWEST = 20
 
 
-@counted("fits")
+@with_counter("fits")
 def calibrate(
     capture: xr.Dataset,
     *,
@@ -212,11 +212,11 @@ def calibrate(
     """
     if resume and store is None:
         raise FitError(
-            "there is no store to go on with", where="calibrate: resume", mend="give store="
+            "there is no store to go on with", where="calibrate: resume", hint="give store="
         )
     if simulations < FEWEST:
         raise FitError(
-            f"simulations is {simulations}", where="calibrate", mend=f"give {FEWEST} or more"
+            f"simulations is {simulations}", where="calibrate", hint=f"give {FEWEST} or more"
         )
     asked = {"model": model, "scene": scene, "priors": priors, "links": links}
     strange = set(truth or {}) - set(asked)
@@ -224,7 +224,7 @@ def calibrate(
         raise FitError(
             f"{', '.join(sorted(strange))} cannot differ",
             where="calibrate: truth",
-            mend=f"give some of {', '.join(asked)}",
+            hint=f"give some of {', '.join(asked)}",
         )
     request, told = (
         _resolved(capture, {**asked, **differing}, largest_view_zenith, seed)
@@ -237,12 +237,12 @@ def calibrate(
         raise FitError(
             "it has no parameter in common with what is fitted",
             where="calibrate: truth",
-            mend="give models whose parameters have the same names and shapes",
+            hint="give models whose parameters have the same names and shapes",
         )
-    kept = None if store is None else Store(as_path(store, "store"), question_of(plan))
+    kept = None if store is None else Store(as_path(store, "store"), fingerprint_of(plan))
     found = kept.begin(resume=resume) if kept is not None else []
     missing = _missing(found, simulations)
-    show = progress or silent
+    show = progress or no_progress
     with on_interrupt(kept.resume_hint) if kept is not None else contextlib.nullcontext():
         found += _fit_all(plan, missing, simulations, kept, scheduler, show)
     about = _provenance(request, settings, truth, simulations)
@@ -257,7 +257,7 @@ def calibrate(
 def _settings(method: str | Method | None, request: Request) -> Method:
     if isinstance(method, Method):
         return method
-    if calls_for_chains(request) and method in (None, "nuts"):
+    if needs_mcmc(request) and method in (None, "nuts"):
         return Nuts()
     if method is None:
         return METHODS["tempered"]
@@ -265,7 +265,7 @@ def _settings(method: str | Method | None, request: Request) -> Method:
         raise FitError(
             "no such method",
             where=f"method={method!r}",
-            mend=f"give one of {', '.join(METHODS)}, or settings such as PixelNuts(draws=1000)",
+            hint=f"give one of {', '.join(METHODS)}, or settings such as PixelNuts(draws=1000)",
         )
     return METHODS[method]
 

@@ -73,14 +73,14 @@ def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
         raise FitError(
             f"the level {missing[0]} is not there once",
             where=f"{source}: marginals/quantile",
-            mend=f"give the tree as {CALIBRATION.made_by} returned it",
+            hint=f"give the tree as {CALIBRATION.made_by} returned it",
         )
     groups = {"predictive_pit", "loo_pit", "readings"}
     if (there := groups & set(tree.children)) and there != groups:
         raise FitError(
             f"it has no group {min(groups - there)}",
             where=source,
-            mend=f"give the tree as {CALIBRATION.made_by} returned it, or drop {min(there)}",
+            hint=f"give the tree as {CALIBRATION.made_by} returned it, or drop {min(there)}",
         )
 
 

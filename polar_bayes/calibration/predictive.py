@@ -46,7 +46,7 @@ FEW = 4
 
 
 class Readings:
-    """Probability integral transforms of readings, filled in as fits come: NaN without an answer."""
+    """Probability integral transforms of readings, filled in as fits come; NaN where one failed."""
 
     # A fresh reading of the same truth, and the posterior's predictions of it, are exchangeable
     # where model, prior and posterior are right. So are a reading that was fitted and what the
@@ -131,16 +131,19 @@ class Readings:
 
 
 def why_untold(
-    program: Program, teller: Program, data: Observations, given: Mapping[str, tuple[int, ...]]
+    program: Program,
+    generative_program: Program,
+    data: Observations,
+    given: Mapping[str, tuple[int, ...]],
 ) -> str:
     """Why readings of this model cannot be ranked."""
     missing = [name for name in program.supports if name not in given]
     if missing:
         return f"draws do not hold {', '.join(missing)}, without which the model predicts nothing"
-    if not set(program.observed) & set(teller.observed):
+    if not set(program.observed) & set(generative_program.observed):
         return "what is simulated and what is fitted read different variables"
     size = int(np.prod(data.shape))
-    for each in (program, teller):
+    for each in (program, generative_program):
         shape = jax.eval_shape(
             lambda z, each=each: each.describe(jax.random.key(0), z, data), jnp.zeros(each.size)
         )
@@ -240,7 +243,7 @@ def calibration_readings(calibration: xr.DataTree) -> pd.DataFrame:
         raise FitError(
             "it holds no ranks of readings",
             where="calibration",
-            mend="give what polar_bayes.calibrate returns with readings=True",
+            hint="give what polar_bayes.calibrate returns with readings=True",
         )
     rows = {label: row for label, row, _ in _rows(calibration)}
     return pd.DataFrame.from_dict(rows, orient="index")

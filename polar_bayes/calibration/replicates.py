@@ -48,7 +48,7 @@ def retest(results: Sequence[xr.DataTree]) -> pd.DataFrame:
     """
     if len(results) < 2:
         raise FitError(
-            "a single fit has nothing to agree with", where="retest", mend="give two or more"
+            "a single fit has nothing to agree with", where="retest", hint="give two or more"
         )
     found = [{each.label: each for each in posterior_scalars(result)} for result in results]
     common = [label for label in found[0] if all(label in each for each in found[1:])]
@@ -56,7 +56,7 @@ def retest(results: Sequence[xr.DataTree]) -> pd.DataFrame:
         raise FitError(
             "these fits share no parameter",
             where="retest",
-            mend="give fits of the same model to captures of the same layout",
+            hint="give fits of the same model to captures of the same layout",
         )
     limit = FALSE_ALARMS / len(common)
     rows = {label: _compare([each[label].draws.ravel() for each in found]) for label in common}
@@ -89,7 +89,7 @@ def proxy_scores(
         raise FitError(
             f"{len(proxies)} mappings do not go with {len(results)} fits",
             where="proxies",
-            mend="give one mapping for all fits, or one for each",
+            hint="give one mapping for all fits, or one for each",
         )
     rows = []
     for at, result in enumerate(results):
@@ -113,7 +113,7 @@ def proxy_scores(
         raise FitError(
             "no proxy is known of any parameter",
             where="proxies",
-            mend="give values by parameter, or captures with `true_<parameter>`",
+            hint="give values by parameter, or captures with `true_<parameter>`",
         )
     return pd.DataFrame(rows)
 

@@ -15,46 +15,46 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.calibration.predictive import Arrays, Readings, why_untold
-from polar_bayes.calibration.scores import Standing
+from polar_bayes.calibration.scores import PitCrps
 from polar_bayes.calibration.simulations import draw_fresh, draw_numbered
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT, SMALLEST_ESS
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_fit import PixelMethod, candidates_of, fit_stack
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_programs import MAKING, Engine, Recipe, make_engine
+from polar_bayes.inference.batch_programs import ENGINE_LOCK, BatchEngine, EngineSpec, make_engine
 from polar_bayes.inference.batch_result import Approach, Describe, Outcome, Status, no_outcome
 from polar_bayes.inference.batching import Stack
-from polar_bayes.inference.compile import TRACING
-from polar_bayes.inference.initialization import AbstractGrounds, Drawn
+from polar_bayes.inference.compile import TRACING_LOCK
+from polar_bayes.inference.initialization import AbstractInitializer, Drawn
 from polar_bayes.inference.laplace import Laplace
 from polar_bayes.inference.mcse import measure
 from polar_bayes.inference.nuts import Nuts
-from polar_bayes.inference.problem import Prepared, prepare
+from polar_bayes.inference.problem import CompiledModel, compile_model
 from polar_bayes.inference.program import Program, Values, compile_program, parameters_of
 from polar_bayes.inference.psis import Marginals, smooth
 from polar_bayes.inference.request import Request
 from polar_bayes.observation.data import READINGS, Observations, observe
 from polar_bayes.physics.discrepancy import Discrepancy
-from polar_bayes.progress import silent
+from polar_bayes.progress import no_progress
 
 # --- Simulations fitted by what `polar_bayes.fit` runs: modes first, then chains or the guide ther
 
 
-OneByOne = Nuts | Laplace
+SequentialMethod = Nuts | Laplace
 CHAINS_BLOCK = 4
 """Simulations of a block: few, since each may take half a minute."""
 
 
-def calls_for_chains(request: Request) -> bool:
+def needs_mcmc(request: Request) -> bool:
     """Whether the posteriors of a capture are out of reach of weighted draws."""
     read = [request.capture[name].sizes for name in READINGS if name in request.capture]
     several = any(dim != "view" and length > 1 for sizes in read for dim, length in sizes.items())
     return several or request.scene.has(Discrepancy)
 
 
-def fit_each(
-    prepared: Prepared,
-    settings: OneByOne,
+def fit_sequentially(
+    compiled_model: CompiledModel,
+    settings: SequentialMethod,
     captures: Stack,
     numbers: np.ndarray,
     seed: int,
@@ -68,12 +68,12 @@ def fit_each(
     # diverged or is no number, the goals were not reached before `most_draws`, or the mode of a
     # normal approximation is not settled. Such fits are ranked all the same.
     found, base = no_outcome(len(captures)), jax.random.fold_in(jax.random.key(seed), 3)
-    with jax.enable_x64(True), TRACING:  # two threads that begin at once share what they make
-        grounds = prepared.grounds
+    with jax.enable_x64(True), TRACING_LOCK:  # two threads that begin at once share what they make
+        initializer = compiled_model.initializer
     for at, number in enumerate(numbers):
         with jax.enable_x64(True):  # a thread does not inherit it
             data, key = captures.pixel(at), jax.random.fold_in(base, int(number))
-            told = _fit_one(grounds, prepared.program, settings, data, key)
+            told = _fit_one(initializer, compiled_model.program, settings, data, key)
         if told is None:
             continue
         drawn, parameters = told
@@ -88,22 +88,26 @@ def fit_each(
 
 
 def _fit_one(
-    grounds: AbstractGrounds, program: Program, settings: OneByOne, data: Observations, key: Array
+    initializer: AbstractInitializer,
+    program: Program,
+    settings: SequentialMethod,
+    data: Observations,
+    key: Array,
 ) -> tuple[Drawn, Values] | None:
     """Draws of one capture and their parameters; None where there are none."""
     key_starts, key_draws = jax.random.split(key)
     if isinstance(settings, Nuts):
         settings = dataclasses.replace(settings, threads=1)
     try:
-        ground = grounds.find(data, key_starts, silent)
-        drawn = ground.draw(key_draws, settings, silent)
+        initialization = initializer.find(data, key_starts, no_progress)
+        drawn = initialization.draw(key_draws, settings, no_progress)
     except (FitError, np.linalg.LinAlgError):  # no peak, or no width around it
         return None
     parameters = parameters_of(program, drawn.z, data)
     return (drawn, parameters) if _whole(parameters).any() else None
 
 
-def _measure(settings: OneByOne, drawn: Drawn, parameters: Values) -> dict[str, float]:
+def _measure(settings: SequentialMethod, drawn: Drawn, parameters: Values) -> dict[str, float]:
     """What a fit is worth, by the names of `Outcome`."""
     fine = _whole(parameters)
     good, worth, pareto_k = not drawn.problems and bool(fine.all()), float(fine.sum()), np.nan
@@ -148,7 +152,7 @@ def _scalars(parameters: Values) -> np.ndarray:
 # --- Some simulations of a calibration: numbers in, ranks and marginals out, in any process -------
 
 
-Method = PixelMethod | OneByOne
+Method = PixelMethod | SequentialMethod
 BLOCK = 64
 """Simulations of a block: what one thread or worker fits at a time, and what a crash can lose."""
 
@@ -190,41 +194,41 @@ class Plan:
         return _data_of(self)
 
     @property
-    def engine(self) -> Engine:
+    def engine(self) -> BatchEngine:
         """The compiled programs, which the next calibration of the same model finds."""
         candidates = candidates_of(self.settings)
-        recipe = Recipe(self.request, lambda: self.data, candidates, self.recipe_key)
-        with MAKING:
+        recipe = EngineSpec(self.request, lambda: self.data, candidates, self.recipe_key)
+        with ENGINE_LOCK:
             return make_engine(recipe)
 
     @property
-    def prepared(self) -> Prepared:
+    def compiled_model(self) -> CompiledModel:
         """The same for fits one by one, which `polar_bayes.fit` finds."""
         return _prepared_of(self)
 
     @property
     def program(self) -> Program:
         """The model that is fitted."""
-        if isinstance(self.settings, OneByOne):
-            return self.prepared.program
+        if isinstance(self.settings, SequentialMethod):
+            return self.compiled_model.program
         return self.engine.program
 
     @property
     def rough(self) -> Program:
         """The same in single precision."""
-        if isinstance(self.settings, OneByOne):
+        if isinstance(self.settings, SequentialMethod):
             return _rough_of(self)
         return self.engine.rough
 
     @property
     def block(self) -> int:
         """Simulations of a block."""
-        return CHAINS_BLOCK if isinstance(self.settings, OneByOne) else BLOCK
+        return CHAINS_BLOCK if isinstance(self.settings, SequentialMethod) else BLOCK
 
     @property
-    def teller(self) -> Program:
+    def generative_program(self) -> Program:
         """The model by which captures are simulated."""
-        return _teller_of(self)
+        return _generative_program_of(self)
 
     @property
     def shared(self) -> dict[str, tuple[int, ...]]:
@@ -254,11 +258,13 @@ def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
     is_ranked = plan.readings and not plan.untold
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), 1)
-        drawn = draw_numbered(plan.teller, plan.data, filled, key)
-        fresh = draw_fresh(plan.teller, plan.data, drawn, filled, key) if is_ranked else {}
+        drawn = draw_numbered(plan.generative_program, plan.data, filled, key)
+        fresh = (
+            draw_fresh(plan.generative_program, plan.data, drawn, filled, key) if is_ranked else {}
+        )
     truth = {name: np.asarray(drawn.truth[name])[wanted] for name in shared}
     captures = drawn.captures.subset(wanted)
-    marginals, standing = Marginals(len(numbers), shared), Standing(truth, numbers, seed)
+    marginals, standing = Marginals(len(numbers), shared), PitCrps(truth, numbers, seed)
     ranked = None
     if is_ranked:
         again = {name: np.asarray(values)[wanted] for name, values in fresh.items()}
@@ -305,8 +311,8 @@ def cut(numbers: np.ndarray, size: int) -> list[np.ndarray]:
 def _fit(plan: Plan, captures: Stack, numbers: np.ndarray, describe: Describe) -> Outcome:
     """Fits of captures by what the settings say."""
     settings, seed = plan.settings, plan.request.seed
-    if isinstance(settings, OneByOne):
-        return fit_each(plan.prepared, settings, captures, numbers, seed, describe)
+    if isinstance(settings, SequentialMethod):
+        return fit_sequentially(plan.compiled_model, settings, captures, numbers, seed, describe)
     return fit_stack(plan.engine, settings, captures, numbers, seed, describe)
 
 
@@ -324,42 +330,48 @@ def _data_of(plan: Plan) -> Observations:
 
 
 @functools.lru_cache(maxsize=4)
-def _prepared_of(plan: Plan) -> Prepared:
+def _prepared_of(plan: Plan) -> CompiledModel:
     with jax.enable_x64(True):
-        return prepare(plan.request, plan.request.scene, plan.data)
+        return compile_model(plan.request, plan.request.scene, plan.data)
 
 
 @functools.lru_cache(maxsize=4)
 def _rough_of(plan: Plan) -> Program:
     single = dataclasses.replace(plan.request, precision="single")
-    with jax.enable_x64(False), TRACING:
+    with jax.enable_x64(False), TRACING_LOCK:
         return compile_program(single.bind(single.scene), plan.data.in_single_precision())
 
 
 @functools.lru_cache(maxsize=4)
-def _teller_of(plan: Plan) -> Program:
+def _generative_program_of(plan: Plan) -> Program:
     told = plan.told
     if told is None:
         return plan.program
-    with jax.enable_x64(True), TRACING:
+    with jax.enable_x64(True), TRACING_LOCK:
         return compile_program(told.bind(told.scene), plan.data)
 
 
 @functools.lru_cache(maxsize=4)
 def _shared_by(plan: Plan) -> dict[str, tuple[int, ...]]:
-    fitted, told = (_shapes(program, plan.data) for program in (plan.program, plan.teller))
+    fitted, told = (
+        _shapes(program, plan.data) for program in (plan.program, plan.generative_program)
+    )
     return {name: shape for name, shape in told.items() if fitted.get(name) == shape}
 
 
 @functools.lru_cache(maxsize=4)
 def _untold_of(plan: Plan) -> str:
-    given, program, teller = _shapes(plan.program, plan.data), plan.program, plan.teller
-    with jax.enable_x64(True), TRACING:
-        return why_untold(program, teller, plan.data, given)
+    given, program, generative_program = (
+        _shapes(plan.program, plan.data),
+        plan.program,
+        plan.generative_program,
+    )
+    with jax.enable_x64(True), TRACING_LOCK:
+        return why_untold(program, generative_program, plan.data, given)
 
 
 def _shapes(program: Program, data: Observations) -> dict[str, tuple[int, ...]]:
     """Of the parameters of a model, in the order of their names."""
-    with jax.enable_x64(True), TRACING:
+    with jax.enable_x64(True), TRACING_LOCK:
         found = jax.eval_shape(program.parameters, jnp.zeros(program.size), data)
     return {name: found[name].shape for name in sorted(found)}

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from polar_bayes.inference.program import Values
 
 
-class Standing:
+class PitCrps:
     """Probability integral transforms and scores, filled in as fits come: NaN without an answer."""
 
     # Source: Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788; Gneiting &

@@ -34,7 +34,7 @@ ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
 LIBRARIES = ("polar_bayes", "jax", "jaxlib", "numpyro", "numpy", "scipy")
 
 
-def question_of(plan: Plan) -> dict[str, str]:
+def fingerprint_of(plan: Plan) -> dict[str, str]:
     """All that fixes the numbers of a calibration, but how many simulations there are."""
     told = _asked(plan.told) if plan.told is not None else {}
     return {
@@ -138,7 +138,7 @@ class Store:
         where, head = str(self._folder), self._folder / QUESTION
         if not resume and self._folder.exists():
             raise FitError(
-                "it is there already", where=where, mend="give another --out, or --resume"
+                "it is there already", where=where, hint="give another --out, or --resume"
             )
         with self._written():
             self._folder.mkdir(exist_ok=resume)
@@ -146,7 +146,7 @@ class Store:
         if head.name in names:
             self._check(head)
         elif any(not name.startswith(UNFINISHED) for name in names):
-            raise FitError("it holds no calibration", where=where, mend="give another --out")
+            raise FitError("it holds no calibration", where=where, hint="give another --out")
         else:  # new, or broken off before it said what is asked
             told = json.dumps(self._question, indent=1, sort_keys=True).encode()
             with self._whole(QUESTION) as unfinished:
@@ -170,7 +170,7 @@ class Store:
             begun = json.loads(head.read_text())
         except (OSError, ValueError) as error:
             raise FitError(
-                "it cannot be read", where=str(head), mend="give another --out"
+                "it cannot be read", where=str(head), hint="give another --out"
             ) from error
         others = differing(self._question, begun)
         if others:
@@ -179,7 +179,7 @@ class Store:
                     "another versions", "other versions of the libraries"
                 ),
                 where=str(self._folder),
-                mend="repeat the command as it was, or give another --out",
+                hint="repeat the command as it was, or give another --out",
             )
 
     @contextlib.contextmanager
@@ -198,7 +198,7 @@ class Store:
             raise FitError(
                 f"it could not be written ({error.strerror})",
                 where=str(self._folder),
-                mend="make room or give another --out; --resume goes on where it stopped",
+                hint="make room or give another --out; --resume goes on where it stopped",
             ) from error
 
 

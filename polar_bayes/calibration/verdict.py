@@ -51,7 +51,7 @@ def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
         raise FitError(
             "its labels are not those of prior_sbc",
             where="calibration: truth",
-            mend="give what polar_bayes.calibrate returned",
+            hint="give what polar_bayes.calibrate returned",
         )
     rows = {each.label: _row(each, truths[each.label], marginals) for each in found}
     return pd.DataFrame.from_dict(rows, orient="index")
@@ -187,7 +187,7 @@ def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFram
     """
     if not calibrations:
         raise FitError(
-            "there is nothing to compare", where="compare_calibrations", mend="give calibrations"
+            "there is nothing to compare", where="compare_calibrations", hint="give calibrations"
         )
     tables = {name: calibration_table(each) for name, each in calibrations.items()}
     (first, expected), *others = tables.items()
@@ -196,7 +196,7 @@ def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFram
             raise FitError(
                 f"it has other parameters than {first}",
                 where=f"compare_calibrations: {name}",
-                mend="calibrate the same model on the same layout",
+                hint="calibrate the same model on the same layout",
             )
     limit = limit_of(expected)
     rows = {}

@@ -70,26 +70,26 @@ def _checked(
 ) -> dict[str, xr.Dataset]:
     """The captures, validated, none with a leading dim."""
     if dim not in DIMS:
-        mend = f"give {' or '.join(map(repr, DIMS))}"
+        hint = f"give {' or '.join(map(repr, DIMS))}"
         what = "captures do not stand side by side along that"
-        raise CaptureError(what, where=f"dim={dim!r}", mend=mend)
+        raise CaptureError(what, where=f"dim={dim!r}", hint=hint)
     if not isinstance(captures, Mapping) or not captures:
-        mend = "give a mapping such as {'glass': capture, 'plexiglas': other}"
-        raise CaptureError("there is nothing to combine", where="combine", mend=mend)
+        hint = "give a mapping such as {'glass': capture, 'plexiglas': other}"
+        raise CaptureError("there is nothing to combine", where="combine", hint=hint)
     dropped = list(drop)
     for row in CONTRACT:  # in which q comes before u, and u before its error
         dropped += [row.name] if row.needs in dropped else []
     checked = {}
     for label, capture in captures.items():
         if not isinstance(label, str) or not label:
-            mend = "name every capture by a text"
-            raise CaptureError(f"{label!r} is no label", where="combine", mend=mend)
+            hint = "name every capture by a text"
+            raise CaptureError(f"{label!r} is no label", where="combine", hint=hint)
         where = f"combine: {label}"
         valid = validate(capture, source=where)
         valid = validate(valid.drop_vars(dropped, errors="ignore"), source=where)
         for leading in (name for name in ("material", "patch", "y", "x") if name in valid.sizes):
-            mend = f"select one with isel({leading}=0), or combine what it was made of"
-            raise CaptureError(f"it has the dim {leading} already", where=where, mend=mend)
+            hint = f"select one with isel({leading}=0), or combine what it was made of"
+            raise CaptureError(f"it has the dim {leading} already", where=where, hint=hint)
         # A label that selection left behind gives way to the new one.
         checked[label] = valid.drop_vars(dim, errors="ignore")
     return checked
@@ -101,8 +101,8 @@ def _check_alike(label: str, capture: xr.Dataset, first: str, pattern: xr.Datase
     for name in _required([pattern, capture]):
         if (name in capture) != (name in pattern):
             with_, without = (label, first) if name in capture else (first, label)
-            mend = f"add it there, or {_leave_out(name)}"
-            raise CaptureError(f"{without} has no {name}, and {with_} has", where=where, mend=mend)
+            hint = f"add it there, or {_leave_out(name)}"
+            raise CaptureError(f"{without} has no {name}, and {with_} has", where=where, hint=hint)
     for name in map(str, pattern.data_vars):
         for attribute in ("units", "saturation_level") if name in capture else ():
             mine, its = (each[name].attrs.get(attribute) for each in (capture, pattern))
@@ -110,7 +110,7 @@ def _check_alike(label: str, capture: xr.Dataset, first: str, pattern: xr.Datase
                 raise CaptureError(
                     f"{attribute} of {name} is {_said(mine)}, that of {first} {_said(its)}",
                     where=where,
-                    mend=f"bring both to one, or {_leave_out(name)}",
+                    hint=f"bring both to one, or {_leave_out(name)}",
                 )
 
 
@@ -119,13 +119,13 @@ def _check_labels(label: str, capture: xr.Dataset, first: str, pattern: xr.Datas
     for name in dict.fromkeys(map(str, [*pattern.coords, *capture.coords])):
         mine, its = (each.variables.get(name) for each in (capture, pattern))
         if mine is None or its is None or not mine.equals(its):
-            mend = f"drop the label with drop_vars({name!r})"
+            hint = f"drop the label with drop_vars({name!r})"
             if name == WAVELENGTH.name:
-                mend = "give captures of the same wavelengths, or select those that all have"
+                hint = "give captures of the same wavelengths, or select those that all have"
             raise CaptureError(
                 f"{name} is {_said(mine)}, that of {first} {_said(its)}",
                 where=f"combine: {label}",
-                mend=mend,
+                hint=hint,
             )
 
 

@@ -41,7 +41,7 @@ def read_netcdf[Data: (xr.Dataset, xr.DataTree)](
         raise type(broken)(
             "its checksum is wrong: the file was damaged after it was written",
             where=str(file),
-            mend="restore it from a copy, or make it again",
+            hint="restore it from a copy, or make it again",
         )
     try:
         with open_netcdf(kind, file) as opened:
@@ -112,8 +112,8 @@ def load_capture(path: str | os.PathLike[str]) -> xr.Dataset:
         CaptureError: The file cannot be read, was damaged, or does not hold a capture.
     """
     file = existing_file(path, "capture")
-    mend = "write it again with save_capture"
-    broken = CaptureError("it cannot be read as netCDF", where=str(file), mend=mend)
+    hint = "write it again with save_capture"
+    broken = CaptureError("it cannot be read as netCDF", where=str(file), hint=hint)
     dataset = read_netcdf(xr.Dataset, file, broken)
     dataset.attrs.setdefault("name", file.stem)
     return validate(dataset, source=str(file))

@@ -67,7 +67,7 @@ class Variable:
     units: str | None
     range: Interval
     meaning: str
-    mend: str
+    hint: str
     needs: str | None = None
 
 
@@ -174,7 +174,7 @@ def _clean_name(name: object, where: str) -> str:
     raise CaptureError(
         f"the attribute name {name!r} cannot be stored",
         where=where,
-        mend="rename it: a letter, then letters, digits or any of _ . + -",
+        hint="rename it: a letter, then letters, digits or any of _ . + -",
     )
 
 
@@ -208,7 +208,7 @@ def _not_storable(value: object, where: str) -> CaptureError:
     return CaptureError(
         f"the value is a {type(value).__name__}, neither a number nor text",
         where=where,
-        mend="give a number or text, for instance JSON",
+        hint="give a number or text, for instance JSON",
     )
 
 
@@ -238,7 +238,7 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
     """
     if not isinstance(dataset, xr.Dataset):
         what = f"a {type(dataset).__name__} is not a capture"
-        raise CaptureError(what, where=source, mend="give an xarray.Dataset")
+        raise CaptureError(what, where=source, hint="give an xarray.Dataset")
     _check_names(dataset, source)
     layout = _layout(dataset, source)
     present = [row for row in CONTRACT if row.name in dataset]
@@ -288,18 +288,18 @@ def _check_names(dataset: xr.Dataset, source: str) -> None:
             raise CaptureError(
                 "a capture has no such variable",
                 where=f"{source}: {name}",
-                mend=f"rename it (nearest known name: {near}), call it true_<name> or drop it",
+                hint=f"rename it (nearest known name: {near}), call it true_<name> or drop it",
             )
     for row in CONTRACT:
         if row.kind == "geometry" and row.name not in dataset:
-            mend = f"add {row.name} in degree, with dim view"
-            raise CaptureError("it is missing", where=f"{source}: {row.name}", mend=mend)
+            hint = f"add {row.name} in degree, with dim view"
+            raise CaptureError("it is missing", where=f"{source}: {row.name}", hint=hint)
         if row.name in dataset and row.needs and row.needs not in dataset:
             what = f"it has no meaning without {row.needs}"
-            mend = f"add {row.needs} or drop {row.name}"
-            raise CaptureError(what, where=f"{source}: {row.name}", mend=mend)
+            hint = f"add {row.needs} or drop {row.name}"
+            raise CaptureError(what, where=f"{source}: {row.name}", hint=hint)
     if not any(name in dataset for name in SIGNALS):
-        raise CaptureError("no reading is there", where=source, mend="add dop, q or intensity")
+        raise CaptureError("no reading is there", where=source, hint="add dop, q or intensity")
 
 
 def _layout(dataset: xr.Dataset, source: str) -> Layout:
@@ -311,15 +311,15 @@ def _layout(dataset: xr.Dataset, source: str) -> Layout:
         raise CaptureError(
             f"its dims are {_listed(dims)}",
             where=f"{source}: {name}",
-            mend="use view[, wavelength], alone or behind material, patch, or y and x together",
+            hint="use view[, wavelength], alone or behind material, patch, or y and x together",
         )
     for dim in dims:
         if dataset.sizes[dim] == 0:
-            mend = f"give at least one {dim}"
-            raise CaptureError("its length is 0", where=f"{source}: dim {dim}", mend=mend)
+            hint = f"give at least one {dim}"
+            raise CaptureError("its length is 0", where=f"{source}: dim {dim}", hint=hint)
     if "wavelength" in dims and "wavelength" not in dataset.variables:
-        mend = "add a coordinate wavelength in nm"
-        raise CaptureError("it has no coordinate", where=f"{source}: dim wavelength", mend=mend)
+        hint = "add a coordinate wavelength in nm"
+        raise CaptureError("it has no coordinate", where=f"{source}: dim wavelength", hint=hint)
     return Layout(leading, "wavelength" in dims)
 
 
@@ -332,7 +332,7 @@ def _ordered(variable: xr.Variable, row: Variable, layout: Layout, source: str) 
     raise CaptureError(
         f"its dims are {_listed(variable.dims)}",
         where=f"{source}: {row.name}",
-        mend=f"give it {' or '.join(_listed(dims) for dims in options)}",
+        hint=f"give it {' or '.join(_listed(dims) for dims in options)}",
     )
 
 
@@ -364,8 +364,8 @@ def _valid_entries(
         return np.ones([dataset.sizes[dim] for dim in layout.readings], dtype=bool)
     valid = flags["valid"].values
     if not valid.any():
-        mend = "mark what was measured valid=True"
-        raise CaptureError("every view is masked", where=f"{source}: valid", mend=mend)
+        hint = "mark what was measured valid=True"
+        raise CaptureError("every view is masked", where=f"{source}: valid", hint=hint)
     return valid
 
 
@@ -389,7 +389,7 @@ def _check_values(
     raise CaptureError(
         f"{values[index]:g} is outside {row.range}",
         where=f"{source}: {_entry(row.name, dims, index)}",
-        mend=row.mend,
+        hint=row.hint,
     )
 
 
@@ -406,7 +406,7 @@ def _check_polarization(
         raise CaptureError(
             f"q^2 + u^2 = {1.0 + excess[index]:g} is more than light can have",
             where=f"{source}: {_entry('u', layout.readings, index)}",
-            mend=f"{MASK} (noise may carry the sum to {1.0 + EXCESS_POLARIZATION:g})",
+            hint=f"{MASK} (noise may carry the sum to {1.0 + EXCESS_POLARIZATION:g})",
         )
 
 
@@ -422,12 +422,12 @@ def _truth(variable: xr.Variable, name: str, layout: Layout, source: str) -> xr.
     where = f"{source}: {name}"
     dims = [dim for dim in layout.readings if dim in variable.dims]
     if not _same_dims(variable.dims, dims):
-        mend = f"give it any of {_listed(layout.readings)}"
-        raise CaptureError(f"its dims are {_listed(variable.dims)}", where=where, mend=mend)
+        hint = f"give it any of {_listed(layout.readings)}"
+        raise CaptureError(f"its dims are {_listed(variable.dims)}", where=where, hint=hint)
     values = _floats(variable.transpose(*dims).values, where)
     if np.isinf(values).any():
-        mend = "give a number, or NaN where the truth is not known"
-        raise CaptureError("a value is infinite", where=where, mend=mend)
+        hint = "give a number, or NaN where the truth is not known"
+        raise CaptureError("a value is infinite", where=where, hint=hint)
     default = {"units": "1", "long_name": f"known {name.removeprefix('true_')}"}
     attributes = default | clean_attributes(variable.attrs, where)
     return xr.Variable(dims, values, attributes | {key: str(attributes[key]) for key in default})
@@ -436,7 +436,7 @@ def _truth(variable: xr.Variable, name: str, layout: Layout, source: str) -> xr.
 def _floats(values: np.ndarray, where: str) -> np.ndarray:
     if values.dtype.kind not in "iuf":
         what = f"it holds {values.dtype.name}, not real numbers"
-        raise CaptureError(what, where=where, mend="store floating-point numbers")
+        raise CaptureError(what, where=where, hint="store floating-point numbers")
     with np.errstate(over="ignore"):  # a wider float may become inf, which the range refuses
         return values.astype(np.float64)
 
@@ -474,11 +474,11 @@ def _label_values(values: np.ndarray, where: str) -> np.ndarray:
         labels = values.ravel().astype(np.float64)
     else:
         what = "a label is neither a finite number nor printable text"
-        mend = "give each a number or a name, or drop the coordinate"
-        raise CaptureError(what, where=where, mend=mend)
+        hint = "give each a number or a name, or drop the coordinate"
+        raise CaptureError(what, where=where, hint=hint)
     if len(set(labels.tolist())) != labels.size:
-        mend = "give each its own, or drop the coordinate"
-        raise CaptureError("two labels are the same", where=where, mend=mend)
+        hint = "give each its own, or drop the coordinate"
+        raise CaptureError("two labels are the same", where=where, hint=hint)
     return labels.reshape(values.shape)
 
 
@@ -487,8 +487,8 @@ def _attributes(variable: xr.Variable, row: Variable, source: str) -> Attributes
     attributes = clean_attributes(variable.attrs, where)
     given = str(attributes.get("units", "")).strip()
     if row.units is not None and "units" in attributes and given not in SPELLINGS[row.units]:
-        mend = f"convert it to units {row.units}"
-        raise CaptureError(f"its units are {given!r}", where=where, mend=mend)
+        hint = f"convert it to units {row.units}"
+        raise CaptureError(f"its units are {given!r}", where=where, hint=hint)
     if row.name == "intensity" and "saturation_level" in attributes:
         attributes["saturation_level"] = _saturation_level(attributes["saturation_level"], where)
     units = row.units or given or ("arbitrary" if row.kind == "reading" else "1")
@@ -497,8 +497,8 @@ def _attributes(variable: xr.Variable, row: Variable, source: str) -> Attributes
 
 def _saturation_level(level: str | int | float, where: str) -> float:
     if isinstance(level, str) or not 0.0 < level < BRIGHTNESS.high:
-        mend = "give the reading, above zero, at which the detector saturates"
-        raise CaptureError(f"saturation_level is {level!r}", where=where, mend=mend)
+        hint = "give the reading, above zero, at which the detector saturates"
+        raise CaptureError(f"saturation_level is {level!r}", where=where, hint=hint)
     return float(level)
 
 
@@ -513,7 +513,7 @@ def _check_intensity_units(numbers: dict[str, xr.Variable], source: str) -> None
         raise CaptureError(
             f"its units are {error['units']!r}, those of intensity {intensity['units']!r}",
             where=f"{source}: intensity_error",
-            mend="give both in the same units",
+            hint="give both in the same units",
         )
 
 

@@ -53,12 +53,12 @@ def read_table(path: str | os.PathLike[str], columns: Sequence[str] | None = Non
     # commas do not separate they may be decimal commas, in the whole table or not at all.
     source, names, body = _parts(path)
     if not body:
-        raise CaptureError("it holds names but no rows", where=source, mend=EACH_READING)
+        raise CaptureError("it holds names but no rows", where=source, hint=EACH_READING)
     for line, cells in body:
         if len(cells) != len(names):
             what = f"it has another number of cells ({len(cells)}) than the first ({len(names)})"
-            mend = "give every line one cell for each column"
-            raise CaptureError(what, where=f"{source}: line {line}", mend=mend)
+            hint = "give every line one cell for each column"
+            raise CaptureError(what, where=f"{source}: line {line}", hint=hint)
     _check_decimal_marks(body, source)
     kept = _positions(columns, names, source)
     pairs = {
@@ -85,20 +85,20 @@ def _parts(path: str | os.PathLike[str]) -> tuple[str, list[str], list[Row]]:
     file = existing_file(path, "table")
     rows = _split_rows(_rows(_text(file)))
     if not rows:
-        raise CaptureError("it holds no rows", where=str(file), mend=EACH_READING)
+        raise CaptureError("it holds no rows", where=str(file), hint=EACH_READING)
     return str(file), *_take_header(rows, str(file))
 
 
 def _text(file: Path) -> str:
     try:
         if file.stat().st_size > LARGEST_FILE:
-            mend = "give a table of at most 50 MB"
-            raise CaptureError("the file is too large", where=str(file), mend=mend)
+            hint = "give a table of at most 50 MB"
+            raise CaptureError("the file is too large", where=str(file), hint=hint)
         content = file.read_bytes()
     except OSError as error:
         raise system_error(error, file) from error
     if b"\0" in content:
-        raise CaptureError("it is not text", where=str(file), mend="save the table as UTF-8 text")
+        raise CaptureError("it is not text", where=str(file), hint="save the table as UTF-8 text")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:  # such as a degree sign in an old header; digits are ASCII anyway
@@ -144,11 +144,11 @@ def _take_header(rows: list[Row], source: str) -> tuple[list[str], list[Row]]:
     names = [name or f"column_{k}" for k, name in enumerate(first, 1)]
     where = f"{source}: line {line}"
     if len(set(names)) != len(names):
-        mend = "name each column once"
-        raise CaptureError("two columns have the same name", where=where, mend=mend)
+        hint = "name each column once"
+        raise CaptureError("two columns have the same name", where=where, hint=hint)
     if not all(name.isprintable() for name in names):
-        mend = "save the table as UTF-8 text"
-        raise CaptureError("a name is not printable text", where=where, mend=mend)
+        hint = "save the table as UTF-8 text"
+        raise CaptureError("a name is not printable text", where=where, hint=hint)
     return names, rows[1:]
 
 
@@ -168,15 +168,15 @@ def _check_decimal_marks(body: list[Row], source: str) -> None:
     for line, cells in body:
         if point and any("," in cell for cell in cells):
             what = "decimal commas stand beside decimal points"
-            mend = "use one of them, and no mark for thousands"
-            raise CaptureError(what, where=f"{source}: line {line}", mend=mend)
+            hint = "use one of them, and no mark for thousands"
+            raise CaptureError(what, where=f"{source}: line {line}", hint=hint)
 
 
 def _positions(columns: Sequence[str] | None, names: list[str], source: str) -> dict[str, int]:
     for name in columns or ():
         if name not in names:
             what = f"there is no column {name!r}"
-            raise CaptureError(what, where=source, mend=f"choose from {', '.join(names)}")
+            raise CaptureError(what, where=source, hint=f"choose from {', '.join(names)}")
     return {name: names.index(name) for name in columns or names}
 
 
@@ -191,5 +191,5 @@ def _number(cell: str, where: str) -> tuple[float, float]:
     raise CaptureError(
         f"{cell!r} is not a finite number",
         where=where,
-        mend="correct it, or take the line out (a # before it makes it a comment)",
+        hint="correct it, or take the line out (a # before it makes it a comment)",
     )

@@ -68,7 +68,7 @@ def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Pa
             raise pb.CaptureError(
                 f"a capture named {label} is there already",
                 where=str(path),
-                mend="import or simulate one of the two again under another --name or file name",
+                hint="import or simulate one of the two again under another --name or file name",
             )
         named[label] = capture
     capture = pb.combine(named, dim=dim, drop=drop)

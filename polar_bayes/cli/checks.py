@@ -47,7 +47,7 @@ def calibrate(
     data = pb.load_capture(capture)
     store = out.with_name(f"{out.name}.fits")
     if resume and out.exists() and not store.exists():
-        raise pb.FitError("nothing is left to resume", where=str(out), mend="give another --out")
+        raise pb.FitError("nothing is left to resume", where=str(out), hint="give another --out")
     settings |= {"readings": not no_readings, "store": store, "resume": resume}
     calibration = pb.calibrate(data, **settings)
     pb.save_result(calibration, out)

@@ -217,7 +217,7 @@ def _make_folder(folder: Path) -> None:
         made_by = pb.load_capture(folder / "capture.nc").attrs.get("made_by", "")
     if made_by != DEMO:
         raise pb.OutputError(
-            "it holds files that no demo made", where=str(folder), mend="give another --out"
+            "it holds files that no demo made", where=str(folder), hint="give another --out"
         )
 
 

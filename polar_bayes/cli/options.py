@@ -27,7 +27,7 @@ class Name(click.ParamType):
             raise self.error(
                 f"no such {self.kind}",
                 where=f"{option}={value!r}",
-                mend=f"give one of {', '.join(self.names)}",
+                hint=f"give one of {', '.join(self.names)}",
             )
         return str(value)
 
@@ -65,7 +65,7 @@ class Input(click.ParamType):
         """Refuse what is not there, unless it may be the name of a column."""
         if self.is_path and not path.exists():
             what = "store" if path.suffix == ".zarr" else "file"
-            raise CaptureError(f"there is no such {what}", where=str(path), mend="check the path")
+            raise CaptureError(f"there is no such {what}", where=str(path), hint="check the path")
 
 
 class Output(click.ParamType):

@@ -60,7 +60,7 @@ def choose(
             raise FitError(
                 f"only {number} of {len(allowed)} candidates can be taken together",
                 where="next_views",
-                mend="ask for fewer, or give more candidates or a rig that can do more",
+                hint="ask for fewer, or give more candidates or a rig that can do more",
             )
         picks.append(pick)
     exchanges, before = 0, -1
@@ -126,14 +126,14 @@ class Rig:
                 raise FitError(
                     f"{name} is ({low:g}, {high:g})",
                     where="Rig",
-                    mend="give two rising angles from 0 to 90 degrees",
+                    hint="give two rising angles from 0 to 90 degrees",
                 )
         for name in ("from_light", "minimum_separation"):
             if not 0.0 <= getattr(self, name) <= 180.0:
                 raise FitError(
                     f"{name} is {getattr(self, name):g}",
                     where="Rig",
-                    mend="give degrees from 0 to 180",
+                    hint="give degrees from 0 to 180",
                 )
 
     def allows(self, candidates: Directions, measured: Directions) -> Bool[np.ndarray, " view"]:
@@ -262,13 +262,13 @@ def links_of_new(
         raise FitError(
             "new views record nothing",
             where="next_views: readings",
-            mend=f"give some of {', '.join(READINGS)}",
+            hint=f"give some of {', '.join(READINGS)}",
         )
     if "dop" in found and {"q", "u"} & set(found):
         raise FitError(
             "the degree of polarization is made of q and u, and would count twice",
             where="next_views: readings",
-            mend="leave out dop, or q and u",
+            hint="leave out dop, or q and u",
         )
     return found
 
@@ -278,7 +278,7 @@ def _link_of(request: Request, name: str, given: AbstractLink | None) -> Abstrac
     where = f"next_views: readings: {name!r}"
     if name not in READINGS:
         raise FitError(
-            "there is no such reading", where=where, mend=f"give some of {', '.join(READINGS)}"
+            "there is no such reading", where=where, hint=f"give some of {', '.join(READINGS)}"
         )
     named = (request.scene_name, str(request.capture.attrs.get("setup")))
     setup = next((SETUPS[word] for word in named if word in SETUPS), None)
@@ -289,13 +289,13 @@ def _link_of(request: Request, name: str, given: AbstractLink | None) -> Abstrac
         raise FitError(
             f"nothing says how {name} scatters",
             where=where,
-            mend=f"give its link: readings={{{name!r}: ...}}",
+            hint=f"give its link: readings={{{name!r}: ...}}",
         )
     if own != request.links.get(name, own):
         raise FitError(
             f"new readings of {name} scatter otherwise than those that were measured",
             where=where,
-            mend=f"leave out its link, which is {request.links[name]!r}",
+            hint=f"leave out its link, which is {request.links[name]!r}",
         )
     return own
 
@@ -347,7 +347,7 @@ def _with_light(capture: xr.Dataset, candidates: xr.Dataset) -> xr.Dataset:
         raise FitError(
             "they are no views",
             where="next_views: candidates",
-            mend="give an xarray.Dataset with view_zenith and view_azimuth over a dim view",
+            hint="give an xarray.Dataset with view_zenith and view_azimuth over a dim view",
         )
     given = [name for name in (*ANGLES, "wavelength") if name in candidates.variables]
     errors = [f"{name}_error" for name in READINGS if f"{name}_error" in candidates]
@@ -359,14 +359,14 @@ def _with_light(capture: xr.Dataset, candidates: xr.Dataset) -> xr.Dataset:
                 raise FitError(
                     "it is missing",
                     where=f"next_views: candidates: {name}",
-                    mend=f"add {name} in degree, with dim view",
+                    hint=f"add {name} in degree, with dim view",
                 )
             candidates[name] = ("view", np.full(candidates.sizes["view"], same[0]))
         if candidates[name].dims != ("view",):
             raise FitError(
                 f"its dims are ({', '.join(map(str, candidates[name].dims))})",
                 where=f"next_views: candidates: {name}",
-                mend="give it the one dim view",
+                hint="give it the one dim view",
             )
         _check_angle(name, candidates[name].to_numpy())
     return candidates
@@ -381,7 +381,7 @@ def _check_angle(name: str, angle: np.ndarray) -> None:
         raise FitError(
             f"{angle[at]:g} is no direction",
             where=f"next_views: candidates: {name}[view={at}]",
-            mend="give degrees; a zenith is from 0 to below 90",
+            hint="give degrees; a zenith is from 0 to below 90",
         )
 
 
@@ -392,7 +392,7 @@ def _wavelengths(capture: xr.Dataset, candidates: xr.Dataset) -> np.ndarray:
             raise FitError(
                 "the capture has no wavelengths",
                 where="next_views: candidates: wavelength",
-                mend="leave the coordinate out",
+                hint="leave the coordinate out",
             )
         return np.ones(1, bool)
     has = capture["wavelength"].to_numpy()
@@ -404,7 +404,7 @@ def _wavelengths(capture: xr.Dataset, candidates: xr.Dataset) -> np.ndarray:
         raise FitError(
             f"{strange[0]:g} nm has parameters of its own, of which the capture says nothing",
             where="next_views: candidates: wavelength",
-            mend=f"give some of {', '.join(f'{x:g}' for x in has)}",
+            hint=f"give some of {', '.join(f'{x:g}' for x in has)}",
         )
     return np.isin(has, asked)
 

@@ -91,6 +91,6 @@ class SingleParameter(AbstractCriterion):
             raise FitError(
                 "no parameter of the material has that name",
                 where=f"SingleParameter({self.name!r})",
-                mend=f"give one of {', '.join(parameters)}",
+                hint=f"give one of {', '.join(parameters)}",
             )
         return np.sum(np.diagonal(covariance, axis1=-2, axis2=-1)[..., rows], axis=-1)

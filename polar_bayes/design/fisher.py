@@ -65,7 +65,7 @@ def information(distribution: dist.Distribution) -> Told:
     raise FitError(
         f"the Fisher information of {type(distribution).__name__} is not known",
         where="identify",
-        mend=f"use a link that gives one of {', '.join(f.__name__ for f in _FAMILIES)}",
+        hint=f"use a link that gives one of {', '.join(f.__name__ for f in _FAMILIES)}",
     )
 
 

@@ -36,7 +36,7 @@ from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
-from polar_bayes.progress import Progress, watched
+from polar_bayes.progress import Progress, with_progress
 
 
 class Expected(NamedTuple):
@@ -50,7 +50,7 @@ class Expected(NamedTuple):
     values: np.ndarray
 
 
-@watched
+@with_progress
 def identify(
     capture: xr.Dataset,
     *,
@@ -291,5 +291,5 @@ def _check(found: xr.Dataset) -> None:
         raise FitError(
             "it says nothing of identifiability",
             where="identifiability",
-            mend="give what polar_bayes.identify returns",
+            hint="give what polar_bayes.identify returns",
         )

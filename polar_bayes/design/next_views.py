@@ -51,7 +51,7 @@ from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.data import ANGLES, Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
-from polar_bayes.progress import Progress, watched
+from polar_bayes.progress import Progress, with_progress
 
 APART = ("wavelength", "reading")
 WIDTH = 2.0 * 1.959963984540054
@@ -74,7 +74,7 @@ class Design(NamedTuple):
         return slopes @ np.linalg.inv(information) @ np.swapaxes(slopes, -1, -2)
 
 
-@watched
+@with_progress
 def next_views(
     capture: xr.Dataset,
     candidates: xr.Dataset | None = None,
@@ -144,14 +144,14 @@ def next_views(
         raise FitError(
             f"count is {count} and draws is {draws}",
             where="next_views",
-            mend="give whole numbers of at least 1",
+            hint="give whole numbers of at least 1",
         )
     criterion, rig = criterion or DOptimal(), rig or Rig()
     if set(apart) - set(APART):
         raise FitError(
             f"apart is {tuple(apart)}",
             where="next_views",
-            mend=f"give some of {', '.join(APART)}",
+            hint=f"give some of {', '.join(APART)}",
         )
     with jax.enable_x64(True):
         question = pose(capture, model, scene, priors, links, largest_view_zenith, seed)
@@ -211,7 +211,7 @@ def _widen(
         raise FitError(
             f"the model does not observe {unheard[0]}",
             where="next_views: readings",
-            mend=f"give some of {', '.join(program.observed)}",
+            hint=f"give some of {', '.join(program.observed)}",
         )
     prior = question.prior
     if program.size != question.program.size:
@@ -240,7 +240,7 @@ def _design(
         raise FitError(
             "the capture has no wavelengths to choose from",
             where="next_views: apart",
-            mend="leave wavelength out",
+            hint="leave wavelength out",
         )
     is_predicted = "intensity" in question.program.observed
 
@@ -409,5 +409,5 @@ def _check(found: xr.Dataset) -> None:
         raise FitError(
             "it names no views",
             where="next_views",
-            mend="give what polar_bayes.next_views returns",
+            hint="give what polar_bayes.next_views returns",
         )

@@ -36,7 +36,7 @@ from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.result import PROVENANCE, posterior_of
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.progress import Progress, watched
+from polar_bayes.progress import Progress, with_progress
 
 KINDS = ("posterior", "likelihood")
 
@@ -50,7 +50,7 @@ class Place(NamedTuple):
     held: int
 
 
-@watched
+@with_progress
 def profile(
     capture: xr.Dataset,
     parameter: str,
@@ -108,7 +108,7 @@ def profile(
         Murphy & van der Vaart (2000), On profile likelihood, JASA 95, 449-465.
     """
     if points < 5:
-        raise FitError(f"points is {points}", where="profile", mend="give 5 or more")
+        raise FitError(f"points is {points}", where="profile", hint="give 5 or more")
     with jax.enable_x64(True):
         question = pose(capture, model, scene, priors, links, largest_view_zenith, seed)
         place = _place_of(question, parameter)
@@ -147,7 +147,7 @@ def _place_of(question: Question, parameter: str) -> Place:
         raise FitError(
             said,
             where=f"parameter={parameter!r}",
-            mend=f"give one of {', '.join(place.label for place in (found or places)[:12])}",
+            hint=f"give one of {', '.join(place.label for place in (found or places)[:12])}",
         )
     return found[0]
 
@@ -174,11 +174,11 @@ def _coordinates_of(question: Question, place: Place, values: Sequence[float]) -
             raise FitError(
                 f"{value:g} is not inside its prior",
                 where=f"profile: values of {place.label}",
-                mend="leave it out",
+                hint="leave it out",
             )
         found.append(float(moved))
     if not found:
-        raise FitError("there are no values", where="profile: values", mend="give at least one")
+        raise FitError("there are no values", where="profile: values", hint="give at least one")
     return np.array(found)
 
 
@@ -310,5 +310,5 @@ def _end_in_words(row: xr.Dataset, side: str, end: float) -> str:
 def _check(found: xr.Dataset) -> None:
     if not isinstance(found, xr.Dataset) or "prior_beyond" not in found:
         raise FitError(
-            "it is no profile", where="profile", mend="give what polar_bayes.profile returns"
+            "it is no profile", where="profile", hint="give what polar_bayes.profile returns"
         )

@@ -23,7 +23,7 @@ from polar_bayes.inference.result import posterior_of
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.progress import Progress, silent
+from polar_bayes.progress import Progress, no_progress
 
 PRIOR_DRAWS = 500
 
@@ -61,7 +61,7 @@ def find_peaks(
 ) -> Modes:
     """The modes of the posterior, heaviest first."""
     potential = potential or CompiledPotential(question.program, question.data)
-    return find_modes(potential, question.prior[:STARTS], progress or silent)
+    return find_modes(potential, question.prior[:STARTS], progress or no_progress)
 
 
 def flat_parameters(
@@ -139,7 +139,7 @@ def draws_of(question: Question, result: xr.DataTree, count: int) -> Float[np.nd
             raise FitError(
                 f"it has no draws of {name} as this model has it",
                 where="next_views: result",
-                mend="give a fit of the same capture, model, scene and links",
+                hint="give a fit of the same capture, model, scene and links",
             )
         values = group[name].transpose("chain", "draw", ...).to_numpy()
         sites[name] = values.reshape(-1, *whole[name].shape)
@@ -152,7 +152,7 @@ def draws_of(question: Question, result: xr.DataTree, count: int) -> Float[np.nd
         raise FitError(
             "none of its draws is finite",
             where="next_views: result",
-            mend="give a fit that succeeded",
+            hint="give a fit that succeeded",
         )
     kept = kept[np.linspace(0, kept.size - 1, min(count, kept.size)).round().astype(int)]
 
@@ -184,7 +184,7 @@ def embed(program: Program, wide: Program) -> Int[np.ndarray, " size"]:
             raise FitError(
                 f"every view has its own {name}, which views not yet taken cannot tell",
                 where="next_views: model",
-                mend="use a model whose parameters do not belong to single views",
+                hint="use a model whose parameters do not belong to single views",
             )
         places[position.astype(int).ravel()] = theirs[name].astype(int).ravel()
     return places

@@ -62,7 +62,7 @@ def compare_fits(fits: Mapping[str, xr.DataTree]) -> FitComparison:
         raise FitError(
             "there is nothing to compare",
             where="compare_fits",
-            mend="give two or more fits by name, such as {'rough': a, 'smooth': b}",
+            hint="give two or more fits by name, such as {'rough': a, 'smooth': b}",
         )
     named = {one_line(str(name)): fit for name, fit in fits.items()}
     for name, fit in named.items():
@@ -111,7 +111,7 @@ def _check_same_capture(one: xr.DataTree, other: xr.DataTree, first: str, name: 
                 raise FitError(
                     f"it is of another capture than {first}: {variable} differs",
                     where=f"compare_fits: {name}",
-                    mend="give fits of one capture",
+                    hint="give fits of one capture",
                 )
 
 
@@ -205,7 +205,7 @@ def stack_readings(result: xr.DataTree) -> xr.DataTree:
         raise FitError(
             "it holds no readings",
             where="stack_readings",
-            mend="give the tree that polar_bayes.fit or load_result returned",
+            hint="give the tree that polar_bayes.fit or load_result returned",
         )
     check_fit(result)
     observed = result["observed_data"].to_dataset()

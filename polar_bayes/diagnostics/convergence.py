@@ -146,7 +146,7 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
 
 
 def laplace_k_hat(result: xr.DataTree) -> float:
-    """How far draws of Laplace or a guide are from the posterior, as Pareto k-hat of their weights."""
+    """Pareto k-hat of the importance weights of Laplace draws or of a variational guide."""
     # $$ w = p(z | data) / q(z) $$
     # Source: Vehtari et al. (2024), JMLR 25(72).
     stats = stats_of(result)

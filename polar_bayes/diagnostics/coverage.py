@@ -64,7 +64,7 @@ def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
         raise CaptureError(
             "it knows the truth of no parameter of the map",
             where=_name_of(truth),
-            mend=f"give a simulated capture, with one of {', '.join(sorted(names))} as `true_...`",
+            hint=f"give a simulated capture, with one of {', '.join(sorted(names))} as `true_...`",
         )
     maps = at_hand(maps)
     counts: dict[str, np.ndarray] = {}
@@ -88,7 +88,7 @@ def map_scalars(maps: xr.Dataset) -> list[Scalar]:
     """The numbers that a map has in each pixel, labeled and in the order of a fit of one."""
     names = [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
     if not names or "status" not in maps:
-        raise FitError("it holds no maps", where="maps", mend="give what fit_pixels returns")
+        raise FitError("it holds no maps", where="maps", hint="give what fit_pixels returns")
     # An empty corner has the axes and labels of a posterior, and nothing is read.
     corner = maps[names].isel({dim: slice(1) for dim in IMAGE}).drop_vars(IMAGE, errors="ignore")
     return scalars(xr.zeros_like(corner).rename(dict(zip(IMAGE, ("chain", "draw"), strict=True))))
@@ -108,7 +108,7 @@ def _truth_of(maps: xr.Dataset, truth: xr.Dataset, name: str) -> xr.DataArray | 
         raise CaptureError(
             f"true_{name} and the map stand on different axes ({sizes})",
             where=_name_of(truth),
-            mend="give the capture of which the map was made",
+            hint="give the capture of which the map was made",
         ) from error
     return true
 

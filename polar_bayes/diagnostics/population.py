@@ -29,7 +29,7 @@ LEAST_ERRORS = 2.0
 NARROWEST = 1e-6
 
 
-class Alone(NamedTuple):
+class GroupProgram(NamedTuple):
     """One member without its population, on the scale on which the population is normal."""
 
     mean: float
@@ -37,7 +37,7 @@ class Alone(NamedTuple):
     leaning: float
 
 
-def estimate_alone(value: np.ndarray, location: np.ndarray, spread: np.ndarray) -> Alone:
+def estimate_alone(value: np.ndarray, location: np.ndarray, spread: np.ndarray) -> GroupProgram:
     """Take a normal population out of the posterior draws of one of its members."""
     # A likelihood $\exp(b x - p x^2 / 2)$ of the member makes its draws, given location $\mu$ and
     # spread $s$ of the same draw,
@@ -47,7 +47,7 @@ def estimate_alone(value: np.ndarray, location: np.ndarray, spread: np.ndarray) 
     # estimate is exact, up to Monte Carlo error, for any posterior of location and spread.
     center, unit = float(value.mean()), float(value.std())
     if not unit > 0.0:
-        return Alone(math.nan, math.nan, math.nan)
+        return GroupProgram(math.nan, math.nan, math.nan)
     x, mu = (value - center) / unit, (location - center) / unit
     belief = np.maximum(spread / unit, NARROWEST) ** -2.0
     b, p = 0.0, max(1.0 - 1.0 / float(np.mean(1.0 / belief)), 0.1)
@@ -67,8 +67,8 @@ def estimate_alone(value: np.ndarray, location: np.ndarray, spread: np.ndarray) 
     error = math.sqrt(np.linalg.inv(_derivatives(x, mu, belief, b, p)[1])[1, 1])
     leaning = float(np.mean(belief / (belief + max(p, 0.0))))
     if not p > LEAST_ERRORS * error:
-        return Alone(math.nan, math.nan, leaning)
-    return Alone(center + unit * b / p, unit / math.sqrt(p), leaning)
+        return GroupProgram(math.nan, math.nan, leaning)
+    return GroupProgram(center + unit * b / p, unit / math.sqrt(p), leaning)
 
 
 def _log_density(x: np.ndarray, mu: np.ndarray, belief: np.ndarray, b: float, p: float) -> float:

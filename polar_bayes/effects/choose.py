@@ -19,7 +19,7 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import FULL_SCENES, Scene
 from polar_bayes.priors import resolve_priors
-from polar_bayes.progress import Progress, silent, watched
+from polar_bayes.progress import Progress, no_progress, with_progress
 
 # --- Which effects a scene keeps: each is weighed alone, then all that may go are weighed together
 
@@ -43,7 +43,7 @@ class Wishes:
         for effect in dropped:
             if effect in kept:
                 raise SceneError(
-                    "it is both to keep and to drop", where=effect.name, mend="name it in one only"
+                    "it is both to keep and to drop", where=effect.name, hint="name it in one only"
                 )
         return cls(kept, dropped)
 
@@ -184,7 +184,7 @@ def _check_names(whole: Reference, parameters: Iterable[str]) -> None:
             raise FitError(
                 "the scene with everything on has no such parameter",
                 where=f"parameters: {name!r}",
-                mend=f"give any of {', '.join(dict.fromkeys(density.sites))}",
+                hint=f"give any of {', '.join(dict.fromkeys(density.sites))}",
             )
 
 
@@ -419,7 +419,7 @@ class ChosenScene(Scene):
         return repr(simplify(self, ()))  # as one would write it
 
 
-@watched
+@with_progress
 def choose_effects(
     capture: xr.Dataset,
     *,
@@ -470,7 +470,7 @@ def choose_effects(
         raise FitError(
             f"tolerance is {tolerance!r}",
             where="choose_effects",
-            mend="give posterior standard deviations above 0, such as 0.1",
+            hint="give posterior standard deviations above 0, such as 0.1",
         )
     request = resolve(
         capture, model, "laplace", scene, None, links, largest_view_zenith, seed, "double"
@@ -481,7 +481,7 @@ def choose_effects(
     wishes = Wishes.of(effects, keep, drop)
     names = None if parameters is None else tuple(parameters)
     with jax.enable_x64(True):
-        scales = Scales(request, priors, progress or silent)
+        scales = Scales(request, priors, progress or no_progress)
         # What is refused here is refused before minutes are spent.
         resolve_priors(scales.priors(full).read, priors)
         weighed = weigh(scales, full, effects, names)

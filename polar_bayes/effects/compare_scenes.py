@@ -34,7 +34,7 @@ from numpyro.infer.util import log_density
 
 from polar_bayes.diagnostics.parameters import scalars
 from polar_bayes.inference.optimize import Status, ValueAndGradient, climb, find_modes, from_prior
-from polar_bayes.inference.program import Program, compile_program, noise_free, read_story
+from polar_bayes.inference.program import Program, compile_program, inspect_model, noise_free
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import posterior_of
 from polar_bayes.observation.data import Observations, observe
@@ -75,8 +75,8 @@ def compile_and_count(function: Callable[..., Any], *arguments: Any) -> Compiled
     begin = time.perf_counter()
     program = jax.jit(function).lower(*arguments).compile()
     seconds = time.perf_counter() - begin
-    counted = program.cost_analysis() or {}
-    operations = sum(counted.get(kind, math.nan) for kind in ("flops", "transcendentals"))
+    with_counter = program.cost_analysis() or {}
+    operations = sum(with_counter.get(kind, math.nan) for kind in ("flops", "transcendentals"))
     return Compiled(program, float(operations), seconds)
 
 
@@ -397,7 +397,7 @@ class Scales:
     def priors(self, scene: Scene) -> PriorTable:
         """The priors, with a note of which ones the model reads with that scene."""
         table = PriorTable(self._priors)
-        read_story(self._request.model, self._data, scene, table, self._request.links)
+        inspect_model(self._request.model, self._data, scene, table, self._request.links)
         return table
 
     def reference(self, scene: Scene, parameters: tuple[str, ...] | None) -> Reference:

@@ -74,7 +74,7 @@ def find_effects(word: str, effects: Iterable[Effect], where: str) -> tuple[Effe
     if not meant:
         known = ", ".join(effect.name for effect in effects) or "none: nothing can be left out"
         raise SceneError(
-            "the scene has no such effect", where=f"{where}={word!r}", mend=f"give one of {known}"
+            "the scene has no such effect", where=f"{where}={word!r}", hint=f"give one of {known}"
         )
     return meant
 

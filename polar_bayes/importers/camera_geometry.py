@@ -63,8 +63,8 @@ class Direction(AbstractPlace):
 
     def __post_init__(self) -> None:
         if _check(self) == 0.0:
-            mend = "give a vector that is not zero"
-            raise CaptureError("it points nowhere", where=repr(self), mend=mend)
+            hint = "give a vector that is not zero"
+            raise CaptureError("it points nowhere", where=repr(self), hint=hint)
 
     @override
     def towards(self, points: np.ndarray) -> np.ndarray:
@@ -94,8 +94,8 @@ class Position(AbstractPlace):
     def __post_init__(self) -> None:
         _check(self)
         if not self.z > 0.0:
-            mend = "give z above 0, in pixels of the frame"
-            raise CaptureError("it stands behind the surface", where=repr(self), mend=mend)
+            hint = "give z above 0, in pixels of the frame"
+            raise CaptureError("it stands behind the surface", where=repr(self), hint=hint)
 
     @override
     def towards(self, points: np.ndarray) -> np.ndarray:
@@ -197,8 +197,8 @@ def as_place(place: Any, where: str) -> AbstractPlace:
         return place
     if isinstance(place, list | tuple | np.ndarray) and len(place) == 3:
         return Direction(*place)
-    mend = "give Direction(x, y, z) or Position(x, y, z)"
-    raise CaptureError(f"{place!r} is no place", where=where, mend=mend)
+    hint = "give Direction(x, y, z) or Position(x, y, z)"
+    raise CaptureError(f"{place!r} is no place", where=where, hint=hint)
 
 
 def _first_axis(view: np.ndarray) -> np.ndarray:

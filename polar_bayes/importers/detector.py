@@ -46,7 +46,7 @@ def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
         raise CaptureError(
             f"it holds {values.dtype.name} of shape {values.shape}, not one frame of gray values",
             where=_place(frame, where),
-            mend="give rows and columns of numbers; of a color frame, one channel",
+            hint="give rows and columns of numbers; of a color frame, one channel",
         )
     counts = values.astype(np.float64)
     if not np.isfinite(counts).all() or np.abs(counts).max() > LARGEST_COUNT:
@@ -54,7 +54,7 @@ def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
         raise CaptureError(
             f"{counts[row, column]:g} is no reading",
             where=f"{_place(frame, where)}[row={row}, column={column}]",
-            mend=f"give finite counts up to {LARGEST_COUNT:g}",
+            hint=f"give finite counts up to {LARGEST_COUNT:g}",
         )
     return counts, 255.0 if values.dtype == np.uint8 else None
 
@@ -62,7 +62,7 @@ def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
 def read_array(path: str | os.PathLike[str], where: str) -> np.ndarray:
     """The array of a .npy file."""
     file = existing_file(path, where)
-    mend = "save one array with numpy.save"
+    hint = "save one array with numpy.save"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what old versions of NumPy wrote can still be read
@@ -71,14 +71,14 @@ def read_array(path: str | os.PathLike[str], where: str) -> np.ndarray:
         if isinstance(mapped, np.memmap):
             if mapped.offset + mapped.nbytes != file.stat().st_size:
                 what = f"its header says {mapped.nbytes} bytes of numbers, and it holds others"
-                raise CaptureError(what, where=str(file), mend=mend)
+                raise CaptureError(what, where=str(file), hint=hint)
             return np.array(mapped)
         mapped.close()  # a .npz archive
     except CaptureError:
         raise
     except Exception as error:  # NumPy raises nearly every type for a broken header
-        raise CaptureError("it cannot be read as .npy", where=str(file), mend=mend) from error
-    raise CaptureError("it holds several arrays", where=str(file), mend=mend)
+        raise CaptureError("it cannot be read as .npy", where=str(file), hint=hint) from error
+    raise CaptureError("it holds several arrays", where=str(file), hint=hint)
 
 
 def _array(frame: Any, where: str) -> np.ndarray:
@@ -93,20 +93,20 @@ def _array(frame: Any, where: str) -> np.ndarray:
             with Image.open(file, formats=FORMATS) as image:
                 if image.mode not in GRAY_MODES:
                     what = f"its pixels are {image.mode}, not gray values"
-                    mend = "save it with 8 or 16 bits of gray, or give one channel as .npy"
-                    raise CaptureError(what, where=str(file), mend=mend)
+                    hint = "save it with 8 or 16 bits of gray, or give one channel as .npy"
+                    raise CaptureError(what, where=str(file), hint=hint)
                 if (pages := getattr(image, "n_frames", 1)) > 1:
-                    mend = "save each page as a file of its own"
-                    raise CaptureError(f"it holds {pages} frames", where=str(file), mend=mend)
+                    hint = "save each page as a file of its own"
+                    raise CaptureError(f"it holds {pages} frames", where=str(file), hint=hint)
                 return np.asarray(image)
     except CaptureError:
         raise
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        mend = "cut it to what matters, or give it as .npy"
-        raise CaptureError("it is larger than any camera", where=str(file), mend=mend) from error
+        hint = "cut it to what matters, or give it as .npy"
+        raise CaptureError("it is larger than any camera", where=str(file), hint=hint) from error
     except Exception as error:  # Pillow raises many types for a broken file
-        mend = "give PNG, TIFF or .npy"
-        raise CaptureError("it cannot be read as an image", where=str(file), mend=mend) from error
+        hint = "give PNG, TIFF or .npy"
+        raise CaptureError("it cannot be read as an image", where=str(file), hint=hint) from error
 
 
 def _place(frame: Any, where: str) -> str:
@@ -184,15 +184,15 @@ def signal_of(frames: list[np.ndarray], level: float | None, detector: Detector)
         raise CaptureError(
             "the frames do not say at which count a pixel is full",
             where="saturation_level",
-            mend="give it: 4095 for 12 bits, 65535 for 16 bits",
+            hint="give it: 4095 for 12 bits, 65535 for 16 bits",
         )
     raw = np.stack(frames)
     shape = raw.shape[1:]
     dark = _dark(detector.dark, shape)
     flat = _flat(detector.flat, shape)
     if not (dark < full).all():
-        mend = "check it and the saturation level"
-        raise CaptureError(f"it reaches the full count {full:g}", where="dark", mend=mend)
+        hint = "check it and the saturation level"
+        raise CaptureError(f"it reaches the full count {full:g}", where="dark", hint=hint)
     gain = full / FULL_WELL if detector.gain is None else float(detector.gain)
     counts = raw - dark
     variance = detector.read_noise**2 + ROUNDING + gain * np.maximum(counts, 0.0)
@@ -218,7 +218,7 @@ def check_number(name: str, value: Any, allowed: Interval) -> float:
     """A number given by the user."""
     if isinstance(value, Real) and not isinstance(value, bool) and allowed.contains(value):
         return float(value)
-    raise CaptureError(f"it is {value!r}", where=name, mend=f"give {allowed}")
+    raise CaptureError(f"it is {value!r}", where=name, hint=f"give {allowed}")
 
 
 def _dark(dark: Frame | float, shape: tuple[int, ...]) -> np.ndarray:
@@ -237,7 +237,7 @@ def _flat(flat: Frame | None, shape: tuple[int, ...]) -> np.ndarray:
         raise CaptureError(
             f"{values[row, column]:g} is less than a twentieth of its mean {mean:g}",
             where=f"flat[row={row}, column={column}]",
-            mend="take it less its dark frame, of even light; mend dead pixels",
+            hint="take it less its dark frame, of even light; mend dead pixels",
         )
     return values / mean
 
@@ -245,8 +245,8 @@ def _flat(flat: Frame | None, shape: tuple[int, ...]) -> np.ndarray:
 def _matching(values: np.ndarray, shape: tuple[int, ...], where: str) -> np.ndarray:
     if values.shape == shape:
         return values
-    mend = "take it with the same camera at the same size"
-    raise CaptureError(f"it is {values.shape}, the frames are {shape}", where=where, mend=mend)
+    hint = "take it with the same camera at the same size"
+    raise CaptureError(f"it is {values.shape}, the frames are {shape}", where=where, hint=hint)
 
 
 def _said(frame: Frame | float | None) -> str | float:

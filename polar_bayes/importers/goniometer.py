@@ -73,7 +73,7 @@ def channel_from_file(name: str, path: str | os.PathLike[str]) -> Channel:
         raise CaptureError(
             f"it has {len(table.names)} columns, not two",
             where=table.source,
-            mend="give angle and reading, or use table= and name the columns angle=, s= and p=",
+            hint="give angle and reading, or use table= and name the columns angle=, s= and p=",
         )
     return channel_from_table(name, table, *table.names)
 
@@ -83,15 +83,15 @@ def channel_from_arrays(name: str, pair: Any) -> Channel:
     try:
         angle, reading = (np.asarray(part) for part in pair)
     except (TypeError, ValueError):
-        mend = "give a path or a pair (angles, readings)"
-        raise CaptureError("it is neither table nor pair", where=name, mend=mend) from None
+        hint = "give a path or a pair (angles, readings)"
+        raise CaptureError("it is neither table nor pair", where=name, hint=hint) from None
     for part in (angle, reading):
         if part.dtype.kind not in "iuf" or part.ndim != 1 or not np.isfinite(part).all():
-            mend = "give one finite number for each reading"
-            raise CaptureError("it holds more than a list of numbers", where=name, mend=mend)
+            hint = "give one finite number for each reading"
+            raise CaptureError("it holds more than a list of numbers", where=name, hint=hint)
     if not 0 < angle.size == reading.size:
         what = f"{angle.size} angles and {reading.size} readings are no pair"
-        raise CaptureError(what, where=name, mend="give one angle for each reading, at least one")
+        raise CaptureError(what, where=name, hint="give one angle for each reading, at least one")
     step = min(
         map(_printed_step, reading if reading.dtype.kind == "f" else reading.astype(np.float64))
     )
@@ -186,12 +186,12 @@ def _sorted(
     return channel
 
 
-def _refuse(channel: Channel, wrong: np.ndarray, what: str, mend: str) -> None:
+def _refuse(channel: Channel, wrong: np.ndarray, what: str, hint: str) -> None:
     """Raise for the first row that is wrong."""
     if wrong.any():
         row = int(np.argmax(wrong))
         values = f"(angle {channel.angle[row]:g}, {channel.name} {channel.light[row]:g})"
-        raise CaptureError(f"{what} {values}", where=channel.places[row], mend=mend)
+        raise CaptureError(f"{what} {values}", where=channel.places[row], hint=hint)
 
 
 def _printed_step(reading: np.floating) -> float:
@@ -287,11 +287,11 @@ def _read(
     """Both channels, and the files that they come from."""
     if table is None:
         if angle is not None:
-            mend = "give the table, or s and p as tables of their own"
-            raise CaptureError("a column is named without table", where="angle", mend=mend)
+            hint = "give the table, or s and p as tables of their own"
+            raise CaptureError("a column is named without table", where="angle", hint=hint)
         if s is None or p is None:
-            mend = "give s and p, each a table or a pair (angles, readings)"
-            raise CaptureError("a channel is missing", where=WHERE, mend=mend)
+            hint = "give s and p, each a table or a pair (angles, readings)"
+            raise CaptureError("a channel is missing", where=WHERE, hint=hint)
         paths = [str(part) for part in (s, p) if isinstance(part, str | os.PathLike)]
         return _channel("s", s), _channel("p", p), paths
     angle = _column("angle", angle, table)
@@ -305,8 +305,8 @@ def _read(
 def _column(key: str, column: object, table: str | os.PathLike[str]) -> str:
     if isinstance(column, str):
         return column
-    mend = f"give {key}= the name of a column of the table"
-    raise CaptureError("its column is not named", where=f"{table}: {key}", mend=mend)
+    hint = f"give {key}= the name of a column of the table"
+    raise CaptureError("its column is not named", where=f"{table}: {key}", hint=hint)
 
 
 def _channel(name: str, readings: object) -> Channel:
@@ -323,7 +323,7 @@ def _combined(s: Channel, p: Channel, relative_error: float, units: str) -> xr.D
     valid = S + P > 0.0  # not where either is NaN
     if not valid.any():
         what = "s and p share no angle at which light was seen"
-        raise CaptureError(what, where=WHERE, mend="read both over the same range of angles")
+        raise CaptureError(what, where=WHERE, hint="read both over the same range of angles")
     total = np.where(valid, S + P, np.nan)
     q = (S - P) / total
     with np.errstate(over="ignore"):  # an error past all bounds is refused by the contract
@@ -351,8 +351,8 @@ def _incident_levels(
     s: float | None, p: float | None, dark_level: float
 ) -> tuple[float | None, float | None]:
     if (s is None) != (p is None):
-        mend = "give s_incident and p_incident, or neither"
-        raise CaptureError("one incident level is missing", where=WHERE, mend=mend)
+        hint = "give s_incident and p_incident, or neither"
+        raise CaptureError("one incident level is missing", where=WHERE, hint=hint)
     above_dark = Interval(dark_level, LARGEST_READING, open_low=True, open_high=True)
     return _optional("s_incident", s, above_dark), _optional("p_incident", p, above_dark)
 
@@ -365,4 +365,4 @@ def _option(name: str, value: object, allowed: Interval) -> float:
     """A number given by the user, refused unless it lies inside the interval."""
     if isinstance(value, Real) and allowed.contains(value):
         return float(value)
-    raise CaptureError(f"it is {value!r}", where=name, mend=f"give {allowed}")
+    raise CaptureError(f"it is {value!r}", where=name, hint=f"give {allowed}")

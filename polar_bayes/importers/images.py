@@ -9,8 +9,8 @@ readings make one pixel of the capture: they are the views of one material, each
 directions at its own place. One picture shows each place from one side only, and a fit needs two
 views; a curved surface has them next to each other.
 
-One frame for each angle, everything else still; `polar_bayes.importers.stokes` tells how they become
-Stokes parameters, `polar_bayes.importers.detector` what noise they have, and
+One frame for each angle, everything else still; `polar_bayes.importers.stokes` tells how they
+become Stokes parameters, `polar_bayes.importers.detector` what noise they have, and
 `polar_bayes.importers.images` what becomes of places that say nothing.
 
 Four neighboring pixels stand behind four polarizers. polanalyser fills in for each angle what the
@@ -114,15 +114,15 @@ def squares_of(frame: tuple[int, ...], bin_: object, window: object) -> Squares:
     """How a frame is cut."""
     for name, value in (("bin", bin_), ("window", window)):
         if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
-            mend = "give a whole number of 1 or more"
-            raise CaptureError(f"it is {value!r}", where=name, mend=mend)
+            hint = "give a whole number of 1 or more"
+            raise CaptureError(f"it is {value!r}", where=name, hint=hint)
     squares = Squares((frame[0], frame[1]), int(bin_), int(window))  # type: ignore[call-overload]
     if min(squares.counts) < 1:
         raise CaptureError(
             f"frames of {frame[0]} rows and {frame[1]} columns hold no square of "
             f"{squares.bin * squares.window} pixels",
             where="bin, window",
-            mend="give smaller ones",
+            hint="give smaller ones",
         )
     return squares
 
@@ -191,7 +191,7 @@ def picture_capture(
         raise CaptureError(
             f"no reading is left ({told})".replace("_", " "),
             where=str(attributes.get("name", "frames")),
-            mend="check shape, light and exposure, or average more pixels (bin)",
+            hint="check shape, light and exposure, or average more pixels (bin)",
         )
     attributes |= _noise_said(turned, valid)
     readings = {
@@ -242,8 +242,8 @@ def _light_of(highlight: Highlight, setting: Setting, frame: tuple[int, int]) ->
     inside = highlight.row <= frame[0] - 1 and highlight.column <= frame[1] - 1
     normal = setting.shape.normals(row, column, 1)[0] if inside else np.full(3, np.nan)
     if not np.isfinite(normal).all():
-        mend = "give row and column of the highlight, row first, in pixels of the frame"
-        raise CaptureError("there is no surface", where=repr(highlight), mend=mend)
+        hint = "give row and column of the highlight, row first, in pixels of the frame"
+        raise CaptureError("there is no surface", where=repr(highlight), hint=hint)
     view = setting.view.towards(_points(row, column, frame))[0]
     return Direction(*(float(x) for x in mirrored(normal, view)))
 
@@ -339,18 +339,18 @@ def from_polarizer(
     detector = Detector() if detector is None else detector
     degrees = check_angles(angles)
     if isinstance(frames, str) or not hasattr(frames, "__len__"):
-        mend = "give a list of frames, one for each angle"
-        raise CaptureError(f"a {type(frames).__name__} is no list", where="frames", mend=mend)
+        hint = "give a list of frames, one for each angle"
+        raise CaptureError(f"a {type(frames).__name__} is no list", where="frames", hint=hint)
     if len(frames) != len(degrees):
         what = f"there are {len(frames)} frames and {len(degrees)} angles"
-        raise CaptureError(what, where="frames", mend="give one frame for each angle")
+        raise CaptureError(what, where="frames", hint="give one frame for each angle")
     read = [read_frame(frame, f"frames[{k}]") for k, frame in enumerate(frames)]
     raw, levels = [values for values, _ in read], [level for _, level in read]
     for k, values in enumerate(raw):
         if values.shape != raw[0].shape:
             what = f"it is {values.shape}, the first {raw[0].shape}"
-            mend = "give frames of one size"
-            raise CaptureError(what, where=f"frames[{k}]", mend=mend)
+            hint = "give frames of one size"
+            raise CaptureError(what, where=f"frames[{k}]", hint=hint)
     squares = squares_of(raw[0].shape, bin, window)
     setting = setting_of(shape, view, light, raw[0].shape)
     signal = signal_of(raw, None if None in levels else levels[0], detector)
@@ -433,12 +433,12 @@ def from_mosaic(
     angles = _angles(layout)
     counts, level = read_frame(frame, "frame")
     if counts.shape[0] % 2 or counts.shape[1] % 2:
-        mend = "give the frame as the sensor has it, from its first row and column"
-        raise CaptureError(f"it is {counts.shape}, not even", where="frame", mend=mend)
+        hint = "give the frame as the sensor has it, from its first row and column"
+        raise CaptureError(f"it is {counts.shape}, not even", where="frame", hint=hint)
     squares = squares_of(counts.shape, bin, window)
     if squares.bin % 2:
-        mend = "give an even number: each square holds all four polarizers"
-        raise CaptureError(f"it is {bin}", where="bin", mend=mend)
+        hint = "give an even number: each square holds all four polarizers"
+        raise CaptureError(f"it is {bin}", where="bin", hint=hint)
     setting = setting_of(shape, view, light, counts.shape)
     signal = signal_of([counts], level, detector)
     # A full pixel spreads to the neighbors that are filled in from it.
@@ -486,8 +486,8 @@ def _angles(layout: ArrayLike) -> np.ndarray:
     except (TypeError, ValueError):
         four = np.full(0, np.nan)
     if four.shape != (2, 2):
-        mend = "give two rows of two angles, such as ((90, 45), (135, 0))"
-        raise CaptureError(f"it is {layout!r}", where="layout", mend=mend)
+        hint = "give two rows of two angles, such as ((90, 45), (135, 0))"
+        raise CaptureError(f"it is {layout!r}", where="layout", hint=hint)
     return check_angles([four[row, column] for row, column in AT])
 
 
@@ -498,5 +498,5 @@ def _polanalyser() -> ModuleType:
         raise CaptureError(
             f"the library for mosaics of polarizers is not installed ({error.name})",
             where=MOSAIC,
-            mend="pip install 'polar_bayes[camera]'",
+            hint="pip install 'polar_bayes[camera]'",
         ) from error

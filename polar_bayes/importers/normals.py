@@ -89,12 +89,12 @@ class Spheres(AbstractShape):
 
     def __post_init__(self) -> None:
         if not isinstance(self.spheres, tuple) or not self.spheres:
-            mend = "give a tuple such as (Sphere(500.0, 640.0, 210.0),)"
-            raise CaptureError("there is no sphere", where="Spheres", mend=mend)
+            hint = "give a tuple such as (Sphere(500.0, 640.0, 210.0),)"
+            raise CaptureError("there is no sphere", where="Spheres", hint=hint)
         for sphere in self.spheres:
             if not isinstance(sphere, Sphere):
-                mend = "give Sphere(row, column, radius)"
-                raise CaptureError(f"{sphere!r} is no sphere", where="Spheres", mend=mend)
+                hint = "give Sphere(row, column, radius)"
+                raise CaptureError(f"{sphere!r} is no sphere", where="Spheres", hint=hint)
 
     @override
     def normals(self, rows: np.ndarray, columns: np.ndarray, width: int) -> np.ndarray:
@@ -120,7 +120,7 @@ class Spheres(AbstractShape):
                 raise CaptureError(
                     f"it lies outside of frames of {shape[0]} rows and {shape[1]} columns",
                     where=repr(sphere),
-                    mend="give row, column and radius in pixels of the frame, row first",
+                    hint="give row, column and radius in pixels of the frame, row first",
                 )
 
     @property
@@ -150,9 +150,9 @@ class NormalMap(AbstractShape):
         else:
             where, values = "normals", np.asarray(self.values)
         if values.dtype.kind not in "iuf" or values.ndim != 3 or values.shape[-1] != 3:
-            mend = "give x, y and z for each pixel: (row, column, 3)"
+            hint = "give x, y and z for each pixel: (row, column, 3)"
             what = f"it holds {values.dtype.name} of shape {values.shape}"
-            raise CaptureError(what, where=where, mend=mend)
+            raise CaptureError(what, where=where, hint=hint)
         values = values.astype(np.float64)
         length = np.linalg.norm(values, axis=-1, keepdims=True)
         missing = ~np.isfinite(length) | (length == 0.0)
@@ -162,7 +162,7 @@ class NormalMap(AbstractShape):
             raise CaptureError(
                 f"its length is {length[row, column, 0]:g}",
                 where=f"{where}[row={row}, column={column}]",
-                mend="give unit normals, from -1 to 1; colors c of 8 bits are 2 c/255 - 1",
+                hint="give unit normals, from -1 to 1; colors c of 8 bits are 2 c/255 - 1",
             )
         unit = np.where(missing, np.nan, values) / np.where(missing, 1.0, length)
         object.__setattr__(self, "_unit", unit)
@@ -184,7 +184,7 @@ class NormalMap(AbstractShape):
             raise CaptureError(
                 f"they are {self._unit.shape[:2]}, the frames {tuple(shape)}",
                 where="normals",
-                mend="give a normal for each pixel of the frame, before any averaging",
+                hint="give a normal for each pixel of the frame, before any averaging",
             )
 
     @property
@@ -215,8 +215,8 @@ def fit_sphere(rim: Any) -> Sphere:
     else:
         where, points = "rim", _points(rim)
     if len(points) < FEWEST_RIM_POINTS:
-        mend = "mark four points or more on the outline, all around"
-        raise CaptureError(f"it has {len(points)} points", where=where, mend=mend)
+        hint = "mark four points or more on the outline, all around"
+        raise CaptureError(f"it has {len(points)} points", where=where, hint=hint)
     center = points.mean(axis=0)
     radius = np.linalg.norm(points - center, axis=1).mean()
 
@@ -229,7 +229,7 @@ def fit_sphere(rim: Any) -> Sphere:
         raise CaptureError(
             f"a point is {off:.3g} pixels off the best circle, of radius {found[2]:.3g}",
             where=where,
-            mend="check for a swapped row and column, or give normals of another shape",
+            hint="check for a swapped row and column, or give normals of another shape",
         )
     return Sphere(*(float(x) for x in found))
 
@@ -244,8 +244,8 @@ def as_shape(shape: Any) -> AbstractShape:
         return NormalMap(shape)
     if isinstance(shape, Sequence):
         return Spheres(tuple(shape))
-    mend = "give a Sphere, several, or normals of shape (row, column, 3)"
-    raise CaptureError(f"a {type(shape).__name__} is no shape", where="shape", mend=mend)
+    hint = "give a Sphere, several, or normals of shape (row, column, 3)"
+    raise CaptureError(f"a {type(shape).__name__} is no shape", where="shape", hint=hint)
 
 
 def _points(rim: Any) -> np.ndarray:
@@ -254,6 +254,6 @@ def _points(rim: Any) -> np.ndarray:
     except (TypeError, ValueError):
         points = np.full((0,), np.nan)
     if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
-        mend = "give an array of shape (point, 2): row and column"
-        raise CaptureError("it is no list of points", where="rim", mend=mend)
+        hint = "give an array of shape (point, 2): row and column"
+        raise CaptureError("it is no list of points", where="rim", hint=hint)
     return points

@@ -110,22 +110,22 @@ def check_angles(angles: Any) -> np.ndarray:
     except (TypeError, ValueError):
         degrees = np.full(1, np.nan)
     if degrees.ndim != 1 or not (np.abs(degrees) <= 360.0).all():
-        mend = "give one number from -360 to 360 for each frame"
-        raise CaptureError(f"{angles!r} are no angles", where="angles", mend=mend)
+        hint = "give one number from -360 to 360 for each frame"
+        raise CaptureError(f"{angles!r} are no angles", where="angles", hint=hint)
     different = np.unique(np.round(degrees % 180.0, 6) % 180.0)
     told = ", ".join(f"{angle:g}" for angle in degrees)
     if different.size < FEWEST_ANGLES:
         raise CaptureError(
             f"the polarizer stood at {different.size} different angles ({told})",
             where="angles",
-            mend="give three or more; 0 and 180 are the same",
+            hint="give three or more; 0 and 180 are the same",
         )
     condition = float(np.linalg.cond(_design(degrees)))
     if condition > LARGEST_CONDITION:
         raise CaptureError(
             f"{told} are so close that noise grows {condition:.0f}-fold",
             where="angles",
-            mend="spread them over 180 degrees, such as 0, 60 and 120",
+            hint="spread them over 180 degrees, such as 0, 60 and 120",
         )
     return degrees
 

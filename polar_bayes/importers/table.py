@@ -75,8 +75,8 @@ def from_table(
         attributes["setup"] = setup
     leading = [dim for dim in DIMS if dim in lines.values]
     if len(leading) > 1:
-        mend = "ignore one of both"
-        raise CaptureError("it has materials and patches", where=source, mend=mend)
+        hint = "ignore one of both"
+        raise CaptureError("it has materials and patches", where=source, hint=hint)
     if leading:
         capture = _side_by_side(lines.values, leading[0], saturation_level)
     else:
@@ -93,15 +93,15 @@ def _read(
     for variable, value in constants.items():
         _check_name(variable, None, source)
         if not _is_finite(value):
-            mend = "give a finite number"
-            raise CaptureError(f"{variable} is {value!r}", where=source, mend=mend)
+            hint = "give a finite number"
+            raise CaptureError(f"{variable} is {value!r}", where=source, hint=hint)
         if variable in taken:
             what = f"{variable} is a constant and the column {taken[variable]!r}"
-            raise CaptureError(what, where=source, mend="give one of both, or ignore the column")
+            raise CaptureError(what, where=source, hint="give one of both, or ignore the column")
     for variable in REQUIRED:
         if variable not in taken and variable not in constants:
-            mend = f"say which column it is, or give it as a constant: {KNOWN[variable].mend}"
-            raise CaptureError(f"nothing gives {variable}", where=source, mend=mend)
+            hint = f"say which column it is, or give it as a constant: {KNOWN[variable].hint}"
+            raise CaptureError(f"nothing gives {variable}", where=source, hint=hint)
     read = read_table(source, list(taken.values()))
     values = {variable: read.columns[column] for variable, column in taken.items()}
     count = len(read.lines)
@@ -123,8 +123,8 @@ def _taken(
     """The column of each variable; every column is one or is ignored."""
     for column in (*columns.values(), *ignored):
         if column not in names:
-            mend = f"choose from {', '.join(names)}"
-            raise CaptureError(f"there is no column {column!r}", where=source, mend=mend)
+            hint = f"choose from {', '.join(names)}"
+            raise CaptureError(f"there is no column {column!r}", where=source, hint=hint)
     for variable, column in columns.items():
         _check_name(variable, column, source)
     taken = dict(columns)
@@ -133,7 +133,7 @@ def _taken(
         if column in taken:
             what = f"{column} is the column {taken[column]!r}, too"
             where = f"{source}: column {column}"
-            raise CaptureError(what, where=where, mend="ignore one of both")
+            raise CaptureError(what, where=where, hint="ignore one of both")
         taken[column] = column
     return taken
 
@@ -143,7 +143,7 @@ def _check_name(variable: str, column: str | None, source: str) -> None:
         raise CaptureError(
             f"a capture has no variable {variable!r}",
             where=source if column is None else f"{source}: column {column}",
-            mend=f"say what it is (nearest: {near}), call it true_<name> or ignore it",
+            hint=f"say what it is (nearest: {near}), call it true_<name> or ignore it",
         )
 
 
@@ -162,7 +162,7 @@ def _check(lines: _Lines, source: str) -> None:
         if variable in lines.columns:
             where += f", column {lines.columns[variable]}"
         what = f"{variable} is {values[first]:g}, which is outside {row.range}"
-        raise CaptureError(what, where=where, mend=row.mend)
+        raise CaptureError(what, where=where, hint=row.hint)
 
 
 def _side_by_side(

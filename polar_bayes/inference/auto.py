@@ -11,14 +11,14 @@ import xarray as xr
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import OutOfTimeError, run_until
 from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.initialization import WholeGround
+from polar_bayes.inference.initialization import JointInit
 from polar_bayes.inference.mcse import count_scalars, draws_needed, expected_error
-from polar_bayes.inference.method import AbstractMethod, Answer
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.nuts import Nuts
-from polar_bayes.inference.problem import Bench
+from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.psis import LARGEST_TRUSTED
 from polar_bayes.inference.request import Method
-from polar_bayes.inference.resampling import most_worth
+from polar_bayes.inference.resampling import max_effective_size
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.inference.run_method import answer, draws_of, with_answer_draws, with_draws
 from polar_bayes.inference.smc import PixelTempering
@@ -31,12 +31,12 @@ HEAVY_MODE = 0.01
 """Laplace weight of a mode that chains must have visited."""
 
 
-def unvisited_weight(z: np.ndarray, bench: Bench) -> float:
+def missed_mode_weight(z: np.ndarray, problem: Problem) -> float:
     """Weight of the heaviest mode to which some chain never came nearest."""
-    ground = bench.ground
-    if not isinstance(ground, WholeGround):
+    initialization = problem.initialization
+    if not isinstance(initialization, JointInit):
         return 0.0
-    modes = ground.modes
+    modes = initialization.modes
     heavy = np.flatnonzero(modes.weight >= HEAVY_MODE)
     if heavy.size < 2:
         return 0.0
@@ -93,14 +93,14 @@ class Auto(AbstractMethod):
             raise FitError(
                 f"tolerance is {self.tolerance}",
                 where="Auto",
-                mend="give posterior standard deviations above 0, at most 1, such as 0.1",
+                hint="give posterior standard deviations above 0, at most 1, such as 0.1",
             )
         if not self.seconds > 0.0:
             raise FitError(
-                f"seconds is {self.seconds}", where="Auto", mend="give a time above 0, such as 60"
+                f"seconds is {self.seconds}", where="Auto", hint="give a time above 0, such as 60"
             )
 
-    def rungs(self, bench: Bench) -> dict[str, Method]:
+    def rungs(self, problem: Problem) -> dict[str, Method]:
         """What is tried for a capture, cheapest first, each with as many draws as it takes.
 
         Weighted draws are left out where even the best weights could not meet the tolerance.
@@ -114,9 +114,9 @@ class Auto(AbstractMethod):
         Raises:
             Nothing.
         """
-        needed = draws_needed(self.tolerance, count_scalars(bench.program, bench.data))
+        needed = draws_needed(self.tolerance, count_scalars(problem.program, problem.data))
         chains = Nuts(effective_draws=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
-        if any(name != "view" and length > 1 for name, length in bench.data.dims):
+        if any(name != "view" and length > 1 for name, length in problem.data.dims):
             return {"nuts": chains}
         weighted = min(RESERVE * needed, MOST_DRAWS)
         tempering = with_answer_draws(PixelTempering(), weighted)
@@ -125,21 +125,23 @@ class Auto(AbstractMethod):
         importance = Importance(draws=max(2048, 2 * weighted))
         rungs: dict[str, Method] = {"importance": importance, "tempered": Tempered(tempering)}
         able = {
-            name: rung for name, rung in rungs.items() if most_worth(draws_of(rung) or 0) >= needed
+            name: rung
+            for name, rung in rungs.items()
+            if max_effective_size(draws_of(rung) or 0) >= needed
         }
         return able | {"nuts": chains}
 
     @override
-    def draw(self, bench: Bench) -> Answer:
-        deadline = bench.begun + self.seconds
+    def draw(self, problem: Problem) -> PosteriorDraws:
+        deadline = problem.begun + self.seconds
         steps: list[Step] = []
-        best: tuple[Step, Answer] | None = None
-        waiting = list(self.rungs(bench).items())
+        best: tuple[Step, PosteriorDraws] | None = None
+        waiting = list(self.rungs(problem).items())
         again = False
         while waiting:
             name, method = waiting.pop(0)
             # The first one always ends: there is nothing else to return.
-            step, found = self._try(name, method, bench, deadline if steps else np.inf)
+            step, found = self._try(name, method, problem, deadline if steps else np.inf)
             steps.append(step)
             # Of two in doubt the dearer one is nearer to exact.
             if found is not None and (best is None or step.error <= best[0].error):
@@ -156,30 +158,30 @@ class Auto(AbstractMethod):
             raise FitError(
                 "; ".join(f"{step.name}: {step.why}" for step in steps),
                 where="method='auto'",
-                mend="give more seconds, or check the capture against the prior predictive",
+                hint="give more seconds, or check the capture against the prior predictive",
             )
         return self._told(*best, steps)
 
     def _try(
-        self, name: str, method: Method, bench: Bench, deadline: float
-    ) -> tuple["Step", Answer | None]:
+        self, name: str, method: Method, problem: Problem, deadline: float
+    ) -> tuple["Step", PosteriorDraws | None]:
         """One rung, judged by its own diagnostics, or abandoned at the deadline."""
         begin = time.perf_counter()
         try:
             return run_until(
                 deadline,
-                bench.progress,
-                lambda progress: self._judged(name, method, bench.reporting(progress)),
+                problem.progress,
+                lambda progress: self._judged(name, method, problem.reporting(progress)),
             )
         except (FitError, OutOfTimeError) as failure:
             return Step(name, time.perf_counter() - begin, why=str(failure)), None
 
-    def _judged(self, name: str, method: Method, bench: Bench) -> tuple["Step", Answer]:
+    def _judged(self, name: str, method: Method, problem: Problem) -> tuple["Step", PosteriorDraws]:
         """A rung's own diagnostics."""
         begin = time.perf_counter()
-        found = answer(method, bench)
-        error = expected_error(found, bench.program, bench.data)
-        doubts = _doubts(found, bench)
+        found = answer(method, problem)
+        error = expected_error(found, problem.program, problem.data)
+        doubts = _doubts(found, problem)
         biased = bool(doubts)
         if not error <= self.tolerance:
             doubts.append(f"its Monte Carlo error may be {error:.2g} posterior sd")
@@ -195,7 +197,7 @@ class Auto(AbstractMethod):
             effective_draws=found.effective_draws,
         ), found
 
-    def _told(self, step: "Step", found: Answer, steps: list["Step"]) -> Answer:
+    def _told(self, step: "Step", found: PosteriorDraws, steps: list["Step"]) -> PosteriorDraws:
         """The answer with what was tried, and a problem where none was good enough."""
         problems = list(found.problems)
         if not step.taken:
@@ -228,14 +230,14 @@ class Step(NamedTuple):
     effective_draws: float = np.nan
 
 
-def _doubts(found: Answer, bench: Bench) -> list[str]:
+def _doubts(found: PosteriorDraws, problem: Problem) -> list[str]:
     """Why an answer may be biased."""
     doubts = list(found.problems)
     if found.k_hat > LARGEST_TRUSTED and not doubts:
         doubts.append(f"its Pareto k-hat is {found.k_hat:.2f}")
     if found.r_hat > LARGEST_R_HAT:
         doubts.append(f"its R-hat is {found.r_hat:.3f}")
-    if found.kind == "nuts" and (share := unvisited_weight(found.z, bench)) > 0.0:
+    if found.kind == "nuts" and (share := missed_mode_weight(found.z, problem)) > 0.0:
         doubts.append(f"a mode of weight {share:.2g} was not visited by every chain")
     return doubts
 

@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_programs import Engine, Settled
+from polar_bayes.inference.batch_programs import BatchEngine, Settled
 from polar_bayes.inference.batch_result import (
     Approximation,
     Describe,
@@ -49,7 +49,7 @@ from polar_bayes.inference.psis import (
     turns,
 )
 from polar_bayes.inference.smc import LIFT, PixelTempering, place
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 # --- Draws of two mixtures as those of one: no draw that cost an evaluation is thrown away --------
 
@@ -83,7 +83,7 @@ def _log_means(first: Mixture, second: Mixture, z: Array) -> Array:
 
 
 def tempered_draws(
-    engine: Engine,
+    engine: BatchEngine,
     settings: PixelTempering,
     pixels: Stack,
     keys: np.ndarray,
@@ -104,7 +104,7 @@ def tempered_draws(
 
 
 def _rounds(
-    engine: Engine,
+    engine: BatchEngine,
     settings: PixelTempering,
     pixels: Stack,
     keys: np.ndarray,
@@ -165,7 +165,7 @@ SAME_MODE = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
-class PixelLaplace(Carded):
+class PixelLaplace(HTMLRepr):
     """The normal approximation of every pixel, checked and corrected.
 
     Args:
@@ -192,14 +192,14 @@ class PixelLaplace(Carded):
     def __post_init__(self) -> None:
         if self.draws < 64 or self.draws & (self.draws - 1):
             raise FitError(
-                f"draws is {self.draws}", where="PixelLaplace", mend="give 64, 128, 256 or so"
+                f"draws is {self.draws}", where="PixelLaplace", hint="give 64, 128, 256 or so"
             )
         if self.candidates < 8:
             raise FitError(
-                f"candidates is {self.candidates}", where="PixelLaplace", mend="give 8 or more"
+                f"candidates is {self.candidates}", where="PixelLaplace", hint="give 8 or more"
             )
         if self.rounds < 0:
-            raise FitError(f"rounds is {self.rounds}", where="PixelLaplace", mend="give 0 or more")
+            raise FitError(f"rounds is {self.rounds}", where="PixelLaplace", hint="give 0 or more")
 
 
 PixelMethod = PixelLaplace | PixelNuts | PixelTempering
@@ -212,7 +212,7 @@ def candidates_of(settings: object) -> int:
 
 
 def fit_stack(
-    engine: Engine,
+    engine: BatchEngine,
     settings: PixelMethod,
     pixels: Stack,
     numbers: np.ndarray,
@@ -240,7 +240,7 @@ def fit_stack(
 
 
 def _sample_all(
-    engine: Engine,
+    engine: BatchEngine,
     settings: PixelNuts,
     pixels: Stack,
     keys: np.ndarray,
@@ -264,7 +264,7 @@ def _sample_all(
 
 
 def _sample_tempered(
-    engine: Engine,
+    engine: BatchEngine,
     settings: PixelNuts,
     start: PixelTempering,
     pixels: Stack,
@@ -290,7 +290,7 @@ def _sample_tempered(
 
 
 def _temper_all(
-    engine: Engine,
+    engine: BatchEngine,
     settings: PixelTempering,
     pixels: Stack,
     keys: np.ndarray,
@@ -303,7 +303,7 @@ def _temper_all(
             pass  # the row has been told
 
 
-def _climb(engine: Engine, pixels: Stack) -> Settled:
+def _climb(engine: BatchEngine, pixels: Stack) -> Settled:
     """The modes of pixels; those that did not converge start again."""
     settled = jax.tree.map(np.array, engine.climb(pixels))
     for rank in RESTARTS:
@@ -321,7 +321,7 @@ def _climb(engine: Engine, pixels: Stack) -> Settled:
 class _Work:
     """What is done to every piece of a row, from the cheapest answer to the dearest."""
 
-    engine: Engine
+    engine: BatchEngine
     settings: PixelLaplace
     points: Points
     further: Points

@@ -12,13 +12,13 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.smc import PixelTempering
 from polar_bayes.observation.data import Observations
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 MOST_DOUBLINGS = 8
 
 
 @dataclasses.dataclass(frozen=True)
-class PixelNuts(Carded):
+class PixelNuts(HTMLRepr):
     """NUTS in each of many pixels, with a metric that is known before.
 
     Args:
@@ -48,14 +48,14 @@ class PixelNuts(Carded):
                 raise FitError(
                     f"{name} is {getattr(self, name)}",
                     where="PixelNuts",
-                    mend=f"give {least} or more",
+                    hint=f"give {least} or more",
                 )
         for name, low, high in (("target_acceptance", 0.5, 1.0), ("largest_r_hat", 1.0, 100.0)):
             if not low < getattr(self, name) < high:
                 raise FitError(
                     f"{name} is {getattr(self, name)}",
                     where="PixelNuts",
-                    mend=f"give a number between {low:g} and {high:g}",
+                    hint=f"give a number between {low:g} and {high:g}",
                 )
 
 

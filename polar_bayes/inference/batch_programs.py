@@ -19,10 +19,10 @@ from numpyro.diagnostics import effective_sample_size
 
 from polar_bayes.inference.batch_nuts import PixelNuts, around_mode, chains
 from polar_bayes.inference.batching import Stack, batched, batches
-from polar_bayes.inference.compile import TRACING, key_of_story
+from polar_bayes.inference.compile import TRACING_LOCK, cache_key
 from polar_bayes.inference.levenberg_marquardt import (
     AnyArray,
-    Climber,
+    LMState,
     Peak,
     crown,
     expand,
@@ -35,7 +35,7 @@ from polar_bayes.inference.program import Program, Values, compile_program
 from polar_bayes.inference.proposals import Proposal, Proposed, draw_mixture, fit_mixture
 from polar_bayes.inference.psis import Points
 from polar_bayes.inference.request import Request
-from polar_bayes.inference.smc import PixelTempering, ScoredProgram, Scores, Tempered, temper
+from polar_bayes.inference.smc import NormalScores, PixelTempering, ScoredProgram, Tempered, temper
 from polar_bayes.observation.data import Observations
 
 BATCH = 128
@@ -74,7 +74,7 @@ class Settled(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Engine:
+class BatchEngine:
     """The model of one pixel, ready to be climbed by many."""
 
     program: Program
@@ -83,7 +83,7 @@ class Engine:
     precision: str
     programs: dict[Any, Callable] = dataclasses.field(default_factory=dict)
 
-    def ready(self) -> "Engine":
+    def ready(self) -> "BatchEngine":
         """The engine with its programs made, though not yet traced."""
         _ = self._start, self._rough_steps, self._exact_steps, self._all_crowned
         return self
@@ -121,7 +121,7 @@ class Engine:
         with jax.enable_x64(False):
             center, half = (np.float32(x) for x in proposal)
             given = [np.float32(x) for x in points]
-            with TRACING:  # no two threads make the same program
+            with TRACING_LOCK:  # no two threads make the same program
                 draws = self._kept(self._draws, weighted)
             return self._map(functools.partial(draws, *given), near, center, half)
 
@@ -130,7 +130,7 @@ class Engine:
     ) -> tuple[Values, np.ndarray, np.ndarray]:
         """Chains in every pixel."""
         with jax.enable_x64(self.precision == "double"):
-            with TRACING:
+            with TRACING_LOCK:
                 several = self._kept(self._chains, settings)
             states = np.asarray(z, self.dtype), np.asarray(half, self.dtype), keys
             kept, draws = self._map(several, pixels.in_precision(self.dtype), *states, batch=FEW)
@@ -143,7 +143,7 @@ class Engine:
     ) -> Tempered:
         """A crowd for every pixel that began as draws from its prior."""
         with jax.enable_x64(False):
-            with TRACING:
+            with TRACING_LOCK:
                 crowded = functools.partial(
                     self._kept(self._tempered, settings), CROWD - np.uint32(attempt)
                 )
@@ -153,7 +153,7 @@ class Engine:
         self,
         pixels: Stack,
         settings: PixelTempering,
-        scores: Scores,
+        scores: NormalScores,
         u: np.ndarray,
         weights: np.ndarray,
         keys: np.ndarray,
@@ -161,7 +161,7 @@ class Engine:
     ) -> Proposed:
         """Draws of mixtures that are fitted to weighted draws."""
         with jax.enable_x64(False):
-            with TRACING:
+            with TRACING_LOCK:
                 proposed = self._kept(self._proposed, settings)
             proposed = functools.partial(proposed, np.uint32(number))
             states = scores, np.float32(u), np.float32(weights), keys
@@ -172,7 +172,7 @@ class Engine:
         """Floating type of the answer."""
         return np.float64 if self.precision == "double" else np.float32
 
-    def _pass(self, steps: list[Callable], pixels: Stack, climbers: Climber) -> Climber:
+    def _pass(self, steps: list[Callable], pixels: Stack, climbers: LMState) -> LMState:
         """Passes of steps; those who have settled leave."""
         climbers = jax.tree.map(np.array, climbers)
         for several in steps:
@@ -221,7 +221,7 @@ class Engine:
     def _all_crowned(self) -> Callable:
         return jax.jit(jax.vmap(crown))
 
-    def _crown(self, climbers: Climber) -> Peak:
+    def _crown(self, climbers: LMState) -> Peak:
         """The last step of all, in batches that are filled up."""
         parts = []
         for index in batches(len(climbers.z), BATCH):
@@ -230,7 +230,7 @@ class Engine:
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(climbers.z)], *parts)
 
     def _kept(self, make: Callable[[Any], Callable], settings: Any) -> Callable:
-        """A program for these settings, made if there is none; the caller holds `TRACING`."""
+        """A program for these settings, made if there is none; the caller holds `TRACING_LOCK`."""
         key = make.__name__, settings
         if key not in self.programs:
             self.programs[key] = make(settings)
@@ -269,7 +269,7 @@ class Engine:
         def pixel(
             number: Array,
             data: Observations,
-            scores: Scores,
+            scores: NormalScores,
             u: Array,
             weights: Array,
             key: Array,
@@ -294,11 +294,11 @@ def _stepping(
 ) -> list[Callable]:
     """A program of one pass, for any number of steps."""
 
-    def several(count: Array, data: Observations, climber: Climber) -> Climber:
-        def goes_on(at: tuple[Array, Climber]) -> Array:
+    def several(count: Array, data: Observations, climber: LMState) -> LMState:
+        def goes_on(at: tuple[Array, LMState]) -> Array:
             return (at[0] < count) & ~at[1].settled
 
-        def onward(at: tuple[Array, Climber]) -> tuple[Array, Climber]:
+        def onward(at: tuple[Array, LMState]) -> tuple[Array, LMState]:
             return at[0] + 1, step(program, curvature, goal, at[1], data)
 
         return jax.lax.while_loop(goes_on, onward, (jnp.zeros_like(count), climber))[1]
@@ -314,13 +314,13 @@ def _whole(z: AnyArray) -> AnyArray:
 # --- From a checked request to the programs that fit many captures of one layout ------------------
 
 
-MAKING = threading.RLock()
+ENGINE_LOCK = threading.RLock()
 """Held by whoever calls `make_engine`, so that no two threads make the same; always taken before
-`TRACING`, because an engine compiles and runs the program that draws its candidates."""
+`TRACING_LOCK`, because an engine compiles and runs the program that draws its candidates."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Recipe:
+class EngineSpec:
     """What programs are made from. Recipes of one key make the same, and share them."""
 
     request: Request
@@ -330,7 +330,7 @@ class Recipe:
 
     def __eq__(self, other: object) -> bool:
         """The same programs."""
-        return isinstance(other, Recipe) and self.key == other.key
+        return isinstance(other, EngineSpec) and self.key == other.key
 
     def __hash__(self) -> int:
         """Of the key."""
@@ -342,7 +342,7 @@ def key_of(request: Request, *further: Any) -> str:
     layout = [
         (name, v.dims, v.shape, str(v.dtype)) for name, v in request.capture.variables.items()
     ]
-    return key_of_story(
+    return cache_key(
         request.model,
         request.scene,
         request.priors,
@@ -354,13 +354,13 @@ def key_of(request: Request, *further: Any) -> str:
 
 
 @functools.lru_cache(maxsize=4)
-def make_engine(recipe: Recipe) -> Engine:
+def make_engine(recipe: EngineSpec) -> BatchEngine:
     """The programs of a recipe; they are traced at their first use."""
     request, data = recipe.request, recipe.observe()
     given = {"double": data, "single": data.in_single_precision()}
 
     def program(precision: str) -> Program:
-        with jax.enable_x64(precision == "double"), TRACING:
+        with jax.enable_x64(precision == "double"), TRACING_LOCK:
             model = dataclasses.replace(request, precision=precision).bind(request.scene)
             return compile_program(model, given[precision])
 
@@ -368,4 +368,4 @@ def make_engine(recipe: Recipe) -> Engine:
     with jax.enable_x64(request.precision == "double"):
         key = jax.random.key(request.seed)
         starts = from_prior(exact, key, recipe.candidates, given[request.precision])
-    return Engine(exact, rough, starts, request.precision).ready()
+    return BatchEngine(exact, rough, starts, request.precision).ready()

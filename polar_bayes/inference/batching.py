@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.inference.compile import TracedOnce
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.observation.data import Observations
 from polar_bayes.physics.geometry import Geometry
 
@@ -144,4 +144,4 @@ def batched(function: Callable, *, given: int = 0, side_by_side: int = CLIMBING)
         filled = jax.lax.fori_loop(0, -(-wanted // side_by_side), fill, empty)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), filled)
 
-    return TracedOnce(run)
+    return JitOnce(run)

@@ -30,12 +30,12 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress
 
-QUICK = {"xla_backend_optimization_level": 1}
+COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
 """Of three levels: fits run as fast as with all, first ones take three quarters of the time."""
 
 CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
-_BESIDE = ThreadPoolExecutor(1, "polar_bayes compiles")
+_COMPILER_THREAD = ThreadPoolExecutor(1, "polar_bayes compiles")
 
 
 class AbandonedError(Exception):
@@ -64,16 +64,18 @@ class _Tracing:
             self._refused.add(thread)
 
 
-TRACING = _Tracing()
+TRACING_LOCK = _Tracing()
 """Held while a model is traced; nobody compiles, runs or waits for a program while holding it."""
 
 
 def compiled(function: Callable) -> Any:
     """The function as `jax.jit` has it, compiled with as much effort as running it pays back."""
-    return jax.jit(function, compiler_options=QUICK if jax.default_backend() == "cpu" else None)
+    return jax.jit(
+        function, compiler_options=COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    )
 
 
-class TracedOnce:
+class JitOnce:
     """A function that is traced alone in the process, and compiled once, by its first call."""
 
     def __init__(self, function: Callable) -> None:
@@ -94,7 +96,7 @@ class TracedOnce:
     def begin(self, *arguments: Any) -> None:
         """Trace it for arguments of such shapes and types, and compile it beside what follows."""
         if self._begun is None:
-            _BESIDE.submit(self._traced(*arguments).result)
+            _COMPILER_THREAD.submit(self._traced(*arguments).result)
 
     def program(self, *arguments: Any) -> Callable:
         """The compiled program for arguments of these shapes and types."""
@@ -104,7 +106,7 @@ class TracedOnce:
         return run
 
     def _traced(self, *arguments: Any) -> "_Compilation":
-        with TRACING:
+        with TRACING_LOCK:
             device = jax.config.jax_default_device  # a compiled program runs where it was made for
             if self._begun is None or self._device != device:
                 self._begun, self._run = _Compilation(self._function.lower(*arguments)), None
@@ -112,12 +114,12 @@ class TracedOnce:
             return self._begun
 
 
-class TracedByShape:
+class JitByShape:
     """The same for a function whose first argument comes in several shapes."""
 
     def __init__(self, function: Callable) -> None:
         self._function = function
-        self._of_shape: dict[tuple[int, ...], TracedOnce] = {}
+        self._of_shape: dict[tuple[int, ...], JitOnce] = {}
 
     def begin(self, first: Any, *others: Any) -> None:
         """Trace it for arguments of such shapes, and compile it beside what follows."""
@@ -127,9 +129,9 @@ class TracedByShape:
         """Run it; with a first argument of a new shape, trace and compile it before."""
         return self._of(first.shape)(first, *others)
 
-    def _of(self, shape: tuple[int, ...]) -> TracedOnce:
+    def _of(self, shape: tuple[int, ...]) -> JitOnce:
         found = self._of_shape.get(shape)
-        return found or self._of_shape.setdefault(shape, TracedOnce(self._function))
+        return found or self._of_shape.setdefault(shape, JitOnce(self._function))
 
 
 class _Compilation:
@@ -141,8 +143,8 @@ class _Compilation:
         self._lock = threading.Lock()
 
     def result(self) -> Callable:
-        # A thread that waits for the queue of `_BESIDE` would wait for programs of others, too:
-        # it compiles what it needs itself, where that has not begun.
+        # A thread that waits for the queue of `_COMPILER_THREAD` would wait for programs of others,
+        # too: it compiles what it needs itself, where that has not begun.
         with self._lock:
             if self._found is None:
                 self._found = self._lowered.compile()
@@ -167,7 +169,7 @@ def check_memory(needed: int) -> None:
         raise FitError(
             f"this fit would need {needed / 1e9:.1f} GB at once, of {there / 1e9:.1f} GB",
             where="memory",
-            mend="average neighboring views, or take a sample of them",
+            hint="average neighboring views, or take a sample of them",
         )
 
 
@@ -191,7 +193,7 @@ def memory_limit() -> int | None:
 INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib")})
 
 
-class Kept[T]:
+class LRUCache[T]:
     """The last few things that were made, by key; safe to ask from several threads."""
 
     def __init__(self, most: int) -> None:
@@ -209,7 +211,7 @@ class Kept[T]:
             return found
 
 
-def key_of_story(
+def cache_key(
     model: Callable,
     scene: Scene,
     priors: Mapping[str, dist.Distribution],
@@ -301,7 +303,7 @@ class _Task[T]:
         """Nobody waits any more; nothing happens where it is done."""
         self._abandoned.set()
         if not self.outcome.done():
-            TRACING.refuse(self._thread)
+            TRACING_LOCK.refuse(self._thread)
 
     def _run(self) -> None:
         try:

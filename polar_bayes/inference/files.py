@@ -158,11 +158,11 @@ class Schema:
     def check(self, tree: xr.DataTree, source: str) -> None:
         """Refuse a tree that does not hold what this kind holds."""
         if not self.describes(tree):
-            mend = f"give the tree that {self.made_by} returned"
-            raise FitError(f"it holds no {self.kind}", where=source, mend=mend)
+            hint = f"give the tree that {self.made_by} returned"
+            raise FitError(f"it holds no {self.kind}", where=source, hint=hint)
         for place, what in self._departures(tree):
-            mend = f"give the tree as {self.made_by} returned it"
-            raise FitError(what, where=f"{source}: {place}", mend=mend)
+            hint = f"give the tree as {self.made_by} returned it"
+            raise FitError(what, where=f"{source}: {place}", hint=hint)
 
     def _departures(self, tree: xr.DataTree) -> Departures:
         yield from _mismatches(provenance_of(tree), self.provenance, PROVENANCE)
@@ -445,11 +445,11 @@ def load_result(path: str | os.PathLike[str]) -> xr.DataTree:
 def load_tree(path: str | os.PathLike[str], schema: Schema) -> xr.DataTree:
     """A tree of one kind from a netCDF file."""
     file = existing_file(path, schema.kind)
-    mend = f"give the file that {schema.command} or save_result wrote"
-    broken = FitError("it cannot be read as netCDF", where=str(file), mend=mend)
+    hint = f"give the file that {schema.command} or save_result wrote"
+    broken = FitError("it cannot be read as netCDF", where=str(file), hint=hint)
     tree = read_netcdf(xr.DataTree, file, broken)
     if not schema.describes(tree) or PROVENANCE not in tree.attrs:
-        raise FitError(f"it holds no {schema.kind}", where=str(file), mend=mend)
+        raise FitError(f"it holds no {schema.kind}", where=str(file), hint=hint)
     schema.check(tree, str(file))
     return tree
 
@@ -479,7 +479,7 @@ def save_result(result: xr.DataTree | xr.Dataset, path: str | os.PathLike[str]) 
     """
     if not isinstance(result, xr.DataTree | xr.Dataset):
         what = f"a {type(result).__name__} is no result"
-        raise FitError(what, where="save_result", mend="give what polar_bayes.fit returned")
+        raise FitError(what, where="save_result", hint="give what polar_bayes.fit returned")
     with replacing(path, is_result) as unfinished:
         try:
             write_netcdf(result, unfinished)
@@ -487,5 +487,5 @@ def save_result(result: xr.DataTree | xr.Dataset, path: str | os.PathLike[str]) 
             raise
         except Exception as error:  # xarray raises nearly every type for what it cannot encode
             what = f"netCDF cannot hold it ({error or type(error).__name__})"
-            mend = "store numbers and text only"
-            raise FitError(what, where="save_result", mend=mend) from error
+            hint = "store numbers and text only"
+            raise FitError(what, where="save_result", hint=hint) from error

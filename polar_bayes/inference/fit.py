@@ -13,7 +13,7 @@ from polar_bayes.inference.request import Method
 from polar_bayes.inference.weighted import Importance, Tempered
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.progress import Progress, watched
+from polar_bayes.progress import Progress, with_progress
 
 METHODS: dict[str, Method] = {
     **CORE,
@@ -23,7 +23,7 @@ METHODS: dict[str, Method] = {
 }
 
 
-@watched
+@with_progress
 def fit(
     capture: xr.Dataset,
     *,
@@ -97,7 +97,7 @@ def _settings(method: str | Method, tolerance: float | None, seconds: float | No
         raise FitError(
             f"{' and '.join(given)} needs method='auto'",
             where=f"fit: method={method!r}",
-            mend="leave it out, or give method='auto'",
+            hint="leave it out, or give method='auto'",
         )
     if given:
         return Auto(**given)
@@ -106,7 +106,7 @@ def _settings(method: str | Method, tolerance: float | None, seconds: float | No
             raise FitError(
                 "no such method",
                 where=f"method={method!r}",
-                mend=f"give one of {', '.join(METHODS)}, or settings such as Nuts(draws=2000)",
+                hint=f"give one of {', '.join(METHODS)}, or settings such as Nuts(draws=2000)",
             )
         return method if method in CORE else METHODS[method]
     return method

@@ -87,14 +87,14 @@ Starts = tuple[np.ndarray, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Lone:
+class GroupModel:
     """The model of one patch, compiled once for all patches of all captures."""
 
     program: Program
     groups: Groups
 
 
-def find_lone(model: Model, groups: Groups, data: Observations) -> Lone | None:
+def find_group_model(model: Model, groups: Groups, data: Observations) -> GroupModel | None:
     """The model told for one patch, where it can be: not where a prior names every patch."""
     first = group_of(data, 0)
     try:
@@ -106,14 +106,14 @@ def find_lone(model: Model, groups: Groups, data: Observations) -> Lone | None:
         return None
     same_local = alone.local.shape == (1, groups.local.shape[1])
     same = same_local and alone.common.size == groups.common.size
-    return Lone(program, alone) if same else None
+    return GroupModel(program, alone) if same else None
 
 
-class Alone:
+class GroupProgram:
     """The patches of one capture, each by itself."""
 
-    def __init__(self, lone: Lone, data: Observations, threads: int = 2) -> None:
-        self._program, self._groups = lone.program, lone.groups
+    def __init__(self, group_model: GroupModel, data: Observations, threads: int = 2) -> None:
+        self._program, self._groups = group_model.program, group_model.groups
         self._parts = [group_of(data, number) for number in range(data.dims[0][1])]
         self._dtype = data.brightness.dtype
         self._threads = threads
@@ -191,7 +191,7 @@ class Alone:
             raise FitError(
                 f"none of {len(points)} starts reached a peak of the posterior",
                 where=f"fit: {self._parts[0].dims[0][0]} {patch}",
-                mend="check its readings against the prior predictive, mark them valid=False, or "
+                hint="check its readings against the prior predictive, mark them valid=False, or "
                 "give narrower priors",
             )
         return modes

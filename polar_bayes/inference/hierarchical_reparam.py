@@ -38,8 +38,8 @@ from jaxtyping import Array, Float
 from numpyro import distributions as dist
 from numpyro import handlers
 
-from polar_bayes.inference.compile import TracedByShape, TracedOnce
-from polar_bayes.inference.group_model import Alone, Groups, Lone, Starts
+from polar_bayes.inference.compile import JitByShape, JitOnce
+from polar_bayes.inference.group_model import GroupModel, GroupProgram, Groups, Starts
 from polar_bayes.inference.optimize import Modes, ValueAndGradient, from_prior
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
@@ -120,24 +120,24 @@ class Transport:
         return jax.jvp(slope, (local,), (jnp.ones_like(local),))
 
     @functools.cached_property
-    def told_once(self) -> Callable[[Array, Anchored], Array]:
+    def potential_jit(self) -> Callable[[Array, Anchored], Array]:
         """The potential; the model is told once, however many programs compute it."""
         return jax.jit(self.potential, inline=True)
 
     @functools.cached_property
     def value_and_gradient(self) -> Callable[[Array, Anchored], tuple[Array, Array]]:
         """The potential with its gradient, compiled."""
-        return TracedOnce(jax.value_and_grad(self.told_once))
+        return JitOnce(jax.value_and_grad(self.potential_jit))
 
     @functools.cached_property
     def there(self) -> Callable[[Array, Anchored], Array]:
         """`to_program` without the volume, compiled."""
-        return TracedOnce(lambda w, given: self.to_program(w, given)[0])
+        return JitOnce(lambda w, given: self.to_program(w, given)[0])
 
     @functools.cached_property
     def back(self) -> Callable[[Array, Anchored], Array]:
         """`from_program`, compiled."""
-        return TracedOnce(self.from_program)
+        return JitOnce(self.from_program)
 
     @functools.cached_property
     def chains_there(self) -> Callable[[Array, Anchored], Array]:
@@ -148,12 +148,12 @@ class Transport:
                 lambda chain: jax.lax.map(lambda x: self.to_program(x, given)[0], chain), w
             )
 
-        return TracedByShape(place)
+        return JitByShape(place)
 
     @functools.cached_property
     def of_population(self) -> Callable[[Array, Array, Observations], tuple[Array, Array]]:
         """`population`, compiled."""
-        return TracedOnce(self.population)
+        return JitOnce(self.population)
 
     def _prior(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """Minus the log prior density of all groups' coordinates."""
@@ -245,10 +245,10 @@ class Anchoring:
 
 
 def anchor(
-    lone: Lone, transport: Transport, data: Observations, key: Array, tell: Progress
+    group_model: GroupModel, transport: Transport, data: Observations, key: Array, tell: Progress
 ) -> Anchoring:
     """Find the anchors."""
-    alone, groups, size = Alone(lone, data), transport.groups, transport.size
+    alone, groups, size = GroupProgram(group_model, data), transport.groups, transport.size
     surveyor = _Surveyor(alone, transport, data)
     peaks = _find_peaks(alone, transport, surveyor, data, key, tell)
     dtype = data.brightness.dtype
@@ -281,7 +281,7 @@ def anchor(
 class _Surveyor:
     """Measures what the anchors are made of."""
 
-    def __init__(self, alone: Alone, transport: Transport, data: Observations) -> None:
+    def __init__(self, alone: GroupProgram, transport: Transport, data: Observations) -> None:
         self._alone, self._data = alone, data
         self._of_population = transport.of_population
         self._dtype = data.brightness.dtype
@@ -311,7 +311,7 @@ class _Surveyor:
 
 
 def _find_peaks(
-    alone: Alone,
+    alone: GroupProgram,
     transport: Transport,
     surveyor: _Surveyor,
     data: Observations,

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference import hierarchical_reparam, laplace, nuts
-from polar_bayes.inference.group_model import Lone, find_groups, find_lone
+from polar_bayes.inference.group_model import GroupModel, find_group_model, find_groups
 from polar_bayes.inference.hierarchical_reparam import Transport
 from polar_bayes.inference.optimize import SETTLED, Modes, ValueAndGradient, find_modes, from_prior
 from polar_bayes.inference.program import Model, Program
@@ -43,7 +43,7 @@ class Drawn(NamedTuple):
     goals_reached: bool | None
 
 
-class AbstractGround(abc.ABC):
+class AbstractInit(abc.ABC):
     """Where draws start."""
 
     said: dict[str, Any]
@@ -90,10 +90,10 @@ class AbstractGround(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class WholeGround(AbstractGround):
+class JointInit(AbstractInit):
     """One material: all coordinates together, a dense metric."""
 
-    grounds: "WholeGrounds"
+    initializer: "JointInitializer"
     data: Observations
     potential: ValueAndGradient
     modes: Modes
@@ -102,7 +102,7 @@ class WholeGround(AbstractGround):
     @override
     def target(self, key: Array, chains: int) -> nuts.Target:
         return nuts.Target(
-            samplers=self.grounds.samplers,
+            samplers=self.initializer.samplers,
             given=self.data,
             potential=self.potential,
             starts=nuts.draw_starts(self.potential, self.modes, key, chains),
@@ -112,12 +112,12 @@ class WholeGround(AbstractGround):
 
     @override
     def laplace(self, key: Array, settings: laplace.Laplace) -> Draws:
-        program, guide = self.grounds.program, self.grounds.guide
+        program, guide = self.initializer.program, self.initializer.guide
         return laplace.sample(program, guide, self.data, self.potential, self.modes, key, settings)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class PatchGround(AbstractGround):
+class HierarchicalInit(AbstractInit):
     """Many patches: the coordinates of `transport`, in which the metric is about the identity."""
 
     samplers: nuts.Samplers
@@ -152,7 +152,7 @@ class PatchGround(AbstractGround):
         return np.asarray(self.found.transport.chains_there(jnp.asarray(w), self.found.given))
 
 
-class AbstractGrounds(abc.ABC):
+class AbstractInitializer(abc.ABC):
     """The grounds of all captures of one layout."""
 
     def expect(self, data: Observations, method: nuts.Nuts) -> None:
@@ -168,7 +168,7 @@ class AbstractGrounds(abc.ABC):
         del data, method
 
     @abc.abstractmethod
-    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractGround:
+    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
         """Search for the peaks of one capture.
 
         Args:
@@ -185,7 +185,7 @@ class AbstractGrounds(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class WholeGrounds(AbstractGrounds):
+class JointInitializer(AbstractInitializer):
     """Of captures that are climbed as a whole."""
 
     program: Program
@@ -210,25 +210,25 @@ class WholeGrounds(AbstractGrounds):
         nuts.expect(target, method)
 
     @override
-    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractGround:
+    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
         potential = CompiledPotential(self.program, data)
         starts = from_prior(self.program, key, STARTS, data)
         modes = find_modes(potential, starts, progress)
         said = _describe(modes) | {"gradients": potential.calls}
-        return WholeGround(self, data, potential, modes, said)
+        return JointInit(self, data, potential, modes, said)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class PatchGrounds(AbstractGrounds):
+class HierarchicalInitializer(AbstractInitializer):
     """Of captures whose patches are climbed one by one."""
 
-    lone: Lone
+    group_model: GroupModel
     transport: Transport
     samplers: nuts.Samplers
 
     @override
-    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractGround:
-        found = hierarchical_reparam.anchor(self.lone, self.transport, data, key, progress)
+    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
+        found = hierarchical_reparam.anchor(self.group_model, self.transport, data, key, progress)
         peaks = found.peaks
         said = {
             "starts": peaks.starts * self.transport.groups.count,
@@ -236,21 +236,21 @@ class PatchGrounds(AbstractGrounds):
             "patches_with_several": sum(len(modes.weight) > 1 for modes in peaks.of_patch),
             "newton_decrement": found.decrement,
         }
-        return PatchGround(self.samplers, found, said)
+        return HierarchicalInit(self.samplers, found, said)
 
 
-def make_grounds(model: Model, program: Program, data: Observations) -> AbstractGrounds:
+def make_initializer(model: Model, program: Program, data: Observations) -> AbstractInitializer:
     """What searches for peaks, in the way that the layout of the capture calls for."""
     groups = find_groups(program, data)
-    lone = None if groups is None else find_lone(model, groups, data)
-    if groups is None or lone is None:
-        return WholeGrounds(program, nuts.Samplers(program.told_once))
+    group_model = None if groups is None else find_group_model(model, groups, data)
+    if groups is None or group_model is None:
+        return JointInitializer(program, nuts.Samplers(program.potential_jit))
     transport = Transport(program, groups)
-    return PatchGrounds(lone, transport, nuts.Samplers(transport.told_once))
+    return HierarchicalInitializer(group_model, transport, nuts.Samplers(transport.potential_jit))
 
 
 class CompiledPotential:
-    """Minus the log density with its gradient, compiled, for searches in NumPy; counts its calls."""
+    """Minus the log density with its gradient, compiled, for NumPy optimizers; counts its calls."""
 
     def __init__(self, program: Program, data: Observations) -> None:
         self._program, self._data = program, data

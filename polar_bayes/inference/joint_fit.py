@@ -28,7 +28,7 @@ from polar_bayes.inference.initialization import STARTS
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.optimize import from_prior
-from polar_bayes.inference.problem import Bench, Prepared, prepare
+from polar_bayes.inference.problem import CompiledModel, Problem, compile_model
 from polar_bayes.inference.program import Draw, Program, parameters_of
 from polar_bayes.inference.request import MODELS, Method, Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
@@ -37,7 +37,7 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior, support_bounds
-from polar_bayes.progress import Progress, silent
+from polar_bayes.progress import Progress, no_progress
 
 PRIOR_DRAWS = 500
 BLOCK = 500
@@ -66,7 +66,7 @@ def fit(
         capture, model, method, scene, priors, links, largest_view_zenith, seed, precision
     )
     with jax.enable_x64(precision == "double"):
-        return _run(request, progress or silent, begun)
+        return _run(request, progress or no_progress, begun)
 
 
 class _Fitted(NamedTuple):
@@ -89,11 +89,11 @@ def _run(request: Request, progress: Progress, begun: float) -> xr.DataTree:
     key_main, key_plain, key_posterior, key_prior = jax.random.split(
         jax.random.key(request.seed), 4
     )
-    prepared = prepare(request, request.scene, data)
-    _check_room(prepared.program, data, PRIOR_DRAWS)
-    _expect(prepared, data, request.method)
-    _expect_draws(prepared.program, data)
-    fitted = _fit_scene(request, prepared, data, key_main, progress, clock)
+    compiled_model = compile_model(request, request.scene, data)
+    _check_room(compiled_model.program, data, PRIOR_DRAWS)
+    _expect(compiled_model, data, request.method)
+    _expect_draws(compiled_model.program, data)
+    fitted = _fit_scene(request, compiled_model, data, key_main, progress, clock)
     _check_room(fitted.program, data, fitted.z[..., 0].size + PRIOR_DRAWS)
     describe = _per_draw(fitted.program)
     posterior = describe(key_posterior, fitted.z, data)
@@ -116,7 +116,7 @@ def _run(request: Request, progress: Progress, begun: float) -> xr.DataTree:
 
 def _fit_scene(
     request: Request,
-    prepared: Prepared,
+    compiled_model: CompiledModel,
     data: Observations,
     key: Array,
     progress: Progress,
@@ -124,9 +124,11 @@ def _fit_scene(
 ) -> _Fitted:
     """Search for modes from prior draws, then do what the method asks."""
     key_starts, key_draws = jax.random.split(key)
-    program = prepared.program
+    program = compiled_model.program
     if isinstance(request.method, AbstractMethod):
-        answer = request.method.draw(Bench(request, prepared, data, key, progress, clock.begun))
+        answer = request.method.draw(
+            Problem(request, compiled_model, data, key, progress, clock.begun)
+        )
         clock.lap("draws")
         own = {name: getattr(answer, name) for name in OF_DRAWS}
         finite = {name: x if math.isfinite(x) else None for name, x in own.items()}
@@ -142,14 +144,14 @@ def _fit_scene(
         )
     if isinstance(request.method, laplace.Point):
         starts = from_prior(program, key_starts, STARTS, data)
-        fitted = _fit_point(prepared, data, starts, request.method)
+        fitted = _fit_point(compiled_model, data, starts, request.method)
         clock.lap("least squares")
         return fitted
-    ground = prepared.grounds.find(data, key_starts, progress)
+    initialization = compiled_model.initializer.find(data, key_starts, progress)
     clock.lap("modes")
-    drawn = ground.draw(key_draws, request.method, progress)
+    drawn = initialization.draw(key_draws, request.method, progress)
     clock.lap("draws")
-    extra: dict[str, Any] = {"modes": ground.said}
+    extra: dict[str, Any] = {"modes": initialization.said}
     if drawn.goals_reached is not None:
         extra["goals_reached"] = drawn.goals_reached
     return _Fitted(program, drawn.z, drawn.stats, drawn.problems, extra)
@@ -169,10 +171,10 @@ class _Clock:
         self._last = now
 
 
-def _expect(prepared: Prepared, data: Observations, method: Method) -> None:
+def _expect(compiled_model: CompiledModel, data: Observations, method: Method) -> None:
     """Begin to compile the sampler, beside the search."""
     if isinstance(method, Nuts):
-        prepared.grounds.expect(data, method)
+        compiled_model.initializer.expect(data, method)
 
 
 def _expect_draws(program: Program, data: Observations) -> None:
@@ -226,10 +228,12 @@ def _per_draw(program: Program) -> Callable[[Array, np.ndarray, Observations], D
 
 
 def _fit_point(
-    prepared: Prepared, data: Observations, starts: np.ndarray, method: laplace.Point
+    compiled_model: CompiledModel, data: Observations, starts: np.ndarray, method: laplace.Point
 ) -> _Fitted:
-    program = prepared.program
-    found = laplace.to_numpy(prepared.least_squares(jnp.asarray(starts[: method.starts]), data))
+    program = compiled_model.program
+    found = laplace.to_numpy(
+        compiled_model.least_squares(jnp.asarray(starts[: method.starts]), data)
+    )
     errors = laplace.standard_errors(program, found)
     problems = [] if found.converged else ["least squares did not meet its tolerance"]
     stats = {"loss": np.asarray(found.loss)[None, None]}
@@ -257,19 +261,23 @@ def _fit_beside(
     failed: dict[str, str] = {}
 
     def compare(progress: Progress) -> None:
-        every: dict[str, Prepared] = {}
+        every: dict[str, CompiledModel] = {}
         for name, asked in requests.items():
             try:
-                every[name] = prepare(asked, asked.scene, data)
+                every[name] = compile_model(asked, asked.scene, data)
                 _expect(every[name], data, method)
             except FitError as error:  # a failed comparison must not cost the user the fit
                 failed[name] = str(error)
-        for number, (name, prepared) in enumerate(every.items()):
+        for number, (name, compiled_model) in enumerate(every.items()):
             at = number / len(every)
             progress("comparing", at)
             try:
                 beside[name] = _compare(
-                    requests[name], prepared, data, key, lambda *_, at=at: progress("comparing", at)
+                    requests[name],
+                    compiled_model,
+                    data,
+                    key,
+                    lambda *_, at=at: progress("comparing", at),
                 )
             except FitError as error:
                 failed[name] = str(error)
@@ -285,10 +293,14 @@ def _fit_beside(
 
 
 def _compare(
-    request: Request, prepared: Prepared, data: Observations, key: Array, progress: Progress
+    request: Request,
+    compiled_model: CompiledModel,
+    data: Observations,
+    key: Array,
+    progress: Progress,
 ) -> xr.Dataset:
     """The posterior of another scene."""
-    found = _fit_scene(request, prepared, data, key, progress, _Clock(time.perf_counter()))
+    found = _fit_scene(request, compiled_model, data, key, progress, _Clock(time.perf_counter()))
     return posterior_of(found.program, parameters_of(found.program, found.z, data))
 
 

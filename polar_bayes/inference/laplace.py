@@ -22,15 +22,15 @@ from numpyro import handlers
 from numpyro.infer.autoguide import AutoLaplaceApproximation
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import TracedOnce
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.optimize import Modes, ValueAndGradient
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 
 @dataclasses.dataclass(frozen=True)
-class Laplace(Carded):
+class Laplace(HTMLRepr):
     """Settings of the approximation.
 
     Args:
@@ -49,7 +49,7 @@ class Laplace(Carded):
             raise FitError(
                 f"draws is {self.draws} and chains is {self.chains}",
                 where="Laplace",
-                mend="give at least 50 draws and 1 chain",
+                hint="give at least 50 draws and 1 chain",
             )
 
 
@@ -83,7 +83,7 @@ def sample(
 
 def compiled_guide(program: Program) -> Guide:
     """NumPyro's guide around a mode, compiled for captures of the program's layout."""
-    return TracedOnce(functools.partial(_guide, program))
+    return JitOnce(functools.partial(_guide, program))
 
 
 def _guide(
@@ -110,7 +110,7 @@ def _guide(
 
 
 @dataclasses.dataclass(frozen=True)
-class Point(Carded):
+class Point(HTMLRepr):
     """Settings of the least squares.
 
     Args:
@@ -124,7 +124,7 @@ class Point(Carded):
 
     def __post_init__(self) -> None:
         if self.starts < 1:
-            raise FitError(f"starts is {self.starts}", where="Point", mend="give at least 1")
+            raise FitError(f"starts is {self.starts}", where="Point", hint="give at least 1")
 
 
 class Estimate(NamedTuple):

@@ -4,12 +4,12 @@ Every function is of one pixel, so that a batch is a map over pixels and nothing
 pixel gets does not depend on who climbs beside it.
 
 A library factors a batch of 4 by 4 matrices one call at a time; written out, the arithmetic of a
-thousand pixels runs side by side. `tests/benchmarks/pixels.py` has the ratio.
+thousand pixels runs side by side. `benchmarks/pixels.py` has the ratio.
 
 A pixel has few coordinates and many readings. Each coordinate is pushed through the model by
 itself, so that what it does not touch is absent from the program: the fraction, for example,
 never differentiates the Fresnel equations. Measured against reverse mode in
-`tests/benchmarks/pixels.py`.
+`benchmarks/pixels.py`.
 """
 
 import functools
@@ -283,7 +283,7 @@ ROUNDING = 8.0  # of the potential, in units of its last digit, that count as no
 Curvature = Callable[[Program, Array, Observations], Slopes]
 
 
-class Climber(NamedTuple):
+class LMState(NamedTuple):
     """Where one pixel is."""
 
     z: Float[AnyArray, " size"]
@@ -304,14 +304,14 @@ class Peak(NamedTuple):
     condition: Float[AnyArray, ""]
 
 
-def stand(z: Float[np.ndarray, "pixel size"]) -> Climber:
+def stand(z: Float[np.ndarray, "pixel size"]) -> LMState:
     """Climbers at their starts; their first step looks around and stays where it is."""
     count, size = z.shape
     far, unit = (
         np.full(count, np.inf, z.dtype),
         np.broadcast_to(np.eye(size, dtype=z.dtype), (count, size, size)),
     )
-    return Climber(
+    return LMState(
         z=z,
         slopes=Slopes(far, np.zeros_like(z), unit),
         damping=np.full(count, FIRST_DAMPING, z.dtype),
@@ -322,8 +322,8 @@ def stand(z: Float[np.ndarray, "pixel size"]) -> Climber:
 
 
 def step(
-    program: Program, curvature: Curvature, goal: float, climber: Climber, data: Observations
-) -> Climber:
+    program: Program, curvature: Curvature, goal: float, climber: LMState, data: Observations
+) -> LMState:
     """One damped step, taken only where it leads down."""
     # Source: Marquardt (1963), J. SIAM 11(2), 431-441.
     value, gradient, bend = climber.slopes
@@ -344,7 +344,7 @@ def step(
         is_first, climber.damping, jnp.maximum(LOOSER * climber.damping, LEAST_DAMPING)
     )
     firmer = FIRMER * jnp.maximum(climber.damping, LEAST_DAMPING)
-    moved = Climber(
+    moved = LMState(
         z=jnp.where(better, z, climber.z),
         slopes=jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, climber.slopes),
         damping=jnp.where(better, looser, firmer),

@@ -9,8 +9,8 @@ import scipy.stats
 from arviz_stats.base import array_stats
 from jaxtyping import Float
 
-from polar_bayes.inference.compile import TRACING
-from polar_bayes.inference.method import Answer
+from polar_bayes.inference.compile import TRACING_LOCK
+from polar_bayes.inference.method import PosteriorDraws
 from polar_bayes.inference.program import Program, parameters_of
 from polar_bayes.observation.data import Observations
 
@@ -55,7 +55,7 @@ FALSE_ALARMS = 0.01
 """How often some mean or standard deviation of one fit may stray further than expected."""
 
 
-def expected_error(answer: Answer, program: Program, data: Observations) -> float:
+def expected_error(answer: PosteriorDraws, program: Program, data: Observations) -> float:
     """The largest error of a mean or a standard deviation that Monte Carlo noise can make."""
     # In posterior standard deviations, over all parameters, exceeded in 1% of the fits: each of the
     # 2P standard errors times the normal quantile of 0.5% / (2P) (Bonferroni). Bias is not seen
@@ -68,7 +68,7 @@ def expected_error(answer: Answer, program: Program, data: Observations) -> floa
 
 
 def errors_of(
-    answer: Answer, describe: Callable[[np.ndarray], np.ndarray]
+    answer: PosteriorDraws, describe: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Monte Carlo standard errors of means and standard deviations, in standard deviations."""
     mean, sd = standard_errors(describe(answer.z))
@@ -100,7 +100,7 @@ def scalars_of(program: Program, z: np.ndarray, data: Observations) -> np.ndarra
 def count_scalars(program: Program, data: Observations) -> int:
     """How many numbers a model estimates."""
     z = jax.ShapeDtypeStruct((program.size,), data.brightness.dtype)
-    with TRACING:
+    with TRACING_LOCK:
         found = jax.eval_shape(program.parameters, z, data)
     return sum(int(np.prod(x.shape)) for x in jax.tree.leaves(found))
 

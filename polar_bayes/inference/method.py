@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Answer:
+class PosteriorDraws:
     """What a method says of one posterior."""
 
     kind: str
@@ -29,11 +29,11 @@ class Answer:
 
 
 @dataclasses.dataclass(frozen=True)
-class AbstractMethod(Carded, abc.ABC):
+class AbstractMethod(HTMLRepr, abc.ABC):
     """How draws of a posterior are made; a small frozen dataclass of settings."""
 
     @abc.abstractmethod
-    def draw(self, bench: Any) -> Answer:
+    def draw(self, problem: Any) -> PosteriorDraws:
         """Draw from the posterior of one capture.
 
         Args:

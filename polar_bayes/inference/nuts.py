@@ -19,10 +19,10 @@ from jaxtyping import Array, Float
 from numpyro import infer
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import Kept, TracedOnce
+from polar_bayes.inference.compile import JitOnce, LRUCache
 from polar_bayes.inference.mcse import measure
 from polar_bayes.inference.optimize import Modes, ValueAndGradient
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 Progress = Callable[[float], None]
 
@@ -34,7 +34,7 @@ MOST_KEPT = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class Nuts(Carded):
+class Nuts(HTMLRepr):
     """Settings of the sampler.
 
     Args:
@@ -78,14 +78,14 @@ class Nuts(Carded):
             given = getattr(self, name)
             if given is not None and given < least:
                 raise FitError(
-                    f"{name} is {getattr(self, name)}", where="Nuts", mend=f"give at least {least}"
+                    f"{name} is {getattr(self, name)}", where="Nuts", hint=f"give at least {least}"
                 )
         wanted = self.target_acceptance
         if wanted is not None and not 0.5 <= wanted < 1.0:
             raise FitError(
                 f"target_acceptance is {self.target_acceptance}",
                 where="Nuts",
-                mend="give a number from 0.5 to below 1",
+                hint="give a number from 0.5 to below 1",
             )
 
 
@@ -225,7 +225,7 @@ class Samplers:
 
     def __init__(self, density: Callable[[Array, Any], Array]) -> None:
         self._density = density
-        self._made: Kept[_Sampler] = Kept(MOST_KEPT)
+        self._made: LRUCache[_Sampler] = LRUCache(MOST_KEPT)
 
     def of(self, fixed: _Fixed) -> "_Sampler":
         """The sampler of such lengths and goals."""
@@ -238,7 +238,7 @@ class _Sampler:
     def __init__(self, density: Callable[[Array, Any], Array], fixed: _Fixed) -> None:
         self.fixed = fixed
         # From a state and the data to the state after a block and its steps.
-        self.advance = TracedOnce(self._advance)
+        self.advance = JitOnce(self._advance)
         self._init, self._next = infer.hmc.hmc(
             potential_fn_gen=lambda given: lambda z: density(z, given), algo="NUTS"
         )

@@ -217,6 +217,6 @@ def find_modes(potential: ValueAndGradient, starts: np.ndarray, progress: Progre
         raise FitError(
             f"none of {len(starts)} starts reached a peak of the posterior",
             where="fit",
-            mend="check the capture against the prior predictive, or give narrower priors",
+            hint="check the capture against the prior predictive, or give narrower priors",
         )
     return modes

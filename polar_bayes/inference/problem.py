@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference import laplace
-from polar_bayes.inference.compile import TRACING, Kept, TracedByShape, key_of_story, layout_of
-from polar_bayes.inference.initialization import AbstractGround, AbstractGrounds, make_grounds
+from polar_bayes.inference.compile import TRACING_LOCK, JitByShape, LRUCache, cache_key, layout_of
+from polar_bayes.inference.initialization import AbstractInit, AbstractInitializer, make_initializer
 from polar_bayes.inference.program import Model, Program, compile_program
 from polar_bayes.inference.request import Request
 from polar_bayes.observation.data import Observations
@@ -25,7 +25,7 @@ MOST_KEPT = 8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Prepared:
+class CompiledModel:
     """What fits of one model to captures of one layout have in common."""
 
     model: Model
@@ -33,31 +33,31 @@ class Prepared:
     layout: Observations
 
     @functools.cached_property
-    def grounds(self) -> AbstractGrounds:
+    def initializer(self) -> AbstractInitializer:
         """What searches for peaks."""
-        with TRACING:
-            return make_grounds(self.model, self.program, self.layout)
+        with TRACING_LOCK:
+            return make_initializer(self.model, self.program, self.layout)
 
     @functools.cached_property
     def least_squares(self) -> Callable[[Array, Observations], laplace.Estimate]:
         """The least squares from some starts, compiled."""
-        return TracedByShape(lambda starts, data: laplace.estimate(self.program, data, starts))
+        return JitByShape(lambda starts, data: laplace.estimate(self.program, data, starts))
 
 
-_KEPT: Kept[Prepared] = Kept(MOST_KEPT)
+_KEPT: LRUCache[CompiledModel] = LRUCache(MOST_KEPT)
 
 
-def prepare(request: Request, scene: Scene, data: Observations) -> Prepared:
-    """What fits the capture, and any other of its layout, kept from the last fit where it can be."""
-    key = key_of_story(
+def compile_model(request: Request, scene: Scene, data: Observations) -> CompiledModel:
+    """The compiled model of a capture and of every other one of its layout, from the cache."""
+    key = cache_key(
         request.model, scene, request.priors, request.links, request.precision, layout_of(data)
     )
 
-    def make() -> Prepared:
+    def make() -> CompiledModel:
         model = request.bind(scene)
-        return Prepared(model, compile_program(model, data), data)
+        return CompiledModel(model, compile_program(model, data), data)
 
-    with TRACING:
+    with TRACING_LOCK:
         return _KEPT.of(key, make)
 
 
@@ -65,11 +65,11 @@ def prepare(request: Request, scene: Scene, data: Observations) -> Prepared:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Bench:
+class Problem:
     """A capture with the programs that fit it."""
 
     request: Request
-    prepared: Prepared
+    compiled_model: CompiledModel
     data: Observations
     key: Array
     progress: Progress
@@ -78,7 +78,7 @@ class Bench:
     @property
     def program(self) -> Program:
         """The model as functions of one unconstrained vector."""
-        return self.prepared.program
+        return self.compiled_model.program
 
     @property
     def key_of_draws(self) -> Array:
@@ -86,15 +86,17 @@ class Bench:
         return jax.random.split(self.key)[1]
 
     @functools.cached_property
-    def ground(self) -> AbstractGround:
+    def initialization(self) -> AbstractInit:
         """The peaks of the posterior, searched for once however many methods ask."""
-        return self.prepared.grounds.find(self.data, jax.random.split(self.key)[0], self.progress)
+        return self.compiled_model.initializer.find(
+            self.data, jax.random.split(self.key)[0], self.progress
+        )
 
-    def reporting(self, progress: Progress) -> "Bench":
+    def reporting(self, progress: Progress) -> "Problem":
         """The same with another callback; the peaks go with it where they are found already."""
         other = dataclasses.replace(self, progress=progress)
-        if "ground" in self.__dict__:
-            other.__dict__["ground"] = self.ground
+        if "initialization" in self.__dict__:
+            other.__dict__["initialization"] = self.initialization
         return other
 
     @property

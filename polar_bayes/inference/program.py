@@ -22,7 +22,7 @@ from numpyro.infer.util import potential_energy
 from numpyro.primitives import Messenger
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import TracedByShape, TracedOnce
+from polar_bayes.inference.compile import JitByShape, JitOnce
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -139,14 +139,14 @@ class Program:
         }
 
     @functools.cached_property
-    def told_once(self) -> Callable[[Array, Observations], Array]:
+    def potential_jit(self) -> Callable[[Array, Observations], Array]:
         """The potential; the model is told once, however many programs compute it."""
         return jax.jit(self.potential, inline=True)
 
     @functools.cached_property
-    def value_and_gradient(self) -> TracedOnce:
+    def value_and_gradient(self) -> JitOnce:
         """The potential with its gradient, compiled."""
-        return TracedOnce(jax.value_and_grad(self.told_once))
+        return JitOnce(jax.value_and_grad(self.potential_jit))
 
     @functools.cached_property
     def drawn_from_prior(self) -> Callable[[np.ndarray, int, Observations], Array]:
@@ -160,28 +160,28 @@ class Program:
                 0, count, lambda i, z: z.at[i].set(self.from_prior(wrapped[i], data)), nothing
             )
 
-        return TracedByShape(draw)
+        return JitByShape(draw)
 
     @functools.cached_property
-    def described(self) -> TracedByShape:
+    def described(self) -> JitByShape:
         """Many draws described, compiled; keys as the numbers that they hold, (draw, ...)."""
 
         def describe(keys: Array, z: Array, data: Observations) -> Draw:
             wrapped = jax.random.wrap_key_data(keys)
             return jax.lax.map(lambda kz: self.describe(kz[0], kz[1], data), (wrapped, z))
 
-        return TracedByShape(describe)
+        return JitByShape(describe)
 
     @functools.cached_property
     def parameters_of_chains(self) -> Callable[[Array, Observations], dict[str, Array]]:
         """The parameters of chains of draws, (chain, draw, size), compiled."""
         over_draws = jax.vmap(self.parameters, in_axes=(0, None))
-        return TracedByShape(jax.vmap(over_draws, in_axes=(0, None)))
+        return JitByShape(jax.vmap(over_draws, in_axes=(0, None)))
 
     @functools.cached_property
     def slopes(self) -> Callable[[Array], dict[str, Array]]:
         """Derivatives of the latent sites in the vector, compiled."""
-        return TracedOnce(jax.jacfwd(self.constrain))
+        return JitOnce(jax.jacfwd(self.constrain))
 
 
 def compile_program(model: Model, data: Observations) -> Program:
@@ -267,7 +267,7 @@ def _plate_names(site: dict) -> tuple[str, ...]:
 # --- What a model says about itself when it is told once, without computing anything --------------
 
 
-class Story(NamedTuple):
+class ModelInfo(NamedTuple):
     """What was found."""
 
     priors: tuple[str, ...]
@@ -275,13 +275,13 @@ class Story(NamedTuple):
     fixed: dict[str, Any]
 
 
-def read_story(
+def inspect_model(
     model: Callable,
     data: Observations,
     scene: Scene,
     priors: PriorTable,
     links: Mapping[str, AbstractLink],
-) -> Story:
+) -> ModelInfo:
     """Tell the story once, with abstract arrays, and refuse what cannot be fitted."""
     sites: dict[str, dict] = {}
 
@@ -298,7 +298,7 @@ def read_story(
         _check_site(name, site["fn"])
     _check_handlers(model, tuple(sampled))
     _check_readings(sampled, data)
-    return Story(
+    return ModelInfo(
         priors=priors.read,
         declared={
             name: family_of(site["fn"])
@@ -328,7 +328,7 @@ def _check_handlers(model: Callable, sites: tuple[str, ...]) -> None:
             raise FitError(
                 f"{type(model).__name__} does not hold {held[0]} while the posterior is sampled",
                 where="model",
-                mend=f"use numpyro.handlers.condition(model, data={{{held[0]!r}: ...}})",
+                hint=f"use numpyro.handlers.condition(model, data={{{held[0]!r}: ...}})",
             )
         model = model.fn
 
@@ -339,7 +339,7 @@ def _check_site(name: str, distribution: dist.Distribution) -> None:
         raise FitError(
             f"{family_of(distribution)} is discrete, and samplers follow gradients",
             where=where,
-            mend="give a continuous distribution, or sum the discrete site out",
+            hint="give a continuous distribution, or sum the discrete site out",
         )
     check_support(name, distribution, where)
 
@@ -351,13 +351,13 @@ def _check_readings(sampled: Mapping[str, dict], data: Observations) -> None:
         raise FitError(
             "it is drawn, not observed",
             where=f"model: sample({drawn[0]!r})",
-            mend="give it obs=link.reading(data.readings[name]), as declare_readings does",
+            hint="give it obs=link.reading(data.readings[name]), as declare_readings does",
         )
     if not any(name in sampled for name in data.readings):
         raise FitError(
             "the model observes none of the readings",
             where="model",
-            mend=f"end it with declare_readings(...), or observe {' or '.join(data.readings)}",
+            hint=f"end it with declare_readings(...), or observe {' or '.join(data.readings)}",
         )
 
 

@@ -1,7 +1,7 @@
 """Mixtures of Student t distributions, fitted to weighted draws: proposals for bent posteriors.
 
 One normal or t distribution wastes most of its draws on a posterior that bends or has two modes; a
-few together follow it. Measured in `tests/benchmarks/calibration.py`.
+few together follow it. Measured in `benchmarks/calibration.py`.
 
 Each round takes mean and covariance of the weighted draws of the last, and draws from a Student t
 distribution with both: its tails are longer than those of nearly every posterior, so weights are
@@ -184,9 +184,9 @@ def learn(
     apart = places - center[:, None]
     covariance = np.einsum("pd,pds,pdt->pst", weights, apart, apart)
     half = np.full_like(covariance, np.nan)
-    for pixel, spread in enumerate(covariance):
+    for pixel, matrix in enumerate(covariance):
         try:
-            half[pixel] = np.linalg.cholesky(spread).T
+            half[pixel] = np.linalg.cholesky(matrix).T
         except np.linalg.LinAlgError:
             continue  # stays NaN, which no weight trusts
     return Proposal(center, half)

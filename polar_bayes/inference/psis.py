@@ -170,7 +170,7 @@ def effective_draws(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarra
 def effective_tails(
     draws: Float[np.ndarray, "pixel draw size"], weights: Float[np.ndarray, "pixel draw"]
 ) -> Float[np.ndarray, " pixel"]:
-    """How many draws of the posterior itself would tell its tails as well as the weighted ones do."""
+    """Tail effective sample size of weighted draws."""
     # Source: Vehtari, Gelman, Simpson, Carpenter & Buerkner (2021), Bayesian Anal. 16(2), section
     # 4.3 (tail effective sample size); Owen (2013), Monte Carlo theory, methods and examples, eq.
     # 9.8 (variance of weighted means).

@@ -13,11 +13,11 @@ from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.compile import TRACING, Kept, key_of_story, layout_of
+from polar_bayes.inference.compile import TRACING_LOCK, LRUCache, cache_key, layout_of
 from polar_bayes.inference.laplace import Laplace, Point
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.nuts import Nuts
-from polar_bayes.inference.program import Story, read_story
+from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.models.gp_spectral import gp_spectral
 from polar_bayes.models.hierarchical import Hierarchical
 from polar_bayes.models.per_material import per_material
@@ -35,7 +35,7 @@ MODELS: dict[str, Callable] = {
 }
 METHODS: dict[str, Method] = {"nuts": Nuts(), "laplace": Laplace(), "point": Point()}
 
-_STORIES: Kept[Story] = Kept(32)
+_STORIES: LRUCache[ModelInfo] = LRUCache(32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +81,7 @@ def resolve(
         raise CaptureError(
             "an image has too many materials for one joint fit",
             where=f"{capture.attrs.get('name', 'capture')}: dims y, x",
-            mend="average a region into one capture first, for example capture.mean(('y', 'x'))",
+            hint="average a region into one capture first, for example capture.mean(('y', 'x'))",
         )
     if scene is None:
         scene = str(capture.attrs.get("setup", "paper"))
@@ -90,13 +90,13 @@ def resolve(
     limit = setup.largest_view_zenith if largest_view_zenith is None else largest_view_zenith
     if not 0.0 < limit <= 90.0:
         raise FitError(
-            f"largest_view_zenith is {limit}", where="fit", mend="give degrees from 0 to 90"
+            f"largest_view_zenith is {limit}", where="fit", hint="give degrees from 0 to 90"
         )
     _check_views(capture, limit)
     if precision not in ("double", "single"):
-        raise FitError(f"precision is {precision!r}", where="fit", mend="give 'double' or 'single'")
+        raise FitError(f"precision is {precision!r}", where="fit", hint="give 'double' or 'single'")
     if not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed < 2**32:
-        raise FitError(f"seed is {seed!r}", where="fit", mend="give an integer from 0 to 2**32 - 1")
+        raise FitError(f"seed is {seed!r}", where="fit", hint="give an integer from 0 to 2**32 - 1")
     story = model if callable(model) else _find(MODELS, "model", model)
     with jax.enable_x64(precision == "double"):
         data = observe(capture, largest_view_zenith=limit)
@@ -133,12 +133,12 @@ def _read(
     scene: Scene,
     priors: Mapping[str, dist.Distribution] | None,
     links: Mapping[str, AbstractLink],
-) -> Story:
+) -> ModelInfo:
     """What the model says about itself, kept from the last capture of that layout."""
     table = PriorTable(priors)
-    key = key_of_story(model, scene, priors or {}, links, layout_of(data))
-    with TRACING:
-        return _STORIES.of(key, lambda: read_story(model, data, scene, table, links))
+    key = cache_key(model, scene, priors or {}, links, layout_of(data))
+    with TRACING_LOCK:
+        return _STORIES.of(key, lambda: inspect_model(model, data, scene, table, links))
 
 
 def _name_of(model: Callable) -> str:
@@ -154,7 +154,7 @@ def _name_of(model: Callable) -> str:
 def _find(table: Mapping[str, Any], kind: str, name: object) -> Any:
     if not isinstance(name, str) or name not in table:
         raise FitError(
-            f"no such {kind}", where=f"{kind}={name!r}", mend=f"give one of {', '.join(table)}"
+            f"no such {kind}", where=f"{kind}={name!r}", hint=f"give one of {', '.join(table)}"
         )
     return table[name]
 
@@ -165,7 +165,7 @@ def _setup_around(scene: object, capture: xr.Dataset) -> Setup:
         raise FitError(
             f"a {type(scene).__name__} is not a scene",
             where="scene",
-            mend=f"give a polar_bayes.Scene or one of {', '.join(SETUPS)}",
+            hint=f"give a polar_bayes.Scene or one of {', '.join(SETUPS)}",
         )
     base = SETUPS.get(str(capture.attrs.get("setup")), SETUPS["paper"])
     return dataclasses.replace(base, scene=scene)
@@ -189,7 +189,7 @@ def _choose_links(
         raise FitError(
             f"a {type(links).__name__} is not a link",
             where="links",
-            mend="give a link such as BetaLink(), or a mapping {'dop': BetaLink()}",
+            hint="give a link such as BetaLink(), or a mapping {'dop': BetaLink()}",
         )
     for name, link in chosen.items():
         _check_link(name, link, capture)
@@ -197,7 +197,7 @@ def _choose_links(
         raise CaptureError(
             f"no polarization that these links describe (wanted {' or '.join(wanted)})",
             where=str(capture.attrs.get("name", "capture")),
-            mend="choose another scene or link: BetaLink for dop, StokesLink for q and u",
+            hint="choose another scene or link: BetaLink for dop, StokesLink for q and u",
         )
     return chosen
 
@@ -208,19 +208,19 @@ def _check_link(name: str, link: object, capture: xr.Dataset) -> None:
         raise FitError(
             f"a {type(link).__name__} is not a link",
             where=where,
-            mend="give a link such as BetaLink()",
+            hint="give a link such as BetaLink()",
         )
     if name not in link.observables:
         raise FitError(
             f"{type(link).__name__} does not describe {name}",
             where=where,
-            mend=f"it describes {', '.join(link.observables)}",
+            hint=f"it describes {', '.join(link.observables)}",
         )
     if name not in capture:
         raise FitError(
             f"the capture has no variable {name}",
             where=where,
-            mend="leave that link out or measure the variable",
+            hint="leave that link out or measure the variable",
         )
 
 
@@ -233,5 +233,5 @@ def _check_views(capture: xr.Dataset, limit: float) -> None:
         raise CaptureError(
             f"only {used} valid view{'s' if used != 1 else ''} up to {limit:g} degrees",
             where=f"{capture.attrs.get('name', 'capture')}: view",
-            mend="measure at two or more angles; the more they differ, the better",
+            hint="measure at two or more angles; the more they differ, the better",
         )

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polar_bayes.inference.compile import TRACING, TracedOnce
+from polar_bayes.inference.compile import TRACING_LOCK, JitOnce
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 
@@ -47,7 +47,7 @@ def choose(
     return random.permutation(chosen).reshape(CHAINS, each)
 
 
-def most_worth(count: int) -> float:
+def max_effective_size(count: int) -> float:
     """How many independent draws the chosen ones stand for at best, all weights being equal."""
     chosen = min(count, CHAINS * MOST)
     return count * chosen / (count + chosen) if count else 0.0
@@ -61,7 +61,7 @@ def generator(key: Array) -> np.random.Generator:
 @functools.lru_cache(maxsize=8)
 def _looker(program: Program) -> Callable[[Array, Observations], Array]:
     def look(z: Array, data: Observations) -> Array:
-        return jax.lax.map(lambda z: -program.told_once(z, data), z, batch_size=SIDE_BY_SIDE)
+        return jax.lax.map(lambda z: -program.potential_jit(z, data), z, batch_size=SIDE_BY_SIDE)
 
-    with TRACING:
-        return TracedOnce(look)
+    with TRACING_LOCK:
+        return JitOnce(look)

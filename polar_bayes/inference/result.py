@@ -77,7 +77,7 @@ def provenance_of(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
         raise FitError(
             "it is no mapping in JSON",
             where=f"result: attribute {PROVENANCE}",
-            mend="give the result as it was saved, or delete the attribute",
+            hint="give the result as it was saved, or delete the attribute",
         )
     return {key: value for key, value in said.items() if value is not None}
 

@@ -14,10 +14,10 @@ from polar_bayes.inference import laplace
 from polar_bayes.inference.initialization import STARTS
 from polar_bayes.inference.laplace import Laplace
 from polar_bayes.inference.mcse import measure
-from polar_bayes.inference.method import AbstractMethod, Answer
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.optimize import from_prior
-from polar_bayes.inference.problem import Bench
+from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.psis import smooth
 from polar_bayes.inference.request import Method
 from polar_bayes.inference.resampling import CHAINS, generator
@@ -29,28 +29,28 @@ POINT_DRAWS = 1000
 
 
 @functools.singledispatch
-def answer(method: Method, bench: Bench) -> Answer:
+def answer(method: Method, problem: Problem) -> PosteriorDraws:
     """What a method says of a capture."""
     raise FitError(
         f"a {type(method).__name__} is not a method",
         where="method",
-        mend="give settings such as polar_bayes.Nuts()",
+        hint="give settings such as polar_bayes.Nuts()",
     )
 
 
 @answer.register
-def _(method: AbstractMethod, bench: Bench) -> Answer:
-    return method.draw(bench)
+def _(method: AbstractMethod, problem: Problem) -> PosteriorDraws:
+    return method.draw(problem)
 
 
 @answer.register
-def _(method: Nuts, bench: Bench) -> Answer:
-    drawn = bench.ground.draw(bench.key_of_draws, method, bench.progress)
+def _(method: Nuts, problem: Problem) -> PosteriorDraws:
+    drawn = problem.initialization.draw(problem.key_of_draws, method, problem.progress)
     bulk, tail, r_hat = measure(np.moveaxis(drawn.z, -1, 0))
     steps = drawn.stats["n_steps"]
     warmup = np.sum(drawn.stats["warmup_steps"][:, 0])
-    climbing = float(bench.ground.said.get("gradients", np.nan))
-    return Answer(
+    climbing = float(problem.initialization.said.get("gradients", np.nan))
+    return PosteriorDraws(
         kind="nuts",
         z=drawn.z,
         stats=drawn.stats,
@@ -59,41 +59,41 @@ def _(method: Nuts, bench: Bench) -> Answer:
         effective_draws=float(min(np.min(bulk), np.min(tail))),
         gradients=climbing + float(warmup + np.sum(steps)),
         densities=0.0,
-        said={"modes": bench.ground.said, "goals_reached": drawn.goals_reached},
+        said={"modes": problem.initialization.said, "goals_reached": drawn.goals_reached},
     )
 
 
 @answer.register
-def _(method: Laplace, bench: Bench) -> Answer:
-    drawn = bench.ground.draw(bench.key_of_draws, method, bench.progress)
+def _(method: Laplace, problem: Problem) -> PosteriorDraws:
+    drawn = problem.initialization.draw(problem.key_of_draws, method, problem.progress)
     count = drawn.z[..., 0].size
     k_hat = smooth(drawn.stats["log_weight"].reshape(1, -1)).pareto_k[0]
-    return Answer(
+    return PosteriorDraws(
         kind="laplace",
         z=drawn.z,
         stats=drawn.stats,
         problems=drawn.problems,
         k_hat=float(k_hat),
         effective_draws=float(count),
-        gradients=float(bench.ground.said.get("gradients", np.nan)) + count,
+        gradients=float(problem.initialization.said.get("gradients", np.nan)) + count,
         densities=0.0,
-        said={"modes": bench.ground.said},
+        said={"modes": problem.initialization.said},
     )
 
 
 @answer.register
-def _(method: laplace.Point, bench: Bench) -> Answer:
+def _(method: laplace.Point, problem: Problem) -> PosteriorDraws:
     """Draws of the normal distribution that the standard errors stand for."""
     # What the readings do not determine has no standard error, and is drawn without any width.
-    key_starts = jax.random.split(bench.key)[0]
-    starts = from_prior(bench.program, key_starts, STARTS, bench.data)
-    least_squares = bench.prepared.least_squares
-    found = laplace.to_numpy(least_squares(jnp.asarray(starts[: method.starts]), bench.data))
+    key_starts = jax.random.split(problem.key)[0]
+    starts = from_prior(problem.program, key_starts, STARTS, problem.data)
+    least_squares = problem.compiled_model.least_squares
+    found = laplace.to_numpy(least_squares(jnp.asarray(starts[: method.starts]), problem.data))
     free = np.isinf(np.diagonal(found.covariance))
     covariance = np.where(free[:, None] | free, 0.0, found.covariance)
-    random = generator(bench.key_of_draws)
+    random = generator(problem.key_of_draws)
     drawn = random.multivariate_normal(found.z, covariance, (CHAINS, POINT_DRAWS // CHAINS))
-    return Answer(
+    return PosteriorDraws(
         kind="point",
         z=drawn,
         stats={},
@@ -134,7 +134,7 @@ def _(method: Tempered, factor: float) -> Method:
         raise FitError(
             f"{wanted:g} draws are fewer than the crowd of {settings.crowd}",
             where="Tempered",
-            mend="give a smaller crowd, or more draws",
+            hint="give a smaller crowd, or more draws",
         )
     more = with_answer_draws(settings, wanted)
     worth = settings.effective_draws * more.answer_draws / settings.answer_draws

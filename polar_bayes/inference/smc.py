@@ -26,7 +26,7 @@ from scipy.special import ndtr
 from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 # --- Coordinates in which each parameter's prior is standard normal: normal scores ----------------
 
@@ -38,7 +38,7 @@ FLATTEST = 1e-4
 """Least slope of a map, in units of its mean one: it must have an inverse."""
 
 
-class Scores(NamedTuple):
+class NormalScores(NamedTuple):
     """A map of each coordinate to its normal score and back."""
 
     # Any increasing map would do: what is drawn and weighed allows for its slope. This one is the
@@ -69,13 +69,15 @@ class Scores(NamedTuple):
         return z, jnp.sum(log_slope, axis=-1)
 
 
-def normal_scores(z: Float[Array, "draw size"]) -> Scores:
+def normal_scores(z: Float[Array, "draw size"]) -> NormalScores:
     """The scores that make draws from a prior standard normal in every coordinate."""
     # Source: van der Waerden (1952), Indag. Math. 14, 453-458: normal scores.
     values = _quantiles(z.T, ndtr(KNOTS.astype(float)))
     steps = jnp.diff(values)
     steps = jnp.maximum(steps, FLATTEST * jnp.mean(steps, axis=-1, keepdims=True))
-    return Scores(jnp.concatenate([values[:, :1], values[:, :1] + jnp.cumsum(steps, 1)], axis=1))
+    return NormalScores(
+        jnp.concatenate([values[:, :1], values[:, :1] + jnp.cumsum(steps, 1)], axis=1)
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,7 +85,7 @@ class ScoredProgram:
     """A program whose vectors are normal scores; densities are those of the scores."""
 
     program: Program
-    scores: Scores
+    scores: NormalScores
 
     def potential(self, u: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """Minus the log posterior density of the scores, up to a constant."""
@@ -100,7 +102,7 @@ class ScoredProgram:
         return self.program.parameters(self.scores.place(u)[0], data)
 
 
-def place(scores: Scores, u: Float[np.ndarray, "pixel draw size"]) -> np.ndarray:
+def place(scores: NormalScores, u: Float[np.ndarray, "pixel draw size"]) -> np.ndarray:
     """Unconstrained vectors of many pixels, each with scores of its own."""
     at = np.clip(np.searchsorted(KNOTS, u) - 1, 0, len(KNOTS) - 2)
     values = np.asarray(scores.values)
@@ -155,7 +157,7 @@ LIFT = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
-class PixelTempering(Carded):
+class PixelTempering(HTMLRepr):
     """Tempered draws of every pixel, corrected by weights.
 
     Args:
@@ -203,25 +205,25 @@ class PixelTempering(Carded):
                 raise FitError(
                     f"{name} is {getattr(self, name)}",
                     where="PixelTempering",
-                    mend=f"give {lowest} or more",
+                    hint=f"give {lowest} or more",
                 )
         if not 0.1 <= self.effective_share <= 0.95:
             raise FitError(
                 f"effective_share is {self.effective_share}",
                 where="PixelTempering",
-                mend="give a number from 0.1 to 0.95",
+                hint="give a number from 0.1 to 0.95",
             )
         if 2 * self.draws < self.crowd:
             raise FitError(
                 f"draws is {self.draws}, and the crowd {self.crowd}",
                 where="PixelTempering",
-                mend="give at least half of walks * length",
+                hint="give at least half of walks * length",
             )
         if self.effective_draws >= 2 * self.draws:
             raise FitError(
                 f"effective_draws is {self.effective_draws}, and there are {2 * self.draws} draws",
                 where="PixelTempering",
-                mend="give fewer, or more draws",
+                hint="give fewer, or more draws",
             )
 
     @property
@@ -248,7 +250,7 @@ class Tempered(NamedTuple):
 
     u: Float[Array | np.ndarray, "draw size"]
     weights: Float[Array | np.ndarray, " draw"]
-    scores: Scores
+    scores: NormalScores
     temperature: Float[Array | np.ndarray, ""]
     stages: Array | np.ndarray
 

@@ -71,7 +71,7 @@ def predict_spectrum(
         raise FitError(
             "the fit ties no color to another",
             where=f"predict_spectrum: result of model {told.get('model', 'unknown')!r}",
-            mend="fit with model='gp_spectral', or in a scene with a law of dispersion",
+            hint="fit with model='gp_spectral', or in a scene with a law of dispersion",
         )
     for name, spectrum in found.items():
         symbol, meaning, unit = notation(name)
@@ -88,7 +88,7 @@ def _checked(wavelengths: Any) -> np.ndarray:
         raise FitError(
             f"{wavelengths!r} is no list of wavelengths",
             where="predict_spectrum: wavelengths",
-            mend="give numbers above zero in nm, such as [500.0, 600.0]",
+            hint="give numbers above zero in nm, such as [500.0, 600.0]",
         )
     return new
 
@@ -109,7 +109,7 @@ def _law_of(told: Mapping[str, Any], scene: Scene | None) -> AbstractDispersion 
             raise FitError(
                 "the law of dispersion of the fit's scene is not one of this package",
                 where="predict_spectrum: scene",
-                mend="give the same scene again: predict_spectrum(result, wavelengths, scene=...)",
+                hint="give the same scene again: predict_spectrum(result, wavelengths, scene=...)",
             ) from error
     return None
 
@@ -121,7 +121,7 @@ def _model_of(told: Mapping[str, Any], model: GpSpectral | None) -> GpSpectral:
             raise FitError(
                 f"a {type(model).__name__} is not a GpSpectral",
                 where="predict_spectrum: model",
-                mend="give the model of the fit, such as GpSpectral()",
+                hint="give the model of the fit, such as GpSpectral()",
             )
         return model
     settings = told.get("model_settings") or {}
@@ -146,8 +146,8 @@ def _process_of(settings: Mapping[str, Any]) -> SpectralProcess:
 
 
 def _unknown(what: str) -> FitError:
-    mend = "give the model again: predict_spectrum(result, wavelengths, model=...)"
-    return FitError(what, where="predict_spectrum: model", mend=mend)
+    hint = "give the model again: predict_spectrum(result, wavelengths, model=...)"
+    return FitError(what, where="predict_spectrum: model", hint=hint)
 
 
 def _follow(law: AbstractDispersion, posterior: xr.Dataset, new: np.ndarray) -> xr.DataArray:
@@ -185,7 +185,7 @@ def _condition(
             raise FitError(
                 f"it has no draws of {variable} by wavelength",
                 where="predict_spectrum: result",
-                mend="give the tree that polar_bayes.fit or load_result returned",
+                hint="give the tree that polar_bayes.fit or load_result returned",
             )
     level = posterior[f"{name}_level"]
     leading = [dim for dim in level.dims if dim not in ("chain", "draw")]
@@ -196,7 +196,7 @@ def _condition(
         raise FitError(
             "the model given does not read the length that the fit has, or the other way round",
             where="predict_spectrum: model",
-            mend="give the model of the fit",
+            hint="give the model of the fit",
         )
     prior = f"{name}_level_location" if f"{name}_level_location" in posterior else f"{name}_level"
     bounds = bounds_of(told, prior)

@@ -16,10 +16,10 @@ from numpyro import handlers, infer, optim
 from numpyro.infer import autoguide
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import TRACING, TracedOnce
-from polar_bayes.inference.initialization import WholeGround
-from polar_bayes.inference.method import AbstractMethod, Answer
-from polar_bayes.inference.problem import Bench
+from polar_bayes.inference.compile import TRACING_LOCK, JitOnce
+from polar_bayes.inference.initialization import JointInit
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
+from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.psis import smooth
 from polar_bayes.inference.resampling import CHAINS
@@ -55,7 +55,7 @@ class AbstractGuide(AbstractMethod):
             raise FitError(
                 f"steps is {self.steps}, draws {self.draws}, learning_rate {self.learning_rate}",
                 where=type(self).__name__,
-                mend="give at least 100 steps, 50 draws, and a learning rate above 0",
+                hint="give at least 100 steps, 50 draws, and a learning rate above 0",
             )
 
     @abc.abstractmethod
@@ -63,33 +63,33 @@ class AbstractGuide(AbstractMethod):
         """NumPyro's guide of a model of one vector, which starts at the mode."""
 
     @override
-    def draw(self, bench: Bench) -> Answer:
-        ground = bench.ground
-        if not isinstance(ground, WholeGround):
+    def draw(self, problem: Problem) -> PosteriorDraws:
+        initialization = problem.initialization
+        if not isinstance(initialization, JointInit):
             raise FitError(
                 "guides are fitted to one material only",
                 where=type(self).__name__,
-                mend="use method='nuts'",
+                hint="use method='nuts'",
             )
-        modes = ground.modes
-        half = jnp.asarray(np.linalg.cholesky(modes.covariance[0]), bench.dtype)
-        center = jnp.asarray(modes.z[0], bench.dtype)
-        fitted = _fitter(bench.program, self)
+        modes = initialization.modes
+        half = jnp.asarray(np.linalg.cholesky(modes.covariance[0]), problem.dtype)
+        center = jnp.asarray(modes.z[0], problem.dtype)
+        fitted = _fitter(problem.program, self)
         z, log_ratio, loss = (
-            np.asarray(x, float) for x in fitted(bench.key_of_draws, center, half, bench.data)
+            np.asarray(x, float) for x in fitted(problem.key_of_draws, center, half, problem.data)
         )
         problems = [] if np.isfinite(z).all() else ["the guide has left the posterior"]
         smoothed = smooth(log_ratio.reshape(1, -1))
-        return Answer(
+        return PosteriorDraws(
             kind="variational",
             z=z,
             stats={"log_weight": log_ratio},
             problems=problems,
             k_hat=float(smoothed.pareto_k[0]),
             effective_draws=float(log_ratio.size),
-            gradients=float(ground.said["gradients"]) + float(self.steps * PARTICLES),
+            gradients=float(initialization.said["gradients"]) + float(self.steps * PARTICLES),
             densities=float(log_ratio.size),
-            said={"modes": ground.said, "loss": float(loss)},
+            said={"modes": initialization.said, "loss": float(loss)},
         )
 
 
@@ -137,7 +137,7 @@ def _fitter(program: Program, settings: AbstractGuide) -> Callable[..., Any]:
             whole = dist.ImproperUniform(dist.constraints.real_vector, (), (size,))
             w = numpyro.sample("w", whole)
             with handlers.block():  # the sites of the model itself are no concern of the guide
-                log_density = -program.told_once(center + half @ w, data)
+                log_density = -program.potential_jit(center + half @ w, data)
             numpyro.factor("posterior", log_density)
 
         def rate(step: Array) -> Array:
@@ -164,9 +164,9 @@ def _fitter(program: Program, settings: AbstractGuide) -> Callable[..., Any]:
             log_guide = posterior.log_prob(w)
         z = center + w @ half.T
         flat = z.reshape(-1, size)
-        log_posterior = jax.lax.map(lambda z: -program.told_once(z, data), flat, batch_size=64)
+        log_posterior = jax.lax.map(lambda z: -program.potential_jit(z, data), flat, batch_size=64)
         log_ratio = log_posterior.reshape(shape) - log_guide
         return z, jnp.where(jnp.isnan(log_ratio), -jnp.inf, log_ratio), losses[-1]
 
-    with TRACING:
-        return TracedOnce(run)
+    with TRACING_LOCK:
+        return JitOnce(run)

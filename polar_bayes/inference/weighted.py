@@ -11,21 +11,21 @@ import numpy as np
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_fit import tempered_draws
-from polar_bayes.inference.batch_programs import Engine
+from polar_bayes.inference.batch_programs import BatchEngine
 from polar_bayes.inference.batch_result import Row, Status, Weighted
 from polar_bayes.inference.batching import Stack
-from polar_bayes.inference.compile import TRACING, Kept
-from polar_bayes.inference.initialization import STARTS, WholeGround
-from polar_bayes.inference.method import AbstractMethod, Answer
+from polar_bayes.inference.compile import TRACING_LOCK, LRUCache
+from polar_bayes.inference.initialization import STARTS, JointInit
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import Modes
-from polar_bayes.inference.problem import Bench, Prepared
+from polar_bayes.inference.problem import CompiledModel, Problem
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.proposals import Mixture, draw_mixture, log_density
 from polar_bayes.inference.psis import LARGEST_TRUSTED, effective_draws, smooth
 from polar_bayes.inference.resampling import choose, generator, log_densities
 from polar_bayes.inference.smc import PixelTempering
 from polar_bayes.observation.data import Observations
-from polar_bayes.progress import Progress, silent
+from polar_bayes.progress import Progress, no_progress
 
 LEAST_SHARE = 1e-3
 """Of the Laplace evidence: lighter modes get no draws."""
@@ -54,30 +54,33 @@ class Importance(AbstractMethod):
 
     def __post_init__(self) -> None:
         if self.draws < 256:
-            raise FitError(f"draws is {self.draws}", where="Importance", mend="give at least 256")
+            raise FitError(f"draws is {self.draws}", where="Importance", hint="give at least 256")
 
     @override
-    def draw(self, bench: Bench) -> Answer:
-        ground = bench.ground
-        if not isinstance(ground, WholeGround):
+    def draw(self, problem: Problem) -> PosteriorDraws:
+        initialization = problem.initialization
+        if not isinstance(initialization, JointInit):
             raise FitError(
                 "the weights of many patches together say nothing",
                 where="Importance",
-                mend="use method='nuts'",
+                hint="use method='nuts'",
             )
-        proposal = _proposal(ground.modes, bench.dtype)
-        key_draw, key_choice = jax.random.split(bench.key_of_draws)
+        proposal = _proposal(initialization.modes, problem.dtype)
+        key_draw, key_choice = jax.random.split(problem.key_of_draws)
         places, proposed = (np.asarray(x) for x in _drawn(proposal, self.draws, key_draw))
-        ratios = log_densities(bench.program, places, bench.data) - proposed
+        ratios = log_densities(problem.program, places, problem.data) - proposed
         weights, k_hat = (x[0] for x in smooth(ratios[None]))
         worth = float(effective_draws(weights[None])[0])
-        said = {"modes": ground.said}
-        evaluations = {"gradients": float(ground.said["gradients"]), "densities": float(self.draws)}
+        said = {"modes": initialization.said}
+        evaluations = {
+            "gradients": float(initialization.said["gradients"]),
+            "densities": float(self.draws),
+        }
         if not np.isfinite(weights).all():
             raise FitError(
                 "the posterior density is zero at every draw",
                 where="Importance",
-                mend="use method='nuts'",
+                hint="use method='nuts'",
             )
         index = choose(weights, worth, generator(key_choice))
         problems = []
@@ -86,7 +89,7 @@ class Importance(AbstractMethod):
                 f"Pareto k-hat of the weights is {k_hat:.2f} (at most {LARGEST_TRUSTED}): they do "
                 "not reach all of the posterior, so use method='nuts'"
             )
-        return Answer(
+        return PosteriorDraws(
             kind="importance",
             z=places[index],
             stats={"lp": (ratios + proposed)[index]},
@@ -151,33 +154,35 @@ class Tempered(AbstractMethod):
     )
 
     @override
-    def draw(self, bench: Bench) -> Answer:
-        if any(name != "view" and length > 1 for name, length in bench.data.dims):
+    def draw(self, problem: Problem) -> PosteriorDraws:
+        if any(name != "view" and length > 1 for name, length in problem.data.dims):
             raise FitError(
                 "draws are tempered of one material in one color only",
                 where="Tempered",
-                mend="use method='nuts'",
+                hint="use method='nuts'",
             )
         row = Row(1, lambda at, parameters, weights: None)
-        keys = np.asarray(jax.random.key_data(bench.key_of_draws))[None]
-        engine = _engine(bench)
+        keys = np.asarray(jax.random.key_data(problem.key_of_draws))[None]
+        engine = _engine(problem)
         found: Weighted | None = None
-        pixels = _alone(bench.data)
+        pixels = _alone(problem.data)
         at = np.zeros(1, int)
         for _, answer in tempered_draws(engine, self.settings, pixels, keys, at, row):
             found = answer
-        bench.progress("tempering", 1.0)
+        problem.progress("tempering", 1.0)
         if found is None:
             raise FitError(
-                "the crowd did not arrive at the posterior", where="Tempered", mend="use 'nuts'"
+                "the crowd did not arrive at the posterior", where="Tempered", hint="use 'nuts'"
             )
-        return self._answer(bench, found, row, engine)
+        return self._answer(problem, found, row, engine)
 
-    def _answer(self, bench: Bench, found: Weighted, row: Row, engine: "_Counting") -> Answer:
+    def _answer(
+        self, problem: Problem, found: Weighted, row: Row, engine: "_Counting"
+    ) -> PosteriorDraws:
         z, weights = found.z[0].astype(float), found.weights[0].astype(float)
         weights = weights / weights.sum()
         worth, k_hat = float(found.worth[0]), float(found.pareto_k[0])
-        index = choose(weights, worth, generator(bench.key_of_draws))
+        index = choose(weights, worth, generator(problem.key_of_draws))
         problems = []
         if row.status[0] != Status.GOOD:
             problems.append(
@@ -190,7 +195,7 @@ class Tempered(AbstractMethod):
         drawn = engine.counts["rounds"] * self.settings.draws
         looked = engine.counts["crowds"] * self.settings.looks * self.settings.crowd
         densities = looked + steps + drawn
-        return Answer(
+        return PosteriorDraws(
             kind="tempered",
             z=z[index],
             stats={"log_weight": np.log(np.maximum(weights, 1e-300))[index]},
@@ -205,11 +210,11 @@ class Tempered(AbstractMethod):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Counting(Engine):
+class _Counting(BatchEngine):
     """The programs of a layout, and how often one fit runs them; made for each fit."""
 
     counts: collections.Counter = dataclasses.field(default_factory=collections.Counter)
-    progress: Progress = silent
+    progress: Progress = no_progress
 
     @override
     def temper(self, pixels: Stack, settings: PixelTempering, *others: Any) -> Any:
@@ -228,37 +233,39 @@ class _Counting(Engine):
         self.counts[what] += 1
 
 
-_ENGINES: Kept[tuple[Prepared, Engine]] = Kept(MOST_KEPT)
+_ENGINES: LRUCache[tuple[CompiledModel, BatchEngine]] = LRUCache(MOST_KEPT)
 """With what they were made for, so that its identity is not given to another."""
 
 
-def _engine(bench: Bench) -> _Counting:
+def _engine(problem: Problem) -> _Counting:
     """The programs of the bench's layout, kept from fit to fit, and counts that begin at zero."""
-    _, kept = _ENGINES.of(id(bench.prepared), functools.partial(_make, bench))
+    _, kept = _ENGINES.of(id(problem.compiled_model), functools.partial(_make, problem))
     return _Counting(
         kept.program,
         kept.rough,
         kept.candidates,
         kept.precision,
         kept.programs,
-        progress=bench.progress,
+        progress=problem.progress,
     )
 
 
-def _make(bench: Bench) -> tuple[Prepared, Engine]:
-    candidates = np.zeros((1, bench.program.size))  # nothing climbs here
-    rough = _rough(bench)
-    with TRACING:
-        return bench.prepared, Engine(bench.program, rough, candidates, bench.request.precision)
+def _make(problem: Problem) -> tuple[CompiledModel, BatchEngine]:
+    candidates = np.zeros((1, problem.program.size))  # nothing climbs here
+    rough = _rough(problem)
+    with TRACING_LOCK:
+        return problem.compiled_model, BatchEngine(
+            problem.program, rough, candidates, problem.request.precision
+        )
 
 
-def _rough(bench: Bench) -> Program:
+def _rough(problem: Problem) -> Program:
     """The same model in single precision."""
-    if bench.request.precision == "single":
-        return bench.program
-    single = dataclasses.replace(bench.request, precision="single")
-    with jax.enable_x64(False), TRACING:
-        return compile_program(single.bind(single.scene), bench.data.in_single_precision())
+    if problem.request.precision == "single":
+        return problem.program
+    single = dataclasses.replace(problem.request, precision="single")
+    with jax.enable_x64(False), TRACING_LOCK:
+        return compile_program(single.bind(single.scene), problem.data.in_single_precision())
 
 
 def _alone(data: Observations) -> Stack:

@@ -16,10 +16,10 @@ import xarray as xr
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_fit import PixelMethod, candidates_of, fit_stack
-from polar_bayes.inference.batch_programs import MAKING, Engine, Recipe, make_engine
+from polar_bayes.inference.batch_programs import ENGINE_LOCK, BatchEngine, EngineSpec, make_engine
 from polar_bayes.inference.batch_result import Approach, Outcome, Status, no_outcome
 from polar_bayes.inference.batching import IMAGE, stack
-from polar_bayes.inference.compile import TRACING
+from polar_bayes.inference.compile import TRACING_LOCK
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import dims_of
@@ -61,12 +61,12 @@ class Plan:
         )
 
     @property
-    def engine(self) -> Engine:
+    def engine(self) -> BatchEngine:
         """The compiled programs, made at first use in each process."""
         observe = functools.partial(self.pixel, "double")
-        with MAKING:
+        with ENGINE_LOCK:
             return make_engine(
-                Recipe(self.request, observe, candidates_of(self.settings), self.key)
+                EngineSpec(self.request, observe, candidates_of(self.settings), self.key)
             )
 
     @property
@@ -157,7 +157,7 @@ def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, layout: Layou
 def _layout_of(plan: Plan) -> Layout:
     engine, pixel = plan.engine, plan.pixel(plan.request.precision)
     program = engine.program
-    with jax.enable_x64(engine.precision == "double"), TRACING:
+    with jax.enable_x64(engine.precision == "double"), TRACING_LOCK:
         shapes = jax.eval_shape(program.parameters, np.zeros(program.size, engine.dtype), pixel)
     dims = dims_of(program)
     return {name: (tuple(dims[name]), x.shape) for name, x in shapes.items()}
@@ -189,7 +189,7 @@ def workers(scheduler: str | None) -> Iterator[tuple[Executor, int]]:
         raise FitError(
             "the library for clusters is not installed",
             where=f"scheduler={scheduler}",
-            mend="pip install 'polar_bayes[cluster]', or leave the scheduler out",
+            hint="pip install 'polar_bayes[cluster]', or leave the scheduler out",
         ) from error
     try:
         client = distributed.Client(scheduler, timeout="5s")
@@ -197,7 +197,7 @@ def workers(scheduler: str | None) -> Iterator[tuple[Executor, int]]:
         raise FitError(
             "no scheduler answers there",
             where=f"scheduler={scheduler}",
-            mend="give the address that `dask scheduler` prints, such as tcp://10.0.0.1:8786",
+            hint="give the address that `dask scheduler` prints, such as tcp://10.0.0.1:8786",
         ) from error
     with client:
         yield client.get_executor(), max(1, len(client.scheduler_info()["workers"]))

@@ -29,7 +29,7 @@ from polar_bayes.observation.data import ANGLES
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior
-from polar_bayes.progress import Counter, counted
+from polar_bayes.progress import Counter, with_counter
 
 BLOCK = 4096
 """Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
@@ -38,7 +38,7 @@ CHUNK = 65536
 """Pixels that are looked at together: a chunk of a store."""
 
 
-@counted("pixels")
+@with_counter("pixels")
 def fit_pixels(
     capture: xr.Dataset,
     *,
@@ -111,7 +111,7 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
     """
     if "status" not in maps:
         raise FitError(
-            "it holds no maps", where="count_pixels", mend="give what fit_pixels returns"
+            "it holds no maps", where="count_pixels", hint="give what fit_pixels returns"
         )
     counts = dict.fromkeys(Status, 0)
     for place in cut(maps, CHUNK):
@@ -157,14 +157,14 @@ def plan_map(
         raise FitError(
             f"{method!r} is no way to fit pixels",
             where="fit_pixels: method",
-            mend="give settings such as PixelLaplace(draws=512) or PixelTempering()",
+            hint="give settings such as PixelLaplace(draws=512) or PixelTempering()",
         )
     missing = [dim for dim in IMAGE if dim not in capture.dims]
     if missing:
         raise CaptureError(
             f"it has no axis {' or '.join(missing)}",
             where=str(capture.attrs.get("name", "capture")),
-            mend="give an image with dims y and x, or use polar_bayes.fit",
+            hint="give an image with dims y and x, or use polar_bayes.fit",
         )
     pixel, limit = _fullest_pixel(capture), largest_view_zenith
     request = resolve(pixel, model, "laplace", scene, priors, links, limit, seed, precision)
@@ -260,7 +260,7 @@ def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
         raise CaptureError(
             f"no pixel has {FEWEST_VIEWS} valid views",
             where=str(capture.attrs.get("name", "capture")),
-            mend="check `valid` and the readings: NaN counts as missing",
+            hint="check `valid` and the readings: NaN counts as missing",
         )
     return best
 

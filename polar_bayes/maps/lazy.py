@@ -54,14 +54,14 @@ def open_image(path: Path) -> xr.Dataset:
     if path.suffix != ".zarr":
         return load_capture(path)
     if not path.is_dir():
-        raise CaptureError("there is no such store", where=str(path), mend="check the path")
+        raise CaptureError("there is no such store", where=str(path), hint="check the path")
     image = _open_store(path, CaptureError, "write it again with to_zarr", decode_times=False)
     for name, variable in image.variables.items():
         if variable.dtype.kind not in "biufUOT":
             raise CaptureError(
                 f"it holds {variable.dtype.name}, neither numbers nor flags",
                 where=f"{path}: {name}",
-                mend="write it again with to_zarr",
+                hint="write it again with to_zarr",
             )
     image.attrs.setdefault("name", path.stem)
     return image
@@ -77,7 +77,7 @@ def check_whole(path: Path) -> None:
             raise CaptureError(
                 f"{missing} of {chunks} chunks are missing",
                 where=f"{path}: {name}",
-                mend="copy the store again, or write it again with to_zarr",
+                hint="copy the store again, or write it again with to_zarr",
             )
 
 
@@ -98,13 +98,13 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
     store = as_path(path, "map")
     where = str(store)
     if not store.is_dir():
-        raise FitError("there is no such store", where=where, mend="check the path")
+        raise FitError("there is no such store", where=where, hint="check the path")
     maps = _open_store(store, FitError, "make the map again")
     if PROVENANCE not in maps.attrs or "status" not in maps:
-        raise FitError("it holds no maps", where=where, mend="give what `polar-bayes map` wrote")
+        raise FitError("it holds no maps", where=where, hint="give what `polar-bayes map` wrote")
     if REQUEST in maps.attrs and FINISHED not in maps.attrs:
-        mend = "wait, or go on with `polar-bayes map --resume`"
-        raise FitError("it is not finished", where=where, mend=mend)
+        hint = "wait, or go on with `polar-bayes map --resume`"
+        raise FitError("it is not finished", where=where, hint=hint)
     _check_maps(maps, store)
     return maps
 
@@ -112,23 +112,23 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
 def _check_maps(maps: xr.Dataset, store: Path) -> None:
     """Refuse metadata that no map has, before anything trips over them."""
     if not _has_provenance(maps):
-        raise FitError("its provenance cannot be read", where=str(store), mend=COPY)
+        raise FitError("its provenance cannot be read", where=str(store), hint=COPY)
     if "quantile" in maps.dims and not np.array_equal(maps["quantile"], LEVELS):
-        raise FitError("its levels are not those of a map", where=f"{store}: quantile", mend=COPY)
+        raise FitError("its levels are not those of a map", where=f"{store}: quantile", hint=COPY)
     for name, variable in maps.variables.items():
         where, is_flag = f"{store}: {name}", name in ("status", "approach")
         if variable.dtype.kind not in ("iu" if is_flag else "iufUOT"):
             what = f"it holds {variable.dtype.name}, which no map does"
-            raise FitError(what, where=where, mend=COPY)
+            raise FitError(what, where=where, hint=COPY)
         mean = str(name).removesuffix("_sd").removesuffix("_quantile")
         own = set(maps[mean].dims) if mean in maps else set(IMAGE)
         if name in maps.data_vars and not set(IMAGE) <= set(variable.dims) - {"quantile"} == own:
-            raise FitError("its axes are not those of a map", where=where, mend=COPY)
+            raise FitError("its axes are not those of a map", where=where, hint=COPY)
         if is_flag and not _has_meanings(variable):
-            raise FitError("its flags have no meanings", where=where, mend=COPY)
+            raise FitError("its flags have no meanings", where=where, hint=COPY)
         is_ours = REQUEST in maps.attrs  # to_zarr of a user leaves out chunks of zeros
         if is_ours and name in maps.coords and _missing(store / str(name), FitError)[0]:
-            raise FitError("its values are missing", where=where, mend=COPY)
+            raise FitError("its values are missing", where=where, hint=COPY)
 
 
 def _has_provenance(maps: xr.Dataset) -> bool:
@@ -156,21 +156,21 @@ def _missing(array: Path, error: type[PolarBayesError]) -> tuple[int, int]:
         raise error(
             "it cannot be read as Zarr",
             where=f"{array.parent}: {array.name}",
-            mend="copy the store again, or write it again",
+            hint="copy the store again, or write it again",
         ) from cause
 
 
-def _open_store(path: Path, error: type[PolarBayesError], mend: str, **options: Any) -> xr.Dataset:
+def _open_store(path: Path, error: type[PolarBayesError], hint: str, **options: Any) -> xr.Dataset:
     """A Zarr store, lazily; each of its variables knows how to say that it is broken."""
     where = str(path)
     try:
         opened = xr.open_dataset(path, engine="zarr", consolidated=False, cache=False, **options)
     except Exception as cause:  # the libraries below raise nearly every type for a broken store
-        raise error("it cannot be read as Zarr", where=where, mend=mend) from cause
+        raise error("it cannot be read as Zarr", where=where, hint=hint) from cause
     guarded = {
         name: xr.Variable(
             variable.dims,
-            indexing.LazilyIndexedArray(_Guarded(variable, f"{where}: {name}", error, mend)),
+            indexing.LazilyIndexedArray(_Guarded(variable, f"{where}: {name}", error, hint)),
             variable.attrs,
             variable.encoding,
             fastpath=True,
@@ -188,10 +188,10 @@ class _Guarded(BackendArray):
     """A variable of a store; a chunk that cannot be read is an error with its place."""
 
     def __init__(
-        self, variable: xr.Variable, where: str, error: type[PolarBayesError], mend: str
+        self, variable: xr.Variable, where: str, error: type[PolarBayesError], hint: str
     ) -> None:
         self.shape, self.dtype = variable.shape, variable.dtype
-        self._variable, self._where, self._error, self._mend = variable, where, error, mend
+        self._variable, self._where, self._error, self._mend = variable, where, error, hint
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(
@@ -206,7 +206,7 @@ class _Guarded(BackendArray):
             ranges = [f"{dim}={_range(part, n)}" for dim, part, n in parts if dim in IMAGE]
             place = f"[{', '.join(ranges)}]" if ranges else ""
             raise self._error(
-                f"it cannot be read ({cause})", where=f"{self._where}{place}", mend=self._mend
+                f"it cannot be read ({cause})", where=f"{self._where}{place}", hint=self._mend
             ) from cause
 
 
@@ -226,6 +226,6 @@ def at_hand(maps: xr.Dataset) -> xr.Dataset:
         raise FitError(
             f"these maps are in chunks and take {maps.nbytes / 2**30:.0f} GB",
             where="maps",
-            mend="write them with to_zarr, if they are not yet, and open them with open_map",
+            hint="write them with to_zarr, if they are not yet, and open them with open_map",
         )
     return maps.compute()

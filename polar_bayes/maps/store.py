@@ -37,7 +37,7 @@ from polar_bayes.paths import (
     sync,
     unfinished_folder,
 )
-from polar_bayes.progress import Counter, counted
+from polar_bayes.progress import Counter, with_counter
 
 # --- The ledger of an unfinished map: which blocks are on the disk, and of which readings ---------
 
@@ -55,7 +55,7 @@ class Entry(NamedTuple):
 
 
 class Ledger:
-    """A file beside the store: a head with the fingerprint of the request, then a line per block."""
+    """A file next to the store: a head with the request's fingerprint, then a line per block."""
 
     # A line is added after the chunks of its block are on the disk. A line without an end was cut
     # off by a crash and counts as not there; any other line that fails its checksum is an error.
@@ -72,10 +72,10 @@ class Ledger:
         if self._head.startswith(content):  # empty, or cut off within the head
             return
         if not content.startswith(MAGIC):
-            mend = "move that file away, or give another --out"
-            raise OutputError("it is not the ledger of a map", where=where, mend=mend)
+            hint = "move that file away, or give another --out"
+            raise OutputError("it is not the ledger of a map", where=where, hint=hint)
         if not content.startswith(self._head):
-            raise FitError(BEGUN_OTHERWISE, where=where, mend=REPEAT)
+            raise FitError(BEGUN_OTHERWISE, where=where, hint=REPEAT)
         *lines, rest = content[len(self._head) :].split(b"\n")
         self._size = len(content) - len(rest)
         for number, line in enumerate(lines, 2):
@@ -85,7 +85,7 @@ class Ledger:
                 raise OutputError(
                     f"line {number} is damaged",
                     where=where,
-                    mend="remove that file to fit all blocks again, or give another --out",
+                    hint="remove that file to fit all blocks again, or give another --out",
                 )
             label, readings, chunks = (field.decode("ascii") for field in fields)
             self.entries[label] = Entry(readings, chunks)
@@ -148,14 +148,14 @@ def _open(file: Path, *, resume: bool) -> tuple[BinaryIO, bool]:
         with contextlib.suppress(FileExistsError):
             return file.open("x+b", buffering=0), True
         if not resume:
-            mend = "give another --out, or --resume"
-            raise OutputError("it is there already", where=str(file), mend=mend)
+            hint = "give another --out, or --resume"
+            raise OutputError("it is there already", where=str(file), hint=hint)
         if file.is_file():
             return file.open("r+b", buffering=0), False
     except OSError as error:
         raise output_error(error, file) from error
-    mend = "move it away, or give another --out"
-    raise OutputError("it is not the ledger of a map", where=str(file), mend=mend)
+    hint = "move it away, or give another --out"
+    raise OutputError("it is not the ledger of a map", where=str(file), hint=hint)
 
 
 def _lock(opened: BinaryIO, file: Path) -> None:
@@ -164,15 +164,15 @@ def _lock(opened: BinaryIO, file: Path) -> None:
             opened, portalocker.LockFlags.EXCLUSIVE | portalocker.LockFlags.NON_BLOCKING
         )
     except portalocker.AlreadyLocked as error:
-        mend = "wait until it has finished, or give another --out"
+        hint = "wait until it has finished, or give another --out"
         raise OutputError(
-            "another process is writing it", where=str(_store_of(file)), mend=mend
+            "another process is writing it", where=str(_store_of(file)), hint=hint
         ) from error
     except portalocker.LockException as error:
         raise OutputError(
             f"it cannot be locked ({error})",
             where=str(file),
-            mend="give an --out on a file system that has locks",
+            hint="give an --out on a file system that has locks",
         ) from error
 
 
@@ -181,7 +181,7 @@ def taken_over(store: Path) -> OutputError:
     return OutputError(
         "another process has finished, moved or removed it",
         where=str(store),
-        mend="let one process at a time write it, and repeat the command with --resume",
+        hint="let one process at a time write it, and repeat the command with --resume",
     )
 
 
@@ -221,7 +221,7 @@ DEFAULTS: dict[str, Any] = {
 }
 
 
-@counted("pixels")
+@with_counter("pixels")
 def map_file(
     capture: str | os.PathLike[str],
     out: str | os.PathLike[str],
@@ -284,15 +284,15 @@ def map_file(
 
 def check_apart(source: Path, store: Path) -> None:
     """Refuse a store that is the source, or in it, or around it; or that has nowhere to stand."""
-    where, mend = str(store), "give another --out"
+    where, hint = str(store), "give another --out"
     with _written(store):
         one, other = source.resolve(), store.resolve()
         is_nested = other.is_relative_to(one) or one.is_relative_to(other)
         if is_nested or is_same_place(source, store):
             what = "it is the capture, inside it, or around it"
-            raise OutputError(what, where=where, mend=mend)
+            raise OutputError(what, where=where, hint=hint)
         if not store.parent.is_dir():
-            raise OutputError("its folder is not there", where=where, mend="make the folder first")
+            raise OutputError("its folder is not there", where=where, hint="make the folder first")
 
 
 def fit_file_block(
@@ -314,7 +314,7 @@ def _in_capture(source: Path, place: Place | None = None) -> Iterator[None]:
     except CaptureError as error:
         if error.where.startswith(str(source)):
             raise
-        raise CaptureError(error.what, where=f"{where}: {error.where}", mend=error.mend) from error
+        raise CaptureError(error.what, where=f"{where}: {error.where}", hint=error.hint) from error
 
 
 def _read(image: xr.Dataset, place: Place) -> xr.Dataset:
@@ -355,26 +355,26 @@ class _MapStore:
         if not os.path.lexists(self._store):
             return False
         if not resume:
-            mend = "give another --out, or --resume"
-            raise OutputError("it is there already", where=where, mend=mend)
+            hint = "give another --out, or --resume"
+            raise OutputError("it is there already", where=where, hint=hint)
         attributes = _metadata(self._store)["attributes"]
         if REQUEST not in attributes:
-            mend = "give another --out"
-            raise OutputError("it is not a map that can be resumed", where=where, mend=mend)
+            hint = "give another --out"
+            raise OutputError("it is not a map that can be resumed", where=where, hint=hint)
         if attributes[REQUEST] != self.request:
-            raise FitError(BEGUN_OTHERWISE, where=where, mend=REPEAT)
+            raise FitError(BEGUN_OTHERWISE, where=where, hint=REPEAT)
         return FINISHED in attributes
 
     def check_finished(self) -> None:
         """Refuse a finished map of readings that have changed, or that has lost chunks."""
-        where, mend = str(self._store), "give another --out"
+        where, hint = str(self._store), "give another --out"
         readings = [_digest(_read(self._image, place)) for place in self._places]
         if _metadata(self._store)["attributes"][FINISHED] != self._combined(readings):
-            raise FitError("the capture has changed since it was made", where=where, mend=mend)
+            raise FitError("the capture has changed since it was made", where=where, hint=hint)
         files = [file for place in self._places for file in self._files(place)]
         if missing := sum(not file.is_file() for file in files):
             what = f"{missing} of {len(files)} chunks are missing"
-            raise OutputError(what, where=where, mend="copy the store again, or give another --out")
+            raise OutputError(what, where=where, hint="copy the store again, or give another --out")
 
     def check_readings(self, ledger: Ledger) -> None:
         """Refuse to go on where the readings of a block that is done have changed."""
@@ -386,7 +386,7 @@ class _MapStore:
                 raise FitError(
                     f"the capture has changed since block {label} was fitted",
                     where=str(self._store),
-                    mend="give another --out",
+                    hint="give another --out",
                 )
 
     def begin(self, ledger: Ledger) -> None:
@@ -428,7 +428,7 @@ class _MapStore:
             raise OutputError(
                 "it is missing, or not as it was written",
                 where=f"{self._store}: {file}",
-                mend="give another --out",
+                hint="give another --out",
             )
 
     def run(
@@ -546,5 +546,5 @@ def _written(store: Path) -> Iterator[None]:
         raise OutputError(
             f"it could not be written ({reason or type(error).__name__})",
             where=str(store),
-            mend="make room or give another --out; --resume goes on where it stopped",
+            hint="make room or give another --out; --resume goes on where it stopped",
         ) from error

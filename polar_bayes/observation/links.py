@@ -27,7 +27,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
 from polar_bayes.physics.geometry import cos_degrees
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 # --- How noise depends on brightness and view angle: the schedules of the paper's section 2 -------
 
@@ -37,7 +37,7 @@ SMOOTHING = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class ConcentrationSchedule(Carded):
+class ConcentrationSchedule(HTMLRepr):
     r"""Concentration of the degree of polarization: bright, upright views are sharper.
 
     $$ \kappa = \kappa_{\min} + \kappa_{scale} (I/I_{\max})^\eta \cos(\theta_v)^\gamma $$
@@ -84,7 +84,7 @@ class ConcentrationSchedule(Carded):
 
 
 @dataclasses.dataclass(frozen=True)
-class ScaleSchedule(Carded):
+class ScaleSchedule(HTMLRepr):
     r"""Scale of the intensity noise: it grows towards full scale and towards grazing.
 
     $$ \sigma = \sigma_0 (1 - I/I_{\max})^{-\delta} \cos(\theta_v)^{-\zeta} $$
@@ -183,7 +183,7 @@ def _check_range(schedule: object, field: str, low: float, high: float) -> None:
         raise FitError(
             f"{field} is {value}",
             where=type(schedule).__name__,
-            mend=f"give a number from {low:g} to {high:g}",
+            hint=f"give a number from {low:g} to {high:g}",
         )
 
 
@@ -195,7 +195,7 @@ Noise = Mapping[str, Float[Array, ""]]
 
 
 @dataclasses.dataclass(frozen=True)
-class AbstractLink(Carded, abc.ABC):
+class AbstractLink(HTMLRepr, abc.ABC):
     """How one recorded variable scatters around its prediction."""
 
     observables: ClassVar[tuple[str, ...]]
@@ -245,7 +245,7 @@ class _DopLink(AbstractLink):
             raise FitError(
                 f"margin is {self.margin}",
                 where=type(self).__name__,
-                mend="give a number from 1e-6 to 1e-3, the paper's range of epsilon",
+                hint="give a number from 1e-6 to 1e-3, the paper's range of epsilon",
             )
 
     @override
@@ -354,13 +354,13 @@ class StokesLink(AbstractLink):
             raise FitError(
                 f"degrees_of_freedom is {self.degrees_of_freedom}",
                 where="StokesLink",
-                mend="give a number above 2, or None for normal noise",
+                hint="give a number above 2, or None for normal noise",
             )
         if not 0.0 < self.least_brightness <= 1.0:
             raise FitError(
                 f"least_brightness is {self.least_brightness}",
                 where="StokesLink",
-                mend="give a number above 0 and up to 1",
+                hint="give a number above 0 and up to 1",
             )
 
     @property
@@ -382,7 +382,7 @@ class StokesLink(AbstractLink):
                 raise FitError(
                     f"the capture states no {name}_error",
                     where="StokesLink(stated_errors=True)",
-                    mend="add that variable to the capture or use stated_errors=False",
+                    hint="add that variable to the capture or use stated_errors=False",
                 )
             scale = noise["stokes_error_factor"] * data.errors[name]
         else:
@@ -424,7 +424,7 @@ class StudentTLink(AbstractLink):
             raise FitError(
                 f"degrees_of_freedom is {self.degrees_of_freedom}",
                 where="StudentTLink",
-                mend="give a number from 3 to 7, the paper's range of nu",
+                hint="give a number from 3 to 7, the paper's range of nu",
             )
 
     @override

@@ -123,7 +123,7 @@ class ThinFilm(AbstractCoat):
             raise SceneError(
                 "fringes depend on the wavelength, and there is none",
                 where="ThinFilm",
-                mend="give the geometry a wavelength in nm, or the capture such a coordinate",
+                hint="give the geometry a wavelength in nm, or the capture such a coordinate",
             )
         thickness = value_of(self.thickness_nm, parameters)
         index = value_of(self.refractive_index, parameters)
@@ -153,7 +153,7 @@ class CoatStack(AbstractCoat):
             raise SceneError(
                 f"two coats read {', '.join(repeated)}",
                 where="CoatStack",
-                mend="name the parameters apart: ClearCoat(absorbance='lacquer_absorbance')",
+                hint="name the parameters apart: ClearCoat(absorbance='lacquer_absorbance')",
             )
 
     @property

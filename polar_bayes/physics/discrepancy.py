@@ -52,7 +52,7 @@ class Discrepancy(AbstractInstrumentTerm):
             raise SceneError(
                 f"basis={self.basis!r} and length={self.length!r} make no smooth function",
                 where="Discrepancy",
-                mend="give a whole number of functions from 1 on and a length above 0 degrees",
+                hint="give a whole number of functions from 1 on and a length above 0 degrees",
             )
 
     @override

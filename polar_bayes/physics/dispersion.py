@@ -105,7 +105,7 @@ class Sellmeier(AbstractDispersion):
             raise SceneError(
                 f"strengths={self.strengths!r} and resonances={self.resonances!r} do not pair",
                 where="Sellmeier",
-                mend="give two tuples of one length: Sellmeier((1.04, 0.23), (0.006, 0.02))",
+                hint="give two tuples of one length: Sellmeier((1.04, 0.23), (0.006, 0.02))",
             )
         for strength, resonance in zip(*both, strict=True):
             check_setting(strength, "Sellmeier: strengths", 0.0, 10.0)

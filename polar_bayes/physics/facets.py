@@ -36,7 +36,7 @@ class FacetQuadrature(Part):
     """How many facets stand for all: one dial of what accuracy costs in time.
 
     Largest error of the degree of polarization for roughness .01 to .3, index 1.2 to 2, and zenith
-    angles up to 89 degrees, against 64 x 64 facets (tests/benchmarks/facet_quadrature.py):
+    angles up to 89 degrees, against 64 x 64 facets (benchmarks/facet_quadrature.py):
 
         along x across        4x4     5x4     5x5     6x5     8x6    10x8   16x16
         Beckmann, sky       .0034   .0004   .0004   .0002  .00007  .00003  .00001
@@ -68,7 +68,7 @@ class FacetQuadrature(Part):
                 raise SceneError(
                     f"{name}={nodes!r} is no number of nodes",
                     where="FacetQuadrature",
-                    mend="give a whole number from 1 to 64",
+                    hint="give a whole number from 1 to 64",
                 )
 
     @override

@@ -291,7 +291,7 @@ class Disc(AbstractExtendedSource):
             raise SceneError(
                 f"half_width={self.half_width!r} is no half width of a disc",
                 where="Disc",
-                mend="give degrees from 0.01 to 90, or use PointSource() or UniformSky()",
+                hint="give degrees from 0.01 to 90, or use PointSource() or UniformSky()",
             )
 
     @override

@@ -19,7 +19,7 @@ from polar_bayes.errors import SceneError
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
 from polar_bayes.physics.stokes import Light, in_turned_frame
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 # Nearest to grazing, in degrees, that a shifted angle may come.
 STEEPEST_ZENITH = 89.999
@@ -68,7 +68,7 @@ class AbstractInstrumentTerm(Part):
 
 
 @dataclasses.dataclass(frozen=True)
-class Instrument(Carded):
+class Instrument(HTMLRepr):
     """Terms that act one after the other.
 
     Args:
@@ -87,14 +87,14 @@ class Instrument(Carded):
             raise SceneError(
                 f"{self.terms!r} is no tuple of instrument terms",
                 where="Instrument",
-                mend="write Instrument((DolpGain(), AngleZero())), with both pairs of brackets",
+                hint="write Instrument((DolpGain(), AngleZero())), with both pairs of brackets",
             )
         names = [type(term).__name__ for term in self.terms]
         if len(set(names)) < len(names):
             raise SceneError(
                 f"the terms {', '.join(names)} repeat one",
                 where="Instrument",
-                mend="give each term once, since its parameters have one name",
+                hint="give each term once, since its parameters have one name",
             )
 
     @property
@@ -237,7 +237,7 @@ class Analyzer(AbstractInstrumentTerm):
                 raise SceneError(
                     f"{angle!r} is no angle",
                     where="Analyzer",
-                    mend="give degrees, or a tuple with one number for each view",
+                    hint="give degrees, or a tuple with one number for each view",
                 )
             check_setting(angle, "Analyzer: angle", -360.0, 360.0)
 
@@ -270,7 +270,7 @@ class Saturation(AbstractInstrumentTerm):
             raise SceneError(
                 f"level={self.level!r} is no full scale",
                 where="Saturation",
-                mend="give a number above 0",
+                hint="give a number above 0",
             )
 
     @override

@@ -13,14 +13,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from polar_bayes.errors import SceneError
-from polar_bayes.repr_html import Carded
+from polar_bayes.repr_html import HTMLRepr
 
 Setting = float | str
 """A known number, or the name of a parameter that stands for it."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Part(Carded, abc.ABC):
+class Part(HTMLRepr, abc.ABC):
     """One effect of a scene."""
 
     parameters: ClassVar[tuple[str, ...]] = ()
@@ -60,7 +60,7 @@ def parameters_of(*parts: Part | None) -> tuple[str, ...]:
 def check_part(value: object, where: str, kind: type, allowed: str) -> None:
     """Refuse a part of the wrong kind, naming the right ones."""
     if not isinstance(value, kind):
-        raise SceneError(f"{value!r} is no such part", where=where, mend=f"give {allowed}")
+        raise SceneError(f"{value!r} is no such part", where=where, hint=f"give {allowed}")
 
 
 def check_setting(value: object, where: str, low: float, high: float) -> None:
@@ -72,7 +72,7 @@ def check_setting(value: object, where: str, low: float, high: float) -> None:
         raise SceneError(
             f"{value!r} is neither a number from {low:g} to {high:g} nor a parameter's name",
             where=where,
-            mend="give the number where it is known, or a name such as 'coat_absorbance' to fit it",
+            hint="give the number where it is known, or a name such as 'coat_absorbance' to fit it",
         )
 
 

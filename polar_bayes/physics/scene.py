@@ -38,7 +38,7 @@ from polar_bayes.physics.surface import (
     RoughSurface,
     SmoothSurface,
 )
-from polar_bayes.repr_html import Carded, Grid
+from polar_bayes.repr_html import Grid, HTMLRepr
 
 # Parameters of a material, in the order in which they are listed; every other one that a scene
 # reads belongs to the whole capture.
@@ -65,7 +65,7 @@ MATERIAL_PARAMETERS = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Scene(Carded):
+class Scene(HTMLRepr):
     """Parts that are there act; parts that are None are absent from the compiled program.
 
     Args:
@@ -114,13 +114,13 @@ class Scene(Carded):
             raise SceneError(
                 "there is no subsurface to mix",
                 where="mixing",
-                mend="give a subsurface, such as Depolarizer(), or leave mixing=None",
+                hint="give a subsurface, such as Depolarizer(), or leave mixing=None",
             )
         if self.subsurface is not None and self.mixing is None:
             raise SceneError(
                 "nothing says how its light adds to the surface's",
                 where="subsurface",
-                mend="give mixing=StokesMixing() or DopMixing(), or leave subsurface=None",
+                hint="give mixing=StokesMixing() or DopMixing(), or leave subsurface=None",
             )
 
     @property
@@ -237,7 +237,7 @@ class Scene(Carded):
             raise SceneError(
                 f"the scene has no {term.__name__}",
                 where="without",
-                mend=f"name one of its instrument terms: {present}",
+                hint=f"name one of its instrument terms: {present}",
             )
         return dataclasses.replace(self, instrument=Instrument(rest) if rest else None)
 
@@ -268,7 +268,7 @@ class Scene(Carded):
             raise SceneError(
                 "a law of dispersion needs a wavelength, and there is none",
                 where="dispersion",
-                mend="give the geometry a wavelength in nm, or the capture such a coordinate",
+                hint="give the geometry a wavelength in nm, or the capture such a coordinate",
             )
         return geometry.wavelength
 
@@ -283,7 +283,7 @@ class Scene(Carded):
             raise SceneError(
                 f"{', '.join(missing)} missing",
                 where="parameters",
-                mend=f"this scene reads {', '.join(needed)}",
+                hint=f"this scene reads {', '.join(needed)}",
             )
         dtype = jnp.result_type(geometry.dtype, *(parameters[name] for name in needed))
         return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}

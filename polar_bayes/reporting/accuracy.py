@@ -102,7 +102,7 @@ def plot_accuracy(
         raise FitError(
             f"there is no time {', '.join(strange)}" if strange else "no time was measured",
             where="plot_accuracy",
-            mend=f"give some of {', '.join(TIME_LABELS)}",
+            hint=f"give some of {', '.join(TIME_LABELS)}",
         )
     figure = Drawing(figsize=(5.2 * len(shown), 4.4), layout="constrained")
     for at, name in enumerate(shown):

@@ -384,17 +384,17 @@ def _check_rivals(rivals: Mapping[str, xr.DataTree], method: str) -> None:
         where = f"report: beside {name}"
         if not is_calibration(each):
             raise FitError(
-                "it is no calibration", where=where, mend="give what polar_bayes.calibrate returns"
+                "it is no calibration", where=where, hint="give what polar_bayes.calibrate returns"
             )
         if name == method:
             raise FitError(
-                "the calibration itself is called so", where=where, mend="give it another name"
+                "the calibration itself is called so", where=where, hint="give it another name"
             )
     if len(rivals) > MOST_RIVALS:
         raise FitError(
             f"{len(rivals)} calibrations are too many for one figure",
             where="report: beside",
-            mend=f"give at most {MOST_RIVALS}",
+            hint=f"give at most {MOST_RIVALS}",
         )
 
 

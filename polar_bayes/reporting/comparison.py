@@ -56,7 +56,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
     labels = list(dict.fromkeys(finite.index.get_level_values("parameter")))[:MOST_PANELS]
     if not labels:
         raise FitError(
-            "there is nothing to draw", where="plot_comparison", mend="give fits with finite draws"
+            "there is nothing to draw", where="plot_comparison", hint="give fits with finite draws"
         )
     colors = {name: COLORS[at % len(COLORS)] for at, name in enumerate(fits)}
     height = 0.55 + 0.2 * len(fits)

@@ -102,7 +102,7 @@ def flag_ranks(flags: xr.DataArray, known: Mapping[int, str]) -> np.ndarray:
         raise FitError(
             f"{values[np.argmin(found)]} has no meaning there",
             where=f"maps: {flags.name}",
-            mend="copy the store again, or make the map again",
+            hint="copy the store again, or make the map again",
         )
     return found
 
@@ -329,7 +329,7 @@ def covered(found: Sequence[Scalar], coverage: pd.DataFrame) -> list[str]:
     return [phrases[off].format(_few(groups[off])) for off in phrases if off in groups]
 
 
-def counted(coverage: pd.DataFrame) -> list[str]:
+def with_counter(coverage: pd.DataFrame) -> list[str]:
     """Which pixels the coverage counts, and which it leaves out."""
     said = []
     for counts, rows in coverage.groupby(["unknown", "masked", "unanswered", "answered"]):
@@ -388,7 +388,7 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
     """
     names = [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
     if not names:
-        raise FitError("it holds no maps", where="plot_maps", mend="give what fit_pixels returns")
+        raise FitError("it holds no maps", where="plot_maps", hint="give what fit_pixels returns")
     shown, place = _one_wavelength(maps, wavelength)
     step = max(1, -(-max(maps.sizes["y"], maps.sizes["x"]) // MOST_PIXELS))
     shown = shown.isel(y=slice(None, None, step), x=slice(None, None, step))
@@ -424,7 +424,7 @@ def _one_wavelength(maps: xr.Dataset, wavelength: float | None) -> tuple[xr.Data
         raise FitError(
             f"there is no wavelength {wavelength:g} nm",
             where="plot_maps",
-            mend=f"give one of {', '.join(f'{each:g}' for each in known)}",
+            hint=f"give one of {', '.join(f'{each:g}' for each in known)}",
         )
     return maps.isel(wavelength=int(np.flatnonzero(known == wavelength)[0])), f"{wavelength:g} nm"
 
@@ -493,7 +493,7 @@ def render_map(
     """The page of a map as text."""
     found = map_scalars(maps)
     if any(name not in maps for name in TRUST):
-        raise FitError("it holds no maps", where="report", mend="give what fit_pixels returns")
+        raise FitError("it holds no maps", where="report", hint="give what fit_pixels returns")
     _check_uncorrected(maps, truth, uncorrected)
     maps, provenance = at_hand(maps), _provenance(maps)
     cases = count_cases(maps)
@@ -530,16 +530,16 @@ def _check_uncorrected(
     where = "report: uncorrected"
     if truth is None:
         raise FitError(
-            "it is compared with the truth only", where=where, mend="give truth=capture as well"
+            "it is compared with the truth only", where=where, hint="give truth=capture as well"
         )
     map_scalars(uncorrected)
     if any(uncorrected.sizes[dim] != maps.sizes[dim] for dim in IMAGE):
-        raise FitError("it is of another image", where=where, mend="map the same capture")
+        raise FitError("it is of another image", where=where, hint="map the same capture")
     if not _is_bare(_provenance(uncorrected), otherwise=True):
         raise FitError(
             "it was corrected as well",
             where=where,
-            mend="make it with PixelLaplace(weighted=False)",
+            hint="make it with PixelLaplace(weighted=False)",
         )
 
 
@@ -574,7 +574,9 @@ def _coverage(
         said += [f"Without the correction: {bare[0].lower()}{bare[1:]}"] if bare else []
     return {
         "table": coverage_table(found, own, other),
-        "sentences": [f"{way}{each}" for way, table in counts.items() for each in counted(table)],
+        "sentences": [
+            f"{way}{each}" for way, table in counts.items() for each in with_counter(table)
+        ],
         "said": said,
     }
 

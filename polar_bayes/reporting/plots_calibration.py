@@ -324,7 +324,7 @@ def plot_calibration(
         raise FitError(
             f"there is no parameter {', '.join(strange)}" if strange else "nothing is asked for",
             where="plot_calibration",
-            mend=f"give some of {', '.join(parts)}",
+            hint=f"give some of {', '.join(parts)}",
         )
     figure, panels = grid(3 * len(shown), columns=3, width=8.2, panel_height=1.7, header=0.3)
     heads = (BELOW, "density", "posterior mean")

@@ -360,7 +360,7 @@ def _narrow(text: str) -> str:
 
 
 def _nothing(what: str, needed: str) -> FitError:
-    return FitError("there is nothing to draw", where=what, mend=f"give a result that has {needed}")
+    return FitError("there is nothing to draw", where=what, hint=f"give a result that has {needed}")
 
 
 # --- Shrinkage: what each member of a population says alone, and what it says among the others ----
@@ -404,7 +404,7 @@ def plot_shrinkage(
         raise FitError(
             f"{label!r} is no pooled parameter",
             where="plot_shrinkage: label",
-            mend=f"choose one of {', '.join(summary.index) or 'none'}",
+            hint=f"choose one of {', '.join(summary.index) or 'none'}",
         )
     population, whole = found[label], summary.loc[label]
     rows = members.loc[[scalar.label for scalar in population.members]].reset_index(drop=True)
@@ -412,7 +412,7 @@ def plot_shrinkage(
         raise FitError(
             "its draws are not finite on the population's scale",
             where=f"plot_shrinkage: {label}",
-            mend="see the verdict",
+            hint="see the verdict",
         )
     rows["true"] = [truth_of(result, scalar) for scalar in population.members]
     rows["name"] = _names(population)

@@ -104,7 +104,7 @@ def curves(result: xr.DataTree, name: str) -> list[Curve]:
         raise FitError(
             f"the result has no readings of {name} to draw{lacks}",
             where="figure",
-            mend=f"choose one of {', '.join(variables(result)) or 'none'}",
+            hint=f"choose one of {', '.join(variables(result)) or 'none'}",
         )
     return list(_curves(result, name))
 

@@ -107,7 +107,7 @@ def plot_spectrum(
         raise FitError(
             f"{name} was not fitted over wavelength",
             where="plot_spectrum",
-            mend=f"choose one of {', '.join(found) or 'none'}",
+            hint=f"choose one of {', '.join(found) or 'none'}",
         )
     shown = found[name]
     many = len(shown) > 1

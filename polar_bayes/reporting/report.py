@@ -114,7 +114,7 @@ def _refuse(given: Mapping[str, object], fitting: bool, what: str) -> None:
     """Arguments that go with another kind of result."""
     for name, value in given.items():
         if value is not None and not fitting:
-            raise FitError(f"it goes with {what} only", where=f"report: {name}", mend=MENDS[name])
+            raise FitError(f"it goes with {what} only", where=f"report: {name}", hint=MENDS[name])
 
 
 def render(result: xr.DataTree) -> str:

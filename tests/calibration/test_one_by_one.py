@@ -19,7 +19,7 @@ from polar_bayes.calibration.runner import Method
 from polar_bayes.errors import FitError
 from polar_bayes.inference import hierarchical_reparam
 from polar_bayes.inference.batch_result import Approach, Status
-from polar_bayes.inference.problem import prepare
+from polar_bayes.inference.problem import compile_model
 from polar_bayes.inference.program import PIECE, parameters_of
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
@@ -118,20 +118,22 @@ def test_fits_without_draws_are_counted(
     capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever a fit raises for want of a peak: it is not left out, and has no rank."""
-    inner = runner.Prepared.grounds.func
+    inner = runner.CompiledModel.initializer.func
     refused = []
 
     class Refusing:
-        def __init__(self, grounds) -> None:
-            self._grounds = grounds
+        def __init__(self, initializer) -> None:
+            self._grounds = initializer
 
         def find(self, data, key, progress):
             if float(data.readings["q"].mean()) > 0.0:
                 refused.append(None)
-                raise FitError("no start reached a peak", where="fit", mend="look at it")
+                raise FitError("no start reached a peak", where="fit", hint="look at it")
             return self._grounds.find(data, key, progress)
 
-    monkeypatch.setattr(runner.Prepared, "grounds", property(lambda self: Refusing(inner(self))))
+    monkeypatch.setattr(
+        runner.CompiledModel, "initializer", property(lambda self: Refusing(inner(self)))
+    )
     laplace = pb.Laplace(draws=50, chains=1)
     found = pb.calibrate(capture, simulations=24, model=population, method=laplace, **ASKED)
     lost = found["fits"]["status"].to_numpy() == Status.NOT_CONVERGED
@@ -163,9 +165,11 @@ def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
     """The same posterior: mean and spread against the closed form."""
     request = resolve(capture, population, SHORT, PLATE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
-    prepared = prepare(request, PLATE, data)
+    compiled_model = compile_model(request, PLATE, data)
     settings = pb.Laplace(draws=4000, chains=1)
-    told = runner._fit(prepared.grounds, prepared.program, settings, data, jax.random.key(1))
+    told = runner._fit(
+        compiled_model.initializer, compiled_model.program, settings, data, jax.random.key(1)
+    )
     assert told is not None
     _, parameters = told
     q = np.asarray(data.readings["q"])
@@ -181,7 +185,7 @@ def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
 def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None:
     request = resolve(capture, population, SHORT, PLATE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
-    program = prepare(request, PLATE, data).program
+    program = compile_model(request, PLATE, data).program
     z = np.random.default_rng(1).normal(size=(2, PIECE + 3, program.size))
     found = parameters_of(program, z, data)
     assert found["level"].shape[:2] == z.shape[:2]

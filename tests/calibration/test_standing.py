@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from polar_bayes.calibration.scores import Standing, ranked_score, share_below
+from polar_bayes.calibration.scores import PitCrps, ranked_score, share_below
 
 
 def even(fits: int, draws: int) -> np.ndarray:
@@ -52,7 +52,7 @@ def test_each_fit_has_the_same_chance_whoever_takes_it_down() -> None:
     random = np.random.default_rng(3)
     truth = {"roughness": random.random((6, 2))}
     draws = {"roughness": random.random((6, 30, 2))}
-    whole, parts = (Standing(truth, np.arange(6), 5) for _ in range(2))
+    whole, parts = (PitCrps(truth, np.arange(6), 5) for _ in range(2))
     whole.describe(np.arange(6), draws, even(6, 30))
     for some in (np.array([4, 1]), np.array([0, 5, 3])):
         parts.describe(some, {"roughness": draws["roughness"][some]}, even(len(some), 30))
@@ -65,9 +65,9 @@ def test_each_fit_has_the_same_chance_whoever_takes_it_down() -> None:
 def test_the_chance_of_a_fit_follows_its_number() -> None:
     truth = {"roughness": np.arange(6.0), "absorption": np.zeros((6, 2))}
     draws = {"roughness": np.zeros((6, 30)), "absorption": np.zeros((6, 30, 2))}
-    whole = Standing(truth, np.arange(6), 5)
+    whole = PitCrps(truth, np.arange(6), 5)
     whole.describe(np.arange(6), draws, even(6, 30))
-    last = Standing({name: x[4:] for name, x in truth.items()}, np.array([4, 5]), 5)
+    last = PitCrps({name: x[4:] for name, x in truth.items()}, np.array([4, 5]), 5)
     last.describe(np.arange(2), {name: x[4:] for name, x in draws.items()}, even(2, 30))
     for name in truth:
         np.testing.assert_array_equal(last.pit[name], whole.pit[name][4:])

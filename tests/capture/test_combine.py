@@ -86,8 +86,8 @@ def test_attributes_that_all_share_are_kept(pair):
 
 
 def test_what_one_does_not_say_has_its_plain_meaning(pair):
-    silent = ["valid", "saturated", "interpolated", "normal_confidence", "true_roughness"]
-    pair["plexiglas"] = pair["plexiglas"].drop_vars(silent)
+    no_progress = ["valid", "saturated", "interpolated", "normal_confidence", "true_roughness"]
+    pair["plexiglas"] = pair["plexiglas"].drop_vars(no_progress)
     pair["plexiglas"]["true_absorption"] = 0.3
     both = combine(pair)
     np.testing.assert_array_equal(both["valid"][1], [True, True, True, False, False])

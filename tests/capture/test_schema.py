@@ -125,10 +125,10 @@ def test_an_error_takes_the_units_of_the_intensity(make_capture):
 
 def test_count_tells_what_was_masked_and_saturated(make_capture):
     capture = validate(make_capture("material", spectral=True))
-    counted = count(capture)
-    assert counted["views"] == 3 * 5 * 2
-    assert counted["masked"] == int((~capture["valid"]).sum()) > 0
-    assert counted["saturated"] == int(capture["saturated"].sum()) > 0
+    with_counter = count(capture)
+    assert with_counter["views"] == 3 * 5 * 2
+    assert with_counter["masked"] == int((~capture["valid"]).sum()) > 0
+    assert with_counter["saturated"] == int(capture["saturated"].sum()) > 0
     bare = capture.drop_vars(["valid", "saturated"])
     assert count(bare) == {"views": 30, "masked": 0, "saturated": 0}
 
@@ -175,13 +175,13 @@ OUT_OF_RANGE = [
 ]
 
 
-@pytest.mark.parametrize(("name", "value", "what", "mend"), OUT_OF_RANGE)
-def test_a_number_outside_its_range_is_named(make_capture, name, value, what, mend):
+@pytest.mark.parametrize(("name", "value", "what", "hint"), OUT_OF_RANGE)
+def test_a_number_outside_its_range_is_named(make_capture, name, value, what, hint):
     capture = make_capture()
     capture[name][3] = value
     message = refused(capture, re.escape(what))
     assert message.startswith(f"leaf.nc: {name}[view=3]: ")
-    assert mend in message
+    assert hint in message
 
 
 def test_the_first_offending_pixel_is_named(make_capture):

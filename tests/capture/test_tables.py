@@ -105,11 +105,11 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("content", "what", "mend"), REFUSED)
-def test_a_slip_is_named_with_its_line(write, content, what, mend):
+@pytest.mark.parametrize(("content", "what", "hint"), REFUSED)
+def test_a_slip_is_named_with_its_line(write, content, what, hint):
     with pytest.raises(CaptureError, match=r"table\.txt: " + re.escape(what)) as caught:
         read_table(write(content))
-    assert mend in caught.value.mend
+    assert hint in caught.value.hint
     assert "\n" not in str(caught.value)
 
 

@@ -94,8 +94,8 @@ def test_estimates_alone_are_what_the_readings_say(spreads, rng) -> None:
 
 
 def test_a_member_without_readings_says_nothing(rng) -> None:
-    silent = 1e6
-    value, mu, spread = exact_draws(READINGS, np.append(ERRORS[:-1], silent), [0.06, 0.1], rng)
+    no_progress = 1e6
+    value, mu, spread = exact_draws(READINGS, np.append(ERRORS[:-1], no_progress), [0.06, 0.1], rng)
     alone = estimate_alone(value[-1], mu, spread)
     assert np.isnan(alone.mean)
     assert np.isnan(alone.sd)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from polar_bayes.inference.compile import (
-    TRACING,
+    TRACING_LOCK,
     AbandonedError,
+    JitOnce,
     OutOfTimeError,
-    TracedOnce,
     run_until,
 )
-from polar_bayes.progress import Progress, silent
+from polar_bayes.progress import Progress, no_progress
 
 LONG = 60.0
 """Seconds after which a test has failed for certain."""
@@ -41,7 +41,7 @@ class Stuck:
 
     @staticmethod
     def _trace() -> None:
-        TracedOnce(lambda x: x + 1.0)(jnp.ones(2))
+        JitOnce(lambda x: x + 1.0)(jnp.ones(2))
 
 
 @pytest.fixture
@@ -76,9 +76,9 @@ def test_work_done_in_time_is_as_if_called_directly() -> None:
 
 def test_without_a_deadline_there_is_no_thread() -> None:
     here = threading.current_thread()
-    found = run_until(float("inf"), silent, lambda _: threading.current_thread())
+    found = run_until(float("inf"), no_progress, lambda _: threading.current_thread())
     assert found is here
-    assert run_until(1e300, silent, lambda _: threading.current_thread()) is not here
+    assert run_until(1e300, no_progress, lambda _: threading.current_thread()) is not here
 
 
 def test_what_reports_nothing_is_abandoned_at_the_deadline(stuck: Stuck) -> None:
@@ -95,7 +95,7 @@ def test_what_reports_nothing_is_abandoned_at_the_deadline(stuck: Stuck) -> None
 
 def test_after_the_deadline_nothing_begins(stuck: Stuck) -> None:
     with pytest.raises(OutOfTimeError, match=r"^the time was up"):
-        run_until(after(-1.0), silent, stuck)
+        run_until(after(-1.0), no_progress, stuck)
     assert not stuck.begun.is_set()
 
 
@@ -104,7 +104,7 @@ def test_an_error_of_the_work_is_raised_where_it_is_waited_for() -> None:
         raise ZeroDivisionError("of the work")
 
     with pytest.raises(ZeroDivisionError, match="of the work"):
-        run_until(after(LONG), silent, fail)
+        run_until(after(LONG), no_progress, fail)
 
 
 def test_an_interrupt_of_the_caller_abandons_the_work(stuck: Stuck) -> None:
@@ -128,12 +128,12 @@ def test_a_caller_waits_until_the_abandoned_thread_is_not_tracing() -> None:
     tracing, ended = threading.Event(), threading.Event()
 
     def work(progress: Progress) -> None:
-        with TRACING:
+        with TRACING_LOCK:
             tracing.set()
             time.sleep(0.5)
             ended.set()
 
     with pytest.raises(OutOfTimeError):
-        run_until(after(0.2), silent, work)
+        run_until(after(0.2), no_progress, work)
     assert tracing.is_set()
     assert ended.is_set()

@@ -307,14 +307,14 @@ def test_a_comparison_that_fails_is_told_and_costs_nothing(
 ) -> None:
     from polar_bayes.inference import joint_fit as fitting
 
-    whole = fitting.prepare
+    whole = fitting.compile_model
 
     def fails_without_instrument(request, scene, data):
         if scene.instrument is None:
-            raise pb.FitError("no peak", where="fit", mend="nothing")
+            raise pb.FitError("no peak", where="fit", hint="nothing")
         return whole(request, scene, data)
 
-    monkeypatch.setattr(fitting, "prepare", fails_without_instrument)
+    monkeypatch.setattr(fitting, "compile_model", fails_without_instrument)
     result = pb.fit(capture, scene="goniometer", method="laplace", seed=1)
     assert "without_discrepancy" in result.children
     assert "without_instrument" not in result.children

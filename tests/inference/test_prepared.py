@@ -25,10 +25,10 @@ import polar_bayes as pb
 from polar_bayes.effects.choose import ChosenScene
 from polar_bayes.inference import hierarchical_reparam, initialization, optimize, request
 from polar_bayes.inference import joint_fit as fitting
-from polar_bayes.inference.compile import Kept, key_of_story, last_edit
+from polar_bayes.inference.compile import LRUCache, cache_key, last_edit
 from polar_bayes.inference.optimize import quiet_line_search
-from polar_bayes.inference.problem import prepare
-from polar_bayes.inference.program import Story, read_story
+from polar_bayes.inference.problem import compile_model
+from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 
@@ -127,7 +127,7 @@ def test_any_number_of_prior_draws_is_served_by_one_program(
     monkeypatch.setattr(optimize, "KEYS", 8)
     with jax.enable_x64(True):
         data = observe(one(1))
-        program = prepared(one(1)).program
+        program = compiled_model(one(1)).program
         few = optimize.from_prior(program, jax.random.key(5), 3, data)
         compiled.clear()
         more = optimize.from_prior(program, jax.random.key(5), 7, data)
@@ -145,7 +145,7 @@ def test_any_number_of_prior_draws_is_served_by_one_program(
 # --- what is shared, and what is not --------------------------------------------------------------
 
 
-def prepared(capture: xr.Dataset, *, precision: str = "double", **asked: object) -> object:
+def compiled_model(capture: xr.Dataset, *, precision: str = "double", **asked: object) -> object:
     model, scene, priors, links = (
         asked.get(name, usual)
         for name, usual in (
@@ -160,7 +160,7 @@ def prepared(capture: xr.Dataset, *, precision: str = "double", **asked: object)
         data = observe(wish.capture)
         if precision == "single":
             data = data.in_single_precision()
-        return prepare(wish, wish.scene, data)
+        return compile_model(wish, wish.scene, data)
 
 
 def held(value: float) -> handlers.condition:
@@ -203,7 +203,7 @@ OTHER: dict[str, tuple[dict, dict]] = {
 @pytest.mark.parametrize("what", SAME)
 def test_the_same_question_shares_what_is_compiled(what: str) -> None:
     first, second = SAME[what]
-    assert prepared(one(1), **first) is prepared(one(2), **second)
+    assert compiled_model(one(1), **first) is compiled_model(one(2), **second)
 
 
 def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
@@ -211,11 +211,11 @@ def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
 ) -> None:
     told: list[tuple[int, ...]] = []
 
-    def watched(model, data, *others) -> Story:
+    def with_progress(model, data, *others) -> ModelInfo:
         told.append(data.shape)
-        return read_story(model, data, *others)
+        return inspect_model(model, data, *others)
 
-    monkeypatch.setattr(request, "read_story", watched)
+    monkeypatch.setattr(request, "inspect_model", with_progress)
     asked = (shifted(0.25), "nuts", PLATE, None, LINKS, None, 0, "double")
     first, again = (resolve(one(seed), *asked) for seed in (1, 2))
     assert told == [(6,)]
@@ -227,12 +227,12 @@ def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
 @pytest.mark.parametrize("what", OTHER)
 def test_another_question_shares_nothing(what: str) -> None:
     first, second = OTHER[what]
-    assert prepared(one(1), **first) is not prepared(one(1), **second)
+    assert compiled_model(one(1), **first) is not compiled_model(one(1), **second)
 
 
 def test_another_layout_shares_nothing() -> None:
     longer = plate_capture(np.linspace(30.0, 75.0, 7), 0.02, 1)
-    assert prepared(one(1)) is not prepared(longer)
+    assert compiled_model(one(1)) is not compiled_model(longer)
 
 
 def test_how_a_scene_was_chosen_does_not_count() -> None:
@@ -240,7 +240,7 @@ def test_how_a_scene_was_chosen_does_not_count() -> None:
     chosen = [ChosenScene(**parts) for _ in range(2)]
     for number, scene in enumerate(chosen):
         object.__setattr__(scene, "ledger", xr.Dataset({"cost": number}))
-    keys = [key_of_story(per_material, scene, {}, LINKS) for scene in chosen]
+    keys = [cache_key(per_material, scene, {}, LINKS) for scene in chosen]
     assert keys[0] == keys[1]
 
 
@@ -252,16 +252,16 @@ def test_a_model_that_is_edited_and_loaded_again_is_another(
     file.write_text("def model(data, scene, priors, links): return 1\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     mine = importlib.import_module("model_of_mine")
-    before = key_of_story(mine.model, PLATE, {}, {})
-    assert key_of_story(mine.model, PLATE, {}, {}) == before
+    before = cache_key(mine.model, PLATE, {}, {})
+    assert cache_key(mine.model, PLATE, {}, {}) == before
     os.utime(file, ns=(last_edit() + 1,) * 2)
-    assert key_of_story(mine.model, PLATE, {}, {}) != before
+    assert cache_key(mine.model, PLATE, {}, {}) != before
     del sys.modules["model_of_mine"]
 
 
 def test_the_last_few_are_kept() -> None:
     made: list[str] = []
-    kept: Kept[str] = Kept(2)
+    kept: LRUCache[str] = LRUCache(2)
 
     def ask(key: str) -> str:
         return kept.of(key, lambda: (made.append(key), key)[1])

@@ -4,12 +4,15 @@ import pytest
 
 import polar_bayes as pb
 
-QUICK = ("leaf",)
+COMPILER_OPTIONS = ("leaf",)
 
 
 @pytest.mark.parametrize(
     "preset",
-    [p if p in QUICK else pytest.param(p, marks=pytest.mark.thorough) for p in pb.PRESETS],
+    [
+        p if p in COMPILER_OPTIONS else pytest.param(p, marks=pytest.mark.thorough)
+        for p in pb.PRESETS
+    ],
 )
 def test_every_preset_converges(preset: str) -> None:
     result = pb.fit(pb.simulate(preset, seed=0), seed=0)

@@ -148,7 +148,7 @@ def forgetful(data, scene, priors, links):
         numpyro.sample("q", dist.Normal(0.0, 1.0))
 
 
-def counted(data, scene, priors, links):
+def with_counter(data, scene, priors, links):
     numpyro.sample("layers", dist.Poisson(2.0))
     per_material(data, scene, priors, links)
 
@@ -162,7 +162,7 @@ def counted(data, scene, priors, links):
         ),
         (blind, "observes none of the readings"),
         (forgetful, r"sample\('q'\): it is drawn, not observed"),
-        (counted, "Poisson is discrete"),
+        (with_counter, "Poisson is discrete"),
     ],
 )
 def test_a_model_that_cannot_work_is_refused(capture: xr.Dataset, model, said: str) -> None:

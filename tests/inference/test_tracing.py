@@ -17,7 +17,7 @@ from toy_models import line
 import polar_bayes as pb
 from polar_bayes.inference import compile
 from polar_bayes.inference import joint_fit as fitting
-from polar_bayes.inference.compile import Kept, TracedByShape, TracedOnce, bytes_of
+from polar_bayes.inference.compile import JitByShape, JitOnce, LRUCache, bytes_of
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def test_what_was_begun_is_compiled_once(programs: list[str]) -> None:
     def twice_the_sum(x: jax.Array, y: jax.Array) -> jax.Array:
         return 2.0 * jnp.sum(x) + y
 
-    run, y = TracedByShape(twice_the_sum), jnp.asarray(1.0)
+    run, y = JitByShape(twice_the_sum), jnp.asarray(1.0)
     run.begin(jax.ShapeDtypeStruct((3,), y.dtype), y)
     run.begin(jax.ShapeDtypeStruct((3,), y.dtype), y)
     assert [float(run(np.full(3, value), y)) for value in (1.0, 2.0)] == [7.0, 13.0]
@@ -42,7 +42,7 @@ def test_what_was_begun_is_compiled_once(programs: list[str]) -> None:
 
 def test_precision_is_that_of_the_caller_not_of_the_thread() -> None:
     with jax.enable_x64(True):
-        divide = TracedOnce(lambda x: x / 3.0)
+        divide = JitOnce(lambda x: x / 3.0)
         divide.begin(jnp.ones(2))
         found = divide(jnp.ones(2))
     assert found.dtype == np.float64
@@ -53,7 +53,7 @@ def test_an_error_of_the_compiler_is_told_where_the_program_is_wanted() -> None:
     def strange(x: jax.Array) -> jax.Array:
         return jax.ffi.ffi_call("no_such_target", jax.ShapeDtypeStruct((), x.dtype))(x)
 
-    run = TracedByShape(strange)
+    run = JitByShape(strange)
     run.begin(jnp.ones(2))
     with pytest.raises(Exception, match="no_such_target"):
         run(jnp.ones(2))
@@ -63,7 +63,7 @@ def test_the_sampler_is_compiled_beside_the_search_and_once(
     programs: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The program that is begun before any state of a chain is known is the one that runs."""
-    monkeypatch.setattr("polar_bayes.inference.problem._KEPT", Kept(1))
+    monkeypatch.setattr("polar_bayes.inference.problem._KEPT", LRUCache(1))
     plastic = pb.simulate("plastic", seed=0, protocol=pb.Protocol(views=9, wavelengths=()))
     scene = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
     pb.fit(plastic, scene=scene, method=pb.Nuts(draws=50, most_draws=50))
@@ -116,11 +116,11 @@ def test_who_compiles_keeps_nobody_from_tracing(gate: Gate, slow_to_compile: Non
     def slow(x: jax.Array) -> jax.Array:
         return 2.0 * x
 
-    run = TracedByShape(slow)
+    run = JitByShape(slow)
     with ThreadPoolExecutor(2) as pool:
         waiting = [pool.submit(run, np.ones(3)) for _ in range(2)]
         assert gate.reached.wait(60.0)
-        other = ThreadPoolExecutor(1).submit(TracedOnce(lambda x: x + 1.0), np.ones(3))
+        other = ThreadPoolExecutor(1).submit(JitOnce(lambda x: x + 1.0), np.ones(3))
         try:
             assert np.array_equal(other.result(60.0), np.full(3, 2.0))
             assert not any(each.done() for each in waiting)
@@ -131,9 +131,9 @@ def test_who_compiles_keeps_nobody_from_tracing(gate: Gate, slow_to_compile: Non
 
 def test_who_runs_for_the_first_time_keeps_nobody_from_tracing(gate: Gate) -> None:
     with ThreadPoolExecutor(1) as pool, ThreadPoolExecutor(1) as another:
-        waiting = pool.submit(TracedOnce(slow_to_run(gate)), np.ones(3))
+        waiting = pool.submit(JitOnce(slow_to_run(gate)), np.ones(3))
         assert gate.reached.wait(60.0)
-        other = another.submit(TracedOnce(lambda x: x + 1.0), np.ones(3))
+        other = another.submit(JitOnce(lambda x: x + 1.0), np.ones(3))
         try:
             assert np.array_equal(other.result(60.0), np.full(3, 2.0))
             assert not waiting.done()
@@ -150,9 +150,9 @@ def test_what_waits_in_the_queue_is_compiled_by_who_needs_it(
     def slow(x: jax.Array) -> jax.Array:
         return 2.0 * x
 
-    TracedOnce(slow).begin(np.ones(3))
+    JitOnce(slow).begin(np.ones(3))
     assert gate.reached.wait(60.0)
-    needed = TracedOnce(lambda x: x + 1.0)
+    needed = JitOnce(lambda x: x + 1.0)
     needed.begin(np.ones(3))
     with ThreadPoolExecutor(1) as pool:
         try:
@@ -165,7 +165,7 @@ def test_two_threads_never_trace_at_once_and_compile_a_program_once(programs: li
     inside: list[int] = []
     most: list[int] = []
 
-    def telling() -> TracedOnce:
+    def telling() -> JitOnce:
         def told(x: jax.Array) -> jax.Array:
             inside.append(1)
             most.append(len(inside))
@@ -173,7 +173,7 @@ def test_two_threads_never_trace_at_once_and_compile_a_program_once(programs: li
             inside.pop()
             return x + 1.0
 
-        return TracedOnce(told)
+        return JitOnce(told)
 
     first, second = telling(), telling()
     with ThreadPoolExecutor(4) as pool:
@@ -190,7 +190,7 @@ def test_the_memory_of_a_program_is_known_before_it_runs() -> None:
         return jnp.outer(x, x)
 
     x = jnp.ones(1000)
-    found = bytes_of(TracedOnce(squares).program(x))
+    found = bytes_of(JitOnce(squares).program(x))
     assert 8.0e6 <= found <= 1.7e7
 
 
@@ -200,13 +200,13 @@ def test_a_program_that_the_memory_cannot_hold_is_refused_and_not_run(
     def many(x: jax.Array) -> jax.Array:
         return jnp.sort(jnp.broadcast_to(x, (10**12, 3)), axis=0)
 
-    run = TracedOnce(many)
+    run = JitOnce(many)
     said = r"memory: this fit would need 2\d{4}\.\d GB at once, of \d+\.\d GB; average neighb"
     for _ in range(2):  # nor later
         with pytest.raises(pb.FitError, match=said):
             run(jnp.ones(3))
     monkeypatch.setattr(compile, "memory_limit", lambda: None)  # where nobody knows, nobody refuses
-    assert TracedOnce(lambda x: x + 1.0)(jnp.ones(3))[0] == 2.0
+    assert JitOnce(lambda x: x + 1.0)(jnp.ones(3))[0] == 2.0
 
 
 @pytest.mark.parametrize("method", ["point", "laplace", pb.Importance()])

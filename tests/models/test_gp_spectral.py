@@ -54,12 +54,12 @@ def held_out(material: Mapping[float, float], held: float, seed: int) -> tuple[f
     return float(low), float(high)
 
 
-@pytest.mark.thorough  # tests/benchmarks/spectrum.py does the same with NUTS
+@pytest.mark.thorough  # benchmarks/spectrum.py does the same with NUTS
 @pytest.mark.parametrize("held", [550.0, 633.0])
 def test_real_materials_lie_in_the_bands_of_a_color_that_was_not_measured(held: float) -> None:
     """Five materials. If bands were exact, two misses of five have chance .023.
 
-    Laplace draws stand in for NUTS, which gives the same bands in tests/benchmarks/spectrum.py.
+    Laplace draws stand in for NUTS, which gives the same bands in benchmarks/spectrum.py.
     """
     missed = []
     for number, (name, material) in enumerate(tabulated().items()):

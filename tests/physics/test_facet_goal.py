@@ -1,7 +1,7 @@
 """The goal of the facet rule: .001 in degree of polarization with at most 32 facets, anywhere.
 
 Anywhere: roughness .01 to .3, index 1.2 to 2, zenith 0 to 89 degrees, both distributions, all
-integrals. The table of the whole dial is printed by tests/benchmarks/facet_quadrature.py.
+integrals. The table of the whole dial is printed by benchmarks/facet_quadrature.py.
 """
 
 import functools
@@ -9,7 +9,7 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from benchmarks.facet_quadrature import INTEGRALS, ROUGHNESS, TRUTH, cases, measure, ours
+from facet_quadrature import INTEGRALS, ROUGHNESS, TRUTH, cases, measure, ours
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

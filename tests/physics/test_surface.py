@@ -105,7 +105,7 @@ def test_rough_reflection_is_near_the_truth(height_field_sky: np.ndarray) -> Non
 
 
 @pytest.mark.parametrize(
-    ("part", "mend"),
+    ("part", "hint"),
     [
         ({"distribution": UniformSky()}, r"Beckmann\(\) or GGX\(\)"),
         ({"illumination": GGX()}, r"PointSource\(\), Disc\(5.0\) or UniformSky\(\)"),
@@ -115,9 +115,9 @@ def test_rough_reflection_is_near_the_truth(height_field_sky: np.ndarray) -> Non
         ({"way_out": "rough"}, r"RoughExit\(\) or SmoothExit\(\)"),
     ],
 )
-def test_parts_are_checked(part: dict, mend: str) -> None:
+def test_parts_are_checked(part: dict, hint: str) -> None:
     name = next(iter(part))
-    with pytest.raises(SceneError, match=rf"RoughSurface: {name}: .* is no such part; give {mend}"):
+    with pytest.raises(SceneError, match=rf"RoughSurface: {name}: .* is no such part; give {hint}"):
         RoughSurface(**part)
 
 

@@ -64,7 +64,7 @@ LEVEL = {
     "sky": Scene(RoughSurface(GGX(), UniformSky(), FEW), Lambertian(), StokesMixing()),
     "turbid body": Scene(SmoothSurface(BEAM), TurbidMedium(), StokesMixing()),
 }
-QUICK = Scene(
+COMPILER_OPTIONS = Scene(
     RoughSurface(Beckmann(), BEAM, way_out=SmoothExit()), Lambertian(), StokesMixing()
 )  # compiles in no time
 EVERY_SCENE = pytest.mark.parametrize("name", LEVEL)
@@ -276,7 +276,7 @@ def test_a_viewer_that_passes_the_true_normal_sees_no_jump() -> None:
 
 def test_slopes_are_those_of_differences() -> None:
     """Also for a viewer on the stated normal, as soon as the true one leans."""
-    scene = leaning(QUICK)
+    scene = leaning(COMPILER_OPTIONS)
     columns = ([20.0, 0.0, 1e-3], [180.0, 180.0, 70.0], [45.0] * 3, [0.0] * 3)
     views = Geometry(*(jnp.array(column) for column in columns))
 
@@ -293,7 +293,7 @@ def test_slopes_are_those_of_differences() -> None:
 
 
 def test_single_precision_stays_single_and_agrees() -> None:
-    scene = leaning(QUICK)
+    scene = leaning(COMPILER_OPTIONS)
     zenith = np.array([0.0, 20.0, 45.0, 70.0])
     views = Geometry(zenith, np.full(4, 180.0), np.full(4, 45.0), np.zeros(4))
     single = jax.tree.map(np.float32, views)
@@ -310,14 +310,14 @@ def test_single_precision_stays_single_and_agrees() -> None:
 def test_the_instrument_acts_on_the_stated_angles() -> None:
     """Angle zero comes before the lean; what the sensor does comes after, in its own frame."""
     terms = Instrument((AngleZero(), BeamOverlap(), DolpGain()))
-    scene = dataclasses.replace(leaning(QUICK), instrument=terms)
+    scene = dataclasses.replace(leaning(COMPILER_OPTIONS), instrument=terms)
     views, values = at((60.0, 150.0), (45.0, 0.0)), tilted((6.0, 5.0))
     moved = views._replace(view_zenith=views.view_zenith + 0.3, light_zenith=jnp.array([45.3]))
     light = scene.light(values, moved)
     found = predict(scene, values, views)
     np.testing.assert_allclose(found["q"], 0.9 * light.q, rtol=1e-12)
     np.testing.assert_allclose(found["u"], 0.9 * light.u, rtol=1e-12)
-    level = dataclasses.replace(QUICK, instrument=terms)
+    level = dataclasses.replace(COMPILER_OPTIONS, instrument=terms)
     lost = predict(level, values, views)["intensity"] / level.light(values, moved).intensity
     np.testing.assert_allclose(found["intensity"], lost * light.intensity, rtol=1e-12)
 

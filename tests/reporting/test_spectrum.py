@@ -101,7 +101,7 @@ def test_a_process_is_drawn_from_its_prediction(monkeypatch) -> None:
 
 def test_a_fit_that_cannot_be_predicted_has_intervals(monkeypatch) -> None:
     def predict(tree, wavelengths):
-        raise FitError("the fit's kernel has no name", where="x", mend="y")
+        raise FitError("the fit's kernel has no name", where="x", hint="y")
 
     monkeypatch.setattr(module, "predict_spectrum", predict)
     assert spectra(make_result(**SMALL))["absorption"][0].between.size == 0

@@ -1,0 +1,145 @@
+"""Error against time of every method, for six captures from easy to hard.
+
+    python benchmarks/accuracy_front.py --keep FOLDER            all six; takes hours
+    python benchmarks/accuracy_front.py --keep FOLDER --quick    rungs alone, no dials
+    python benchmarks/accuracy_front.py --keep FOLDER --only 1   the first alone
+
+Every trial runs in a process of its own, so nothing else should run beside. A finished scene is
+kept in the folder and not measured again. Draws docs/figures/accuracy_front.png and writes the
+table of docs/accuracy.md, between the lines that say so. The advice is then tried on another
+capture of each scene, which it has not seen.
+"""
+
+import argparse
+import os
+import platform
+from pathlib import Path
+
+import jax
+import numpy as np
+import xarray as xr
+from accuracy_scenes import CASES, Case
+from matplotlib.figure import Figure
+
+import polar_bayes as pb
+from polar_bayes.benchmark.advice import accuracy_of, advised
+from polar_bayes.reporting.accuracy import front_panel
+from polar_bayes.reporting.style import styled
+
+ROOT = Path(__file__).parents[1]
+PICTURE = ROOT / "docs" / "figures" / "accuracy_front.png"
+PAGE = ROOT / "docs" / "accuracy.md"
+BEGIN, END = "<!-- gallery: begin -->\n", "<!-- gallery: end -->\n"
+TOLERANCE = 0.1
+
+
+def study(name: str, case: Case, number: int, keep: Path, quick: bool) -> xr.DataTree:
+    """The study of one scene, measured now or kept."""
+    file = keep / f"{number}{'-quick' if quick else ''}.nc"
+    if not file.exists():
+        asked = {"dials": ()} if quick else {}
+        found = pb.accuracy(
+            case.capture(seed=1),
+            scene=case.scene,
+            links=case.links,
+            progress=lambda stage, done: print(f"{name}: {stage} {done:.0%}", flush=True),
+            **asked,
+        )
+        pb.save_result(found, file)
+    return pb.load_accuracy(file)
+
+
+def tried(case: Case, found: xr.DataTree, number: int, keep: Path) -> tuple[str, float]:
+    """The advised method on a capture that the advice has not seen, and its error there."""
+    rung = advised(found, TOLERANCE)
+    if rung is None:
+        return "none", np.nan
+    file = keep / f"{number}-tried-{rung.replace(' ', '-')}.nc"
+    if not file.exists():
+        again = pb.accuracy(
+            case.capture(seed=2),
+            scene=case.scene,
+            links=case.links,
+            rungs={rung: pb.LADDER[rung]},
+            dials=(),
+            fresh=False,
+            seed=1,
+        )
+        pb.save_result(again, file)
+    return rung, float(pb.accuracy_table(pb.load_accuracy(file))["error"].iloc[0])
+
+
+@styled
+def draw(studies: dict[str, xr.DataTree]) -> Figure:
+    """A panel for each scene."""
+    columns = min(2, len(studies))
+    rows = -(-len(studies) // columns)
+    figure = Figure(figsize=(5.2 * columns, 3.7 * rows), layout="constrained")
+    for at, (name, found) in enumerate(studies.items()):
+        axes = figure.add_subplot(rows, columns, at + 1)
+        front_panel(axes, accuracy_of(found), "seconds_first")
+        axes.set_title(name, loc="left")
+        axes.set_ylabel("largest error [posterior sd]" if at % columns == 0 else "")
+    return figure
+
+
+def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]]) -> str:
+    """Errors and times of the rungs, and the advice, in Markdown."""
+    lines = [f"Measured on {platform.machine()}, {os.cpu_count()} cores.", ""]
+    lines += [
+        "| scene | " + " | ".join(pb.LADDER) + " | reference |",
+        "|---" * (len(pb.LADDER) + 2) + "|",
+    ]
+    for name, found in studies.items():
+        rows = pb.accuracy_table(found)
+        noise = float(accuracy_of(found).attrs["reference_error"])
+        cells = [_cell(rows, rung) for rung in pb.LADDER]
+        lines.append(f"| {name} | " + " | ".join(cells) + f" | {noise:.2g} |")
+    lines += ["", "| scene | advice | the advised method on another capture |", "|---|---|---|"]
+    for name, found in studies.items():
+        rung, error = trials[name]
+        seen = "" if np.isnan(error) else f"{rung}: {error:.2g} sd"
+        lines.append(f"| {name} | {pb.accuracy_advice(found, TOLERANCE)} | {seen} |")
+    return "\n".join(lines)
+
+
+def _cell(rows, rung: str) -> str:
+    if rung not in rows.index or np.isnan(rows.loc[rung, "error"]):
+        return "none"
+    row = rows.loc[rung]
+    return f"{row['error']:.2g} ({row['seconds_first']:.0f}, {row['seconds_again']:.2g} s)"
+
+
+def write(text: str) -> None:
+    """Put the table between its lines in the page."""
+    page = PAGE.read_text()
+    before, rest = page.split(BEGIN)
+    _, after = rest.split(END)
+    PAGE.write_text(f"{before}{BEGIN}\n{text}\n\n{END}{after}")
+
+
+def main(keep: Path, quick: bool, only: tuple[int, ...]) -> None:
+    """Measure, draw and write what was asked for."""
+    jax.config.update("jax_enable_x64", True)
+    keep.mkdir(parents=True, exist_ok=True)
+    studies, trials = {}, {}
+    for number, (name, case) in enumerate(CASES.items(), start=1):
+        if only and number not in only:
+            continue
+        studies[name] = study(name, case, number, keep, quick)
+        trials[name] = tried(case, studies[name], number, keep)
+    text = table(studies, trials)
+    print(text)
+    if not only:
+        PICTURE.parent.mkdir(exist_ok=True)
+        draw(studies).savefig(PICTURE, dpi=110)
+        write(text)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--keep", type=Path, required=True)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--only", type=int, nargs="*", default=())
+    arguments = parser.parse_args()
+    main(arguments.keep, arguments.quick, tuple(arguments.only))

@@ -1,0 +1,294 @@
+"""The study of a posterior that is known: references, trials, dials, and processes of their own."""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from typing import override
+
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+from toy_models import capture, line, of_line, squared
+
+import polar_bayes as pb
+from polar_bayes.benchmark import run
+from polar_bayes.benchmark.accuracy import AS_GIVEN
+from polar_bayes.benchmark.reference import Judge, nearest, run_reference
+from polar_bayes.benchmark.run import AbstractDial, Trial, problem_of, run_fresh
+from polar_bayes.effects.variants import parts_of
+from polar_bayes.inference.mcse import errors_of, standard_errors
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
+from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.request import resolve
+from polar_bayes.inference.resampling import choose
+from polar_bayes.inference.run_method import draws_of
+
+LINKS = {"q": pb.StokesLink()}
+ROUGHLY = pb.Reference(error=0.05, longer=0)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compile_fast_rather_than_fast_code() -> Iterator[None]:
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@dataclasses.dataclass(frozen=True)
+class Biased(AbstractMethod):
+    """Draws of the exact posterior of the line, moved by so many standard deviations."""
+
+    shift: float = 0.5
+    draws: int = 4000
+
+    @override
+    def draw(self, problem: Problem) -> PosteriorDraws:
+        mean, covariance = of_line(np.asarray(problem.data.readings["q"]))
+        sd = np.sqrt(np.diagonal(covariance))
+        random = np.random.default_rng(0)
+        z = random.multivariate_normal(mean + self.shift * sd, covariance, (4, self.draws // 4))
+        return PosteriorDraws("variational", z, {}, k_hat=0.6, effective_draws=float(self.draws))
+
+
+@dataclasses.dataclass(frozen=True)
+class Broken(AbstractMethod):
+    """A method that never has an answer."""
+
+    @override
+    def draw(self, problem: Problem) -> PosteriorDraws:
+        raise pb.FitError("it cannot be", where="Broken", hint="nothing")
+
+
+@dataclasses.dataclass(frozen=True)
+class Stuck(AbstractDial):
+    """A dial that cannot be turned."""
+
+    @property
+    @override
+    def name(self) -> str:
+        return "stuck"
+
+    @override
+    def turn(self, request, method):
+        raise pb.FitError("it is rusty", where="Stuck", hint="oil it")
+
+
+@pytest.fixture(scope="module")
+def study() -> xr.DataTree:
+    return pb.accuracy(
+        capture(),
+        model=line,
+        links=LINKS,
+        rungs={"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()},
+        dials=(pb.DrawsDial(0.1), pb.FacetsDial(2.0), pb.PrecisionDial(), Stuck()),
+        reference=ROUGHLY,
+        fresh=False,
+    )
+
+
+def test_errors_are_in_sds_of_the_reference(study):
+    found = study["accuracy"].to_dataset()
+    mean, covariance = of_line(capture()["q"].to_numpy())
+    sd = np.sqrt(np.diagonal(covariance))
+    assert list(found["parameter"].to_numpy()) == ["level", "slope"]
+    # Five standard errors of a reference that is known to 0.05, and 4000 draws.
+    np.testing.assert_allclose(found["reference_mean"], mean, atol=5 * 0.05 * sd.max())
+    np.testing.assert_allclose(found["reference_sd"] / sd, 1.0, atol=0.25)
+    errors = found["mean_error"].to_numpy()
+    np.testing.assert_allclose(errors[0], 0.5, atol=0.3)
+    np.testing.assert_allclose(errors[1], 0.0, atol=0.3)
+    np.testing.assert_allclose(errors[0] - errors[1], 0.5, atol=0.1)
+
+
+def test_the_reference_states_its_own_error(study):
+    told = study["accuracy"].attrs
+    assert told["reference"] == "NUTS"
+    assert 0.0 < told["reference_error"] < 0.05
+    assert told["reference_r_hat"] < 1.01
+    assert told["reference_doubts"] == ""
+    assert told["reference_effective_draws"] > 400
+
+
+def test_a_rung_that_fails_is_a_row_that_says_why(study):
+    table = pb.accuracy_table(study)
+    assert "it cannot be" in table.loc["broken", "problems"]
+    assert np.isnan(table.loc["broken", "error"])
+    assert not table.loc["broken", "on_front"]
+
+
+def test_a_dial_that_fails_is_a_row_that_says_why(study):
+    table = pb.accuracy_table(study)
+    for rung in ("biased", "right", "broken"):
+        assert "it is rusty" in table.loc[f"{rung}, stuck", "problems"]
+        assert np.isnan(table.loc[f"{rung}, stuck", "error"])
+
+
+def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
+    tries = []
+
+    def refuse(*arguments, **keywords):
+        tries.append(arguments)
+        raise pb.FitError("no peak", where="choose_effects", hint="nothing")
+
+    monkeypatch.setattr(run, "choose_effects", refuse)
+    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    for method in (pb.Laplace(), pb.Nuts()):
+        with pytest.raises(pb.FitError, match="no peak"):
+            pb.EffectsDial().turn(request, method)
+    assert len(tries) == 1
+
+
+def test_dials_turn_what_they_can_and_leave_the_rest_out(study):
+    found = study["accuracy"].to_dataset()
+    pairs = list(zip(found["rung"].to_numpy(), found["dial"].to_numpy(), strict=True))
+    assert pairs[:3] == [("biased", AS_GIVEN), ("right", AS_GIVEN), ("broken", AS_GIVEN)]
+    assert ("biased", "draws / 10") in pairs
+    assert ("broken", "draws / 10") not in pairs  # it has no draws
+    assert ("right", "single precision") in pairs
+    table = pb.accuracy_table(study)
+    assert table.loc["right, draws / 10", "effective_draws"] == 400
+
+
+def test_without_processes_of_their_own_first_times_and_memory_are_not_told(study):
+    table = pb.accuracy_table(study)
+    assert table["seconds_first"].isna().all()
+    assert table["peak_memory"].isna().all()
+    assert (table.loc[["biased", "right"], "seconds_again"] > 0.0).all()
+    about = json.loads(study.attrs["polar_bayes"])
+    assert about["fresh_processes"] is False
+
+
+def test_facets_are_turned_where_there_are_any():
+    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    turned, method = pb.FacetsDial(0.5).turn(request, pb.Nuts())
+    before, after = (
+        [part for _, part in parts_of(scene) if isinstance(part, pb.FacetQuadrature)]
+        for scene in (request.scene, turned.scene)
+    )
+    assert len(before) == len(after) > 0
+    for one, other in zip(before, after, strict=True):
+        assert other.along == round(0.5 * one.along)
+        assert other.across == round(0.5 * one.across)
+    assert method == pb.Nuts()
+    smooth = dataclasses.replace(request, scene=pb.Scene(pb.SmoothSurface()))
+    assert pb.FacetsDial(0.5).turn(smooth, pb.Nuts()) is None
+    single = dataclasses.replace(request, precision="single")
+    assert pb.PrecisionDial().turn(single, pb.Nuts()) is None
+
+
+def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
+    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    quarter = pb.DrawsDial(0.25)
+    for name, method in pb.LADDER.items():
+        turned = quarter.turn(request, method)
+        assert (turned is None) == (name in ("point", "nuts short"))  # no draws, or too few
+        if turned is not None:
+            assert draws_of(turned[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
+    # A crowd and a half, of which half would be three quarters: fewer than the crowd.
+    few = pb.Tempered(pb.PixelTempering(draws=1536))
+    assert pb.DrawsDial(0.5).turn(request, few) is None
+    enough = pb.DrawsDial(0.5).turn(request, pb.Tempered(pb.PixelTempering(draws=3072)))
+    assert enough is not None
+    assert draws_of(enough[1]) == 3072
+
+
+def test_every_dial_has_a_name_of_its_own():
+    every: list[AbstractDial] = [
+        pb.DrawsDial(0.25), pb.DrawsDial(4.0), pb.FacetsDial(0.5), pb.FacetsDial(2.0),
+        pb.EffectsDial(), pb.PrecisionDial(),
+    ]  # fmt: skip
+    names = [dial.name for dial in every]
+    assert names[:3] == ["draws / 4", "draws x 4", "facets / 2"]
+    assert len(set(names)) == len(names)
+
+
+def test_chains_that_miss_a_mode_hand_the_reference_over():
+    request = resolve(capture(), squared, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    judge = run_reference(ROUGHLY, problem_of(request, jax.random.key(0)))
+    assert judge.made_by == "tempered draws"
+    assert not judge.doubts
+    # Its own error is that of the weights, too.
+    assert (judge.mean_error > 1.1 * standard_errors(judge.draws)[0]).all()
+    share = np.mean(judge.draws[judge.labels.index("root")] > 0.0)
+    assert abs(share - 0.5) < 5 * 0.5 * 0.05
+
+
+def judged(biases: tuple[str, ...], error: float) -> Judge:
+    errors = np.array([error, 0.5 * error])
+    return Judge(("x", "y"), np.zeros((2, 4, 9)), "made", errors, errors, None, None, biases)
+
+
+def test_noise_is_no_reason_to_take_a_biased_reference():
+    noisy, biased = judged((), 0.03)._replace(noise="its error is 0.03"), judged(("R-hat",), 0.001)
+    assert len(noisy.doubts) == len(biased.doubts) == 1
+    assert nearest([biased, noisy]) is noisy
+    assert nearest([judged(("R-hat", "a mode"), 0.001), biased]) is biased
+    assert nearest([judged((), np.nan), noisy]) is nearest([noisy, judged((), np.nan)]) is noisy
+
+
+def test_draws_chosen_by_weight_have_the_error_of_their_weights_too():
+    """Over 60 choices the error that is told is that of weights and choice together."""
+    random = np.random.default_rng(0)
+    count, told, seen = 2000, [], []
+    for _ in range(60):
+        z = 1.5 * random.standard_normal((count, 1))
+        weights = np.exp(-0.5 * z[:, 0] ** 2 * (1.0 - 1.0 / 1.5**2))
+        weights /= weights.sum()
+        chosen = z[choose(weights, 1.0 / np.sum(weights**2), random)]
+        found = PosteriorDraws("tempered", chosen, {}, weighted=(z, weights))
+        mean, _ = errors_of(found, lambda z: np.moveaxis(z, -1, 0))
+        told.append(mean[0])
+        seen.append(chosen.mean())
+    # A standard normal, of which the weights alone lose 0.0197 and choosing as many as they are
+    # worth at most 0.0245; the sd of 60 means is known to 9%.
+    assert np.mean(told) == pytest.approx(np.hypot(0.0197, 0.0245), rel=0.05)
+    assert np.std(seen) < (1.0 + 4 * 0.09) * np.mean(told)
+
+
+def test_the_tempered_reference_draws_what_its_own_error_takes():
+    settings = pb.Reference(error=0.02).tempered.settings
+    assert settings.effective_draws == pytest.approx(4.0 / 0.02**2)
+    least = 4 * settings.effective_draws
+    assert least <= settings.answer_draws < least + settings.crowd
+    assert settings.crowd == 8192
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"rungs": {}}, "there is no rung"),
+        ({"rungs": {"mine": "nuts"}}, "a str is not a method"),
+    ],
+)
+def test_what_cannot_be_studied_is_refused(asked, said):
+    with pytest.raises(pb.FitError, match=said):
+        pb.accuracy(capture(), model=line, links=LINKS, **asked)
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(pb.FitError, match="error is 0"):
+        pb.Reference(error=0.0)
+    with pytest.raises(pb.FitError, match="factor is 0"):
+        pb.DrawsDial(0.0)
+    with pytest.raises(pb.FitError, match="factor is -1"):
+        pb.FacetsDial(-1.0)
+
+
+def test_a_process_of_its_own_finds_no_compiled_programs(monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/somewhere")
+    told = run._environment()
+    assert "JAX_COMPILATION_CACHE_DIR" not in told
+    assert told["JAX_ENABLE_COMPILATION_CACHE"] == "false"
+
+
+def test_a_trial_runs_in_a_process_of_its_own():
+    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    found = run_fresh(Trial(request, pb.Laplace(draws=50), 0))
+    assert found.labels == ("level", "slope")
+    assert found.draws.shape == (2, 4, 50)
+    assert found.seconds_first > 0.0
+    assert found.seconds_again > 0.0
+    assert found.peak_memory >= found.memory_before > 50.0
+    with pytest.raises(pb.FitError, match="it cannot be"):
+        run_fresh(Trial(request, Broken(), 0))
