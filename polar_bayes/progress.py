@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any, override
+from typing import Any, cast, override
 
 from rich.console import Console
 from rich.progress import (
@@ -136,7 +136,7 @@ class _NotebookBars(Bars):
             if time.monotonic() < self._next_refresh:
                 return
             self._next_refresh = time.monotonic() + REFRESH_SECONDS
-            bundle = self._repr_mimebundle_((), ())
+            bundle = cast(Any, self)._repr_mimebundle_((), ())
             if self._handle is None:
                 display = sys.modules["IPython.display"].display
                 self._handle = display(bundle, raw=True, display_id=True)

@@ -119,8 +119,7 @@ def test_a_demo_writes_in_no_folder_of_anothers(held, plate, tmp_path, capsys):
 
 def test_names_of_options_are_those_of_the_tables():
     from polar_bayes.calibration.calibrate import METHODS as CALIBRATION_METHODS
-    from polar_bayes.inference.joint_fit import METHODS
-    from polar_bayes.inference.request import MODELS
+    from polar_bayes.inference.request import METHODS, MODELS
 
     known = {
         cli_options.MODEL: MODELS,
