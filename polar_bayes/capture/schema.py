@@ -13,6 +13,7 @@ import dataclasses
 import difflib
 import re
 from collections.abc import Hashable, Mapping, Sequence
+from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
@@ -51,6 +52,12 @@ class Interval:
         above = values > self.low if self.open_low else values >= self.low
         below = values < self.high if self.open_high else values <= self.high
         return above & below
+
+    def check(self, value: object, where: str) -> float:
+        """A number given by the user, refused unless it lies inside."""
+        if isinstance(value, Real) and not isinstance(value, bool) and self.contains(value):
+            return float(value)
+        raise CaptureError(f"it is {value!r}", where=where, hint=f"give {self}")
 
     def __str__(self) -> str:
         """The interval as an inequality."""
