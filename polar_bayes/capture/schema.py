@@ -256,9 +256,6 @@ def count(capture: xr.Dataset) -> dict[str, int]:
 
     Returns:
         `views`: all entries; `masked`: those with `valid=False`; `saturated`: those flagged.
-
-    Raises:
-        Nothing.
     """
     signal = next(capture[name] for name in SIGNALS if name in capture)
     return {

@@ -31,7 +31,9 @@ from typing import Any, NoReturn
 import click
 import platformdirs
 
-from polar_bayes.cli import captures, checks, fits
+from polar_bayes.cli.captures import COMMANDS as CAPTURE_COMMANDS
+from polar_bayes.cli.checks import COMMANDS as CHECK_COMMANDS
+from polar_bayes.cli.fits import COMMANDS as FIT_COMMANDS
 from polar_bayes.errors import PolarBayesError, one_line
 from polar_bayes.interrupts import clean_up
 from polar_bayes.paths import system_error
@@ -275,5 +277,5 @@ def commands() -> None:
     """From polarization captures to calibrated posteriors of layered dielectrics."""
 
 
-for _command in (*captures.COMMANDS, *fits.COMMANDS, *checks.COMMANDS):
+for _command in (*CAPTURE_COMMANDS, *FIT_COMMANDS, *CHECK_COMMANDS):
     commands.add_command(_command)

@@ -219,7 +219,7 @@ def _flat(flat: Frame | None, shape: tuple[int, ...]) -> np.ndarray:
     return values / mean
 
 
-def _calibration_frame(frame: Frame, shape: tuple[int, ...], where: str) -> np.ndarray:
+def _calibration_frame(frame: Frame | float, shape: tuple[int, ...], where: str) -> np.ndarray:
     values, _ = read_frame(frame, where)
     if values.shape != shape:
         what = f"it is {values.shape}, the frames are {shape}"

@@ -143,16 +143,14 @@ def _locate(
     normals = surface.normals(rows, columns, binning.bin)
     points = _points(rows, columns, binning.frame)
     to_view = view.towards(points)
-    description = repr(light)
     if isinstance(light, Surroundings):
-        to_light = mirror_direction(normals, to_view)
+        description, to_light = repr(light), mirror_direction(normals, to_view)
     elif isinstance(light, Highlight):
-        source = _light_of_highlight(light, surface, view, binning.frame)
-        description += f": {source!r}"
-        to_light = source.towards(points)
+        direction = _light_of_highlight(light, surface, view, binning.frame)
+        description, to_light = f"{light!r}: {direction!r}", direction.towards(points)
     else:
-        source = as_location(light, "light")
-        description, to_light = repr(source), source.towards(points)
+        location = as_location(light, "light")
+        description, to_light = repr(location), location.towards(points)
     attributes = {"surface": surface.description, "view": repr(view), "light": description}
     return local_geometry(normals, to_view, to_light), attributes
 

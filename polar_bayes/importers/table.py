@@ -148,7 +148,7 @@ def _check_values(
         row, numbers = KNOWN[variable], values[variable]
         wrong = ~row.range.contains(numbers) & (valid | (row.kind != "reading"))
         if wrong.any():
-            first = np.argmax(wrong)
+            first = int(np.argmax(wrong))
             column = f", column {columns[variable]}" if variable in columns else ""
             raise CaptureError(
                 f"{variable} is {numbers[first]:g}, which is outside {row.range}",
