@@ -29,7 +29,7 @@ wavelength_option = option("--wavelength", type=float, help="Nanometers.")
 def _save(capture: Any, out: Path) -> None:
     """Write a capture and print its counts."""
     pb.save_capture(capture, out)
-    counts = ", ".join(f"{number} {what}" for what, number in pb.count(capture).items())
+    counts = ", ".join(f"{number} {what}" for what, number in pb.capture.count(capture).items())
     click.echo(f"{out}: {counts}")
 
 
@@ -46,7 +46,10 @@ def _save(capture: Any, out: Path) -> None:
 @seed_option
 def simulate(out: Path, preset: str, scene: str, seed: int, **protocol: Any) -> None:
     """Draw a capture of a known material, by the paper's protocol."""
-    _save(pb.simulate(preset, scene=scene, protocol=pb.Protocol(**protocol), seed=seed), out)
+    _save(
+        pb.simulate(preset, scene=scene, protocol=pb.simulation.Protocol(**protocol), seed=seed),
+        out,
+    )
 
 
 @command()
@@ -67,7 +70,7 @@ def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Pa
                 hint="import or simulate one of the two again under another --name or file name",
             )
         named[label] = capture
-    _save(pb.combine(named, dim=dim, drop=drop), out)
+    _save(pb.capture.combine(named, dim=dim, drop=drop), out)
 
 
 # --- Commands that import raw measurements --------------------------------------------------------
@@ -114,11 +117,9 @@ def goniometer(out: Path, **settings: Any) -> None:
 @out_capture
 def table(table: Path, out: Path, columns: Any, constants: Any, **settings: Any) -> None:
     """Import a table with a line for each reading and its directions."""
-    named = {
-        "columns": _mapping(columns, "--column"),
-        "constants": _mapping(constants, "--constant"),
-    }
-    _save(pb.from_table(table, **named, **settings), out)
+    settings["columns"] = _mapping(columns, "--column")
+    settings["constants"] = _mapping(constants, "--constant")
+    _save(pb.from_table(table, **settings), out)
 
 
 def _mapping(pairs: tuple[tuple[str, Any], ...], flag: str) -> dict[str, Any]:
@@ -230,25 +231,28 @@ def _image_arguments(
     """Arguments of an import from the options of a command."""
     if dark is not None and dark_level is not None:
         raise click.UsageError("--dark and --dark-level exclude each other")
-    outlines = (*(pb.Sphere(*each) for each in spheres), *map(pb.fit_sphere, rims))
+    outlines = (
+        *(pb.importers.Sphere(*each) for each in spheres),
+        *map(pb.importers.fit_sphere, rims),
+    )
     detector = {
         field.name: options.pop(field.name)
-        for field in dataclasses.fields(pb.Detector)
+        for field in dataclasses.fields(pb.importers.Detector)
         if field.name != "dark"
     }
     if view_position:
-        options["view"] = pb.Position(*view_position)
+        options["view"] = pb.importers.Position(*view_position)
     return {
         "shape": _only_one({"--sphere or --rim": outlines, "--normals": normals}),
         "light": _only_one(
             {
-                "--light": light and pb.Direction(*light),
-                "--light-position": light_position and pb.Position(*light_position),
-                "--highlight": highlight and pb.Highlight(*highlight),
-                "--surroundings": pb.Surroundings() if surroundings else None,
+                "--light": light and pb.importers.Direction(*light),
+                "--light-position": light_position and pb.importers.Position(*light_position),
+                "--highlight": highlight and pb.importers.Highlight(*highlight),
+                "--surroundings": pb.importers.Surroundings() if surroundings else None,
             }
         ),
-        "detector": pb.Detector(dark=dark or dark_level or 0.0, **detector),
+        "detector": pb.importers.Detector(dark=dark or dark_level or 0.0, **detector),
         **options,
     }
 

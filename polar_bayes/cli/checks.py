@@ -59,10 +59,13 @@ def calibrate(
         data, readings=not no_readings, store=store, resume=resume, **settings
     )
     pb.save_result(calibration, out)
-    table, verdict = pb.calibration_table(calibration), pb.calibration_verdict(calibration)
+    table, verdict = (
+        pb.calibration.calibration_table(calibration),
+        pb.calibration.calibration_verdict(calibration),
+    )
     tables = {"parameters": table}
     if "predictive_pit" in calibration.children:
-        tables["readings"] = pb.calibration_readings(calibration)
+        tables["readings"] = pb.calibration.calibration_readings(calibration)
     if as_json:
         rows = {name: json_rows(each) for name, each in tables.items()}
         print_json({**rows, "verdict": verdict})
@@ -73,7 +76,7 @@ def calibrate(
             click.echo()
             print_frame(tables["readings"].drop(columns=["reading", "test"]))
         click.echo("\n".join(["", *verdict]))
-    return 0 if pb.is_calibrated(table) else NOT_CONVERGED
+    return 0 if pb.calibration.is_calibrated(table) else NOT_CONVERGED
 
 
 @command()
@@ -108,15 +111,28 @@ def identify(
     with stages() as progress:
         settings["progress"] = progress
         study = pb.identify(data, **settings)
-        found["parameters"] = pb.identifiability_table(study), pb.identifiability_sentences(study)
+        found["parameters"] = (
+            pb.design.identifiability_table(study),
+            pb.design.identifiability_sentences(study),
+        )
         for name in profiled:
             curve = pb.profile(data, name, **settings)
-            found[f"profile of {name}"] = pb.profile_table(curve), pb.profile_sentences(curve)
+            found[f"profile of {name}"] = (
+                pb.design.profile_table(curve),
+                pb.design.profile_sentences(curve),
+            )
         if count is not None:
-            letters = {"D": pb.DOptimal, "A": pb.AOptimal}
-            goal = letters[criterion]() if criterion in letters else pb.SingleParameter(criterion)
+            letters = {"D": pb.design.DOptimal, "A": pb.design.AOptimal}
+            goal = (
+                letters[criterion]()
+                if criterion in letters
+                else pb.design.SingleParameter(criterion)
+            )
             views = pb.next_views(data, count=count, criterion=goal, **settings)
-            found["next views"] = pb.next_views_table(views), pb.next_views_sentences(views)
+            found["next views"] = (
+                pb.design.next_views_table(views),
+                pb.design.next_views_sentences(views),
+            )
     if as_json:
         rows: dict[str, Any] = {name: json_rows(table) for name, (table, _) in found.items()}
         for name, (_, sentences) in found.items():
@@ -154,12 +170,15 @@ def accuracy(
     **settings: Any,
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
-    settings["rungs"] = {name: pb.LADDER[name] for name in rungs or pb.LADDER}
+    settings["rungs"] = {name: pb.methods.LADDER[name] for name in rungs or pb.methods.LADDER}
     if no_dials:
         settings["dials"] = ()
     study = pb.accuracy(pb.load_capture(capture), **settings)
     pb.save_result(study, out)
-    table, advice = pb.accuracy_table(study), pb.accuracy_advice(study, tolerance)
+    table, advice = (
+        pb.benchmark.accuracy_table(study),
+        pb.benchmark.accuracy_advice(study, tolerance),
+    )
     if as_json:
         print_json({"rows": json_rows(table), "advice": advice})
         return

@@ -107,15 +107,15 @@ def fit(
             options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             scene = pb.choose_effects(data, progress=progress, **options)
-            click.echo(pb.ledger_sentence(scene.ledger), err=True)
+            click.echo(pb.effects.ledger_sentence(scene.ledger), err=True)
         settings |= {"tolerance": tolerance} if is_auto else {}
         result = pb.fit(data, scene=scene, progress=progress, **settings)
     pb.save_result(result, out)
-    for sentence in pb.auto_sentences(result):
+    for sentence in pb.inference.auto_sentences(result):
         click.echo(sentence, err=True)
     if not as_json:
         return print_fit(result)
-    print_json(pb.json_summary(result))
+    print_json(pb.diagnostics.json_summary(result))
     return print_verdict(result)
 
 
@@ -138,10 +138,14 @@ def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: A
     """Fit every pixel of an image."""
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
-    given = {} if draws is None else {"draws": draws}
-    chosen = pb.PixelLaplace(**given) if method == "laplace" else pb.PixelTempering()
-    maps = pb.map_file(capture, out, method=chosen, **settings)
-    counts = ", ".join(f"{count} {what}" for what, count in pb.count_pixels(maps).items() if count)
+    given: dict[str, Any] = {} if draws is None else {"draws": draws}
+    chosen = (
+        pb.methods.PixelLaplace(**given) if method == "laplace" else pb.methods.PixelTempering()
+    )
+    maps = pb.maps.map_file(capture, out, method=chosen, **settings)
+    counts = ", ".join(
+        f"{count} {what}" for what, count in pb.maps.count_pixels(maps).items() if count
+    )
     click.echo(f"{out}: {counts}")
 
 
@@ -161,13 +165,13 @@ def effects(
     """What each effect changes and costs; which of them this capture can see."""
     data = _with_setup(pb.load_capture(capture), scene)
     with stages() as progress:
-        ledger = pb.choose_effects(data, progress=progress, **settings).ledger
+        ledger: Any = pb.choose_effects(data, progress=progress, **settings).ledger
     if out is not None:
         pb.save_result(ledger, out)
     if as_json:
-        print_json(pb.ledger_summary(ledger))
+        print_json(pb.effects.ledger_summary(ledger))
     else:
-        click.echo(f"{pb.ledger_table(ledger)}\n\n{pb.ledger_sentence(ledger)}")
+        click.echo(f"{pb.effects.ledger_table(ledger)}\n\n{pb.effects.ledger_sentence(ledger)}")
 
 
 def _with_setup(capture: Any, setup: str | None) -> Any:
@@ -188,12 +192,13 @@ def report(
     fit: Path, out: Path, truth: Path | None, uncorrected: Path | None, beside: tuple[Path, ...]
 ) -> None:
     """Write the standardized report of a fit, calibration, accuracy study, or map (.zarr)."""
-    others = {
-        "truth": None if truth is None else pb.open_capture(truth),
-        "uncorrected": None if uncorrected is None else pb.open_map(uncorrected),
-        "beside": _load_all(pb.load_calibration, beside) or None,
-    }
-    page = pb.report(_load(fit), out, **others)
+    page = pb.report(
+        _load(fit),
+        out,
+        truth=None if truth is None else pb.maps.open_capture(truth),
+        uncorrected=None if uncorrected is None else pb.maps.open_map(uncorrected),
+        beside=_load_all(pb.calibration.load_calibration, beside) or None,
+    )
     click.echo(f"report: {page}")
 
 
@@ -203,12 +208,12 @@ def report(
 def compare(fits: tuple[Path, ...], out: Path) -> int:
     """Compare fits of one capture: predictions, parameters, and the effect of the priors."""
     results = _load_all(pb.load_result, fits)
-    comparison = pb.compare_fits(results)
+    comparison = pb.diagnostics.compare_fits(results)
     page = pb.report(results, out)
     if not comparison.loo.empty:
         print_frame(comparison.loo.rename(columns={"elpd_diff": "difference", "dse": "error"}))
         click.echo()
-    for sentence in pb.comparison_of_fits_sentences(comparison):
+    for sentence in pb.reporting.comparison_of_fits_sentences(comparison):
         click.echo(sentence)
     click.echo(f"report: {page}")
     converged = all(verdict.converged for verdict in comparison.verdicts.values())
@@ -225,10 +230,14 @@ def _load_all(load: Any, paths: tuple[Path, ...]) -> dict[str, Any]:
 def _load(path: Path) -> Any:
     """A map, an accuracy study, a calibration or a fit."""
     if path.suffix == ".zarr":
-        return pb.open_map(path)
-    if pb.holds_accuracy(path):
-        return pb.load_accuracy(path)
-    return pb.load_calibration(path) if pb.holds_calibration(path) else pb.load_result(path)
+        return pb.maps.open_map(path)
+    if pb.benchmark.holds_accuracy(path):
+        return pb.benchmark.load_accuracy(path)
+    return (
+        pb.calibration.load_calibration(path)
+        if pb.calibration.holds_calibration(path)
+        else pb.load_result(path)
+    )
 
 
 COMMANDS = (demo, fit, map_, effects, report, compare)

@@ -201,7 +201,7 @@ def _text(cell: Any) -> str:
 def print_fit(result: Any) -> int:
     """Print a row per parameter, and the problems on the error stream; returns the exit status."""
     columns = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
-    rows = pb.json_summary(result)["parameters"]
+    rows = pb.diagnostics.json_summary(result)["parameters"]
     print_table(
         ["", "mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"],
         [[name, *(row[column] for column in columns)] for name, row in rows.items()],
