@@ -1,7 +1,7 @@
 """Error against time of every method, for six captures from easy to hard.
 
     python benchmarks/accuracy_front.py --keep FOLDER            all six; takes hours
-    python benchmarks/accuracy_front.py --keep FOLDER --quick    rungs alone, no dials
+    python benchmarks/accuracy_front.py --keep FOLDER --quick    methods alone, no overrides
     python benchmarks/accuracy_front.py --keep FOLDER --only 1   the first alone
 
 Every trial runs in a process of its own, so nothing else should run beside. A finished scene is
@@ -37,7 +37,7 @@ def study(name: str, case: Case, number: int, keep: Path, quick: bool) -> xr.Dat
     """The study of one scene, measured now or kept."""
     file = keep / f"{number}{'-quick' if quick else ''}.nc"
     if not file.exists():
-        asked = {"dials": ()} if quick else {}
+        asked = {"overrides": ()} if quick else {}
         found = pb.accuracy(
             case.capture(seed=1),
             scene=case.scene,
@@ -51,22 +51,22 @@ def study(name: str, case: Case, number: int, keep: Path, quick: bool) -> xr.Dat
 
 def tried(case: Case, found: xr.DataTree, number: int, keep: Path) -> tuple[str, float]:
     """The advised method on a capture that the advice has not seen, and its error there."""
-    rung = advised(found, TOLERANCE)
-    if rung is None:
+    method = advised(found, TOLERANCE)
+    if method is None:
         return "none", np.nan
-    file = keep / f"{number}-tried-{rung.replace(' ', '-')}.nc"
+    file = keep / f"{number}-tried-{method.replace(' ', '-')}.nc"
     if not file.exists():
         again = pb.accuracy(
             case.capture(seed=2),
             scene=case.scene,
             links=case.links,
-            rungs={rung: pb.LADDER[rung]},
-            dials=(),
+            methods={method: pb.LADDER[method]},
+            overrides=(),
             fresh=False,
             seed=1,
         )
         pb.save_result(again, file)
-    return rung, float(pb.accuracy_table(pb.load_accuracy(file))["error"].iloc[0])
+    return method, float(pb.accuracy_table(pb.load_accuracy(file))["error"].iloc[0])
 
 
 @styled
@@ -84,7 +84,7 @@ def draw(studies: dict[str, xr.DataTree]) -> Figure:
 
 
 def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]]) -> str:
-    """Errors and times of the rungs, and the advice, in Markdown."""
+    """Errors and times of the methods, and the advice, in Markdown."""
     lines = [f"Measured on {platform.machine()}, {os.cpu_count()} cores.", ""]
     lines += [
         "| scene | " + " | ".join(pb.LADDER) + " | reference |",
@@ -93,20 +93,20 @@ def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]])
     for name, found in studies.items():
         rows = pb.accuracy_table(found)
         noise = float(accuracy_of(found).attrs["reference_error"])
-        cells = [_cell(rows, rung) for rung in pb.LADDER]
+        cells = [_cell(rows, method) for method in pb.LADDER]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {noise:.2g} |")
     lines += ["", "| scene | advice | the advised method on another capture |", "|---|---|---|"]
     for name, found in studies.items():
-        rung, error = trials[name]
-        seen = "" if np.isnan(error) else f"{rung}: {error:.2g} sd"
+        method, error = trials[name]
+        seen = "" if np.isnan(error) else f"{method}: {error:.2g} sd"
         lines.append(f"| {name} | {pb.accuracy_advice(found, TOLERANCE)} | {seen} |")
     return "\n".join(lines)
 
 
-def _cell(rows, rung: str) -> str:
-    if rung not in rows.index or np.isnan(rows.loc[rung, "error"]):
+def _cell(rows, method: str) -> str:
+    if method not in rows.index or np.isnan(rows.loc[method, "error"]):
         return "none"
-    row = rows.loc[rung]
+    row = rows.loc[method]
     return f"{row['error']:.2g} ({row['seconds_first']:.0f}, {row['seconds_again']:.2g} s)"
 
 

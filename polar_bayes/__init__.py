@@ -15,7 +15,7 @@ _HOMES = {
     "benchmark.accuracy": ("accuracy", "holds_accuracy", "load_accuracy"),
     "benchmark.advice": ("accuracy_advice", "accuracy_table"),
     "benchmark.reference": ("Reference",),
-    "benchmark.run": ("DrawsDial", "EffectsDial", "FacetsDial", "PrecisionDial"),
+    "benchmark.run": ("DrawsOverride", "EffectsOverride", "FacetsOverride", "PrecisionOverride"),
     "calibration.calibrate": ("calibrate",),
     "calibration.files": ("holds_calibration", "load_calibration"),
     "calibration.predictive": ("calibration_readings",),

@@ -14,8 +14,8 @@ from numpyro import distributions as dist
 
 from polar_bayes.benchmark.reference import Distances, Judge, Reference, distances, run_reference
 from polar_bayes.benchmark.run import (
-    DIALS,
-    AbstractDial,
+    OVERRIDES,
+    AbstractOverride,
     Measured,
     Trial,
     problem_of,
@@ -63,8 +63,8 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
 def accuracy(
     capture: xr.Dataset,
     *,
-    rungs: Mapping[str, Method] | None = None,
-    dials: Iterable[AbstractDial] = DIALS,
+    methods: Mapping[str, Method] | None = None,
+    overrides: Iterable[AbstractOverride] = OVERRIDES,
     reference: Reference | None = None,
     fresh: bool = True,
     model: str | Callable = "per_material",
@@ -75,12 +75,12 @@ def accuracy(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> xr.DataTree:
-    """Climb the ladder of methods on one capture, and measure every rung against the top.
+    """Compare methods on one capture with a reference posterior: their errors and their costs.
 
     Args:
         capture: A Dataset of the capture schema; validated here.
-        rungs: Methods by name; by default `polar_bayes.LADDER`.
-        dials: What else is turned, one at a time, on every rung; `()` for the rungs alone.
+        methods: Methods by name; by default `polar_bayes.LADDER`.
+        overrides: What else is changed, one at a time, on every method; `()` for the methods alone.
         reference: How well the posterior that all are judged by must be known.
         fresh: True runs every trial in a process of its own, so that the first time includes all
             compilation and the memory is its own. False runs them here: much faster, but without
@@ -94,9 +94,9 @@ def accuracy(
         progress: Called with the name of a stage and the fraction of it that is done.
 
     Returns:
-        A tree whose group `accuracy` has a row for each rung and dial (coordinates `rung` and
-        `dial`), and by row and parameter the distances from the reference; see the attribute
-        `long_name` of each variable. `polar_bayes.accuracy_table`, `accuracy_advice` and
+        A tree whose group `accuracy` has a row for each method and override (coordinates `method`
+        and `override`), and by row and parameter the distances from the reference; see the
+        attribute `long_name` of each variable. `polar_bayes.accuracy_table`, `accuracy_advice` and
         `plot_accuracy` read it.
 
     Raises:
@@ -108,16 +108,16 @@ def accuracy(
         capture, model, "nuts", scene, priors, links, largest_view_zenith, seed, "double"
     )
     show = progress or no_progress
-    trials = _trials(request, LADDER if rungs is None else rungs, tuple(dials))
+    trials = _trials(request, LADDER if methods is None else methods, tuple(overrides))
     show("reference", 0.0)
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), FOLD)  # no random number of any trial
         judge = run_reference(reference or Reference(), problem_of(request, key))
     show("reference", 1.0)
     rows = []
-    for number, ((rung, dial), trial) in enumerate(trials.items()):
+    for number, ((method, override), trial) in enumerate(trials.items()):
         show("trials", number / len(trials))
-        rows.append(_row(rung, dial, trial, judge, run_fresh if fresh else run_trial, fresh))
+        rows.append(_row(method, override, trial, judge, run_fresh if fresh else run_trial, fresh))
     show("trials", 1.0)
     about = {
         "accuracy": len(rows),
@@ -138,8 +138,8 @@ def accuracy(
 class Row(NamedTuple):
     """One trial, judged."""
 
-    rung: str
-    dial: str
+    method: str
+    override: str
     apart: Distances
     measured: Measured | None
     problems: str
@@ -174,37 +174,39 @@ _NUMBERS = (
 
 
 def _trials(
-    request: Request, rungs: Mapping[str, Method], dials: tuple[AbstractDial, ...]
+    request: Request, methods: Mapping[str, Method], overrides: tuple[AbstractOverride, ...]
 ) -> dict[tuple[str, str], Trial | PolarBayesError]:
-    """What is run, or why it cannot be, by rung and dial; all rungs as given come first."""
-    if not isinstance(rungs, Mapping) or not rungs:
+    """What is run, or why it cannot be, by method and override; all methods as given come first."""
+    if not isinstance(methods, Mapping) or not methods:
         raise FitError(
-            "there is no rung", where="accuracy: rungs", hint="give methods by name, as in LADDER"
+            "there is no method",
+            where="accuracy: methods",
+            hint="give methods by name, as in LADDER",
         )
     trials: dict[tuple[str, str], Trial | PolarBayesError] = {}
-    for name, method in rungs.items():
+    for name, method in methods.items():
         if not isinstance(method, Method):
             raise FitError(
                 f"a {type(method).__name__} is not a method",
-                where=f"accuracy: rungs[{name!r}]",
+                where=f"accuracy: methods[{name!r}]",
                 hint="give settings such as polar_bayes.Nuts()",
             )
         trials[str(name), AS_GIVEN] = Trial(request, method, request.seed)
-    for dial in dials:
-        for name, method in rungs.items():
+    for override in overrides:
+        for name, method in methods.items():
             try:
-                turned = dial.turn(request, method)
-            except PolarBayesError as error:  # a dial that fails is a row of every rung
-                trials[str(name), dial.name] = error
+                changed = override.apply(request, method)
+            except PolarBayesError as error:  # an override that fails is a row of every method
+                trials[str(name), override.name] = error
                 continue
-            if turned is not None:
-                trials[str(name), dial.name] = Trial(*turned, request.seed)
+            if changed is not None:
+                trials[str(name), override.name] = Trial(*changed, request.seed)
     return trials
 
 
 def _row(
-    rung: str,
-    dial: str,
+    method: str,
+    override: str,
     trial: Trial | PolarBayesError,
     judge: Judge,
     run: Callable[[Trial], Measured],
@@ -213,11 +215,11 @@ def _row(
     lost = np.full(len(judge.labels), np.nan)
     nothing = Distances(*(lost.copy() for _ in Distances._fields))
     if isinstance(trial, PolarBayesError):
-        return Row(rung, dial, nothing, None, str(trial), fresh)
+        return Row(method, override, nothing, None, str(trial), fresh)
     try:
         found = run(trial)
-    except PolarBayesError as error:  # a rung that fails is a row, too
-        return Row(rung, dial, nothing, None, str(error), fresh)
+    except PolarBayesError as error:  # a method that fails is a row, too
+        return Row(method, override, nothing, None, str(error), fresh)
     shared = [label for label in judge.labels if label in found.labels]
     ours, theirs = (
         np.stack([draws[labels.index(label)].ravel() for label in shared])
@@ -226,7 +228,7 @@ def _row(
     at = [judge.labels.index(label) for label in shared]
     for whole, part in zip(nothing, distances(ours, theirs), strict=True):
         whole[at] = part
-    return Row(rung, dial, nothing, found, "; ".join(found.answer.problems), fresh)
+    return Row(method, override, nothing, found, "; ".join(found.answer.problems), fresh)
 
 
 def _dataset(rows: list[Row], judge: Judge) -> xr.Dataset:
@@ -251,8 +253,8 @@ def _dataset(rows: list[Row], judge: Judge) -> xr.Dataset:
             for name, (dims, values) in columns.items()
         },
         coords={
-            "rung": ("row", np.array([row.rung for row in rows], object)),
-            "dial": ("row", np.array([row.dial for row in rows], object)),
+            "method": ("row", np.array([row.method for row in rows], object)),
+            "override": ("row", np.array([row.override for row in rows], object)),
             "parameter": np.array(judge.labels, object),
         },
         attrs={

@@ -32,7 +32,7 @@ def accuracy_of(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
     check = FIT.check if is_fit and "accuracy" in result.children else STUDY.check
     check(result, "accuracy")
     found = result["accuracy"].to_dataset().transpose("row", "parameter", ...)
-    pairs = (found[name].to_numpy().tolist() for name in ("rung", "dial"))
+    pairs = (found[name].to_numpy().tolist() for name in ("method", "override"))
     names = list(zip(*pairs, strict=True))
     if len(set(names)) < len(names):
         raise FitError(
@@ -44,7 +44,7 @@ def accuracy_of(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
 
 
 def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
-    """One row for each rung and dial, the errors of the worst parameter.
+    """One row for each method and override, the errors of the worst parameter.
 
     Args:
         result: What `polar_bayes.accuracy` returns, or one read back from a file.
@@ -55,7 +55,7 @@ def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
         reference's own standard error), `interval` (the largest of both ends), `wasserstein`,
         `r_hat`, `k_hat`, `effective_draws`, `gradients`, `densities`, `seconds_first` and
         `seconds_again` [s], `peak_memory` [MiB], `on_front` (nothing is both faster and better),
-        `rung`, `dial` and `problems`.
+        `method`, `override` and `problems`.
 
     Raises:
         FitError: It holds no accuracy study.
@@ -74,8 +74,8 @@ def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
             "interval": _largest(ends),
             "wasserstein": _largest(found["wasserstein"].to_numpy()),
             **{name: found[name].to_numpy() for name in alone},
-            "rung": [str(x) for x in found["rung"].to_numpy()],
-            "dial": [str(x) for x in found["dial"].to_numpy()],
+            "method": [str(x) for x in found["method"].to_numpy()],
+            "override": [str(x) for x in found["override"].to_numpy()],
             "problems": [str(x) for x in found["problems"].to_numpy()],
         },
         index=pd.Index(errors.index, name="row"),
@@ -88,8 +88,11 @@ def parameter_errors(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
     """The larger error of mean and sd of every parameter, in reference sds."""
     found = accuracy_of(result)
     values = _larger(found, "mean_error", "sd_error")
-    pairs = zip(found["rung"].to_numpy(), found["dial"].to_numpy(), strict=True)
-    names = [str(rung) if dial == AS_GIVEN else f"{rung}, {dial}" for rung, dial in pairs]
+    pairs = zip(found["method"].to_numpy(), found["override"].to_numpy(), strict=True)
+    names = [
+        str(method) if override == AS_GIVEN else f"{method}, {override}"
+        for method, override in pairs
+    ]
     labels = [str(label) for label in found["parameter"].to_numpy()]
     return pd.DataFrame(values, index=names, columns=labels)
 
@@ -119,7 +122,7 @@ def accuracy_advice(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERAN
 
     Returns:
         `laplace is within 0.08 sd here and 60 times faster than nuts; ...`. Speed is that of the
-        first fit where it was measured (else of the next), among rungs as given.
+        first fit where it was measured (else of the next), among methods as given.
 
     Raises:
         FitError: It holds no accuracy study, or the tolerance is not above 0.
@@ -130,7 +133,7 @@ def accuracy_advice(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERAN
         )
     found = accuracy_of(result)
     every, errors = accuracy_table(found), parameter_errors(found)
-    given = every["dial"] == AS_GIVEN
+    given = every["override"] == AS_GIVEN
     told = _advice(every[given], errors[given.to_numpy()], tolerance)
     if found.attrs["reference_doubts"]:
         told += f" Take it with care: of the reference itself, {found.attrs['reference_doubts']}."
@@ -138,10 +141,10 @@ def accuracy_advice(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERAN
 
 
 def advised(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> str | None:
-    """The fastest rung as given that is good for every parameter."""
+    """The fastest method as given that is good for every parameter."""
     table = accuracy_table(result)
     seconds = table[time_of(table)]
-    good = (table["dial"] == AS_GIVEN) & (table["error"] <= tolerance) & seconds.notna()
+    good = (table["override"] == AS_GIVEN) & (table["error"] <= tolerance) & seconds.notna()
     return str(seconds[good].idxmin()) if good.any() else None
 
 

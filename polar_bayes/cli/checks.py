@@ -13,8 +13,8 @@ from polar_bayes.cli.options import (
     MODEL,
     NOT_CONVERGED,
     RESULT_FILE,
-    RUNG,
     SCENE,
+    STUDY_METHOD,
     command,
 )
 from polar_bayes.progress import stages
@@ -139,26 +139,26 @@ def identify(
 @click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
 @click.option(
-    "--rung", "rungs", type=RUNG, multiple=True,
+    "--method", "methods", type=STUDY_METHOD, multiple=True,
     help="Method to try; by default the whole ladder.",
 )  # fmt: skip
-@click.option("--no-dials", is_flag=True, help="Methods alone, nothing turned beside them.")
+@click.option("--no-overrides", is_flag=True, help="Methods alone, nothing else changed.")
 @click.option("--tolerance", type=float, default=0.1, show_default=True, help="Of the advice.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
 def accuracy(
     capture: Path,
     out: Path,
-    rungs: tuple[str, ...],
-    no_dials: bool,
+    methods: tuple[str, ...],
+    no_overrides: bool,
     tolerance: float,
     as_json: bool,
     **settings: Any,
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
     data = pb.load_capture(capture)
-    settings["rungs"] = {name: pb.LADDER[name] for name in rungs or pb.LADDER}
-    settings |= {"dials": ()} if no_dials else {}
+    settings["methods"] = {name: pb.LADDER[name] for name in methods or pb.LADDER}
+    settings |= {"overrides": ()} if no_overrides else {}
     study = pb.accuracy(data, **settings)
     pb.save_result(study, out)
     table, advice = pb.accuracy_table(study), pb.accuracy_advice(study, tolerance)

@@ -1,4 +1,4 @@
-"""The study of a posterior that is known: references, trials, dials, and processes of their own."""
+"""The study of a posterior that is known: references, trials, overrides, fresh processes."""
 
 import dataclasses
 import json
@@ -15,7 +15,7 @@ import polar_bayes as pb
 from polar_bayes.benchmark import run
 from polar_bayes.benchmark.accuracy import AS_GIVEN
 from polar_bayes.benchmark.reference import Judge, nearest, run_reference
-from polar_bayes.benchmark.run import AbstractDial, Trial, problem_of, run_fresh
+from polar_bayes.benchmark.run import AbstractOverride, Trial, problem_of, run_fresh
 from polar_bayes.effects.variants import parts_of
 from polar_bayes.inference.mcse import errors_of, standard_errors
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
@@ -61,8 +61,8 @@ class Broken(AbstractMethod):
 
 
 @dataclasses.dataclass(frozen=True)
-class Stuck(AbstractDial):
-    """A dial that cannot be turned."""
+class Stuck(AbstractOverride):
+    """An override that cannot be changed."""
 
     @property
     @override
@@ -70,7 +70,7 @@ class Stuck(AbstractDial):
         return "stuck"
 
     @override
-    def turn(self, request, method):
+    def apply(self, request, method):
         raise pb.FitError("it is rusty", where="Stuck", hint="oil it")
 
 
@@ -80,8 +80,8 @@ def study() -> xr.DataTree:
         capture(),
         model=line,
         links=LINKS,
-        rungs={"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()},
-        dials=(pb.DrawsDial(0.1), pb.FacetsDial(2.0), pb.PrecisionDial(), Stuck()),
+        methods={"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()},
+        overrides=(pb.DrawsOverride(0.1), pb.FacetsOverride(2.0), pb.PrecisionOverride(), Stuck()),
         reference=ROUGHLY,
         fresh=False,
     )
@@ -110,18 +110,18 @@ def test_the_reference_states_its_own_error(study):
     assert told["reference_effective_draws"] > 400
 
 
-def test_a_rung_that_fails_is_a_row_that_says_why(study):
+def test_a_method_that_fails_is_a_row_that_says_why(study):
     table = pb.accuracy_table(study)
     assert "it cannot be" in table.loc["broken", "problems"]
     assert np.isnan(table.loc["broken", "error"])
     assert not table.loc["broken", "on_front"]
 
 
-def test_a_dial_that_fails_is_a_row_that_says_why(study):
+def test_an_override_that_fails_is_a_row_that_says_why(study):
     table = pb.accuracy_table(study)
-    for rung in ("biased", "right", "broken"):
-        assert "it is rusty" in table.loc[f"{rung}, stuck", "problems"]
-        assert np.isnan(table.loc[f"{rung}, stuck", "error"])
+    for method in ("biased", "right", "broken"):
+        assert "it is rusty" in table.loc[f"{method}, stuck", "problems"]
+        assert np.isnan(table.loc[f"{method}, stuck", "error"])
 
 
 def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
@@ -135,13 +135,13 @@ def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
     for method in (pb.Laplace(), pb.Nuts()):
         with pytest.raises(pb.FitError, match="no peak"):
-            pb.EffectsDial().turn(request, method)
+            pb.EffectsOverride().apply(request, method)
     assert len(tries) == 1
 
 
 def test_dials_turn_what_they_can_and_leave_the_rest_out(study):
     found = study["accuracy"].to_dataset()
-    pairs = list(zip(found["rung"].to_numpy(), found["dial"].to_numpy(), strict=True))
+    pairs = list(zip(found["method"].to_numpy(), found["override"].to_numpy(), strict=True))
     assert pairs[:3] == [("biased", AS_GIVEN), ("right", AS_GIVEN), ("broken", AS_GIVEN)]
     assert ("biased", "draws / 10") in pairs
     assert ("broken", "draws / 10") not in pairs  # it has no draws
@@ -161,10 +161,10 @@ def test_without_processes_of_their_own_first_times_and_memory_are_not_told(stud
 
 def test_facets_are_turned_where_there_are_any():
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    turned, method = pb.FacetsDial(0.5).turn(request, pb.Nuts())
+    changed, method = pb.FacetsOverride(0.5).apply(request, pb.Nuts())
     before, after = (
         [part for _, part in parts_of(scene) if isinstance(part, pb.FacetQuadrature)]
-        for scene in (request.scene, turned.scene)
+        for scene in (request.scene, changed.scene)
     )
     assert len(before) == len(after) > 0
     for one, other in zip(before, after, strict=True):
@@ -172,33 +172,34 @@ def test_facets_are_turned_where_there_are_any():
         assert other.across == round(0.5 * one.across)
     assert method == pb.Nuts()
     smooth = dataclasses.replace(request, scene=pb.Scene(pb.SmoothSurface()))
-    assert pb.FacetsDial(0.5).turn(smooth, pb.Nuts()) is None
+    assert pb.FacetsOverride(0.5).apply(smooth, pb.Nuts()) is None
     single = dataclasses.replace(request, precision="single")
-    assert pb.PrecisionDial().turn(single, pb.Nuts()) is None
+    assert pb.PrecisionOverride().apply(single, pb.Nuts()) is None
 
 
-def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
+def test_an_override_of_draws_turns_what_its_name_says_or_nothing():
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    quarter = pb.DrawsDial(0.25)
+    quarter = pb.DrawsOverride(0.25)
     for name, method in pb.LADDER.items():
-        turned = quarter.turn(request, method)
-        assert (turned is None) == (name in ("point", "nuts short"))  # no draws, or too few
-        if turned is not None:
-            assert draws_of(turned[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
+        changed = quarter.apply(request, method)
+        assert (changed is None) == (name in ("point", "nuts short"))  # no draws, or too few
+        if changed is not None:
+            assert draws_of(changed[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
     # A crowd and a half, of which half would be three quarters: fewer than the crowd.
     few = pb.Tempered(pb.PixelTempering(draws=1536))
-    assert pb.DrawsDial(0.5).turn(request, few) is None
-    enough = pb.DrawsDial(0.5).turn(request, pb.Tempered(pb.PixelTempering(draws=3072)))
+    assert pb.DrawsOverride(0.5).apply(request, few) is None
+    enough = pb.DrawsOverride(0.5).apply(request, pb.Tempered(pb.PixelTempering(draws=3072)))
     assert enough is not None
     assert draws_of(enough[1]) == 3072
 
 
-def test_every_dial_has_a_name_of_its_own():
-    every: list[AbstractDial] = [
-        pb.DrawsDial(0.25), pb.DrawsDial(4.0), pb.FacetsDial(0.5), pb.FacetsDial(2.0),
-        pb.EffectsDial(), pb.PrecisionDial(),
+def test_every_override_has_a_name_of_its_own():
+    every: list[AbstractOverride] = [
+        pb.DrawsOverride(0.25), pb.DrawsOverride(4.0),
+        pb.FacetsOverride(0.5), pb.FacetsOverride(2.0),
+        pb.EffectsOverride(), pb.PrecisionOverride(),
     ]  # fmt: skip
-    names = [dial.name for dial in every]
+    names = [override.name for override in every]
     assert names[:3] == ["draws / 4", "draws x 4", "facets / 2"]
     assert len(set(names)) == len(names)
 
@@ -257,8 +258,8 @@ def test_the_tempered_reference_draws_what_its_own_error_takes():
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ({"rungs": {}}, "there is no rung"),
-        ({"rungs": {"mine": "nuts"}}, "a str is not a method"),
+        ({"methods": {}}, "there is no method"),
+        ({"methods": {"mine": "nuts"}}, "a str is not a method"),
     ],
 )
 def test_what_cannot_be_studied_is_refused(asked, said):
@@ -270,9 +271,9 @@ def test_settings_out_of_range_are_refused():
     with pytest.raises(pb.FitError, match="error is 0"):
         pb.Reference(error=0.0)
     with pytest.raises(pb.FitError, match="factor is 0"):
-        pb.DrawsDial(0.0)
+        pb.DrawsOverride(0.0)
     with pytest.raises(pb.FitError, match="factor is -1"):
-        pb.FacetsDial(-1.0)
+        pb.FacetsOverride(-1.0)
 
 
 def test_a_process_of_its_own_finds_no_compiled_programs(monkeypatch):
