@@ -22,7 +22,7 @@ from accuracy_scenes import CASES, Case
 from matplotlib.figure import Figure
 
 import polar_bayes as pb
-from polar_bayes.benchmark.advice import accuracy_of, advised
+from polar_bayes.benchmark.advice import accuracy_dataset, best_method
 from polar_bayes.reporting.accuracy import front_panel
 from polar_bayes.reporting.style import styled
 
@@ -50,8 +50,8 @@ def study(name: str, case: Case, number: int, keep: Path, quick: bool) -> xr.Dat
 
 
 def tried(case: Case, found: xr.DataTree, number: int, keep: Path) -> tuple[str, float]:
-    """The advised method on a capture that the advice has not seen, and its error there."""
-    method = advised(found, TOLERANCE)
+    """The best_method method on a capture that the advice has not seen, and its error there."""
+    method = best_method(found, TOLERANCE)
     if method is None:
         return "none", np.nan
     file = keep / f"{number}-tried-{method.replace(' ', '-')}.nc"
@@ -77,7 +77,7 @@ def draw(studies: dict[str, xr.DataTree]) -> Figure:
     figure = Figure(figsize=(5.2 * columns, 3.7 * rows), layout="constrained")
     for at, (name, found) in enumerate(studies.items()):
         axes = figure.add_subplot(rows, columns, at + 1)
-        front_panel(axes, accuracy_of(found), "seconds_first")
+        front_panel(axes, accuracy_dataset(found), "seconds_first")
         axes.set_title(name, loc="left")
         axes.set_ylabel("largest error [posterior sd]" if at % columns == 0 else "")
     return figure
@@ -92,14 +92,14 @@ def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]])
     ]
     for name, found in studies.items():
         rows = pb.accuracy_table(found)
-        noise = float(accuracy_of(found).attrs["reference_error"])
+        noise = float(accuracy_dataset(found).attrs["reference_error"])
         cells = [_cell(rows, method) for method in pb.LADDER]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {noise:.2g} |")
-    lines += ["", "| scene | advice | the advised method on another capture |", "|---|---|---|"]
+    lines += ["", "| scene | advice | the best_method method on another capture |", "|---|---|---|"]
     for name, found in studies.items():
         method, error = trials[name]
         seen = "" if np.isnan(error) else f"{method}: {error:.2g} sd"
-        lines.append(f"| {name} | {pb.accuracy_advice(found, TOLERANCE)} | {seen} |")
+        lines.append(f"| {name} | {' '.join(pb.accuracy_sentences(found, TOLERANCE))} | {seen} |")
     return "\n".join(lines)
 
 

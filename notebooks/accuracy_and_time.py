@@ -73,7 +73,7 @@ pb.plot_accuracy(study)
 # The same as a sentence:
 
 # %%
-print(pb.accuracy_advice(study))
+print("\n".join(pb.accuracy_sentences(study)))
 
 # %% [markdown]
 # That is said of this capture. With more readings a posterior comes closer to a normal

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 _HOMES = {
     "benchmark.accuracy": ("accuracy", "holds_accuracy", "load_accuracy"),
-    "benchmark.advice": ("accuracy_advice", "accuracy_table"),
+    "benchmark.advice": ("accuracy_sentences", "accuracy_table"),
     "benchmark.reference": ("Reference",),
     "benchmark.run": ("DrawsOverride", "EffectsOverride", "FacetsOverride", "PrecisionOverride"),
     "calibration.calibrate": ("calibrate",),
@@ -42,7 +42,7 @@ _HOMES = {
     "effects.choose": (
         "ChosenScene",
         "choose_effects",
-        "ledger_sentence",
+        "ledger_sentences",
         "ledger_summary",
         "ledger_table",
     ),

@@ -284,8 +284,8 @@ class FacetsOverride(AbstractOverride):
     @override
     def apply(self, request: Request, method: Method) -> Overridden | None:
         changed = [
-            Effect("", place, part, self._of(part))
-            for place, part in parts_of(request.scene)
+            Effect("", key_path, part, self._of(part))
+            for key_path, part in parts_of(request.scene)
             if isinstance(part, FacetQuadrature)
         ]
         scene = simplify(request.scene, changed)

@@ -161,7 +161,8 @@ def accuracy(
     settings |= {"overrides": ()} if no_overrides else {}
     study = pb.accuracy(data, **settings)
     pb.save_result(study, out)
-    table, advice = pb.accuracy_table(study), pb.accuracy_advice(study, tolerance)
+    table = pb.accuracy_table(study)
+    advice = " ".join(pb.accuracy_sentences(study, tolerance))
     if as_json:
         rows = json.loads(table.to_json(orient="index"))
         click.echo(json.dumps({"rows": rows, "advice": advice}, indent=2, allow_nan=False))

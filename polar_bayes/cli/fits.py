@@ -86,7 +86,7 @@ def fit(
             options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             scene = pb.choose_effects(data, progress=progress, **options)
-            click.echo(pb.ledger_sentence(scene.ledger), err=True)
+            click.echo(" ".join(pb.ledger_sentences(scene.ledger)), err=True)
         wish: dict[str, Any] = {"tolerance": tolerance} if is_auto else {}
         result = pb.fit(data, scene=scene, progress=progress, **wish, **settings)
     pb.save_result(result, out)
@@ -152,7 +152,10 @@ def effects(
     if as_json:
         click.echo(json.dumps(pb.ledger_summary(ledger), indent=2, allow_nan=False))
     else:
-        click.echo(f"{pb.ledger_table(ledger)}\n\n{pb.ledger_sentence(ledger)}")
+        table = pb.ledger_table(ledger)
+        table["result"] = table["result"].str.ljust(table["result"].str.len().max())
+        click.echo(table.to_string())
+        click.echo(f"\n{' '.join(pb.ledger_sentences(ledger))}")
 
 
 @command()

@@ -64,17 +64,16 @@ def identify(
 
     Returns:
         By `parameter`: `value` at the mode, `prior_sd`, `expected_sd` of the posterior,
-        `prior_share` of the information (1: the data say nothing; 0: the prior does not matter),
+        `prior_share` of the variance (1: the data add nothing; 0: the prior does not matter),
         `sensitivity` (by how many standard deviations of the noise one prior sd moves all readings
-        together, all else held); `paper_information` (the paper's sum of kappa S^2 over degrees of
-        polarization with Beta noise, all else held), `exact_information` (what the same readings
-        tell), both per squared unit of the parameter, and `paper_sd`, the posterior sd that the
-        paper's sum promises: these three NaN where no noise is Beta. `correlation` of two
-        parameters. By `direction`, weakest first: `information` that the data add to what the
-        prior has in that combination of the model's coordinates, and `weight` of each parameter in
-        it, in prior sds, and `movement`: by how many sds of the noise that
-        parameter's part alone moves the readings. (All parts together move them by the root of
-        `information`.)
+        together, all else fixed); `paper_information` (the paper's sum of kappa S^2 over degrees of
+        polarization with Beta noise, all else fixed), `exact_information` (the Fisher information
+        of the same readings), both per squared unit of the parameter, and `paper_sd`, the posterior
+        sd expected from the paper's sum: these three NaN where no noise is Beta. `correlation` of
+        two parameters. By `direction`, weakest first: `information` of the data over that of the
+        prior in that combination of the model's coordinates, `weight` of each parameter in it, in
+        prior sds, and `movement`: by how many sds of the noise that parameter's part alone moves
+        the readings. (All parts together move them by the root of `information`.)
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.

@@ -73,11 +73,10 @@ def profile(
 
     over all other parameters, those of the noise included, from the mode outwards in both
     directions. The values of $\theta$ at which it has fallen by less than 1.92 are the 95%
-    interval of the likelihood ratio. What is known of the instrument belongs to the likelihood:
-    the priors of its parameters stay whole (but for the one that is followed). Of all others a
-    thousandth of the log prior stays, so that what the data do not determine stays where it can be
-    found; the profile of the posterior has all of it (as a density of the unconstrained
-    coordinates).
+    interval of the likelihood ratio. The priors of the instrument's parameters belong to the
+    likelihood, except that of the profiled parameter. Of all other log priors the profile of the
+    likelihood keeps a thousandth, so that parameters that the data do not determine stay finite;
+    the profile of the posterior has all of them (as a density of the unconstrained coordinates).
 
     Args:
         capture: As for `polar_bayes.fit`; model, scene, priors, links, largest_view_zenith too.
@@ -437,16 +436,11 @@ def _on_default_grid(
 
     low, high = center - reach, center + reach
     curve = on_grid(grid(low, high))
-    is_open = [any(_is_open(value, end) for value in curve.value) for end in (0, -1)]
+    ends = [likelihood_interval(curve.grid, value)[2:] for value in curve.value]
+    open_below, open_above = np.any(ends, axis=0)
     lowest, highest = np.quantile(prior, [0.001, 0.999])
-    wider = (min(low, lowest) if is_open[0] else low, max(high, highest) if is_open[1] else high)
+    wider = (min(low, lowest) if open_below else low, max(high, highest) if open_above else high)
     return curve if wider == (low, high) else on_grid(grid(*wider))
-
-
-def _is_open(value: np.ndarray, end: int) -> bool:
-    """True where a profile has not fallen by 1.92 at the last point that converged."""
-    known = value[np.isfinite(value)]
-    return bool(known.size == 0 or known.max() - known[end] < DROP)
 
 
 def likelihood_interval(theta: np.ndarray, value: np.ndarray) -> tuple[float, float, bool, bool]:

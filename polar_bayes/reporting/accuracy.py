@@ -20,8 +20,8 @@ from matplotlib.transforms import Bbox
 from polar_bayes.benchmark.accuracy import AS_GIVEN
 from polar_bayes.benchmark.advice import (
     RESOLVED,
-    accuracy_advice,
-    accuracy_of,
+    accuracy_dataset,
+    accuracy_sentences,
     accuracy_table,
     parameter_errors,
 )
@@ -94,7 +94,7 @@ def plot_accuracy(
     Raises:
         FitError: It holds no accuracy study, or no such column.
     """
-    found = accuracy_of(result)
+    found = accuracy_dataset(result)
     table = accuracy_table(found)
     shown = list(times) if times is not None else _measured(table)
     strange = [name for name in shown if name not in TIME_LABELS]
@@ -258,9 +258,9 @@ def render_accuracy(result: xr.DataTree) -> str:
 
 def accuracy_section(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
     """What a page says of a study: advice, reference, figure and tables."""
-    found = accuracy_of(result)
+    found = accuracy_dataset(result)
     return {
-        "advice": accuracy_advice(found),
+        "advice": " ".join(accuracy_sentences(found)),
         "is_sound": not found.attrs["reference_doubts"],
         "reference": reference_sentence(found),
         "picture": accuracy_picture(found),
@@ -283,7 +283,7 @@ def accuracy_picture(found: xr.Dataset) -> Picture:
 
 def reference_sentence(result: xr.DataTree | xr.Dataset) -> str:
     """What the reference is, and how well it is known."""
-    told = accuracy_of(result).attrs
+    told = accuracy_dataset(result).attrs
     sentence = (
         f"The reference is {told['reference_draws']:,} draws of {told['reference']}, worth "
         f"{told['reference_effective_draws']:,.0f} independent ones; its own Monte Carlo error is "

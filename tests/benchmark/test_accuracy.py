@@ -14,7 +14,7 @@ from toy_models import capture, line, of_line, squared
 import polar_bayes as pb
 from polar_bayes.benchmark import run
 from polar_bayes.benchmark.accuracy import AS_GIVEN
-from polar_bayes.benchmark.reference import Judge, nearest, run_reference
+from polar_bayes.benchmark.reference import ReferenceRun, best_reference, run_reference
 from polar_bayes.benchmark.run import AbstractOverride, Trial, problem_of, run_fresh
 from polar_bayes.effects.variants import parts_of
 from polar_bayes.inference.mcse import errors_of, standard_errors
@@ -204,28 +204,29 @@ def test_every_override_has_a_name_of_its_own():
     assert len(set(names)) == len(names)
 
 
-def test_chains_that_miss_a_mode_hand_the_reference_over():
+def test_where_chains_miss_a_mode_tempered_draws_are_the_reference():
     request = resolve(capture(), squared, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    judge = run_reference(ROUGHLY, problem_of(request, jax.random.key(0)))
-    assert judge.made_by == "tempered draws"
-    assert not judge.doubts
+    reference = run_reference(ROUGHLY, problem_of(request, jax.random.key(0)))
+    assert reference.method == "tempered draws"
+    assert not reference.doubts
     # Its own error is that of the weights, too.
-    assert (judge.mean_error > 1.1 * standard_errors(judge.draws)[0]).all()
-    share = np.mean(judge.draws[judge.labels.index("root")] > 0.0)
+    assert (reference.mean_error > 1.1 * standard_errors(reference.draws)[0]).all()
+    share = np.mean(reference.draws[reference.labels.index("root")] > 0.0)
     assert abs(share - 0.5) < 5 * 0.5 * 0.05
 
 
-def judged(biases: tuple[str, ...], error: float) -> Judge:
+def judged(biases: tuple[str, ...], error: float) -> ReferenceRun:
     errors = np.array([error, 0.5 * error])
-    return Judge(("x", "y"), np.zeros((2, 4, 9)), "made", errors, errors, None, None, biases)
+    return ReferenceRun(("x", "y"), np.zeros((2, 4, 9)), "made", errors, errors, None, None, biases)
 
 
 def test_noise_is_no_reason_to_take_a_biased_reference():
     noisy, biased = judged((), 0.03)._replace(noise="its error is 0.03"), judged(("R-hat",), 0.001)
     assert len(noisy.doubts) == len(biased.doubts) == 1
-    assert nearest([biased, noisy]) is noisy
-    assert nearest([judged(("R-hat", "a mode"), 0.001), biased]) is biased
-    assert nearest([judged((), np.nan), noisy]) is nearest([noisy, judged((), np.nan)]) is noisy
+    assert best_reference([biased, noisy]) is noisy
+    assert best_reference([judged(("R-hat", "a mode"), 0.001), biased]) is biased
+    unknown = judged((), np.nan)
+    assert best_reference([unknown, noisy]) is best_reference([noisy, unknown]) is noisy
 
 
 def test_draws_chosen_by_weight_have_the_error_of_their_weights_too():

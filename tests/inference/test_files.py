@@ -79,7 +79,7 @@ OF_CALIBRATIONS = (
     lambda tree: pb.show(tree)._repr_html_(),
     lambda tree: pb.compare_calibrations({"this": tree, "that": CALIBRATION}),
 )
-OF_STUDIES = (pb.accuracy_table, pb.accuracy_advice, lambda tree: pb.show(tree)._repr_html_())
+OF_STUDIES = (pb.accuracy_table, pb.accuracy_sentences, lambda tree: pb.show(tree)._repr_html_())
 
 
 def check_mutations(trees, functions, random, count):
@@ -218,7 +218,7 @@ def test_a_study_of_nothing_is_refused(dim):
     study = make_accuracy()
     study["accuracy"] = xr.DataTree(study["accuracy"].to_dataset().isel({dim: slice(0)}))
     with pytest.raises(pb.FitError, match="accuracy: it is empty"):
-        pb.accuracy_advice(study)
+        pb.accuracy_sentences(study)
 
 
 @pytest.mark.parametrize("number", [1596, 2340, 2419])
