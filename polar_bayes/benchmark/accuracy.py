@@ -89,7 +89,7 @@ def accuracy(
 
     Args:
         capture: A Dataset of the capture schema; validated here.
-        methods: Methods by name; by default `polar_bayes.LADDER`.
+        methods: Methods by name; by default `polar_bayes.methods.LADDER`.
         overrides: What else is changed, one at a time, on every method; `()` for the methods alone.
         reference: How well the reference posterior must be known.
         fresh: True runs every trial in a process of its own, so that the first time includes all
@@ -106,7 +106,7 @@ def accuracy(
     Returns:
         A tree whose group `accuracy` has a row for each method and override (coordinates `method`
         and `override`), and by row and parameter the distances from the reference; see the
-        attribute `long_name` of each variable. `polar_bayes.accuracy_table`,
+        attribute `long_name` of each variable. `polar_bayes.benchmark.accuracy_table`,
         `accuracy_sentences` and `plot_accuracy` read it.
 
     Raises:
@@ -166,7 +166,7 @@ def _trials(
             raise FitError(
                 f"a {type(method).__name__} is not a method",
                 where=f"accuracy: methods[{name!r}]",
-                hint="give settings such as polar_bayes.Nuts()",
+                hint="give settings such as polar_bayes.methods.Nuts()",
             )
         trials[str(name), AS_GIVEN] = Trial(request, method, request.seed)
     for override in overrides:
