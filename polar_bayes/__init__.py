@@ -18,10 +18,10 @@ _HOMES = {
     "benchmark.run": ("DrawsDial", "EffectsDial", "FacetsDial", "PrecisionDial"),
     "calibration.calibrate": ("calibrate",),
     "calibration.files": ("holds_calibration", "load_calibration"),
-    "calibration.predictive": ("calibration_readings",),
     "calibration.replicates": ("proxy_coverage", "proxy_scores", "retest"),
     "calibration.scores": ("is_calibrated",),
     "calibration.verdict": (
+        "calibration_readings",
         "calibration_table",
         "calibration_verdict",
         "compare_calibrations",
