@@ -1,4 +1,8 @@
-"""May these numbers be quoted? A table of every parameter and a verdict in plain sentences."""
+"""Convergence: a table of every parameter, and a verdict on the fit in sentences.
+
+Source: Vehtari et al. (2021), Bayesian Analysis 16(2) (R-hat, ESS); Vehtari et al. (2024), JMLR
+25(72) (Pareto k-hat).
+"""
 
 import dataclasses
 import math
@@ -12,6 +16,7 @@ from arviz_stats.base import array_stats
 
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
+    CENTRAL_95,
     Scalar,
     method_of,
     posterior_scalars,
@@ -21,26 +26,25 @@ from polar_bayes.inference.result import bounds_of, provenance_of
 from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
-INTERVAL = (0.025, 0.975)
 TAILS = (0.05, 0.95)
 LARGEST_R_HAT = 1.01
 SMALLEST_ESS = 400
 LARGEST_K_HAT = 0.7
-LARGEST_SECOND_MODE = 0.01
-MANY_MASKED = 0.25
-MANY_DEEP = 0.01
-LONGEST_LIST = 4
+MAX_SECOND_MODE = 0.01
+MAX_MASKED = 0.25
+MAX_DEEP_TREES = 0.01
+MAX_LISTED = 4
 ROUNDING = 1e-6
-"""How far draws in single precision may lie beyond the end of their prior."""
-HEAVIEST = ", and only the heaviest is described here; use method='nuts', or "
+"""Tolerance of draws in single precision at the ends of their prior."""
+ONLY_HEAVIEST = ", and only the heaviest is described here; use method='nuts', or "
 OTHER_MODES = {
-    "laplace": HEAVIEST,
-    "variational": HEAVIEST,
+    "laplace": ONLY_HEAVIEST,
+    "variational": ONLY_HEAVIEST,
     "importance": ", and the draws are of both; a mean may lie between them; ",
     "nuts": ", and chains may not have visited them in proportion; compare chains in the rank "
     "plot, or ",
 }
-"""What methods make of a further mode; of one's own nothing is known."""
+"""The effect of a further mode on the results of each method."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,8 +80,8 @@ def summary(result: xr.DataTree) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index([s.label for s in found]))
 
 
-def verdict(result: xr.DataTree) -> Verdict:
-    """Whether the numbers of a fit may be used, and what a reader of them should know.
+def verdict(result: xr.DataTree, table: pd.DataFrame | None = None) -> Verdict:
+    """Whether the numbers of a fit may be used, and cautions for their reader.
 
     Sampling fails on any R-hat above 1.01, any effective sample size below 400 and any divergence;
     every method fails on a draw that is not finite or that its prior or physics rules out, on draws
@@ -85,6 +89,7 @@ def verdict(result: xr.DataTree) -> Verdict:
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+        table: Its `summary`, if it is computed already.
 
     Returns:
         The verdict; its sentences name the parameter, the number and the remedy.
@@ -92,25 +97,25 @@ def verdict(result: xr.DataTree) -> Verdict:
     Raises:
         FitError: The tree holds no posterior.
     """
-    return judge(result, summary(result))
-
-
-def judge(result: xr.DataTree, table: pd.DataFrame) -> Verdict:
-    """The verdict of `verdict`, from a table that is already there."""
+    table = summary(result) if table is None else table
     method, provenance = method_of(result), provenance_of(result)
-    problems = [f"{_sentence(problem)}." for problem in provenance.get("problems", ())]
     found = posterior_scalars(result)
-    problems += _not_finite(found, method) + _impossible(found, provenance)
+    noted = (str(problem).rstrip(".") for problem in provenance.get("problems", ()))
+    problems = [
+        *(f"{text[:1].upper()}{text[1:]}." for text in noted),
+        *_not_finite(found, method),
+        *_out_of_range(found, provenance),
+    ]
     if method != "point":
-        problems += _frozen(found, provenance)
+        problems += _constant(found, provenance)
     if method == "nuts":
-        problems += _chains_disagree(table) + _divergences(result)
+        problems += _not_converged(table) + _divergences(result)
     cautions = [
         *_approximation(result, method),
         *_several_modes(provenance),
         *_deep_trees(result),
         *_undetermined_point(table, method),
-        *_readings(provenance.get("counts", {})),
+        *_masked_or_moved(provenance.get("counts", {})),
     ]
     return Verdict(not problems, tuple(problems), tuple(cautions))
 
@@ -129,19 +134,19 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
         FitError: The tree holds no posterior.
     """
     table, provenance = summary(result), provenance_of(result)
-    judged = judge(result, table)
+    found = verdict(result, table)
     shown = [column for column in COLUMNS if column != "mcse_mean"]
-    said = {key: provenance.get(key) for key in ("model", "scene", "seed", "counts", "timings")}
+    about = {key: provenance.get(key) for key in ("model", "scene", "seed", "counts", "timings")}
     return {
         "parameters": {
             str(label): {column: _number(row[column]) for column in shown}
             for label, row in table.iterrows()
         },
-        "converged": judged.converged,
-        "problems": list(judged.problems),
-        "cautions": list(judged.cautions),
+        "converged": found.converged,
+        "problems": list(found.problems),
+        "cautions": list(found.cautions),
         "method": method_of(result),
-        **said,
+        **about,
     }
 
 
@@ -166,26 +171,26 @@ def laplace_k_hat(result: xr.DataTree) -> float:
 
 def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
     draws = np.stack([scalar.draws for scalar in found])
-    # A draw that is not finite spoils its whole row, visibly, and no other.
-    whole = np.isfinite(draws).all(axis=(1, 2))
+    # A draw that is not finite makes its whole row NaN, and no other.
+    finite = np.isfinite(draws).all(axis=(1, 2))
     rows = np.full((len(found), len(COLUMNS)), np.nan)
     if draws[0].size == 1:  # one draw is a number without a width
-        rows[whole, 0] = draws[whole, 0, 0]
+        rows[finite, 0] = draws[finite, 0, 0]
         return rows
-    if not whole.any():
+    if not finite.any():
         return rows
-    kept = draws[whole]
-    flat = kept.reshape(len(kept), -1)
+    draws = draws[finite]
+    flat = draws.reshape(len(draws), -1)
     with np.errstate(all="ignore"):  # R-hat of a parameter that never moved is 0/0
-        rows[whole] = np.stack(
+        rows[finite] = np.stack(
             [
                 flat.mean(axis=1),
                 flat.std(axis=1, ddof=1),
-                *np.quantile(flat, INTERVAL, axis=1),
-                array_stats.rhat(kept),
-                array_stats.ess(kept, method="bulk"),
-                array_stats.ess(kept, method="tail", prob=TAILS),
-                array_stats.mcse(kept, method="mean"),
+                *np.quantile(flat, CENTRAL_95, axis=1),
+                array_stats.rhat(draws),
+                array_stats.ess(draws, method="bulk"),
+                array_stats.ess(draws, method="tail", prob=TAILS),
+                array_stats.mcse(draws, method="mean"),
             ],
             axis=1,
         )
@@ -194,31 +199,28 @@ def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
 
 def _point_rows(result: xr.DataTree, found: Sequence[Scalar]) -> np.ndarray:
     errors = provenance_of(result).get("standard_errors", {})
+    stated = {name: iter(values) for name, values in errors.items()}
     rows = np.full((len(found), len(COLUMNS)), np.nan)
-    rows[:, 0] = [scalar.draws.mean() for scalar in found]
-    place: dict[str, int] = {}
-    for row, scalar in enumerate(found):
-        stated, at = errors.get(scalar.name, []), place.get(scalar.name, 0)
-        place[scalar.name] = at + 1
-        if at < len(stated) and stated[at] is not None:
-            rows[row, 1] = stated[at]
+    for row, scalar in zip(rows, found, strict=True):
+        error = next(stated.get(scalar.name, iter(())), None)
+        row[:2] = scalar.draws.mean(), math.nan if error is None else error
     return rows
 
 
 def _not_finite(found: Iterable[Scalar], method: str) -> list[str]:
-    bad = {s.label: float(np.mean(~np.isfinite(s.draws))) for s in found}
-    bad = {label: share for label, share in bad.items() if share > 0.0}
+    shares = {s.label: float(np.mean(~np.isfinite(s.draws))) for s in found}
+    bad = {label: share for label, share in shares.items() if share > 0.0}
     if not bad:
         return []
-    remedy = {
+    hint = {
         "laplace": "the posterior is flat or open at its mode, so use method='nuts'",
         "point": "give starting values a chance with narrower priors",
     }.get(method, "check the readings that the fit could not explain, or narrow the priors")
-    return [f"Not finite: {_list(bad, lambda x: f'{x:.0%} of its draws')}; {remedy}."]
+    return [f"Not finite: {_list(bad, lambda x: f'{x:.0%} of its draws')}; {hint}."]
 
 
-def _impossible(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]:
-    """Draws beyond the ends of their prior, or beyond what the parameter can be at all."""
+def _out_of_range(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]:
+    """Draws outside their prior, or outside the physical range of the parameter."""
     bad = {}
     for scalar in found:
         if scalar.name in (provenance.get("declared") or {}):
@@ -226,10 +228,9 @@ def _impossible(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[
         least, most = RANGES.get(scalar.name, (-math.inf, math.inf))
         low, high = bounds_of(provenance, scalar.name)
         low, high = max(low, least), min(high, most)
-        slack = [
-            ROUNDING * max(1.0, abs(end)) if math.isfinite(end) else 0.0 for end in (low, high)
-        ]
-        outside = (scalar.draws < low - slack[0]) | (scalar.draws > high + slack[1])
+        ends = np.array([low, high])
+        lowest, highest = ends + np.array([-ROUNDING, ROUNDING]) * np.maximum(1.0, abs(ends))
+        outside = (scalar.draws < lowest) | (scalar.draws > highest)
         if share := float(np.mean(outside & np.isfinite(scalar.draws))):
             bad[f"{scalar.label} [{low:g}, {high:g}]"] = share
     if not bad:
@@ -240,8 +241,8 @@ def _impossible(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[
     ]
 
 
-def _frozen(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]:
-    """Parameters whose draws say nothing of a width, but for those that were held fixed."""
+def _constant(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]:
+    """Parameters whose draws are all equal, without those that were held fixed."""
     free = (s for s in found if s.name not in (provenance.get("fixed") or {}))
     same = {s.label: 0.0 for s in free if s.draws.min() == s.draws.max()}
     if not same:
@@ -252,22 +253,22 @@ def _frozen(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]
     ]
 
 
-def _chains_disagree(table: pd.DataFrame) -> list[str]:
+def _not_converged(table: pd.DataFrame) -> list[str]:
     problems = []
     r_hat = table["r_hat"]
-    unequal = r_hat[~(r_hat <= LARGEST_R_HAT)].sort_values(ascending=False)
-    if len(unequal):
+    high = r_hat[~(r_hat <= LARGEST_R_HAT)].sort_values(ascending=False)
+    if len(high):
         problems.append(
-            f"R-hat above {LARGEST_R_HAT}: {_list(unequal, lambda x: f'{x:.4g}')}; the chains "
+            f"R-hat above {LARGEST_R_HAT}: {_list(high, lambda x: f'{x:.4g}')}; the chains "
             "have not found one distribution, so sample longer, as in Nuts(warmup=1000, "
             "most_draws=20000), and look at the pair plot for several modes."
         )
-    for column, part, place in (("ess_bulk", "Bulk", "center"), ("ess_tail", "Tail", "interval")):
+    for column, part, what in (("ess_bulk", "Bulk", "center"), ("ess_tail", "Tail", "interval")):
         few = table[column][~(table[column] >= SMALLEST_ESS)].sort_values()
         if len(few):
             problems.append(
                 f"{part} ESS below {SMALLEST_ESS}: {_list(few, lambda x: f'{np.floor(x):.0f}')}; "
-                f"the {place} is not known well enough, so sample longer, as in "
+                f"the {what} is not known well enough, so sample longer, as in "
                 "Nuts(most_draws=20000)."
             )
     return problems
@@ -305,7 +306,7 @@ def _approximation(result: xr.DataTree, method: str) -> list[str]:
 
 def _several_modes(provenance: Mapping[str, Any]) -> list[str]:
     weights = (provenance.get("modes") or {}).get("weights", [])
-    if len(weights) < 2 or not weights[1] > LARGEST_SECOND_MODE:
+    if len(weights) < 2 or not weights[1] > MAX_SECOND_MODE:
         return []
     method = str(provenance.get("method", "laplace"))
     return [
@@ -319,7 +320,7 @@ def _deep_trees(result: xr.DataTree) -> list[str]:
     if "reached_max_treedepth" not in stats:
         return []
     count, size = int(stats["reached_max_treedepth"].sum()), stats["reached_max_treedepth"].size
-    if count <= MANY_DEEP * size:
+    if count <= MAX_DEEP_TREES * size:
         return []
     return [
         f"{count} of {size} draws reached the largest tree depth: steps were cut short, which "
@@ -337,10 +338,10 @@ def _undetermined_point(table: pd.DataFrame, method: str) -> list[str]:
     ]
 
 
-def _readings(counts: Mapping[str, Any]) -> list[str]:
+def _masked_or_moved(counts: Mapping[str, Any]) -> list[str]:
     cautions = []
     total, masked = counts.get("views") or 0, counts.get("masked") or 0
-    if total and masked / total > MANY_MASKED:
+    if total and masked / total > MAX_MASKED:
         cautions.append(
             f"{masked} of {total} readings are marked valid=False: the rest may not be a fair "
             "sample of the angles."
@@ -356,15 +357,9 @@ def _readings(counts: Mapping[str, Any]) -> list[str]:
 
 def _list(values: Mapping[Any, float] | pd.Series, number: Callable[[float], str] | None) -> str:
     """`roughness 1.08, absorption[450] 1.03 and 2 more`."""
-    items = [
-        f"{label} {number(value)}" if number else str(label) for label, value in values.items()
-    ]
-    shown, more = items[:LONGEST_LIST], len(items) - LONGEST_LIST
+    items = [f"{label} {number(x)}" if number else str(label) for label, x in values.items()]
+    shown, more = items[:MAX_LISTED], len(items) - MAX_LISTED
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
-
-
-def _sentence(text: str) -> str:
-    return (text[:1].upper() + text[1:]).rstrip(".")
 
 
 def _number(value: float) -> float | None:

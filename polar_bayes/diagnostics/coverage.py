@@ -97,9 +97,8 @@ def map_scalars(maps: xr.Dataset) -> list[Scalar]:
     names = [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
     if not names or "status" not in maps:
         raise FitError("it holds no maps", where="maps", hint="give what fit_pixels returns")
-    # An empty corner has the axes and labels of a posterior, and nothing is read.
-    corner = maps[names].isel({dim: slice(1) for dim in IMAGE}).drop_vars(IMAGE, errors="ignore")
-    return scalars(xr.zeros_like(corner).rename(dict(zip(IMAGE, ("chain", "draw"), strict=True))))
+    # One pixel of zeros has the axes and labels of all, and nothing is read from a store.
+    return scalars(xr.zeros_like(maps[names].isel({dim: slice(1) for dim in IMAGE})), IMAGE)
 
 
 def _truth_of(maps: xr.Dataset, truth: xr.Dataset, name: str) -> xr.DataArray | None:

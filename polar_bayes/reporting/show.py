@@ -17,7 +17,7 @@ from polar_bayes.calibration.verdict import (
     calibration_verdict,
     parameter_deviation,
 )
-from polar_bayes.diagnostics.convergence import judge, summary
+from polar_bayes.diagnostics.convergence import summary, verdict
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.diagnostics.parameters import method_of, posterior_scalars
 from polar_bayes.diagnostics.sensitivity import sensitivity
@@ -56,7 +56,7 @@ def show(result: xr.DataTree | xr.Dataset) -> Card:
 def _of_fit(result: xr.DataTree) -> Card:
     found, table = posterior_scalars(result), summary(result)
     method, provenance = method_of(result), provenance_of(result)
-    judged, prior = judge(result, table), sensitivity(result)
+    judged, prior = verdict(result, table), sensitivity(result)
     posterior = result["posterior"].to_dataset()
     determined = text.determined(found, prior, posterior) if judged.converged else []
     said = [
