@@ -6,7 +6,7 @@ Source: Vehtari et al. (2021), Bayesian Analysis 16(2) (R-hat, ESS); Vehtari et 
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -101,23 +101,17 @@ def verdict(result: xr.DataTree, table: pd.DataFrame | None = None) -> Verdict:
     method, provenance = method_of(result), provenance_of(result)
     found = posterior_scalars(result)
     noted = (str(problem).rstrip(".") for problem in provenance.get("problems", ()))
-    problems = [
-        *(f"{text[:1].upper()}{text[1:]}." for text in noted),
-        *_not_finite(found, method),
-        *_out_of_range(found, provenance),
-    ]
-    if method != "point":
-        problems += _constant(found, provenance)
+    problems = [f"{text[:1].upper()}{text[1:]}." for text in noted]
+    problems += _draw_problems(found, method, provenance)
     if method == "nuts":
-        problems += _not_converged(table) + _divergences(result)
-    cautions = [
-        *_approximation(result, method),
-        *_several_modes(provenance),
-        *_deep_trees(result),
-        *_undetermined_point(table, method),
-        *_masked_or_moved(provenance.get("counts", {})),
-    ]
-    return Verdict(not problems, tuple(problems), tuple(cautions))
+        problems += _chain_problems(result, table)
+    cautions = (
+        *_approximation_cautions(result, method),
+        *_mode_cautions(provenance),
+        *_estimate_cautions(result, table, method),
+        *_reading_cautions(provenance.get("counts", {})),
+    )
+    return Verdict(not problems, tuple(problems), cautions)
 
 
 def json_summary(result: xr.DataTree) -> dict[str, Any]:
@@ -207,159 +201,138 @@ def _point_rows(result: xr.DataTree, found: Sequence[Scalar]) -> np.ndarray:
     return rows
 
 
-def _not_finite(found: Iterable[Scalar], method: str) -> list[str]:
-    shares = {s.label: float(np.mean(~np.isfinite(s.draws))) for s in found}
-    bad = {label: share for label, share in shares.items() if share > 0.0}
-    if not bad:
-        return []
-    hint = {
-        "laplace": "the posterior is flat or open at its mode, so use method='nuts'",
-        "point": "give starting values a chance with narrower priors",
-    }.get(method, "check the readings that the fit could not explain, or narrow the priors")
-    return [f"Not finite: {_list(bad, lambda x: f'{x:.0%} of its draws')}; {hint}."]
-
-
-def _out_of_range(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]:
-    """Draws outside their prior, or outside the physical range of the parameter."""
-    bad = {}
-    for scalar in found:
-        if scalar.name in (provenance.get("declared") or {}):
-            continue  # a model of the user's own may give any name to anything
-        least, most = RANGES.get(scalar.name, (-math.inf, math.inf))
-        low, high = bounds_of(provenance, scalar.name)
-        low, high = max(low, least), min(high, most)
-        ends = np.array([low, high])
-        lowest, highest = ends + np.array([-ROUNDING, ROUNDING]) * np.maximum(1.0, abs(ends))
-        outside = (scalar.draws < lowest) | (scalar.draws > highest)
-        if share := float(np.mean(outside & np.isfinite(scalar.draws))):
-            bad[f"{scalar.label} [{low:g}, {high:g}]"] = share
-    if not bad:
-        return []
-    return [
-        f"Outside its range: {_list(bad, lambda x: f'{x:.0%} of its draws')}; no fit gives such "
-        "values, so the result was changed or damaged: fit the capture again."
-    ]
-
-
-def _constant(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]:
-    """Parameters whose draws are all equal, without those that were held fixed."""
+def _draw_problems(
+    found: Sequence[Scalar], method: str, provenance: Mapping[str, Any]
+) -> Iterator[str]:
+    """Draws that are not finite, out of range, or all equal."""
+    if infinite := _percentages((s.label, ~np.isfinite(s.draws)) for s in found):
+        hint = {
+            "laplace": "the posterior is flat or open at its mode, so use method='nuts'",
+            "point": "give starting values a chance with narrower priors",
+        }.get(method, "check the readings that the fit could not explain, or narrow the priors")
+        yield f"Not finite: {infinite}; {hint}."
+    declared = provenance.get("declared") or {}  # a user's model may give any name to anything
+    known = (s for s in found if s.name not in declared)
+    if outside := _percentages(_out_of_range(scalar, provenance) for scalar in known):
+        yield (
+            f"Outside its range: {outside}; no fit gives such values, so the result was changed or "
+            "damaged: fit the capture again."
+        )
     free = (s for s in found if s.name not in (provenance.get("fixed") or {}))
-    same = {s.label: 0.0 for s in free if s.draws.min() == s.draws.max()}
-    if not same:
-        return []
-    return [
-        f"All draws are equal: {_list(same, None)}; nothing is known of the width of the "
-        "posterior, so fit again with more draws, or hold the parameter fixed."
-    ]
+    equal = [s.label for s in free if s.draws.min() == s.draws.max()]
+    if equal and method != "point":
+        yield (
+            f"All draws are equal: {_list(equal)}; nothing is known of the width of the posterior, "
+            "so fit again with more draws, or hold the parameter fixed."
+        )
 
 
-def _not_converged(table: pd.DataFrame) -> list[str]:
-    problems = []
+def _out_of_range(scalar: Scalar, provenance: Mapping[str, Any]) -> tuple[str, np.ndarray]:
+    """Finite draws outside the prior, or outside the physical range of the parameter."""
+    least, most = RANGES.get(scalar.name, (-math.inf, math.inf))
+    low, high = bounds_of(provenance, scalar.name)
+    ends = np.array([max(low, least), min(high, most)])
+    low, high = ends + np.array([-ROUNDING, ROUNDING]) * np.maximum(1.0, abs(ends))
+    outside = (scalar.draws < low) | (scalar.draws > high)
+    label = f"{scalar.label} [{ends[0]:g}, {ends[1]:g}]"
+    return label, outside & np.isfinite(scalar.draws)
+
+
+def _percentages(flags: Iterable[tuple[str, np.ndarray]]) -> str:
+    """`roughness 3% of its draws` of each parameter that has flagged draws; empty without any."""
+    return _list(f"{label} {bad.mean():.0%} of its draws" for label, bad in flags if bad.any())
+
+
+def _chain_problems(result: xr.DataTree, table: pd.DataFrame) -> Iterator[str]:
+    """Chains that disagree, are too short, or have diverged."""
     r_hat = table["r_hat"]
     high = r_hat[~(r_hat <= LARGEST_R_HAT)].sort_values(ascending=False)
     if len(high):
-        problems.append(
-            f"R-hat above {LARGEST_R_HAT}: {_list(high, lambda x: f'{x:.4g}')}; the chains "
-            "have not found one distribution, so sample longer, as in Nuts(warmup=1000, "
+        yield (
+            f"R-hat above {LARGEST_R_HAT}: {_list(f'{n} {x:.4g}' for n, x in high.items())}; the "
+            "chains have not found one distribution, so sample longer, as in Nuts(warmup=1000, "
             "most_draws=20000), and look at the pair plot for several modes."
         )
-    for column, part, what in (("ess_bulk", "Bulk", "center"), ("ess_tail", "Tail", "interval")):
-        few = table[column][~(table[column] >= SMALLEST_ESS)].sort_values()
-        if len(few):
-            problems.append(
-                f"{part} ESS below {SMALLEST_ESS}: {_list(few, lambda x: f'{np.floor(x):.0f}')}; "
-                f"the {what} is not known well enough, so sample longer, as in "
-                "Nuts(most_draws=20000)."
+    for column, part, estimate in (
+        ("ess_bulk", "Bulk", "center"),
+        ("ess_tail", "Tail", "interval"),
+    ):
+        low = table[column][~(table[column] >= SMALLEST_ESS)].sort_values()
+        if len(low):
+            numbers = _list(f"{label} {np.floor(x):.0f}" for label, x in low.items())
+            yield (
+                f"{part} ESS below {SMALLEST_ESS}: {numbers}; the {estimate} is not known well "
+                "enough, so sample longer, as in Nuts(most_draws=20000)."
             )
-    return problems
-
-
-def _divergences(result: xr.DataTree) -> list[str]:
     diverging = stats_of(result).get("diverging")
-    count = 0 if diverging is None else int(diverging.sum())
-    if diverging is None or not count:
-        return []
-    return [
-        f"{count} of {diverging.size} draws diverged: the sampler could not follow a sharp corner "
-        "of the posterior and may have missed part of it, so raise target_acceptance, as in "
-        "Nuts(target_acceptance=0.99), or narrow the priors."
-    ]
+    if diverging is not None and diverging.any():
+        yield (
+            f"{int(diverging.sum())} of {diverging.size} draws diverged: the sampler could not "
+            "follow a sharp corner of the posterior and may have missed part of it, so raise "
+            "target_acceptance, as in Nuts(target_acceptance=0.99), or narrow the priors."
+        )
 
 
-def _approximation(result: xr.DataTree, method: str) -> list[str]:
-    if method not in APPROXIMATIONS:
-        return []
-    stats = stats_of(result)
+def _approximation_cautions(result: xr.DataTree, method: str) -> Iterator[str]:
+    if method not in APPROXIMATIONS or "log_weight" not in stats_of(result):
+        return
     k_hat = laplace_k_hat(result)
-    if "log_weight" not in stats or k_hat <= LARGEST_K_HAT:
-        return []
-    whose, what = (
-        ("the Laplace draws", "a normal distribution")
-        if method == "laplace"
-        else ("the guide's draws", "the guide")
-    )
-    return [
-        f"Pareto k-hat of {whose} is {k_hat:.2f} (at most {LARGEST_K_HAT}): the posterior is not "
-        f"close to {what}; use method='nuts' for intervals."
-    ]
+    if not k_hat <= LARGEST_K_HAT:
+        draws, shape = ("the guide's draws", "the guide")
+        if method == "laplace":
+            draws, shape = ("the Laplace draws", "a normal distribution")
+        yield (
+            f"Pareto k-hat of {draws} is {k_hat:.2f} (at most {LARGEST_K_HAT}): the posterior is "
+            f"not close to {shape}; use method='nuts' for intervals."
+        )
 
 
-def _several_modes(provenance: Mapping[str, Any]) -> list[str]:
+def _mode_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
     weights = (provenance.get("modes") or {}).get("weights", [])
-    if len(weights) < 2 or not weights[1] > MAX_SECOND_MODE:
-        return []
-    method = str(provenance.get("method", "laplace"))
-    return [
-        f"The posterior has another mode, of weight {weights[1]:.2g}: another explanation of the "
-        f"readings exists{OTHER_MODES.get(method, '; ')}add views that tell them apart."
-    ]
+    if len(weights) > 1 and weights[1] > MAX_SECOND_MODE:
+        effect = OTHER_MODES.get(str(provenance.get("method", "laplace")), "; ")
+        yield (
+            f"The posterior has another mode, of weight {weights[1]:.2g}: another explanation of "
+            f"the readings exists{effect}add views that tell them apart."
+        )
 
 
-def _deep_trees(result: xr.DataTree) -> list[str]:
-    stats = stats_of(result)
-    if "reached_max_treedepth" not in stats:
-        return []
-    count, size = int(stats["reached_max_treedepth"].sum()), stats["reached_max_treedepth"].size
-    if count <= MAX_DEEP_TREES * size:
-        return []
-    return [
-        f"{count} of {size} draws reached the largest tree depth: steps were cut short, which "
-        "biases nothing but makes draws alike; raise it, as in Nuts(max_tree_depth=10)."
-    ]
+def _estimate_cautions(result: xr.DataTree, table: pd.DataFrame, method: str) -> Iterator[str]:
+    deep = stats_of(result).get("reached_max_treedepth")
+    if deep is not None and deep.sum() > MAX_DEEP_TREES * deep.size:
+        yield (
+            f"{int(deep.sum())} of {deep.size} draws reached the largest tree depth: steps were "
+            "cut short, which biases nothing but makes draws alike; raise it, as in "
+            "Nuts(max_tree_depth=10)."
+        )
+    undetermined = table.index[table["sd"].isna()]
+    if method == "point" and len(undetermined):
+        yield (
+            f"No standard error: {_list(dict.fromkeys(undetermined))}; least squares does not "
+            "determine such values, so they say nothing."
+        )
 
 
-def _undetermined_point(table: pd.DataFrame, method: str) -> list[str]:
-    open_ = table.index[table["sd"].isna()] if method == "point" else ()
-    if not len(open_):
-        return []
-    return [
-        f"No standard error: {_list(dict.fromkeys(open_, 0.0), None)}; least squares does not "
-        "determine such values, so they say nothing."
-    ]
-
-
-def _masked_or_moved(counts: Mapping[str, Any]) -> list[str]:
-    cautions = []
+def _reading_cautions(counts: Mapping[str, Any]) -> Iterator[str]:
     total, masked = counts.get("views") or 0, counts.get("masked") or 0
     if total and masked / total > MAX_MASKED:
-        cautions.append(
+        yield (
             f"{masked} of {total} readings are marked valid=False: the rest may not be a fair "
             "sample of the angles."
         )
     for name, count in (counts.get("at_margin") or {}).items():
         if count:
-            cautions.append(
+            yield (
                 f"{count} readings of {name} lie at the edge of their range and were moved to "
                 "the link's margin: their noise is not what the link describes."
             )
-    return cautions
 
 
-def _list(values: Mapping[Any, float] | pd.Series, number: Callable[[float], str] | None) -> str:
+def _list(items: Iterable[str]) -> str:
     """`roughness 1.08, absorption[450] 1.03 and 2 more`."""
-    items = [f"{label} {number(x)}" if number else str(label) for label, x in values.items()]
-    shown, more = items[:MAX_LISTED], len(items) - MAX_LISTED
-    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+    items = list(items)
+    more = len(items) - MAX_LISTED
+    return ", ".join(items[:MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _number(value: float) -> float | None:
