@@ -79,7 +79,7 @@ class LeastSquares:
             self.drawn = draw_captures(
                 story, data, np.arange(study.simulations), jax.random.fold_in(key, 1)
             )
-            starts = from_prior(self.program, key, pb.Point().starts, data)
+            starts = from_prior(self.program, key, pb.methods.Point().starts, data)
         self._run = jax.jit(lambda own, shared: _each(self.program, own, shared, starts))
 
     def __call__(self) -> Found:
