@@ -61,7 +61,7 @@ def tried(case: Case, found: xr.DataTree, number: int, keep: Path) -> tuple[str,
             scene=case.scene,
             links=case.links,
             rungs={rung: pb.methods.LADDER[rung]},
-            dials=(),
+            overrides=(),
             fresh=False,
             seed=1,
         )
@@ -94,14 +94,14 @@ def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]])
     ]
     for name, found in studies.items():
         rows = pb.benchmark.accuracy_table(found)
-        noise = float(accuracy_of(found).attrs["reference_error"])
+        noise = float(accuracy_dataset(found).attrs["reference_error"])
         cells = [_cell(rows, rung) for rung in pb.methods.LADDER]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {noise:.2g} |")
     lines += ["", "| scene | advice | the best_method method on another capture |", "|---|---|---|"]
     for name, found in studies.items():
         rung, error = trials[name]
         seen = "" if np.isnan(error) else f"{rung}: {error:.2g} sd"
-        lines.append(f"| {name} | {pb.benchmark.accuracy_advice(found, TOLERANCE)} | {seen} |")
+        lines.append(f"| {name} | {pb.benchmark.accuracy_sentences(found, TOLERANCE)} | {seen} |")
     return "\n".join(lines)
 
 

@@ -49,7 +49,7 @@ study = pb.accuracy(
     scene=plate,
     links=links,
     rungs={name: pb.methods.LADDER[name] for name in names},
-    dials=(),
+    overrides=(),
     fresh=False,
     reference=pb.benchmark.Reference(error=0.03),
 )
@@ -73,7 +73,7 @@ pb.plots.plot_accuracy(study)
 # The same as a sentence:
 
 # %%
-print(pb.benchmark.accuracy_advice(study))
+print(pb.benchmark.accuracy_sentences(study))
 
 # %% [markdown]
 # That is said of this capture. With more readings a posterior comes closer to a normal

@@ -89,9 +89,9 @@ def accuracy(
 
     Args:
         capture: A Dataset of the capture schema; validated here.
-        rungs: Methods by name; by default `polar_bayes.methods.LADDER`.
-        dials: What else is turned, one at a time, on every rung; `()` for the rungs alone.
-        reference: How well the posterior that all are judged by must be known.
+        methods: Methods by name; by default `polar_bayes.methods.LADDER`.
+        overrides: What else is changed, one at a time, on every method; `()` for the methods alone.
+        reference: How well the reference posterior must be known.
         fresh: True runs every trial in a process of its own, so that the first time includes all
             compilation and the memory is its own. False runs them here: much faster, but without
             first times and memory, which would not be theirs.
@@ -104,10 +104,10 @@ def accuracy(
         progress: Called with the name of a stage and the fraction of it that is done.
 
     Returns:
-        A tree whose group `accuracy` has a row for each rung and dial (coordinates `rung` and
-        `dial`), and by row and parameter the distances from the reference; see the attribute
-        `long_name` of each variable. `polar_bayes.benchmark.accuracy_table`, `accuracy_advice` and
-        `plot_accuracy` read it.
+        A tree whose group `accuracy` has a row for each method and override (coordinates `method`
+        and `override`), and by row and parameter the distances from the reference; see the
+        attribute `long_name` of each variable. `polar_bayes.benchmark.accuracy_table`,
+        `accuracy_sentences` and `plot_accuracy` read it.
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.
@@ -165,7 +165,7 @@ def _trials(
         if not isinstance(method, Method):
             raise FitError(
                 f"a {type(method).__name__} is not a method",
-                where=f"accuracy: rungs[{name!r}]",
+                where=f"accuracy: methods[{name!r}]",
                 hint="give settings such as polar_bayes.methods.Nuts()",
             )
         trials[str(name), AS_GIVEN] = Trial(request, method, request.seed)

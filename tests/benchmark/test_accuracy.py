@@ -80,11 +80,11 @@ def study() -> xr.DataTree:
         capture(),
         model=line,
         links=LINKS,
-        rungs={"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()},
-        dials=(
-            pb.benchmark.DrawsDial(0.1),
-            pb.benchmark.FacetsDial(2.0),
-            pb.benchmark.PrecisionDial(),
+        methods={"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()},
+        overrides=(
+            pb.benchmark.DrawsOverride(0.1),
+            pb.benchmark.FacetsOverride(2.0),
+            pb.benchmark.PrecisionOverride(),
             Stuck(),
         ),
         reference=ROUGHLY,
@@ -115,18 +115,18 @@ def test_the_reference_states_its_own_error(study):
     assert told["reference_effective_draws"] > 400
 
 
-def test_a_rung_that_fails_is_a_row_that_says_why(study):
+def test_a_method_that_fails_is_a_row_that_says_why(study):
     table = pb.benchmark.accuracy_table(study)
     assert "it cannot be" in table.loc["broken", "problems"]
     assert np.isnan(table.loc["broken", "error"])
     assert not table.loc["broken", "on_front"]
 
 
-def test_a_dial_that_fails_is_a_row_that_says_why(study):
+def test_an_override_that_fails_is_a_row_that_says_why(study):
     table = pb.benchmark.accuracy_table(study)
-    for rung in ("biased", "right", "broken"):
-        assert "it is rusty" in table.loc[f"{rung}, stuck", "problems"]
-        assert np.isnan(table.loc[f"{rung}, stuck", "error"])
+    for method in ("biased", "right", "broken"):
+        assert "it is rusty" in table.loc[f"{method}, stuck", "problems"]
+        assert np.isnan(table.loc[f"{method}, stuck", "error"])
 
 
 def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
@@ -140,7 +140,7 @@ def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
     for method in (pb.methods.Laplace(), pb.methods.Nuts()):
         with pytest.raises(pb.FitError, match="no peak"):
-            pb.benchmark.EffectsDial().turn(request, method)
+            pb.benchmark.EffectsOverride().apply(request, method)
     assert len(tries) == 1
 
 
@@ -166,10 +166,10 @@ def test_without_processes_of_their_own_first_times_and_memory_are_not_told(stud
 
 def test_facets_are_turned_where_there_are_any():
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    turned, method = pb.benchmark.FacetsDial(0.5).turn(request, pb.methods.Nuts())
+    changed, method = pb.benchmark.FacetsOverride(0.5).apply(request, pb.methods.Nuts())
     before, after = (
         [part for _, part in parts_of(scene) if isinstance(part, pb.physics.FacetQuadrature)]
-        for scene in (request.scene, turned.scene)
+        for scene in (request.scene, changed.scene)
     )
     assert len(before) == len(after) > 0
     for one, other in zip(before, after, strict=True):
@@ -177,33 +177,34 @@ def test_facets_are_turned_where_there_are_any():
         assert other.across == round(0.5 * one.across)
     assert method == pb.methods.Nuts()
     smooth = dataclasses.replace(request, scene=pb.Scene(pb.SmoothSurface()))
-    assert pb.benchmark.FacetsDial(0.5).turn(smooth, pb.methods.Nuts()) is None
+    assert pb.benchmark.FacetsOverride(0.5).apply(smooth, pb.methods.Nuts()) is None
     single = dataclasses.replace(request, precision="single")
-    assert pb.benchmark.PrecisionDial().turn(single, pb.methods.Nuts()) is None
+    assert pb.benchmark.PrecisionOverride().apply(single, pb.methods.Nuts()) is None
 
 
 def test_an_override_of_draws_turns_what_its_name_says_or_nothing():
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    quarter = pb.benchmark.DrawsDial(0.25)
+    quarter = pb.benchmark.DrawsOverride(0.25)
     for name, method in pb.methods.LADDER.items():
-        turned = quarter.turn(request, method)
-        assert (turned is None) == (name in ("point", "nuts short"))  # no draws, or too few
-        if turned is not None:
-            assert draws_of(turned[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
+        changed = quarter.apply(request, method)
+        assert (changed is None) == (name in ("point", "nuts short"))  # no draws, or too few
+        if changed is not None:
+            assert draws_of(changed[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
     # A crowd and a half, of which half would be three quarters: fewer than the crowd.
     few = pb.methods.Tempered(pb.methods.PixelTempering(draws=1536))
-    assert pb.benchmark.DrawsDial(0.5).turn(request, few) is None
-    enough = pb.benchmark.DrawsDial(0.5).turn(
+    assert pb.benchmark.DrawsOverride(0.5).apply(request, few) is None
+    enough = pb.benchmark.DrawsOverride(0.5).apply(
         request, pb.methods.Tempered(pb.methods.PixelTempering(draws=3072))
     )
     assert enough is not None
     assert draws_of(enough[1]) == 3072
 
 
-def test_every_dial_has_a_name_of_its_own():
-    every: list[AbstractDial] = [
-        pb.benchmark.DrawsDial(0.25), pb.benchmark.DrawsDial(4.0), pb.benchmark.FacetsDial(0.5), pb.benchmark.FacetsDial(2.0),
-        pb.benchmark.EffectsDial(), pb.benchmark.PrecisionDial(),
+def test_every_override_has_a_name_of_its_own():
+    every: list[AbstractOverride] = [
+        pb.benchmark.DrawsOverride(0.25), pb.benchmark.DrawsOverride(4.0),
+        pb.benchmark.FacetsOverride(0.5), pb.benchmark.FacetsOverride(2.0),
+        pb.benchmark.EffectsOverride(), pb.benchmark.PrecisionOverride(),
     ]  # fmt: skip
     names = [override.name for override in every]
     assert names[:3] == ["draws / 4", "draws x 4", "facets / 2"]
@@ -278,9 +279,9 @@ def test_settings_out_of_range_are_refused():
     with pytest.raises(pb.FitError, match="error is 0"):
         pb.benchmark.Reference(error=0.0)
     with pytest.raises(pb.FitError, match="factor is 0"):
-        pb.benchmark.DrawsDial(0.0)
+        pb.benchmark.DrawsOverride(0.0)
     with pytest.raises(pb.FitError, match="factor is -1"):
-        pb.benchmark.FacetsDial(-1.0)
+        pb.benchmark.FacetsOverride(-1.0)
 
 
 def test_a_process_of_its_own_finds_no_compiled_programs(monkeypatch):

@@ -28,7 +28,7 @@ def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys
     assert main(["accuracy", str(plate), "--out", str(out)]) == 0
     told = capsys.readouterr().out
     assert told.splitlines()[0].split()[:2] == ["error", "worst"]
-    assert told.splitlines()[-1] == pb.benchmark.accuracy_advice(make_accuracy())
+    assert told.splitlines()[-1] == pb.benchmark.accuracy_sentences(make_accuracy())
     assert set(studied["rungs"]) == set(pb.methods.LADDER)
     assert "dials" not in studied
     assert pb.benchmark.accuracy_table(pb.benchmark.load_accuracy(out)).equals(

@@ -127,7 +127,7 @@ def test_names_of_options_are_those_of_the_tables():
         cli_options.MATERIAL: pb.simulation.PRESETS,
         cli_options.FIT_METHOD: METHODS,
         cli_options.CALIBRATION_METHOD: CALIBRATION_METHODS,
-        cli_options.RUNG: pb.methods.LADDER,
+        cli_options.STUDY_METHOD: pb.methods.LADDER,
     }
     for kind, table in known.items():
         assert kind.names == tuple(table), kind.kind

@@ -175,5 +175,5 @@ def test_a_prior_that_bends_the_other_way_stays_a_precision() -> None:
 
 
 def test_something_else_is_refused() -> None:
-    with pytest.raises(pb.FitError, match="it says nothing of identifiability"):
+    with pytest.raises(pb.FitError, match="identify: it has no variable"):
         pb.design.identifiability_table(xr.Dataset())

@@ -104,5 +104,5 @@ def test_what_cannot_be_profiled_is_told() -> None:
         pb.profile(capture, "slope", model=line, points=2, **ASKED)
     with pytest.raises(pb.FitError, match="values of slope: nan is not inside its prior"):
         pb.profile(capture, "slope", model=line, values=[np.nan], **ASKED)
-    with pytest.raises(pb.FitError, match="it is no profile"):
+    with pytest.raises(pb.FitError, match="profile: it has no variable"):
         pb.design.profile_sentences(xr.Dataset())

@@ -75,14 +75,15 @@ def test_a_row_says_what_the_rule_saw(chosen: pb.effects.ChosenScene) -> None:
     assert chosen.ledger.attrs["full_operations"] >= chosen.ledger.attrs["chosen_operations"] > 0
 
 
-def test_the_table_and_the_sentence(chosen: pb.effects.ChosenScene) -> None:
-    head, *rows = ledger_table(chosen.ledger).splitlines()
-    assert head.split() == ["effect", "data", "shift", "sd", "operations", "time"]
-    assert [row.split()[0] for row in rows] == list(chosen.ledger["effect"].to_numpy())
-    assert all("kept: " in row or "dropped: " in row for row in rows)
-    sentence = ledger_sentence(chosen.ledger)
-    assert f"of {len(rows)} effects are kept; leaving out the others together" in sentence
-    assert sentence.endswith(" ms.")
+def test_the_table_and_the_sentences(chosen: pb.effects.ChosenScene) -> None:
+    table = ledger_table(chosen.ledger)
+    assert list(table.columns) == ["data", "shift", "sd", "operations", "time", "result"]
+    assert list(table.index) == list(chosen.ledger["effect"].to_numpy())
+    assert table["result"].str.match("kept: |dropped: ").all()
+    first, second, last = ledger_sentences(chosen.ledger)
+    assert first.endswith(f"of {len(table)} effects are kept.")
+    assert second.startswith("Leaving out the others together")
+    assert last.endswith(" ms.")
 
 
 def test_two_that_are_light_alone_and_heavy_together_do_not_both_go(q: np.ndarray) -> None:
