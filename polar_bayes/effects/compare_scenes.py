@@ -33,7 +33,13 @@ from numpyro import handlers
 from numpyro.infer.util import log_density
 
 from polar_bayes.diagnostics.parameters import scalars
-from polar_bayes.inference.optimize import Status, ValueAndGradient, climb, find_modes, from_prior
+from polar_bayes.inference.optimize import (
+    ModeStatus,
+    ValueAndGradient,
+    find_mode,
+    find_modes,
+    from_prior,
+)
 from polar_bayes.inference.program import Program, compile_program, inspect_model, noise_free
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import posterior_of
@@ -292,13 +298,13 @@ def _climb(density: Density, z: np.ndarray, covariance: np.ndarray) -> Peak:
     for _ in range(CLIMBS):
         width = np.linalg.cholesky(covariance)
         potential = _with_gradient(density, z, width, STEP)
-        end = climb(potential, np.zeros(z.size))
+        end = find_mode(potential, np.zeros(z.size))
         if not np.isfinite(end.covariance).all():
             return Peak(density, z, np.full_like(covariance, np.nan), found=False)
         # A climb ends within a hundredth of a width; one more step makes that nothing.
         z = z + width @ (end.z - end.covariance @ potential(end.z)[1])
         covariance = width @ end.covariance @ width.T
-    return Peak(density, z, covariance, found=end.status is Status.OK)
+    return Peak(density, z, covariance, found=end.status is ModeStatus.OK)
 
 
 def _with_gradient(

@@ -75,10 +75,14 @@ def sample(
     noise = jax.random.normal(key, (settings.chains, settings.draws, program.size))
     drawn = location + noise @ factor.T
     z = np.asarray(drawn)[..., np.argsort(np.asarray(order))]
-    lp = -np.array([potential(draw)[0] for draw in z.reshape(-1, program.size)])
-    approximation = -0.5 * np.asarray(jnp.sum(noise**2, axis=-1))
+    return z, weigh(potential, z, np.asarray(noise))
+
+
+def weigh(potential: ValueAndGradient, z: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
+    """Log density and log importance weight of draws that are affine in standard normal noise."""
+    lp = -np.array([potential(draw)[0] for draw in z.reshape(-1, z.shape[-1])])
     lp = lp.reshape(z.shape[:2])
-    return z, {"lp": lp, "log_weight": lp - approximation}
+    return {"lp": lp, "log_weight": lp + 0.5 * np.sum(noise**2, axis=-1)}
 
 
 def compiled_guide(program: Program) -> Guide:

@@ -25,7 +25,7 @@ from polar_bayes.effects.choose import ChosenScene
 from polar_bayes.inference import hierarchical_reparam, initialization, optimize, request
 from polar_bayes.inference import joint_fit as fitting
 from polar_bayes.inference.compile import LRUCache, cache_key
-from polar_bayes.inference.optimize import quiet_line_search
+from polar_bayes.inference.optimize import ignore_line_search_warnings
 from polar_bayes.inference.problem import compile_model
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.inference.request import resolve
@@ -312,7 +312,7 @@ def test_fits_side_by_side_leave_warnings_as_they_were() -> None:
     heard: list[str] = []
 
     def second() -> None:
-        with quiet_line_search():
+        with ignore_line_search_warnings():
             second_began.set()
             first_ended.wait(10.0)
             try:
@@ -321,7 +321,7 @@ def test_fits_side_by_side_leave_warnings_as_they_were() -> None:
                 heard.append(str(warning))
 
     thread = threading.Thread(target=second)
-    with quiet_line_search():
+    with ignore_line_search_warnings():
         thread.start()
         assert second_began.wait(10.0)
     first_ended.set()
