@@ -39,7 +39,6 @@ import scipy.optimize
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
-from numpyro import handlers
 
 from polar_bayes.inference.compile import JitByShape, JitOnce
 from polar_bayes.inference.group_model import GroupModel, GroupProgram, Groups, Starts
@@ -166,8 +165,7 @@ class HierarchicalReparam:
     def _group_prior(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """Minus the log prior density of the coordinates of all groups."""
         free, latent = self.program.unravel(z), self.program.constrain(z)
-        fixed = handlers.substitute(self.program.model, data=latent)
-        trace = handlers.trace(handlers.seed(fixed, jax.random.key(0))).get_trace(data)
+        trace = self.program.trace(z, data)
         total = jnp.zeros((), z.dtype)
         for name, value in latent.items():
             if self.groups.axis in self.program.dims[name]:
