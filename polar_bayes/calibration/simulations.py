@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference.batching import Stack, together
-from polar_bayes.inference.compile import JitByShape
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.observation.data import Observations
 
@@ -68,7 +68,7 @@ def _reading_again(program: Program) -> Callable[..., Values]:
     ) -> Values:
         return jax.lax.map(lambda at: read(at[0], key, data, at[1], shared), (numbers, own))
 
-    return JitByShape(read_all)
+    return JitOnce(read_all)
 
 
 @functools.lru_cache(maxsize=4)
@@ -85,7 +85,7 @@ def _drawing(program: Program) -> Callable[[Array, Array, Observations], tuple[V
             seen = _recorded(data, {**again, "intensity": told.predictive["intensity"]})
         return told.parameters, (seen.readings, seen.brightness, seen.saturated)
 
-    return JitByShape(
+    return JitOnce(
         lambda numbers, key, data: jax.lax.map(lambda at: simulate(at, key, data), numbers)
     )
 

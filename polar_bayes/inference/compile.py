@@ -13,7 +13,6 @@ import queue
 import sys
 import threading
 import time
-import weakref
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -45,26 +44,32 @@ class AbandonedError(Exception):
     """Ends a thread that passed its deadline."""
 
 
+_ABANDONED: contextvars.ContextVar[threading.Event | None] = contextvars.ContextVar(
+    "polar_bayes_abandoned", default=None
+)
+"""In a thread with a deadline: set when the deadline has passed."""
+
+
 class _TracingLock:
     """A reentrant lock that abandoned threads cannot acquire."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
-        self._refused: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
 
     def __enter__(self) -> None:
         self._lock.acquire()
-        if threading.current_thread() in self._refused:
+        abandoned = _ABANDONED.get()
+        if abandoned is not None and abandoned.is_set():
             self._lock.release()
             raise AbandonedError
 
     def __exit__(self, *_: object) -> None:
         self._lock.release()
 
-    def refuse(self, thread: threading.Thread) -> None:
-        """Wait until a thread is not tracing, and let it never trace again."""
+    def wait(self) -> None:
+        """Wait until no other thread is tracing, even in an abandoned thread."""
         with self._lock:
-            self._refused.add(thread)
+            pass
 
 
 TRACING_LOCK = _TracingLock()
@@ -79,18 +84,19 @@ def compiled(function: Callable) -> Any:
 
 
 class JitOnce:
-    """A function of arguments of one shape: traced under the lock and compiled once."""
+    """A function that is traced under the lock, and compiled once for each shape and device.
+
+    The shape is that of the first argument; those of others must follow from it.
+    """
 
     def __init__(self, function: Callable) -> None:
         self._function = compiled(function)
-        self._compilation: _Compilation | None = None
-        self._program: Callable | None = None
-        self._device: Any = None
+        self._compilations: dict[Hashable, _Compilation] = {}
 
     @property
     def is_begun(self) -> bool:
-        """Whether the compilation has begun."""
-        return self._compilation is not None
+        """Whether a compilation has begun."""
+        return bool(self._compilations)
 
     def __call__(self, *arguments: Any) -> Any:
         """Run the program, which the first call compiles."""
@@ -98,43 +104,25 @@ class JitOnce:
 
     def begin(self, *arguments: Any) -> None:
         """Trace now, and compile on another thread; the arguments may be `ShapeDtypeStruct`."""
-        if self._compilation is None:
-            _COMPILER_THREAD.submit(self._trace(*arguments).result)
+        if self._key(arguments) not in self._compilations:
+            _COMPILER_THREAD.submit(self._trace(arguments).result)
 
     def program(self, *arguments: Any) -> Callable:
         """The compiled program for arguments of these shapes and types."""
-        program = self._program
-        if program is None or self._device != jax.config.jax_default_device:
-            program = self._program = self._trace(*arguments).result()
-        return program
+        found = self._compilations.get(self._key(arguments))
+        return (found or self._trace(arguments)).result()
 
-    def _trace(self, *arguments: Any) -> "_Compilation":
+    def _trace(self, arguments: tuple) -> "_Compilation":
         with TRACING_LOCK:
-            device = jax.config.jax_default_device  # a compiled program runs on one device
-            if self._compilation is None or self._device != device:
-                self._compilation = _Compilation(self._function.lower(*arguments))
-                self._program, self._device = None, device
-            return self._compilation
+            key = self._key(arguments)
+            if key not in self._compilations:
+                self._compilations[key] = _Compilation(self._function.lower(*arguments))
+            return self._compilations[key]
 
-
-class JitByShape:
-    """A function whose first argument comes in several shapes: one `JitOnce` for each."""
-
-    def __init__(self, function: Callable) -> None:
-        self._function = function
-        self._programs: dict[tuple[int, ...], JitOnce] = {}
-
-    def begin(self, first: Any, *others: Any) -> None:
-        """Trace now, and compile on another thread; the arguments may be `ShapeDtypeStruct`."""
-        self._of(first.shape).begin(first, *others)
-
-    def __call__(self, first: Any, *others: Any) -> Any:
-        """Run the program of this shape, which its first call compiles."""
-        return self._of(first.shape)(first, *others)
-
-    def _of(self, shape: tuple[int, ...]) -> JitOnce:
-        found = self._programs.get(shape)
-        return found or self._programs.setdefault(shape, JitOnce(self._function))
+    @staticmethod
+    def _key(arguments: tuple) -> Hashable:
+        shape = getattr(arguments[0], "shape", None)
+        return shape, jax.config.jax_default_device  # a compiled program runs on one device
 
 
 class _Compilation:
@@ -142,18 +130,20 @@ class _Compilation:
 
     def __init__(self, lowered: Any) -> None:
         self._lowered = lowered
+        self._compiled: Any = None
         self._program: Callable | None = None
         self._lock = threading.Lock()
 
     def result(self) -> Callable:
         # A thread does not wait for the queue of `_COMPILER_THREAD`, which holds programs of other
         # fits: what is still in the queue is compiled by the thread that needs it.
-        with self._lock:
-            if self._program is None:
-                self._program = self._lowered.compile()
-                self._lowered = None  # frees the traced program
-            check_memory(bytes_of(self._program))
-            return self._program
+        if self._program is None:
+            with self._lock:
+                if self._lowered is not None:
+                    self._compiled, self._lowered = self._lowered.compile(), None
+                check_memory(bytes_of(self._compiled))
+                self._program = self._compiled
+        return self._program
 
 
 def bytes_of(program: Any) -> int:
@@ -312,49 +302,49 @@ def run_until[T](deadline: float, progress: Progress, work: Callable[[Progress],
         return work(progress)
     if time.perf_counter() >= deadline:
         raise OutOfTimeError("the time was up")
-    task = _Task(work)
+    reports: _Reports = queue.SimpleQueue()
+    abandoned = threading.Event()
+    outcome = _start(work, reports, abandoned)
     try:
         while True:
             remaining = max(deadline - time.perf_counter(), 0.0)
-            report = task.reports.get(timeout=min(remaining, threading.TIMEOUT_MAX))
+            report = reports.get(timeout=min(remaining, threading.TIMEOUT_MAX))
             if report is None:
-                return task.outcome.result()
+                return outcome.result()
             progress(*report)
     except queue.Empty:
         raise OutOfTimeError("abandoned when the time was up") from None
     finally:
-        task.abandon()
+        abandoned.set()
+        if not outcome.done():
+            TRACING_LOCK.wait()
 
 
-class _Task[T]:
-    """Work on a thread of its own."""
+_Reports = queue.SimpleQueue[tuple[str, float] | None]
+"""Progress of a thread; None when it has ended."""
 
-    def __init__(self, work: Callable[[Progress], T]) -> None:
-        self.outcome: Future[T] = Future()
-        self.reports: queue.SimpleQueue[tuple[str, float] | None] = queue.SimpleQueue()
-        self._work, self._abandoned = work, threading.Event()
-        self._enable_x64 = jax.config.jax_enable_x64  # a thread does not inherit it
-        # Not a daemon: an interpreter that shuts down while compiled code runs crashes.
-        self._thread = threading.Thread(
-            target=contextvars.copy_context().run, args=(self._run,), name="polar_bayes in time"
-        )
-        self._thread.start()
 
-    def abandon(self) -> None:
-        """End the thread as soon as possible; no effect after it has finished."""
-        self._abandoned.set()
-        if not self.outcome.done():
-            TRACING_LOCK.refuse(self._thread)
+def _start[T](
+    work: Callable[[Progress], T], reports: _Reports, abandoned: threading.Event
+) -> Future[T]:
+    """Run work on a new thread until it is abandoned."""
+    enable_x64 = jax.config.jax_enable_x64  # a thread does not inherit it
 
-    def _run(self) -> None:
-        try:
-            with jax.enable_x64(self._enable_x64):
-                self.outcome.set_result(self._work(self._report))
-        except BaseException as error:  # raised again by `outcome.result()`
-            self.outcome.set_exception(error)
-        self.reports.put(None)
-
-    def _report(self, stage: str, fraction: float) -> None:
-        if self._abandoned.is_set():
+    def report(stage: str, fraction: float) -> None:
+        if abandoned.is_set():
             raise AbandonedError
-        self.reports.put((stage, fraction))
+        reports.put((stage, fraction))
+
+    def run() -> T:
+        _ABANDONED.set(abandoned)
+        try:
+            with jax.enable_x64(enable_x64):
+                return work(report)
+        finally:
+            reports.put(None)
+
+    # Not a daemon thread: an interpreter that shuts down while compiled code runs crashes.
+    executor = ThreadPoolExecutor(1, "polar_bayes deadline")
+    outcome = executor.submit(contextvars.copy_context().run, run)
+    executor.shutdown(wait=False)
+    return outcome

@@ -40,7 +40,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
-from polar_bayes.inference.compile import JitByShape, JitOnce
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.group_model import GroupModel, GroupProgram, Groups, Starts
 from polar_bayes.inference.optimize import (
     Modes,
@@ -147,7 +147,7 @@ class HierarchicalReparam:
         return JitOnce(self.inverse)
 
     @functools.cached_property
-    def forward_chains(self) -> JitByShape:
+    def forward_chains(self) -> JitOnce:
         """`forward_jit` of chains of draws, (chain, draw, size), one after the other."""
 
         def chains(w: Array, given: ReparamInputs) -> Array:
@@ -155,7 +155,7 @@ class HierarchicalReparam:
                 lambda chain: jax.lax.map(lambda x: self.forward(x, given)[0], chain), w
             )
 
-        return JitByShape(chains)
+        return JitOnce(chains)
 
     @functools.cached_property
     def population_jit(self) -> JitOnce:

@@ -21,7 +21,7 @@ from numpyro.infer.util import potential_energy
 from numpyro.primitives import Messenger
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import JitByShape, JitOnce
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -155,23 +155,23 @@ class Program:
                 0, count, lambda i, z: z.at[i].set(self.from_prior(wrapped[i], data)), zeros
             )
 
-        return JitByShape(draw)
+        return JitOnce(draw)
 
     @functools.cached_property
-    def described(self) -> JitByShape:
+    def described(self) -> JitOnce:
         """`describe` of many draws, compiled; keys as the data that they hold, (draw, ...)."""
 
         def describe(keys: Array, z: Array, data: Observations) -> Draw:
             wrapped = jax.random.wrap_key_data(keys)
             return jax.lax.map(lambda kz: self.describe(kz[0], kz[1], data), (wrapped, z))
 
-        return JitByShape(describe)
+        return JitOnce(describe)
 
     @functools.cached_property
     def parameters_of_chains(self) -> Callable[[Array, Observations], dict[str, Array]]:
         """`parameters` of chains of draws, (chain, draw, size), compiled."""
         over_draws = jax.vmap(self.parameters, in_axes=(0, None))
-        return JitByShape(jax.vmap(over_draws, in_axes=(0, None)))
+        return JitOnce(jax.vmap(over_draws, in_axes=(0, None)))
 
     @functools.cached_property
     def slopes(self) -> Callable[[Array], dict[str, Array]]:
