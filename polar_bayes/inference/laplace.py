@@ -69,7 +69,7 @@ def sample(
     key: Array,
     settings: Laplace,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Draws (chain, draw, size) from NumPyro's guide at the mode of largest weight, and statistics."""
+    """Draws (chain, draw, size) from NumPyro's guide at the heaviest mode, and statistics."""
     location, factor, order = guide(
         jnp.asarray(modes.z[0]), jnp.linalg.inv(jnp.asarray(modes.covariance[0])), data
     )
