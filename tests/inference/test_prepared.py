@@ -258,7 +258,7 @@ def jitted(x):
     return x + 1
 def model(data, scene, priors, links):
     return jax.vmap(lambda x: jitted(inner(x)))(data)
-class Link(polar_bayes.StokesLink):
+class Link(polar_bayes.links.StokesLink):
     def reading(self, values):
         return values
 @dataclasses.dataclass(frozen=True)
