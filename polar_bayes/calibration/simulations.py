@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference.batching import Stack, together
-from polar_bayes.inference.compile import JitByShape, LRUCache
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.observation.data import Observations
 
@@ -48,8 +48,29 @@ def redraw_readings(
     return jax.tree.map(np.asarray, found)
 
 
-def _simulator(program: Program) -> Callable[[Array, Array, Observations], tuple[Values, tuple]]:
-    """Compiled: parameters and readings of many captures."""
+@functools.lru_cache(maxsize=4)
+def _reading_again(program: Program) -> Callable[..., Values]:
+    """Fresh readings of many truths, compiled once for a program."""
+
+    def read(
+        number: Array, key: Array, data: Observations, own: Observations, shared: Observations
+    ) -> Values:
+        key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
+        z = program.from_prior(key_truth, data)
+        told = program.describe(jax.random.fold_in(key_noise, 1), z, together(own, shared))
+        return told.predictive
+
+    def read_all(
+        numbers: Array, key: Array, data: Observations, own: Observations, shared: Observations
+    ) -> Values:
+        return jax.lax.map(lambda at: read(at[0], key, data, at[1], shared), (numbers, own))
+
+    return JitOnce(read_all)
+
+
+@functools.lru_cache(maxsize=4)
+def _drawing(program: Program) -> Callable[[Array, Array, Observations], tuple[Values, tuple]]:
+    """The story of many captures, compiled once for a program."""
 
     def simulate(number: Array, key: Array, data: Observations) -> tuple[Values, tuple]:
         key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
@@ -61,8 +82,8 @@ def _simulator(program: Program) -> Callable[[Array, Array, Observations], tuple
             recorded = _recorded(data, {**others, "intensity": draw.predictive["intensity"]})
         return draw.parameters, (recorded.readings, recorded.brightness, recorded.saturated)
 
-    return JitByShape(
-        lambda numbers, key, data: jax.lax.map(lambda number: simulate(number, key, data), numbers)
+    return JitOnce(
+        lambda numbers, key, data: jax.lax.map(lambda at: simulate(at, key, data), numbers)
     )
 
 
