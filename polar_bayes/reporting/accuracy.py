@@ -24,17 +24,7 @@ from polar_bayes.benchmark.advice import (
 )
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.reporting import style, text
-from polar_bayes.reporting.page import (
-    Cells,
-    Page,
-    Picture,
-    Section,
-    Table,
-    make_facts,
-    make_picture,
-    make_table,
-)
+from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import DASH, column, or_dash
 
@@ -192,17 +182,19 @@ def _name_methods(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, 
 # --- The page -------------------------------------------------------------------------------------
 
 
-def accuracy_page(result: xr.DataTree) -> Page:
+def accuracy_page(result: xr.DataTree) -> page.Page:
     """The page of an accuracy study."""
     study, provenance = accuracy_of(result), provenance_of(result)
-    facts = make_facts({str(key).replace("_", " "): value for key, value in provenance.items()})
+    facts = page.make_facts(
+        {str(key).replace("_", " "): value for key, value in provenance.items()}
+    )
     sections = [
-        Section("front", "Error against time", "Error against time", [accuracy_picture(study)]),
-        Section("methods", "Methods and settings", "Methods and settings", [study_table(study)]),
-        Section("parameters", "Parameters", "Errors of every parameter", [error_table(study)]),
-        Section("provenance", "Provenance", "Provenance", facts),
+        page.Section("front", "Error against time", [accuracy_picture(study)]),
+        page.Section("methods", "Methods and settings", [study_table(study)]),
+        page.Section("parameters", "Errors of every parameter", [error_table(study)]),
+        page.Section("provenance", "Provenance", facts),
     ]
-    return Page(
+    return page.Page(
         kind="Accuracy against time",
         name=text.capture_name(provenance),
         subtitles=[text.made_by(provenance, "every method of the study")],
@@ -214,9 +206,9 @@ def accuracy_page(result: xr.DataTree) -> Page:
     )
 
 
-def accuracy_picture(study: xr.Dataset) -> Picture:
+def accuracy_picture(study: xr.Dataset) -> page.Picture:
     """Error against time."""
-    return make_picture(
+    return page.make_picture(
         plot_accuracy(study),
         "Error against time of every method",
         "Down is better, left is faster. A color stands for a method, a marker for what was "
@@ -226,7 +218,7 @@ def accuracy_picture(study: xr.Dataset) -> Picture:
     )
 
 
-def study_table(study: xr.Dataset) -> Table:
+def study_table(study: xr.Dataset) -> page.Table:
     """A row for each method and each variation of it."""
     noise = float(study.attrs["reference_error"])
     table = accuracy_table(study)
@@ -240,7 +232,7 @@ def study_table(study: xr.Dataset) -> Table:
         marks = ["*" if table.loc[name, "on_front"] else "", table.loc[name, "problems"]]
         return "; ".join(filter(None, marks)) or name
 
-    cells: Cells = {
+    cells: page.Cells = {
         "error": error,
         "of": lambda row: row["worst"] if math.isfinite(row["error"]) else DASH,
         "first s": column("seconds_first", ".2g"),
@@ -262,12 +254,14 @@ def study_table(study: xr.Dataset) -> Table:
         "one. Gradients and densities: evaluations, warm-up included. * on the front: nothing is "
         "both faster and better."
     )
-    return make_table("study", caption, "method", cells, table, describe=describe, prose=["method"])
+    return page.make_table(
+        "study", caption, "method", cells, table, describe=describe, prose=["method"]
+    )
 
 
-def error_table(study: xr.Dataset) -> Table:
+def error_table(study: xr.Dataset) -> page.Table:
     """Errors of every parameter by the methods as given."""
     errors = parameter_errors(study)[study[VARIATION].to_numpy() == AS_GIVEN]
-    cells: Cells = {str(name): column(name, ".2g") for name in errors.columns}
+    cells: page.Cells = {str(name): column(name, ".2g") for name in errors.columns}
     caption = "The larger error of mean and standard deviation of each, in posterior sds."
-    return make_table("error", caption, "method", cells, errors)
+    return page.make_table("error", caption, "method", cells, errors)

@@ -29,20 +29,9 @@ from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batch_result import Approach, Status
 from polar_bayes.inference.psis import LARGEST_TRUSTED
 from polar_bayes.inference.result import provenance_of
+from polar_bayes.reporting import page, text
 from polar_bayes.reporting import plots_calibration as figures
-from polar_bayes.reporting import text
 from polar_bayes.reporting.maps import count_table
-from polar_bayes.reporting.page import (
-    Block,
-    Cells,
-    Page,
-    Picture,
-    Section,
-    Table,
-    make_facts,
-    make_picture,
-    make_table,
-)
 from polar_bayes.reporting.plots_calibration import MAX_INTERVALS, Ranks
 from polar_bayes.reporting.style import QUANTITIES
 from polar_bayes.reporting.text import DASH, column, number
@@ -63,7 +52,7 @@ RANKS_COLUMN = "the ranks"
 
 def calibration_page(
     calibration: xr.DataTree, beside: Mapping[str, xr.DataTree] | None = None
-) -> Page:
+) -> page.Page:
     """The page of a calibration, compared with others of the same layout."""
     others = {one_line(str(name)): each for name, each in (beside or {}).items()}
     provenance = provenance_of(calibration)
@@ -80,7 +69,7 @@ def calibration_page(
         "fitted. Where model, prior and method are right, the truth is one draw more of each "
         "posterior."
     )
-    comparison: list[Block] = []
+    comparison: list[page.Block] = []
     if others:
         compared = compare_calibrations({method: calibration, **others})
         comparison = [*comparison_sentences(compared), comparison_table(compared, titles)]
@@ -91,22 +80,18 @@ def calibration_page(
     )
     simulations = next(iter(ranks.values())).pit.size
     elsewhere = " What it is compared with stays where it is." if others else ""
+    fits = [*_fit_tables(calibration, ranks), *page.make_facts(_fit_facts(calibration))]
     sections = [
-        Section("parameters", "Parameters", "Parameters", [introduction, rank_table(table, ranks)]),
-        Section("comparison", "Comparison", "Comparison with other methods", comparison),
-        Section("ranks", "Ranks", "Ranks of the truth", pictures["ranks"]),
-        Section("coverage", "Coverage", "Coverage of the intervals", pictures["coverage"]),
-        Section("estimates", "Estimates", "Estimates against the truth", pictures["estimates"]),
-        Section("readings", "Readings", "Readings", _readings(calibration, readings, method)),
-        Section(
-            "fits",
-            "Fits",
-            "Status of the fits",
-            [*_fit_tables(calibration, ranks), *make_facts(_fit_facts(calibration))],
-        ),
-        Section("provenance", "Provenance", "Provenance", list(_provenance_facts(provenance))),
+        page.Section("parameters", "Parameters", [introduction, rank_table(table, ranks)]),
+        page.Section("comparison", "Comparison with other methods", comparison),
+        page.Section("ranks", "Ranks of the truth", pictures["ranks"]),
+        page.Section("coverage", "Coverage of the intervals", pictures["coverage"]),
+        page.Section("estimates", "Estimates against the truth", pictures["estimates"]),
+        page.Section("readings", "Readings", _readings(calibration, readings, method)),
+        page.Section("fits", "Status of the fits", fits),
+        page.Section("provenance", "Provenance", list(_provenance_facts(provenance))),
     ]
-    return Page(
+    return page.Page(
         kind="Calibration report",
         name=text.capture_name(provenance),
         subtitles=[f"{simulations:,} simulations. {text.made_by(provenance, method)}"],
@@ -148,7 +133,7 @@ def _check_others(others: Mapping[str, xr.DataTree], method: str) -> None:
 
 def _pictures(
     ranks: Sequence[Ranks], others: Mapping[str, Mapping[str, Ranks]], method: str
-) -> dict[str, list[Block]]:
+) -> dict[str, list[page.Block]]:
     """The figures of each section."""
     colors = f" Band and dots are those of {method}; the others are drawn over it."
     ecdf = _paged(
@@ -198,12 +183,12 @@ def _paged(
     draw: Callable[[Sequence[Ranks]], Figure],
     alternative: str,
     caption: str,
-) -> Iterator[Picture]:
+) -> Iterator[page.Picture]:
     """A few panels at a time; the first caption says how to read them all."""
     for at in range(0, len(ranks), MAX_PANELS):
         some = ranks[at : at + MAX_PANELS]
         labels = text.join([each.label for each in some])
-        yield make_picture(
+        yield page.make_picture(
             draw(some), f"{alternative}: {labels}", caption if at == 0 else f"The same of {labels}."
         )
 
@@ -211,7 +196,7 @@ def _paged(
 # --- Tables of parameters -------------------------------------------------------------------------
 
 
-def _score_cells() -> Cells:
+def _score_cells() -> page.Cells:
     """Columns of coverage, ranks, width and score."""
 
     def held(level: int) -> Callable[[pd.Series], str]:
@@ -230,7 +215,7 @@ def _score_cells() -> Cells:
     }
 
 
-def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
+def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> page.Table:
     """Every parameter: uniform ranks, coverage, width and score."""
     level = limit_of(table)
     simulations = next(iter(ranks.values())).pit.size
@@ -238,7 +223,7 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
     def passes(row: pd.Series) -> bool:
         return bool(row["p_value"] >= level)
 
-    cells: Cells = {
+    cells: page.Cells = {
         "p": lambda row: text.p_value(row["p_value"], passes=passes(row)),
         RANKS_COLUMN: lambda row: "uniform" if passes(row) else how_ranks_stray(row),
         "failed": lambda row: f"{int(row['failed']):,} of {simulations:,}",
@@ -253,7 +238,7 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
         "probability score: means over the fits, in the unit of the parameter; ranks cannot detect "
         "a posterior that ignores the data, these can."
     )
-    return make_table(
+    return page.make_table(
         "parameter",
         caption,
         "parameter",
@@ -264,7 +249,7 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
     )
 
 
-def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table:
+def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> page.Table:
     """Every parameter by every method."""
     first = one_line(str(compared.index.get_level_values("method")[0]))
 
@@ -272,7 +257,7 @@ def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table
         label: Any = row.name
         return one_line(str(label[1]))
 
-    cells: Cells = {
+    cells: page.Cells = {
         "method": method,
         "p": lambda row: text.p_value(row["p_value"], passes=bool(row["passes"])),
         RANKS_COLUMN: lambda row: row["ways"],
@@ -285,7 +270,7 @@ def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table
         "fit by fit where both have an answer, minus one; below zero is better, the number after ± "
         "is its standard error; a dash where the simulations are not the same."
     )
-    return make_table(
+    return page.make_table(
         "comparison",
         caption,
         "parameter",
@@ -307,7 +292,9 @@ def _score_change(row: pd.Series) -> str:
 # --- Readings and fits ----------------------------------------------------------------------------
 
 
-def _readings(calibration: xr.DataTree, readings: pd.DataFrame | None, method: str) -> list[Block]:
+def _readings(
+    calibration: xr.DataTree, readings: pd.DataFrame | None, method: str
+) -> list[page.Block]:
     if readings is None or readings.empty:
         return []
     level, pit = limit_of(readings), reading_ranks(calibration)
@@ -329,7 +316,7 @@ def _readings(calibration: xr.DataTree, readings: pd.DataFrame | None, method: s
         "A hump above zero on the left and a dip below it on the right: readings lie too often at "
         "both ends, predictions are too narrow; dip first, then hump: too wide.",
     )
-    cells: Cells = {
+    cells: page.Cells = {
         "p": lambda row: text.p_value(row["p_value"], passes=bool(row["p_value"] >= level)),
         RANKS_COLUMN: lambda row: (
             "uniform" if row["p_value"] >= level else how_predictions_stray(row)
@@ -349,7 +336,7 @@ def _readings(calibration: xr.DataTree, readings: pd.DataFrame | None, method: s
         "Untrusted: fits whose weights without the reading are unreliable (Pareto k above "
         f"{LARGEST_TRUSTED:g})."
     )
-    table = make_table(
+    table = page.make_table(
         "reading",
         caption,
         "reading",
@@ -362,7 +349,7 @@ def _readings(calibration: xr.DataTree, readings: pd.DataFrame | None, method: s
     return [note, table, *pictures]
 
 
-def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterator[Table]:
+def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterator[page.Table]:
     """Numbers of fits by status and by approach."""
     fits = calibration["fits"].to_dataset()
     answered = np.all([np.isfinite(each.pit) for each in ranks.values()], axis=0)
@@ -414,7 +401,7 @@ def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
     return facts
 
 
-def _provenance_facts(provenance: Mapping[str, Any]) -> Iterator[Block]:
+def _provenance_facts(provenance: Mapping[str, Any]) -> Iterator[page.Block]:
     """How the calibration was made, in titled groups of names and values."""
     titles = {
         "truth": "What captures were simulated by, where it differs from what is fitted",
@@ -434,6 +421,6 @@ def _provenance_facts(provenance: Mapping[str, Any]) -> Iterator[Block]:
         for key, value in provenance.items()
         if key not in groups
     }
-    yield from make_facts(own, "Calibration")
+    yield from page.make_facts(own, "Calibration")
     for key, title in titles.items():
-        yield from make_facts(groups.get(key, {}), title)
+        yield from page.make_facts(groups.get(key, {}), title)

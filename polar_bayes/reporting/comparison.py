@@ -13,18 +13,7 @@ from polar_bayes.diagnostics.compare import FitComparison, compare_fits
 from polar_bayes.diagnostics.sensitivity import SENSITIVE
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.reporting import style, text
-from polar_bayes.reporting.page import (
-    Block,
-    Cells,
-    Page,
-    Row,
-    Section,
-    Table,
-    make_bullets,
-    make_picture,
-    make_table,
-)
+from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import CLEAR, DASH, column, interval, number, or_dash, percent
 
@@ -83,7 +72,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
     return figure
 
 
-def comparison_page(fits: Mapping[str, xr.DataTree]) -> Page:
+def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     """The page of a comparison."""
     named = {one_line(str(name)): fit for name, fit in fits.items()}
     comparison = compare_fits(named)
@@ -92,9 +81,9 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> Page:
     failed = {name: verdict for name, verdict in verdicts.items() if not verdict.converged}
     sensitivity = sensitivity_table(comparison)
     left_out = [f"{name}: {why}." if name else why for name, why in comparison.left_out.items()]
-    predictions: list[Block] = [] if comparison.loo.empty else [loo_table(comparison)]
+    predictions: list[page.Block] = [] if comparison.loo.empty else [loo_table(comparison)]
     more = comparison.parameters.index.get_level_values("parameter").nunique() - MAX_PANELS
-    figure = make_picture(
+    figure = page.make_picture(
         plot_comparison(comparison),
         "Means and 95% intervals of each parameter by every fit",
         "Dots are posterior means, bars 95% intervals; dashed bars are twice the standard error of "
@@ -102,21 +91,15 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> Page:
         "much shorter bar claims more knowledge, which the fit's own report should justify."
         + (f" {more} more parameters are in the table only." if more > 0 else ""),
     )
+    prior = [sensitivity] if sensitivity else []
     sections = [
-        Section(
-            "predictions", "Predictions", "Predictions", [*predictions, *make_bullets(left_out)]
-        ),
-        Section("parameters", "Parameters", "Parameters", [figure, parameter_table(comparison)]),
-        Section(
-            "prior",
-            "Prior and data",
-            "What the prior said, and what the data",
-            [sensitivity] if sensitivity else [],
-        ),
-        Section("settings", "What differs", "What differs", [settings_table(provenances)]),
+        page.Section("predictions", "Predictions", [*predictions, *page.make_bullets(left_out)]),
+        page.Section("parameters", "Parameters", [figure, parameter_table(comparison)]),
+        page.Section("prior", "What the prior said, and what the data", prior, "Prior and data"),
+        page.Section("settings", "What differs", [settings_table(provenances)]),
     ]
     names = (text.capture_name(each, "") for each in provenances.values())
-    return Page(
+    return page.Page(
         kind="Comparison of fits",
         name=next(filter(None, names), "capture"),
         subtitles=[f"{len(named)} fits of one capture: {text.join(list(named))}."],
@@ -130,7 +113,7 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> Page:
     )
 
 
-def loo_table(comparison: FitComparison) -> Table:
+def loo_table(comparison: FitComparison) -> page.Table:
     """Expected log densities, best first."""
 
     def difference(row: pd.Series) -> str:
@@ -139,7 +122,7 @@ def loo_table(comparison: FitComparison) -> Table:
         scale = max(float(row["dse"]), 0.2)
         return f"{number(row['elpd_diff'], scale)} ± {number(row['dse'], scale)}"
 
-    cells: Cells = {
+    cells: page.Cells = {
         "elpd": lambda row: f"{row['elpd']:.1f} ± {or_dash(row['se'], '.1f')}",
         "difference": difference,
         "p": lambda row: f"{row['p']:.1f}",
@@ -153,7 +136,7 @@ def loo_table(comparison: FitComparison) -> Table:
         "parameters. Weight: share in the mixture of fits that would predict best (stacking). "
         "k > 0.7: readings for which this cannot be trusted."
     )
-    return make_table("loo", caption, "fit", cells, comparison.loo)
+    return page.make_table("loo", caption, "fit", cells, comparison.loo)
 
 
 def _fit_name(row: pd.Series) -> str:
@@ -162,9 +145,9 @@ def _fit_name(row: pd.Series) -> str:
     return str(label[1])
 
 
-def parameter_table(comparison: FitComparison) -> Table:
+def parameter_table(comparison: FitComparison) -> page.Table:
     """Every parameter by every fit."""
-    cells: Cells = {
+    cells: page.Cells = {
         "fit": _fit_name,
         "mean": lambda row: number(row["mean"], row["sd"]),
         "sd": lambda row: number(row["sd"], row["sd"]),
@@ -174,15 +157,15 @@ def parameter_table(comparison: FitComparison) -> Table:
     }
     caption = "Posterior mean, standard deviation and equal-tailed 95% interval by each fit."
     data = comparison.parameters
-    return make_table("parameter", caption, "parameter", cells, data, prose=["fit"])
+    return page.make_table("parameter", caption, "parameter", cells, data, prose=["fit"])
 
 
-def sensitivity_table(comparison: FitComparison) -> Table | None:
+def sensitivity_table(comparison: FitComparison) -> page.Table | None:
     """What the priors did in each fit; None where no fit has draws."""
     known = comparison.parameters.dropna(subset=["prior_sensitivity"])
     if known.empty:
         return None
-    cells: Cells = {
+    cells: page.Cells = {
         "fit": _fit_name,
         "prior inside": lambda row: percent(row["prior_inside"]),
         "by the data": lambda row: str(row["verdict"]),
@@ -196,20 +179,20 @@ def sensitivity_table(comparison: FitComparison) -> Table | None:
         f"count a little more (power scaling); from {SENSITIVE} on it matters."
     )
     prose = ["fit", "remark"]
-    return make_table("sensitivity", caption, "parameter", cells, known, prose=prose)
+    return page.make_table("sensitivity", caption, "parameter", cells, known, prose=prose)
 
 
-def settings_table(provenances: Mapping[str, Mapping[str, Any]]) -> Table:
+def settings_table(provenances: Mapping[str, Mapping[str, Any]]) -> page.Table:
     """What the fits were asked for, where it is not the same for all."""
     settings = [_settings(each) for each in provenances.values()]
     rows = []
     for key in dict.fromkeys(key for each in settings for key in each):
         cells = tuple(each.get(key, DASH) for each in settings)
         if len(set(cells)) > 1:
-            rows.append(Row(key, key, cells))
+            rows.append(page.Row(key, key, cells))
     caption = "Only what differs between the fits." if rows else "The fits were asked for the same."
     names: Sequence[str] = list(provenances)
-    return Table("settings", caption, ("asked for", *names), tuple(rows), prose=names)
+    return page.Table("settings", caption, ("asked for", *names), tuple(rows), prose=names)
 
 
 def _settings(provenance: Mapping[str, Any]) -> dict[str, str]:

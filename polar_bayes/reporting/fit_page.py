@@ -33,24 +33,8 @@ from polar_bayes.effects.choose import ledger_rows, ledger_sentence
 from polar_bayes.errors import one_line
 from polar_bayes.inference.auto import auto_sentences
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.reporting import plots_curves, plots_fit, text
+from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table
-from polar_bayes.reporting.page import (
-    MAIN_GROUP,
-    Block,
-    Cells,
-    Details,
-    Heading,
-    Page,
-    Picture,
-    Row,
-    Section,
-    Table,
-    make_bullets,
-    make_facts,
-    make_picture,
-    make_table,
-)
 from polar_bayes.reporting.style import QUANTITIES, parameter_title
 from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
 
@@ -86,8 +70,13 @@ class Fit(NamedTuple):
     verdict: Verdict
 
     def table(
-        self, name: str, caption: str, cells: Cells, data: pd.DataFrame, prose: Sequence[str] = ()
-    ) -> Table:
+        self,
+        name: str,
+        caption: str,
+        cells: page.Cells,
+        data: pd.DataFrame,
+        prose: Sequence[str] = (),
+    ) -> page.Table:
         """A table with a row for each parameter that the numbers have, in groups."""
         scalars = {s.label: s for s in self.scalars if s.label in data.index}
         names = set(map(str, self.posterior.data_vars))
@@ -95,9 +84,9 @@ class Fit(NamedTuple):
         def group(label: str) -> str:
             if is_hyperparameter(scalars[label].name, names):
                 return SHARED_GROUP
-            return MAIN_GROUP if scalars[label].is_material else INSTRUMENT_GROUP
+            return page.MAIN_GROUP if scalars[label].is_material else INSTRUMENT_GROUP
 
-        return make_table(
+        return page.make_table(
             name,
             caption,
             "parameter",
@@ -141,7 +130,7 @@ def read_fit(result: xr.DataTree) -> Fit:
     )
 
 
-def fit_page(result: xr.DataTree) -> Page:
+def fit_page(result: xr.DataTree) -> page.Page:
     """The page of a fit."""
     fit = read_fit(result)
     checks = predictive_checks(result)
@@ -155,33 +144,25 @@ def fit_page(result: xr.DataTree) -> Page:
         sentences.append(text.trust(fit.method, fit.verdict.cautions, checks))
     has_draws = not is_point and bool(plots_fit.drawable(result))
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
+    without = [] if is_point else list(_without(fit))
+    prior = [] if is_point else [*_prior(result, has_draws), sensitivity_table(fit)]
     sections = [
-        Section("parameters", "Parameters", "Parameters", [parameter_table(fit)]),
-        Section("population", "Population", "Population", _population(fit, summary, pooled)),
-        Section("spectrum", "Spectrum", "Spectrum", _spectrum(result) if has_draws else []),
-        Section(
-            "without",
-            "Trusting the instrument",
-            "What trusting the instrument would claim",
-            [] if is_point else list(_without(fit)),
-        ),
-        Section("readings", "Readings", "Readings and fit", list(_readings(result, has_draws))),
-        Section("pairs", "Pairs", "Material parameters together", _pairs(result, has_draws)),
-        Section(
-            "prior",
-            "Prior and data",
-            "What the prior said, and what the data",
-            [] if is_point else [*_prior(result, has_draws), sensitivity_table(fit)],
-        ),
-        Section("convergence", approximation, approximation, _convergence(fit, has_draws)),
-        Section("checks", "Predictive checks", "Predictive checks", _checks(result, checks)),
-        Section("effects", "Effects", "Effects", _effects(result)),
-        Section("accuracy", "Accuracy", "Accuracy against time", _accuracy(result)),
-        Section("provenance", "Provenance", "Provenance", _provenance(fit.provenance)),
+        page.Section("parameters", "Parameters", [parameter_table(fit)]),
+        page.Section("population", "Population", _population(fit, summary, pooled)),
+        page.Section("spectrum", "Spectrum", _spectrum(result) if has_draws else []),
+        page.Section("without", "What trusting the instrument would claim", without, "Instrument"),
+        page.Section("readings", "Readings and fit", list(_readings(result, has_draws))),
+        page.Section("pairs", "Material parameters together", _pairs(result, has_draws)),
+        page.Section("prior", "What the prior said, and what the data", prior, "Prior and data"),
+        page.Section("convergence", approximation, _convergence(fit, has_draws), approximation),
+        page.Section("checks", "Predictive checks", _checks(result, checks)),
+        page.Section("effects", "Effects", _effects(result)),
+        page.Section("accuracy", "Accuracy against time", _accuracy(result)),
+        page.Section("provenance", "Provenance", _provenance(fit.provenance)),
     ]
     method = METHODS.get(fit.method, one_line(fit.method))
     swapped = text.swapped_sentence(fit.provenance)
-    return Page(
+    return page.Page(
         kind="Fit report",
         name=text.capture_name(fit.provenance),
         subtitles=[text.made_by(fit.provenance, method), *filter(None, [swapped])],
@@ -198,7 +179,7 @@ def fit_page(result: xr.DataTree) -> Page:
 # --- Parameters -----------------------------------------------------------------------------------
 
 
-def parameter_table(fit: Fit) -> Table:
+def parameter_table(fit: Fit) -> page.Table:
     """Every parameter with its interval, the truth where known, and what the data determine."""
     if fit.method == "point":
         return _estimate_table(fit)
@@ -228,7 +209,7 @@ def _truth_cell(row: pd.Series) -> str:
     return f"{truth} (outside)" if is_outside else truth
 
 
-def _estimate_table(fit: Fit) -> Table:
+def _estimate_table(fit: Fit) -> page.Table:
     data = fit.summary[["mean", "sd"]].set_axis(["estimate", "standard_error"], axis="columns")
     data, has_truth = fit.with_truth(data)
     cells: dict[str, Callable[[pd.Series], str]] = {
@@ -245,9 +226,9 @@ def _estimate_table(fit: Fit) -> Table:
     return fit.table("parameter", caption, cells, data)
 
 
-def sensitivity_table(fit: Fit) -> Table:
+def sensitivity_table(fit: Fit) -> page.Table:
     """Prior against posterior, and how far a changed prior would change the posterior."""
-    cells: Cells = {
+    cells: page.Cells = {
         "prior 95%": lambda row: interval(row["prior_q2.5"], row["prior_q97.5"]),
         "posterior 95%": lambda row: interval(row["q2.5"], row["q97.5"]),
         "width left": lambda row: percent(row["width_left"]),
@@ -263,11 +244,11 @@ def sensitivity_table(fit: Fit) -> Table:
     return fit.table("sensitivity", caption, cells, fit.prior, prose=["remark"])
 
 
-def _prior(result: xr.DataTree, has_draws: bool) -> list[Block]:
+def _prior(result: xr.DataTree, has_draws: bool) -> list[page.Block]:
     if not has_draws or "prior" not in result.children:
         return []
     return [
-        make_picture(
+        page.make_picture(
             plots_fit.plot_prior_posterior(result),
             "Prior and posterior of each parameter",
             "Histograms are scaled to equal height. Where blue covers gray, the data said nothing "
@@ -276,11 +257,11 @@ def _prior(result: xr.DataTree, has_draws: bool) -> list[Block]:
     ]
 
 
-def _pairs(result: xr.DataTree, has_draws: bool) -> list[Block]:
+def _pairs(result: xr.DataTree, has_draws: bool) -> list[page.Block]:
     if not has_draws or len(plots_fit.drawable(result, material=True)) < 2:
         return []
     return [
-        make_picture(
+        page.make_picture(
             plots_fit.plot_pairs(result),
             "Pair plot of the material parameters",
             "Each dot is a joint draw. A long narrow cloud means that the data determine a "
@@ -293,7 +274,7 @@ def _pairs(result: xr.DataTree, has_draws: bool) -> list[Block]:
 # --- Populations and spectra ----------------------------------------------------------------------
 
 
-def _population(fit: Fit, summary: pd.DataFrame, pooled: Sequence[Population]) -> list[Block]:
+def _population(fit: Fit, summary: pd.DataFrame, pooled: Sequence[Population]) -> list[page.Block]:
     """What the members of each population have in common, where anything is pooled."""
     if not pooled:
         return []
@@ -307,7 +288,7 @@ def _population(fit: Fit, summary: pd.DataFrame, pooled: Sequence[Population]) -
         "arrowhead stands for an estimate beyond the axis."
     )
     pictures = [
-        make_picture(
+        page.make_picture(
             plots_fit.plot_shrinkage(fit.result, label, summary, members),
             f"Shrinkage of {label}: each member alone and pooled",
             caption if at == 0 else "The same.",
@@ -320,11 +301,11 @@ def _population(fit: Fit, summary: pd.DataFrame, pooled: Sequence[Population]) -
         population_table(summary, pooled),
         *pictures,
         *([f"{more} more populations are in the table only."] if more > 0 else []),
-        Details("Every member in numbers", (member_table(fit.result, members, pooled),)),
+        page.Details("Every member in numbers", (member_table(fit.result, members, pooled),)),
     ]
 
 
-def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> Table:
+def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> page.Table:
     """Location, spread and the range of a new member, for every pooled parameter."""
 
     def with_interval(row: pd.Series, part: str) -> str:
@@ -332,7 +313,7 @@ def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> Tab
         scale = (high - low) / 2.0
         return f"{number(row[part], scale)} {interval(low, high, scale)}"
 
-    cells: Cells = {
+    cells: page.Cells = {
         "location": lambda row: with_interval(row, "location"),
         "spread": lambda row: with_interval(row, "spread"),
         "members differ by": lambda row: (
@@ -350,7 +331,7 @@ def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> Tab
         "included. Pooling factor (Gelman and Pardoe 2006): 0 without pooling, 1 where all members "
         "share one value; above 0.5 the population says more than the readings of a member."
     )
-    return make_table(
+    return page.make_table(
         "population",
         caption,
         "parameter",
@@ -360,7 +341,9 @@ def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> Tab
     )
 
 
-def member_table(result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Population]) -> Table:
+def member_table(
+    result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Population]
+) -> page.Table:
     """Every member of every population, with and without it."""
     posterior = result["posterior"].to_dataset()
     scalars = {scalar.label: scalar for each in pooled for scalar in each.members}
@@ -368,7 +351,7 @@ def member_table(result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Po
     def scale(row: pd.Series) -> float:
         return (row["q97.5"] - row["q2.5"]) / 4.0
 
-    cells: Cells = {
+    cells: page.Cells = {
         "mean": lambda row: number(row["mean"], scale(row)),
         "95% interval": lambda row: interval(row["q2.5"], row["q97.5"]),
         "alone": lambda row: number(row["alone"], scale(row)),
@@ -380,7 +363,7 @@ def member_table(result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Po
         "computed from the draws as if both were normal; a dash where they say nothing. Pooled "
         "share: the population's share in the precision of the estimate."
     )
-    return make_table(
+    return page.make_table(
         "member",
         caption,
         "parameter",
@@ -390,7 +373,7 @@ def member_table(result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Po
     )
 
 
-def _spectrum(result: xr.DataTree) -> list[Block]:
+def _spectrum(result: xr.DataTree) -> list[page.Block]:
     spectra = plots_curves.spectra(result)
     tied = (
         "Median, 50% and 95% of the posterior at every wavelength; between and beyond the measured "
@@ -402,7 +385,7 @@ def _spectrum(result: xr.DataTree) -> list[Block]:
         "ties the colors together, so it says nothing in between. Orange: true values, where known."
     )
     return [
-        make_picture(
+        page.make_picture(
             plots_curves.plot_spectrum(result, name, spectra),
             f"{name.replace('_', ' ').capitalize()} against wavelength",
             tied if members[0].between.size else free,
@@ -414,21 +397,21 @@ def _spectrum(result: xr.DataTree) -> list[Block]:
 # --- The instrument -------------------------------------------------------------------------------
 
 
-def _without(fit: Fit) -> Iterator[Block]:
+def _without(fit: Fit) -> Iterator[page.Block]:
     """Each fit without a part of the instrument, compared with the main one."""
     for at, (key, part) in enumerate(WITHOUT.items(), start=1):
         compared = compare_without(fit.result, key)
         if compared.empty:
             continue
-        yield Heading(f"Without {part}")
+        yield page.Heading(f"Without {part}")
         yield discrepancy_table(fit, compared, part, f"without-{at}")
         yield from text.overconfidence(compared, fit.scalars, fit.posterior, part)
     for key, reason in (fit.provenance.get("comparisons_failed") or {}).items():
-        yield Heading(f"Without {WITHOUT.get(key.removeprefix('without_'), one_line(key))}")
+        yield page.Heading(f"Without {WITHOUT.get(key.removeprefix('without_'), one_line(key))}")
         yield f"This comparison failed, so nothing is said of it: {one_line(reason)}."
 
 
-def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) -> Table:
+def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) -> page.Table:
     """The fit of the report next to the same fit without a part of the instrument."""
     data, has_truth = fit.with_truth(compared)
 
@@ -454,20 +437,20 @@ def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) ->
 # --- Readings and checks --------------------------------------------------------------------------
 
 
-def _readings(result: xr.DataTree, has_draws: bool) -> Iterator[Picture]:
+def _readings(result: xr.DataTree, has_draws: bool) -> Iterator[page.Picture]:
     bands = (
         " (posterior median). Half of new readings of the same material should fall in the dark "
         "band and 95% in the light one."
     )
     for name in plots_curves.variables(result):
         quantity = QUANTITIES[name]
-        yield make_picture(
+        yield page.make_picture(
             plots_curves.plot_readings(result, name),
             f"Readings of {quantity} and the fitted curve against view zenith",
             f"Readings of {quantity} with the fitted curve{bands if has_draws else '.'}",
         )
         if name != "intensity":
-            yield make_picture(
+            yield page.make_picture(
                 plots_curves.plot_residuals(result, name),
                 f"Readings of {quantity} minus the fitted curve against view zenith",
                 "The same after subtracting the fitted curve. A wave that many neighbors "
@@ -475,13 +458,13 @@ def _readings(result: xr.DataTree, has_draws: bool) -> Iterator[Picture]:
             )
 
 
-def _checks(result: xr.DataTree, checks: Mapping[str, Check]) -> list[Block]:
+def _checks(result: xr.DataTree, checks: Mapping[str, Check]) -> list[page.Block]:
     if not checks:
         return []
-    blocks: list[Block] = [check_table(checks)]
+    blocks: list[page.Block] = [check_table(checks)]
     if any(check.pit.size > 1 for check in checks.values()):
         blocks.append(
-            make_picture(
+            page.make_picture(
                 plots_fit.plot_pit(result, dict(checks)),
                 "PIT and leave-one-out PIT of each variable",
                 "For a model that expects its readings the curve stays in the gray band in 95 of "
@@ -494,7 +477,7 @@ def _checks(result: xr.DataTree, checks: Mapping[str, Check]) -> list[Block]:
     return blocks
 
 
-def check_table(checks: Mapping[str, Check]) -> Table:
+def check_table(checks: Mapping[str, Check]) -> page.Table:
     """Residuals, coverage, and leave-one-out results of every variable."""
     has_draws = any(check.pit.size for check in checks.values())
     columns = ["variable", "readings", "residual RMS"]
@@ -511,10 +494,10 @@ def check_table(checks: Mapping[str, Check]) -> Table:
     for check in checks.values():
         cells = [str(check.count), f"{check.residual_rms:.3g}"]
         cells += _predictive_cells(check) if has_draws else []
-        rows.append(Row(check.name, QUANTITIES.get(check.name, check.name), tuple(cells)))
+        rows.append(page.Row(check.name, QUANTITIES.get(check.name, check.name), tuple(cells)))
         data[check.name] = _check_numbers(check)
     frame = pd.DataFrame.from_dict(data, "index")
-    return Table("check", caption, tuple(columns), tuple(rows), frame)
+    return page.Table("check", caption, tuple(columns), tuple(rows), frame)
 
 
 def _check_numbers(check: Check) -> dict[str, float]:
@@ -541,13 +524,13 @@ def _predictive_cells(check: Check) -> list[str]:
 # --- The method -----------------------------------------------------------------------------------
 
 
-def _convergence(fit: Fit, has_draws: bool) -> list[Block]:
-    blocks: list[Block] = [convergence_table(fit)] if fit.method == "nuts" else []
-    blocks += make_bullets(auto_sentences(fit.result))
-    blocks += make_facts(_sampler_facts(fit))
+def _convergence(fit: Fit, has_draws: bool) -> list[page.Block]:
+    blocks: list[page.Block] = [convergence_table(fit)] if fit.method == "nuts" else []
+    blocks += page.make_bullets(auto_sentences(fit.result))
+    blocks += page.make_facts(_sampler_facts(fit))
     if fit.method == "nuts" and has_draws:
         blocks.append(
-            make_picture(
+            page.make_picture(
                 plots_fit.plot_ranks(fit.result),
                 "Rank plot of each chain",
                 "Each line is one chain. Lines that are flat and overlap mean that all chains "
@@ -558,9 +541,9 @@ def _convergence(fit: Fit, has_draws: bool) -> list[Block]:
     return blocks
 
 
-def convergence_table(fit: Fit) -> Table:
+def convergence_table(fit: Fit) -> page.Table:
     """R-hat, effective sample sizes and Monte Carlo error of every parameter."""
-    cells: Cells = {
+    cells: page.Cells = {
         "R-hat": column("r_hat", ".4f"),
         "ESS bulk": lambda row: or_dash(np.floor(row["ess_bulk"]), ".0f"),
         "ESS tail": lambda row: or_dash(np.floor(row["ess_tail"]), ".0f"),
@@ -609,14 +592,14 @@ def _weight_facts(fit: Fit, *, has_weights: bool) -> dict[str, object]:
 # --- Effects, accuracy and provenance -------------------------------------------------------------
 
 
-def _effects(result: xr.DataTree) -> list[Block]:
+def _effects(result: xr.DataTree) -> list[page.Block]:
     """How the scene was chosen, where it was."""
     if "effects" not in result.children:
         return []
     ledger = result["effects"].to_dataset()
     paths = map(str, ledger["path"].to_numpy())
     rows = tuple(
-        Row(name, path, cells)
+        page.Row(name, path, cells)
         for path, (name, cells) in zip(paths, ledger_rows(ledger).items(), strict=True)
     )
     reason = "kept or dropped, and why"
@@ -630,10 +613,10 @@ def _effects(result: xr.DataTree) -> list[Block]:
     )
     single = [name for name in ledger.data_vars if ledger[name].dims == ("effect",)]
     data = ledger[single].to_dataframe()
-    return [ledger_sentence(ledger), Table("effect", caption, columns, rows, data, [reason])]
+    return [ledger_sentence(ledger), page.Table("effect", caption, columns, rows, data, [reason])]
 
 
-def _accuracy(result: xr.DataTree) -> list[Block]:
+def _accuracy(result: xr.DataTree) -> list[page.Block]:
     """An accuracy study of the same capture, where the result holds one."""
     if "accuracy" not in result.children:
         return []
@@ -642,7 +625,7 @@ def _accuracy(result: xr.DataTree) -> list[Block]:
     return [sentences, accuracy_picture(study), study_table(study)]
 
 
-def provenance_facts(provenance: Mapping[str, Any]) -> list[Block]:
+def provenance_facts(provenance: Mapping[str, Any]) -> list[page.Block]:
     """How the fit was made, in titled groups of names and values; swapped parts are marked."""
     keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
     keys += ["chain_method", "largest_view_zenith"]
@@ -675,13 +658,13 @@ def provenance_facts(provenance: Mapping[str, Any]) -> list[Block]:
     return [
         block
         for title, values in groups.items()
-        for block in make_facts(values, title, marked=marked.get(title, ()), mark=SWAPPED)
+        for block in page.make_facts(values, title, marked=marked.get(title, ()), mark=SWAPPED)
     ]
 
 
-def _provenance(provenance: Mapping[str, Any]) -> list[Block]:
+def _provenance(provenance: Mapping[str, Any]) -> list[page.Block]:
     source = str(provenance.get("model_source") or "")
-    details = [Details("Source of the model", code=source)] if source else []
+    details = [page.Details("Source of the model", code=source)] if source else []
     return [*provenance_facts(provenance), *details]
 
 

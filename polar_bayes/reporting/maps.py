@@ -22,20 +22,8 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.fit_map import checked_status, cut
 from polar_bayes.maps.lazy import at_hand
 from polar_bayes.physics.part import notation
-from polar_bayes.reporting import style, text
+from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts
-from polar_bayes.reporting.page import (
-    MAIN_GROUP,
-    Block,
-    Cells,
-    Page,
-    Picture,
-    Row,
-    Section,
-    Table,
-    make_picture,
-    make_table,
-)
 from polar_bayes.reporting.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import APPROACHES, DASH, SLIGHT, count_percent, number
 
@@ -220,7 +208,7 @@ UNCHECKED = (
 
 def map_page(
     maps: xr.Dataset, truth: xr.Dataset | None = None, uncorrected: xr.Dataset | None = None
-) -> Page:
+) -> page.Page:
     """The page of a map."""
     titles = parameter_titles(map_scalars(maps))
     if any(name not in maps for name in TRUST):
@@ -233,7 +221,7 @@ def map_page(
     method = FITTED_BY[provenance.get("fitted_by", "PixelLaplace")] if is_weighted else UNCORRECTED
     size = " x ".join(f"{maps.sizes[dim]:,}" for dim in IMAGE)
     sentences = text.pixel_sentences(counts)
-    coverage: list[Block] = []
+    coverage: list[page.Block] = []
     if truth is not None:
         conclusions, coverage = _coverage(maps, titles, truth, uncorrected)
         sentences += conclusions
@@ -241,16 +229,16 @@ def map_page(
         "Each pixel was fitted by itself. The mean of a region and its uncertainty are not on this "
         "page: fit the region as one capture."
     )
-    tables: list[Block] = [parameter_table(maps, titles), regions]
+    tables: list[page.Block] = [parameter_table(maps, titles), regions]
     sections = [
-        Section("maps", "Maps", "Maps", list(_pictures(maps, list(titles)))),
-        Section("pixels", "Pixels", "Pixels", [status_table(counts), approach_table(counts)]),
-        Section("parameters", "Parameters", "Parameters", tables),
-        Section("coverage", "Coverage", "Coverage", coverage),
-        Section("provenance", "Provenance", "Provenance", provenance_facts(provenance)),
+        page.Section("maps", "Maps", list(_pictures(maps, list(titles)))),
+        page.Section("pixels", "Pixels", [status_table(counts), approach_table(counts)]),
+        page.Section("parameters", "Parameters", tables),
+        page.Section("coverage", "Coverage", coverage),
+        page.Section("provenance", "Provenance", provenance_facts(provenance)),
     ]
     swapped = text.swapped_sentence(provenance)
-    return Page(
+    return page.Page(
         kind="Map report",
         name=_name(maps, provenance, truth),
         subtitles=[f"{size} pixels. {text.made_by(provenance, method)}", *filter(None, [swapped])],
@@ -307,7 +295,7 @@ def parameter_titles(scalars: Sequence[Scalar]) -> dict[Scalar, str]:
     return titles
 
 
-def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[Picture]:
+def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Picture]:
     """Means, widths and trust, a few parameters and one wavelength at a time."""
     dims = {scalar.name: set(scalar.index) for scalar in scalars}
     names = [name for name in dims if dims[name] <= {"wavelength"}]
@@ -325,7 +313,7 @@ def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[Picture]:
             variables = [f"{name}{ending}" for name in shown for ending in ("", "_quantile")]
             place = "" if wavelength is None else f" at {wavelength:g} nm"
             titles = text.join([name.replace("_", " ") for name in shown])
-            yield make_picture(
+            yield page.make_picture(
                 plot_maps(maps[[*variables, *TRUST]], wavelength=wavelength),
                 f"Maps of {text.join(shown)}{place}, with Pareto k, approach and status",
                 caption if at + turn == 0 else f"The same of {titles}{place}.",
@@ -341,13 +329,13 @@ def _wavelengths(maps: xr.Dataset) -> list[float]:
 # --- Tables ---------------------------------------------------------------------------------------
 
 
-def status_table(counts: pd.DataFrame) -> Table:
+def status_table(counts: pd.DataFrame) -> page.Table:
     """Pixels by status."""
     caption = "The status of each pixel. Only good ones count in the other tables."
     return count_table("status", caption, counts.sum(axis=1).to_frame("pixels"), STATUSES)
 
 
-def approach_table(counts: pd.DataFrame) -> Table:
+def approach_table(counts: pd.DataFrame) -> page.Table:
     """Pixels by approach, and how many of them are good."""
     caption = "How the numbers of each pixel were found, from the cheapest approach to the dearest."
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
@@ -355,18 +343,20 @@ def approach_table(counts: pd.DataFrame) -> Table:
     return count_table("approach", caption, data, APPROACHES)
 
 
-def count_table(name: str, caption: str, data: pd.DataFrame, meanings: Mapping[str, str]) -> Table:
+def count_table(
+    name: str, caption: str, data: pd.DataFrame, meanings: Mapping[str, str]
+) -> page.Table:
     """Counts by flag: how many there are, their share, and how many of them fulfil a condition."""
     what, *others = map(str, data.columns)
     total = int(data[what].sum())
-    cells: Cells = {
+    cells: page.Cells = {
         what: text.column(what, ",.0f"),
         "share": lambda row: count_percent(int(row[what]), total),
         **{each: text.column(each, ",.0f") for each in others},
     }
     data = data.copy()
     data.insert(1, "share", data[what] / max(total, 1))
-    return make_table(
+    return page.make_table(
         name,
         caption,
         name,
@@ -377,7 +367,7 @@ def count_table(name: str, caption: str, data: pd.DataFrame, meanings: Mapping[s
     )
 
 
-def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
+def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> page.Table:
     """Every parameter over the good pixels: its value, its variation, its uncertainty."""
     data = {}
     for scalar in titles:
@@ -401,7 +391,7 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
         "material."
     )
     by_label = {scalar.label: scalar for scalar in titles}
-    return make_table(
+    return page.make_table(
         "parameter",
         caption,
         "parameter",
@@ -413,7 +403,7 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
 
 
 def _group(scalar: Scalar) -> str:
-    return MAIN_GROUP if scalar.is_material else INSTRUMENT_GROUP
+    return page.MAIN_GROUP if scalar.is_material else INSTRUMENT_GROUP
 
 
 def _over_good(maps: xr.Dataset, scalar: Scalar, ending: str) -> np.ndarray:
@@ -439,7 +429,7 @@ def _coverage(
     titles: Mapping[Scalar, str],
     truth: xr.Dataset,
     uncorrected: xr.Dataset | None,
-) -> tuple[list[str], list[Block]]:
+) -> tuple[list[str], list[page.Block]]:
     """Conclusions on the coverage of the maps, and of those that were not corrected; blocks."""
     by_label = {scalar.label: title for scalar, title in titles.items()}
     own = map_coverage(maps, truth)
@@ -455,7 +445,7 @@ def _coverage(
     return conclusions, [coverage_table(titles, list(tables.values())), *counted]
 
 
-def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame]) -> Table:
+def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame]) -> page.Table:
     """How often the intervals hold the truth, next to those of a map that was not corrected."""
     ways = ["holds the truth"] if len(tables) == 1 else ["corrected", "uncorrected"]
     columns = [column for way in ways for column in (way, "within", "of all read")]
@@ -466,7 +456,7 @@ def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame])
             for table in tables:
                 cells += _coverage_cells(table, scalar.label, claimed)
             description = title if claimed == min(INTERVALS) else scalar.label
-            rows.append(Row(scalar.label, description, tuple(cells), _group(scalar)))
+            rows.append(page.Row(scalar.label, description, tuple(cells), _group(scalar)))
     caption = (
         "Share of the pixels with an answer whose central interval holds the true value, and the "
         "95% interval of that share, given so many pixels. Of all read: the same where a pixel "
@@ -478,7 +468,7 @@ def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame])
     data = tables[0]
     for other in tables[1:]:
         data = data.join(other.add_suffix("_uncorrected"))
-    return Table("coverage", caption, ("parameter", "interval", *columns), tuple(rows), data)
+    return page.Table("coverage", caption, ("parameter", "interval", *columns), tuple(rows), data)
 
 
 def _coverage_cells(table: pd.DataFrame, label: str, claimed: int) -> list[str]:

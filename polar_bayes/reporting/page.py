@@ -163,12 +163,12 @@ type Block = str | Table | Picture | Facts | Heading | Bullets | Details
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """A part of a page with a link in its menu; one without blocks is left out."""
+    """A part of a page, which the menu calls `link`; one without blocks is left out."""
 
     id: str
-    link: str
     title: str
     blocks: Sequence[Block]
+    link: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
