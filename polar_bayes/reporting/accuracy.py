@@ -208,14 +208,7 @@ def accuracy_page(result: xr.DataTree) -> page.Page:
 
 def accuracy_picture(study: xr.Dataset) -> page.Picture:
     """Error against time."""
-    return page.make_picture(
-        plot_accuracy(study),
-        "Error against time of every method",
-        "Down is better, left is faster. A color stands for a method, a marker for what was "
-        "changed of it; methods as given are filled and named. The line joins those than which "
-        "nothing is both faster and better. In the gray area the reference itself cannot tell an "
-        "error from nothing.",
-    )
+    return page.make_picture(plot_accuracy(study), *text.figure_caption("accuracy.figure_front"))
 
 
 def study_table(study: xr.Dataset) -> page.Table:
@@ -246,14 +239,7 @@ def study_table(study: xr.Dataset) -> page.Table:
         "gradients": column("gradients", ",.0f"),
         "densities": column("densities", ",.0f"),
     }
-    caption = (
-        "Error: the largest of any mean or standard deviation, in posterior standard deviations, "
-        "and of which parameter; marked < where the reference itself cannot tell it from nothing. "
-        "Interval: the same of the ends of 95% intervals. ESS: effective sample size. First and "
-        "next: seconds of a first fit in a fresh process, compilation included, and of the next "
-        "one. Gradients and densities: evaluations, warm-up included. * on the front: nothing is "
-        "both faster and better."
-    )
+    caption = text.caption("accuracy.study")
     return page.make_table(
         "study", caption, "method", cells, table, describe=describe, prose=["method"]
     )

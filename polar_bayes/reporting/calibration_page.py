@@ -64,11 +64,7 @@ def calibration_page(
     readings = calibration_readings(calibration) if holds_readings(calibration) else None
     headline, passed = text.calibration_headline(table, readings)
     first, *problems = text.verdict_after_headline(calibration)
-    introduction = (
-        "Parameters were drawn from the prior, captures of this layout simulated from them and "
-        "fitted. Where model, prior and method are right, the truth is one draw more of each "
-        "posterior."
-    )
+    introduction = text.caption("calibration.introduction")
     comparison: list[page.Block] = []
     if others:
         compared = compare_calibrations({method: calibration, **others})
@@ -136,61 +132,36 @@ def _pictures(
 ) -> dict[str, list[page.Block]]:
     """The figures of each section."""
     colors = f" Band and dots are those of {method}; the others are drawn over it."
-    ecdf = _paged(
-        ranks,
-        lambda some: figures.ecdf_differences(some, others, method),
-        "Distribution of the ranks minus the uniform one",
-        "Where the posterior is right, the rank of the truth among its draws is uniform, and the "
-        "curve stays in the gray band: curves of all parameters together leave it in at most one "
-        "of twenty right calibrations. Black dots mark where it leaves the band, which is narrow "
-        "at both ends. A hump above zero on the left and a dip below it on the right: the truth "
-        "lies too often at both ends, intervals are too narrow; dip first, then hump: too wide. "
-        "All above zero: truths rank low among the draws, the posterior is too high; all below: "
-        f"too low.{colors if others else ''}",
-    )
-    histograms = _paged(
-        ranks,
-        figures.rank_histograms,
-        "Histograms of the ranks",
-        "The same ranks as histograms. All bars of a uniform one stay in the gray band in at least "
-        "19 of 20 calibrations. High at both ends: intervals too narrow; high in the middle: too "
-        "wide; high on the left: the posterior is too high; on the right: too low.",
-    )
-    coverage = _paged(
-        ranks,
-        lambda some: figures.interval_coverage(some, others, method),
-        "Share of the fits whose 50, 80 and 95% intervals hold the truth",
-        "A dot for each interval: the share of all fits, failed ones counted as misses, whose "
-        "interval holds the truth; bars are the 95% ranges (Wilson) that so many simulations "
-        "allow. Dots belong on the dashed lines at 50, 80 and 95%: left of them intervals are too "
-        "narrow or biased, right of them too wide.",
-    )
-    estimates = _paged(
-        ranks,
-        figures.estimates,
-        "Posterior means and 80% intervals against the truth",
-        f"Of at most {MAX_INTERVALS} simulations, evenly chosen, those that failed included. About "
-        "one interval in five should miss the truth (orange). Points along the dashed line: the "
-        "data determine the parameter. A flatter cloud: estimates shrink towards the prior, fully "
-        "so where it is level, and intervals are long. A cloud next to the line: estimates are "
-        "biased.",
-    )
-    return {"ranks": [*ecdf, *histograms], "coverage": list(coverage), "estimates": list(estimates)}
+
+    def ecdf(some: Sequence[Ranks]) -> Figure:
+        return figures.ecdf_differences(some, others, method)
+
+    def coverage(some: Sequence[Ranks]) -> Figure:
+        return figures.interval_coverage(some, others, method)
+
+    return {
+        "ranks": [
+            *_paged(ranks, ecdf, "ecdf", colors=colors if others else ""),
+            *_paged(ranks, figures.rank_histograms, "histograms"),
+        ],
+        "coverage": list(_paged(ranks, coverage, "coverage")),
+        "estimates": list(
+            _paged(ranks, figures.estimates, "estimates", max_intervals=MAX_INTERVALS)
+        ),
+    }
 
 
 def _paged(
-    ranks: Sequence[Ranks],
-    draw: Callable[[Sequence[Ranks]], Figure],
-    alternative: str,
-    caption: str,
+    ranks: Sequence[Ranks], draw: Callable[[Sequence[Ranks]], Figure], name: str, **values: object
 ) -> Iterator[page.Picture]:
     """A few panels at a time; the first caption says how to read them all."""
     for at in range(0, len(ranks), MAX_PANELS):
         some = ranks[at : at + MAX_PANELS]
         labels = text.join([each.label for each in some])
-        yield page.make_picture(
-            draw(some), f"{alternative}: {labels}", caption if at == 0 else f"The same of {labels}."
-        )
+        key = f"calibration.figure_{name}"
+        alternative, caption = text.figure_caption(key, labels=labels, **values)
+        caption = f"The same of {labels}." if at else caption
+        yield page.make_picture(draw(some), alternative, caption)
 
 
 # --- Tables of parameters -------------------------------------------------------------------------
@@ -229,15 +200,7 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> page.Table:
         "failed": lambda row: f"{int(row['failed']):,} of {simulations:,}",
         **_score_cells(),
     }
-    caption = (
-        f"p: how often uniform ranks deviate as far; marked below {level:.2g} (5% shared by all "
-        "parameters). Mean rank: above 0.5 the posterior is too low, below too high. Spread, over "
-        "that of uniform ranks: above 1 intervals are too narrow, below too wide. Hold: share of "
-        "all fits whose central interval holds the truth, failed ones counted as misses, and the "
-        "95% range that so many simulations allow. Width of the 95% interval and continuous ranked "
-        "probability score: means over the fits, in the unit of the parameter; ranks cannot detect "
-        "a posterior that ignores the data, these can."
-    )
+    caption = text.caption("calibration.parameter", level=level)
     return page.make_table(
         "parameter",
         caption,
@@ -265,11 +228,7 @@ def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> page.
         f"score against {first}": _score_change,
         **_score_cells(),
     }
-    caption = (
-        f"The same by each method. Score against {first}: mean ranked score over that of {first}, "
-        "fit by fit where both have an answer, minus one; below zero is better, the number after ± "
-        "is its standard error; a dash where the simulations are not the same."
-    )
+    caption = text.caption("calibration.comparison", first=first)
     return page.make_table(
         "comparison",
         caption,
@@ -306,16 +265,7 @@ def _readings(
         Ranks(str(label), titles[label], pit[label], row, level)
         for label, row in readings.iterrows()
     ]
-    pictures = _paged(
-        ranks,
-        lambda some: figures.ecdf_differences(some, {}, method),
-        "Distribution of the ranks of readings minus the uniform one",
-        "Where model, links and posterior are right, the rank of a reading among its predictions "
-        "is uniform, and the curve stays in the gray band: curves of all readings together leave "
-        "it in at most one of twenty right calibrations. Black dots mark where it leaves the band. "
-        "A hump above zero on the left and a dip below it on the right: readings lie too often at "
-        "both ends, predictions are too narrow; dip first, then hump: too wide.",
-    )
+    pictures = _paged(ranks, lambda some: figures.ecdf_differences(some, {}, method), "readings")
     cells: page.Cells = {
         "p": lambda row: text.p_value(row["p_value"], passes=bool(row["p_value"] >= level)),
         RANKS_COLUMN: lambda row: (
@@ -326,16 +276,7 @@ def _readings(
         "spread": column("rank_spread", ".3f"),
         "untrusted": column("untrusted", ",.0f"),
     }
-    caption = (
-        "In each simulation one entry of each reading is tested. Fresh: read once more from the "
-        "same truth, and ranked among the predictions of the fit. Left out: one that was fitted, "
-        "ranked among the predictions of the fit of all the others. p: how often uniform ranks "
-        f"deviate as far; marked below {level:.2g} (5% shared by these rows, in addition to the 5% "
-        "of the parameters). Mean rank: above 0.5 predictions are too low, below too high. Spread, "
-        "over that of uniform ranks: above 1 predictions are too narrow, below too wide. "
-        "Untrusted: fits whose weights without the reading are unreliable (Pareto k above "
-        f"{LARGEST_TRUSTED:g})."
-    )
+    caption = text.caption("calibration.reading", level=level, largest_trusted=LARGEST_TRUSTED)
     table = page.make_table(
         "reading",
         caption,
@@ -353,10 +294,7 @@ def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterato
     """Numbers of fits by status and by approach."""
     fits = calibration["fits"].to_dataset()
     answered = np.all([np.isfinite(each.pit) for each in ranks.values()], axis=0)
-    status = (
-        "The status of each fit. With ranks: those of which every parameter is ranked; the others "
-        "count as misses in the table of parameters."
-    )
+    status = text.caption("calibration.status")
     tables: dict[str, tuple[type[enum.IntEnum], Mapping[str, str], str]] = {
         "status": (Status, STATUSES, status),
         "approach": (Approach, text.APPROACHES, "How the numbers of each fit were found."),

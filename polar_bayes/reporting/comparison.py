@@ -83,14 +83,9 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     left_out = [f"{name}: {why}." if name else why for name, why in comparison.left_out.items()]
     predictions: list[page.Block] = [] if comparison.loo.empty else [loo_table(comparison)]
     more = comparison.parameters.index.get_level_values("parameter").nunique() - MAX_PANELS
-    figure = page.make_picture(
-        plot_comparison(comparison),
-        "Means and 95% intervals of each parameter by every fit",
-        "Dots are posterior means, bars 95% intervals; dashed bars are twice the standard error of "
-        "a point fit. Bars that do not overlap disagree by more than their uncertainty allows; a "
-        "much shorter bar claims more knowledge, which the fit's own report should justify."
-        + (f" {more} more parameters are in the table only." if more > 0 else ""),
-    )
+    alternative, caption = text.figure_caption("comparison.figure_parameters")
+    caption += f" {more} more parameters are in the table only." if more > 0 else ""
+    figure = page.make_picture(plot_comparison(comparison), alternative, caption)
     prior = [sensitivity] if sensitivity else []
     sections = [
         page.Section("predictions", "Predictions", [*predictions, *page.make_bullets(left_out)]),
@@ -129,13 +124,7 @@ def loo_table(comparison: FitComparison) -> page.Table:
         "weight": lambda row: f"{row['weight']:.2f}",
         "k > 0.7": lambda row: f"{int(row['unreliable'])}",
     }
-    caption = (
-        "elpd: log density of each reading given all others, summed over all variables (nat); "
-        "higher is better. Difference: to the best, with its standard error; below "
-        f"{CLEAR:g}, or below two standard errors, it says little. p: effective number of "
-        "parameters. Weight: share in the mixture of fits that would predict best (stacking). "
-        "k > 0.7: readings for which this cannot be trusted."
-    )
+    caption = text.caption("comparison.loo", clear=CLEAR)
     return page.make_table("loo", caption, "fit", cells, comparison.loo)
 
 
@@ -173,11 +162,7 @@ def sensitivity_table(comparison: FitComparison) -> page.Table | None:
         "to the data": column("likelihood_sensitivity", ".3f"),
         "remark": lambda row: str(row["remark"]),
     }
-    caption = (
-        "Prior inside: the prior's probability of the 95% interval, 95% if the data said nothing. "
-        "To the priors, to the data: how fast the posterior moves when all priors, or all data, "
-        f"count a little more (power scaling); from {SENSITIVE} on it matters."
-    )
+    caption = text.caption("comparison.sensitivity", sensitive=SENSITIVE)
     prose = ["fit", "remark"]
     return page.make_table("sensitivity", caption, "parameter", cells, known, prose=prose)
 

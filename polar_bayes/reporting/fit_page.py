@@ -194,12 +194,7 @@ def parameter_table(fit: Fit) -> page.Table:
         cells["true value"] = _truth_cell
     cells["prior inside"] = lambda row: percent(row["prior_inside"])
     cells["by the data"] = lambda row: str(row["verdict"])
-    caption = (
-        "Posterior mean, standard deviation and equal-tailed 95% interval. Prior inside: the "
-        "prior's probability of that interval, 95% if the data said nothing; up to "
-        f"{DETERMINED:.0%} the parameter counts as determined by the data, up to {PARTLY:.0%} as "
-        "partly determined."
-    )
+    caption = text.caption("fit.parameter", determined=DETERMINED, partly=PARTLY)
     return fit.table("parameter", caption, cells, data)
 
 
@@ -236,11 +231,7 @@ def sensitivity_table(fit: Fit) -> page.Table:
         "to the data": column("likelihood_sensitivity", ".3f"),
         "remark": lambda row: str(row["remark"]),
     }
-    caption = (
-        "Width left: the width of the posterior's interval over that of the prior's. To the "
-        "priors, to the data: how fast the posterior moves when all priors, or all data, count a "
-        f"little more (power scaling); from {SENSITIVE} on it matters."
-    )
+    caption = text.caption("fit.sensitivity", sensitive=SENSITIVE)
     return fit.table("sensitivity", caption, cells, fit.prior, prose=["remark"])
 
 
@@ -249,10 +240,7 @@ def _prior(result: xr.DataTree, has_draws: bool) -> list[page.Block]:
         return []
     return [
         page.make_picture(
-            plots_fit.plot_prior_posterior(result),
-            "Prior and posterior of each parameter",
-            "Histograms are scaled to equal height. Where blue covers gray, the data said nothing "
-            "about this parameter.",
+            plots_fit.plot_prior_posterior(result), *text.figure_caption("fit.figure_prior")
         )
     ]
 
@@ -261,13 +249,7 @@ def _pairs(result: xr.DataTree, has_draws: bool) -> list[page.Block]:
     if not has_draws or len(plots_fit.drawable(result, material=True)) < 2:
         return []
     return [
-        page.make_picture(
-            plots_fit.plot_pairs(result),
-            "Pair plot of the material parameters",
-            "Each dot is a joint draw. A long narrow cloud means that the data determine a "
-            "combination of the two better than either; numbers above the diagonal are "
-            "correlations. Orange dashes: true values, where known. Crosses: divergent draws.",
-        )
+        page.make_picture(plots_fit.plot_pairs(result), *text.figure_caption("fit.figure_pairs"))
     ]
 
 
@@ -280,21 +262,12 @@ def _population(fit: Fit, summary: pd.DataFrame, pooled: Sequence[Population]) -
         return []
     members = shrinkage(fit.result)
     drawn = [each.label for each in pooled if math.isfinite(summary.loc[each.label, "pooling"])]
-    caption = (
-        "Two estimates of each member: above, hollow, approximately what its own readings alone "
-        "would give; below, filled, its estimate in this fit, which is shrunk towards the others. "
-        "The less the readings of a member say, the more it is shrunk towards the population. Dark "
-        "gray: the population's location; light gray: where a new member would lie; both 95%. An "
-        "arrowhead stands for an estimate beyond the axis."
-    )
-    pictures = [
-        page.make_picture(
-            plots_fit.plot_shrinkage(fit.result, label, summary, members),
-            f"Shrinkage of {label}: each member alone and pooled",
-            caption if at == 0 else "The same.",
-        )
-        for at, label in enumerate(drawn[:MAX_POPULATIONS])
-    ]
+    pictures: list[page.Block] = []
+    for label in drawn[:MAX_POPULATIONS]:
+        alternative, caption = text.figure_caption("fit.figure_shrinkage", label=label)
+        figure = plots_fit.plot_shrinkage(fit.result, label, summary, members)
+        caption = "The same." if pictures else caption
+        pictures.append(page.make_picture(figure, alternative, caption))
     more = len(drawn) - MAX_POPULATIONS
     return [
         *(text.pooling(summary, pooled, fit.posterior) if fit.verdict.converged else []),
@@ -323,14 +296,7 @@ def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> pag
         "pooling factor": column("pooling", ".2f"),
     }
     scales = {each.label: SCALES[each.scale] for each in pooled}
-    caption = (
-        "Location: the median of the population, in the unit of the parameter. Spread: the "
-        "standard deviation between members on the scale named under the parameter, and next to it "
-        "what it means in the unit of the parameter. Brackets: 95% intervals. A new member: where "
-        "one that was not measured would lie with 95%, the uncertainty of location and spread "
-        "included. Pooling factor (Gelman and Pardoe 2006): 0 without pooling, 1 where all members "
-        "share one value; above 0.5 the population says more than the readings of a member."
-    )
+    caption = text.caption("fit.population")
     return page.make_table(
         "population",
         caption,
@@ -358,11 +324,7 @@ def member_table(
         "95% alone": lambda row: interval(row["alone_q2.5"], row["alone_q97.5"], scale(row)),
         "pooled share": lambda row: percent(row["leaning"]),
     }
-    caption = (
-        "Alone: approximately what the readings of a member would give without the population, "
-        "computed from the draws as if both were normal; a dash where they say nothing. Pooled "
-        "share: the population's share in the precision of the estimate."
-    )
+    caption = text.caption("fit.member")
     return page.make_table(
         "member",
         caption,
@@ -375,23 +337,13 @@ def member_table(
 
 def _spectrum(result: xr.DataTree) -> list[page.Block]:
     spectra = plots_curves.spectra(result)
-    tied = (
-        "Median, 50% and 95% of the posterior at every wavelength; between and beyond the measured "
-        "ones (dashed lines) the fit knows it only from its assumption about how it varies with "
-        "wavelength. Orange: true values, where known."
-    )
-    free = (
-        "Median, 50% and 95% of the posterior at each measured wavelength. Nothing in this fit "
-        "ties the colors together, so it says nothing in between. Orange: true values, where known."
-    )
-    return [
-        page.make_picture(
-            plots_curves.plot_spectrum(result, name, spectra),
-            f"{name.replace('_', ' ').capitalize()} against wavelength",
-            tied if members[0].between.size else free,
-        )
-        for name, members in spectra.items()
-    ]
+    pictures: list[page.Block] = []
+    for name, members in spectra.items():
+        key = f"fit.figure_spectrum_{'bands' if members[0].between.size else 'intervals'}"
+        captions = text.figure_caption(key, name=name.replace("_", " ").capitalize())
+        figure = plots_curves.plot_spectrum(result, name, spectra)
+        pictures.append(page.make_picture(figure, *captions))
+    return pictures
 
 
 # --- The instrument -------------------------------------------------------------------------------
@@ -427,10 +379,7 @@ def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) ->
     }
     if has_truth:
         cells["true value"] = lambda row: number(row["true_value"], scale(row))
-    caption = (
-        f"This fit and the same fit without {part}. Width: that of the interval without it over "
-        "that with it."
-    )
+    caption = text.caption("fit.without", part=part)
     return fit.table(name, caption, cells, data)
 
 
@@ -438,24 +387,13 @@ def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) ->
 
 
 def _readings(result: xr.DataTree, has_draws: bool) -> Iterator[page.Picture]:
-    bands = (
-        " (posterior median). Half of new readings of the same material should fall in the dark "
-        "band and 95% in the light one."
-    )
+    key = "fit.figure_readings" if has_draws else "fit.figure_point_readings"
     for name in plots_curves.variables(result):
-        quantity = QUANTITIES[name]
-        yield page.make_picture(
-            plots_curves.plot_readings(result, name),
-            f"Readings of {quantity} and the fitted curve against view zenith",
-            f"Readings of {quantity} with the fitted curve{bands if has_draws else '.'}",
-        )
+        captions = text.figure_caption(key, quantity=QUANTITIES[name])
+        yield page.make_picture(plots_curves.plot_readings(result, name), *captions)
         if name != "intensity":
-            yield page.make_picture(
-                plots_curves.plot_residuals(result, name),
-                f"Readings of {quantity} minus the fitted curve against view zenith",
-                "The same after subtracting the fitted curve. A wave that many neighbors "
-                "share is a smooth error of the instrument or of the model.",
-            )
+            captions = text.figure_caption("fit.figure_residuals", quantity=QUANTITIES[name])
+            yield page.make_picture(plots_curves.plot_residuals(result, name), *captions)
 
 
 def _checks(result: xr.DataTree, checks: Mapping[str, Check]) -> list[page.Block]:
@@ -465,13 +403,7 @@ def _checks(result: xr.DataTree, checks: Mapping[str, Check]) -> list[page.Block
     if any(check.pit.size > 1 for check in checks.values()):
         blocks.append(
             page.make_picture(
-                plots_fit.plot_pit(result, dict(checks)),
-                "PIT and leave-one-out PIT of each variable",
-                "For a model that expects its readings the curve stays in the gray band in 95 of "
-                "100 captures. Up, then down: readings scatter more than the model says; down, "
-                "then up: less; all on one side: the prediction is shifted. Red lines leave the "
-                "band. The leave-one-out panel predicts each reading from the others and is the "
-                "stricter one.",
+                plots_fit.plot_pit(result, dict(checks)), *text.figure_caption("fit.figure_pit")
             )
         )
     return blocks
@@ -484,12 +416,7 @@ def check_table(checks: Mapping[str, Check]) -> page.Table:
     caption = "Residual: reading minus the noise-free prediction, in the unit of the reading."
     if has_draws:
         columns += [*(f"inside {p:.0%}" for p in PROBABILITIES), "elpd", "p", "k > 0.7"]
-        caption += (
-            " Inside: share of the readings in the central predictive interval, and in brackets "
-            "how far chance alone moves it. Leave-one-out: elpd is the log density of each reading "
-            "given all others, summed; p the effective number of parameters; k > 0.7 counts "
-            "readings for which this cannot be trusted. Saturated readings are not compared."
-        )
+        caption += text.caption("fit.predictive_check")
     rows, data = [], {}
     for check in checks.values():
         cells = [str(check.count), f"{check.residual_rms:.3g}"]
@@ -531,11 +458,7 @@ def _convergence(fit: Fit, has_draws: bool) -> list[page.Block]:
     if fit.method == "nuts" and has_draws:
         blocks.append(
             page.make_picture(
-                plots_fit.plot_ranks(fit.result),
-                "Rank plot of each chain",
-                "Each line is one chain. Lines that are flat and overlap mean that all chains "
-                "sample one distribution; a chain with a slope or a peak explored another part of "
-                "it.",
+                plots_fit.plot_ranks(fit.result), *text.figure_caption("fit.figure_ranks")
             )
         )
     return blocks
@@ -604,13 +527,7 @@ def _effects(result: xr.DataTree) -> list[page.Block]:
     )
     reason = "kept or dropped, and why"
     columns = ("effect", "data", "shift", "sd", "operations", "time", reason)
-    caption = (
-        "What leaving out one effect alone changes. Data: the prediction that moves most, in "
-        "standard deviations of its noise. Shift and sd: the posterior that moves most, in its "
-        "standard deviations, and the one whose standard deviation changes most, both taken as "
-        "normal. Operations and time: the effect's share of one log density with everything on. "
-        f"What changes no parameter by more than {ledger.attrs['tolerance']:g} may go."
-    )
+    caption = text.caption("fit.effect", tolerance=ledger.attrs["tolerance"])
     single = [name for name in ledger.data_vars if ledger[name].dims == ("effect",)]
     data = ledger[single].to_dataframe()
     return [ledger_sentence(ledger), page.Table("effect", caption, columns, rows, data, [reason])]

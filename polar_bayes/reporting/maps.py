@@ -200,10 +200,6 @@ FITTED_BY = {
     "PixelTempering": "tempered sequential Monte Carlo in each pixel",
     "PixelNuts": "NUTS in each pixel",
 }
-UNCHECKED = (
-    "The approximation was taken as it is (weighted=False): good means that the search for the "
-    "mode converged, and nothing says how far the numbers can be trusted."
-)
 
 
 def map_page(
@@ -225,10 +221,7 @@ def map_page(
     if truth is not None:
         conclusions, coverage = _coverage(maps, titles, truth, uncorrected)
         sentences += conclusions
-    regions = (
-        "Each pixel was fitted by itself. The mean of a region and its uncertainty are not on this "
-        "page: fit the region as one capture."
-    )
+    regions = text.caption("map.regions")
     tables: list[page.Block] = [parameter_table(maps, titles), regions]
     sections = [
         page.Section("maps", "Maps", list(_pictures(maps, list(titles)))),
@@ -245,7 +238,7 @@ def map_page(
         headline=headline,
         passed=passed,
         sentences=sentences,
-        cautions=[] if is_weighted else [UNCHECKED],
+        cautions=[] if is_weighted else [text.caption("map.unchecked")],
         sections=sections,
         footer="Computed from the maps of every pixel, which stay where they are.",
     )
@@ -300,11 +293,7 @@ def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Pict
     dims = {scalar.name: set(scalar.index) for scalar in scalars}
     names = [name for name in dims if dims[name] <= {"wavelength"}]
     step = _pixel_step(maps)
-    caption = (
-        "Posterior means, below them the widths of their 95% intervals, and how far each pixel can "
-        "be trusted. Gray: no answer. One pixel in a hundred lies beyond each end of a scale."
-    )
-    caption += f" Of every {step} x {step} pixels one is drawn." if step > 1 else ""
+    thinned = f" Of every {step} x {step} pixels one is drawn." if step > 1 else ""
     for at in range(0, len(names), MAX_COLUMNS):
         some = names[at : at + MAX_COLUMNS]
         spectral = [name for name in some if "wavelength" in dims[name]]
@@ -312,12 +301,12 @@ def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Pict
             shown = some if turn == 0 else spectral
             variables = [f"{name}{ending}" for name in shown for ending in ("", "_quantile")]
             place = "" if wavelength is None else f" at {wavelength:g} nm"
-            titles = text.join([name.replace("_", " ") for name in shown])
-            yield page.make_picture(
-                plot_maps(maps[[*variables, *TRUST]], wavelength=wavelength),
-                f"Maps of {text.join(shown)}{place}, with Pareto k, approach and status",
-                caption if at + turn == 0 else f"The same of {titles}{place}.",
-            )
+            drawn = f"{text.join(shown)}{place}"
+            alternative, caption = text.figure_caption("map.figure_maps", names=drawn)
+            is_first = at + turn == 0
+            caption = caption + thinned if is_first else f"The same of {drawn.replace('_', ' ')}."
+            figure = plot_maps(maps[[*variables, *TRUST]], wavelength=wavelength)
+            yield page.make_picture(figure, alternative, caption)
 
 
 def _wavelengths(maps: xr.Dataset) -> list[float]:
@@ -383,13 +372,7 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> page.Tabl
         return lambda row: number(row[column], row["typical sd"])
 
     cells = {column: cell(column) for column in columns}
-    caption = (
-        "Over the good pixels: median of the posterior means, the values that 5% of them lie "
-        "below and above, and medians of the standard deviations and of the widths of the 95% "
-        "intervals. Means differ from pixel to pixel because the material does and because each "
-        "is uncertain: where the spread is not much larger than the sd, it says little about the "
-        "material."
-    )
+    caption = text.caption("map.parameter")
     by_label = {scalar.label: scalar for scalar in titles}
     return page.make_table(
         "parameter",
@@ -457,14 +440,7 @@ def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame])
                 cells += _coverage_cells(table, scalar.label, claimed)
             description = title if claimed == min(INTERVALS) else scalar.label
             rows.append(page.Row(scalar.label, description, tuple(cells), _group(scalar)))
-    caption = (
-        "Share of the pixels with an answer whose central interval holds the true value, and the "
-        "95% interval of that share, given so many pixels. Of all read: the same where a pixel "
-        "that was read and has no answer counts as a miss. Correct intervals hold the truth as "
-        "often as they say if the truths are drawn from the priors; of truths that were chosen, "
-        "some are held more often and some less. Marked: too few, beyond chance and by more than "
-        f"{100 * SLIGHT:g} in 100 pixels."
-    )
+    caption = text.caption("map.coverage", slight=100 * SLIGHT)
     data = tables[0]
     for other in tables[1:]:
         data = data.join(other.add_suffix("_uncorrected"))
