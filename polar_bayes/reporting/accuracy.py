@@ -133,7 +133,7 @@ def front_panel(axes: Axes, study: xr.Dataset, time: str) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # often less than a decade
     style.plain_numbers(axes.xaxis, axes.yaxis)
     _name_methods(axes, known, time, colors)
-    style.set_ticks(axes)
+    style.set_tick_style(axes)
 
 
 def _assign(names: pd.Series, values: Sequence[str]) -> dict[str, str]:
@@ -221,10 +221,11 @@ def study_table(study: xr.Dataset) -> page.Table:
             return f"< {RESOLVED * noise:.2g}"
         return or_dash(row["error"], ".2g")
 
-    def describe(name: str) -> str:
-        marks = ["*" if table.loc[name, "on_front"] else "", table.loc[name, "problems"]]
-        return "; ".join(filter(None, marks)) or name
-
+    marks = {
+        str(name): "; ".join(filter(None, ["*" if row["on_front"] else "", row["problems"]]))
+        or str(name)
+        for name, row in table.iterrows()
+    }
     cells: page.Cells = {
         "error": error,
         "of": lambda row: row["worst"] if math.isfinite(row["error"]) else DASH,
@@ -241,7 +242,7 @@ def study_table(study: xr.Dataset) -> page.Table:
     }
     caption = text.caption("accuracy.study")
     return page.make_table(
-        "study", caption, "method", cells, table, describe=describe, prose=["method"]
+        "study", caption, cells, table, label="method", descriptions=marks, prose=["method"]
     )
 
 
@@ -250,4 +251,4 @@ def error_table(study: xr.Dataset) -> page.Table:
     errors = parameter_errors(study)[study[VARIATION].to_numpy() == AS_GIVEN]
     cells: page.Cells = {str(name): column(name, ".2g") for name in errors.columns}
     caption = "The larger error of mean and standard deviation of each, in posterior sds."
-    return page.make_table("error", caption, "method", cells, errors)
+    return page.make_table("error", caption, cells, errors, label="method")

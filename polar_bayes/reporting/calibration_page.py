@@ -201,15 +201,9 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> page.Table:
         **_score_cells(),
     }
     caption = text.caption("calibration.parameter", level=level)
-    return page.make_table(
-        "parameter",
-        caption,
-        "parameter",
-        cells,
-        table.loc[list(ranks)],
-        describe=lambda label: ranks[label].title,
-        prose=[RANKS_COLUMN],
-    )
+    titles = {label: each.title for label, each in ranks.items()}
+    data, prose = table.loc[list(ranks)], [RANKS_COLUMN]
+    return page.make_table("parameter", caption, cells, data, descriptions=titles, prose=prose)
 
 
 def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> page.Table:
@@ -229,15 +223,8 @@ def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> page.
         **_score_cells(),
     }
     caption = text.caption("calibration.comparison", first=first)
-    return page.make_table(
-        "comparison",
-        caption,
-        "parameter",
-        cells,
-        compared,
-        describe=lambda label: titles[label],
-        prose=[RANKS_COLUMN],
-    )
+    prose = [RANKS_COLUMN]
+    return page.make_table("comparison", caption, cells, compared, descriptions=titles, prose=prose)
 
 
 def _score_change(row: pd.Series) -> str:
@@ -258,11 +245,11 @@ def _readings(
         return []
     level, pit = limit_of(readings), reading_ranks(calibration)
     titles = {
-        label: f"{QUANTITIES.get(row['reading'], row['reading'])}, {row['test']}"
+        str(label): f"{QUANTITIES.get(row['reading'], row['reading'])}, {row['test']}"
         for label, row in readings.iterrows()
     }
     ranks = [
-        Ranks(str(label), titles[label], pit[label], row, level)
+        Ranks(str(label), titles[str(label)], pit[label], row, level)
         for label, row in readings.iterrows()
     ]
     pictures = _paged(ranks, lambda some: figures.ecdf_differences(some, {}, method), "readings")
@@ -280,10 +267,10 @@ def _readings(
     table = page.make_table(
         "reading",
         caption,
-        "reading",
         cells,
         readings,
-        describe=lambda label: titles[label],
+        label="reading",
+        descriptions=titles,
         prose=[RANKS_COLUMN],
     )
     note = "Readings are judged by themselves; the verdict above is that of the parameters."

@@ -63,7 +63,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
         axes.locator_params(axis="x", nbins=5)
         title = style.label_text(label.replace("_", " "))
         axes.set_title(style.wrap(title, 38), loc="left")
-    style.set_ticks(panels)
+    style.set_tick_style(panels)
     handles = [
         Line2D([], [], color=color, marker="o", ms=4.5, lw=2.0, label=style.label_text(name, 24))
         for name, color in colors.items()
@@ -125,7 +125,7 @@ def loo_table(comparison: FitComparison) -> page.Table:
         "k > 0.7": lambda row: f"{int(row['unreliable'])}",
     }
     caption = text.caption("comparison.loo", clear=CLEAR)
-    return page.make_table("loo", caption, "fit", cells, comparison.loo)
+    return page.make_table("loo", caption, cells, comparison.loo, label="fit")
 
 
 def _fit_name(row: pd.Series) -> str:
@@ -146,7 +146,7 @@ def parameter_table(comparison: FitComparison) -> page.Table:
     }
     caption = "Posterior mean, standard deviation and equal-tailed 95% interval by each fit."
     data = comparison.parameters
-    return page.make_table("parameter", caption, "parameter", cells, data, prose=["fit"])
+    return page.make_table("parameter", caption, cells, data, prose=["fit"])
 
 
 def sensitivity_table(comparison: FitComparison) -> page.Table | None:
@@ -158,13 +158,11 @@ def sensitivity_table(comparison: FitComparison) -> page.Table | None:
         "fit": _fit_name,
         "prior inside": lambda row: percent(row["prior_inside"]),
         "by the data": lambda row: str(row["verdict"]),
-        "to the priors": column("prior_sensitivity", ".3f"),
-        "to the data": column("likelihood_sensitivity", ".3f"),
-        "remark": lambda row: str(row["remark"]),
+        **text.SENSITIVITY_CELLS,
     }
     caption = text.caption("comparison.sensitivity", sensitive=SENSITIVE)
     prose = ["fit", "remark"]
-    return page.make_table("sensitivity", caption, "parameter", cells, known, prose=prose)
+    return page.make_table("sensitivity", caption, cells, known, prose=prose)
 
 
 def settings_table(provenances: Mapping[str, Mapping[str, Any]]) -> page.Table:

@@ -78,23 +78,17 @@ class Fit(NamedTuple):
         prose: Sequence[str] = (),
     ) -> page.Table:
         """A table with a row for each parameter that the numbers have, in groups."""
-        scalars = {s.label: s for s in self.scalars if s.label in data.index}
         names = set(map(str, self.posterior.data_vars))
-
-        def group(label: str) -> str:
-            if is_hyperparameter(scalars[label].name, names):
-                return SHARED_GROUP
-            return page.MAIN_GROUP if scalars[label].is_material else INSTRUMENT_GROUP
-
+        titles, groups = {}, {}
+        for scalar in self.scalars:
+            if scalar.label in data.index:
+                titles[scalar.label] = parameter_title(scalar, self.posterior)
+                groups[scalar.label] = page.MAIN_GROUP if scalar.is_material else INSTRUMENT_GROUP
+                if is_hyperparameter(scalar.name, names):
+                    groups[scalar.label] = SHARED_GROUP
+        data = data.loc[list(titles)]
         return page.make_table(
-            name,
-            caption,
-            "parameter",
-            cells,
-            data.loc[list(scalars)],
-            describe=lambda label: parameter_title(scalars[label], self.posterior),
-            group=group,
-            prose=prose,
+            name, caption, cells, data, descriptions=titles, groups=groups, prose=prose
         )
 
     def with_truth(self, data: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
@@ -227,9 +221,7 @@ def sensitivity_table(fit: Fit) -> page.Table:
         "prior 95%": lambda row: interval(row["prior_q2.5"], row["prior_q97.5"]),
         "posterior 95%": lambda row: interval(row["q2.5"], row["q97.5"]),
         "width left": lambda row: percent(row["width_left"]),
-        "to the priors": column("prior_sensitivity", ".3f"),
-        "to the data": column("likelihood_sensitivity", ".3f"),
-        "remark": lambda row: str(row["remark"]),
+        **text.SENSITIVITY_CELLS,
     }
     caption = text.caption("fit.sensitivity", sensitive=SENSITIVE)
     return fit.table("sensitivity", caption, cells, fit.prior, prose=["remark"])
@@ -295,16 +287,12 @@ def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> pag
         "a new member": lambda row: interval(row["new_q2.5"], row["new_q97.5"]),
         "pooling factor": column("pooling", ".2f"),
     }
-    scales = {each.label: SCALES[each.scale] for each in pooled}
+    members = {
+        each.label: f"{summary.loc[each.label, 'members']} members, {SCALES[each.scale]}"
+        for each in pooled
+    }
     caption = text.caption("fit.population")
-    return page.make_table(
-        "population",
-        caption,
-        "parameter",
-        cells,
-        summary,
-        describe=lambda label: f"{summary.loc[label, 'members']} members, {scales[label]}",
-    )
+    return page.make_table("population", caption, cells, summary, descriptions=members)
 
 
 def member_table(
@@ -312,7 +300,11 @@ def member_table(
 ) -> page.Table:
     """Every member of every population, with and without it."""
     posterior = result["posterior"].to_dataset()
-    scalars = {scalar.label: scalar for each in pooled for scalar in each.members}
+    titles = {
+        scalar.label: parameter_title(scalar, posterior)
+        for each in pooled
+        for scalar in each.members
+    }
 
     def scale(row: pd.Series) -> float:
         return (row["q97.5"] - row["q2.5"]) / 4.0
@@ -324,15 +316,8 @@ def member_table(
         "95% alone": lambda row: interval(row["alone_q2.5"], row["alone_q97.5"], scale(row)),
         "pooled share": lambda row: percent(row["leaning"]),
     }
-    caption = text.caption("fit.member")
-    return page.make_table(
-        "member",
-        caption,
-        "parameter",
-        cells,
-        members.loc[list(scalars)],
-        describe=lambda label: parameter_title(scalars[label], posterior),
-    )
+    data = members.loc[list(titles)]
+    return page.make_table("member", text.caption("fit.member"), cells, data, descriptions=titles)
 
 
 def _spectrum(result: xr.DataTree) -> list[page.Block]:

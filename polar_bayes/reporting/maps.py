@@ -346,13 +346,7 @@ def count_table(
     data = data.copy()
     data.insert(1, "share", data[what] / max(total, 1))
     return page.make_table(
-        name,
-        caption,
-        name,
-        cells,
-        data,
-        describe=lambda flag: meanings.get(flag, flag),
-        prose=[name],
+        name, caption, cells, data, label=name, descriptions=meanings, prose=[name]
     )
 
 
@@ -373,16 +367,10 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> page.Tabl
 
     cells = {column: cell(column) for column in columns}
     caption = text.caption("map.parameter")
-    by_label = {scalar.label: scalar for scalar in titles}
-    return page.make_table(
-        "parameter",
-        caption,
-        "parameter",
-        cells,
-        pd.DataFrame.from_dict(data, orient="index", columns=columns),
-        describe=lambda label: titles[by_label[label]],
-        group=lambda label: _group(by_label[label]),
-    )
+    frame = pd.DataFrame.from_dict(data, orient="index", columns=columns)
+    by_label = {scalar.label: title for scalar, title in titles.items()}
+    groups = {scalar.label: _group(scalar) for scalar in titles}
+    return page.make_table("parameter", caption, cells, frame, descriptions=by_label, groups=groups)
 
 
 def _group(scalar: Scalar) -> str:

@@ -93,23 +93,24 @@ type Cells = Mapping[str, Callable[[pd.Series], str]]
 
 
 def make_table(
-    name: str,
+    table: str,
     caption: str,
-    label: str,
     cells: Cells,
     data: pd.DataFrame,
     *,
-    describe: Callable[[Any], str] = str,
-    group: Callable[[Any], str] = lambda row: MAIN_GROUP,
+    label: str = "parameter",
+    descriptions: Mapping[str, str] = {},
+    groups: Mapping[str, str] = {},
     prose: Collection[str] = (),
 ) -> Table:
     """A table with a row for each row of numbers; `label` heads the column of their names."""
     rows = []
     for key, numbers in data.iterrows():
-        first = str(key[0] if isinstance(key, tuple) else key)
+        name = str(key[0] if isinstance(key, tuple) else key)
         texts = tuple(cell(numbers) for cell in cells.values())
-        rows.append(Row(first, describe(first), texts, group(first)))
-    return Table(name, caption, (label, *cells), tuple(rows), data, prose)
+        group = groups.get(name, MAIN_GROUP)
+        rows.append(Row(name, descriptions.get(name, name), texts, group))
+    return Table(table, caption, (label, *cells), tuple(rows), data, prose)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -263,7 +263,7 @@ def plot_calibration(
         right.set_ylabel("posterior mean", fontsize=8)
     for axes, label in zip(panels[-3:], (*2 * ("rank of the truth",), "truth"), strict=True):
         axes.set_xlabel(label, fontsize=8)
-    style.set_ticks(panels)
+    style.set_tick_style(panels)
     return figure
 
 
@@ -322,7 +322,7 @@ def interval_coverage(
     ticks = [each / 100.0 for each in (*range(0, 50, 10), *INTERVALS) if each / 100.0 > least]
     axes.set_xticks(ticks, [f"{tick:.0%}" for tick in ticks])
     axes.set_xlabel("share of all fits whose interval holds the truth", fontsize=9)
-    style.set_ticks(axes)
+    style.set_tick_style(axes)
     _name_methods(figure, method, colors)
     return figure
 
@@ -353,7 +353,7 @@ def _panels(count: int, *, panel_height: float, header: float) -> tuple[Figure, 
 
 
 def _set_labels(figure: Figure, panels: Sequence[Axes], x: str, y: str) -> None:
-    style.set_ticks(panels)
+    style.set_tick_style(panels)
     figure.supxlabel(x, fontsize=9)
     figure.supylabel(y, fontsize=9)
 

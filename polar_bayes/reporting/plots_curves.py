@@ -211,7 +211,7 @@ def _draw_readings(result: xr.DataTree, found: list[Curve], label: str, short_la
     drawn: set[str] = set()
     for axes, curve in panels:
         drawn |= _draw_curve(axes, curve, limit)
-    style.set_ticks(figure.axes)
+    style.set_tick_style(figure.axes)
     zenith = np.concatenate([curve.zenith for curve in found])
     zenith = zenith[np.isfinite(zenith)]
     low, high = (float(zenith.min()), float(zenith.max())) if zenith.size else (0.0, 90.0)
@@ -497,7 +497,7 @@ def plot_spectrum(
     for axes in panels:
         axes.set_ylim(low, high)
         axes.locator_params(axis="x", nbins=5)
-    style.set_ticks(panels)
+    style.set_tick_style(panels)
     sizes = result["posterior"][name].sizes
     total = np.prod([sizes[dim] for dim in sizes if dim not in (*SAMPLE_DIMS, "wavelength")])
     part = f" (the first {len(shown)} of {int(total)})" if total > len(shown) else ""

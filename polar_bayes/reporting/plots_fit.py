@@ -150,7 +150,7 @@ def plot_ranks(result: xr.DataTree) -> Figure:
         axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
         axes.set(xlim=(0, 1), ylim=(0, max(2.0, axes.get_ylim()[1])), xticks=[0, 0.5, 1])
         axes.set_title(style.wrap(parameter_title(scalar, posterior), 38), loc="left")
-    style.set_ticks(panels)
+    style.set_tick_style(panels)
     figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)", fontsize=9)
     figure.supylabel("density", fontsize=9)
     handles = [
@@ -207,7 +207,7 @@ def plot_prior_posterior(result: xr.DataTree) -> Figure:
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
         axes.set_title(style.wrap(parameter_title(scalar, posterior), 38), loc="left")
-    style.set_ticks(panels)
+    style.set_tick_style(panels)
     handles: list[Patch | Line2D] = [
         Patch(color=lighten(GRAY, 0.72), label="prior"),
         Patch(color=lighten(BLUE, 0.45), label="posterior"),
@@ -245,7 +245,7 @@ def plot_pit(result: xr.DataTree, checks: dict[str, Check] | None = None) -> Fig
             _pit_panel(axes, values)
             axes.set_title(f"{QUANTITIES.get(check.name, check.name)}: {kind}", loc="left")
         panels[row, 0].set_ylabel("share below, minus uniform")
-    style.set_ticks(list(panels.flat))
+    style.set_tick_style(list(panels.flat))
     figure.supxlabel("PIT: share of the prediction below the reading", fontsize=9)
     return figure
 
@@ -427,7 +427,7 @@ def plot_shrinkage(
     names += map(style.label_text, style.coordinate_labels(population.location))
     part = f" ({len(rows)} of {count}, evenly from low to high)" if count > len(rows) else ""
     axes.set_xlabel(", ".join(names) + part)
-    style.set_ticks(axes)
+    style.set_tick_style(axes)
     axes.tick_params(axis="y", length=0, labelsize=6.0 if is_dense else 7.5)
     style.add_legend(figure, _shrinkage_legend(rows), columns=2)
     return figure

@@ -147,7 +147,7 @@ def add_legend(figure: Figure, handles: Iterable[Artist], columns: int) -> None:
     figure.legend(handles=list(handles), loc="outside upper left", ncols=columns, frameon=False)
 
 
-def set_ticks(axes: Axes | Iterable[Axes]) -> None:
+def set_tick_style(axes: Axes | Iterable[Axes]) -> None:
     """Fix tick sizes now: matplotlib would look them up only when the figure is drawn."""
     for each in [axes] if isinstance(axes, Axes) else axes:
         each.tick_params(labelsize=matplotlib.rcParams["xtick.labelsize"], length=3.0, color=GRAY)

@@ -83,6 +83,13 @@ def column(name: str, form: str) -> Callable[[pd.Series], str]:
     return lambda row: or_dash(row[name], form)
 
 
+SENSITIVITY_CELLS: Mapping[str, Callable[[pd.Series], str]] = {
+    "to the priors": column("prior_sensitivity", ".3f"),
+    "to the data": column("likelihood_sensitivity", ".3f"),
+    "remark": lambda row: str(row["remark"]),
+}
+
+
 def p_value(value: float, *, passes: bool) -> str:
     """A p-value, marked where the test fails."""
     text = or_dash(value, ".2g")
