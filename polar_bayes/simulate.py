@@ -371,7 +371,7 @@ def simulate(
         >>> image = pb.simulate(
         ...     "glass",
         ...     scene=pb.Scene(pb.SmoothSurface()),
-        ...     protocol=pb.Protocol(views=5, wavelengths=()),
+        ...     protocol=pb.simulation.Protocol(views=5, wavelengths=()),
         ...     parameters={"refractive_index": index},
         ...     noise={"exposure": light},
         ... )

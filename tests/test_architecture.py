@@ -20,7 +20,7 @@ LAYERS = (
     ("polar_bayes.importers",),
     ("polar_bayes.physics",),
     ("polar_bayes.observation",),
-    ("polar_bayes.priors", "polar_bayes.setups", "polar_bayes.prior_table"),
+    ("polar_bayes.priors", "polar_bayes.setups", "polar_bayes.setups.prior_table"),
     ("polar_bayes.models",),
     ("polar_bayes.simulate",),
     ("polar_bayes.inference",),

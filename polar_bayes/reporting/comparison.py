@@ -31,7 +31,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
     """Means and 95% intervals of each parameter by every fit that has it.
 
     Args:
-        comparison: Of `polar_bayes.compare_fits`.
+        comparison: Of `polar_bayes.diagnostics.compare_fits`.
 
     Returns:
         The figure, a panel for each of the first 12 parameters. Point fits have twice their

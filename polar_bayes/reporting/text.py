@@ -412,7 +412,7 @@ def comparison_of_fits_sentences(comparison: FitComparison) -> list[str]:
     """What the fits say about the readings, and on which parameters they disagree.
 
     Args:
-        comparison: Of `polar_bayes.compare_fits`.
+        comparison: Of `polar_bayes.diagnostics.compare_fits`.
 
     Returns:
         Sentences.
