@@ -249,7 +249,8 @@ def test_how_a_scene_was_chosen_does_not_count() -> None:
 
 
 SOURCE = """
-import dataclasses, jax, helper_of_mine, polar_bayes
+import dataclasses, jax, helper_of_mine
+from polar_bayes.observation.links import StokesLink
 SCALE = 2.0
 def inner(x):
     return [helper_of_mine.shift(SCALE * y) for y in x]
@@ -258,7 +259,7 @@ def jitted(x):
     return x + 1
 def model(data, scene, priors, links):
     return jax.vmap(lambda x: jitted(inner(x)))(data)
-class Link(polar_bayes.links.StokesLink):
+class Link(StokesLink):
     def reading(self, values):
         return values
 @dataclasses.dataclass(frozen=True)
