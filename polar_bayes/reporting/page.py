@@ -14,7 +14,7 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from polar_bayes.paths import check_output, move_into_place, unfinished_folder, written
+from polar_bayes.paths import check_output, replace_file, temporary_folder, write_errors
 from polar_bayes.reporting.style import ALWAYS
 
 PAGE = "index.html"
@@ -64,17 +64,17 @@ def write_page(
     folder: Path, page: str, others: Mapping[str, Callable[[Path], object]] | None = None
 ) -> Path:
     """Write a page and the files that go with it; an older report in the folder is replaced."""
-    with written(folder):
+    with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     is_report = is_page(folder / PAGE)
     names = (*(others or {}), PAGE)
     files = {name: check_output(folder / name, lambda _: is_report) for name in names}
-    with written(folder), unfinished_folder(folder) as unfinished:
+    with write_errors(folder), temporary_folder(folder) as unfinished:
         (unfinished / PAGE).write_text(page, encoding="utf-8")
         for name, write in (others or {}).items():
             write(unfinished / name)
         for name, file in files.items():
-            move_into_place(unfinished / name, file)
+            replace_file(unfinished / name, file)
     return folder / PAGE
 
 

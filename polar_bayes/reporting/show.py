@@ -24,12 +24,12 @@ from polar_bayes.reporting import maps as map_tables
 from polar_bayes.reporting.accuracy import reference_sentence, study_table
 from polar_bayes.reporting.plots_calibration import parts_of
 from polar_bayes.reporting.tables import Table, swapped_sentence
-from polar_bayes.repr_html import Card, Grid
+from polar_bayes.repr_html import DisplaySummary, DisplayTable
 
 MOST_ROWS = 40
 
 
-def show(result: xr.DataTree | xr.Dataset) -> Card:
+def show(result: xr.DataTree | xr.Dataset) -> DisplaySummary:
     """What a result says, for the last line of a cell.
 
     Args:
@@ -49,7 +49,7 @@ def show(result: xr.DataTree | xr.Dataset) -> Card:
     return _of_calibration(result) if is_calibration(result) else _of_fit(result)
 
 
-def _of_fit(result: xr.DataTree) -> Card:
+def _of_fit(result: xr.DataTree) -> DisplaySummary:
     found, table = posterior_scalars(result), summary(result)
     method, provenance = method_of(result), provenance_of(result)
     judged, prior = judge(result, table), sensitivity(result)
@@ -70,7 +70,7 @@ def _of_fit(result: xr.DataTree) -> Card:
     return _card(_name(provenance, "fit"), said, numbers, judged.converged)
 
 
-def _of_maps(maps: xr.Dataset) -> Card:
+def _of_maps(maps: xr.Dataset) -> DisplaySummary:
     found, cases = map_scalars(maps), map_tables.count_cases(maps)
     headline, is_enough = map_tables.headline(cases)
     about = provenance_of(maps)
@@ -78,7 +78,7 @@ def _of_maps(maps: xr.Dataset) -> Card:
     return _card(_name(about, "map"), said, map_tables.parameter_table(maps, found), is_enough)
 
 
-def _of_calibration(calibration: xr.DataTree) -> Card:
+def _of_calibration(calibration: xr.DataTree) -> DisplaySummary:
     table = calibration_table(calibration)
     parts = parts_of(calibration, table)
     words = {label: how_ranks_stray(part.row) for label, part in parts.items() if not part.passes}
@@ -88,7 +88,7 @@ def _of_calibration(calibration: xr.DataTree) -> Card:
     return _card(_name(provenance_of(calibration), "calibration"), said, rows, is_good)
 
 
-def _of_study(study: xr.DataTree) -> Card:
+def _of_study(study: xr.DataTree) -> DisplaySummary:
     said = [accuracy_advice(study), reference_sentence(study)]
     found = accuracy_of(study)
     is_sound = not found.attrs["reference_doubts"]
@@ -103,8 +103,10 @@ def _name(provenance: Mapping[str, Any], kind: str) -> str:
     return one_line(f"{capture or 'capture'}: {kind}")
 
 
-def _card(title: str, said: list[str], table: Table, good: bool) -> Card:
+def _card(title: str, said: list[str], table: Table, good: bool) -> DisplaySummary:
     rows = tuple((row.name, *row.cells) for row in table.rows[:MOST_ROWS])
     more = len(table.rows) - MOST_ROWS
     said = [*said, f"The first {MOST_ROWS} of {len(table.rows)} rows."] if more > 0 else said
-    return Card(title, tuple(filter(None, said)), (Grid(table.heads, rows, numeric=True),), good)
+    return DisplaySummary(
+        title, tuple(filter(None, said)), (DisplayTable(table.heads, rows, numeric=True),), good
+    )
