@@ -21,7 +21,7 @@ from accuracy_scenes import CASES, Case
 import polar_bayes as pb
 from polar_bayes.benchmark.reference import distances, run_reference
 from polar_bayes.benchmark.run import labeled, problem_of
-from polar_bayes.calibration.simulations import draw_numbered
+from polar_bayes.calibration.simulations import draw_captures
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.run_method import answer
@@ -38,7 +38,7 @@ def fit_some(case: Case, numbers: np.ndarray, auto: pb.methods.Auto) -> list[dic
     request = resolve(layout, "per_material", auto, case.scene, None, case.links, None, 0, "double")
     key = jax.random.key(7)
     base = problem_of(request, key)
-    drawn = draw_numbered(base.program, base.data, np.resize(numbers, CHUNK), key)
+    drawn = draw_captures(base.program, base.data, np.resize(numbers, CHUNK), key)
     found = []
     for at, number in enumerate(numbers):
         data = drawn.captures.pixel(at)
@@ -54,9 +54,9 @@ def _judged(problem: Problem, auto: pb.methods.Auto) -> dict[str, Any]:
     told = answer(auto, problem)
     seconds = time.perf_counter() - begin
     other = dataclasses.replace(problem, key=jax.random.fold_in(problem.key, 9))
-    judge = run_reference(REFERENCE, other)
+    reference_run = run_reference(REFERENCE, other)
     _, draws = labeled(problem.program, told.z, problem.data)
-    flat, reference = (x.reshape(len(x), -1) for x in (draws, judge.draws))
+    flat, reference = (x.reshape(len(x), -1) for x in (draws, reference_run.draws))
     apart = distances(flat, reference)
     error = float(np.max(np.abs([apart.mean_error, apart.sd_error])))
     return {
@@ -65,8 +65,8 @@ def _judged(problem: Problem, auto: pb.methods.Auto) -> dict[str, Any]:
         "chosen": told.said["auto"]["chosen"],
         "said_met": told.said["auto"]["met"],
         "expected": told.said["auto"]["expected_error"],
-        "reference_error": judge.error,
-        "reference_doubts": list(judge.doubts),
+        "reference_error": reference_run.error,
+        "reference_doubts": list(reference_run.doubts),
     }
 
 

@@ -10,7 +10,7 @@ from polar_bayes.cli.options import (
     CALIBRATION_METHOD,
     NOT_CONVERGED,
     RESULT_FILE,
-    RUNG,
+    STUDY_METHOD,
     capture_argument,
     command,
     json_option,
@@ -153,32 +153,30 @@ def identify(
 @scene_option
 @view_limit_option
 @option(
-    "--rung", "rungs", type=RUNG, multiple=True,
+    "--method", "methods", type=STUDY_METHOD, multiple=True,
     help="Method to try, once for each; by default all of them.",
 )  # fmt: skip
-@option("--no-dials", is_flag=True, help="Compare methods only, with their default settings.")
+@option("--no-overrides", is_flag=True, help="Compare methods only, with their default settings.")
 @option("--tolerance", type=float, default=0.1, help="Of the advice.")
 @seed_option
 @json_option
 def accuracy(
     capture: Path,
     out: Path,
-    rungs: tuple[str, ...],
-    no_dials: bool,
+    methods: tuple[str, ...],
+    no_overrides: bool,
     tolerance: float,
     as_json: bool,
     **settings: Any,
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
-    settings["rungs"] = {name: pb.methods.LADDER[name] for name in rungs or pb.methods.LADDER}
-    if no_dials:
-        settings["dials"] = ()
+    settings["methods"] = {name: pb.methods.LADDER[name] for name in methods or pb.methods.LADDER}
+    if no_overrides:
+        settings["overrides"] = ()
     study = pb.accuracy(pb.load_capture(capture), **settings)
     pb.save_result(study, out)
-    table, advice = (
-        pb.benchmark.accuracy_table(study),
-        pb.benchmark.accuracy_advice(study, tolerance),
-    )
+    table = pb.benchmark.accuracy_table(study)
+    advice = " ".join(pb.benchmark.accuracy_sentences(study, tolerance))
     if as_json:
         print_json({"rows": json_rows(table), "advice": advice})
         return

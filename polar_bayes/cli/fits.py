@@ -107,7 +107,7 @@ def fit(
             options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             scene = pb.choose_effects(data, progress=progress, **options)
-            click.echo(pb.effects.ledger_sentence(scene.ledger), err=True)
+            click.echo(pb.effects.ledger_sentences(scene.ledger), err=True)
         settings |= {"tolerance": tolerance} if is_auto else {}
         result = pb.fit(data, scene=scene, progress=progress, **settings)
     pb.save_result(result, out)
@@ -171,7 +171,7 @@ def effects(
     if as_json:
         print_json(pb.effects.ledger_summary(ledger))
     else:
-        click.echo(f"{pb.effects.ledger_table(ledger)}\n\n{pb.effects.ledger_sentence(ledger)}")
+        click.echo(f"{pb.effects.ledger_table(ledger)}\n\n{pb.effects.ledger_sentences(ledger)}")
 
 
 def _with_setup(capture: Any, setup: str | None) -> Any:

@@ -48,8 +48,8 @@ FIT_METHOD = Name(
     "method", ("nuts", "laplace", "point", "importance", "tempered", "auto"), FitError
 )
 CALIBRATION_METHOD = Name("method", ("laplace", "importance", "tempered", "nuts"), FitError)
-RUNG = Name(
-    "rung",
+STUDY_METHOD = Name(
+    "method",
     (
         *("point", "laplace", "importance", "tempered", "normal guide", "flow guide"),
         *("nuts short", "nuts", "nuts long"),
