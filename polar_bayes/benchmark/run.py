@@ -37,7 +37,7 @@ from polar_bayes.inference.result import posterior_of
 from polar_bayes.inference.run_method import answer, draws_of, with_draws
 from polar_bayes.interrupts import on_interrupt
 from polar_bayes.observation.data import Observations, observe
-from polar_bayes.paths import unfinished_folder
+from polar_bayes.paths import temporary_folder
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import no_progress
@@ -128,7 +128,7 @@ LAST_WORDS = 300
 
 def run_fresh(trial: Trial) -> Measured:
     """Run a trial in a new process, with compiled programs of earlier ones out of reach."""
-    with unfinished_folder(Path(tempfile.gettempdir())) as folder:
+    with temporary_folder(Path(tempfile.gettempdir())) as folder:
         given, made = folder / "trial", folder / "measured"
         given.write_bytes(cloudpickle.dumps(trial))
         words = [sys.executable, "-m", "polar_bayes.benchmark.run", str(given), str(made)]

@@ -24,7 +24,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_result import Outcome
 from polar_bayes.inference.request import Request
 from polar_bayes.interrupts import resume_hint
-from polar_bayes.paths import UNFINISHED, move_into_place, unfinished_folder
+from polar_bayes.paths import TEMPORARY_PREFIX, replace_file, temporary_folder
 from polar_bayes.priors import describe_prior
 
 # --- What a calibration asks, in texts that are the same in every process: who resumes must ask it
@@ -145,7 +145,7 @@ class Store:
             names = [path.name for path in self._folder.iterdir()]
         if head.name in names:
             self._check(head)
-        elif any(not name.startswith(UNFINISHED) for name in names):
+        elif any(not name.startswith(TEMPORARY_PREFIX) for name in names):
             raise FitError("it holds no calibration", where=where, hint="give another --out")
         else:  # new, or broken off before it said what is asked
             told = json.dumps(self._question, indent=1, sort_keys=True).encode()
@@ -185,9 +185,9 @@ class Store:
     @contextlib.contextmanager
     def _whole(self, name: str) -> Iterator[Path]:
         """A file to write to, which then takes its place at once."""
-        with self._written(), unfinished_folder(self._folder) as unfinished:
+        with self._written(), temporary_folder(self._folder) as unfinished:
             yield unfinished / name
-            move_into_place(unfinished / name, self._folder / name)
+            replace_file(unfinished / name, self._folder / name)
 
     @contextlib.contextmanager
     def _written(self) -> Iterator[None]:

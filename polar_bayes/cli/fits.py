@@ -28,7 +28,7 @@ from polar_bayes.cli.options import (
     seed_option,
     view_limit_option,
 )
-from polar_bayes.paths import written
+from polar_bayes.paths import write_errors
 from polar_bayes.progress import stages
 
 DEMO = "polar-bayes demo"
@@ -56,7 +56,7 @@ def demo(out: Path, seed: int) -> int:
 
 def _make_folder(folder: Path) -> None:
     """The folder of a demo: new, empty, or that of an earlier demo."""
-    with written(folder):
+    with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         names = {path.name for path in folder.iterdir()}
     if not names:

@@ -24,7 +24,7 @@ from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import PriorTable, in_this_precision, resolve_priors
+from polar_bayes.priors import PriorTable, cast_prior, resolve_priors
 from polar_bayes.setups import SETUPS, Setup, find_setup
 
 Method = Nuts | Laplace | Point | AbstractMethod
@@ -60,7 +60,7 @@ class Request:
 
     def bind(self, scene: Scene) -> Callable[[Observations], None]:
         """The model with everything but its data in place."""
-        priors = {name: in_this_precision(prior) for name, prior in self.priors.items()}
+        priors = {name: cast_prior(prior) for name, prior in self.priors.items()}
         return functools.partial(self.model, scene=scene, priors=priors, links=self.links)
 
 

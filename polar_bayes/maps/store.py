@@ -31,11 +31,11 @@ from polar_bayes.maps.fit_map import blank, cut, fit_pixels, numbered_block, pla
 from polar_bayes.maps.lazy import FINISHED, LEDGER, REQUEST, check_whole, open_image, open_map
 from polar_bayes.paths import (
     as_path,
-    is_same_place,
-    move_into_place,
+    is_same_file,
     output_error,
+    replace_file,
     sync,
-    unfinished_folder,
+    temporary_folder,
 )
 from polar_bayes.progress import Counter, with_counter
 
@@ -288,7 +288,7 @@ def check_apart(source: Path, store: Path) -> None:
     with _written(store):
         one, other = source.resolve(), store.resolve()
         is_nested = other.is_relative_to(one) or one.is_relative_to(other)
-        if is_nested or is_same_place(source, store):
+        if is_nested or is_same_file(source, store):
             what = "it is the capture, inside it, or around it"
             raise OutputError(what, where=where, hint=hint)
         if not store.parent.is_dir():
@@ -391,7 +391,7 @@ class _MapStore:
 
     def begin(self, ledger: Ledger) -> None:
         """Put the store without values in its place, or see that it is as it was put there."""
-        with _written(self._store), unfinished_folder(self._store.parent) as folder:
+        with _written(self._store), temporary_folder(self._store.parent) as folder:
             empty = folder / self._store.name
             self._write_blank(empty)
             files = sorted(path.relative_to(empty) for path in empty.rglob("*") if path.is_file())
@@ -486,14 +486,14 @@ class _MapStore:
     def finish(self, ledger: Ledger) -> None:
         """Say in the store itself that it is finished, and of which readings."""
         readings = [ledger.entries[_label(place)].readings for place in self._places]
-        with _written(self._store), unfinished_folder(self._store.parent) as folder:
+        with _written(self._store), temporary_folder(self._store.parent) as folder:
             metadata = _metadata(self._store)
             if metadata["attributes"].get(REQUEST) != self.request:
                 raise taken_over(self._store)
             metadata["attributes"][FINISHED] = self._combined(readings)
             unfinished = folder / METADATA
             unfinished.write_text(json.dumps(metadata, indent=2))
-            move_into_place(unfinished, self._store / METADATA)
+            replace_file(unfinished, self._store / METADATA)
 
     def _combined(self, readings: Iterable[str]) -> str:
         """Digest of the readings of all blocks."""

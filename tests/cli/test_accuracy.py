@@ -80,7 +80,7 @@ def test_the_automatic_choice_says_what_it_did(
         return fit(capture, **settings | {"method": "point"})
 
     monkeypatch.setattr(pb, "fit", quick)
-    monkeypatch.setattr(pb, "auto_sentences", lambda result: ["point (0.1 s) was taken."])
+    monkeypatch.setattr(pb.inference, "auto_sentences", lambda result: ["point (0.1 s) was taken."])
     words = ["fit", str(plate), "--out", str(tmp_path / "fit.nc"), "--method", "auto"]
     assert main([*words, "--tolerance", "0.2", "--seconds", "30"]) in (0, 2)
     assert "point (0.1 s) was taken." in capsys.readouterr().err
