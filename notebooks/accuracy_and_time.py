@@ -19,7 +19,7 @@ import polar_bayes as pb
 
 # %%
 plate = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
-links = {"q": pb.StokesLink(stated_errors=True)}
+links = {"q": pb.links.StokesLink(stated_errors=True)}
 zenith = np.linspace(35.0, 75.0, 6)
 directions = {
     "view_zenith": zenith,
@@ -39,9 +39,8 @@ capture = xr.Dataset(
 # %% [markdown]
 # ## The study
 #
-# Five rungs of the ladder, none of its dials, all in this process. (`fresh=True`, the default,
-# gives each its own process and measures memory and the time of a first fit, compilation included;
-# that takes minutes.)
+# Five methods, no overrides, all in this process. (`fresh=True`, the default, gives each its own
+# process and measures memory and the time of a first fit, compilation included, in minutes.)
 
 # %%
 names = ("point", "laplace", "importance", "nuts short", "nuts")
@@ -49,16 +48,16 @@ study = pb.accuracy(
     capture,
     scene=plate,
     links=links,
-    rungs={name: pb.LADDER[name] for name in names},
-    dials=(),
+    rungs={name: pb.methods.LADDER[name] for name in names},
+    overrides=(),
     fresh=False,
-    reference=pb.Reference(error=0.03),
+    reference=pb.benchmark.Reference(error=0.03),
 )
 columns = ["error", "worst", "resolved", "effective_draws", "gradients", "seconds_again"]
-pb.accuracy_table(study)[columns].round(3)
+pb.benchmark.accuracy_table(study)[columns].round(3)
 
 # %%
-pb.plot_accuracy(study)
+pb.plots.plot_accuracy(study)
 
 # %% [markdown]
 # `error` is the largest error of any mean or standard deviation, in posterior standard deviations;
@@ -74,7 +73,7 @@ pb.plot_accuracy(study)
 # The same as a sentence:
 
 # %%
-print(pb.accuracy_advice(study))
+print(pb.benchmark.accuracy_sentences(study))
 
 # %% [markdown]
 # That is said of this capture. With more readings a posterior comes closer to a normal
@@ -83,12 +82,14 @@ print(pb.accuracy_advice(study))
 #
 # ## Let it choose
 #
-# `method="auto"` needs no reference. It climbs the ladder and takes the first rung whose own
+# `method="auto"` needs no reference. It climbs the ladder and takes the first method whose own
 # diagnostics say that it is good enough: here within a quarter of a posterior standard deviation.
 
 # %%
-result = pb.fit(capture, scene=plate, links=links, method=pb.Auto(tolerance=0.25, seconds=600.0))
-print(*pb.auto_sentences(result), sep="\n")
+result = pb.fit(
+    capture, scene=plate, links=links, method=pb.methods.Auto(tolerance=0.25, seconds=600.0)
+)
+print(*pb.inference.auto_sentences(result), sep="\n")
 pb.summary(result).round(3)
 
 # %% [markdown]

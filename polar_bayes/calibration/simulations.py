@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference.batching import Stack, together
-from polar_bayes.inference.compile import JitByShape, LRUCache
+from polar_bayes.inference.compile import JitOnce, LRUCache
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.observation.data import Observations
 
@@ -61,7 +61,7 @@ def _simulator(program: Program) -> Callable[[Array, Array, Observations], tuple
             recorded = _recorded(data, {**others, "intensity": draw.predictive["intensity"]})
         return draw.parameters, (recorded.readings, recorded.brightness, recorded.saturated)
 
-    return JitByShape(
+    return JitOnce(
         lambda numbers, key, data: jax.lax.map(lambda number: simulate(number, key, data), numbers)
     )
 
@@ -81,7 +81,7 @@ def _reader(program: Program) -> Callable[..., Values]:
 
         return jax.lax.map(read, (numbers, own))
 
-    return JitByShape(read_all)
+    return JitOnce(read_all)
 
 
 def _recorded(data: Observations, readings: Mapping[str, Any]) -> Observations:

@@ -17,7 +17,7 @@ from toy_models import line
 import polar_bayes as pb
 from polar_bayes.inference import compile
 from polar_bayes.inference import joint_fit as fitting
-from polar_bayes.inference.compile import JitByShape, JitOnce, LRUCache, bytes_of
+from polar_bayes.inference.compile import JitOnce, LRUCache, bytes_of
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def test_what_was_begun_is_compiled_once(programs: list[str]) -> None:
     def twice_the_sum(x: jax.Array, y: jax.Array) -> jax.Array:
         return 2.0 * jnp.sum(x) + y
 
-    run, y = JitByShape(twice_the_sum), jnp.asarray(1.0)
+    run, y = JitOnce(twice_the_sum), jnp.asarray(1.0)
     run.begin(jax.ShapeDtypeStruct((3,), y.dtype), y)
     run.begin(jax.ShapeDtypeStruct((3,), y.dtype), y)
     assert [float(run(np.full(3, value), y)) for value in (1.0, 2.0)] == [7.0, 13.0]
@@ -53,7 +53,7 @@ def test_an_error_of_the_compiler_is_told_where_the_program_is_wanted() -> None:
     def strange(x: jax.Array) -> jax.Array:
         return jax.ffi.ffi_call("no_such_target", jax.ShapeDtypeStruct((), x.dtype))(x)
 
-    run = JitByShape(strange)
+    run = JitOnce(strange)
     run.begin(jnp.ones(2))
     with pytest.raises(Exception, match="no_such_target"):
         run(jnp.ones(2))
@@ -64,9 +64,11 @@ def test_the_sampler_is_compiled_beside_the_search_and_once(
 ) -> None:
     """The program that is begun before any state of a chain is known is the one that runs."""
     monkeypatch.setattr("polar_bayes.inference.problem._KEPT", LRUCache(1))
-    plastic = pb.simulate("plastic", seed=0, protocol=pb.Protocol(views=9, wavelengths=()))
+    plastic = pb.simulate(
+        "plastic", seed=0, protocol=pb.simulation.Protocol(views=9, wavelengths=())
+    )
     scene = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
-    pb.fit(plastic, scene=scene, method=pb.Nuts(draws=50, most_draws=50))
+    pb.fit(plastic, scene=scene, method=pb.methods.Nuts(draws=50, most_draws=50))
     assert programs.count("jit(_advance)") == 1
     assert programs.count("jit(describe)") == 1
 
@@ -116,7 +118,7 @@ def test_who_compiles_keeps_nobody_from_tracing(gate: Gate, slow_to_compile: Non
     def slow(x: jax.Array) -> jax.Array:
         return 2.0 * x
 
-    run = JitByShape(slow)
+    run = JitOnce(slow)
     with ThreadPoolExecutor(2) as pool:
         waiting = [pool.submit(run, np.ones(3)) for _ in range(2)]
         assert gate.reached.wait(60.0)
@@ -209,11 +211,11 @@ def test_a_program_that_the_memory_cannot_hold_is_refused_and_not_run(
     assert JitOnce(lambda x: x + 1.0)(jnp.ones(3))[0] == 2.0
 
 
-@pytest.mark.parametrize("method", ["point", "laplace", pb.Importance()])
+@pytest.mark.parametrize("method", ["point", "laplace", pb.methods.Importance()])
 def test_a_fit_is_refused_in_one_line_where_memory_is_short(
     method: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = {"model": line, "links": {"q": pb.StokesLink()}}
+    asked = {"model": line, "links": {"q": pb.links.StokesLink()}}
     views = np.linspace(20.0, 70.0, 9)  # a layout of its own: no other test has its programs
     readings = plate_capture(views, 0.05, seed=0)
     said = r"memory: this fit would need .*; average neighboring"
