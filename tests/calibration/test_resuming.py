@@ -199,13 +199,15 @@ import json
 import numpy as np
 import numpyro.distributions as dist
 from plates import plate_capture
-from polar_bayes.calibration.calibrate import METHODS, planned, _resolved
-from polar_bayes.calibration.store import question_of
+from polar_bayes.calibration.calibrate import METHODS, make_plan
+from polar_bayes.calibration.store import fingerprint_of
+from polar_bayes.inference.request import resolve
 from test_resuming import ASKED
 capture = plate_capture(np.array([30.0, 42.0, 68.0, 80.0]), 0.03, seed=0)
 priors = {"refractive_index": dist.TruncatedNormal(1.5, 0.1, low=1.2)}
-request = _resolved(capture, {**ASKED, "priors": priors}, None, 0)
-print(json.dumps(question_of(planned(request, None, METHODS["tempered"], True))))
+model, scene, links = (ASKED[name] for name in ("model", "scene", "links"))
+request = resolve(capture, model, "laplace", scene, priors, links, None, 0, "double")
+print(json.dumps(fingerprint_of(make_plan(request, None, METHODS["tempered"], True))))
 """
 
 
