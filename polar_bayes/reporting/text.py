@@ -625,9 +625,9 @@ def reference_sentence(result: xr.DataTree | xr.Dataset) -> str:
     """What the reference is, and how accurate it is."""
     study = accuracy_dataset(result).attrs
     sentence = (
-        f"The reference is {study['reference_draws']:,} draws of {study['reference']}, worth "
-        f"{study['reference_effective_draws']:,.0f} independent ones; its own Monte Carlo error is "
-        f"at most {study['reference_error']:.2g} posterior sd."
+        f"The reference is {study['reference_draws']:,} draws of {study['reference']} with an "
+        f"effective sample size of {study['reference_effective_draws']:,.0f}; its own Monte Carlo "
+        f"error is at most {study['reference_error']:.2g} posterior sd."
     )
     doubts = study["reference_doubts"]
     return f"{sentence} Against it speaks: {doubts}." if doubts else sentence
