@@ -19,7 +19,7 @@ from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.request import Method
 from polar_bayes.inference.run_method import answer, with_answer_draws, with_draws
-from polar_bayes.inference.smc import PixelTempering
+from polar_bayes.inference.smc import PixelSMC
 from polar_bayes.inference.weighted import Tempered
 
 # --- How far draws are from those of a reference, in its standard deviations ----------------------
@@ -99,7 +99,7 @@ class Reference:
     def tempered(self) -> Tempered:
         """What takes over where chains do not find each other's modes."""
         goal = 4.0 / self.error**2  # half of it is lost where draws are chosen by weight
-        settings = with_answer_draws(PixelTempering(walks=1024, draws=4096), 4.0 * goal)
+        settings = with_answer_draws(PixelSMC(num_chains=1024, draws=4096), 4.0 * goal)
         return Tempered(dataclasses.replace(settings, effective_draws=goal))
 
 

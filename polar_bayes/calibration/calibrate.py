@@ -23,16 +23,16 @@ from polar_bayes.calibration.runner import (
 )
 from polar_bayes.calibration.store import Store, fingerprint_of
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import PixelLaplace, candidates_of
+from polar_bayes.inference.batch_engine import engine_key
+from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_programs import key_of
-from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.program import Program, Values
-from polar_bayes.inference.psis import LARGEST_TRUSTED, LEVELS
+from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE, dims_of, shape_of
-from polar_bayes.inference.smc import PixelTempering
+from polar_bayes.inference.smc import PixelSMC
 from polar_bayes.interrupts import on_interrupt
 from polar_bayes.maps.blocks import as_completed, workers
 from polar_bayes.observation.data import Observations
@@ -76,7 +76,7 @@ def assemble(
             for name, x in values.items()
         }
 
-    flags = {"status": Status, "approach": Approach}
+    flags = {"status": Status, "approach": MethodUsed}
     fits = {
         name: (
             "simulation",
@@ -119,7 +119,7 @@ def _of_readings(values: Values) -> dict[str, tuple]:
 
 def _chosen(found: Block, data: Observations) -> dict[str, tuple]:
     """Which entries were looked at, and how far leaving them out can be trusted."""
-    said = f"Pareto k of the weights without it; above {LARGEST_TRUSTED} they say little"
+    said = f"Pareto k of the weights without it; above {MAX_PARETO_K} they say little"
     chosen: dict[str, tuple] = {}
     for name, place in found.place.items():
         chosen[f"{name}_pareto_k"] = ("simulation", found.left_out_k[name], {"long_name": said})
@@ -136,8 +136,8 @@ def _chosen(found: Block, data: Observations) -> dict[str, tuple]:
 METHODS: dict[str, Method] = {
     "laplace": PixelLaplace(weighted=False),
     "importance": PixelLaplace(draws=512),
-    "tempered": PixelTempering(),
-    "nuts": PixelNuts(start=PixelTempering()),
+    "tempered": PixelSMC(),
+    "nuts": PixelNuts(start=PixelSMC()),
 }
 FEWEST = 20
 
@@ -285,8 +285,8 @@ def _resolved(
 def planned(request: Request, told: Request | None, settings: Method, readings: bool) -> Plan:
     """What is done to every block."""
     limit = request.largest_view_zenith
-    recipe_key = key_of(request, candidates_of(settings), limit)
-    told_key = "" if told is None else key_of(told)
+    recipe_key = engine_key(request, limit)
+    told_key = "" if told is None else engine_key(told)
     key = tokenize(recipe_key, told_key, repr(settings), readings, tokenize(request.capture))
     return Plan(request, told, settings, readings, recipe_key, key)
 

@@ -27,9 +27,9 @@ from polar_bayes.calibration.scores import (
     which_stray,
 )
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batching import Stack, batched, batches
+from polar_bayes.inference.batching import ObservationBatch, batched, batches
 from polar_bayes.inference.program import Program, Values
-from polar_bayes.inference.psis import LARGEST_TRUSTED, smooth
+from polar_bayes.inference.psis import MAX_PARETO_K, smooth
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.observation.data import Observations
 
@@ -59,12 +59,17 @@ class Readings:
     # (2022), Stat. Comput. 32, 32 (the test).
 
     def __init__(
-        self, program: Program, captures: Stack, again: Values, numbers: np.ndarray, seed: int
+        self,
+        program: Program,
+        captures: ObservationBatch,
+        again: Values,
+        numbers: np.ndarray,
+        seed: int,
     ) -> None:
         self._program, self._captures = program, captures.in_precision(np.float32)
         self._names = tuple(sorted(again))
         count = len(numbers)
-        valid = np.asarray(captures.own.valid).reshape(count, -1)
+        valid = np.asarray(captures.batched.valid).reshape(count, -1)
         chance = np.array(
             [np.random.default_rng([seed, n, 1]).random(1 + 3 * len(again)) for n in numbers]
         )
@@ -75,7 +80,7 @@ class Readings:
             name: np.stack(
                 [
                     _entry(np.asarray(values, np.float32), self.place[name])
-                    for values in (again[name], self._captures.own.readings[name])
+                    for values in (again[name], self._captures.batched.readings[name])
                 ],
                 axis=-1,
             )
@@ -116,7 +121,7 @@ class Readings:
     def _look(self, at: np.ndarray, latent: Values) -> tuple[Arrays, Arrays]:
         """Run the program on all fits, a few at a time."""
         looking = _looking(self._program, self._names)
-        shared = jax.tree.map(jnp.asarray, self._captures.shared)
+        shared = jax.tree.map(jnp.asarray, self._captures.static)
         place = {name: np.maximum(x[at], 0).astype(np.int32) for name, x in self.place.items()}
         states = (place, latent, self._keys[at])
         parts: list = []
@@ -179,7 +184,7 @@ def _looking(program: Program, names: tuple[str, ...]) -> Callable:
 
         return jax.lax.map(one, (latent, keys), batch_size=LOOKED)
 
-    return batched(look, side_by_side=1)
+    return batched(look, lanes=1)
 
 
 def _choose(valid: np.ndarray, chance: np.ndarray) -> np.ndarray:
@@ -272,7 +277,7 @@ def readings_verdict(calibration: xr.DataTree) -> list[str]:
         if row["untrusted"] > 0:
             said.append(
                 f"{label}: in {int(row['untrusted'])} of {int(row['answered'])} fits the weights "
-                f"without it say little (Pareto k above {LARGEST_TRUSTED:g})."
+                f"without it say little (Pareto k above {MAX_PARETO_K:g})."
             )
     return said
 
@@ -303,7 +308,7 @@ def _rows(calibration: xr.DataTree) -> Iterator[tuple[str, dict, np.ndarray]]:
             untrusted = math.nan
             if group == "loo_pit":
                 pareto_k = chosen[f"{name}_pareto_k"].to_numpy()
-                untrusted = float(np.sum(pareto_k[np.isfinite(pit)] > LARGEST_TRUSTED))
+                untrusted = float(np.sum(pareto_k[np.isfinite(pit)] > MAX_PARETO_K))
             row = {
                 "reading": name,
                 "test": test,

@@ -19,11 +19,17 @@ from polar_bayes.calibration.scores import PitCrps
 from polar_bayes.calibration.simulations import draw_fresh, draw_numbered
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT, SMALLEST_ESS
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import PixelMethod, candidates_of, fit_stack
+from polar_bayes.inference.batch_engine import BatchEngine, make_engine
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_programs import ENGINE_LOCK, BatchEngine, EngineSpec, make_engine
-from polar_bayes.inference.batch_result import Approach, Describe, Outcome, Status, no_outcome
-from polar_bayes.inference.batching import Stack
+from polar_bayes.inference.batch_result import (
+    AbstractPixelMethod,
+    Describe,
+    MethodUsed,
+    Outcome,
+    Status,
+    empty_outcome,
+)
+from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.compile import TRACING_LOCK
 from polar_bayes.inference.initialization import AbstractInitializer, Drawn
 from polar_bayes.inference.laplace import Laplace
@@ -55,7 +61,7 @@ def needs_mcmc(request: Request) -> bool:
 def fit_sequentially(
     compiled_model: CompiledModel,
     settings: SequentialMethod,
-    captures: Stack,
+    captures: ObservationBatch,
     numbers: np.ndarray,
     seed: int,
     describe: Describe,
@@ -67,7 +73,7 @@ def fit_sequentially(
     # good, or not trusted where R-hat is above 1.01, an effective sample size below 400, a draw
     # diverged or is no number, the goals were not reached before `most_draws`, or the mode of a
     # normal approximation is not settled. Such fits are ranked all the same.
-    found, base = no_outcome(len(captures)), jax.random.fold_in(jax.random.key(seed), 3)
+    found, base = empty_outcome(len(captures)), jax.random.fold_in(jax.random.key(seed), 3)
     with jax.enable_x64(True), TRACING_LOCK:  # two threads that begin at once share what they make
         initializer = compiled_model.initializer
     for at, number in enumerate(numbers):
@@ -121,7 +127,7 @@ def _measure(settings: SequentialMethod, drawn: Drawn, parameters: Values) -> di
     return {
         "effective_draws": worth,
         "pareto_k": pareto_k,
-        "approach": Approach.NUTS if isinstance(settings, Nuts) else Approach.LAPLACE,
+        "approach": MethodUsed.NUTS if isinstance(settings, Nuts) else MethodUsed.LAPLACE,
         "status": Status.GOOD if good else Status.NOT_TRUSTED,
     }
 
@@ -152,7 +158,7 @@ def _scalars(parameters: Values) -> np.ndarray:
 # --- Some simulations of a calibration: numbers in, ranks and marginals out, in any process -------
 
 
-Method = PixelMethod | SequentialMethod
+Method = AbstractPixelMethod | SequentialMethod
 BLOCK = 64
 """Simulations of a block: what one thread or worker fits at a time, and what a crash can lose."""
 
@@ -196,10 +202,7 @@ class Plan:
     @property
     def engine(self) -> BatchEngine:
         """The compiled programs, which the next calibration of the same model finds."""
-        candidates = candidates_of(self.settings)
-        recipe = EngineSpec(self.request, lambda: self.data, candidates, self.recipe_key)
-        with ENGINE_LOCK:
-            return make_engine(recipe)
+        return make_engine(self.recipe_key, self.request, lambda: self.data)
 
     @property
     def compiled_model(self) -> CompiledModel:
@@ -214,11 +217,11 @@ class Plan:
         return self.engine.program
 
     @property
-    def rough(self) -> Program:
+    def single_program(self) -> Program:
         """The same in single precision."""
         if isinstance(self.settings, SequentialMethod):
             return _rough_of(self)
-        return self.engine.rough
+        return self.engine.single_program
 
     @property
     def block(self) -> int:
@@ -268,7 +271,7 @@ def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
     ranked = None
     if is_ranked:
         again = {name: np.asarray(values)[wanted] for name, values in fresh.items()}
-        ranked = Readings(plan.rough, captures, again, numbers, seed)
+        ranked = Readings(plan.single_program, captures, again, numbers, seed)
     apart = _apart(plan.settings)
 
     def describe(at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
@@ -308,12 +311,14 @@ def cut(numbers: np.ndarray, size: int) -> list[np.ndarray]:
     return [part for part in np.split(numbers, ends) if part.size]
 
 
-def _fit(plan: Plan, captures: Stack, numbers: np.ndarray, describe: Describe) -> Outcome:
+def _fit(
+    plan: Plan, captures: ObservationBatch, numbers: np.ndarray, describe: Describe
+) -> Outcome:
     """Fits of captures by what the settings say."""
     settings, seed = plan.settings, plan.request.seed
     if isinstance(settings, SequentialMethod):
         return fit_sequentially(plan.compiled_model, settings, captures, numbers, seed, describe)
-    return fit_stack(plan.engine, settings, captures, numbers, seed, describe)
+    return settings.run_batch(plan.engine, captures, numbers, seed, describe)
 
 
 def _apart(settings: Method) -> int:

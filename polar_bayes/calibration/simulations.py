@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.inference.batching import Stack, together
+from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.compile import JitByShape
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.observation.data import Observations
@@ -21,7 +21,7 @@ class Simulations(NamedTuple):
     """Truths and what was recorded of them."""
 
     truth: Values
-    captures: Stack
+    captures: ObservationBatch
 
 
 def draw_captures(program: Program, data: Observations, count: int, key: Array) -> Simulations:
@@ -46,7 +46,7 @@ def draw_fresh(
     """Read the same truths once more."""
     captures = drawn.captures
     found = _reading_again(program)(
-        np.asarray(numbers, np.uint32), key, data, captures.own, captures.shared
+        np.asarray(numbers, np.uint32), key, data, captures.batched, captures.static
     )
     return jax.tree.map(np.asarray, found)
 
@@ -60,7 +60,7 @@ def _reading_again(program: Program) -> Callable[..., Values]:
     ) -> Values:
         key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
         z = program.from_prior(key_truth, data)
-        told = program.describe(jax.random.fold_in(key_noise, 1), z, together(own, shared))
+        told = program.describe(jax.random.fold_in(key_noise, 1), z, eqx.combine(own, shared))
         return told.predictive
 
     def read_all(
@@ -103,7 +103,7 @@ def _recorded(data: Observations, readings: Mapping[str, Any]) -> Observations:
     )
 
 
-def _in_a_row(data: Observations, parts: tuple) -> Stack:
+def _in_a_row(data: Observations, parts: tuple) -> ObservationBatch:
     """What was drawn is each capture's own, all else is shared."""
 
     def drawn(capture: Observations) -> tuple:
@@ -121,4 +121,4 @@ def _in_a_row(data: Observations, parts: tuple) -> Stack:
     )
     own, shared = eqx.partition(whole, is_own)
     views = valid.reshape(count, -1, data.shape[-1]).any(axis=1).sum(axis=-1)
-    return Stack(own, shared, views)
+    return ObservationBatch(own, shared, views)

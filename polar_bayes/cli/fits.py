@@ -122,7 +122,7 @@ def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: A
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
     asked = {} if draws is None else {"draws": draws}
-    chosen = pb.PixelLaplace(**asked) if method == "laplace" else pb.PixelTempering()
+    chosen = pb.PixelLaplace(**asked) if method == "laplace" else pb.PixelSMC()
     maps = pb.map_file(capture, out, method=chosen, **settings)
     counts = ", ".join(f"{count} {what}" for what, count in pb.count_pixels(maps).items() if count)
     click.echo(f"{out}: {counts}")

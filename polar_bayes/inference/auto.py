@@ -16,12 +16,12 @@ from polar_bayes.inference.mcse import count_scalars, draws_needed, expected_err
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.problem import Problem
-from polar_bayes.inference.psis import LARGEST_TRUSTED
+from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.request import Method
 from polar_bayes.inference.resampling import max_effective_size
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.inference.run_method import answer, draws_of, with_answer_draws, with_draws
-from polar_bayes.inference.smc import PixelTempering
+from polar_bayes.inference.smc import PixelSMC
 from polar_bayes.inference.weighted import Importance, Tempered
 
 # --- Whether chains have been at every mode: where all began at one, R-hat cannot see the others
@@ -119,7 +119,7 @@ class Auto(AbstractMethod):
         if any(name != "view" and length > 1 for name, length in problem.data.dims):
             return {"nuts": chains}
         weighted = min(RESERVE * needed, MOST_DRAWS)
-        tempering = with_answer_draws(PixelTempering(), weighted)
+        tempering = with_answer_draws(PixelSMC(), weighted)
         enough = min(needed, 0.5 * tempering.answer_draws)
         tempering = dataclasses.replace(tempering, effective_draws=enough)
         importance = Importance(draws=max(2048, 2 * weighted))
@@ -233,7 +233,7 @@ class Step(NamedTuple):
 def _doubts(found: PosteriorDraws, problem: Problem) -> list[str]:
     """Why an answer may be biased."""
     doubts = list(found.problems)
-    if found.k_hat > LARGEST_TRUSTED and not doubts:
+    if found.k_hat > MAX_PARETO_K and not doubts:
         doubts.append(f"its Pareto k-hat is {found.k_hat:.2f}")
     if found.r_hat > LARGEST_R_HAT:
         doubts.append(f"its R-hat is {found.r_hat:.3f}")

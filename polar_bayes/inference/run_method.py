@@ -21,7 +21,7 @@ from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.psis import smooth
 from polar_bayes.inference.request import Method
 from polar_bayes.inference.resampling import CHAINS, generator
-from polar_bayes.inference.smc import PixelTempering
+from polar_bayes.inference.smc import PixelSMC
 from polar_bayes.inference.weighted import Tempered
 
 POINT_DRAWS = 1000
@@ -130,20 +130,20 @@ def _(method: Nuts, factor: float) -> Method:
 def _(method: Tempered, factor: float) -> Method:
     settings = method.settings
     wanted = factor * settings.answer_draws
-    if wanted < settings.crowd:
+    if wanted < settings.num_particles:
         raise FitError(
-            f"{wanted:g} draws are fewer than the crowd of {settings.crowd}",
+            f"{wanted:g} draws are fewer than the {settings.num_particles} particles",
             where="Tempered",
-            hint="give a smaller crowd, or more draws",
+            hint="give fewer particles, or more draws",
         )
     more = with_answer_draws(settings, wanted)
     worth = settings.effective_draws * more.answer_draws / settings.answer_draws
     return Tempered(dataclasses.replace(more, effective_draws=worth))
 
 
-def with_answer_draws(settings: PixelTempering, count: float) -> PixelTempering:
+def with_answer_draws(settings: PixelSMC, count: float) -> PixelSMC:
     """The same settings with at least so many draws in an answer."""
-    half = math.ceil(0.5 * max(count, settings.crowd))
+    half = math.ceil(0.5 * max(count, settings.num_particles))
     worth = min(settings.effective_draws, float(half))
     return dataclasses.replace(settings, draws=half, effective_draws=worth)
 

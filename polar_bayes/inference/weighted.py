@@ -3,29 +3,32 @@
 import collections
 import dataclasses
 import functools
-from typing import Any, override
+from typing import override
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import tempered_draws
-from polar_bayes.inference.batch_programs import BatchEngine
-from polar_bayes.inference.batch_result import Row, Status, Weighted
-from polar_bayes.inference.batching import Stack
+from polar_bayes.inference.batch_engine import BatchEngine
+from polar_bayes.inference.batch_result import BatchFit, Outcome, Status
+from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.compile import TRACING_LOCK, LRUCache
 from polar_bayes.inference.initialization import STARTS, JointInit
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import Modes
 from polar_bayes.inference.problem import CompiledModel, Problem
 from polar_bayes.inference.program import Program, compile_program
-from polar_bayes.inference.proposals import Mixture, draw_mixture, log_density
-from polar_bayes.inference.psis import LARGEST_TRUSTED, effective_draws, smooth
+from polar_bayes.inference.proposals import (
+    Mixture,
+    WeightedSample,
+    draw_mixture,
+    log_density,
+)
+from polar_bayes.inference.psis import MAX_PARETO_K, effective_draws, smooth
 from polar_bayes.inference.resampling import choose, generator, log_densities
-from polar_bayes.inference.smc import PixelTempering
+from polar_bayes.inference.smc import PixelSMC, smc_draws
 from polar_bayes.observation.data import Observations
-from polar_bayes.progress import Progress, no_progress
 
 LEAST_SHARE = 1e-3
 """Of the Laplace evidence: lighter modes get no draws."""
@@ -84,9 +87,9 @@ class Importance(AbstractMethod):
             )
         index = choose(weights, worth, generator(key_choice))
         problems = []
-        if not k_hat <= LARGEST_TRUSTED:
+        if not k_hat <= MAX_PARETO_K:
             problems.append(
-                f"Pareto k-hat of the weights is {k_hat:.2f} (at most {LARGEST_TRUSTED}): they do "
+                f"Pareto k-hat of the weights is {k_hat:.2f} (at most {MAX_PARETO_K}): they do "
                 "not reach all of the posterior, so use method='nuts'"
             )
         return PosteriorDraws(
@@ -138,20 +141,18 @@ MOST_KEPT = 4
 class Tempered(AbstractMethod):
     """Tempered draws of one material in one color, corrected by weights.
 
-    A crowd that begins as draws from the prior sees all modes before any of them is narrow, and
+    Particles start from the prior, so every mode has particles before any mode is narrow, and
     nothing is differentiated.
 
     Args:
-        settings: Of the crowd, and of the mixtures that are fitted to it; one fit alone has time
-            for more draws than each of thousands.
+        settings: Of the particles, and of the mixtures that are fitted to them; a single fit has
+            time for more draws than each of thousands.
 
     Raises:
         FitError: A setting is outside its range.
     """
 
-    settings: PixelTempering = dataclasses.field(
-        default_factory=functools.partial(PixelTempering, draws=4096)
-    )
+    settings: PixelSMC = dataclasses.field(default_factory=functools.partial(PixelSMC, draws=4096))
 
     @override
     def draw(self, problem: Problem) -> PosteriorDraws:
@@ -161,39 +162,43 @@ class Tempered(AbstractMethod):
                 where="Tempered",
                 hint="use method='nuts'",
             )
-        row = Row(1, lambda at, parameters, weights: None)
         keys = np.asarray(jax.random.key_data(problem.key_of_draws))[None]
-        engine = _engine(problem)
-        found: Weighted | None = None
-        pixels = _alone(problem.data)
-        at = np.zeros(1, int)
-        for _, answer in tempered_draws(engine, self.settings, pixels, keys, at, row):
-            found = answer
+        counts: collections.Counter[str] = collections.Counter()
+        every = self.settings.num_attempts * (self.settings.rounds + 1)
+
+        def count(what: str) -> None:
+            problem.progress("tempering", counts.total() / every)
+            counts[what] += 1
+
+        batch = BatchFit(_engine(problem), _batch_of_one(problem.data), keys)
+        found: WeightedSample | None = None
+        for _, sample in smc_draws(batch, self.settings, np.zeros(1, int), count):
+            found = sample
         problem.progress("tempering", 1.0)
         if found is None:
             raise FitError(
-                "the crowd did not arrive at the posterior", where="Tempered", hint="use 'nuts'"
+                "the particles did not reach the posterior", where="Tempered", hint="use 'nuts'"
             )
-        return self._answer(problem, found, row, engine)
+        return self._answer(problem, found, batch.outcome, counts)
 
     def _answer(
-        self, problem: Problem, found: Weighted, row: Row, engine: "_Counting"
+        self, problem: Problem, found: WeightedSample, outcome: Outcome, counts: collections.Counter
     ) -> PosteriorDraws:
         z, weights = found.z[0].astype(float), found.weights[0].astype(float)
         weights = weights / weights.sum()
-        worth, k_hat = float(found.worth[0]), float(found.pareto_k[0])
+        worth, k_hat = float(found.ess[0]), float(found.pareto_k[0])
         index = choose(weights, worth, generator(problem.key_of_draws))
         problems = []
-        if row.status[0] != Status.GOOD:
+        if outcome.status[0] != Status.GOOD:
             problems.append(
                 f"the weighted draws are worth {worth:.0f} independent ones (at least "
                 f"{self.settings.effective_draws:.0f}), with a Pareto k-hat of {k_hat:.2f} (at "
-                f"most {LARGEST_TRUSTED}): use method='nuts'"
+                f"most {MAX_PARETO_K}): use method='nuts'"
             )
-        walks, length = self.settings.walks, self.settings.length
-        steps = int(row.outcome.steps[0]) * walks * (length - 1)
-        drawn = engine.counts["rounds"] * self.settings.draws
-        looked = engine.counts["crowds"] * self.settings.looks * self.settings.crowd
+        num_chains, length = self.settings.num_chains, self.settings.chain_length
+        steps = int(outcome.steps[0]) * num_chains * (length - 1)
+        drawn = counts["rounds"] * self.settings.draws
+        looked = counts["particles"] * self.settings.init_factor * self.settings.num_particles
         densities = looked + steps + drawn
         return PosteriorDraws(
             kind="tempered",
@@ -205,58 +210,24 @@ class Tempered(AbstractMethod):
             effective_draws=worth,
             gradients=0.0,
             densities=float(densities),
-            said={"stages": int(row.outcome.steps[0]), "rounds": engine.counts["rounds"]},
+            said={"stages": int(outcome.steps[0]), "rounds": counts["rounds"]},
         )
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Counting(BatchEngine):
-    """The programs of a layout, and how often one fit runs them; made for each fit."""
-
-    counts: collections.Counter = dataclasses.field(default_factory=collections.Counter)
-    progress: Progress = no_progress
-
-    @override
-    def temper(self, pixels: Stack, settings: PixelTempering, *others: Any) -> Any:
-        self._count("crowds", settings)
-        return super().temper(pixels, settings, *others)
-
-    @override
-    def propose(self, pixels: Stack, settings: PixelTempering, *others: Any) -> Any:
-        self._count("rounds", settings)
-        return super().propose(pixels, settings, *others)
-
-    def _count(self, what: str, settings: PixelTempering) -> None:
-        """Of every attempt, one crowd and some rounds; what is abandoned ends here."""
-        every = settings.crowds * (settings.rounds + 1)
-        self.progress("tempering", self.counts.total() / every)
-        self.counts[what] += 1
 
 
 _ENGINES: LRUCache[tuple[CompiledModel, BatchEngine]] = LRUCache(MOST_KEPT)
 """With what they were made for, so that its identity is not given to another."""
 
 
-def _engine(problem: Problem) -> _Counting:
-    """The programs of the bench's layout, kept from fit to fit, and counts that begin at zero."""
-    _, kept = _ENGINES.of(id(problem.compiled_model), functools.partial(_make, problem))
-    return _Counting(
-        kept.program,
-        kept.rough,
-        kept.candidates,
-        kept.precision,
-        kept.programs,
-        progress=problem.progress,
-    )
+def _engine(problem: Problem) -> BatchEngine:
+    """The programs of the problem's layout, kept from fit to fit."""
 
-
-def _make(problem: Problem) -> tuple[CompiledModel, BatchEngine]:
-    candidates = np.zeros((1, problem.program.size))  # nothing climbs here
-    rough = _rough(problem)
-    with TRACING_LOCK:
+    def make() -> tuple[CompiledModel, BatchEngine]:
+        single = _rough(problem)
         return problem.compiled_model, BatchEngine(
-            problem.program, rough, candidates, problem.request.precision
+            problem.program, single, problem.data, problem.request.precision
         )
+
+    return _ENGINES.of(id(problem.compiled_model), make)[1]
 
 
 def _rough(problem: Problem) -> Program:
@@ -268,7 +239,9 @@ def _rough(problem: Problem) -> Program:
         return compile_program(single.bind(single.scene), problem.data.in_single_precision())
 
 
-def _alone(data: Observations) -> Stack:
-    """One capture as a row of one pixel, which shares nothing with others."""
-    own = jax.tree.map(lambda x: np.asarray(x)[None], data)
-    return Stack(own, jax.tree.map(lambda _: None, data), np.array([int(np.sum(data.valid))]))
+def _batch_of_one(data: Observations) -> ObservationBatch:
+    """One capture as a batch of one pixel."""
+    batched = jax.tree.map(lambda x: np.asarray(x)[None], data)
+    return ObservationBatch(
+        batched, jax.tree.map(lambda _: None, data), np.array([int(np.sum(data.valid))])
+    )

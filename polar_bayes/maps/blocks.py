@@ -15,10 +15,15 @@ import xarray as xr
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import PixelMethod, candidates_of, fit_stack
-from polar_bayes.inference.batch_programs import ENGINE_LOCK, BatchEngine, EngineSpec, make_engine
-from polar_bayes.inference.batch_result import Approach, Outcome, Status, no_outcome
-from polar_bayes.inference.batching import IMAGE, stack
+from polar_bayes.inference.batch_engine import BatchEngine, make_engine
+from polar_bayes.inference.batch_result import (
+    AbstractPixelMethod,
+    MethodUsed,
+    Outcome,
+    Status,
+    empty_outcome,
+)
+from polar_bayes.inference.batching import IMAGE, batch_pixels
 from polar_bayes.inference.compile import TRACING_LOCK
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.inference.request import Request
@@ -47,7 +52,7 @@ class Plan:
     """What is done to every block of one image; it can be sent to another process."""
 
     request: Request
-    settings: PixelMethod
+    settings: AbstractPixelMethod
     intensity_unit: float | None
     own_directions: frozenset[str]
     key: str
@@ -63,11 +68,7 @@ class Plan:
     @property
     def engine(self) -> BatchEngine:
         """The compiled programs, made at first use in each process."""
-        observe = functools.partial(self.pixel, "double")
-        with ENGINE_LOCK:
-            return make_engine(
-                EngineSpec(self.request, observe, candidates_of(self.settings), self.key)
-            )
+        return make_engine(self.key, self.request, functools.partial(self.pixel, "double"))
 
     @property
     def layout(self) -> Layout:
@@ -99,24 +100,24 @@ def fit_block(block: xr.Dataset, plan: Plan) -> xr.Dataset:
     engine = plan.engine
     numbers = block[NUMBER].transpose(*IMAGE).to_numpy()
     with jax.enable_x64(True):
-        readings = set_aside(block.drop_vars(NUMBER))
+        readings = mask_missing(block.drop_vars(NUMBER))
         if not readings["valid"].any():  # a corner of a picture; as a capture it would be refused
             return _masked(block, plan)
-        pixels = stack(plan.observe(validate(readings)), plan.own_directions)
+        pixels = batch_pixels(plan.observe(validate(readings)), plan.own_directions)
     found, seed = Marginals(len(pixels), plan.sizes), plan.request.seed
-    outcome = fit_stack(engine, plan.settings, pixels, numbers.ravel(), seed, found.describe)
+    outcome = plan.settings.run_batch(engine, pixels, numbers.ravel(), seed, found.describe)
     return maps_of(found, outcome, block, plan.layout)
 
 
 def _masked(block: xr.Dataset, plan: Plan) -> xr.Dataset:
     """The maps of a block in which nothing was read."""
     count = block.sizes["y"] * block.sizes["x"]
-    outcome = no_outcome(count)
+    outcome = empty_outcome(count)
     outcome.status[:] = Status.MASKED
     return maps_of(Marginals(count, plan.sizes), outcome, block, plan.layout)
 
 
-def set_aside(capture: xr.Dataset) -> xr.Dataset:
+def mask_missing(capture: xr.Dataset) -> xr.Dataset:
     """A capture whose missing readings are marked as such."""
     valid = capture.get("valid", xr.DataArray(True)).astype(bool)
     for name in READINGS:
@@ -142,7 +143,7 @@ def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, layout: Layou
     for name, meaning in DIAGNOSTICS.items():
         said = {"units": "1", "long_name": meaning}
         variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), said)
-    for name, names in (("approach", Approach), ("status", Status)):
+    for name, names in (("approach", MethodUsed), ("status", Status)):
         flags: dict[str, Any] = {
             "long_name": DIAGNOSTICS[name],
             "flag_values": [int(each) for each in names],

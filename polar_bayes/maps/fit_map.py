@@ -9,9 +9,9 @@ import xarray as xr
 from numpyro import distributions as dist
 
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.batch_fit import FEWEST_VIEWS, PixelLaplace, PixelMethod
-from polar_bayes.inference.batch_programs import key_of
-from polar_bayes.inference.batch_result import Status, no_outcome
+from polar_bayes.inference.batch_engine import engine_key
+from polar_bayes.inference.batch_laplace import PixelLaplace
+from polar_bayes.inference.batch_result import MIN_VIEWS, AbstractPixelMethod, Status, empty_outcome
 from polar_bayes.inference.batching import IMAGE
 from polar_bayes.inference.psis import Marginals
 from polar_bayes.inference.request import resolve
@@ -22,7 +22,7 @@ from polar_bayes.maps.blocks import (
     as_completed,
     fit_block,
     maps_of,
-    set_aside,
+    mask_missing,
     workers,
 )
 from polar_bayes.observation.data import ANGLES
@@ -43,7 +43,7 @@ def fit_pixels(
     capture: xr.Dataset,
     *,
     model: str | Callable = "per_material",
-    method: PixelMethod | None = None,
+    method: AbstractPixelMethod | None = None,
     scene: str | Scene | None = None,
     priors: Mapping[str, dist.Distribution] | None = None,
     links: AbstractLink | Mapping[str, AbstractLink] | None = None,
@@ -63,7 +63,7 @@ def fit_pixels(
         capture: A capture with dims y and x. In chunks (Dask), it is read block by block, and the
             maps come in the same chunks, computed when they are asked for.
         model: See `polar_bayes.fit`; the other arguments too.
-        method: What is done in each pixel; by default `PixelLaplace()`. `PixelTempering()` sees
+        method: What is done in each pixel; by default `PixelLaplace()`. `PixelSMC()` sees
             all modes of a pixel, at many times the cost; `PixelNuts()` runs chains in each.
         scene: A name in `SETUPS` or a `Scene`.
         priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
@@ -88,7 +88,7 @@ def fit_pixels(
         capture, model, method, scene, priors, links, largest_view_zenith, seed, precision
     )
     if capture.chunks:
-        numbered = number_pixels(capture)
+        numbered = with_pixel_numbers(capture)
         maps = xr.map_blocks(fit_block, numbered, args=[plan], template=blank(capture, plan))
     else:
         maps = _at_once(capture, plan, progress)
@@ -143,7 +143,7 @@ def checked_status(maps: xr.Dataset) -> xr.DataArray:
 def plan_map(
     capture: xr.Dataset,
     model: str | Callable,
-    method: PixelMethod | None,
+    method: AbstractPixelMethod | None,
     scene: str | Scene | None,
     priors: Mapping[str, dist.Distribution] | None,
     links: AbstractLink | Mapping[str, AbstractLink] | None,
@@ -153,11 +153,11 @@ def plan_map(
 ) -> Plan:
     """Check what is asked of a map, on one of its pixels."""
     settings = PixelLaplace() if method is None else method
-    if not isinstance(settings, PixelMethod):
+    if not isinstance(settings, AbstractPixelMethod):
         raise FitError(
             f"{method!r} is no way to fit pixels",
             where="fit_pixels: method",
-            hint="give settings such as PixelLaplace(draws=512) or PixelTempering()",
+            hint="give settings such as PixelLaplace(draws=512) or PixelSMC()",
         )
     missing = [dim for dim in IMAGE if dim not in capture.dims]
     if missing:
@@ -174,10 +174,12 @@ def plan_map(
         if name in capture and set(IMAGE) & set(capture[name].dims)
     )
     unit = _intensity_unit(capture)
-    return Plan(request, settings, unit, own, key_of(request, settings, sorted(own), unit is None))
+    return Plan(
+        request, settings, unit, own, engine_key(request, settings, sorted(own), unit is None)
+    )
 
 
-def number_pixels(capture: xr.Dataset) -> xr.Dataset:
+def with_pixel_numbers(capture: xr.Dataset) -> xr.Dataset:
     """An image whose pixels know where they stand, row by row, in chunks like its own."""
     rows, columns = (capture.sizes[dim] for dim in IMAGE)
     along = [
@@ -199,14 +201,15 @@ def numbered_block(block: xr.Dataset, place: Mapping[str, slice], columns: int) 
 def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
     """Maps of the image before any pixel is fitted: names, axes, types and attributes."""
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
-    nothing = no_outcome(1)
+    nothing = empty_outcome(1)
     nothing.status[:] = Status.NOT_FITTED
     tiny = maps_of(Marginals(1, plan.sizes), nothing, corner, plan.layout)
     one = tiny.isel({dim: 0 for dim in IMAGE}, drop=True)
     whole = one.expand_dims({dim: capture.sizes[dim] for dim in IMAGE})
     whole = whole.assign_coords({dim: capture[dim] for dim in IMAGE if dim in capture.coords})
     whole = xr.Dataset(
-        {n: v.transpose(*tiny[n].dims) for n, v in whole.items()}, attrs={PROVENANCE: said_of(plan)}
+        {n: v.transpose(*tiny[n].dims) for n, v in whole.items()},
+        attrs={PROVENANCE: provenance_json(plan)},
     )
     chunks = {dim: capture.chunks[dim] for dim in IMAGE if dim in capture.chunks}
     return whole.chunk(chunks) if chunks else whole
@@ -248,7 +251,7 @@ def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
     rows = capture.sizes["y"]
     best, most = None, 0
     for y in range(rows):
-        row = set_aside(capture.isel(y=y).load())
+        row = mask_missing(capture.isel(y=y).load())
         views = row["valid"].any([d for d in row["valid"].dims if d not in ("x", "view")])
         counts = views.sum("view")
         found, x = int(counts.max()), int(counts.argmax("x")) if "x" in counts.dims else 0
@@ -256,9 +259,9 @@ def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
             best, most = row.isel(x=x), found
         if most == capture.sizes["view"]:
             break
-    if best is None or most < FEWEST_VIEWS:
+    if best is None or most < MIN_VIEWS:
         raise CaptureError(
-            f"no pixel has {FEWEST_VIEWS} valid views",
+            f"no pixel has {MIN_VIEWS} valid views",
             where=str(capture.attrs.get("name", "capture")),
             hint="check `valid` and the readings: NaN counts as missing",
         )
@@ -269,12 +272,12 @@ def _intensity_unit(capture: xr.Dataset) -> float | None:
     """The largest intensity of the whole image, where it states no saturation level."""
     if "intensity" not in capture or "saturation_level" in capture["intensity"].attrs:
         return None
-    readings = set_aside(capture)
+    readings = mask_missing(capture)
     largest = float(readings["intensity"].where(readings["valid"]).max())
     return largest if largest > 0.0 else 1.0
 
 
-def said_of(plan: Plan) -> str:
+def provenance_json(plan: Plan) -> str:
     """How maps are made, as JSON."""
     request = plan.request
     about = {

@@ -217,7 +217,7 @@ def _range(part: slice | np.ndarray | int, length: int) -> str:
     return str(part) if np.ndim(part) == 0 else f"{np.min(part)}:{np.max(part) + 1}"
 
 
-def at_hand(maps: xr.Dataset) -> xr.Dataset:
+def ensure_loaded(maps: xr.Dataset) -> xr.Dataset:
     """Maps whose values can be looked at again and again."""
     # Those in chunks (Dask) would be fitted anew at each look: they are computed, once.
     if not any(variable.chunks for variable in maps.variables.values()):

@@ -27,7 +27,14 @@ from polar_bayes.inference.batch_result import Status
 from polar_bayes.inference.batching import IMAGE
 from polar_bayes.interrupts import on_interrupt, resume_hint
 from polar_bayes.maps.blocks import Plan, as_completed, fit_block, workers
-from polar_bayes.maps.fit_map import blank, cut, fit_pixels, numbered_block, plan_map, said_of
+from polar_bayes.maps.fit_map import (
+    blank,
+    cut,
+    fit_pixels,
+    numbered_block,
+    plan_map,
+    provenance_json,
+)
 from polar_bayes.maps.lazy import FINISHED, LEDGER, REQUEST, check_whole, open_image, open_map
 from polar_bayes.paths import (
     as_path,
@@ -345,7 +352,7 @@ class _MapStore:
         self._chunks = {dim: part.stop for dim, part in self._places[0].items()}
         pixel = plan.request.capture.drop_attrs(deep=False)
         read = pixel[sorted(READ & set(pixel.data_vars))].to_dict()
-        asked = [said_of(plan), dict(image.sizes), self._chunks, read]
+        asked = [provenance_json(plan), dict(image.sizes), self._chunks, read]
         text = json.dumps(asked, sort_keys=True, default=str)
         self.request = hashlib.sha256(text.encode()).hexdigest()
 

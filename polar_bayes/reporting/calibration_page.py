@@ -28,8 +28,8 @@ from polar_bayes.calibration.verdict import (
 )
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.errors import FitError, one_line
-from polar_bayes.inference.batch_result import Approach, Status
-from polar_bayes.inference.psis import LARGEST_TRUSTED
+from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import plots_calibration as figures
 from polar_bayes.reporting.maps import APPROACHES, MOST_NAMED, share
@@ -146,7 +146,7 @@ def fit_tables(calibration: xr.DataTree, parts: Mapping[str, Part]) -> list[tupl
     wanted = {
         "status": (Status, STATUSES, "What became of each fit. With ranks: those of which every "
                    "parameter is ranked; the others count as misses in the table of parameters."),
-        "approach": (Approach, APPROACHES, "How the numbers of each fit were found."),
+        "approach": (MethodUsed, APPROACHES, "How the numbers of each fit were found."),
     }  # fmt: skip
     found = []
     for name, (known, meanings, caption) in wanted.items():
@@ -170,8 +170,8 @@ def fit_facts(calibration: xr.DataTree) -> list[Row]:
         k = fits["pareto_k"].to_numpy()
         known = k[~np.isnan(k)]
         if known.size:
-            above = int(np.sum(known > LARGEST_TRUSTED))
-            facts[f"Pareto k above {LARGEST_TRUSTED:g}"] = (
+            above = int(np.sum(known > MAX_PARETO_K))
+            facts[f"Pareto k above {MAX_PARETO_K:g}"] = (
                 f"{above:,} of {known.size:,} fits that know it ({share(above, known.size)})"
             )
     return fact_rows(facts)
@@ -311,7 +311,7 @@ def reading_rows(parts: list[ReadingRanks]) -> Table:
         rows.append(Row(part.label, part.title, tuple(cells)))
     heads = ("reading", "p", "the ranks", "failed", "mean rank", "spread", "untrusted")
     behind = pd.DataFrame({part.label: part.row for part in parts}).T
-    caption = CAPTION.format(level=parts[0].level, k=LARGEST_TRUSTED)
+    caption = CAPTION.format(level=parts[0].level, k=MAX_PARETO_K)
     return Table(caption, heads, tuple(rows), behind)
 
 

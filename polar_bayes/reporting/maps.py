@@ -15,13 +15,12 @@ from matplotlib.figure import Figure
 from polar_bayes.diagnostics.coverage import BLOCK, INTERVALS, map_coverage, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
-from polar_bayes.inference.batch_fit import FEWEST_VIEWS
-from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.batch_result import MIN_VIEWS, Status
 from polar_bayes.inference.batching import IMAGE
-from polar_bayes.inference.psis import LARGEST_TRUSTED
+from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.fit_map import checked_status, cut
-from polar_bayes.maps.lazy import at_hand
+from polar_bayes.maps.lazy import ensure_loaded
 from polar_bayes.physics.part import notation
 from polar_bayes.reporting.page import Picture, fill, picture
 from polar_bayes.reporting.style import (
@@ -63,7 +62,7 @@ MOST_NAMED = 6
 STATUSES = {
     "good": "an answer that the checks let pass",
     "masked": "no valid reading",
-    "too few views": f"fewer than {FEWEST_VIEWS} valid views",
+    "too few views": f"fewer than {MIN_VIEWS} valid views",
     "not converged": "no answer was reached; NaN",
     "not trusted": "numbers that no check confirms, by the approach told below",
     "not fitted": "called good without finite numbers, or never written",
@@ -167,9 +166,9 @@ def verdict(cases: pd.DataFrame) -> list[str]:
         )
     phrases = {
         "masked": "{} masked: no reading there is valid.",
-        "too few views": f"{{}} read in fewer than {FEWEST_VIEWS} views and not fitted.",
+        "too few views": f"{{}} read in fewer than {MIN_VIEWS} views and not fitted.",
         "not converged": "{} not converged: no start led to an answer, and the maps are NaN there.",
-        "not trusted": f"{{}} not trusted: Pareto k is above {LARGEST_TRUSTED:g}, or draws are "
+        "not trusted": f"{{}} not trusted: Pareto k is above {MAX_PARETO_K:g}, or draws are "
         "worth too little, and nothing else confirmed them. The maps show its numbers there; do "
         "not quote them.",
         "not fitted": "{} not fitted: they are called good without finite numbers, or were never "
@@ -478,7 +477,7 @@ COLUMNS = 4
 BARE = "bare normal approximation of each pixel"
 FITTED_BY = {
     "PixelLaplace": "normal approximation of each pixel, checked and corrected",
-    "PixelTempering": "tempered draws of each pixel",
+    "PixelSMC": "tempered draws of each pixel",
     "PixelNuts": "chains in each pixel",
 }
 UNCHECKED = (
@@ -495,7 +494,7 @@ def render_map(
     if any(name not in maps for name in TRUST):
         raise FitError("it holds no maps", where="report", hint="give what fit_pixels returns")
     _check_uncorrected(maps, truth, uncorrected)
-    maps, provenance = at_hand(maps), _provenance(maps)
+    maps, provenance = ensure_loaded(maps), _provenance(maps)
     cases = count_cases(maps)
     said, is_enough = headline(cases)
     is_bare, fitted_by = _is_bare(provenance), provenance.get("fitted_by", "PixelLaplace")

@@ -186,9 +186,9 @@ def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
         if turned is not None:
             assert draws_of(turned[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
     # A crowd and a half, of which half would be three quarters: fewer than the crowd.
-    few = pb.Tempered(pb.PixelTempering(draws=1536))
+    few = pb.Tempered(pb.PixelSMC(draws=1536))
     assert pb.DrawsDial(0.5).turn(request, few) is None
-    enough = pb.DrawsDial(0.5).turn(request, pb.Tempered(pb.PixelTempering(draws=3072)))
+    enough = pb.DrawsDial(0.5).turn(request, pb.Tempered(pb.PixelSMC(draws=3072)))
     assert enough is not None
     assert draws_of(enough[1]) == 3072
 
@@ -250,8 +250,8 @@ def test_the_tempered_reference_draws_what_its_own_error_takes():
     settings = pb.Reference(error=0.02).tempered.settings
     assert settings.effective_draws == pytest.approx(4.0 / 0.02**2)
     least = 4 * settings.effective_draws
-    assert least <= settings.answer_draws < least + settings.crowd
-    assert settings.crowd == 8192
+    assert least <= settings.answer_draws < least + settings.num_particles
+    assert settings.num_particles == 8192
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from polar_bayes.calibration.calibrate import METHODS, _settings
 from polar_bayes.calibration.runner import Method
 from polar_bayes.errors import FitError
 from polar_bayes.inference import hierarchical_reparam
-from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.inference.problem import compile_model
 from polar_bayes.inference.program import PIECE, parameters_of
 from polar_bayes.inference.request import resolve
@@ -81,7 +81,7 @@ def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
         assert np.abs(table[f"held_{percent}"] - share).max() < 3.3 * error
     assert exact["truth"]["level"].dims == ("simulation", "patch")
     assert (exact["fits"]["status"] == Status.GOOD).all()
-    assert (exact["fits"]["approach"] == Approach.LAPLACE).all()
+    assert (exact["fits"]["approach"] == MethodUsed.LAPLACE).all()
 
 
 def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
@@ -106,7 +106,7 @@ def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Datase
     found = pb.calibrate(capture, simulations=20, model=population, method=SHORT, **ASKED)
     fits = found["fits"].to_dataset()
     assert (fits["status"] == Status.NOT_TRUSTED).all()  # 100 draws are not worth 400
-    assert (fits["approach"] == Approach.NUTS).all()
+    assert (fits["approach"] == MethodUsed.NUTS).all()
     assert (fits["effective_draws"] < 400.0).all()
     assert np.isfinite(found["prior_sbc"]["level"]).all()
     said = pb.calibration_verdict(found)

@@ -129,7 +129,7 @@ def test_a_damaged_block_is_fitted_again(capture, whole, begun, tmp_path) -> Non
     ("other", "topic"),
     [
         ({"seed": 1}, "seed"),
-        ({"method": pb.PixelTempering(walks=32)}, "method"),
+        ({"method": pb.PixelSMC(num_chains=32)}, "method"),
         ({"priors": {"refractive_index": dist.Uniform(1.2, 2.0 + 1e-9)}}, "priors"),
         ({"truth": {"priors": {"refractive_index": dist.Uniform(1.2, 2.0)}}}, "truth"),
         ({"links": {"q": pb.StokesLink(degrees_of_freedom=5.0, stated_errors=True)}}, "links"),
@@ -197,12 +197,12 @@ import numpy as np
 import numpyro.distributions as dist
 from plates import plate_capture
 from polar_bayes.calibration.calibrate import METHODS, planned, _resolved
-from polar_bayes.calibration.store import question_of
+from polar_bayes.calibration.store import fingerprint_of
 from test_resuming import ASKED
 capture = plate_capture(np.array([30.0, 42.0, 68.0, 80.0]), 0.03, seed=0)
 priors = {"refractive_index": dist.TruncatedNormal(1.5, 0.1, low=1.2)}
 request = _resolved(capture, {**ASKED, "priors": priors}, None, 0)
-print(json.dumps(question_of(planned(request, None, METHODS["tempered"], True))))
+print(json.dumps(fingerprint_of(planned(request, None, METHODS["tempered"], True))))
 """
 
 
@@ -224,10 +224,10 @@ import sys
 import numpy as np
 import polar_bayes as pb
 from plates import plate_capture
-from polar_bayes.calibration import block
+from polar_bayes.calibration import runner
 from test_resuming import ASKED
 store, resume, scheduler, out, size, count = sys.argv[1:]
-block.BLOCK = int(size)
+runner.BLOCK = int(size)
 found = pb.calibrate(
     plate_capture(np.array([30.0, 42.0, 68.0, 80.0]), 0.03, seed=0),
     simulations=int(count),

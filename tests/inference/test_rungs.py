@@ -22,7 +22,7 @@ SMALL = {
     "point": pb.Point(starts=2),
     "laplace": pb.Laplace(draws=1000),
     "importance": pb.Importance(),
-    "tempered": pb.Tempered(pb.PixelTempering(draws=4096)),
+    "tempered": pb.Tempered(pb.PixelSMC(draws=4096)),
     "normal guide": pb.NormalGuide(steps=400, draws=1000),
     "flow guide": pb.FlowGuide(steps=400, draws=1000),
     "nuts": pb.Nuts(effective_draws=2000.0),
@@ -176,24 +176,26 @@ def test_draws_are_scaled_and_settings_kept():
     chains = with_draws(pb.Nuts(warmup=77), 2.0)
     assert (chains.draws, chains.most_draws, chains.effective_draws) == (1000, 16000, 900.0)
     assert chains.warmup == 77
-    tempered = with_draws(pb.Tempered(pb.PixelTempering(draws=4096)), 4.0).settings
+    tempered = with_draws(pb.Tempered(pb.PixelSMC(draws=4096)), 4.0).settings
     assert (tempered.draws, tempered.effective_draws) == (16384, 800.0)
     assert draws_of(pb.Tempered(tempered)) == tempered.answer_draws == 32768
-    fewer = with_draws(pb.Tempered(pb.PixelTempering(draws=4096)), 0.25).settings
+    fewer = with_draws(pb.Tempered(pb.PixelSMC(draws=4096)), 0.25).settings
     assert (fewer.draws, fewer.effective_draws) == (1024, 50.0)
-    with pytest.raises(FitError, match="512 draws are fewer than the crowd of 2048"):
-        with_draws(pb.Tempered(pb.PixelTempering(draws=1024)), 0.25)
+    with pytest.raises(FitError, match="512 draws are fewer than the 2048 particles"):
+        with_draws(pb.Tempered(pb.PixelSMC(draws=1024)), 0.25)
     assert with_draws(pb.Point(), 2.0) is None
 
 
 def test_tempered_answers_have_as_many_draws_as_are_asked_for():
-    settings = pb.PixelTempering()
+    settings = pb.PixelSMC()
     for count, draws in ((1.0, 2048), (2048, 2048), (2049, 2050), (5000, 5000)):
         assert with_answer_draws(settings, count).answer_draws == draws
     auto, here = pb.Auto(tolerance=0.1), problem(line)
     needed = draws_needed(0.1, 2)
     rungs = auto.rungs(here)
-    assert 8 * needed <= rungs["tempered"].settings.answer_draws < 8 * needed + settings.crowd
+    assert (
+        8 * needed <= rungs["tempered"].settings.answer_draws < 8 * needed + settings.num_particles
+    )
     assert rungs["tempered"].settings.effective_draws == needed
     assert rungs["importance"].draws == 16 * needed
 

@@ -25,7 +25,7 @@ METHODS = {
 }
 DEAR = {
     "flow guide": pb.FlowGuide(steps=200, draws=200),
-    "tempered": pb.Tempered(pb.PixelTempering(draws=4096)),
+    "tempered": pb.Tempered(pb.PixelSMC(draws=4096)),
 }
 OF_DRAWS = (
     "plot_dist",
