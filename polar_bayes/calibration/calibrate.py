@@ -21,7 +21,7 @@ from polar_bayes.calibration.runner import (
     join,
     needs_mcmc,
 )
-from polar_bayes.calibration.store import Store, fingerprint_of
+from polar_bayes.calibration.store import BlockStore, fingerprint_of
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import engine_key
 from polar_bayes.inference.batch_laplace import PixelLaplace
@@ -239,7 +239,7 @@ def calibrate(
             where="calibrate: truth",
             hint="give models whose parameters have the same names and shapes",
         )
-    kept = None if store is None else Store(as_path(store, "store"), fingerprint_of(plan))
+    kept = None if store is None else BlockStore(as_path(store, "store"), fingerprint_of(plan))
     found = kept.begin(resume=resume) if kept is not None else []
     missing = _missing(found, simulations)
     show = progress or no_progress
@@ -301,7 +301,7 @@ def _fit_all(
     plan: Plan,
     missing: np.ndarray,
     every: int,
-    kept: Store | None,
+    kept: BlockStore | None,
     scheduler: str | None,
     progress: Counter,
 ) -> list[Block]:

@@ -18,6 +18,7 @@ from polar_bayes.inference.compile import TRACING_LOCK, LRUCache, cache_key
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request
+from polar_bayes.inference.result import dims_of
 from polar_bayes.observation.data import Observations
 
 BATCH = 128
@@ -77,6 +78,19 @@ class BatchEngine:
                 return program(wanted, pixels.take(index), static, *state)
 
             return map_batches(of_batch, count, batch)
+
+    @property
+    def parameter_axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
+        """By parameter: names and lengths of the axes that it has in one pixel."""
+
+        def find() -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
+            z = np.zeros(self.program.size, self.dtype)
+            with jax.enable_x64(self.precision == "double"), TRACING_LOCK:
+                shapes = jax.eval_shape(self.program.parameters, z, self.layout)
+            dims = dims_of(self.program)
+            return {name: (tuple(dims[name]), x.shape) for name, x in shapes.items()}
+
+        return self.programs.of("parameter axes", find)
 
     def prior_draws(self, count: int) -> np.ndarray:
         """Draws from the prior, the starting points of mode searches. (draw, size)."""

@@ -1,4 +1,4 @@
-"""An image in, maps out: the public verb of this room."""
+"""Maps of an image: every pixel fitted by itself."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ BLOCK = 4096
 """Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
 
 CHUNK = 65536
-"""Pixels that are looked at together: a chunk of a store."""
+"""Pixels of a chunk of a store, which are read together."""
 
 
 @with_counter("pixels")
@@ -63,8 +63,8 @@ def fit_pixels(
         capture: A capture with dims y and x. In chunks (Dask), it is read block by block, and the
             maps come in the same chunks, computed when they are asked for.
         model: See `polar_bayes.fit`; the other arguments too.
-        method: What is done in each pixel; by default `PixelLaplace()`. `PixelSMC()` sees
-            all modes of a pixel, at many times the cost; `PixelNuts()` runs chains in each.
+        method: By default `PixelLaplace()`. `PixelSMC()` explores all modes of a pixel, at many
+            times the cost; `PixelNuts()` runs chains in each.
         scene: A name in `SETUPS` or a `Scene`.
         priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
         links: One link for the polarization, or a mapping from variable to link.
@@ -75,9 +75,9 @@ def fit_pixels(
 
     Returns:
         For each parameter its mean `<name>`, `<name>_sd` and `<name>_quantile`, each (y, x, ...);
-        `pareto_k`, `effective_draws`, `condition`, `steps`, `approach` (how the numbers were
-        found) and `status` (what became of the pixel). NaN where a pixel has no answer; the
-        attribute `polar_bayes` says how the maps were made.
+        `pareto_k`, `effective_draws`, `condition`, `steps`, `approach` (the method by which the
+        numbers were found) and `status` of each pixel. NaN where a pixel has no answer; the
+        attribute `polar_bayes` holds the provenance.
 
     Raises:
         CaptureError: The capture is no image, or does not hold what a fit needs.
@@ -97,7 +97,7 @@ def fit_pixels(
 
 
 def count_pixels(maps: xr.Dataset) -> dict[str, int]:
-    """What became of the pixels of a map.
+    """The number of pixels of each status.
 
     Args:
         maps: Of `fit_pixels`, or opened from a store.
@@ -151,11 +151,11 @@ def plan_map(
     seed: int,
     precision: str,
 ) -> Plan:
-    """Check what is asked of a map, on one of its pixels."""
+    """Check the request of a map on one of its pixels."""
     settings = PixelLaplace() if method is None else method
     if not isinstance(settings, AbstractPixelMethod):
         raise FitError(
-            f"{method!r} is no way to fit pixels",
+            f"{method!r} is no method for pixels",
             where="fit_pixels: method",
             hint="give settings such as PixelLaplace(draws=512) or PixelSMC()",
         )
@@ -179,31 +179,23 @@ def plan_map(
     )
 
 
-def with_pixel_numbers(capture: xr.Dataset) -> xr.Dataset:
-    """An image whose pixels know where they stand, row by row, in chunks like its own."""
-    rows, columns = (capture.sizes[dim] for dim in IMAGE)
-    along = [
-        xr.Variable((dim,), np.arange(n)) for dim, n in zip(IMAGE, (rows, columns), strict=True)
-    ]
-    if capture.chunks:
-        along = [
-            each.chunk({dim: capture.chunks[dim]}) for dim, each in zip(IMAGE, along, strict=True)
-        ]
-    return capture.assign({NUMBER: along[0] * columns + along[1]})
-
-
-def numbered_block(block: xr.Dataset, place: Mapping[str, slice], columns: int) -> xr.Dataset:
-    """A block of an image so many columns wide, whose pixels know where they stand in the whole."""
+def with_pixel_numbers(
+    block: xr.Dataset, place: Mapping[str, slice] | None = None, columns: int = 0
+) -> xr.Dataset:
+    """A block, by default a whole image, with the index of each pixel in the image, row by row."""
+    if place is None:
+        place, columns = {dim: slice(0, block.sizes[dim]) for dim in IMAGE}, block.sizes["x"]
     y, x = (xr.Variable((d,), np.arange(place[d].start, place[d].stop)) for d in IMAGE)
+    if block.chunks:
+        y, x = y.chunk(y=block.chunks["y"]), x.chunk(x=block.chunks["x"])
     return block.assign({NUMBER: y * columns + x})
 
 
 def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
-    """Maps of the image before any pixel is fitted: names, axes, types and attributes."""
+    """Maps of the image without values: names, axes, types and attributes."""
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
-    nothing = empty_outcome(1)
-    nothing.status[:] = Status.NOT_FITTED
-    tiny = maps_of(Marginals(1, plan.sizes), nothing, corner, plan.layout)
+    nothing = empty_outcome(1, Status.NOT_FITTED)
+    tiny = maps_of(Marginals(1, plan.sizes), nothing, corner, plan.engine.parameter_axes)
     one = tiny.isel({dim: 0 for dim in IMAGE}, drop=True)
     whole = one.expand_dims({dim: capture.sizes[dim] for dim in IMAGE})
     whole = whole.assign_coords({dim: capture[dim] for dim in IMAGE if dim in capture.coords})
@@ -233,7 +225,7 @@ def _at_once(capture: xr.Dataset, plan: Plan, progress: Counter | None) -> xr.Da
         tasks = ((place,) for place in cut(capture))
 
         def fit(place: dict[str, slice]) -> xr.Dataset:
-            block = numbered_block(capture.isel(place), place, capture.sizes["x"])
+            block = with_pixel_numbers(capture.isel(place), place, capture.sizes["x"])
             return fit_block(block, plan)
 
         blocks = as_completed(pool, count, fit, tasks)
@@ -278,9 +270,9 @@ def _intensity_unit(capture: xr.Dataset) -> float | None:
 
 
 def provenance_json(plan: Plan) -> str:
-    """How maps are made, as JSON."""
+    """Provenance of maps, as JSON."""
     request = plan.request
-    about = {
+    provenance = {
         "method": "pixels",
         "fitted_by": type(plan.settings).__name__,
         "settings": dataclasses.asdict(plan.settings),
@@ -296,4 +288,4 @@ def provenance_json(plan: Plan) -> str:
         "precision": request.precision,
         "intensity_unit": plan.intensity_unit,
     }
-    return json.dumps(about, sort_keys=True)
+    return json.dumps(provenance, sort_keys=True)

@@ -191,6 +191,8 @@ def test_single_precision_stays_single() -> None:
     here = case("known noise")
     data = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, here.data)
     with jax.enable_x64(False):
-        found = jax.jit(functools.partial(scoring_derivatives, here.program))(np.float32(here.points[0]), data)
+        found = jax.jit(functools.partial(scoring_derivatives, here.program))(
+            np.float32(here.points[0]), data
+        )
     assert {leaf.dtype for leaf in found} == {np.dtype(np.float32)}
     assert all(np.isfinite(leaf).all() for leaf in found)

@@ -265,7 +265,7 @@ def masked(image: xr.Dataset) -> xr.Dataset:
         (lambda c: c.isel(y=0, x=0), {}, r"plates: it has no axis y or x; give an image"),
         (lambda c: c.isel(y=0), {}, r"plates: it has no axis y; give an image"),
         (lambda c: c, {"method": pb.Nuts()}, r"fit_pixels: method: Nuts\(.*give settings such as"),
-        (lambda c: c, {"method": "laplace"}, r"'laplace' is no way to fit pixels; give settings"),
+        (lambda c: c, {"method": "laplace"}, r"'laplace' is no method for pixels; give settings"),
         (masked, {}, r"plates: no pixel has 2 valid views; check `valid`"),
         (lambda c: c.assign(q=c["q"] * np.nan), {}, r"plates: no pixel has 2 valid views"),
         (lambda c: c, {"precision": "half"}, r"precision is 'half'; give 'double' or 'single'"),
