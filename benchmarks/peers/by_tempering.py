@@ -12,7 +12,7 @@ from polar_bayes.inference.batching import ObservationBatch, batch_pixels
 from polar_bayes.inference.program import Values
 from polar_bayes.observation.data import observe
 
-SETTINGS = pb.PixelSMC(effective_draws=400.0)
+SETTINGS = pb.methods.PixelSMC(effective_draws=400.0)
 
 
 class Peer(AbstractPeer):

@@ -20,9 +20,9 @@ from polar_bayes.calibration.simulations import draw_fresh, draw_numbered
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT, SMALLEST_ESS
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine, make_engine
+from polar_bayes.inference.batch_method import AbstractPixelMethod
 from polar_bayes.inference.batch_nuts import PixelNuts
 from polar_bayes.inference.batch_result import (
-    AbstractPixelMethod,
     Describe,
     MethodUsed,
     Outcome,

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine
+from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import AbstractPixelMethod, BatchFit, MethodUsed, Status
+from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.inference.batching import (
     batched,
     put_rows,
@@ -88,16 +88,8 @@ class PixelLaplace(AbstractPixelMethod):
 
     def __post_init__(self) -> None:
         if self.draws < 64 or self.draws & (self.draws - 1):
-            raise FitError(
-                f"draws is {self.draws}", where="PixelLaplace", hint="give 64, 128, 256 or so"
-            )
-        for name, least in (("candidates", 8), ("rounds", 0)):
-            if getattr(self, name) < least:
-                raise FitError(
-                    f"{name} is {getattr(self, name)}",
-                    where="PixelLaplace",
-                    hint=f"give {least} or more",
-                )
+            self._refuse(f"draws is {self.draws}", "give 64, 128, 256 or so")
+        self._check_least(candidates=8, rounds=0)
 
     @override
     def fit(

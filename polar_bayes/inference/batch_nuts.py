@@ -16,9 +16,9 @@ from jaxtyping import Array, Float
 from numpyro import infer
 from numpyro.diagnostics import effective_sample_size
 
-from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine
-from polar_bayes.inference.batch_result import AbstractPixelMethod, BatchFit, MethodUsed, Status
+from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
+from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.inference.batching import (
     AnyArray,
     ObservationBatch,
@@ -61,20 +61,11 @@ class PixelNuts(AbstractPixelMethod):
     start: PixelSMC | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("chains", 2), ("warmup", 10), ("draws", 50)):
-            if getattr(self, name) < least:
-                raise FitError(
-                    f"{name} is {getattr(self, name)}",
-                    where="PixelNuts",
-                    hint=f"give {least} or more",
-                )
+        self._check_least(chains=2, warmup=10, draws=50)
         for name, low, high in (("target_acceptance", 0.5, 1.0), ("largest_r_hat", 1.0, 100.0)):
             if not low < getattr(self, name) < high:
-                raise FitError(
-                    f"{name} is {getattr(self, name)}",
-                    where="PixelNuts",
-                    hint=f"give a number between {low:g} and {high:g}",
-                )
+                what = f"{name} is {getattr(self, name)}"
+                self._refuse(what, f"give a number between {low:g} and {high:g}")
 
     @override
     def fit(

@@ -30,9 +30,9 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 from scipy.special import ndtr
 
-from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine
-from polar_bayes.inference.batch_result import AbstractPixelMethod, BatchFit, MethodUsed, Status
+from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
+from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.inference.batching import batched, take_rows
 from polar_bayes.inference.levenberg_marquardt import NormalApproximation
 from polar_bayes.inference.program import Program, Values
@@ -218,18 +218,8 @@ class PixelSMC(AbstractPixelMethod):
     effective_draws: float = 200.0
 
     def __post_init__(self) -> None:
-        least = {
-            "num_chains": 16,
-            "chain_length": 2,
-            "init_factor": 1,
-            "components": 1,
-            "rounds": 2,
-            "num_attempts": 1,
-            "effective_draws": 1,
-        }
-        for name, lowest in least.items():
-            if getattr(self, name) < lowest:
-                self._refuse(f"{name} is {getattr(self, name)}", f"give {lowest} or more")
+        self._check_least(num_chains=16, chain_length=2, init_factor=1)
+        self._check_least(components=1, rounds=2, num_attempts=1, effective_draws=1)
         if not 0.1 <= self.target_ess <= 0.95:
             self._refuse(f"target_ess is {self.target_ess}", "give a number from 0.1 to 0.95")
         if self.answer_draws < self.num_particles:
@@ -242,9 +232,6 @@ class PixelSMC(AbstractPixelMethod):
                 f"effective_draws is {self.effective_draws}, of {self.answer_draws} draws",
                 "give fewer, or more draws",
             )
-
-    def _refuse(self, what: str, hint: str) -> None:
-        raise FitError(what, where="PixelSMC", hint=hint)
 
     @property
     def num_particles(self) -> int:

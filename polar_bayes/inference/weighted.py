@@ -11,7 +11,8 @@ import numpy as np
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine
-from polar_bayes.inference.batch_result import BatchFit, Outcome, Status
+from polar_bayes.inference.batch_method import BatchFit
+from polar_bayes.inference.batch_result import Outcome, Status
 from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.compile import TRACING_LOCK, LRUCache
 from polar_bayes.inference.initialization import STARTS, JointInit

@@ -16,8 +16,8 @@ import xarray as xr
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine, make_engine
+from polar_bayes.inference.batch_method import AbstractPixelMethod
 from polar_bayes.inference.batch_result import (
-    AbstractPixelMethod,
     MethodUsed,
     Outcome,
     Status,

@@ -419,7 +419,7 @@ class _MapStore:
     def run(
         self, ledger: Ledger, source: Path, scheduler: str | None, progress: Counter | None
     ) -> None:
-        """Fit and write every block that the ledger does not hold, or whose files are not the same."""
+        """Fit and write every block that the ledger does not hold or whose files have changed."""
         places = [place for place in self._places if not self._is_done(ledger, place)]
         every = sum(map(_size, self._places))
         done = every - sum(map(_size, places))

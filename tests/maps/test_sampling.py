@@ -7,8 +7,8 @@ from arviz_stats.base import array_stats
 from plate_images import NAMES, VIEWS, on_a_grid, planned, plate_image, stacked
 
 from polar_bayes.inference.batch_engine import BatchEngine
+from polar_bayes.inference.batch_method import random_keys
 from polar_bayes.inference.batch_nuts import PixelNuts, sample_chains
-from polar_bayes.inference.batch_result import random_keys
 from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.levenberg_marquardt import ModeSearch, NormalApproximation, find_modes
 

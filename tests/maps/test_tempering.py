@@ -215,7 +215,7 @@ def test_skewed_pixels_have_the_posteriors_of_a_grid(chains: bool) -> None:
 )
 def test_mistakes_are_told(settings: dict, said: str) -> None:
     with pytest.raises(pb.FitError, match=said):
-        pb.PixelSMC(**settings)
+        pb.methods.PixelSMC(**settings)
 
 
 def test_two_mixtures_are_weighed_as_one() -> None:
