@@ -16,8 +16,9 @@ Source:
 """
 
 import functools
+import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -25,7 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpyro import distributions as dist
-from numpyro.infer.util import compute_log_probs
+from numpyro import handlers
+from numpyro.infer.util import compute_log_probs, potential_energy
 
 from polar_bayes.inference.batch_engine import BATCH, BatchEngine
 from polar_bayes.inference.batching import (
@@ -112,22 +114,19 @@ def scoring_derivatives(
     for at, (own, likelihood) in enumerate(zip(arguments, likelihoods, strict=True)):
         active = pixel.active(at, coordinates)
         value = value - jnp.sum(likelihood(own))
-        first = jax.grad(lambda a, f=likelihood: jnp.sum(f(a)))
-        first_of_site = first(own)
-        weight = {a: jax.jvp(first, (own,), (_unit(own, a),))[1] for a in active}
+        gradient_of = jax.grad(lambda a, f=likelihood: jnp.sum(f(a)))
+        first = gradient_of(own)
+        units = {a: [jnp.full_like(x, float(k == a)) for k, x in enumerate(own)] for a in active}
+        second = {a: jax.jvp(gradient_of, (own,), (unit,))[1] for a, unit in units.items()}
         jacobian = [jacobians[k][at] for k in range(program.size)]
         # The barrier keeps the compiler from computing these again for each of the sums below.
-        first_of_site, weight, jacobian = jax.lax.optimization_barrier(
-            (first_of_site, weight, jacobian)
-        )
+        first, second, jacobian = jax.lax.optimization_barrier((first, second, jacobian))
         gradient = gradient - jnp.stack(
-            [sum(jnp.sum(j[a] * first_of_site[a]) for a in active) for j in jacobian]
+            [sum(jnp.sum(j[a] * first[a]) for a in active) for j in jacobian]
         )
-        for a in active:
-            for b in active:
-                curvature = curvature - _outer(
-                    [j[a] * weight[a][b] for j in jacobian], [j[b] for j in jacobian]
-                )
+        for a, b in itertools.product(active, active):
+            rows = [[jnp.sum(i[a] * second[a][b] * j[b]) for j in jacobian] for i in jacobian]
+            curvature = curvature - jnp.stack([jnp.stack(row) for row in rows])
     return Derivatives(value, gradient, curvature)
 
 
@@ -173,16 +172,8 @@ class _Pixel:
 
     def _prior(self, *coordinates: Array) -> Array:
         """Minus the log prior density of the coordinates."""
-        unconstrained = self._sites(coordinates)
-        log_probs, _ = self._log_probs(unconstrained)
-        log_jacobian = jnp.zeros(())
-        for name, value in unconstrained.items():
-            bijection = dist.biject_to(self._program.supports[name])
-            log_jacobian = log_jacobian + jnp.sum(
-                bijection.log_abs_det_jacobian(value, bijection(value))
-            )
-        prior = sum(x for name, x in log_probs.items() if name not in self._program.observed)
-        return -prior - log_jacobian
+        prior = handlers.block(self._program.model, hide=list(self._program.observed))
+        return potential_energy(prior, (self._data,), {}, self._sites(coordinates))
 
     def _arguments(self, coordinates: Coordinates) -> list[list[Array]]:
         """For each observed site, the arguments of its distribution, a value for each reading."""
@@ -200,7 +191,11 @@ class _Pixel:
         return jax.tree.unflatten(tree, whole).log_prob(value)
 
     def _observed(self, coordinates: Coordinates) -> list[tuple[dist.Distribution, Array]]:
-        _, trace = self._log_probs(self._sites(coordinates))
+        latent = {
+            name: dist.biject_to(self._program.supports[name])(value)
+            for name, value in self._sites(coordinates).items()
+        }
+        _, trace = compute_log_probs(self._program.model, (self._data,), {}, latent)
         return [(trace[name]["fn"], trace[name]["value"]) for name in self._program.observed]
 
     def _sites(self, coordinates: Coordinates) -> dict[str, Array]:
@@ -211,13 +206,6 @@ class _Pixel:
             found[name] = jnp.stack(own).reshape(like.shape) if like.shape else own[0]
             start += count
         return found
-
-    def _log_probs(self, unconstrained: Mapping[str, Array]) -> tuple[dict[str, Array], dict]:
-        latent = {
-            name: dist.biject_to(self._program.supports[name])(value)
-            for name, value in unconstrained.items()
-        }
-        return compute_log_probs(self._program.model, (self._data,), {}, latent)
 
 
 def _is_number(x: Array) -> bool:
@@ -258,15 +246,6 @@ def _derivatives(function: Callable, coordinates: Coordinates) -> tuple[Array, A
         rows[i] += [_directional(first[i], j)(*coordinates) for j in range(i, size)]
     gradient = jnp.stack([each(*coordinates) for each in first])
     return function(*coordinates), gradient, jnp.stack([jnp.stack(row) for row in rows])
-
-
-def _unit(arguments: list[Array], which: int) -> list[Array]:
-    """A step of one argument alone."""
-    return [jnp.full_like(x, float(at == which)) for at, x in enumerate(arguments)]
-
-
-def _outer(left: list[Array], right: list[Array]) -> Array:
-    return jnp.stack([jnp.stack([jnp.sum(x * y) for y in right]) for x in left])
 
 
 def _depends(function: Callable, coordinates: Coordinates) -> bool:
