@@ -49,7 +49,7 @@ study = pb.accuracy(
     capture,
     scene=plate,
     links=links,
-    rungs={name: pb.LADDER[name] for name in names},
+    rungs={name: pb.STUDY_METHODS[name] for name in names},
     dials=(),
     fresh=False,
     reference=pb.Reference(error=0.03),

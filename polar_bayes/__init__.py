@@ -58,9 +58,8 @@ _HOMES = {
     "inference.batch_nuts": ("PixelNuts",),
     "inference.files": ("load_result", "save_result"),
     "inference.fit": ("fit",),
-    "inference.laplace": ("Laplace", "Point"),
-    "inference.methods": ("LADDER",),
-    "inference.nuts": ("Nuts",),
+    "inference.methods": ("STUDY_METHODS",),
+    "inference.mode_methods": ("Laplace", "Nuts", "Point"),
     "inference.smc": ("PixelTempering",),
     "inference.spectrum": ("predict_spectrum",),
     "inference.variational": ("FlowGuide", "NormalGuide"),
@@ -143,7 +142,7 @@ _MODULE_OF = {name: module for module, names in _HOMES.items() for name in names
 __all__ = sorted(_MODULE_OF)
 
 if TYPE_CHECKING:
-    from polar_bayes.inference.joint_fit import fit as fit
+    from polar_bayes.inference.fit import fit as fit
 
 
 def __getattr__(name: str) -> Any:

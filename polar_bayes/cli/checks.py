@@ -157,7 +157,7 @@ def accuracy(
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
     data = pb.load_capture(capture)
-    settings["rungs"] = {name: pb.LADDER[name] for name in rungs or pb.LADDER}
+    settings["rungs"] = {name: pb.STUDY_METHODS[name] for name in rungs or pb.STUDY_METHODS}
     settings |= {"dials": ()} if no_dials else {}
     study = pb.accuracy(data, **settings)
     pb.save_result(study, out)
