@@ -5,8 +5,11 @@ from types import MappingProxyType
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.auto import Auto
+from polar_bayes.inference.batch_fit import PixelLaplace
+from polar_bayes.inference.batch_nuts import PixelNuts
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.mode_methods import Laplace, Nuts, Point
+from polar_bayes.inference.smc import PixelTempering
 from polar_bayes.inference.variational import FlowGuide, NormalGuide
 from polar_bayes.inference.weighted import Importance, Tempered
 
@@ -57,3 +60,19 @@ def find_method(
             hint=f"give one of {', '.join(METHODS)}, or settings such as Nuts(draws=2000)",
         )
     return METHODS[method]
+
+
+__all__ = [
+    "STUDY_METHODS",
+    "Auto",
+    "FlowGuide",
+    "Importance",
+    "Laplace",
+    "NormalGuide",
+    "Nuts",
+    "PixelLaplace",
+    "PixelNuts",
+    "PixelTempering",
+    "Point",
+    "Tempered",
+]

@@ -19,13 +19,13 @@ from polar_bayes.inference.weighted import counting_engine, laplace_mixture
 from polar_bayes.progress import no_progress
 
 SMALL = {
-    "point": pb.Point(starts=2),
-    "laplace": pb.Laplace(draws=1000),
-    "importance": pb.Importance(),
-    "tempered": pb.Tempered(pb.PixelTempering(draws=4096)),
-    "normal guide": pb.NormalGuide(steps=400, draws=1000),
-    "flow guide": pb.FlowGuide(steps=400, draws=1000),
-    "nuts": pb.Nuts(effective_draws=2000.0),
+    "point": pb.methods.Point(starts=2),
+    "laplace": pb.methods.Laplace(draws=1000),
+    "importance": pb.methods.Importance(),
+    "tempered": pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)),
+    "normal guide": pb.methods.NormalGuide(steps=400, draws=1000),
+    "flow guide": pb.methods.FlowGuide(steps=400, draws=1000),
+    "nuts": pb.methods.Nuts(effective_draws=2000.0),
 }
 WITHOUT_PRIOR = {"point"}
 
@@ -38,7 +38,9 @@ def compile_fast_rather_than_fast_code() -> Iterator[None]:
 
 
 def problem(model, seed: int = 0):
-    request = resolve(capture(), model, "paper", None, {"q": pb.StokesLink()}, 90.0, 0, "double")
+    request = resolve(
+        capture(), model, "paper", None, {"q": pb.links.StokesLink()}, 90.0, 0, "double"
+    )
     return make_problem(request, jax.random.split(jax.random.key(seed))[0])
 
 
@@ -47,8 +49,8 @@ def run(method, problem, seed: int = 0):
 
 
 def test_the_ladder_holds_every_method_that_is_tested_here():
-    assert set(pb.STUDY_METHODS) == {*SMALL, "nuts short", "nuts long"}
-    assert {type(method) for method in pb.STUDY_METHODS.values()} == {
+    assert set(pb.methods.STUDY_METHODS) == {*SMALL, "nuts short", "nuts long"}
+    assert {type(method) for method in pb.methods.STUDY_METHODS.values()} == {
         type(m) for m in SMALL.values()
     }
 
@@ -74,7 +76,7 @@ def test_a_normal_posterior_is_found_by_every_rung(name):
 
 def test_gradients_of_a_warm_up_are_counted_as_they_were_made():
     here = problem(line)
-    method = pb.Nuts(chains=2, warmup=60, draws=50, most_draws=50, block=50)
+    method = pb.methods.Nuts(chains=2, warmup=60, draws=50, most_draws=50, block=50)
     found = run(method, here)
     climbing = here.initialize().said["gradients"]
     before = sum(found.stats["warmup_steps"][:, 0])
@@ -143,7 +145,7 @@ def test_the_expected_error_is_the_one_that_is_seen():
     sd, seen, expected = np.sqrt(np.diagonal(covariance)), [], []
     here = problem(line)
     for seed in range(40):
-        found = run(pb.Importance(draws=1024), here, seed)
+        found = run(pb.methods.Importance(draws=1024), here, seed)
         _, draws = labeled(here, found.z)
         seen.append(np.max(np.abs(draws.mean(axis=(1, 2)) - mean) / sd))
         expected.append(expected_error(found, here))
@@ -175,25 +177,25 @@ def test_each_tempered_fit_counts_for_itself_with_the_same_programs():
 
 
 def test_draws_are_scaled_and_settings_kept():
-    assert pb.Laplace(draws=500).scale_draws(2.0) == pb.Laplace(draws=1000)
-    chains = pb.Nuts(warmup=77).scale_draws(2.0)
+    assert pb.methods.Laplace(draws=500).scale_draws(2.0) == pb.methods.Laplace(draws=1000)
+    chains = pb.methods.Nuts(warmup=77).scale_draws(2.0)
     assert (chains.draws, chains.most_draws, chains.effective_draws) == (1000, 16000, 900.0)
     assert chains.warmup == 77
-    tempered = pb.Tempered(pb.PixelTempering(draws=4096)).scale_draws(4.0).settings
+    tempered = pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)).scale_draws(4.0).settings
     assert (tempered.draws, tempered.effective_draws) == (16384, 800.0)
-    assert pb.Tempered(tempered).num_draws == tempered.answer_draws == 32768
-    fewer = pb.Tempered(pb.PixelTempering(draws=4096)).scale_draws(0.25).settings
+    assert pb.methods.Tempered(tempered).num_draws == tempered.answer_draws == 32768
+    fewer = pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)).scale_draws(0.25).settings
     assert (fewer.draws, fewer.effective_draws) == (1024, 50.0)
     with pytest.raises(FitError, match="512 draws are fewer than the crowd of 2048"):
-        pb.Tempered(pb.PixelTempering(draws=1024)).scale_draws(0.25)
-    assert pb.Point().scale_draws(2.0) is None
+        pb.methods.Tempered(pb.methods.PixelTempering(draws=1024)).scale_draws(0.25)
+    assert pb.methods.Point().scale_draws(2.0) is None
 
 
 def test_tempered_answers_have_as_many_draws_as_are_asked_for():
-    settings = pb.PixelTempering()
+    settings = pb.methods.PixelTempering()
     for count, draws in ((1.0, 2048), (2048, 2048), (2049, 2050), (5000, 5000)):
-        assert pb.Tempered(settings).with_draws(count).num_draws == draws
-    auto, here = pb.Auto(tolerance=0.1), problem(line)
+        assert pb.methods.Tempered(settings).with_draws(count).num_draws == draws
+    auto, here = pb.methods.Auto(tolerance=0.1), problem(line)
     needed = draws_needed(0.1, 2)
     rungs = auto.candidates(here)
     assert 8 * needed <= rungs["tempered"].settings.answer_draws < 8 * needed + settings.crowd
@@ -204,9 +206,9 @@ def test_tempered_answers_have_as_many_draws_as_are_asked_for():
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: pb.Importance(draws=10), "draws is 10"),
-        (lambda: pb.NormalGuide(steps=1), "steps is 1"),
-        (lambda: pb.FlowGuide(learning_rate=0.0), "learning_rate 0.0"),
+        (lambda: pb.methods.Importance(draws=10), "draws is 10"),
+        (lambda: pb.methods.NormalGuide(steps=1), "steps is 1"),
+        (lambda: pb.methods.FlowGuide(learning_rate=0.0), "learning_rate 0.0"),
     ],
 )
 def test_settings_out_of_range_are_refused(make, said):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polar_bayes.errors import CaptureError
-from polar_bayes.simulate import Protocol
+from polar_bayes.simulation import Protocol
 
 
 def test_the_default_is_the_papers():
