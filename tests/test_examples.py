@@ -26,9 +26,8 @@ from test_architecture import LAYERS
 import polar_bayes as pb
 from polar_bayes.capture.schema import CONTRACT
 from polar_bayes.cli import commands
-from polar_bayes.inference import fit as fitting
-from polar_bayes.inference import problem
-from polar_bayes.inference.fit import fit
+from polar_bayes.inference import fitting, problem
+from polar_bayes.inference.fitting import fit
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe

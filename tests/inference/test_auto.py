@@ -16,7 +16,7 @@ from plates import plate_capture
 from toy_models import capture, funnel, line, of_line
 
 import polar_bayes as pb
-from polar_bayes.inference import fit as fitting
+from polar_bayes.inference import fitting
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.request import resolve

@@ -23,8 +23,14 @@ from spectral_plates import spectral_plate
 
 import polar_bayes as pb
 from polar_bayes.effects.choose import ChosenScene
-from polar_bayes.inference import fit as fitting
-from polar_bayes.inference import hierarchical_reparam, initialization, optimize, problem, request
+from polar_bayes.inference import (
+    fitting,
+    hierarchical_reparam,
+    initialization,
+    optimize,
+    problem,
+    request,
+)
 from polar_bayes.inference.compile import LRUCache, cache_key, last_edit
 from polar_bayes.inference.optimize import quiet_line_search
 from polar_bayes.inference.problem import compile_model

@@ -15,8 +15,7 @@ from plates import plate_capture
 from toy_models import line
 
 import polar_bayes as pb
-from polar_bayes.inference import compile
-from polar_bayes.inference import fit as fitting
+from polar_bayes.inference import compile, fitting
 from polar_bayes.inference.compile import JitByShape, JitOnce, LRUCache, bytes_of
 
 

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import jax
 import pytest
 
-from polar_bayes.inference import fit as fitting
-from polar_bayes.inference import hierarchical_reparam, initialization, problem
+from polar_bayes.inference import fitting, hierarchical_reparam, initialization, problem
 
 
 @pytest.fixture

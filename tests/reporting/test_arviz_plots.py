@@ -13,8 +13,7 @@ from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.errors import FitError
-from polar_bayes.inference import fit as fitting
-from polar_bayes.inference import problem
+from polar_bayes.inference import fitting, problem
 
 METHODS = {
     "nuts": pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50),
