@@ -60,7 +60,7 @@ def tried(case: Case, found: xr.DataTree, number: int, keep: Path) -> tuple[str,
             case.capture(seed=2),
             scene=case.scene,
             links=case.links,
-            rungs={rung: pb.methods.LADDER[rung]},
+            rungs={rung: pb.methods.STUDY_METHODS[rung]},
             dials=(),
             fresh=False,
             seed=1,
@@ -89,13 +89,13 @@ def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]])
     """Errors and times of the rungs, and the advice, in Markdown."""
     lines = [f"Measured on {platform.machine()}, {os.cpu_count()} cores.", ""]
     lines += [
-        "| scene | " + " | ".join(pb.methods.LADDER) + " | reference |",
-        "|---" * (len(pb.methods.LADDER) + 2) + "|",
+        "| scene | " + " | ".join(pb.methods.STUDY_METHODS) + " | reference |",
+        "|---" * (len(pb.methods.STUDY_METHODS) + 2) + "|",
     ]
     for name, found in studies.items():
         rows = pb.benchmark.accuracy_table(found)
         noise = float(accuracy_of(found).attrs["reference_error"])
-        cells = [_cell(rows, rung) for rung in pb.methods.LADDER]
+        cells = [_cell(rows, rung) for rung in pb.methods.STUDY_METHODS]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {noise:.2g} |")
     lines += ["", "| scene | advice | the advised method on another capture |", "|---|---|---|"]
     for name, found in studies.items():

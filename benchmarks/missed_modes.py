@@ -26,7 +26,7 @@ LARGE = pb.methods.PixelSMC(num_chains=4096, draws=16384)
 
 def large(seed: int) -> Plan:
     """The same simulations, fitted by the larger crowd."""
-    request = resolve(layout(), "per_material", "laplace", SCENE, None, None, None, seed, "double")
+    request = resolve(layout(), "per_material", SCENE, None, None, None, seed, "double")
     return planned(request, None, LARGE, readings=False)
 
 

@@ -151,7 +151,7 @@ def main(count: int) -> None:
     capture, links = layout(), {"dop": pb.links.BetaLink()}
     views = capture.sizes["view"]
     with jax.enable_x64(True):
-        request = resolve(capture, "per_material", "laplace", SCENE, None, links, None, 0, "double")
+        request = resolve(capture, "per_material", SCENE, None, links, None, 0, "double")
         data = observe(request.capture)
         key = engine_key(request, request.largest_view_zenith)
         engine = make_engine(key, request, lambda: data)

@@ -60,7 +60,6 @@ class LeastSquares:
             resolve(
                 capture,
                 model,
-                "laplace",
                 SCENE,
                 None,
                 None,

@@ -49,7 +49,7 @@ study = pb.accuracy(
     capture,
     scene=plate,
     links=links,
-    rungs={name: pb.methods.LADDER[name] for name in names},
+    rungs={name: pb.methods.STUDY_METHODS[name] for name in names},
     dials=(),
     fresh=False,
     reference=pb.benchmark.Reference(error=0.03),

@@ -18,14 +18,15 @@ from polar_bayes.benchmark.run import (
     AbstractDial,
     Measured,
     Trial,
-    problem_of,
     run_fresh,
     run_trial,
 )
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.files import ACCURACY, OF_ALL, Schema, holds, load_tree
-from polar_bayes.inference.methods import LADDER
-from polar_bayes.inference.request import Method, Request, resolve
+from polar_bayes.inference.method import AbstractMethod
+from polar_bayes.inference.methods import STUDY_METHODS
+from polar_bayes.inference.problem import make_problem
+from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -63,7 +64,7 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
 def accuracy(
     capture: xr.Dataset,
     *,
-    rungs: Mapping[str, Method] | None = None,
+    rungs: Mapping[str, AbstractMethod] | None = None,
     dials: Iterable[AbstractDial] = DIALS,
     reference: Reference | None = None,
     fresh: bool = True,
@@ -79,7 +80,7 @@ def accuracy(
 
     Args:
         capture: A Dataset of the capture schema; validated here.
-        rungs: Methods by name; by default `polar_bayes.methods.LADDER`.
+        rungs: Methods by name; by default `polar_bayes.methods.STUDY_METHODS`.
         dials: What else is turned, one at a time, on every rung; `()` for the rungs alone.
         reference: How well the posterior that all are judged by must be known.
         fresh: True runs every trial in a process of its own, so that the first time includes all
@@ -104,15 +105,15 @@ def accuracy(
         SceneError: No such scene.
         FitError: A prior, link or setting cannot be used, or there is no reference.
     """
-    request = resolve(
-        capture, model, "nuts", scene, priors, links, largest_view_zenith, seed, "double"
-    )
+    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
     show = progress or no_progress
-    trials = _trials(request, LADDER if rungs is None else rungs, tuple(dials))
+    trials = _trials(request, STUDY_METHODS if rungs is None else rungs, tuple(dials))
     show("reference", 0.0)
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), FOLD)  # no random number of any trial
-        judge = run_reference(reference or Reference(), problem_of(request, key))
+        key_search, key_draws = jax.random.split(key)
+        problem = make_problem(request, key_search)
+        judge = run_reference(reference or Reference(), problem, key_draws)
     show("reference", 1.0)
     rows = []
     for number, ((rung, dial), trial) in enumerate(trials.items()):
@@ -174,16 +175,18 @@ _NUMBERS = (
 
 
 def _trials(
-    request: Request, rungs: Mapping[str, Method], dials: tuple[AbstractDial, ...]
+    request: Request, rungs: Mapping[str, AbstractMethod], dials: tuple[AbstractDial, ...]
 ) -> dict[tuple[str, str], Trial | PolarBayesError]:
     """What is run, or why it cannot be, by rung and dial; all rungs as given come first."""
     if not isinstance(rungs, Mapping) or not rungs:
         raise FitError(
-            "there is no rung", where="accuracy: rungs", hint="give methods by name, as in LADDER"
+            "there is no rung",
+            where="accuracy: rungs",
+            hint="give methods by name, as STUDY_METHODS",
         )
     trials: dict[tuple[str, str], Trial | PolarBayesError] = {}
     for name, method in rungs.items():
-        if not isinstance(method, Method):
+        if not isinstance(method, AbstractMethod):
             raise FitError(
                 f"a {type(method).__name__} is not a method",
                 where=f"accuracy: rungs[{name!r}]",

@@ -7,20 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.stats
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from polar_bayes.benchmark.run import labeled
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT
 from polar_bayes.errors import FitError
 from polar_bayes.inference.auto import missed_mode_weight
-from polar_bayes.inference.mcse import errors_of
-from polar_bayes.inference.method import PosteriorDraws
-from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
+from polar_bayes.inference.mode_methods import Nuts
 from polar_bayes.inference.problem import Problem
-from polar_bayes.inference.request import Method
-from polar_bayes.inference.run_method import answer, with_answer_draws, with_draws
 from polar_bayes.inference.smc import PixelSMC
 from polar_bayes.inference.weighted import Tempered
+from polar_bayes.progress import no_progress
 
 # --- How far draws are from those of a reference, in its standard deviations ----------------------
 
@@ -99,7 +97,7 @@ class Reference:
     def tempered(self) -> Tempered:
         """What takes over where chains do not find each other's modes."""
         goal = 4.0 / self.error**2  # half of it is lost where draws are chosen by weight
-        settings = with_answer_draws(PixelSMC(num_chains=1024, draws=4096), 4.0 * goal)
+        settings = Tempered(PixelSMC(num_chains=1024, draws=4096)).with_draws(4.0 * goal).settings
         return Tempered(dataclasses.replace(settings, effective_draws=goal))
 
 
@@ -127,14 +125,14 @@ class Judge(NamedTuple):
         return float(max(self.mean_error.max(), self.sd_error.max()))
 
 
-def run_reference(settings: Reference, problem: Problem) -> Judge:
+def run_reference(settings: Reference, problem: Problem, key: Array) -> Judge:
     """Chains that go on until their own error is small enough."""
     # Where they do not agree, or some of them missed a mode, tempered draws take over, where the
     # capture allows it. Where nothing is good enough, the best of it says so in its doubts.
-    tried = [_climb(settings, "NUTS", settings.chains, problem)]
+    tried = [_climb(settings, "NUTS", settings.chains, problem, key)]
     if tried[0].doubts:
         with contextlib.suppress(FitError):  # several patches or colors
-            tried.append(_climb(settings, "tempered draws", settings.tempered, problem))
+            tried.append(_climb(settings, "tempered draws", settings.tempered, problem, key))
     return nearest(tried)
 
 
@@ -143,27 +141,31 @@ def nearest(tried: Sequence[Judge]) -> Judge:
     return min(tried, key=lambda judge: (len(judge.biases), not judge.error < np.inf, judge.error))
 
 
-def _climb(settings: Reference, name: str, method: Method, problem: Problem) -> Judge:
-    judge = _judge(settings, name, method, problem)
+def _climb(
+    settings: Reference, name: str, method: AbstractMethod, problem: Problem, key: Array
+) -> Judge:
+    judge = _judge(settings, name, method, problem, key)
     for _ in range(settings.longer):
-        longer = with_draws(method, 4.0)
+        longer = method.scale_draws(4.0)
         if judge.error <= settings.error or longer is None:
             break
         method = longer
-        judge = _judge(settings, name, method, problem)
+        judge = _judge(settings, name, method, problem, key)
     return judge
 
 
-def _judge(settings: Reference, name: str, method: Method, problem: Problem) -> Judge:
-    found = answer(method, problem)
-    labels, draws = labeled(problem.program, found.z, problem.data)
-    mean_error, sd_error = errors_of(found, lambda z: labeled(problem.program, z, problem.data)[1])
+def _judge(
+    settings: Reference, name: str, method: AbstractMethod, problem: Problem, key: Array
+) -> Judge:
+    found = method.run(problem, key, no_progress)
+    labels, draws = labeled(problem, found.z)
+    mean_error, sd_error = found.standard_errors(lambda z: labeled(problem, z)[1])
     half = draws.shape[1] // 2
     one, other = (part.reshape(len(draws), -1) for part in (draws[:, :half], draws[:, half:]))
-    biases = list(found.problems)
+    biases = found.doubts
     if found.r_hat > LARGEST_R_HAT:
         biases.append(f"its R-hat is {found.r_hat:.3f}")
-    if isinstance(method, Nuts) and (weight := missed_mode_weight(found.z, problem)) > 0.0:
+    if found.method == "nuts" and (weight := missed_mode_weight(found.z, problem)) > 0.0:
         biases.append(f"a mode of weight {weight:.2g} was not visited by every chain")
     judge = Judge(
         labels, draws, name, mean_error, sd_error, distances(one, other), found, tuple(biases)

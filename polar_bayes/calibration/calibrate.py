@@ -27,7 +27,7 @@ from polar_bayes.inference.batch_engine import engine_key
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
 from polar_bayes.inference.batch_result import MethodUsed, Status
-from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.mode_methods import Nuts
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
 from polar_bayes.inference.request import Request, resolve
@@ -250,7 +250,7 @@ def calibrate(
     if missing.size < simulations:
         about["fits found in the store"] = simulations - missing.size
     if readings:
-        about["readings_told"] = plan.untold or "ranked"
+        about["readings_told"] = plan.unranked_reason or "ranked"
     return assemble(plan.program, request, plan.data, join(found, simulations), about)
 
 
@@ -279,7 +279,7 @@ def _resolved(
     capture: xr.Dataset, asked: Mapping[str, Any], limit: float | None, seed: int
 ) -> Request:
     model, scene, priors, links = (asked[name] for name in ("model", "scene", "priors", "links"))
-    return resolve(capture, model, "laplace", scene, priors, links, limit, seed, "double")
+    return resolve(capture, model, scene, priors, links, limit, seed, "double")
 
 
 def planned(request: Request, told: Request | None, settings: Method, readings: bool) -> Plan:

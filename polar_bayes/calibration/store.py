@@ -36,7 +36,7 @@ LIBRARIES = ("polar_bayes", "jax", "jaxlib", "numpyro", "numpy", "scipy")
 
 def fingerprint_of(plan: Plan) -> dict[str, str]:
     """One text per topic that determines the fits; their number may differ between runs."""
-    truth = _topics(plan.told) if plan.told is not None else {}
+    truth = _topics(plan.generative_request) if plan.generative_request is not None else {}
     return {
         "capture": digest(jax.tree.leaves(plan.data), plan.data.dims, tuple(plan.data.readings)),
         **_topics(plan.request),

@@ -160,7 +160,9 @@ def accuracy(
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
     data = pb.load_capture(capture)
-    settings["rungs"] = {name: pb.methods.LADDER[name] for name in rungs or pb.methods.LADDER}
+    settings["rungs"] = {
+        name: pb.methods.STUDY_METHODS[name] for name in rungs or pb.methods.STUDY_METHODS
+    }
     settings |= {"dials": ()} if no_dials else {}
     study = pb.accuracy(data, **settings)
     pb.save_result(study, out)

@@ -199,7 +199,7 @@ def _widen(
     links = {**request.links, **new}
     limit = request.largest_view_zenith
     wide = resolve(
-        views.capture, model, "laplace", request.scene, priors, links, limit, request.seed, "double"
+        views.capture, model, request.scene, priors, links, limit, request.seed, "double"
     )
     data = observe(wide.capture, largest_view_zenith=limit)
     recorded = jnp.broadcast_to(question.data.brightness, question.data.shape)

@@ -47,9 +47,7 @@ def pose(
     seed: int,
 ) -> Question:
     """Check what a caller asked for and compile it; to be called in double precision."""
-    request = resolve(
-        capture, model, "laplace", scene, priors, links, largest_view_zenith, seed, "double"
-    )
+    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     program = compile_program(request.bind(request.scene), data)
     drawn = from_prior(program, jax.random.key(seed), PRIOR_DRAWS, data)

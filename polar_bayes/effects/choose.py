@@ -472,9 +472,7 @@ def choose_effects(
             where="choose_effects",
             hint="give posterior standard deviations above 0, such as 0.1",
         )
-    request = resolve(
-        capture, model, "laplace", scene, None, links, largest_view_zenith, seed, "double"
-    )
+    request = resolve(capture, model, scene, None, links, largest_view_zenith, seed, "double")
     named = not isinstance(scene, Scene)
     full = simplify(FULL_SCENES[request.scene_name] if named else request.scene, ())
     effects = effects_of(full)

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import ClassVar, NoReturn
+from typing import ClassVar, NoReturn, override
 
 import jax
 import numpy as np
@@ -19,8 +19,8 @@ from polar_bayes.inference.batch_result import (
 )
 from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.levenberg_marquardt import ModeSearch, NormalApproximation
+from polar_bayes.inference.method import AbstractBatchMethod
 from polar_bayes.inference.program import Values
-from polar_bayes.repr_html import HTMLRepr
 
 
 class BatchFit:
@@ -69,12 +69,13 @@ def random_keys(seed: int, numbers: np.ndarray) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class AbstractPixelMethod(HTMLRepr, abc.ABC):
-    """A method that fits many pixels at once."""
+class AbstractPixelMethod(AbstractBatchMethod[BatchEngine]):
+    """A method that fits many pixels side by side."""
 
     memory_limit: ClassVar[int] = 1024
     """Pixels whose draws are in memory at a time."""
 
+    @override
     def run_batch(
         self,
         engine: BatchEngine,
@@ -83,18 +84,6 @@ class AbstractPixelMethod(HTMLRepr, abc.ABC):
         seed: int,
         describe: Describe,
     ) -> Outcome:
-        """Fit every pixel of a batch.
-
-        Args:
-            engine: Compiled programs of the model.
-            observations: Their readings.
-            numbers: Of the pixels, (pixel,): with the seed they fix the random keys.
-            seed: Of the image.
-            describe: Receives the weighted draws of pixels as answers come.
-
-        Returns:
-            The diagnostics of each pixel.
-        """
         batch = BatchFit(engine, observations, random_keys(seed, numbers), describe, seed)
         batch.outcome.status[observations.views < MIN_VIEWS] = Status.TOO_FEW_VIEWS
         batch.outcome.status[observations.views == 0] = Status.MASKED

@@ -9,7 +9,7 @@ What is compiled belongs to the grounds of a layout, and serves every capture of
 import abc
 import dataclasses
 import functools
-from typing import Any, NamedTuple, override
+from typing import Any, override
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from jaxtyping import Array
 from polar_bayes.inference import hierarchical_reparam, laplace, nuts
 from polar_bayes.inference.group_model import GroupModel, find_group_model, find_groups
 from polar_bayes.inference.hierarchical_reparam import Transport
-from polar_bayes.inference.optimize import SETTLED, Modes, ValueAndGradient, find_modes, from_prior
+from polar_bayes.inference.optimize import Modes, ValueAndGradient, find_modes, from_prior
 from polar_bayes.inference.program import Model, Program
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress
@@ -34,15 +34,6 @@ Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 """Unconstrained draws (chain, draw, size), and statistics, each (chain, draw)."""
 
 
-class Drawn(NamedTuple):
-    """What became of one posterior."""
-
-    z: np.ndarray
-    stats: dict[str, np.ndarray]
-    problems: list[str]
-    goals_reached: bool | None
-
-
 class AbstractInit(abc.ABC):
     """Where draws start."""
 
@@ -54,38 +45,12 @@ class AbstractInit(abc.ABC):
         """How far, in posterior standard deviations, the true peak may still be."""
         return float(self.said["newton_decrement"])
 
-    def draw(self, key: Array, method: nuts.Nuts | laplace.Laplace, progress: Progress) -> Drawn:
-        """Do what the method asks.
-
-        Args:
-            key: Random key.
-            method: Settings.
-            progress: Called with the name of a stage and the fraction of it that is done.
-
-        Returns:
-            The draws.
-        """
-        if isinstance(method, laplace.Laplace):
-            problems = []
-            if self.decrement > SETTLED:
-                problems.append(
-                    f"the mode is not settled (Newton decrement {self.decrement:.2g} posterior "
-                    "standard deviations): use method='nuts'"
-                )
-            return Drawn(*self.laplace(key, method), problems, None)
-        key_first, key_chains = jax.random.split(key)
-        target = self.target(key_first, method.chains)
-        z, stats, mixed = nuts.sample(
-            target, key_chains, method, lambda done: progress("sampling", done)
-        )
-        return Drawn(z, stats, [], mixed)
-
     @abc.abstractmethod
     def target(self, key: Array, chains: int) -> nuts.Target:
         """What the sampler needs."""
 
     @abc.abstractmethod
-    def laplace(self, key: Array, settings: laplace.Laplace) -> Draws:
+    def laplace(self, key: Array, settings: laplace.LaplaceSettings) -> Draws:
         """Draws from the normal distribution at the heaviest peak."""
 
 
@@ -111,7 +76,7 @@ class JointInit(AbstractInit):
         )
 
     @override
-    def laplace(self, key: Array, settings: laplace.Laplace) -> Draws:
+    def laplace(self, key: Array, settings: laplace.LaplaceSettings) -> Draws:
         program, guide = self.initializer.program, self.initializer.guide
         return laplace.sample(program, guide, self.data, self.potential, self.modes, key, settings)
 
@@ -140,7 +105,7 @@ class HierarchicalInit(AbstractInit):
         )
 
     @override
-    def laplace(self, key: Array, settings: laplace.Laplace) -> Draws:
+    def laplace(self, key: Array, settings: laplace.LaplaceSettings) -> Draws:
         shape = (settings.chains, settings.draws, self.found.transport.size)
         noise = np.asarray(jax.random.normal(key, shape))
         lp = -np.array([self.found.potential(draw)[0] for draw in noise.reshape(-1, shape[-1])])
@@ -155,7 +120,7 @@ class HierarchicalInit(AbstractInit):
 class AbstractInitializer(abc.ABC):
     """The grounds of all captures of one layout."""
 
-    def expect(self, data: Observations, method: nuts.Nuts) -> None:
+    def expect(self, data: Observations, method: nuts.NutsSettings) -> None:
         """Begin to compile the sampler beside the search, where its shapes are known before it.
 
         Args:
@@ -197,7 +162,7 @@ class JointInitializer(AbstractInitializer):
         return laplace.compiled_guide(self.program)
 
     @override
-    def expect(self, data: Observations, method: nuts.Nuts) -> None:
+    def expect(self, data: Observations, method: nuts.NutsSettings) -> None:
         size = self.program.size
         target = nuts.Target(
             samplers=self.samplers,

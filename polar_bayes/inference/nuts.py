@@ -22,7 +22,6 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import JitOnce, LRUCache
 from polar_bayes.inference.mcse import measure
 from polar_bayes.inference.optimize import Modes, ValueAndGradient
-from polar_bayes.repr_html import HTMLRepr
 
 Progress = Callable[[float], None]
 
@@ -34,25 +33,8 @@ MOST_KEPT = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class Nuts(HTMLRepr):
-    """Settings of the sampler.
-
-    Args:
-        chains: Independent chains, at least 2.
-        warmup: Draws spent on step size and metric, per chain. None: 300; 150 for many patches,
-            whose metric is known before.
-        draws: Draws kept at least, per chain.
-        most_draws: Draws kept at most, per chain; set it to `draws` for a fixed length.
-        effective_draws: Goal for the bulk and tail effective sample size of every coordinate.
-        target_acceptance: Higher means smaller steps, range [0.5, 1). None: 0.9 for one material,
-            0.98 for a few patches, 0.7 for many, whose coordinates are close to normal.
-        max_tree_depth: A trajectory has at most 2 ** this steps.
-        threads: Chains that run at once.
-        block: Draws between two looks at the progress, per chain.
-
-    Raises:
-        FitError: A setting is out of range.
-    """
+class NutsSettings:
+    """Numbers of chains and draws, and goals; `Nuts` explains each."""
 
     chains: int = 4
     warmup: int | None = None
@@ -121,7 +103,7 @@ class Target(NamedTuple):
 def sample(
     target: Target,
     key: Array,
-    settings: Nuts,
+    settings: NutsSettings,
     progress: Progress = lambda _: None,
 ) -> tuple[np.ndarray, dict[str, np.ndarray], bool]:
     """Draw from the posterior."""
@@ -167,7 +149,7 @@ def sample(
     return z, stats, mixed
 
 
-def expect(target: Target, settings: Nuts) -> None:
+def expect(target: Target, settings: NutsSettings) -> None:
     """Begin to compile what `sample` will need, beside whatever follows."""
     sampler = _sampler(target, settings)
     if not sampler.advance.is_begun:
@@ -175,14 +157,14 @@ def expect(target: Target, settings: Nuts) -> None:
         sampler.advance.begin(state, target.given)
 
 
-def _sampler(target: Target, settings: Nuts) -> "_Sampler":
+def _sampler(target: Target, settings: NutsSettings) -> "_Sampler":
     warmup, acceptance = _warmup(settings, target)
     return target.samplers.of(
         _Fixed(warmup, acceptance, settings.max_tree_depth, settings.block, target.knows_its_metric)
     )
 
 
-def _warmup(settings: Nuts, target: Target) -> tuple[int, float]:
+def _warmup(settings: NutsSettings, target: Target) -> tuple[int, float]:
     """Length and goal of the warm-up, where the settings leave them open."""
     return (
         target.warmup if settings.warmup is None else settings.warmup,
@@ -190,7 +172,7 @@ def _warmup(settings: Nuts, target: Target) -> tuple[int, float]:
     )
 
 
-def _mixed(rounds: list[Step], settings: Nuts) -> bool:
+def _mixed(rounds: list[Step], settings: NutsSettings) -> bool:
     """Whether every coordinate has reached the goals; both are invariant to monotone maps."""
     z = np.concatenate([steps.z for steps in rounds], axis=1)
     bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))

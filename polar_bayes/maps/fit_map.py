@@ -168,7 +168,7 @@ def plan_map(
             hint="give an image with dims y and x, or use polar_bayes.fit",
         )
     pixel, limit = _fullest_pixel(capture), largest_view_zenith
-    request = resolve(pixel, model, "laplace", scene, priors, links, limit, seed, precision)
+    request = resolve(pixel, model, scene, priors, links, limit, seed, precision)
     own = frozenset(
         name
         for name in (*ANGLES, "normal_confidence")

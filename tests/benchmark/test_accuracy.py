@@ -15,14 +15,13 @@ import polar_bayes as pb
 from polar_bayes.benchmark import run
 from polar_bayes.benchmark.accuracy import AS_GIVEN
 from polar_bayes.benchmark.reference import Judge, nearest, run_reference
-from polar_bayes.benchmark.run import AbstractDial, Trial, problem_of, run_fresh
+from polar_bayes.benchmark.run import AbstractDial, Trial, run_fresh
 from polar_bayes.effects.variants import parts_of
-from polar_bayes.inference.mcse import errors_of, standard_errors
+from polar_bayes.inference.mcse import standard_errors
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
-from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.resampling import choose
-from polar_bayes.inference.run_method import draws_of
+from polar_bayes.inference.resampling import systematic_resample
 
 LINKS = {"q": pb.links.StokesLink()}
 ROUGHLY = pb.benchmark.Reference(error=0.05, longer=0)
@@ -43,7 +42,7 @@ class Biased(AbstractMethod):
     draws: int = 4000
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
+    def run(self, problem, key, progress) -> PosteriorDraws:
         mean, covariance = of_line(np.asarray(problem.data.readings["q"]))
         sd = np.sqrt(np.diagonal(covariance))
         random = np.random.default_rng(0)
@@ -56,7 +55,7 @@ class Broken(AbstractMethod):
     """A method that never has an answer."""
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
+    def run(self, problem, key, progress) -> PosteriorDraws:
         raise pb.FitError("it cannot be", where="Broken", hint="nothing")
 
 
@@ -137,7 +136,7 @@ def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
         raise pb.FitError("no peak", where="choose_effects", hint="nothing")
 
     monkeypatch.setattr(run, "choose_effects", refuse)
-    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
     for method in (pb.methods.Laplace(), pb.methods.Nuts()):
         with pytest.raises(pb.FitError, match="no peak"):
             pb.benchmark.EffectsDial().turn(request, method)
@@ -165,7 +164,7 @@ def test_without_processes_of_their_own_first_times_and_memory_are_not_told(stud
 
 
 def test_facets_are_turned_where_there_are_any():
-    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
     turned, method = pb.benchmark.FacetsDial(0.5).turn(request, pb.methods.Nuts())
     before, after = (
         [part for _, part in parts_of(scene) if isinstance(part, pb.physics.FacetQuadrature)]
@@ -183,13 +182,13 @@ def test_facets_are_turned_where_there_are_any():
 
 
 def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
-    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
     quarter = pb.benchmark.DrawsDial(0.25)
-    for name, method in pb.methods.LADDER.items():
+    for name, method in pb.methods.STUDY_METHODS.items():
         turned = quarter.turn(request, method)
         assert (turned is None) == (name in ("point", "nuts short"))  # no draws, or too few
         if turned is not None:
-            assert draws_of(turned[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
+            assert turned[1].num_draws == pytest.approx(0.25 * method.num_draws, abs=1)
     # A crowd and a half, of which half would be three quarters: fewer than the crowd.
     few = pb.methods.Tempered(pb.methods.PixelSMC(draws=1536))
     assert pb.benchmark.DrawsDial(0.5).turn(request, few) is None
@@ -197,7 +196,7 @@ def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
         request, pb.methods.Tempered(pb.methods.PixelSMC(draws=3072))
     )
     assert enough is not None
-    assert draws_of(enough[1]) == 3072
+    assert enough[1].num_draws == 3072
 
 
 def test_every_dial_has_a_name_of_its_own():
@@ -213,8 +212,8 @@ def test_every_dial_has_a_name_of_its_own():
 
 
 def test_chains_that_miss_a_mode_hand_the_reference_over():
-    request = resolve(capture(), squared, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    judge = run_reference(ROUGHLY, problem_of(request, jax.random.key(0)))
+    request = resolve(capture(), squared, "paper", None, LINKS, 90.0, 0, "double")
+    judge = run_reference(ROUGHLY, make_problem(request, jax.random.key(0)), jax.random.key(1))
     assert judge.made_by == "tempered draws"
     assert not judge.doubts
     # Its own error is that of the weights, too.
@@ -244,9 +243,9 @@ def test_draws_chosen_by_weight_have_the_error_of_their_weights_too():
         z = 1.5 * random.standard_normal((count, 1))
         weights = np.exp(-0.5 * z[:, 0] ** 2 * (1.0 - 1.0 / 1.5**2))
         weights /= weights.sum()
-        chosen = z[choose(weights, 1.0 / np.sum(weights**2), random)]
+        chosen = z[systematic_resample(weights, 1.0 / np.sum(weights**2), random)]
         found = PosteriorDraws("tempered", chosen, {}, weighted=(z, weights))
-        mean, _ = errors_of(found, lambda z: np.moveaxis(z, -1, 0))
+        mean, _ = found.standard_errors(lambda z: np.moveaxis(z, -1, 0))
         told.append(mean[0])
         seen.append(chosen.mean())
     # A standard normal, of which the weights alone lose 0.0197 and choosing as many as they are
@@ -292,7 +291,7 @@ def test_a_process_of_its_own_finds_no_compiled_programs(monkeypatch):
 
 
 def test_a_trial_runs_in_a_process_of_its_own():
-    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
     found = run_fresh(Trial(request, pb.methods.Laplace(draws=50), 0))
     assert found.labels == ("level", "slope")
     assert found.draws.shape == (2, 4, 50)

@@ -77,9 +77,7 @@ EVERY = [
 def case(name: str) -> Case:
     build, size = CASES[name]
     capture, asked = build()
-    request = resolve(
-        capture, asked["model"], "laplace", PLATE, None, asked["links"], None, 0, "double"
-    )
+    request = resolve(capture, asked["model"], PLATE, None, asked["links"], None, 0, "double")
     data = observe(request.capture)
     program = compile_program(request.bind(PLATE), data)
     assert program.size == size
