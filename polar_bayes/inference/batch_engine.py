@@ -107,7 +107,7 @@ _ENGINES: LRUCache[BatchEngine] = LRUCache(4)
 
 
 def make_engine(key: str, request: Request, observe: Callable[[], Observations]) -> BatchEngine:
-    """The engine of a request, from the cache where one of this key is kept."""
+    """The engine of a request, from the cache where it has one of this key."""
 
     def make() -> BatchEngine:
         data = observe()

@@ -114,7 +114,7 @@ def _interpolate(level: float, below: np.ndarray, ranked: np.ndarray) -> np.ndar
 
 
 def effective_draws(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarray, " pixel"]:
-    """How many draws of the posterior itself the weighted ones are worth (Kish)."""
+    """Effective sample size of weighted draws (Kish), as a number of independent draws."""
     return 1.0 / np.sum(weights**2, axis=-1)
 
 
@@ -135,21 +135,21 @@ def effective_tails(
             p, inside = (np.take_along_axis(x, at, axis=-1)[:, 0] for x in (within, squares))
             outside = squares[:, -1] - inside
             variance = inside * (1.0 - p) ** 2 + outside * p**2
-            with np.errstate(invalid="ignore"):  # weights may be no numbers
-                # One draw that is all there is: p is 1 and the variance 0, and it is worth itself.
-                told = np.where(p < 1.0, p * (1.0 - p) / np.where(p < 1.0, variance, 1.0), 1.0)
-                least = np.fmin(least, told)
+            with np.errstate(invalid="ignore"):  # weights may be NaN
+                # One draw with all the weight has p = 1 and variance 0; its sample size is 1.
+                size = np.where(p < 1.0, p * (1.0 - p) / np.where(p < 1.0, variance, 1.0), 1.0)
+                least = np.fmin(least, size)
     return least
 
 
-# --- Means, standard deviations and quantiles of a row of pixels: what maps show ------------------
+# --- Marginals of a batch of pixels: what maps show -----------------------------------------------
 
 
 LEVELS = (0.025, 0.1, 0.25, 0.5, 0.75, 0.9, 0.975)
 
 
 class Marginals:
-    """What a row of pixels has, filled in as answers come: NaN where a pixel has none."""
+    """Marginals of a batch of pixels, filled in as answers come: NaN where a pixel has none."""
 
     def __init__(self, count: int, sizes: Mapping[str, tuple[int, ...]]) -> None:
         self.mean = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
@@ -159,7 +159,7 @@ class Marginals:
         }
 
     def describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        """Take down some pixels."""
+        """Summarize the weighted draws of some pixels."""
         for name, mean in self.mean.items():
             draws = np.asarray(parameters[name], float)
             for own in np.ndindex(mean.shape[1:]):

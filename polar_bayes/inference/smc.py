@@ -257,7 +257,7 @@ def smc_draws(
     at: np.ndarray,
     count: Callable[[str], None] = lambda what: None,
 ) -> Iterator[tuple[np.ndarray, WeightedSample]]:
-    """Weighted draws of some pixels as answers come; `count` is told what is computed next."""
+    """Weighted draws of some pixels as answers come; `count` is called before each computation."""
     outcome = batch.outcome
     outcome.status[at] = Status.NOT_CONVERGED
     for attempt in range(settings.num_attempts):

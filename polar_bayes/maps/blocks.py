@@ -48,7 +48,7 @@ NUMBER = "pixel_number"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plan:
-    """What is done to every block of one image; it can be sent to another process."""
+    """A checked request of a map, which can be sent to another process."""
 
     request: Request
     settings: AbstractPixelMethod
@@ -76,7 +76,7 @@ class Plan:
 
     @property
     def sizes(self) -> dict[str, tuple[int, ...]]:
-        """Lengths of the own axes of every parameter."""
+        """Lengths of the axes of every parameter within a pixel."""
         return {name: own for name, (_, own) in self.engine.parameter_axes.items()}
 
     def __eq__(self, other: object) -> bool:

@@ -115,8 +115,8 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
             "it holds no maps", where="count_pixels", hint="give what fit_pixels returns"
         )
     counts = dict.fromkeys(Status, 0)
-    for place in cut(maps, CHUNK):
-        found = checked_status(maps.isel(place)).to_numpy()
+    for region in cut(maps, CHUNK):
+        found = checked_status(maps.isel(region)).to_numpy()
         for each in Status:
             counts[each] += int(np.sum(found == each))
     return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
@@ -181,12 +181,12 @@ def plan_map(
 
 
 def with_pixel_numbers(
-    block: xr.Dataset, place: Mapping[str, slice] | None = None, columns: int = 0
+    block: xr.Dataset, region: Mapping[str, slice] | None = None, columns: int = 0
 ) -> xr.Dataset:
     """A block, by default a whole image, with the index of each pixel in the image, row by row."""
-    if place is None:
-        place, columns = {dim: slice(0, block.sizes[dim]) for dim in IMAGE}, block.sizes["x"]
-    y, x = (xr.Variable((d,), np.arange(place[d].start, place[d].stop)) for d in IMAGE)
+    if region is None:
+        region, columns = {dim: slice(0, block.sizes[dim]) for dim in IMAGE}, block.sizes["x"]
+    y, x = (xr.Variable((d,), np.arange(region[d].start, region[d].stop)) for d in IMAGE)
     if block.chunks:
         y, x = y.chunk(y=block.chunks["y"]), x.chunk(x=block.chunks["x"])
     return block.assign({NUMBER: y * columns + x})
@@ -223,16 +223,16 @@ def _at_once(capture: xr.Dataset, plan: Plan, progress: Counter | None) -> xr.Da
     maps = blank(capture, plan).copy(deep=True)
     every, done = capture.sizes["y"] * capture.sizes["x"], 0
     with workers(None) as (pool, count):
-        tasks = ((place,) for place in cut(capture))
+        tasks = ((region,) for region in cut(capture))
 
-        def fit(place: dict[str, slice]) -> xr.Dataset:
-            block = with_pixel_numbers(capture.isel(place), place, capture.sizes["x"])
+        def fit(region: dict[str, slice]) -> xr.Dataset:
+            block = with_pixel_numbers(capture.isel(region), region, capture.sizes["x"])
             return fit_block(block, plan)
 
         blocks = as_completed(pool, count, fit, tasks)
-        for (place,), block in blocks:
+        for (region,), block in blocks:
             for name, values in block.items():
-                maps[name][place] = values
+                maps[name][region] = values
             done += block.sizes["y"] * block.sizes["x"]
             if progress is not None:
                 progress(done, every)

@@ -197,14 +197,14 @@ BLOCK = 65536
 """Most pixels of a block, and of a chunk on the disk: few files, little memory."""
 
 PARTS, LEAST = 4, 1024
-"""Blocks of a smaller image, so that every core has work; but none has fewer pixels."""
+"""Blocks of a smaller image, so that every core has work, and the fewest pixels of one."""
 
 READ = frozenset((*(row.name for row in CONTRACT), WAVELENGTH.name, *LABELS))
 """Variables of a capture that a fit reads; known truths and other variables are not among them."""
 
 METADATA = "zarr.json"
 
-Place = dict[str, slice]
+Region = dict[str, slice]
 
 DEFAULTS: dict[str, Any] = {
     name: parameter.default
@@ -221,7 +221,7 @@ def map_file(
     scheduler: str | None = None,
     resume: bool = False,
     progress: Counter | None = None,
-    **asked: Any,
+    **settings: Any,
 ) -> xr.Dataset:
     """Fit every pixel of an image in a file, and write the maps to another.
 
@@ -237,16 +237,16 @@ def map_file(
         resume: Go on with a map that was broken off; what is done stays. Blocks whose files are
             missing or altered are fitted again. A finished map of the same capture is returned.
         progress: Called with the pixels that are done, and all.
-        asked: Arguments of `polar_bayes.fit_pixels`.
+        settings: Arguments of `polar_bayes.fit_pixels`.
 
     Returns:
         The maps, opened lazily.
 
     Raises:
         CaptureError: The capture cannot be read, or is not what a fit needs.
-        FitError: Something asked for cannot be used; or, to resume, the map was begun otherwise or
+        FitError: A setting cannot be used; or, to resume, the map was begun with others or
             the capture has changed since.
-        OutputError: The store cannot be written, is there already, is (to resume) no map of ours or
+        OutputError: The store cannot be written, is there already, is (to resume) no map of this package or
             not as it was written, or another process is writing it.
     """
     source, store = as_path(capture, "capture"), as_path(out, "out")
@@ -254,7 +254,7 @@ def map_file(
     image = open_image(source)
     check_whole(source)
     with _in_capture(source):
-        plan = plan_map(image, **(DEFAULTS | asked))
+        plan = plan_map(image, **(DEFAULTS | settings))
     target = _MapStore(store, image, plan)
     file = store.with_name(f"{store.name}{LEDGER}")
     with locked_ledger(file, target.request, resume=resume) as ledger:
@@ -288,19 +288,19 @@ def check_apart(source: Path, store: Path) -> None:
 
 
 def fit_file_block(
-    source: Path, place: Place, plan: Plan, opened: xr.Dataset | None = None
+    source: Path, region: Region, plan: Plan, opened: xr.Dataset | None = None
 ) -> tuple[xr.Dataset, str]:
     """Fit one block of a capture, which a worker opens: its maps, and a digest of its readings."""
     image = open_image(source) if opened is None else opened
-    block = _read(image, place)
-    with _in_capture(source, place):
-        return fit_block(with_pixel_numbers(block, place, image.sizes["x"]), plan), _digest(block)
+    block = _read(image, region)
+    with _in_capture(source, region):
+        return fit_block(with_pixel_numbers(block, region, image.sizes["x"]), plan), _digest(block)
 
 
 @contextlib.contextmanager
-def _in_capture(source: Path, place: Place | None = None) -> Iterator[None]:
+def _in_capture(source: Path, region: Region | None = None) -> Iterator[None]:
     """Errors of a capture, with its name and the block."""
-    where = str(source) if place is None else f"{source}: block {_label(place)}"
+    where = str(source) if region is None else f"{source}: block {_label(region)}"
     try:
         yield
     except CaptureError as error:
@@ -309,9 +309,9 @@ def _in_capture(source: Path, place: Place | None = None) -> Iterator[None]:
         raise CaptureError(error.what, where=f"{where}: {error.where}", hint=error.hint) from error
 
 
-def _read(image: xr.Dataset, place: Place) -> xr.Dataset:
+def _read(image: xr.Dataset, region: Region) -> xr.Dataset:
     """The variables of a block of a capture that a fit reads, in memory."""
-    return image[[name for name in image.data_vars if name in READ]].isel(place).load()
+    return image[[name for name in image.data_vars if name in READ]].isel(region).load()
 
 
 def _digest(block: xr.Dataset) -> str:
@@ -333,12 +333,12 @@ class _MapStore:
     def __init__(self, store: Path, image: xr.Dataset, plan: Plan) -> None:
         self._store, self._image, self._plan = store, image, plan
         self._maps = blank(image, plan)
-        self._places = list(cut(image, _block(image)))
-        self._chunks = {dim: part.stop for dim, part in self._places[0].items()}
+        self._regions = list(cut(image, _block(image)))
+        self._chunks = {dim: part.stop for dim, part in self._regions[0].items()}
         pixel = plan.request.capture.drop_attrs(deep=False)
         read = pixel[sorted(READ & set(pixel.data_vars))].to_dict()
-        asked = [provenance_json(plan), dict(image.sizes), self._chunks, read]
-        text = json.dumps(asked, sort_keys=True, default=str)
+        parts = [provenance_json(plan), dict(image.sizes), self._chunks, read]
+        text = json.dumps(parts, sort_keys=True, default=str)
         self.request = hashlib.sha256(text.encode()).hexdigest()
 
     def is_finished(self, *, resume: bool) -> bool:
@@ -360,21 +360,21 @@ class _MapStore:
     def check_finished(self) -> None:
         """Refuse a finished map of readings that have changed, or with missing chunks."""
         where = str(self._store)
-        readings = [_digest(_read(self._image, place)) for place in self._places]
+        readings = [_digest(_read(self._image, region)) for region in self._regions]
         if _metadata(self._store)["attributes"][FINISHED] != self._combined(readings):
             what = "the capture has changed since it was made"
             raise FitError(what, where=where, hint=OTHER_OUT)
-        files = [file for place in self._places for file in self._files(place)]
+        files = [file for region in self._regions for file in self._files(region)]
         if missing := sum(not file.is_file() for file in files):
             what = f"{missing} of {len(files)} chunks are missing"
             raise OutputError(what, where=where, hint=f"copy the store again, or {OTHER_OUT}")
 
     def check_readings(self, ledger: Ledger) -> None:
         """Refuse to resume where the readings of a finished block have changed."""
-        for place in self._places:
-            entry = ledger.entries.get(_label(place))
-            if entry is not None and _digest(_read(self._image, place)) != entry.readings:
-                what = f"the capture has changed since block {_label(place)} was fitted"
+        for region in self._regions:
+            entry = ledger.entries.get(_label(region))
+            if entry is not None and _digest(_read(self._image, region)) != entry.readings:
+                what = f"the capture has changed since block {_label(region)} was fitted"
                 raise FitError(what, where=str(self._store), hint=OTHER_OUT)
 
     def begin(self, ledger: Ledger) -> None:
@@ -420,50 +420,50 @@ class _MapStore:
         self, ledger: Ledger, source: Path, scheduler: str | None, progress: Counter | None
     ) -> None:
         """Fit and write every block that the ledger does not hold or whose files have changed."""
-        places = [place for place in self._places if not self._is_done(ledger, place)]
-        every = sum(map(_size, self._places))
-        done = every - sum(map(_size, places))
+        regions = [region for region in self._regions if not self._is_done(ledger, region)]
+        every = sum(map(_size, self._regions))
+        done = every - sum(map(_size, regions))
         with workers(scheduler) as (executor, count):
             opened = self._image if scheduler is None else None  # a cluster opens it for itself
-            tasks = ((source, place, self._plan, opened) for place in places)
-            for (_, place, *_), (block, readings) in as_completed(
+            tasks = ((source, region, self._plan, opened) for region in regions)
+            for (_, region, *_), (block, readings) in as_completed(
                 executor, count, fit_file_block, tasks
             ):
                 with _written(self._store):
-                    self._write(block, place)
-                    entry = Entry(readings, _contents(self._files(place)))
-                    ledger.add(_label(place), entry)
-                done += _size(place)
+                    self._write(block, region)
+                    entry = Entry(readings, _contents(self._files(region)))
+                    ledger.add(_label(region), entry)
+                done += _size(region)
                 if progress is not None:
                     progress(done, every)
 
-    def _is_done(self, ledger: Ledger, place: Place) -> bool:
-        entry, files = ledger.entries.get(_label(place)), self._files(place)
+    def _is_done(self, ledger: Ledger, region: Region) -> bool:
+        entry, files = ledger.entries.get(_label(region)), self._files(region)
         if entry is None or not all(file.is_file() for file in files):
             return False
         with _written(self._store):
             return _contents(files) == entry.chunks
 
-    def _write(self, block: xr.Dataset, place: Place) -> None:
+    def _write(self, block: xr.Dataset, region: Region) -> None:
         """Write a block and wait until it is on the disk."""
         values = block.drop_vars(list(block.coords))
-        values.to_zarr(self._store, region=place, consolidated=False, write_empty_chunks=True)
-        files = self._files(place)
+        values.to_zarr(self._store, region=region, consolidated=False, write_empty_chunks=True)
+        files = self._files(region)
         folders = {up for file in files for up in file.parents if up.is_relative_to(self._store)}
         for path in (*files, *sorted(folders)):
             sync(path)
 
-    def _files(self, place: Place) -> list[Path]:
+    def _files(self, region: Region) -> list[Path]:
         """Chunk files of a block: one of each array, as the default names of Zarr have it."""
         found = []
         for name, variable in self._maps.data_vars.items():
-            at = [place[d].start // self._chunks[d] if d in IMAGE else 0 for d in variable.dims]
+            at = [region[d].start // self._chunks[d] if d in IMAGE else 0 for d in variable.dims]
             found.append(self._store.joinpath(str(name), "c", *map(str, at)))
         return found
 
     def finish(self, ledger: Ledger) -> None:
         """Mark the store as finished, with a digest of the readings."""
-        readings = [ledger.entries[_label(place)].readings for place in self._places]
+        readings = [ledger.entries[_label(region)].readings for region in self._regions]
         with _written(self._store), unfinished_folder(self._store.parent) as folder:
             metadata = _metadata(self._store)
             if metadata["attributes"].get(REQUEST) != self.request:
@@ -475,7 +475,7 @@ class _MapStore:
 
     def _combined(self, readings: Iterable[str]) -> str:
         """Digest of the readings of all blocks."""
-        labels = map(_label, self._places)
+        labels = map(_label, self._regions)
         text = "\n".join(f"{label} {one}" for label, one in zip(labels, readings, strict=True))
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -497,16 +497,16 @@ def _metadata(store: Path) -> dict[str, Any]:
     return found if isinstance(found.get("attributes"), dict) else {**found, "attributes": {}}
 
 
-def _label(place: Place) -> str:
-    return " ".join(f"{dim}={part.start}:{part.stop}" for dim, part in place.items())
+def _label(region: Region) -> str:
+    return " ".join(f"{dim}={part.start}:{part.stop}" for dim, part in region.items())
 
 
-def _size(place: Place) -> int:
-    return math.prod(part.stop - part.start for part in place.values())
+def _size(region: Region) -> int:
+    return math.prod(part.stop - part.start for part in region.values())
 
 
 def _block(image: xr.Dataset) -> int:
-    """Most pixels of a block; it follows from the image alone, so that work can be resumed."""
+    """Most pixels of a block; it depends on the image alone, so a resumed map has the same blocks."""
     return min(BLOCK, max(LEAST, image.sizes["y"] * image.sizes["x"] // PARTS))
 
 
