@@ -246,8 +246,8 @@ def map_file(
         CaptureError: The capture cannot be read, or is not what a fit needs.
         FitError: A setting cannot be used; or, to resume, the map was begun with others or
             the capture has changed since.
-        OutputError: The store cannot be written, is there already, is (to resume) no map of this package or
-            not as it was written, or another process is writing it.
+        OutputError: The store cannot be written, is there already, is (to resume) not a map of
+            this package or not as it was written, or another process is writing it.
     """
     source, store = as_path(capture, "capture"), as_path(out, "out")
     check_apart(source, store)
@@ -506,7 +506,7 @@ def _size(region: Region) -> int:
 
 
 def _block(image: xr.Dataset) -> int:
-    """Most pixels of a block; it depends on the image alone, so a resumed map has the same blocks."""
+    """Most pixels of a block; it depends on the image alone, so resumed maps have the same."""
     return min(BLOCK, max(LEAST, image.sizes["y"] * image.sizes["x"] // PARTS))
 
 
