@@ -21,7 +21,7 @@ from jaxtyping import Array
 import polar_bayes as pb
 from polar_bayes.benchmark.reference import distances, run_reference
 from polar_bayes.benchmark.run import labeled
-from polar_bayes.calibration.simulations import draw_numbered
+from polar_bayes.calibration.simulations import draw_captures
 from polar_bayes.inference.problem import CompiledModel, Problem, make_problem
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations
@@ -39,7 +39,7 @@ def fit_some(case: Case, numbers: np.ndarray, auto: pb.methods.Auto) -> list[dic
     request = resolve(layout, "per_material", case.scene, None, case.links, None, 0, "double")
     key = jax.random.key(7)
     base = make_problem(request, key)
-    drawn = draw_numbered(base.program, base.data, np.resize(numbers, CHUNK), key)
+    drawn = draw_captures(base.program, base.data, np.resize(numbers, CHUNK), key)
     found = []
     for at, number in enumerate(numbers):
         data = drawn.captures.pixel(at)
@@ -58,9 +58,9 @@ def _judged(
     draws_of_auto = auto.run(problem, key_draws, no_progress)
     seconds = time.perf_counter() - begin
     key_search, key_draws = jax.random.split(jax.random.fold_in(key, 9))
-    judge = run_reference(REFERENCE, Problem(model, data, key_search), key_draws)
+    reference_run = run_reference(REFERENCE, Problem(model, data, key_search), key_draws)
     _, draws = labeled(problem, draws_of_auto.z)
-    flat, reference = (x.reshape(len(x), -1) for x in (draws, judge.draws))
+    flat, reference = (x.reshape(len(x), -1) for x in (draws, reference_run.draws))
     apart = distances(flat, reference)
     error = float(np.max(np.abs([apart.mean_error, apart.sd_error])))
     return {
@@ -69,8 +69,8 @@ def _judged(
         "chosen": draws_of_auto.metadata["auto"]["chosen"],
         "said_met": draws_of_auto.metadata["auto"]["met"],
         "expected": draws_of_auto.metadata["auto"]["expected_error"],
-        "reference_error": judge.error,
-        "reference_doubts": list(judge.doubts),
+        "reference_error": reference_run.error,
+        "reference_doubts": list(reference_run.doubts),
     }
 
 

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from polar_bayes.calibration.predictive import Arrays, Readings, why_untold
+from polar_bayes.calibration.predictive import Arrays, PredictivePit, unranked_reason
 from polar_bayes.calibration.scores import PitCrps
-from polar_bayes.calibration.simulations import draw_fresh, draw_numbered
+from polar_bayes.calibration.simulations import draw_captures, redraw_readings
 from polar_bayes.inference.batch_engine import BatchEngine, make_engine
 from polar_bayes.inference.batch_method import AbstractPixelMethod
 from polar_bayes.inference.batch_nuts import PixelNuts
@@ -28,7 +28,7 @@ from polar_bayes.inference.program import Program, Values, compile_program
 from polar_bayes.inference.psis import Marginals
 from polar_bayes.inference.request import Request
 from polar_bayes.observation.data import READINGS, Observations, observe
-from polar_bayes.physics.discrepancy import Discrepancy
+from polar_bayes.physics.instrument import Discrepancy
 
 SequentialMethod = Nuts | Laplace
 Method = AbstractPixelMethod | SequentialMethod
@@ -55,7 +55,7 @@ class Block(NamedTuple):
     fresh: Arrays
     left_out: Arrays
     left_out_k: Arrays
-    place: Arrays
+    entry: Arrays
     outcome: Outcome
 
 
@@ -162,7 +162,7 @@ class CompiledPlan:
         """Why readings cannot be ranked; empty where they can."""
         program, given = self.program, _shapes(self.program, self.data)
         with jax.enable_x64(True), TRACING_LOCK:
-            return why_untold(program, self.generative_program, self.data, given)
+            return unranked_reason(program, self.generative_program, self.data, given)
 
 
 _COMPILED: LRUCache[CompiledPlan] = LRUCache(4)
@@ -184,15 +184,15 @@ def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
     is_ranked = plan.readings and not plan.unranked_reason
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), 1)
-        drawn = draw_numbered(program, plan.data, filled, key)
-        fresh = draw_fresh(program, plan.data, drawn, filled, key) if is_ranked else {}
+        drawn = draw_captures(program, plan.data, filled, key)
+        fresh = redraw_readings(program, plan.data, drawn, filled, key) if is_ranked else {}
     truth = {name: np.asarray(drawn.truth[name])[wanted] for name in shared}
     captures = drawn.captures.subset(wanted)
     marginals, scores = Marginals(len(numbers), shared), PitCrps(truth, numbers, seed)
     ranked = None
     if is_ranked:
         again = {name: np.asarray(values)[wanted] for name, values in fresh.items()}
-        ranked = Readings(plan.compiled.single, captures, again, numbers, seed)
+        ranked = PredictivePit(plan.compiled.single, captures, again, numbers, seed)
     step = _thinning(plan.settings)
 
     def describe(at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
@@ -214,7 +214,7 @@ def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
         fresh=ranked.fresh if ranked else {},
         left_out=ranked.left_out if ranked else {},
         left_out_k=ranked.left_out_k if ranked else {},
-        place=ranked.place if ranked else {},
+        entry=ranked.entry if ranked else {},
         outcome=outcome,
     )
 

@@ -19,7 +19,6 @@ from jaxtyping import Array, Float
 from polar_bayes.inference import laplace
 from polar_bayes.inference.compile import (
     TRACING_LOCK,
-    JitByShape,
     JitOnce,
     LRUCache,
     cache_key,
@@ -88,7 +87,7 @@ class CompiledModel:
     @functools.cached_property
     def least_squares(self) -> Callable[[Array, Observations], laplace.Estimate]:
         """Least squares from several starts, compiled."""
-        return JitByShape(lambda starts, data: laplace.estimate(self.program, data, starts))
+        return JitOnce(lambda starts, data: laplace.estimate(self.program, data, starts))
 
     @functools.cached_property
     def log_densities(self) -> Callable[[Array, Observations], Array]:

@@ -128,7 +128,7 @@ def test_names_of_options_are_those_of_the_tables():
         cli_options.MATERIAL: pb.simulation.PRESETS,
         cli_options.FIT_METHOD: METHODS,
         cli_options.CALIBRATION_METHOD: CALIBRATION_METHODS,
-        cli_options.RUNG: pb.methods.STUDY_METHODS,
+        cli_options.STUDY_METHOD: pb.methods.STUDY_METHODS,
     }
     for kind, table in known.items():
         assert kind.names == tuple(table), kind.kind
@@ -149,7 +149,7 @@ assert not {"jax", "numpyro", "arviz", "matplotlib"} & set(sys.modules), "loaded
         ("fit", "x.nc", "--method", "nutz", "--out", "o.nc"),
         ("map", "x.nc", "--scene", "moon", "--out", "o.zarr"),
         ("calibrate", "x.nc", "--method", "magic", "--out", "o.nc"),
-        ("accuracy", "x.nc", "--rung", "magic", "--out", "o.nc"),
+        ("accuracy", "x.nc", "--method", "magic", "--out", "o.nc"),
         ("simulate", "--preset", "gold", "--out", "o.nc"),
         ("fit", "t.csv", "--out", "o.nc"),
         ("fit", "x.nc", "--out", "y.nc"),

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.instrument import (
     AbstractInstrumentTerm,
@@ -15,6 +14,7 @@ from polar_bayes.physics.instrument import (
     BeamOverlap,
     ChannelGain,
     DarkLevel,
+    Discrepancy,
     DolpGain,
     Instrument,
     Leakage,

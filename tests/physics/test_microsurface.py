@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import vector_optics as twin
 
-from polar_bayes.physics.facets import FacetQuadrature, seen
+from polar_bayes.physics.facets import FacetQuadrature, Microsurface, seen
 from polar_bayes.physics.geometry import Geometry, mirror_facet
 from polar_bayes.physics.microfacet import (
     GGX,
@@ -15,7 +15,6 @@ from polar_bayes.physics.microfacet import (
     IsotropicSlopes,
     SeparableShadowing,
 )
-from polar_bayes.physics.microsurface import Microsurface
 
 DISTRIBUTIONS = {"Beckmann": Beckmann(), "GGX": GGX()}
 named = pytest.mark.parametrize("name", DISTRIBUTIONS)

@@ -65,7 +65,7 @@ def test_every_rung_as_given_is_named_and_nothing_is_cut_off():
     assert len(figure.axes) == 2
     for axes in figure.axes:
         named = {text.get_text() for text in axes.texts}
-        assert named == {rung for rung, dial in ROWS if dial == "as given"}
+        assert named == {method for method, override in ROWS if override == "as given"}
     assert not clipped(figure)
 
 
