@@ -139,9 +139,7 @@ def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: A
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
     given: dict[str, Any] = {} if draws is None else {"draws": draws}
-    chosen = (
-        pb.methods.PixelLaplace(**given) if method == "laplace" else pb.methods.PixelTempering()
-    )
+    chosen = pb.methods.PixelLaplace(**given) if method == "laplace" else pb.methods.PixelSMC()
     maps = pb.maps.map_file(capture, out, method=chosen, **settings)
     counts = ", ".join(
         f"{count} {what}" for what, count in pb.maps.count_pixels(maps).items() if count

@@ -29,7 +29,7 @@ def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys
     told = capsys.readouterr().out
     assert told.splitlines()[0].split()[:2] == ["error", "worst"]
     assert told.splitlines()[-1] == pb.benchmark.accuracy_sentences(make_accuracy())
-    assert set(studied["rungs"]) == set(pb.methods.LADDER)
+    assert set(studied["rungs"]) == set(pb.methods.STUDY_METHODS)
     assert "dials" not in studied
     assert pb.benchmark.accuracy_table(pb.benchmark.load_accuracy(out)).equals(
         pb.benchmark.accuracy_table(make_accuracy())

@@ -3,6 +3,7 @@
 All in one file, so that one worker executes the notebooks and builds the site from them.
 """
 
+import inspect
 import functools
 import os
 import subprocess

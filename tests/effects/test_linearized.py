@@ -16,7 +16,7 @@ from polar_bayes.observation.data import observe
 
 
 def request_of(capture, scene, links=LINKS, model="per_material"):
-    return resolve(capture, model, "laplace", scene, None, links, None, 0, "double")
+    return resolve(capture, model, scene, None, links, None, 0, "double")
 
 
 def no_progress(stage: str, fraction: float) -> None:

@@ -22,8 +22,8 @@ from spectral_plates import spectral_plate
 
 import polar_bayes as pb
 from polar_bayes.effects.choose import ChosenScene
-from polar_bayes.inference import hierarchical_reparam, initialization, optimize, request
-from polar_bayes.inference import joint_fit as fitting
+from polar_bayes.inference import fitting as fitting
+from polar_bayes.inference import hierarchical_reparam, initialization, optimize, problem, request
 from polar_bayes.inference.compile import LRUCache, cache_key
 from polar_bayes.inference.optimize import ignore_line_search_warnings
 from polar_bayes.inference.problem import compile_model
@@ -58,7 +58,7 @@ def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Itera
     monkeypatch.setattr(hierarchical_reparam, "MOST_STARTS", 4)
     monkeypatch.setattr(hierarchical_reparam, "TYPICAL_DRAWS", 20)
     monkeypatch.setattr(fitting, "PRIOR_DRAWS", 20)
-    monkeypatch.setattr(fitting, "BLOCK", 50)
+    monkeypatch.setattr(problem, "BLOCK", 50)
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
@@ -117,7 +117,7 @@ def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
     """`fit` splits a round number of keys; the first of them must be those of any number."""
     key = jax.random.key(5)
     many, few = (
-        jax.random.key_data(jax.random.split(key, count)) for count in (fitting.KEYS, 1234)
+        jax.random.key_data(jax.random.split(key, count)) for count in (problem.KEYS, 1234)
     )
     assert np.array_equal(many[:1234], few)
 
@@ -156,12 +156,12 @@ def compiled_model(capture: xr.Dataset, *, precision: str = "double", **asked: o
             ("links", LINKS),
         )
     )
-    wish = resolve(capture, model, NUTS, scene, priors, links, None, 0, precision)
+    wish = resolve(capture, model, scene, priors, links, None, 0, precision)
     with jax.enable_x64(precision == "double"):
         data = observe(wish.capture)
         if precision == "single":
             data = data.in_single_precision()
-        return compile_model(wish, wish.scene, data)
+        return compile_model(wish, data)
 
 
 def held(value: float) -> handlers.condition:
@@ -220,7 +220,7 @@ def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
         return inspect_model(model, data, *others)
 
     monkeypatch.setattr(request, "inspect_model", with_progress)
-    asked = (shifted(0.25), "nuts", PLATE, None, LINKS, None, 0, "double")
+    asked = (shifted(0.25), PLATE, None, LINKS, None, 0, "double")
     first, again = (resolve(one(seed), *asked) for seed in (1, 2))
     assert told == [(6,)]
     assert first.declared == again.declared == {"mean": "Normal"}
