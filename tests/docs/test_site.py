@@ -3,8 +3,8 @@
 All in one file, so that one worker executes the notebooks and builds the site from them.
 """
 
-import inspect
 import functools
+import inspect
 import os
 import subprocess
 import sys
