@@ -45,8 +45,8 @@ def study(name: str, case: Case, number: int, keep: Path, quick: bool) -> xr.Dat
             progress=lambda stage, done: print(f"{name}: {stage} {done:.0%}", flush=True),
             **asked,
         )
-        pb.save_result(found, file)
-    return pb.benchmark.load_accuracy(file)
+        pb.save(found, file)
+    return pb.load(file)
 
 
 def tried(case: Case, found: xr.DataTree, number: int, keep: Path) -> tuple[str, float]:
@@ -65,10 +65,8 @@ def tried(case: Case, found: xr.DataTree, number: int, keep: Path) -> tuple[str,
             fresh=False,
             seed=1,
         )
-        pb.save_result(again, file)
-    return method, float(
-        pb.benchmark.accuracy_table(pb.benchmark.load_accuracy(file))["error"].iloc[0]
-    )
+        pb.save(again, file)
+    return method, float(pb.summary(pb.load(file))["error"].iloc[0])
 
 
 @styled
@@ -93,7 +91,7 @@ def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]])
         "|---" * (len(pb.methods.STUDY_METHODS) + 2) + "|",
     ]
     for name, found in studies.items():
-        rows = pb.benchmark.accuracy_table(found)
+        rows = pb.summary(found)
         noise = float(accuracy_dataset(found).attrs["reference_error"])
         cells = [_cell(rows, method) for method in pb.methods.STUDY_METHODS]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {noise:.2g} |")

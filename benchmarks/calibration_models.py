@@ -128,7 +128,7 @@ EVERY = {
 
 def said(found: xr.DataTree) -> str:
     """Table and verdict of one calibration."""
-    table = pb.calibration.calibration_table(found)
+    table = pb.summary(found)
     shown = pd.DataFrame({"p": table["p_value"].map("{:.3f}".format)})
     for percent in (50, 80, 95):
         name = f"held_{percent}"
@@ -145,7 +145,7 @@ def said(found: xr.DataTree) -> str:
     worth = fits["effective_draws"].to_numpy()
     worth = worth[np.isfinite(worth)]
     lines = [
-        *pb.calibration.calibration_verdict(found),
+        *pb.verdict(found).sentences,
         shown.to_string(),
         f"fits: {', '.join(f'{count} {name}' for name, count in counts.items() if count)}",
     ]

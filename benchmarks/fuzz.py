@@ -171,7 +171,7 @@ def netcdf(folder: Path) -> Case:
     """Captures and results in netCDF, a bit flipped or more, read by a subprocess."""
     capture = plate_capture(np.linspace(20.0, 75.0, 40), 0.01, seed=1)
     pb.save_capture(capture, folder / "capture.nc")
-    pb.save_result(make_result(views=12, chains=2, draws=30), folder / "result.nc")
+    pb.save(make_result(views=12, chains=2, draws=30), folder / "result.nc")
     capture.to_netcdf(folder / "foreign.nc")  # by another program: without a checksum
     whole = {name: (folder / name).read_bytes() for name in FILES}
     reader = Reader(folder)
@@ -267,7 +267,7 @@ def results(folder: Path) -> Case:
         json.dumps(pb.diagnostics.json_summary(tree), allow_nan=False)
         str(pb.show(tree))
         pb.inference.auto_sentences(tree)
-        return "IMPOSSIBLE" if impossible and pb.verdict(tree).converged else "accepted"
+        return "IMPOSSIBLE" if impossible and pb.verdict(tree).passed else "accepted"
 
     return case
 
@@ -362,7 +362,7 @@ class Reader:
 
 def read_on(folder: Path) -> None:
     """What the subprocess does: read the files that standard input names."""
-    reads = dict(zip(FILES, (pb.load_capture, pb.load_result, pb.load_capture), strict=True))
+    reads = dict(zip(FILES, (pb.load_capture, pb.load, pb.load_capture), strict=True))
     whole = {name: read(folder / name) for name, read in reads.items()}
     print("ready", flush=True)
     for line in sys.stdin:

@@ -134,7 +134,7 @@ def pooling(study: Study) -> None:
         capture = plates(truth, ERROR, seed=study.seed + repetition)
         for model, told in found.items():
             result = pb.fit(capture, model=model, scene=PLATE, links=LINKS, seed=repetition)
-            converged[model] += bool(pb.verdict(result).converged)
+            converged[model] += bool(pb.verdict(result).passed)
             draws = result["posterior"][INDEX].stack(all=("chain", "draw"))
             low, high = draws.quantile([0.025, 0.975], "all").to_numpy()
             told.append(score(draws.mean("all"), low, high, truth))

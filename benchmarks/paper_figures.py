@@ -148,7 +148,7 @@ def calibration(study: Study) -> Picture:
 
 
 def _say(method: str, tree: xr.DataTree) -> None:
-    table = pb.calibration.calibration_table(tree)
+    table = pb.summary(tree)
     for name in NAMES:
         told = table.loc[name]
         shares = (

@@ -51,7 +51,7 @@ def replicates(label: str) -> None:
         capture = plates(truth, ERROR, seed=seed)
         for model in converged:
             result = pb.fit(capture, model=model, scene=PLATE, links=LINKS, seed=seed)
-            converged[model] += pb.verdict(result).converged
+            converged[model] += pb.verdict(result).passed
             draws = result["posterior"]["refractive_index"].stack(all=("chain", "draw"))
             low, high = draws.quantile([0.025, 0.975], "all").to_numpy()
             errors = draws.mean("all").to_numpy() - truth
@@ -91,7 +91,7 @@ def patches() -> None:
             f"{table['r_hat'].max():.4f}, ESS of what is shared at least "
             f"{hyper[['ess_bulk', 'ess_tail']].min().min():.0f}, of all "
             f"{table[['ess_bulk', 'ess_tail']].min().min():.0f}; converged "
-            f"{pb.verdict(result).converged}",
+            f"{pb.verdict(result).passed}",
             flush=True,
         )
 

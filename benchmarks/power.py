@@ -76,7 +76,7 @@ BROKEN: dict[str, tuple[str, dict[str, Any]]] = {
 def fails(calibration: xr.DataTree) -> tuple[bool, bool]:
     """Whether the test of the parameters fails, and that of the readings."""
     tables = (
-        pb.calibration.calibration_table(calibration),
+        pb.summary(calibration),
         pb.calibration.calibration_readings(calibration),
     )
     return not pb.calibration.is_calibrated(tables[0]), not pb.calibration.is_calibrated(tables[1])

@@ -29,7 +29,7 @@ def band(material: Mapping[float, float], held: float, method: str, seed: int) -
     measured = {color: index for color, index in material.items() if color != held}
     capture = spectral_plate(measured, error=ERROR, seed=seed, views=VIEWS)
     result = pb.fit(capture, model=MODEL, scene=PLATE, links=LINKS, method=method, seed=seed)
-    if method == "nuts" and not pb.verdict(result).converged:
+    if method == "nuts" and not pb.verdict(result).passed:
         print("not converged:", pb.verdict(result).problems)
     draws = pb.inference.predict_spectrum(result, held, seed=seed)["refractive_index"].to_numpy()
     return np.quantile(draws, (0.025, 0.975))

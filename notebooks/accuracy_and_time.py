@@ -54,7 +54,7 @@ study = pb.accuracy(
     reference=pb.benchmark.Reference(error=0.03),
 )
 columns = ["error", "worst", "resolved", "effective_draws", "gradients", "seconds_again"]
-pb.benchmark.accuracy_table(study)[columns].round(3)
+pb.summary(study)[columns].round(3)
 
 # %%
 pb.plots.plot_accuracy(study)

@@ -44,10 +44,10 @@ asked = {
     "simulations": 200,
 }
 calibration = pb.calibrate(layout, **asked, seed=0)
-pb.calibration.calibration_table(calibration).transpose()
+pb.summary(calibration).transpose()
 
 # %%
-print(*pb.calibration.calibration_verdict(calibration), sep="\n")
+print(*pb.verdict(calibration).sentences, sep="\n")
 pb.plots.plot_calibration(calibration)
 
 # %% [markdown]
@@ -69,8 +69,8 @@ pb.plots.plot_calibration(calibration)
 # %%
 elsewhere = {"priors": {"refractive_index": dist.Uniform(1.2, 2.0)}}
 broken = pb.calibrate(layout, **asked, truth=elsewhere, seed=0)
-print(*pb.calibration.calibration_verdict(broken), sep="\n")
-pb.calibration.calibration_table(broken).transpose()
+print(*pb.verdict(broken).sentences, sep="\n")
+pb.summary(broken).transpose()
 
 # %% [markdown]
 # It noticed: the 95% intervals of the index hold about 82% of such truths, and the ranks say in

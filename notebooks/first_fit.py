@@ -56,7 +56,7 @@ pb.summary(result).round(3)
 # Before any number is quoted:
 
 # %%
-print("converged:", verdict.converged)
+print("converged:", verdict.passed)
 print("problems:", verdict.problems)
 print("cautions:", verdict.cautions)
 

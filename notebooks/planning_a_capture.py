@@ -25,10 +25,10 @@ capture = pb.simulate("leaf", scene=scene, protocol=protocol, seed=0)
 
 # %%
 found = pb.identify(capture, scene=scene)
-pb.design.identifiability_table(found).round(3)
+pb.summary(found).round(3)
 
 # %%
-print(*pb.design.identifiability_sentences(found), sep="\n")
+print(*pb.verdict(found).sentences, sep="\n")
 
 # %% [markdown]
 # `expected_sd` is what the posterior will be like, `prior_share` how much of its variance is still
@@ -45,7 +45,7 @@ print(*pb.design.identifiability_sentences(found), sep="\n")
 
 # %%
 curve = pb.profile(capture, "refractive_index", scene=scene)
-print(*pb.design.profile_sentences(curve), sep="\n")
+print(*pb.verdict(curve).sentences, sep="\n")
 curve["profile"].sel(kind="likelihood").plot.line("o-", x="value")
 plt.axhline(-1.92, color="0.7")
 plt.axvline(float(capture["true_refractive_index"]), color="k", linestyle=":")
@@ -80,8 +80,8 @@ views = pb.next_views(
     criterion=pb.design.SingleParameter("refractive_index"),
     scene=scene,
 )
-print(*pb.design.next_views_sentences(views), sep="\n")
-pb.design.next_views_table(views)
+print(*pb.verdict(views).sentences, sep="\n")
+pb.summary(views)
 
 # %% [markdown]
 # Two steep views on the mirror side, as the paper would take them, and one at 25 degrees. The index

@@ -23,10 +23,6 @@ from .capture.files import (
 from .design.identify import identify as identify
 from .design.next_views import next_views as next_views
 from .design.profile import profile as profile
-from .diagnostics.convergence import (
-    summary as summary,
-    verdict as verdict,
-)
 from .effects.choose import choose_effects as choose_effects
 from .errors import (
     CaptureError as CaptureError,
@@ -42,10 +38,6 @@ from .importers.images import (
 )
 from .importers.table import from_table as from_table
 from .inference import methods as methods
-from .inference.files import (
-    load_result as load_result,
-    save_result as save_result,
-)
 from .inference.fitting import fit as fit
 from .maps.fit_map import fit_pixels as fit_pixels
 from .observation import links as links
@@ -81,6 +73,13 @@ from .physics.surface import (
 )
 from .priors import PRIORS as PRIORS
 from .reporting import plots as plots
+from .reporting.plots import plot as plot
 from .reporting.report import report as report
 from .reporting.report import show as show
+from .results import (
+    load as load,
+    save as save,
+    summary as summary,
+    verdict as verdict,
+)
 from .simulation import simulate as simulate

@@ -30,6 +30,7 @@ LAYERS = (
     ("polar_bayes.calibration", "polar_bayes.design"),
     ("polar_bayes.effects",),
     ("polar_bayes.benchmark",),
+    ("polar_bayes.results",),
     ("polar_bayes.reporting",),
     ("polar_bayes.cli",),
 )

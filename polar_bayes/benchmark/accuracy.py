@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
 from typing import Any
@@ -28,7 +27,7 @@ from polar_bayes.benchmark.run import (
 )
 from polar_bayes.design.setup import request_provenance
 from polar_bayes.errors import FitError, PolarBayesError
-from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, Schema, holds, load_tree
+from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, Schema
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.methods import STUDY_METHODS
 from polar_bayes.inference.problem import make_problem
@@ -108,7 +107,7 @@ def accuracy(
     Returns:
         A tree whose group `accuracy` has a row for each method and override (coordinates `method`
         and `override`), and by row and parameter the distances from the reference; see the
-        attribute `long_name` of each variable. `polar_bayes.benchmark.accuracy_table`,
+        attribute `long_name` of each variable. `polar_bayes.summary`,
         `accuracy_sentences` and `plot_accuracy` read it.
 
     Raises:
@@ -249,7 +248,7 @@ def _dataset(
 
 STUDY = Schema(
     kind="accuracy study",
-    made_by="polar_bayes.accuracy or load_accuracy",
+    made_by="polar_bayes.accuracy or load",
     command="`polar-bayes accuracy`",
     groups={"accuracy": dataclasses.replace(ACCURACY, required=True)},
     provenance=COMMON_PROVENANCE,
@@ -259,34 +258,3 @@ STUDY = Schema(
 def is_accuracy(tree: object) -> bool:
     """Whether a tree is what `polar_bayes.accuracy` returns, and no fit."""
     return STUDY.describes(tree)
-
-
-def holds_accuracy(path: str | os.PathLike[str]) -> bool:
-    """Whether a file holds an accuracy study; its numbers are not read.
-
-    Args:
-        path: Any file.
-
-    Returns:
-        False where it is not there, cannot be read, or holds something else.
-
-    Raises:
-        Nothing.
-    """
-    return holds(path, STUDY)
-
-
-def load_accuracy(path: str | os.PathLike[str]) -> xr.DataTree:
-    """An accuracy study from a netCDF file.
-
-    Args:
-        path: A file that `polar-bayes accuracy` or `polar_bayes.save_result` wrote.
-
-    Returns:
-        The tree, in memory; the file is closed.
-
-    Raises:
-        CaptureError: The file is not there.
-        FitError: It was damaged, or holds no accuracy study; the variable that is wrong.
-    """
-    return load_tree(path, STUDY)

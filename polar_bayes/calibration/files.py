@@ -1,7 +1,5 @@
 """Calibrations in netCDF files, and what they hold."""
 
-import os
-
 import xarray as xr
 
 from polar_bayes.errors import FitError
@@ -14,8 +12,6 @@ from polar_bayes.inference.files import (
     Group,
     Like,
     Schema,
-    holds,
-    load_tree,
 )
 from polar_bayes.inference.psis import LEVELS
 
@@ -24,7 +20,7 @@ _RANKS = Group(_SIMULATION, extra_dims=False)
 
 CALIBRATION = Schema(
     kind="calibration",
-    made_by="polar_bayes.calibrate or load_calibration",
+    made_by="polar_bayes.calibrate or load",
     command="`polar-bayes calibrate`",
     groups={
         "prior_sbc": Group(_SIMULATION, required=True),
@@ -84,36 +80,3 @@ def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
             where=source,
             hint=f"give the tree as {CALIBRATION.made_by} returned it, or drop {min(there)}",
         )
-
-
-def holds_calibration(path: str | os.PathLike[str]) -> bool:
-    """Whether a file holds a calibration; its numbers are not read.
-
-    Args:
-        path: Any file.
-
-    Returns:
-        False where it is not there, cannot be read, or holds something else.
-
-    Raises:
-        Nothing.
-    """
-    return holds(path, CALIBRATION)
-
-
-def load_calibration(path: str | os.PathLike[str]) -> xr.DataTree:
-    """A calibration from a netCDF file.
-
-    Args:
-        path: A file that `polar-bayes calibrate` or `polar_bayes.save_result` wrote.
-
-    Returns:
-        The tree, in memory; the file is closed.
-
-    Raises:
-        CaptureError: The file is not there.
-        FitError: It was damaged, or holds no calibration; the group and variable that is wrong.
-    """
-    tree = load_tree(path, CALIBRATION)
-    check_calibration(tree, str(path))
-    return tree

@@ -58,10 +58,10 @@ def calibrate(
     calibration = pb.calibrate(
         data, readings=not no_readings, store=store, resume=resume, **settings
     )
-    pb.save_result(calibration, out)
+    pb.save(calibration, out)
     table, verdict = (
-        pb.calibration.calibration_table(calibration),
-        pb.calibration.calibration_verdict(calibration),
+        pb.summary(calibration),
+        pb.verdict(calibration).sentences,
     )
     tables = {"parameters": table}
     if "predictive_pit" in calibration.children:
@@ -112,14 +112,14 @@ def identify(
         settings["progress"] = progress
         study = pb.identify(data, **settings)
         found["parameters"] = (
-            pb.design.identifiability_table(study),
-            pb.design.identifiability_sentences(study),
+            pb.summary(study),
+            pb.verdict(study).sentences,
         )
         for name in profiled:
             curve = pb.profile(data, name, **settings)
             found[f"profile of {name}"] = (
-                pb.design.profile_table(curve),
-                pb.design.profile_sentences(curve),
+                pb.summary(curve),
+                pb.verdict(curve).sentences,
             )
         if count is not None:
             letters = {"D": pb.design.DOptimal, "A": pb.design.AOptimal}
@@ -130,8 +130,8 @@ def identify(
             )
             views = pb.next_views(data, count=count, criterion=goal, **settings)
             found["next views"] = (
-                pb.design.next_views_table(views),
-                pb.design.next_views_sentences(views),
+                pb.summary(views),
+                pb.verdict(views).sentences,
             )
     if as_json:
         rows: dict[str, Any] = {name: json_rows(table) for name, (table, _) in found.items()}
@@ -176,8 +176,8 @@ def accuracy(
     if no_overrides:
         settings["overrides"] = ()
     study = pb.accuracy(pb.load_capture(capture), **settings)
-    pb.save_result(study, out)
-    table = pb.benchmark.accuracy_table(study)
+    pb.save(study, out)
+    table = pb.summary(study)
     advice = " ".join(pb.benchmark.accuracy_sentences(study, tolerance))
     if as_json:
         print_json({"rows": json_rows(table), "advice": advice})

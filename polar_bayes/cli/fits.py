@@ -45,7 +45,7 @@ def demo(out: Path, seed: int) -> int:
     pb.save_capture(capture, out / "capture.nc")
     with stages() as progress:
         result = pb.fit(capture, seed=seed, progress=progress)
-        pb.save_result(result, out / "fit.nc")
+        pb.save(result, out / "fit.nc")
         progress("writing the report", 0.0)
         page = pb.report(result, out / "report")
         progress("writing the report", 1.0)
@@ -107,10 +107,10 @@ def fit(
             options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             scene = pb.choose_effects(data, progress=progress, **options)
-            click.echo(pb.effects.ledger_sentences(scene.ledger), err=True)
+            click.echo(pb.verdict(scene.ledger).sentences, err=True)
         settings |= {"tolerance": tolerance} if is_auto else {}
         result = pb.fit(data, scene=scene, progress=progress, **settings)
-    pb.save_result(result, out)
+    pb.save(result, out)
     for sentence in pb.inference.auto_sentences(result):
         click.echo(sentence, err=True)
     if not as_json:
@@ -165,11 +165,11 @@ def effects(
     with stages() as progress:
         ledger: Any = pb.choose_effects(data, progress=progress, **settings).ledger
     if out is not None:
-        pb.save_result(ledger, out)
+        pb.save(ledger, out)
     if as_json:
         print_json(pb.effects.ledger_summary(ledger))
     else:
-        click.echo(f"{pb.effects.ledger_table(ledger)}\n\n{pb.effects.ledger_sentences(ledger)}")
+        click.echo(f"{pb.summary(ledger)}\n\n{pb.verdict(ledger).sentences}")
 
 
 def _with_setup(capture: Any, setup: str | None) -> Any:
@@ -191,11 +191,11 @@ def report(
 ) -> None:
     """Write the standardized report of a fit, calibration, accuracy study, or map (.zarr)."""
     page = pb.report(
-        _load(fit),
+        pb.load(fit),
         out,
         truth=None if truth is None else pb.maps.open_capture(truth),
         uncorrected=None if uncorrected is None else pb.maps.open_map(uncorrected),
-        beside=_load_all(pb.calibration.load_calibration, beside) or None,
+        beside=_load_all(beside, "calibration") or None,
     )
     click.echo(f"report: {page}")
 
@@ -205,7 +205,7 @@ def report(
 @out_option(FOLDER, "Folder to write.")
 def compare(fits: tuple[Path, ...], out: Path) -> int:
     """Compare fits of one capture: predictions, parameters, and the effect of the priors."""
-    results = _load_all(pb.load_result, fits)
+    results = _load_all(fits, "fit")
     comparison = pb.diagnostics.compare_fits(results)
     page = pb.report(results, out)
     if not comparison.loo.empty:
@@ -214,28 +214,15 @@ def compare(fits: tuple[Path, ...], out: Path) -> int:
     for sentence in pb.reporting.comparison_of_fits_sentences(comparison):
         click.echo(sentence)
     click.echo(f"report: {page}")
-    converged = all(verdict.converged for verdict in comparison.verdicts.values())
+    converged = all(verdict.passed for verdict in comparison.verdicts.values())
     return 0 if converged else NOT_CONVERGED
 
 
-def _load_all(load: Any, paths: tuple[Path, ...]) -> dict[str, Any]:
-    """Results by the names of their files."""
+def _load_all(paths: tuple[Path, ...], kind: str) -> dict[str, Any]:
+    """Results of one kind by the names of their files."""
     if len({path.stem for path in paths}) < len(paths):
         raise click.UsageError("two of the files have the same name")
-    return {path.stem: load(path) for path in paths}
-
-
-def _load(path: Path) -> Any:
-    """A map, an accuracy study, a calibration or a fit."""
-    if path.suffix == ".zarr":
-        return pb.maps.open_map(path)
-    if pb.benchmark.holds_accuracy(path):
-        return pb.benchmark.load_accuracy(path)
-    return (
-        pb.calibration.load_calibration(path)
-        if pb.calibration.holds_calibration(path)
-        else pb.load_result(path)
-    )
+    return {path.stem: pb.load(path, kind) for path in paths}
 
 
 COMMANDS = (demo, fit, map_, effects, report, compare)

@@ -216,4 +216,4 @@ def print_verdict(result: Any) -> int:
         click.echo(f"problem: {problem}", err=True)
     for caution in verdict.cautions:
         click.echo(f"caution: {caution}", err=True)
-    return 0 if verdict.converged else NOT_CONVERGED
+    return 0 if verdict.passed else NOT_CONVERGED

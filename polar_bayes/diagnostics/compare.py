@@ -226,7 +226,7 @@ def stack_readings(result: xr.DataTree) -> xr.DataTree:
         raise FitError(
             "it holds no readings",
             where="stack_readings",
-            hint="give the tree that polar_bayes.fit or load_result returned",
+            hint="give the tree that polar_bayes.fit or load returned",
         )
     check_fit(result)
     observed = result["observed_data"].to_dataset()

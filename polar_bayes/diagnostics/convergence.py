@@ -49,54 +49,36 @@ OTHER_MODES = {
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """Whether a fit may be used."""
+    """Whether a result may be used, and what follows from it, in sentences.
 
-    converged: bool
+    Args:
+        passed: False where the numbers must not be used.
+        problems: Why it did not pass.
+        cautions: What a reader should know of a result that passed.
+        findings: What the result says.
+    """
+
+    passed: bool
     problems: tuple[str, ...]
     cautions: tuple[str, ...]
+    findings: tuple[str, ...] = ()
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Problems, cautions and findings, in this order."""
+        return self.problems + self.cautions + self.findings
 
 
 def summary(result: xr.DataTree) -> pd.DataFrame:
-    """One row per scalar parameter, numbers unrounded.
-
-    Intervals are equal-tailed. A point fit has no draws: its standard errors stand in `sd` and
-    the rest is NaN, as is the standard error of a parameter that the readings do not determine.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-
-    Returns:
-        Columns mean, sd, q2.5, q97.5 (unit of the parameter), r_hat, ess_bulk, ess_tail (unit 1)
-        and mcse_mean; the index holds labels such as `refractive_index[450]`, the material first.
-
-    Raises:
-        FitError: The tree holds no posterior.
-
-    Source:
-        Vehtari et al. (2021), Bayesian Analysis 16(2): rank-normalized split R-hat and ESS.
-    """
+    """One row per scalar parameter of a fit, as `polar_bayes.summary` returns it."""
+    # Source: Vehtari et al. (2021), Bayesian Analysis 16(2): rank-normalized split R-hat and ESS.
     found = posterior_scalars(result)
     rows = _point_rows(result, found) if method_of(result) == "point" else _draw_rows(found)
     return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index([s.label for s in found]))
 
 
 def verdict(result: xr.DataTree, table: pd.DataFrame | None = None) -> Verdict:
-    """Whether the numbers of a fit may be used, and cautions for their reader.
-
-    Sampling fails on any R-hat above 1.01, any effective sample size below 400 and any divergence;
-    every method fails on a draw that is not finite or that its prior or physics rules out, on draws
-    of a parameter that are all equal, and on a problem that the fit itself noted.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-        table: Its `summary`, if it is computed already.
-
-    Returns:
-        The verdict; its sentences name the parameter, the number and the remedy.
-
-    Raises:
-        FitError: The tree holds no posterior.
-    """
+    """Whether the numbers of a fit may be used; `table` is its summary, if computed already."""
     table = summary(result) if table is None else table
     method, provenance = method_of(result), provenance_of(result)
     found = posterior_scalars(result)
@@ -136,7 +118,7 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
             str(label): {column: _number(row[column]) for column in shown}
             for label, row in table.iterrows()
         },
-        "converged": found.converged,
+        "converged": found.passed,
         "problems": list(found.problems),
         "cautions": list(found.cautions),
         "method": method_of(result),

@@ -10,17 +10,14 @@ The schemas of calibrations and accuracy studies are in `polar_bayes.calibration
 import dataclasses
 import fnmatch
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
-from polar_bayes.capture.files import is_result, open_netcdf, read_netcdf, write_netcdf
-from polar_bayes.errors import FitError, OutputError
+from polar_bayes.errors import FitError
 from polar_bayes.inference.result import GEOMETRY, PROVENANCE, provenance_of
-from polar_bayes.paths import atomic_write, existing_file
 
 Problems = Iterator[tuple[str, str]]
 """Where a tree departs from its schema, and what is wrong there."""
@@ -372,7 +369,7 @@ _FLAGS = ("valid", "saturated", "diverging", "reached_max_treedepth")
 _OF_READINGS = Group(DRAWS, tied=True, like=Like("observed_data", {"": DRAWS}))
 FIT = Schema(
     kind="fit",
-    made_by="polar_bayes.fit or load_result",
+    made_by="polar_bayes.fit or load",
     command="`polar-bayes fit`",
     groups={
         "posterior": Group(DRAWS, required=True, tied=True),
@@ -404,68 +401,3 @@ FIT = Schema(
 def check_fit(result: xr.DataTree, source: str = "result") -> None:
     """Raise a `FitError` where a tree is no fit, or its parts do not fit together."""
     FIT.check(result, source)
-
-
-def load_result(path: str | os.PathLike[str]) -> xr.DataTree:
-    """A result from a netCDF file.
-
-    Args:
-        path: A file that `save_result` wrote.
-
-    Returns:
-        The tree, in memory; the file is closed.
-
-    Raises:
-        CaptureError: The file is not there.
-        FitError: It was damaged, or is not a result; the group and variable that is wrong.
-    """
-    return load_tree(path, FIT)
-
-
-def load_tree(path: str | os.PathLike[str], schema: Schema) -> xr.DataTree:
-    """A tree of one kind from a netCDF file, checked."""
-    file = existing_file(path, schema.kind)
-    hint = f"give the file that {schema.command} or save_result wrote"
-    broken = FitError("it cannot be read as netCDF", where=str(file), hint=hint)
-    tree = read_netcdf(xr.DataTree, file, broken)
-    if not schema.describes(tree) or PROVENANCE not in tree.attrs:
-        raise FitError(f"it holds no {schema.kind}", where=str(file), hint=hint)
-    schema.check(tree, str(file))
-    return tree
-
-
-def holds(path: str | os.PathLike[str], schema: Schema) -> bool:
-    """Whether a file holds a tree of one kind; its numbers are not read."""
-    try:
-        with open_netcdf(xr.DataTree, existing_file(path, schema.kind)) as tree:
-            return schema.describes(tree)
-    except Exception:  # the libraries below raise nearly every type for a broken file
-        return False
-
-
-def save_result(result: xr.DataTree | xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write a result to a netCDF-4 file, beside its place first and then moved there.
-
-    A checksum goes with it, which `load_result` verifies.
-
-    Args:
-        result: A tree that `polar_bayes.fit`, `calibrate` or `accuracy` returned, or a dataset of
-            another function of this package.
-        path: The file; an older one is replaced and its mode kept.
-
-    Raises:
-        FitError: It is neither, or netCDF cannot hold it.
-        OutputError: The file cannot be written, or is none that may be replaced.
-    """
-    if not isinstance(result, xr.DataTree | xr.Dataset):
-        what = f"a {type(result).__name__} is no result"
-        raise FitError(what, where="save_result", hint="give what polar_bayes.fit returned")
-    with atomic_write(path, is_result) as unfinished:
-        try:
-            write_netcdf(result, unfinished)
-        except (OSError, RuntimeError, OutputError):
-            raise
-        except Exception as error:  # xarray raises nearly every type for what it cannot encode
-            what = f"netCDF cannot hold it ({error or type(error).__name__})"
-            hint = "store numbers and text only"
-            raise FitError(what, where="save_result", hint=hint) from error

@@ -184,7 +184,7 @@ def _predict(
             raise FitError(
                 f"it has no draws of {variable} by wavelength",
                 where="predict_spectrum: result",
-                hint="give the tree that polar_bayes.fit or load_result returned",
+                hint="give the tree that polar_bayes.fit or load returned",
             )
     level = posterior[f"{name}_level"]
     leading = [dim for dim in level.dims if dim not in ("chain", "draw")]

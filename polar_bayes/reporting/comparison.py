@@ -79,7 +79,7 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     comparison = compare_fits(named)
     provenances = {name: provenance_of(fit) for name, fit in named.items()}
     verdicts = comparison.verdicts
-    failed = {name: verdict for name, verdict in verdicts.items() if not verdict.converged}
+    failed = {name: verdict for name, verdict in verdicts.items() if not verdict.passed}
     sensitivity = sensitivity_table(comparison)
     left_out = [f"{name}: {why}." if name else why for name, why in comparison.left_out.items()]
     predictions: list[page.Block] = [] if comparison.loo.empty else [loo_table(comparison)]

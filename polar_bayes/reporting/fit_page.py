@@ -100,13 +100,13 @@ class Fit(NamedTuple):
 
     def determined(self) -> list[str]:
         """Which parameters the data determine; nothing of a fit that failed."""
-        if not self.verdict.converged:
+        if not self.verdict.passed:
             return []
         return text.determined(self.scalars, self.prior, self.posterior)
 
     def headline(self) -> str:
         """The verdict in one sentence."""
-        return text.fit_headline(self.method, self.verdict.converged, self.verdict.cautions)
+        return text.fit_headline(self.method, self.verdict.passed, self.verdict.cautions)
 
 
 def read_fit(result: xr.DataTree) -> Fit:
@@ -128,7 +128,7 @@ def fit_page(result: xr.DataTree) -> page.Page:
     """The page of a fit."""
     fit = read_fit(result)
     checks = predictive_checks(result)
-    is_point, converged = fit.method == "point", fit.verdict.converged
+    is_point, converged = fit.method == "point", fit.verdict.passed
     pooled = [] if is_point else populations(result)
     summary = population_summary(result) if pooled else pd.DataFrame()
     sentences = fit.determined()
@@ -262,7 +262,7 @@ def _population(fit: Fit, summary: pd.DataFrame, pooled: Sequence[Population]) -
         pictures.append(page.make_picture(figure, alternative, caption))
     more = len(drawn) - MAX_POPULATIONS
     return [
-        *(text.pooling(summary, pooled, fit.posterior) if fit.verdict.converged else []),
+        *(text.pooling(summary, pooled, fit.posterior) if fit.verdict.passed else []),
         population_table(summary, pooled),
         *pictures,
         *([f"{more} more populations are in the table only."] if more > 0 else []),

@@ -1,5 +1,14 @@
-"""Every figure by its own function, from a saved result alone."""
+"""Every figure by its own function, from a saved result alone, and `plot` for any result."""
 
+from typing import Any
+
+import xarray as xr
+from matplotlib.figure import Figure
+
+from polar_bayes.benchmark.accuracy import is_accuracy
+from polar_bayes.calibration.files import is_calibration
+from polar_bayes.diagnostics.compare import FitComparison
+from polar_bayes.errors import FitError
 from polar_bayes.reporting.accuracy import plot_accuracy
 from polar_bayes.reporting.comparison import plot_comparison
 from polar_bayes.reporting.maps import plot_maps
@@ -14,6 +23,7 @@ from polar_bayes.reporting.plots_fit import (
 )
 
 __all__ = [
+    "plot",
     "plot_accuracy",
     "plot_calibration",
     "plot_comparison",
@@ -27,3 +37,34 @@ __all__ = [
     "plot_shrinkage",
     "plot_spectrum",
 ]
+
+
+def plot(result: Any) -> Figure:
+    """The main figure of a result.
+
+    Args:
+        result: A fit, a map, a calibration, an accuracy study, or what
+            `polar_bayes.diagnostics.compare_fits` returned.
+
+    Returns:
+        Prior and posterior of a fit; means and widths of a map; ranks of a calibration; error
+        against time of a study; intervals of compared fits.
+
+    Raises:
+        FitError: It is none of these.
+    """
+    if isinstance(result, FitComparison):
+        return plot_comparison(result)
+    if isinstance(result, xr.Dataset) and "status" in result:
+        return plot_maps(result)
+    if is_accuracy(result):
+        return plot_accuracy(result)
+    if is_calibration(result):
+        return plot_calibration(result)
+    if isinstance(result, xr.DataTree):
+        return plot_prior_posterior(result)
+    raise FitError(
+        f"there is no figure of a {type(result).__name__}",
+        where="plot",
+        hint="polar_bayes.summary has the table of every result",
+    )

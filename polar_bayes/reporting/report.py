@@ -15,7 +15,6 @@ from polar_bayes.calibration.files import is_calibration
 from polar_bayes.calibration.verdict import calibration_table, calibration_verdict
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.errors import FitError
-from polar_bayes.inference.files import save_result
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.paths import as_path
 from polar_bayes.reporting import maps, text
@@ -27,6 +26,7 @@ from polar_bayes.reporting.page import Page, Table, write_page
 from polar_bayes.reporting.plots_calibration import parameter_ranks
 from polar_bayes.reporting.style import in_default_style
 from polar_bayes.repr_html import DisplaySummary
+from polar_bayes.results import save
 
 MAX_ROWS = 40
 """Rows of a table in a notebook or a terminal."""
@@ -81,7 +81,7 @@ def report(
     page = render(result, truth=truth, uncorrected=uncorrected, beside=beside)
     files = {}
     if file := _kind_of(result).file:
-        files[file] = functools.partial(save_result, cast(xr.DataTree, result))
+        files[file] = functools.partial(save, cast(xr.DataTree, result))
     return write_page(folder, page, files)
 
 
@@ -135,7 +135,7 @@ def _fit_card(result: xr.DataTree) -> DisplaySummary:
         *(f"Caution: {caution}" for caution in fit.verdict.cautions),
         text.swapped_sentence(fit.provenance),
     ]
-    converged = fit.verdict.converged
+    converged = fit.verdict.passed
     return _make_card(fit.provenance, "fit", sentences, parameter_table(fit), converged)
 
 

@@ -393,7 +393,7 @@ CLEAR = 4.0
 
 def comparison_headline(comparison: FitComparison) -> str:
     """Which fit predicts best, or that this cannot be told."""
-    failed = [name for name, verdict in comparison.verdicts.items() if not verdict.converged]
+    failed = [name for name, verdict in comparison.verdicts.items() if not verdict.passed]
     if failed:
         return f"Do not use the numbers of {join(failed)}: read why first."
     if len(comparison.loo) < 2:

@@ -115,14 +115,14 @@ def test_the_reference_states_its_own_error(study):
 
 
 def test_a_method_that_fails_is_a_row_that_says_why(study):
-    table = pb.benchmark.accuracy_table(study)
+    table = pb.summary(study)
     assert "it cannot be" in table.loc["broken", "problems"]
     assert np.isnan(table.loc["broken", "error"])
     assert not table.loc["broken", "on_front"]
 
 
 def test_an_override_that_fails_is_a_row_that_says_why(study):
-    table = pb.benchmark.accuracy_table(study)
+    table = pb.summary(study)
     for method in ("biased", "right", "broken"):
         assert "it is rusty" in table.loc[f"{method}, stuck", "problems"]
         assert np.isnan(table.loc[f"{method}, stuck", "error"])
@@ -150,12 +150,12 @@ def test_dials_turn_what_they_can_and_leave_the_rest_out(study):
     assert ("biased", "draws / 10") in pairs
     assert ("broken", "draws / 10") not in pairs  # it has no draws
     assert ("right", "single precision") in pairs
-    table = pb.benchmark.accuracy_table(study)
+    table = pb.summary(study)
     assert table.loc["right, draws / 10", "effective_draws"] == 400
 
 
 def test_without_processes_of_their_own_first_times_and_memory_are_not_told(study):
-    table = pb.benchmark.accuracy_table(study)
+    table = pb.summary(study)
     assert table["seconds_first"].isna().all()
     assert table["peak_memory"].isna().all()
     assert (table.loc[["biased", "right"], "seconds_again"] > 0.0).all()

@@ -9,7 +9,7 @@ from polar_bayes.benchmark.advice import parameter_errors, pareto_front
 
 
 def test_the_table_has_the_worst_parameter_of_every_row():
-    table = pb.benchmark.accuracy_table(make_accuracy())
+    table = pb.summary(make_accuracy())
     assert list(table.index) == ["point", "laplace", "laplace, draws x 4", "nuts", "nuts long"]
     np.testing.assert_allclose(table["error"], [0.9, 0.4, 0.4, 0.05, 0.02])
     assert set(table["worst"]) == {"subsurface_fraction"}
@@ -86,14 +86,14 @@ def test_a_doubtful_reference_is_told_with_the_advice():
 def test_rows_without_an_answer_are_neither_advised_nor_on_the_front():
     rows = {("laplace", "as given"): ([np.nan] * 3, np.nan, np.nan)}
     study = make_accuracy(rows)
-    assert not pb.benchmark.accuracy_table(study)["on_front"].any()
+    assert not pb.summary(study)["on_front"].any()
     assert pb.benchmark.accuracy_sentences(study) == ["No method has an answer here."]
 
 
 def test_what_holds_no_study_is_refused():
     study = make_accuracy()["accuracy"].to_dataset()
     with pytest.raises(pb.FitError, match="accuracy/mean_error: it is missing; give the tree as"):
-        pb.benchmark.accuracy_table(study.drop_vars("mean_error"))
+        pb.summary(study.drop_vars("mean_error"))
 
 
 def test_a_tolerance_of_nothing_is_refused():
@@ -103,12 +103,12 @@ def test_a_tolerance_of_nothing_is_refused():
 
 def test_a_study_survives_a_file(tmp_path):
     study = make_accuracy()
-    pb.save_result(study, tmp_path / "accuracy.nc")
+    pb.save(study, tmp_path / "accuracy.nc")
     assert pb.benchmark.holds_accuracy(tmp_path / "accuracy.nc")
-    again = pb.benchmark.load_accuracy(tmp_path / "accuracy.nc")
-    assert pb.benchmark.accuracy_table(again).equals(pb.benchmark.accuracy_table(study))
+    again = pb.load(tmp_path / "accuracy.nc")
+    assert pb.summary(again).equals(pb.summary(study))
     with pytest.raises(pb.FitError, match="it holds no fit"):
-        pb.load_result(tmp_path / "accuracy.nc")
-    pb.save_result(study["accuracy"].to_dataset(), tmp_path / "other.nc")
+        pb.load(tmp_path / "accuracy.nc")
+    pb.save(study["accuracy"].to_dataset(), tmp_path / "other.nc")
     with pytest.raises(pb.FitError, match="it holds no accuracy study"):
-        pb.benchmark.load_accuracy(tmp_path / "other.nc")
+        pb.load(tmp_path / "other.nc")

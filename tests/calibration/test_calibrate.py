@@ -34,9 +34,9 @@ def test_what_is_right_passes(method: str, capture: xr.Dataset, corrected: xr.Da
     calibration = corrected
     if method != "importance":
         calibration = pb.calibrate(capture, simulations=COUNT, method=method, **ASKED)
-    table = pb.calibration.calibration_table(calibration)
+    table = pb.summary(calibration)
     assert pb.calibration.is_calibrated(table)
-    assert pb.calibration.calibration_verdict(calibration)[0].startswith("Calibrated: ")
+    assert pb.verdict(calibration).sentences[0].startswith("Calibrated: ")
     for percent in (50, 80, 95):
         share = percent / 100.0
         error = np.sqrt(share * (1.0 - share) / COUNT)
@@ -61,10 +61,10 @@ def test_what_is_right_passes(method: str, capture: xr.Dataset, corrected: xr.Da
 )
 def test_what_is_broken_on_purpose_is_caught(capture, truth, parameter) -> None:
     calibration = pb.calibrate(capture, simulations=COUNT, truth=truth, **ASKED)
-    table = pb.calibration.calibration_table(calibration)
+    table = pb.summary(calibration)
     assert not pb.calibration.is_calibrated(table)
     assert table.loc[parameter, "p_value"] < 0.025
-    verdict = pb.calibration.calibration_verdict(calibration)
+    verdict = pb.verdict(calibration).sentences
     assert verdict[0].startswith("Not calibrated: ")
     assert any(line.startswith(f"{parameter}: ") for line in verdict[1:])
 
@@ -84,10 +84,7 @@ def test_readings_of_a_right_model_pass(corrected: xr.DataTree) -> None:
     table = pb.calibration.calibration_readings(corrected)
     assert list(table.index) == ["q, fresh", "q, left out"]
     assert pb.calibration.is_calibrated(table)
-    assert (
-        "Readings (q; fresh ones and ones left out) pass"
-        in pb.calibration.calibration_verdict(corrected)[1]
-    )
+    assert "Readings (q; fresh ones and ones left out) pass" in pb.verdict(corrected).sentences[1]
     views = corrected["readings"]["q_view"].to_numpy()
     assert np.bincount(views, minlength=6).min() > 60  # all six, equally likely
 
@@ -104,7 +101,7 @@ def test_readings_see_a_wrong_noise(capture: xr.Dataset) -> None:
 def test_what_is_off_leaves_no_trace(capture: xr.Dataset, corrected: xr.DataTree) -> None:
     bare = pb.calibrate(capture, simulations=64, readings=False, **ASKED)
     assert set(bare.children) == {"prior_sbc", "truth", "marginals", "fits"}
-    assert not any("eadings" in line for line in pb.calibration.calibration_verdict(bare))
+    assert not any("eadings" in line for line in pb.verdict(bare).sentences)
     for name in bare.children:
         some = corrected[name].to_dataset().isel(simulation=slice(64))
         xr.testing.assert_identical(bare[name].to_dataset(), some)
@@ -123,12 +120,12 @@ def test_a_simulation_does_not_depend_on_how_many_there_are(capture, corrected) 
 def test_fits_that_fail_are_counted(capture: xr.Dataset) -> None:
     method = pb.methods.PixelNuts(chains=2, warmup=10, draws=50, largest_r_hat=1.01)
     calibration = pb.calibrate(capture, simulations=40, method=method, **ASKED)
-    table = pb.calibration.calibration_table(calibration)
+    table = pb.summary(calibration)
     failed = int(table["failed"].iloc[0])
     assert 0 < failed < 40
     assert (table["answered"] + table["failed"] == 40).all()
     assert (table["held_95"] <= 1.0 - failed / 40).all()
-    assert f"{failed} of 40 fits: not trusted." in pb.calibration.calibration_verdict(calibration)
+    assert f"{failed} of 40 fits: not trusted." in pb.verdict(calibration).sentences
 
 
 def test_mistakes_are_told(capture: xr.Dataset) -> None:
@@ -141,4 +138,4 @@ def test_mistakes_are_told(capture: xr.Dataset) -> None:
     with pytest.raises(pb.FitError, match="seed cannot differ"):
         pb.calibrate(capture, truth={"seed": 1}, **ASKED)
     with pytest.raises(pb.FitError, match="it holds no calibration; give the tree"):
-        pb.calibration.calibration_table(xr.DataTree())
+        pb.summary(xr.DataTree())

@@ -71,10 +71,10 @@ def test_what_cannot_be_compared_is_refused() -> None:
 
 def test_calibrations_come_back_from_files(tmp_path: Path) -> None:
     tree, fit = make_calibration(failed=(1,)), make_result(views=4, draws=20, wavelengths=())
-    pb.save_result(tree, tmp_path / "sbc.nc")
-    pb.save_result(fit, tmp_path / "fit.nc")
+    pb.save(tree, tmp_path / "sbc.nc")
+    pb.save(fit, tmp_path / "fit.nc")
     (tmp_path / "text.nc").write_text("nothing")
-    read = pb.calibration.load_calibration(tmp_path / "sbc.nc")
+    read = pb.load(tmp_path / "sbc.nc")
     xr.testing.assert_identical(read["prior_sbc"].to_dataset(), tree["prior_sbc"].to_dataset())
     assert np.isnan(read["prior_sbc"]["roughness"].to_numpy()[1])
     held = {
@@ -88,6 +88,6 @@ def test_calibrations_come_back_from_files(tmp_path: Path) -> None:
         "text": "cannot be read as netCDF",
     }.items():
         with pytest.raises(pb.FitError, match=f"{what}; give the file that `polar-bayes calibr"):
-            pb.calibration.load_calibration(tmp_path / f"{name}.nc")
+            pb.load(tmp_path / f"{name}.nc")
     with pytest.raises(pb.CaptureError, match="there is no such file"):
-        pb.calibration.load_calibration(tmp_path / "nowhere.nc")
+        pb.load(tmp_path / "nowhere.nc")

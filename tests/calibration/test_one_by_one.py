@@ -72,7 +72,7 @@ def exact(capture: xr.Dataset) -> xr.DataTree:
 
 
 def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
-    table = pb.calibration.calibration_table(exact)
+    table = pb.summary(exact)
     assert sorted(table.index) == ["level[0]", "level[1]", "level[2]", "location"]
     assert pb.calibration.is_calibrated(table)
     assert (table["answered"] == COUNT).all()
@@ -88,7 +88,7 @@ def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
 def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
     laplace, told = pb.methods.Laplace(draws=200, chains=1), {"model": population}
     asked = {"model": too_sure, "method": laplace, "truth": told, **ASKED}
-    table = pb.calibration.calibration_table(pb.calibrate(capture, simulations=40, **asked))
+    table = pb.summary(pb.calibrate(capture, simulations=40, **asked))
     assert not pb.calibration.is_calibrated(table)
     assert (table["rank_spread"].drop("location") > 1.0).all()
 
@@ -110,7 +110,7 @@ def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Datase
     assert (fits["approach"] == MethodUsed.NUTS).all()
     assert (fits["effective_draws"] < 400.0).all()
     assert np.isfinite(found["prior_sbc"]["level"]).all()
-    said = pb.calibration.calibration_verdict(found)
+    said = pb.verdict(found).sentences
     assert "20 of 20 fits: not trusted." in said
     assert any("the ranks judge the method, not the model" in sentence for sentence in said)
 
@@ -140,7 +140,7 @@ def test_fits_without_draws_are_counted(
     lost = found["fits"]["status"].to_numpy() == Status.NOT_CONVERGED
     assert 0 < lost.sum() == len(refused) < 24
     assert np.array_equal(np.isnan(found["prior_sbc"]["location"].to_numpy()), lost)
-    table = pb.calibration.calibration_table(found)
+    table = pb.summary(found)
     assert (table["failed"] == lost.sum()).all()
 
 

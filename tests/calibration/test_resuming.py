@@ -240,7 +240,7 @@ found = pb.calibrate(
     progress=lambda done, every: print(done, flush=True),
     **ASKED,
 )
-pb.save_result(found, out)
+pb.save(found, out)
 """
 
 
@@ -283,7 +283,7 @@ def test_a_killed_calibration_goes_on_to_the_bits_of_one_that_was_not(whole, tmp
         assert process.stdout is not None
         assert int(process.stdout.readline()) > 12
         assert process.wait() == 0
-    assert_same_bits(pb.calibration.load_calibration(out), whole)
+    assert_same_bits(pb.load(out), whole)
 
 
 @pytest.mark.thorough
@@ -306,5 +306,5 @@ def test_workers_of_a_cluster_make_the_same_bits(tmp_path: Path) -> None:
         ) as process,
     ):
         assert process.wait() == 0
-    whole = pb.calibration.load_calibration(tmp_path / "sbc.nc")
-    assert_same_bits(pb.calibration.load_calibration(tmp_path / "cluster.nc"), whole)
+    whole = pb.load(tmp_path / "sbc.nc")
+    assert_same_bits(pb.load(tmp_path / "cluster.nc"), whole)

@@ -31,9 +31,7 @@ def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys
     assert told.splitlines()[-1] == pb.benchmark.accuracy_sentences(make_accuracy())
     assert set(studied["rungs"]) == set(pb.methods.STUDY_METHODS)
     assert "dials" not in studied
-    assert pb.benchmark.accuracy_table(pb.benchmark.load_accuracy(out)).equals(
-        pb.benchmark.accuracy_table(make_accuracy())
-    )
+    assert pb.summary(pb.load(out)).equals(pb.summary(make_accuracy()))
     report = tmp_path / "report"
     assert main(["report", str(out), "--out", str(report)]) == 0
     assert "Error against time" in (report / "index.html").read_text()
@@ -43,7 +41,7 @@ def test_rungs_and_dials_are_chosen_and_json_is_json(plate, tmp_path, capsys, st
     words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--json", "--no-overrides"]
     assert main([*words, "--method", "laplace", "--method", "nuts", "--tolerance", "0.001"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert set(said["rows"]) == set(pb.benchmark.accuracy_table(make_accuracy()).index)
+    assert set(said["rows"]) == set(pb.summary(make_accuracy()).index)
     assert said["advice"].startswith("No method is within 0.001 sd")
     assert list(studied["methods"]) == ["laplace", "nuts"]
     assert studied["overrides"] == ()

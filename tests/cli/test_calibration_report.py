@@ -11,9 +11,9 @@ from polar_bayes.cli import main
 
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
-    pb.save_result(make_calibration(count=60), tmp_path / "sbc.nc")
+    pb.save(make_calibration(count=60), tmp_path / "sbc.nc")
     narrow = make_calibration(count=60, narrow={"roughness": 0.4}, method="laplace")
-    pb.save_result(narrow, tmp_path / "laplace.nc")
+    pb.save(narrow, tmp_path / "laplace.nc")
     return tmp_path
 
 
@@ -32,7 +32,7 @@ def test_a_mistake_gets_one_line(
 ) -> None:
     monkeypatch.chdir(files)
     (files / "other").mkdir()
-    pb.save_result(make_calibration(count=60), files / "other" / "laplace.nc")
+    pb.save(make_calibration(count=60), files / "other" / "laplace.nc")
     twice = ["--beside", "laplace.nc", "--beside", "other/laplace.nc"]
     for options, says in (
         (["nowhere.nc"], "nowhere.nc: there is no such file"),

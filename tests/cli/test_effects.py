@@ -36,7 +36,7 @@ def test_effects_as_json_are_what_a_fit_of_the_chosen_scene_keeps(
     words = ["fit", str(plate), "--choose-effects", "--tolerance", "0.2", "--method", "point"]
     assert main([*words, "--out", str(out)]) in (0, 2)
     assert "effects are kept" in capsys.readouterr().err
-    result = pb.load_result(out)
+    result = pb.load(out)
     kept = result["effects"]["kept"]
     assert {
         name: bool(row) for name, row in zip(kept["effect"].values, kept.values, strict=True)

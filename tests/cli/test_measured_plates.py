@@ -41,7 +41,7 @@ def test_a_measured_plate_from_table_to_interval(
     assert found["q97.5"] - found["q2.5"] < 0.2
     # Nothing but the surface reflects from a polished plate with an opaque back.
     assert said["parameters"]["subsurface_fraction"]["q97.5"] < 0.05
-    result = pb.load_result(fit)
+    result = pb.load(fit)
     assert "without_discrepancy" in result.children
     assert main(["report", str(fit), "--out", str(tmp_path / "report")]) == 0
     page = (tmp_path / "report" / "index.html").read_text()

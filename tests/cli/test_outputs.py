@@ -99,7 +99,7 @@ def test_a_report_is_made_again_in_its_folder_beside_what_is_there(tmp_path):
     page = pb.report(make_result(), tmp_path)
     page.chmod(0o640)
     first = digest(page)
-    pb.report(pb.load_result(tmp_path / "result.nc"), tmp_path)
+    pb.report(pb.load(tmp_path / "result.nc"), tmp_path)
     assert digest(page) == first
     assert page.stat().st_mode & 0o777 == 0o640
     assert sorted(path.name for path in tmp_path.iterdir()) == [

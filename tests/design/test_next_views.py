@@ -144,12 +144,12 @@ def test_a_fit_may_say_what_the_parameters_may_be() -> None:
 
 def test_the_choice_is_said_in_words() -> None:
     found = on_a_line(count=2)
-    assert pb.design.next_views_sentences(found)[0] == (
+    assert pb.verdict(found).sentences[0] == (
         "Look next at zenith 10, azimuth 180; then at zenith 80, azimuth 180."
     )
-    assert list(pb.design.next_views_table(found)) == ["now", "after 1", "after 2"]
+    assert list(pb.summary(found)) == ["now", "after 1", "after 2"]
     with pytest.raises(pb.FitError, match="next_views: it has no variable"):
-        pb.design.next_views_table(xr.Dataset())
+        pb.summary(xr.Dataset())
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_another_reading_can_be_added_even_at_the_ends(plate: xr.Dataset) -> Non
     assert set(found["reading"].to_numpy()) == {"intensity"}
     assert np.isfinite(found["expected_sd"]).all()
     assert (np.diff(found["criterion"]) < 0.0).all()
-    assert pb.design.next_views_sentences(found)[0].count(", intensity") == 3
+    assert pb.verdict(found).sentences[0].count(", intensity") == 3
 
 
 def test_one_wavelength_at_a_time(plate: xr.Dataset) -> None:

@@ -68,7 +68,7 @@ def test_two_readings_at_one_wavelength_keep_two_rows() -> None:
 
 def test_a_good_fit_converges_without_a_word() -> None:
     judged = verdict(make_result())
-    assert judged.converged
+    assert judged.passed
     assert judged.problems == judged.cautions == ()
 
 
@@ -77,7 +77,7 @@ def test_a_stuck_chain_is_named() -> None:
     draws = posterior_of(tree, "roughness")
     draws[0] += 5.0 * draws.std()
     judged = verdict(replace(tree, "posterior", "roughness", draws))
-    assert not judged.converged
+    assert not judged.passed
     assert any("R-hat above 1.01: roughness" in p and "sample longer" in p for p in judged.problems)
 
 
@@ -85,19 +85,19 @@ def test_a_parameter_that_never_moves_fails() -> None:
     tree = make_result(discrepancy=True)
     draws = np.full_like(posterior_of(tree, "exposure"), 0.7)
     judged = verdict(replace(tree, "posterior", "exposure", draws))
-    assert not judged.converged
+    assert not judged.passed
     assert any("exposure nan" in problem for problem in judged.problems)
 
 
 def test_chains_that_each_stand_still_fail() -> None:
     tree = make_result()
     draws = posterior_of(tree, "exposure") * 0.0 + np.arange(4.0)[:, None]
-    assert not verdict(replace(tree, "posterior", "exposure", draws)).converged
+    assert not verdict(replace(tree, "posterior", "exposure", draws)).passed
 
 
 def test_too_few_effective_draws_fail() -> None:
     judged = verdict(make_result(draws=60))
-    assert not judged.converged
+    assert not judged.passed
     assert any("ESS below 400" in p and "most_draws" in p for p in judged.problems)
 
 
@@ -125,7 +125,7 @@ def test_one_draw_that_is_not_finite_fails(method: str, bad: float) -> None:
     draws[0, 0, 1] = bad
     tree = replace(tree, "posterior", "refractive_index", draws)
     judged = verdict(tree)
-    assert not judged.converged
+    assert not judged.passed
     assert any("Not finite: refractive_index[550]" in problem for problem in judged.problems)
     assert np.isfinite(summary(tree).loc["refractive_index[650]", "mean"])
 
@@ -134,7 +134,7 @@ def test_one_draw_that_is_not_finite_fails(method: str, bad: float) -> None:
 def test_what_the_fit_noted_itself_fails(method: str) -> None:
     tree = edit_provenance(make_result(method=method), problems=["it never ended"])
     judged = verdict(tree)
-    assert not judged.converged
+    assert not judged.passed
     assert judged.problems == ("It never ended.",)
 
 
@@ -148,7 +148,7 @@ def test_what_the_fit_noted_itself_fails(method: str) -> None:
 )
 def test_cautions_do_not_fail(change: dict, words: str) -> None:
     judged = verdict(edit_provenance(make_result(), **change))
-    assert judged.converged
+    assert judged.passed
     assert any(words in caution for caution in judged.cautions)
 
 
@@ -205,7 +205,7 @@ def test_k_hat_has_the_right_sign(width: float, trusted: bool) -> None:
     # Of a normal seen through a narrower one k tends to 1 - width^2; a wider one bounds weights.
     assert k_hat == pytest.approx(1.0 - width**2, abs=0.2) if not trusted else k_hat < 0.2
     judged = verdict(tree)
-    assert judged.converged
+    assert judged.passed
     assert bool(judged.cautions) == (not trusted)
     assert trusted or "Pareto k-hat" in judged.cautions[0]
 
@@ -241,7 +241,7 @@ def test_a_point_fit_has_standard_errors_and_no_chains() -> None:
     assert np.isnan(table.loc["exposure", "sd"])
     assert table[["q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail"]].isna().all(axis=None)
     judged = verdict(tree)
-    assert judged.converged
+    assert judged.passed
     assert judged.cautions[0].startswith("No standard error: exposure;")
 
 

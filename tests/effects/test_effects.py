@@ -179,8 +179,8 @@ def test_a_fit_keeps_the_ledger(
     chosen: pb.effects.ChosenScene, plate: xr.Dataset, tmp_path
 ) -> None:
     result = pb.fit(plate, scene=chosen, links=LINKS, method=TINY)
-    pb.save_result(result, tmp_path / "fit.nc")
-    ledger = pb.load_result(tmp_path / "fit.nc")["effects"].to_dataset()
+    pb.save(result, tmp_path / "fit.nc")
+    ledger = pb.load(tmp_path / "fit.nc")["effects"].to_dataset()
     assert ledger_table(ledger).equals(ledger_table(chosen.ledger))
     assert ledger_sentences(ledger) == ledger_sentences(chosen.ledger)
     assert provenance_of(result)["scene_parts"].startswith("Scene(")

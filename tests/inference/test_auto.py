@@ -130,7 +130,7 @@ def test_the_first_rung_that_is_good_enough_is_taken():
     assert said["auto"]["chosen"] == "rung 0"
     assert said["auto"]["met"]
     assert said["method"] == "importance"
-    assert pb.verdict(result).converged
+    assert pb.verdict(result).passed
     (sentence,) = pb.inference.auto_sentences(result)
     assert "was taken: its means and standard deviations are expected within" in sentence
 
@@ -156,7 +156,7 @@ def test_a_rung_that_fails_its_own_diagnostics_is_climbed_over(rung, why):
     assert said["auto"]["chosen"] == "rung 1"
     assert why in said["auto"]["steps"][0]["why"]
     assert why in pb.inference.auto_sentences(result)[0]
-    assert pb.verdict(result).converged
+    assert pb.verdict(result).passed
 
 
 def test_too_few_draws_are_mended_by_more_of_the_same():
@@ -173,7 +173,7 @@ def test_where_nothing_is_good_enough_the_nearest_is_returned_and_flagged():
     assert not said["auto"]["met"]
     assert said["auto"]["chosen"] == "rung 1"
     judged = pb.verdict(result)
-    assert not judged.converged
+    assert not judged.passed
     assert any(
         "no method met the tolerance of 0.01" in problem.lower() for problem in judged.problems
     )

@@ -73,14 +73,14 @@ OF_FITS = (
     lambda tree: pb.diagnostics.compare_fits({"this": tree, "that": RESULTS[1]}),
 )
 OF_CALIBRATIONS = (
-    pb.calibration.calibration_table,
-    pb.calibration.calibration_verdict,
+    pb.summary,
+    pb.verdict,
     pb.calibration.calibration_readings,
     lambda tree: pb.show(tree)._repr_html_(),
     lambda tree: pb.calibration.compare_calibrations({"this": tree, "that": CALIBRATION}),
 )
 OF_STUDIES = (
-    pb.benchmark.accuracy_table,
+    pb.summary,
     pb.benchmark.accuracy_sentences,
     lambda tree: pb.show(tree)._repr_html_(),
 )
@@ -260,16 +260,16 @@ def test_other_kinds_of_tree_are_named(tmp_path):
             ):
                 function(wrong)
     with pytest.raises(pb.FitError, match="calibration: it holds no calibration; give the tree"):
-        pb.calibration.calibration_table(MANY)
-    pb.save_result(CALIBRATION, tmp_path / "sbc.nc")
+        pb.summary(MANY)
+    pb.save(CALIBRATION, tmp_path / "sbc.nc")
     with pytest.raises(pb.FitError, match=r"sbc\.nc: it holds no fit; give the file that `polar"):
-        pb.load_result(tmp_path / "sbc.nc")
+        pb.load(tmp_path / "sbc.nc")
     with pytest.raises(pb.FitError, match="a str is no result"):
-        pb.save_result("fit", tmp_path / "fit.nc")
+        pb.save("fit", tmp_path / "fit.nc")
     odd = MANY.copy()
     odd.attrs["what"] = {"a": 1}
     with pytest.raises(pb.FitError, match=r"netCDF cannot hold it \(.*\); store numbers"):
-        pb.save_result(odd, tmp_path / "fit.nc")
+        pb.save(odd, tmp_path / "fit.nc")
     with pytest.raises(pb.FitError, match="compare_fits: b: it holds no fit"):
         pb.diagnostics.compare_fits({"a": MANY, "b": CALIBRATION})
 
@@ -287,7 +287,7 @@ def test_a_tree_that_arviz_made_is_summed_up():
         }
     )
     assert list(pb.summary(tree).index) == ["mu", "tau[0]", "tau[1]", "tau[2]"]
-    assert pb.verdict(tree).converged
+    assert pb.verdict(tree).passed
     with pytest.raises(pb.FitError, match="no readings of dop to draw, for it has no observed_dat"):
         pb.plots.plot_readings(tree, "dop")
 
@@ -348,13 +348,11 @@ def test_comparisons_have_the_labels_of_the_fit():
 def test_a_file_gives_back_what_was_saved(tmp_path):
     for number, tree in enumerate((*RESULTS, CALIBRATION, make_accuracy())):
         path = tmp_path / f"{number}.nc"
-        pb.save_result(tree, path)
+        pb.save(tree, path)
         with xr.open_datatree(path, engine="netcdf4", decode_times=False) as opened:
             assert set(opened.attrs) == {"polar_bayes"}
             read = opened.load()
-        load = (pb.load_result, pb.calibration.load_calibration, pb.benchmark.load_accuracy)[
-            max(0, number - 2)
-        ]
+        load = (pb.load, pb.load, pb.load)[max(0, number - 2)]
         xr.testing.assert_identical(load(path), read)
         assert set(read.children) == set(tree.children)
 
@@ -362,27 +360,27 @@ def test_a_file_gives_back_what_was_saved(tmp_path):
 @pytest.mark.parametrize("part", ["posterior/roughness", "posterior/wavelength", "provenance"])
 def test_a_flipped_bit_is_an_error_and_no_value(tmp_path, part):
     tree = edit_provenance(RESULTS[0].copy(), model_source="x" * 80_000 + "rainy" + "x" * 80_000)
-    pb.save_result(tree, tmp_path / "fit.nc")
-    pb.load_result(tmp_path / "fit.nc")
+    pb.save(tree, tmp_path / "fit.nc")
+    pb.load(tmp_path / "fit.nc")
     content = bytearray((tmp_path / "fit.nc").read_bytes())
     found = b"rainy" if part == "provenance" else tree[part].values.tobytes()
     content[content.index(found) + 2] ^= 1
     (tmp_path / "damaged.nc").write_bytes(content)
     with pytest.raises(pb.FitError, match=r"damaged\.nc: its checksum is wrong"):
-        pb.load_result(tmp_path / "damaged.nc")
+        pb.load(tmp_path / "damaged.nc")
 
 
 def test_a_result_edited_elsewhere_has_no_checksum(tmp_path):
-    pb.save_result(RESULTS[1], tmp_path / "fit.nc")
+    pb.save(RESULTS[1], tmp_path / "fit.nc")
     with xr.open_datatree(tmp_path / "fit.nc", engine="netcdf4") as opened:
         tree = opened.load()
     del tree["prior"]
     tree.to_netcdf(tmp_path / "edited.nc", engine="netcdf4")
-    assert "prior" not in pb.load_result(tmp_path / "edited.nc").children
+    assert "prior" not in pb.load(tmp_path / "edited.nc").children
 
 
 def test_a_result_is_no_capture(tmp_path):
-    pb.save_result(RESULTS[1], tmp_path / "fit.nc")
+    pb.save(RESULTS[1], tmp_path / "fit.nc")
     with pytest.raises(pb.CaptureError, match=r"fit\.nc: view_zenith: it is missing"):
         pb.load_capture(tmp_path / "fit.nc")
 
@@ -400,7 +398,7 @@ def _with_draws(method, name, values, **provenance):
 def test_draws_that_are_all_equal_are_a_problem(method):
     kind = "nuts" if method == "nuts" else "laplace"
     judged = pb.verdict(edit_provenance(_with_draws(kind, "roughness", 0.2), method=method))
-    assert not judged.converged
+    assert not judged.passed
     assert any("All draws are equal: roughness; nothing is known" in p for p in judged.problems)
 
 
@@ -416,7 +414,7 @@ def test_draws_that_are_all_equal_are_a_problem(method):
 )
 def test_draws_that_their_prior_rules_out_are_a_problem(method, name, value, provenance, words):
     judged = pb.verdict(_with_draws(method, name, value, **provenance))
-    assert not judged.converged
+    assert not judged.passed
     problem = next(p for p in judged.problems if p.startswith("Outside its range"))
     assert re.search(words, problem)
 
@@ -425,15 +423,15 @@ def test_one_draw_beyond_the_end_is_a_problem_and_rounding_is_none():
     tree = make_result(wavelengths=())
     draws = tree["posterior"]["roughness"].to_numpy().copy()
     bounds = {"roughness": [float(draws.min()), float(draws.max())]}
-    assert pb.verdict(edit_provenance(tree, bounds=bounds)).converged
+    assert pb.verdict(edit_provenance(tree, bounds=bounds)).passed
     single = replace(tree, "posterior", "roughness", draws.astype("float32"))
-    assert pb.verdict(single).converged
+    assert pb.verdict(single).passed
     draws[0, 0] = draws.max() + 1e-4
-    assert not pb.verdict(replace(tree, "posterior", "roughness", draws)).converged
+    assert not pb.verdict(replace(tree, "posterior", "roughness", draws)).passed
 
 
 def test_a_name_that_the_users_own_model_declares_means_what_it_wants():
     tree = make_result(wavelengths=())
     tree = replace(tree, "posterior", "roughness", tree["posterior"]["roughness"].to_numpy() - 0.4)
-    assert not pb.verdict(tree).converged
-    assert pb.verdict(edit_provenance(tree, declared={"roughness": "Normal"})).converged
+    assert not pb.verdict(tree).passed
+    assert pb.verdict(edit_provenance(tree, declared={"roughness": "Normal"})).passed

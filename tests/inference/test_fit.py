@@ -63,8 +63,8 @@ def test_provenance_says_enough_to_repeat_the_fit(short: xr.DataTree, capture: x
 
 
 def test_a_result_survives_a_file(short: xr.DataTree, tmp_path) -> None:
-    pb.save_result(short, tmp_path / "fit.nc")
-    back = pb.load_result(tmp_path / "fit.nc")
+    pb.save(short, tmp_path / "fit.nc")
+    back = pb.load(tmp_path / "fit.nc")
     assert back.attrs[PROVENANCE] == short.attrs[PROVENANCE]
     for group in GROUPS:
         xr.testing.assert_identical(back[group].to_dataset(), short[group].to_dataset())
@@ -84,7 +84,7 @@ def test_another_seed_gives_other_draws(short: xr.DataTree, capture: xr.Dataset)
 
 def test_a_fit_that_is_too_short_says_so(short: xr.DataTree) -> None:
     verdict = pb.verdict(short)
-    assert not verdict.converged
+    assert not verdict.passed
     assert provenance_of(short)["goals_reached"] is False
     assert any("ESS" in problem or "effective" in problem for problem in verdict.problems)
 
@@ -182,7 +182,7 @@ def test_laplace_says_where_it_is_not_to_be_trusted(
 
     result = pb.fit(capture, model=tails, scene=PLATE, links=LINKS, method="laplace", seed=1)
     verdict = pb.verdict(result)
-    assert verdict.converged
+    assert verdict.passed
     assert any("k-hat" in caution for caution in verdict.cautions) != trusted
 
 
@@ -221,7 +221,7 @@ def test_two_views_have_a_proper_posterior() -> None:
     capture["intensity"] = ("view", [0.02, 0.06])
     links = {**LINKS, "intensity": pb.links.StudentTLink()}
     result = pb.fit(capture, scene=PLATE, links=links, method="laplace", seed=1)
-    assert pb.verdict(result).converged
+    assert pb.verdict(result).passed
     scale = result["posterior"]["intensity_scale"].to_numpy()
     prior = result["prior"]["intensity_scale"].to_numpy()
     # Two readings and a free exposure say little about their noise: within the prior's range.

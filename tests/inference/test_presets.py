@@ -17,7 +17,7 @@ COMPILER_OPTIONS = ("leaf",)
 def test_every_preset_converges(preset: str) -> None:
     result = pb.fit(pb.simulate(preset, seed=0), seed=0)
     verdict = pb.verdict(result)
-    assert verdict.converged, verdict.problems
+    assert verdict.passed, verdict.problems
     rows = pb.diagnostics.json_summary(result)["parameters"]
     assert max(row["r_hat"] for row in rows.values()) <= 1.01
     assert min(row["ess_bulk"] for row in rows.values()) >= 400.0

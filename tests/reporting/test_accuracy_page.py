@@ -46,7 +46,7 @@ def test_a_doubtful_reference_is_said_in_red():
 
 def test_the_report_lies_beside_its_file(tmp_path):
     page = pb.report(make_accuracy(), tmp_path / "report")
-    again = pb.benchmark.load_accuracy(page.parent / "accuracy.nc")
+    again = pb.load(page.parent / "accuracy.nc")
     assert page.read_text() == render(again)
     with pytest.raises(pb.FitError, match="it goes with calibrations only"):
         pb.report(make_accuracy(), tmp_path / "other", beside={})

@@ -52,7 +52,7 @@ def test_the_verdict_comes_first(page: Page, broken: xr.DataTree) -> None:
     assert "Not calibrated." in text
     assert "roughness: intervals are too narrow (p = " in text
     assert "refractive_index: the posterior is too high (p = " in text
-    table = pb.calibration.calibration_table(broken)
+    table = pb.summary(broken)
     for label in ("roughness", "refractive_index"):
         said = f"the true {label.replace('_', ' ')} in {table.loc[label, 'held_95']:.1%}"
         assert said in text
@@ -60,7 +60,7 @@ def test_the_verdict_comes_first(page: Page, broken: xr.DataTree) -> None:
 
 
 def test_every_number_of_the_table_is_the_tree_s(page: Page, good: xr.DataTree) -> None:
-    for _, row in pb.calibration.calibration_table(good).iterrows():
+    for _, row in pb.summary(good).iterrows():
         held = f"{row['held_80']:.1%} ({100 * row['held_80_low']:.1f}"
         assert held in page.text
         assert f"{row['crps']:.3g}" in page.text
@@ -173,7 +173,7 @@ def test_a_calibration_without_an_answer_has_a_page() -> None:
 def test_the_folder_holds_page_and_calibration(tmp_path: Path, broken: xr.DataTree) -> None:
     page = pb.report(broken, tmp_path / "report")
     assert sorted(path.name for path in page.parent.iterdir()) == ["calibration.nc", "index.html"]
-    read = pb.calibration.load_calibration(page.parent / "calibration.nc")
+    read = pb.load(page.parent / "calibration.nc")
     assert render(read) == page.read_text()
 
 

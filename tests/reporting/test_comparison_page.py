@@ -79,7 +79,7 @@ def test_a_report_of_several_fits_is_one_page(tmp_path: Path) -> None:
 
 def test_the_command_compares_files(tmp_path: Path, capsys) -> None:
     for name, fit in {"a": make_result(**SMALL), "b": worse(1.0)}.items():
-        pb.save_result(fit, tmp_path / f"{name}.nc")
+        pb.save(fit, tmp_path / f"{name}.nc")
     files = [str(tmp_path / "a.nc"), str(tmp_path / "b.nc")]
     assert main(["compare", *files, "--out", str(tmp_path / "both")]) == 0
     said = capsys.readouterr().out
@@ -89,7 +89,7 @@ def test_the_command_compares_files(tmp_path: Path, capsys) -> None:
 
 def test_the_command_refuses_another_capture(tmp_path: Path, capsys) -> None:
     for name, seed in (("a", 0), ("b", 1)):
-        pb.save_result(make_result(**SMALL, seed=seed), tmp_path / f"{name}.nc")
+        pb.save(make_result(**SMALL, seed=seed), tmp_path / f"{name}.nc")
     files = [str(tmp_path / "a.nc"), str(tmp_path / "b.nc")]
     assert main(["compare", *files, "--out", str(tmp_path / "both")]) == 1
     assert "it is of another capture than a" in capsys.readouterr().err

@@ -1,0 +1,233 @@
+"""What every kind of result can do: `summary`, `verdict`, `save` and `load`."""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from polar_bayes.benchmark.accuracy import STUDY
+from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences, accuracy_table
+from polar_bayes.calibration.files import CALIBRATION, check_calibration
+from polar_bayes.calibration.scores import is_calibrated
+from polar_bayes.calibration.verdict import calibration_table, calibration_verdict
+from polar_bayes.capture.files import is_result, read_netcdf, write_netcdf
+from polar_bayes.design.identify import identifiability_sentences, identifiability_table
+from polar_bayes.design.next_views import next_views_sentences, next_views_table
+from polar_bayes.design.profile import profile_sentences, profile_table
+from polar_bayes.diagnostics import convergence
+from polar_bayes.diagnostics.convergence import Verdict
+from polar_bayes.diagnostics.coverage import map_scalars
+from polar_bayes.effects.choose import ledger_sentences, ledger_table
+from polar_bayes.errors import FitError, OutputError
+from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.files import FIT, check_fit
+from polar_bayes.maps.fit_map import count_pixels
+from polar_bayes.maps.lazy import open_map
+from polar_bayes.paths import as_path, atomic_write, existing_file
+
+MIN_GOOD_SHARE = 0.95
+"""Share of the pixels read that need an answer for a map to pass."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """A kind of result: its name, how it is recognized, its table, verdict and check."""
+
+    name: str
+    applies: Callable[[Any], bool]
+    summary: Callable[[Any], pd.DataFrame]
+    verdict: Callable[[Any], Verdict]
+    check: Callable[[Any, str], None] = lambda result, source: None
+
+
+def _has(variable: str) -> Callable[[Any], bool]:
+    return lambda result: isinstance(result, xr.Dataset) and variable in result
+
+
+def _findings(sentences: Callable[[Any], list[str]]) -> Callable[[Any], Verdict]:
+    """The verdict of a result that describes and cannot fail."""
+    return lambda result: Verdict(True, (), (), tuple(sentences(result)))
+
+
+def _calibration_verdict(calibration: xr.DataTree) -> Verdict:
+    sentences = tuple(calibration_verdict(calibration))
+    passed = is_calibrated(calibration_table(calibration))
+    return Verdict(passed, () if passed else sentences, (), sentences if passed else ())
+
+
+def _accuracy_verdict(study: xr.DataTree | xr.Dataset) -> Verdict:
+    doubts = str(accuracy_dataset(study).attrs["reference_doubts"])
+    problems = (f"The reference is in doubt: {doubts}.",) if doubts else ()
+    return Verdict(not doubts, problems, (), tuple(accuracy_sentences(study)))
+
+
+def _map_summary(maps: xr.Dataset) -> pd.DataFrame:
+    """Over the good pixels: mean and sd of the posterior means, and the median posterior sd."""
+    good = (maps["status"] == Status.GOOD).to_numpy()
+    rows = {}
+    for scalar in map_scalars(maps):
+        mean, sd = (
+            np.asarray(maps[name].isel(dict(scalar.index)), float)[good]
+            for name in (scalar.name, f"{scalar.name}_sd")
+        )
+        rows[scalar.label] = (
+            (mean.mean(), mean.std(), np.median(sd)) if mean.size else (np.nan,) * 3
+        )
+    columns = ["mean", "sd_over_pixels", "median_sd"]
+    return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+
+
+def _map_verdict(maps: xr.Dataset) -> Verdict:
+    counts = count_pixels(maps)
+    total, good = sum(counts.values()), counts["good"]
+    read = total - counts["masked"]
+    passed = good > 0 and good >= MIN_GOOD_SHARE * read
+    sentence = f"{good:,} of {read:,} pixels that were read have a good posterior."
+    others = tuple(
+        f"{number:,} pixels are {status}."
+        for status, number in counts.items()
+        if number and status != "good"
+    )
+    return Verdict(passed, () if passed else (sentence,), others, (sentence,) if passed else ())
+
+
+KINDS = (
+    Kind("accuracy", STUDY.describes, accuracy_table, _accuracy_verdict, STUDY.check),
+    Kind(
+        "calibration",
+        CALIBRATION.describes,
+        calibration_table,
+        _calibration_verdict,
+        check_calibration,
+    ),
+    Kind("map", _has("status"), _map_summary, _map_verdict),
+    Kind("profile", _has("prior_beyond"), profile_table, _findings(profile_sentences)),
+    Kind(
+        "identification",
+        _has("prior_share"),
+        identifiability_table,
+        _findings(identifiability_sentences),
+    ),
+    Kind("next views", _has("interval_width"), next_views_table, _findings(next_views_sentences)),
+    Kind("effects", _has("kept"), ledger_table, _findings(ledger_sentences)),
+    Kind("fit", FIT.describes, convergence.summary, convergence.verdict, check_fit),
+)
+"""The kinds of results in the order in which they are tried."""
+
+
+def _kind_of(result: object) -> Kind:
+    """The kind of a result; what is none is taken as a fit, which refuses it with a hint."""
+    return next((kind for kind in KINDS if kind.applies(result)), KINDS[-1])
+
+
+def summary(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
+    """The table of a result of any kind, numbers unrounded.
+
+    Args:
+        result: What `polar_bayes.fit`, `fit_pixels`, `calibrate`, `accuracy`, `identify`,
+            `profile` or `next_views` returned, the `ledger` of `choose_effects`, or one of them
+            read back from a file.
+
+    Returns:
+        Of a fit: a row for each scalar parameter with mean, sd, q2.5, q97.5 (unit of the
+        parameter), r_hat, ess_bulk, ess_tail (unit 1) and mcse_mean; intervals are equal-tailed. A
+        point fit has standard errors in `sd` and NaN elsewhere. Of a map: a row for each parameter
+        over the good pixels. Of a calibration: coverage and ranks of each parameter. Of an accuracy
+        study: the errors and times of each method. Of the others: a row for each parameter, grid
+        value, view or effect.
+
+    Raises:
+        FitError: It is no result, or its parts do not fit together.
+
+    Source:
+        Vehtari et al. (2021), Bayesian Analysis 16(2): rank-normalized split R-hat and ESS.
+    """
+    return _kind_of(result).summary(result)
+
+
+def verdict(result: xr.DataTree | xr.Dataset) -> Verdict:
+    """Whether the numbers of a result of any kind may be used, and what follows from them.
+
+    A fit by sampling fails on any R-hat above 1.01, any effective sample size below 400 and any
+    divergence; every method fails on a draw that is not finite or that its prior or physics rules
+    out, on draws of a parameter that are all equal, and on a problem that the fit itself noted. A
+    calibration fails where ranks are not uniform, a map where fewer than 95% of the pixels read
+    have an answer, an accuracy study where its reference is in doubt. The other kinds describe and
+    do not fail.
+
+    Args:
+        result: As for `summary`.
+
+    Returns:
+        `passed`, and sentences: `problems`, `cautions` and `findings`.
+
+    Raises:
+        FitError: It is no result, or its parts do not fit together.
+    """
+    return _kind_of(result).verdict(result)
+
+
+def save(result: xr.DataTree | xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a result of any kind to a netCDF-4 file with a checksum, which `load` verifies.
+
+    Args:
+        result: As for `summary`.
+        path: The file; an older one is replaced when the new one is complete, and its mode kept.
+
+    Raises:
+        FitError: It is no result, or netCDF cannot hold it.
+        OutputError: The file cannot be written, or is none that may be replaced.
+    """
+    if not isinstance(result, xr.DataTree | xr.Dataset):
+        what = f"a {type(result).__name__} is no result"
+        raise FitError(what, where="save", hint="give what polar_bayes.fit returned")
+    with atomic_write(path, is_result) as unfinished:
+        try:
+            write_netcdf(result, unfinished)
+        except (OSError, RuntimeError, OutputError):
+            raise
+        except Exception as error:  # xarray raises nearly every type for what it cannot encode
+            what = f"netCDF cannot hold it ({error or type(error).__name__})"
+            raise FitError(what, where="save", hint="store numbers and text only") from error
+
+
+def load(path: str | os.PathLike[str], kind: str | None = None) -> Any:
+    """A result of any kind from the file that `save` wrote, or a map from its Zarr store.
+
+    Args:
+        path: A netCDF file, or the folder of a store (its name ends in .zarr).
+        kind: Refuse other kinds: "fit", "calibration", "accuracy", "map", "profile",
+            "identification", "next views" or "effects".
+
+    Returns:
+        A DataTree (fit, calibration, accuracy) or a Dataset, in memory and the file closed; the
+        values of a Zarr store are read when they are needed.
+
+    Raises:
+        CaptureError: The file is not there.
+        FitError: It was damaged, holds no such result, or its parts do not fit together; the group
+            and variable that is wrong.
+    """
+    wanted = kind or "result"
+    result, source = _read(path, wanted)
+    found = _kind_of(result)
+    if not found.applies(result) or kind not in (None, found.name):
+        hint = "give the file that polar_bayes.save or a command wrote"
+        raise FitError(f"it holds no {wanted}", where=source, hint=hint)
+    found.check(result, source)
+    return result
+
+
+def _read(path: str | os.PathLike[str], wanted: str) -> tuple[xr.DataTree | xr.Dataset, str]:
+    """A tree, or the dataset of a store or of a file without groups, and the path as text."""
+    if as_path(path, wanted).suffix == ".zarr":
+        return open_map(path), str(path)
+    file = existing_file(path, wanted)
+    hint = "give the file that polar_bayes.save or a command wrote"
+    broken = FitError("it cannot be read as netCDF", where=str(file), hint=hint)
+    tree = read_netcdf(xr.DataTree, file, broken)
+    return (tree if tree.children else tree.to_dataset()), str(file)
