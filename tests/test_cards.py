@@ -3,6 +3,7 @@
 import dataclasses
 
 import pytest
+from cases import each
 from pages import EVIL, Page
 
 import polar_bayes as pb
@@ -22,7 +23,7 @@ VALUES = {
 }
 
 
-@pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
+@each("value", VALUES.values(), ids=VALUES)
 def test_a_card_is_balanced_html_and_runs_nothing(value) -> None:
     page = Page(value._repr_html_())
     assert page.open == []

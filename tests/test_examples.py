@@ -21,6 +21,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from test_architecture import LAYERS
 
 import polar_bayes as pb
@@ -47,7 +48,7 @@ CHANGED = (
     "jax_persistent_cache_min_entry_size_bytes",
 )
 
-of_every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+of_every_page = each("page", PAGES, ids=lambda page: page.name)
 
 
 def blocks(page: Path, language: str) -> Iterator[tuple[int, str]]:
@@ -114,7 +115,7 @@ def settings_of_jax() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("settings_of_jax")
-@pytest.mark.parametrize(
+@each(
     "page",
     [page for page in PAGES if any(blocks(page, "python"))],
     ids=lambda page: page.name,
@@ -220,7 +221,7 @@ def anchors(page: Path) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("page", [README, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.name)
+@each("page", [README, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.name)
 def test_the_links_of_a_page_lead_somewhere(page: Path) -> None:
     """Those of the site are resolved when it is built (tests/docs)."""
     for target in re.findall(r"\]\(([^)\s]+)\)", CODE.sub("", prose(page))):

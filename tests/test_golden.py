@@ -17,6 +17,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 
 import polar_bayes as pb
 
@@ -196,7 +197,7 @@ def differences(case: str, found: dict, stored: dict) -> list[str]:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("case", CASES)
+@each("case", CASES)
 def test_results_are_as_before(case):
     assert not differences(case, CASES[case](), json.loads(STORED.read_text())[case])
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from cases import each
 from numpyro import distributions as dist
 from numpyro.distributions import biject_to
 
@@ -30,7 +31,7 @@ def value_in_digits(z: float) -> mpmath.mpf:
         return high
 
 
-@pytest.mark.parametrize(
+@each(
     ("z", "dtype"),
     [(z, dtype) for z in SCORES for dtype in (np.float64, np.float32) if abs(z) < REACH[dtype]],
 )
@@ -47,8 +48,8 @@ def test_values_and_slopes_agree_with_fifty_digits(z: float, dtype: type) -> Non
     assert float(jax.grad(folded)(jnp.asarray(given))) == pytest.approx(float(slope), rel=allowed)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("z", [*SCORES, *FAR])
+@each("dtype", [np.float64, np.float32])
+@each("z", [*SCORES, *FAR])
 def test_what_is_far_out_is_finite_and_comes_back(z: float, dtype: type) -> None:
     """Value, gradient and Hessian of the density of a score; where the value is not yet zero."""
     move = biject_to(HalfNormal(SCALE).support)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import each
 from plates import plate_capture
 
 import polar_bayes as pb
@@ -55,9 +56,7 @@ def test_a_device_or_pipe_is_not_replaced(capture, tmp_path):
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
-@pytest.mark.parametrize(
-    "content", [b"angle,s,p\n1,2,3\n", b"\x89PNG\r\n", b"\x89HDF\r\n\x1a\n..."]
-)
+@each("content", [b"angle,s,p\n1,2,3\n", b"\x89PNG\r\n", b"\x89HDF\r\n\x1a\n..."])
 def test_a_file_of_another_kind_is_not_replaced(capture, tmp_path, content):
     file = tmp_path / "mine"
     file.write_bytes(content)

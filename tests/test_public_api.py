@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from cases import each
 
 import polar_bayes as pb
 
@@ -27,7 +28,7 @@ def run(code):
 # --- names ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", pb.__all__)
+@each("name", pb.__all__)
 def test_every_public_name_loads_and_says_what_it_is(name):
     thing = getattr(pb, name)
     if callable(thing):
@@ -164,7 +165,7 @@ assert program.potential_energy is numpyro.infer.util.potential_energy  # there 
 """
 
 
-@pytest.mark.parametrize(
+@each(
     "imports",
     [
         "import arviz, polar_bayes",

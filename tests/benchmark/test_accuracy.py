@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from toy_models import capture, line, of_line, squared
 
 import polar_bayes as pb
@@ -254,7 +255,7 @@ def test_the_tempered_reference_draws_what_its_own_error_takes():
     assert settings.crowd == 8192
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "said"),
     [
         ({"rungs": {}}, "there is no rung"),

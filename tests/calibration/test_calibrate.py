@@ -4,6 +4,7 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture
 from polar_bayes.models.per_material import per_material
@@ -28,7 +29,7 @@ def corrected(capture: xr.Dataset) -> xr.DataTree:
     return pb.calibrate(capture, simulations=COUNT, **ASKED)
 
 
-@pytest.mark.parametrize("method", ["importance", "tempered", "nuts"])
+@each("method", ["importance", "tempered", "nuts"])
 def test_what_is_right_passes(method: str, capture: xr.Dataset, corrected: xr.DataTree) -> None:
     """At a rate of false alarms of 5%, with a fixed seed; intervals within 3.3 standard errors."""
     calibration = corrected
@@ -44,7 +45,7 @@ def test_what_is_right_passes(method: str, capture: xr.Dataset, corrected: xr.Da
     assert (table["failed"] <= 3).all()  # chains that did not mix say so, and count as misses
 
 
-@pytest.mark.parametrize(
+@each(
     ("truth", "parameter"),
     [
         ({"priors": {"refractive_index": dist.Uniform(1.2, 2.0)}}, "refractive_index"),

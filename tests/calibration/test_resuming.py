@@ -14,6 +14,7 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture
 from polar_bayes.models.per_material import per_material
@@ -125,7 +126,7 @@ def test_a_damaged_block_is_fitted_again(capture, whole, begun, tmp_path) -> Non
     assert_same_bits(found, whole)
 
 
-@pytest.mark.parametrize(
+@each(
     ("other", "topic"),
     [
         ({"seed": 1}, "seed"),

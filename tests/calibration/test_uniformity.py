@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from cases import each
 from scipy import stats
 
 from polar_bayes.calibration.scores import uniformity
 
 
-@pytest.mark.parametrize("count", [50, 300, 1000])
+@each("count", [50, 300, 1000])
 def test_false_alarms_are_as_many_as_the_level_says(count: int) -> None:
     random = np.random.default_rng(count)
     p_values = np.array([uniformity(random.random(count)).p_value for _ in range(600)])
@@ -18,7 +19,7 @@ def test_false_alarms_are_as_many_as_the_level_says(count: int) -> None:
         assert alarms <= stats.binom.ppf(0.9999, 600, level)
 
 
-@pytest.mark.parametrize(
+@each(
     ("shape", "is_low", "is_narrow"),
     [((0.8, 1.2), False, None), ((1.2, 0.8), True, None), ((0.8, 0.8), None, True)],
 )

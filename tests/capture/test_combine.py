@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 
 from polar_bayes.capture.combine import combine
 from polar_bayes.capture.files import load_capture, save_capture
@@ -29,8 +30,8 @@ def pair(make_capture):
     }
 
 
-@pytest.mark.parametrize("dim", ["material", "patch"])
-@pytest.mark.parametrize("spectral", [False, True])
+@each("dim", ["material", "patch"])
+@each("spectral", [False, True])
 def test_every_number_comes_through_and_the_rest_is_not_valid(make_capture, dim, spectral):
     pair = {
         "glass": validate(make_capture(spectral=spectral)),
@@ -163,12 +164,12 @@ def test_the_measured_plates_combine(measured):
 # --- what does not fit --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dim", ["y", "view", "wavelength", "sample", None])
+@each("dim", ["y", "view", "wavelength", "sample", None])
 def test_another_dim_is_refused(pair, dim):
     assert "give 'material' or 'patch'" in refused(pair, "dim=", dim=dim)
 
 
-@pytest.mark.parametrize("captures", [{}, [], None, "glass.nc"])
+@each("captures", [{}, [], None, "glass.nc"])
 def test_nothing_to_combine_is_refused(captures):
     assert "give a mapping such as {'glass'" in refused(captures, "there is nothing to combine")
 
@@ -177,7 +178,7 @@ def test_a_label_is_text(pair):
     assert "name every capture" in refused({1: pair["glass"]}, "combine: 1 is no label")
 
 
-@pytest.mark.parametrize("leading", [("material",), ("patch",), ("y", "x")], ids=str)
+@each("leading", [("material",), ("patch",), ("y", "x")], ids=str)
 def test_a_capture_of_several_is_refused(make_capture, leading):
     several = {"leaf": make_capture(), "oak": make_capture(*leading)}
     message = refused(several, f"combine: oak: it has the dim {leading[0]} already")
@@ -189,7 +190,7 @@ def test_an_invalid_capture_is_named(pair):
     assert refused(pair, "7 is outside").startswith("combine: plexiglas: dop[view=2]: ")
 
 
-@pytest.mark.parametrize("lacks", ["glass", "plexiglas"])
+@each("lacks", ["glass", "plexiglas"])
 def test_readings_must_be_the_same(pair, lacks):
     other = next(label for label in pair if label != lacks)
     pair[lacks] = pair[lacks].drop_vars(["intensity", "intensity_error"])

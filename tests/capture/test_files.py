@@ -9,6 +9,7 @@ import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 
 from polar_bayes.capture.files import load_capture, save_capture
 from polar_bayes.capture.schema import LEADING, validate
@@ -22,8 +23,8 @@ def assert_same(left, right):
         assert left[name].dtype == right[name].dtype
 
 
-@pytest.mark.parametrize("leading", LEADING, ids=str)
-@pytest.mark.parametrize("spectral", [False, True])
+@each("leading", LEADING, ids=str)
+@each("spectral", [False, True])
 def test_a_round_trip_is_identical(make_capture, tmp_path, leading, spectral):
     capture = validate(make_capture(*leading, spectral=spectral))
     save_capture(capture, tmp_path / "leaf.nc")
@@ -58,7 +59,7 @@ def test_a_loaded_capture_needs_its_file_no_more(make_capture, tmp_path):
     assert np.isfinite(capture["dop"].values).all()
 
 
-@pytest.mark.parametrize("name", ["a b.nc", "x#mode=zarr.nc", "<script>.nc", "http:", "Öl\n.nc"])
+@each("name", ["a b.nc", "x#mode=zarr.nc", "<script>.nc", "http:", "Öl\n.nc"])
 def test_odd_file_names_are_file_names(make_capture, tmp_path, name):
     save_capture(make_capture(), tmp_path / name)
     assert_same(load_capture(tmp_path / name), validate(make_capture()))
@@ -164,7 +165,7 @@ def test_wrong_packing_is_a_clear_error(foreign):
 # --- files that cannot be read or written -----------------------------------------------------
 
 
-@pytest.mark.parametrize("path", [None, 3, "", "a\0b", b"leaf.nc"])
+@each("path", [None, 3, "", "a\0b", b"leaf.nc"])
 def test_what_is_no_path_is_refused(make_capture, path):
     with pytest.raises(CaptureError, match=r"capture: .* is not a path; give the path of a file"):
         load_capture(path)
@@ -184,7 +185,7 @@ def test_files_that_are_not_there_or_empty_are_named(tmp_path):
         load_capture(tmp_path / ("x" * 300))
 
 
-@pytest.mark.parametrize("content", [b"view,dop\n1,2\n", b"\x89HDF\r\n\x1a\n", b"CDF\x01", b"PK"])
+@each("content", [b"view,dop\n1,2\n", b"\x89HDF\r\n\x1a\n", b"CDF\x01", b"PK"])
 def test_what_is_not_netcdf_is_refused(tmp_path, content):
     path = tmp_path / "leaf.nc"
     path.write_bytes(content)
@@ -231,9 +232,7 @@ def flip(path, found, at=3):
     return damaged
 
 
-@pytest.mark.parametrize(
-    "part", ["dop", "view_zenith", "valid", "wavelength", "true_exposure", "patch", "note"]
-)
+@each("part", ["dop", "view_zenith", "valid", "wavelength", "true_exposure", "patch", "note"])
 def test_a_flipped_bit_is_an_error_and_no_value(make_capture, tmp_path, part):
     random = np.random.default_rng(0)
     capture = make_capture("patch", spectral=True).assign(true_exposure=((), 1.2345678901))
@@ -267,7 +266,7 @@ def test_a_file_edited_elsewhere_has_no_checksum(make_capture, tmp_path):
     assert load_capture(tmp_path / "leaf.nc")["dop"][0] == 0.5
 
 
-@pytest.mark.parametrize(
+@each(
     ("damage", "what"),
     [
         (lambda content: content[:-1], "its checksum is wrong"),
@@ -291,7 +290,7 @@ def test_what_is_no_capture_is_not_written(make_capture, tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("HDF")])
+@each("error", [OSError(28, "No space left on device"), RuntimeError("HDF")])
 def test_a_failed_write_leaves_the_older_capture(make_capture, tmp_path, monkeypatch, error):
     path = tmp_path / "leaf.nc"
     save_capture(make_capture(seed=1), path)

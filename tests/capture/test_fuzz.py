@@ -7,6 +7,7 @@ library itself may hang on a flipped bit of its structure, which no reader above
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from mutations import (
     ODD_ATTRIBUTES,
     ODD_NUMBERS,
@@ -39,7 +40,7 @@ def outcome(function, *arguments, **options):
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate dimension names", "ignore:.*rename", "ignore:.*cast")
-@pytest.mark.parametrize("seed", range(8))
+@each("seed", range(8))
 def test_a_damaged_capture_is_refused_or_inside_the_contract(make_capture, tmp_path, seed):
     random = np.random.default_rng([1, seed])
     passed = 0
@@ -62,7 +63,7 @@ def test_a_damaged_capture_is_refused_or_inside_the_contract(make_capture, tmp_p
 # --- damaged tables ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(4))
+@each("seed", range(4))
 def test_a_damaged_table_is_refused_or_all_numbers(tmp_path, seed):
     random = np.random.default_rng([2, seed])
     path = tmp_path / "table.txt"
@@ -88,7 +89,7 @@ def test_a_damaged_table_is_refused_or_all_numbers(tmp_path, seed):
     assert 100 < passed < 400
 
 
-@pytest.mark.parametrize("seed", range(4))
+@each("seed", range(4))
 def test_odd_readings_are_refused_or_inside_the_contract(seed):
     random = np.random.default_rng([3, seed])
     passed = 0
@@ -119,7 +120,7 @@ def test_odd_readings_are_refused_or_inside_the_contract(seed):
 # --- damaged files ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("format", ["NETCDF4", "NETCDF3_64BIT"])
+@each("format", ["NETCDF4", "NETCDF3_64BIT"])
 def test_a_file_cut_short_is_refused(make_capture, tmp_path, format):
     whole = tmp_path / "whole.nc"
     validate(make_capture("patch", spectral=True)).to_netcdf(whole, format=format)
@@ -145,7 +146,7 @@ FRAMES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", range(2))
+@each("seed", range(2))
 def test_a_damaged_header_is_refused_or_of_the_same_size(tmp_path, seed):
     random = np.random.default_rng([4, seed])
     passed = 0
@@ -170,7 +171,7 @@ def test_a_damaged_header_is_refused_or_of_the_same_size(tmp_path, seed):
     assert 5 < passed < 300
 
 
-@pytest.mark.parametrize("frame", FRAMES, ids=str)
+@each("frame", FRAMES, ids=str)
 def test_a_whole_npy_file_is_read_as_it_was_saved(tmp_path, frame):
     np.save(tmp_path / "frame.npy", frame)
     found = read_array(tmp_path / "frame.npy", "frame")
@@ -178,7 +179,7 @@ def test_a_whole_npy_file_is_read_as_it_was_saved(tmp_path, frame):
     np.testing.assert_array_equal(found, frame, strict=True)
 
 
-@pytest.mark.parametrize(
+@each(
     ("shape", "what"),
     [
         ("(1000000000000, 8)", "cannot be read"),

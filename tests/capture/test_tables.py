@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.capture import table_reader
 from polar_bayes.capture.table_reader import read_table
@@ -43,7 +44,7 @@ SAME_TABLE = {
 }
 
 
-@pytest.mark.parametrize("form", SAME_TABLE)
+@each("form", SAME_TABLE)
 def test_every_form_of_a_table_is_read_alike(write, form):
     table = read_table(write(SAME_TABLE[form]))
     assert table.names == ("angle", "level")
@@ -105,7 +106,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("content", "what", "hint"), REFUSED)
+@each(("content", "what", "hint"), REFUSED)
 def test_a_slip_is_named_with_its_line(write, content, what, hint):
     with pytest.raises(CaptureError, match=r"table\.txt: " + re.escape(what)) as caught:
         read_table(write(content))
@@ -150,7 +151,7 @@ def test_a_long_table_is_read_in_reasonable_time(write):
     assert table.columns["level"].shape == (rows,)
 
 
-@pytest.mark.parametrize("name", ["s1.txt", "p1.txt"])
+@each("name", ["s1.txt", "p1.txt"])
 def test_a_measured_table_is_read(measured, name):
     table = read_table(measured / "glass_fresnel" / name)
     assert table.names == ("column_1", "column_2")

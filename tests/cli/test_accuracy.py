@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from cases import each
 from synthetic_accuracy import make_accuracy
 
 import polar_bayes as pb
@@ -53,7 +54,7 @@ def test_a_rung_that_is_not_there_is_refused(plate, tmp_path, capsys):
     assert "rung='magic': no such rung; give one of point, laplace" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
+@each(
     ("words", "said"),
     [
         (["--tolerance", "0.1"], "--tolerance needs --choose-effects or --method auto"),

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from cases import each
 
 import polar_bayes as pb
 from polar_bayes.cli import main
@@ -116,7 +117,7 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("mistake", WRONG)
+@each("mistake", WRONG)
 def test_a_mistake_gets_one_line_and_exit_status_1(
     mistake: str, plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:

@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import pytest
+from cases import each
 from plate_images import plate_image
 
 import polar_bayes as pb
@@ -89,7 +90,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc to see h
 
 
 @linux
-@pytest.mark.parametrize("number", BOTH)
+@each("number", BOTH)
 def test_a_signal_ends_a_fit_that_imports_or_compiles(
     plate: Path, tmp_path: Path, number: int
 ) -> None:
@@ -109,9 +110,9 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @linux
 @pytest.mark.thorough
-@pytest.mark.parametrize("number", BOTH)
-@pytest.mark.parametrize("moment", [0.0, 2.0, 10.0, 40.0])
-@pytest.mark.parametrize("name", ["fit", "map", "calibrate"])
+@each("number", BOTH)
+@each("moment", [0.0, 2.0, 10.0, 40.0])
+@each("name", ["fit", "map", "calibrate"])
 def test_a_signal_ends_every_long_command_at_any_moment(
     plate: Path, image: Path, tmp_path: Path, name: str, moment: float, number: int
 ) -> None:
@@ -205,7 +206,7 @@ def hanging(limit: float) -> str:
     """
 
 
-@pytest.mark.parametrize("number", BOTH)
+@each("number", BOTH)
 def test_a_second_signal_ends_at_once_what_hangs_while_it_cleans_up(
     tmp_path: Path, number: int
 ) -> None:

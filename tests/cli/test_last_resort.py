@@ -8,6 +8,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from cases import each
 
 import polar_bayes as pb
 from polar_bayes.cli import main
@@ -40,8 +41,8 @@ ERRORS = {
 }
 
 
-@pytest.mark.parametrize("name", ERRORS)
-@pytest.mark.parametrize("traced", ["", "1"])
+@each("name", ERRORS)
+@each("traced", ["", "1"])
 def test_an_error_that_no_command_expects_is_one_line(
     name: str,
     traced: str,

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pictures
 import pytest
+from cases import each
 from pictures import BALL, LAMP
 
 import polar_bayes as pb
@@ -88,7 +89,7 @@ def rim() -> np.ndarray:
     return np.stack([row, BALL.column + BALL.radius * np.cos(around)], axis=-1)
 
 
-@pytest.mark.parametrize(
+@each(
     ("words", "said"),
     [
         ([*LIGHT], "give one of --sphere or --rim, --normals"),

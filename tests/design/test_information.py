@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from numpyro import distributions as dist
 
 import polar_bayes as pb
@@ -35,7 +36,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@each("case", CASES)
 def test_it_is_the_mean_square_of_scores(case: str) -> None:
     make, at = CASES[case]
     given = jnp.asarray(at)
@@ -50,7 +51,7 @@ def test_it_is_the_mean_square_of_scores(case: str) -> None:
     assert (np.abs(products.mean(axis=0) - told.information) < slack).all()
 
 
-@pytest.mark.parametrize("location", [0.95, 1.0, 1.05])
+@each("location", [0.95, 1.0, 1.05])
 def test_a_saturated_reading_tells_less(location: float) -> None:
     """Readings are stopped at 1: simulated as the sensor does, the flag set where it stopped."""
     given = jnp.asarray([location, 0.05])

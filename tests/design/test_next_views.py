@@ -6,6 +6,7 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
+from cases import each
 from design_lines import (
     ASKED,
     NOISE,
@@ -47,9 +48,7 @@ def test_a_line_is_best_seen_from_its_ends() -> None:
         np.testing.assert_allclose(row["interval_width"], 3.92 * row["expected_sd"], rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    "criterion", [pb.DOptimal(), pb.AOptimal(), pb.SingleParameter("level")], ids=repr
-)
+@each("criterion", [pb.DOptimal(), pb.AOptimal(), pb.SingleParameter("level")], ids=repr)
 def test_no_other_choice_is_better(criterion: pb.DOptimal) -> None:
     """Against all choices of three of eight, where greedy steps with exchange find the best."""
     base, rows = np.linalg.inv(np.cov(rows_of(START).T) + np.eye(2)), rows_of(GRID)
@@ -148,7 +147,7 @@ def test_the_choice_is_said_in_words() -> None:
         pb.next_views_table(xr.Dataset())
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "match"),
     [
         ({"count": 0}, "give whole numbers of at least 1"),

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from design_lines import ASKED, NOISE, PRIOR, line, line_capture, precision_of, rows_of
 
 import polar_bayes as pb
@@ -28,7 +29,7 @@ def closed_form(capture, theta, weight):
     return height - 0.5 * weight * (level**2 + theta**2) / PRIOR**2, level
 
 
-@pytest.mark.parametrize(("kind", "weight"), [("posterior", 1.0), ("likelihood", FAINT)])
+@each(("kind", "weight"), [("posterior", 1.0), ("likelihood", FAINT)])
 def test_the_profile_of_a_line_is_its_parabola(slope: xr.Dataset, kind: str, weight: float) -> None:
     theta = slope["value"].to_numpy()
     height, level = closed_form(line_capture(ZENITHS), theta, weight)
@@ -81,7 +82,7 @@ def test_a_gap_is_left_out_and_counted(slope: xr.Dataset) -> None:
     )
 
 
-@pytest.mark.parametrize(
+@each(
     ("value", "expected"),
     [
         ([-3.84, 0.0, -3.84], (0.5, 1.5, False, False)),

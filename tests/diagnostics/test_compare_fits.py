@@ -4,6 +4,7 @@ import arviz_stats
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from synthetic_results import make_result, replace
 
 import polar_bayes as pb
@@ -85,7 +86,7 @@ def test_other_views_or_variables_are_not_compared_by_predictions() -> None:
     assert "They predict different readings" in compared.left_out[""]
 
 
-@pytest.mark.parametrize("fits", [{}, {"a": make_result(**SMALL)}, None])
+@each("fits", [{}, {"a": make_result(**SMALL)}, None])
 def test_one_fit_is_not_compared(fits) -> None:
     with pytest.raises(FitError, match="there is nothing to compare"):
         pb.compare_fits(fits)

@@ -7,6 +7,7 @@ import arviz_stats
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from scipy import stats
 from synthetic_results import edit_provenance, make_result, replace
 
@@ -117,8 +118,8 @@ def test_one_divergence_fails() -> None:
     assert "target_acceptance" in judged.problems[0]
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@each("method", ["nuts", "laplace", "point"])
+@each("bad", [np.nan, np.inf])
 def test_one_draw_that_is_not_finite_fails(method: str, bad: float) -> None:
     tree = make_result(method=method)
     draws = posterior_of(tree, "refractive_index")
@@ -130,7 +131,7 @@ def test_one_draw_that_is_not_finite_fails(method: str, bad: float) -> None:
     assert np.isfinite(summary(tree).loc["refractive_index[650]", "mean"])
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
+@each("method", ["nuts", "laplace", "point"])
 def test_what_the_fit_noted_itself_fails(method: str) -> None:
     tree = edit_provenance(make_result(method=method), problems=["it never ended"])
     judged = verdict(tree)
@@ -138,7 +139,7 @@ def test_what_the_fit_noted_itself_fails(method: str) -> None:
     assert judged.problems == ("It never ended.",)
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "words"),
     [
         ({"modes": {"weights": [0.9, 0.1]}}, "another mode, of weight 0.1"),
@@ -152,7 +153,7 @@ def test_cautions_do_not_fail(change: dict, words: str) -> None:
     assert any(words in caution for caution in judged.cautions)
 
 
-@pytest.mark.parametrize(
+@each(
     ("method", "words"),
     [
         ("laplace", "only the heaviest is described here; use method='nuts'"),
@@ -195,7 +196,7 @@ def laplace_tree(log_weight: np.ndarray) -> xr.DataTree:
     return replace(tree, "sample_stats", "log_weight", log_weight)
 
 
-@pytest.mark.parametrize(("width", "trusted"), [(0.3, False), (2.0, True)])
+@each(("width", "trusted"), [(0.3, False), (2.0, True)])
 def test_k_hat_has_the_right_sign(width: float, trusted: bool) -> None:
     """A standard normal: draws from a narrower one have unbounded weights, from a wider not."""
     z = np.random.default_rng(3).normal(0.0, width, (4, 1000))
@@ -219,9 +220,7 @@ def test_a_guide_is_judged_by_its_weights_as_laplace_is() -> None:
     assert not verdict(edit_provenance(tree, method="tempered")).cautions
 
 
-@pytest.mark.parametrize(
-    ("value", "cautious"), [(0.0, False), (np.nan, True), (np.inf, True), (-np.inf, True)]
-)
+@each(("value", "cautious"), [(0.0, False), (np.nan, True), (np.inf, True), (-np.inf, True)])
 def test_k_hat_of_weights_that_are_all_alike(value: float, cautious: bool) -> None:
     judged = verdict(laplace_tree(np.full((4, 1000), value)))
     assert bool(judged.cautions) == cautious
@@ -245,7 +244,7 @@ def test_a_point_fit_has_standard_errors_and_no_chains() -> None:
     assert judged.cautions[0].startswith("No standard error: exposure;")
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
+@each("method", ["nuts", "laplace", "point"])
 def test_json_is_valid_json(method: str) -> None:
     tree = make_result(method=method)
     said = json.loads(json.dumps(json_summary(tree), allow_nan=False))
@@ -273,7 +272,7 @@ def test_a_file_gives_the_same_table(tmp_path) -> None:
     assert verdict(read) == verdict(tree)
 
 
-@pytest.mark.parametrize("wrong", [xr.DataTree(), "fit.nc", None])
+@each("wrong", [xr.DataTree(), "fit.nc", None])
 def test_what_is_no_result_is_refused(wrong: object) -> None:
     with pytest.raises(FitError, match="result: it holds no fit; give the tree"):
         summary(wrong)

@@ -4,6 +4,7 @@ import arviz_stats
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from scipy import stats
 from synthetic_results import SCALE, make_result, replace
 
@@ -30,7 +31,7 @@ def test_pooled_pit_of_calibrated_fits_is_uniform() -> None:
     assert stats.kstest(values, "uniform").pvalue > 1e-3
 
 
-@pytest.mark.parametrize(("noise", "first_side"), [(3.0, "above"), (0.25, "below")])
+@each(("noise", "first_side"), [(3.0, "above"), (0.25, "below")])
 def test_readings_that_scatter_otherwise_leave_the_band(noise: float, first_side: str) -> None:
     check = predictive_checks(make_result(noise=noise))["dop"]
     band = pit_band(check.loo.pit)
@@ -96,7 +97,7 @@ def test_unsaturated_readings_are_compared_with_unsaturated_predictions() -> Non
     np.testing.assert_allclose(predictive_checks(tree)["intensity"].pit, 0.5, atol=0.15)
 
 
-@pytest.mark.parametrize("views", [2, 3, 5, 20])
+@each("views", [2, 3, 5, 20])
 def test_few_readings(views: int) -> None:
     checks = predictive_checks(make_result(wavelengths=(), views=views))
     for check in checks.values():

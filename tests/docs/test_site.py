@@ -19,6 +19,7 @@ import nbformat
 import pytest
 from browsers import WIDTHS, browser, console, open_page, sideways
 from bs4 import BeautifulSoup
+from cases import each
 from nbclient import NotebookClient
 
 import polar_bayes as pb
@@ -34,7 +35,7 @@ def executed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("notebooks")
 
 
-@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda source: source.stem)
+@each("source", NOTEBOOKS, ids=lambda source: source.stem)
 def test_a_notebook_runs_without_a_warning(
     source: Path,
     executed: Path,
@@ -131,7 +132,7 @@ class Quiet(SimpleHTTPRequestHandler):
         """Say nothing."""
 
 
-@pytest.mark.parametrize("width", WIDTHS)
+@each("width", WIDTHS)
 def test_pages_fit_the_window_and_raise_no_error(
     site: Path, address: str, tmp_path: Path, width: int
 ) -> None:

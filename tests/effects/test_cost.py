@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 import polar_bayes as pb
 from polar_bayes.effects.compare_scenes import compile_and_count, run_seconds
@@ -150,7 +151,7 @@ def test_a_scene_with_everything_off_is_the_bare_formula_and_nothing_else(plain:
     assert plain == pytest.approx(operations(by_hand, PLAIN.parameters), rel=SAME)
 
 
-@pytest.mark.parametrize("name", ON)
+@each("name", ON)
 def test_an_effect_costs_when_it_is_on_and_leaves_nothing_when_it_is_off(
     name: str, plain: float
 ) -> None:

@@ -7,6 +7,7 @@ import linear
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plates import LINKS, plate_capture
 from synthetic_results import make_result
 
@@ -132,7 +133,7 @@ def test_a_parameter_that_the_user_names_is_not_given_up(q: np.ndarray) -> None:
     assert "it leaves nothing to judge" in choice.ledger["reason"].sel(effect="DarkLevel").item()
 
 
-@pytest.mark.parametrize(
+@each(
     ("options", "message"),
     [
         ({"keep": "Fog"}, "keep='Fog': the scene has no such effect; give one of AngleZero"),

@@ -4,6 +4,7 @@ import dataclasses
 from typing import ClassVar, override
 
 import pytest
+from cases import each
 
 import polar_bayes as pb
 from polar_bayes.effects.variants import effects_of, find_effects, parts_of, simplify
@@ -113,7 +114,7 @@ def test_a_part_and_what_is_inside_it_go_together() -> None:
     )
 
 
-@pytest.mark.parametrize("scene", [ROUGH, *FULL_SCENES.values()])
+@each("scene", [ROUGH, *FULL_SCENES.values()])
 def test_no_two_effects_share_a_name_or_a_scene(scene: pb.Scene) -> None:
     effects = effects_of(scene)
     assert len({effect.name for effect in effects}) == len(effects)
@@ -134,7 +135,7 @@ def test_a_replacement_that_does_not_fit_is_refused() -> None:
         effects_of(pb.Scene(pb.RoughSurface(shadowing=Mistaken())))
 
 
-@pytest.mark.parametrize(
+@each(
     ("word", "found"),
     [
         ("AngleZero", ["AngleZero"]),

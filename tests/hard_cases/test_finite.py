@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from cases import each
 from hard_cases.catalogue import (
     DIRECTIONS,
     EFFECTS,
@@ -145,14 +145,14 @@ def readings(scene: Scene, row: Array) -> Array:
 
 # Single precision of the turbid body is tested where it is made: tests/physics/test_half_space.py.
 RUNS = [
-    pytest.param(name, dtype, id=f"{name}-{dtype.__name__}")
+    (name, dtype)
     for name in ALL_SCENES
     for dtype in (np.float64, np.float32)
     if (name, dtype) != ("a turbid body", np.float32)
 ]
 
 
-@pytest.mark.parametrize(("name", "dtype"), RUNS)
+@each(("name", "dtype"), RUNS)
 def test_value_gradient_and_hessian_are_finite(name: str, dtype: type) -> None:
     scene = ALL_SCENES[name]
     names, inputs = rows(scene, dtype)
@@ -181,7 +181,7 @@ def test_value_gradient_and_hessian_are_finite(name: str, dtype: type) -> None:
         assert not where, f"{what} of scene {name} is not finite at {len(where)}: {where[:8]}"
 
 
-@pytest.mark.parametrize("name", ALL_SCENES)
+@each("name", ALL_SCENES)
 def test_light_is_possible(name: str) -> None:
     """S0 >= |S|: no reading of an ideal instrument is more than fully polarized, or negative."""
     scene = dataclasses.replace(ALL_SCENES[name], instrument=None)

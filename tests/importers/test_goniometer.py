@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 
 from polar_bayes.capture.files import load_capture, save_capture
 from polar_bayes.capture.schema import count, validate
@@ -270,7 +271,7 @@ OPTIONS = [
 ]
 
 
-@pytest.mark.parametrize(("options", "what", "hint"), OPTIONS)
+@each(("options", "what", "hint"), OPTIONS)
 def test_what_is_wrong_is_named_with_its_mend(options, what, hint):
     pattern = "|".join(map(re.escape, what.split("|")))
     with pytest.raises(CaptureError, match=pattern) as caught:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -73,7 +74,7 @@ def test_lines_of_the_same_directions_are_one_view_of_several_wavelengths(write)
     np.testing.assert_array_equal(capture["saturated"], np.array(expected) == 0.2)
 
 
-@pytest.mark.parametrize("dim", ["patch", "material"])
+@each("dim", ["patch", "material"])
 def test_patches_stand_side_by_side(write, dim):
     text = f"{dim},view_zenith,dop,true_roughness\n2,10,.1,.3\n1,20,.2,.4\n2,30,.3,.3\n"
     capture = from_table(write(text), constants=ANGLES)
@@ -90,9 +91,7 @@ def test_long_numbers_of_patches_stay_apart(write):
     assert capture["patch"].values.tolist() == ["20261122", "20261123"]
 
 
-@pytest.mark.parametrize(
-    ("number", "label"), [(1.5, "1.5"), (-0.0, "0"), (7, "7"), (1e300, "1e+300")]
-)
+@each(("number", "label"), [(1.5, "1.5"), (-0.0, "0"), (7, "7"), (1e300, "1e+300")])
 def test_a_patch_may_be_a_constant(write, number, label):
     capture = from_table(write(PLAIN), constants={**ANGLES, "patch": number})
     assert capture["patch"].values.tolist() == [label]
@@ -163,7 +162,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("text", "given", "what", "hint"), REFUSED)
+@each(("text", "given", "what", "hint"), REFUSED)
 def test_what_is_wrong_is_named_with_its_line(write, text, given, what, hint):
     with pytest.raises(CaptureError) as caught:
         from_table(write(text), **given)

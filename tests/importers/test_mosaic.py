@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pictures
 import pytest
+from cases import each
 from pictures import FULL, LAMP
 from PIL import Image
 
@@ -36,9 +37,7 @@ def sloping(shape=pictures.SHAPE):
     return clean * (0.5 + 0.4 * row / shape[0] - 0.2 * column / shape[1])
 
 
-@pytest.mark.parametrize(
-    "layout", [SONY, ((0.0, 45.0), (135.0, 90.0)), ((135.0, 0.0), (90.0, 45.0))]
-)
+@each("layout", [SONY, ((0.0, 45.0), (135.0, 90.0)), ((135.0, 0.0), (90.0, 45.0))])
 def test_a_mosaic_tells_what_four_frames_tell(layout):
     """Any order of the four polarizers: away from the edges linear light comes back whole."""
     known = {"shape": FLAT, "light": LAMP, "detector": QUIET, "bin": 4, "window": 1}
@@ -81,7 +80,7 @@ def test_a_ball_comes_back_in_the_plane_of_the_model():
         assert np.asarray(said[name])[valid].max() > 0.02
 
 
-@pytest.mark.parametrize("width", [2, 4, 8])
+@each("width", [2, 4, 8])
 def test_the_noise_that_is_left_is_the_stated_one(width):
     """Scores of q over a frame of even light; neighbors share a little noise.
 
@@ -139,7 +138,7 @@ def test_a_frame_in_a_file(tmp_path):
     assert file.drop_attrs().equals(array.drop_attrs())
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "said"),
     [
         ({"layout": ((0, 180), (90, 90))}, "the polarizer stood at 2 different angles"),

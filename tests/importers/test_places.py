@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -62,7 +63,7 @@ def test_azimuths_count_counterclockwise_around_the_normal_from_the_light():
     assert behind.view_azimuth[0] == pytest.approx(180.0)  # the mirror side
 
 
-@pytest.mark.parametrize("light", [(0.3, 0.4, 0.8), (0.0, 0.0, 1.0)])
+@each("light", [(0.3, 0.4, 0.8), (0.0, 0.0, 1.0)])
 def test_straight_on_the_frame_is_that_of_the_light(light):
     """Continuous with a camera opposite to the light, and finite where both are on the normal."""
     ray = unit(light)
@@ -141,7 +142,7 @@ def test_a_rim_may_stand_in_a_table(tmp_path):
     np.testing.assert_allclose([found.row, found.column, found.radius], [50.0, 50.0, 40.0])
 
 
-@pytest.mark.parametrize(
+@each(
     ("rim", "said"),
     [
         (np.ones((3, 2)), "rim: it has 3 points; mark four points or more"),
@@ -164,7 +165,7 @@ def test_normals_over_a_square_are_averaged_and_gaps_spread():
     assert np.isnan(found[1]).all()
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "said"),
     [
         (lambda: pb.Sphere(1.0, 2.0, 0.5), "Sphere: radius: it is 0.5; give 1 <= value"),

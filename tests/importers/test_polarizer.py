@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pictures
 import pytest
+from cases import each
 from pictures import BALL, FULL, LAMP, SCENE, TRUTH, ball_normals, frames
 from PIL import Image
 
@@ -36,7 +37,7 @@ def check_same_light(capture):
     assert valid.sum() > 700  # of 960 pixels of the ball
 
 
-@pytest.mark.parametrize(
+@each(
     "angles",
     [
         FOUR,
@@ -233,7 +234,7 @@ def test_averaging_pixels_lowers_the_noise_but_not_what_stays_unknown():
     np.testing.assert_allclose(left, 1.0, rtol=0.1)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif", ".npy"])
+@each("suffix", [".png", ".tif", ".npy"])
 def test_files_hold_the_same_as_arrays(tmp_path, suffix):
     raw = np.rint(frames(FOUR)).astype(np.uint16)
     paths = [tmp_path / f"ball{angle:.0f}{suffix}" for angle in FOUR]
@@ -272,7 +273,7 @@ def with_defaults(**asked):
     return from_polarizer(given.pop("frames"), given.pop("angles"), **given)
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "said"),
     [
         ({"angles": (0, 90, 180, 270)}, "the polarizer stood at 2 different angles"),
@@ -309,7 +310,7 @@ def test_a_mistake_is_told_with_its_mend(asked, said):
         with_defaults(**asked)
 
 
-@pytest.mark.parametrize(
+@each(
     ("field", "said"),
     [
         ({"gain": 0.0}, "gain: it is 0.0; give 0 < value"),
@@ -323,7 +324,7 @@ def test_a_detector_is_checked(field, said):
         pb.Detector(**field)
 
 
-@pytest.mark.parametrize(
+@each(
     ("field", "said"),
     [
         ({"dark": np.ones((2, 2))}, "dark: it is (2, 2), the frames are (40, 48)"),

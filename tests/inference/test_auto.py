@@ -12,6 +12,7 @@ from typing import ClassVar, override
 import jax
 import numpy as np
 import pytest
+from cases import each
 from plates import plate_capture
 from toy_models import capture, funnel, line, of_line
 
@@ -141,7 +142,7 @@ def test_what_a_method_says_of_its_draws_stays_with_the_result():
     assert (said["k_hat"], said["effective_draws"], said["r_hat"]) == (2.0, 4000.0, None)
 
 
-@pytest.mark.parametrize(
+@each(
     ("rung", "why"),
     [
         (Made(k_hat=0.9), "its Pareto k-hat is 0.90"),
@@ -311,7 +312,7 @@ def test_a_funnel_is_left_to_higher_rungs():
     assert len(steps) > 1
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "said"),
     [
         ({"method": "nuts", "tolerance": 0.1}, "tolerance needs method='auto'"),

@@ -10,6 +10,7 @@ import arviz_base as az
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import make_calibration
 from synthetic_results import edit_provenance, make_result, pool, replace
@@ -94,13 +95,13 @@ def check_mutations(trees, functions, random, count):
     return refused
 
 
-@pytest.mark.parametrize("seed", range(3))
+@each("seed", range(3))
 def test_a_damaged_fit_is_refused_in_one_line_or_works(seed):
     random = np.random.default_rng([11, seed])
     assert 15 < check_mutations(RESULTS, OF_FITS, random, 50) < 45
 
 
-@pytest.mark.parametrize("seed", range(2))
+@each("seed", range(2))
 def test_a_damaged_calibration_is_refused_in_one_line_or_works(seed):
     random = np.random.default_rng([12, seed])
     assert 20 < check_mutations([CALIBRATION], OF_CALIBRATIONS, random, 40) < 40
@@ -114,7 +115,7 @@ def test_a_damaged_study_is_refused_in_one_line_or_works():
 # Matplotlib says that an axis from 1e-300 to 1e300 overflows; the figure is drawn all the same.
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning:matplotlib")
 @pytest.mark.thorough
-@pytest.mark.parametrize("seed", range(8))
+@each("seed", range(8))
 def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
     random = np.random.default_rng([14, seed])
     figures = (
@@ -139,7 +140,7 @@ def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
 # --- provenance -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("odd", ODD_ATTRIBUTES, ids=lambda odd: str(odd)[:9])
+@each("odd", ODD_ATTRIBUTES, ids=lambda odd: str(odd)[:9])
 def test_provenance_that_is_no_mapping_is_refused(odd):
     tree = RESULTS[1].copy()
     tree.attrs["polar_bayes"] = odd
@@ -147,7 +148,7 @@ def test_provenance_that_is_no_mapping_is_refused(odd):
         pb.summary(tree)
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "what"),
     [
         ({"counts": {"views": "9"}}, "polar_bayes.counts.views: it is '9', not a count"),
@@ -207,13 +208,13 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize(("change", "what"), REFUSED.values(), ids=REFUSED)
+@each(("change", "what"), REFUSED.values(), ids=REFUSED)
 def test_a_posterior_that_does_not_hold_together_is_refused(change, what):
     with pytest.raises(pb.FitError, match=f"result: .*{what}"):
         pb.verdict(_edited(change))
 
 
-@pytest.mark.parametrize("dim", ["row", "parameter"])
+@each("dim", ["row", "parameter"])
 def test_a_study_of_nothing_is_refused(dim):
     study = make_accuracy()
     study["accuracy"] = xr.DataTree(study["accuracy"].to_dataset().isel({dim: slice(0)}))
@@ -221,7 +222,7 @@ def test_a_study_of_nothing_is_refused(dim):
         pb.accuracy_advice(study)
 
 
-@pytest.mark.parametrize("number", [1596, 2340, 2419])
+@each("number", [1596, 2340, 2419])
 def test_a_group_that_xarray_cannot_read_is_refused(number):
     """Cases of `benchmarks/fuzz.py`: edits that xarray allows, and whose group it then refuses."""
     whole = make_result(views=12, chains=2, draws=60)
@@ -282,7 +283,7 @@ def test_a_tree_that_arviz_made_is_summed_up():
 OPTIONAL = sorted(set(RESULTS[1].children) - {"posterior"})
 
 
-@pytest.mark.parametrize("group", OPTIONAL)
+@each("group", OPTIONAL)
 def test_any_group_but_the_posterior_may_be_missing(group):
     tree = RESULTS[1].copy()
     del tree[group]
@@ -344,7 +345,7 @@ def test_a_file_gives_back_what_was_saved(tmp_path):
         assert set(read.children) == set(tree.children)
 
 
-@pytest.mark.parametrize("part", ["posterior/roughness", "posterior/wavelength", "provenance"])
+@each("part", ["posterior/roughness", "posterior/wavelength", "provenance"])
 def test_a_flipped_bit_is_an_error_and_no_value(tmp_path, part):
     tree = edit_provenance(RESULTS[0].copy(), model_source="x" * 80_000 + "rainy" + "x" * 80_000)
     pb.save_result(tree, tmp_path / "fit.nc")
@@ -381,7 +382,7 @@ def _with_draws(method, name, values, **provenance):
     return replace(tree, "posterior", name, draws + values)
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace", "importance", "tempered"])
+@each("method", ["nuts", "laplace", "importance", "tempered"])
 def test_draws_that_are_all_equal_are_a_problem(method):
     kind = "nuts" if method == "nuts" else "laplace"
     judged = pb.verdict(edit_provenance(_with_draws(kind, "roughness", 0.2), method=method))
@@ -389,8 +390,8 @@ def test_draws_that_are_all_equal_are_a_problem(method):
     assert any("All draws are equal: roughness; nothing is known" in p for p in judged.problems)
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
-@pytest.mark.parametrize(
+@each("method", ["nuts", "laplace", "point"])
+@each(
     ("name", "value", "provenance", "words"),
     [
         ("refractive_index", -1.0, {}, r"refractive_index \[1, inf\] 100% of its draws"),

@@ -8,6 +8,7 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.autoguide import AutoLaplaceApproximation
@@ -166,9 +167,7 @@ def test_a_model_of_ones_own_with_a_known_posterior(capture: xr.Dataset) -> None
     assert provenance_of(result)["model"] == "conjugate"
 
 
-@pytest.mark.parametrize(
-    ("belief", "trusted"), [(dist.Normal(0.0, 1.0), True), (dist.StudentT(1.5, 0.0, 1.0), False)]
-)
+@each(("belief", "trusted"), [(dist.Normal(0.0, 1.0), True), (dist.StudentT(1.5, 0.0, 1.0), False)])
 def test_laplace_says_where_it_is_not_to_be_trusted(
     capture: xr.Dataset, belief: dist.Distribution, trusted: bool
 ) -> None:
@@ -234,7 +233,7 @@ def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:
     xr.testing.assert_identical(before, capture)
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "says"),
     [
         ({"model": "per_leaf"}, r"model='per_leaf': no such model; give one of per_material"),
@@ -274,7 +273,7 @@ def test_an_image_is_refused_with_the_way_out(capture: xr.Dataset) -> None:
         pb.fit(image, scene=PLATE, links=LINKS)
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "says"),
     [
         ({"chains": 1}, "chains is 1; give at least 2"),

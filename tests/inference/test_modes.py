@@ -1,7 +1,7 @@
 """Peaks are found, told apart, weighed, and never invented."""
 
 import numpy as np
-import pytest
+from cases import each
 from scipy.stats import multivariate_normal
 
 from polar_bayes.inference.optimize import Status, climb, curvature, distinct
@@ -80,7 +80,7 @@ def test_a_wall_of_nan_ends_a_climb_without_a_peak() -> None:
     assert distinct([climb(nowhere, np.zeros(3))]) is None
 
 
-@pytest.mark.parametrize("seed", range(3))
+@each("seed", range(3))
 def test_the_order_of_the_starts_does_not_matter(seed: int) -> None:
     centers = np.array([[-6.0, 0.0], [6.0, 0.0]])
     potential = mixture_potential(centers, np.array([0.3, 0.7]))

@@ -14,6 +14,7 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
+from cases import each
 from compilations import compilations
 from numpyro import distributions as dist
 from numpyro import handlers
@@ -73,7 +74,7 @@ def compiled() -> Iterator[list[str]]:
 SPECTRAL = pb.GpSpectral(coupled=("refractive_index",))
 
 
-@pytest.mark.parametrize(
+@each(
     ("model", "method", "capture"),
     [
         ("per_material", NUTS, one),
@@ -200,7 +201,7 @@ OTHER: dict[str, tuple[dict, dict]] = {
 }
 
 
-@pytest.mark.parametrize("what", SAME)
+@each("what", SAME)
 def test_the_same_question_shares_what_is_compiled(what: str) -> None:
     first, second = SAME[what]
     assert compiled_model(one(1), **first) is compiled_model(one(2), **second)
@@ -224,7 +225,7 @@ def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
     assert told == [(6,), (7,)]
 
 
-@pytest.mark.parametrize("what", OTHER)
+@each("what", OTHER)
 def test_another_question_shares_nothing(what: str) -> None:
     first, second = OTHER[what]
     assert compiled_model(one(1), **first) is not compiled_model(one(1), **second)

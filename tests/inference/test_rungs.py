@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 import pytest
+from cases import each
 from toy_models import capture, funnel, line, of_line, squared
 
 import polar_bayes as pb
@@ -49,7 +50,7 @@ def test_the_ladder_holds_every_method_that_is_tested_here():
     assert {type(method) for method in pb.LADDER.values()} == {type(m) for m in SMALL.values()}
 
 
-@pytest.mark.parametrize("name", [name for name in SMALL if name not in WITHOUT_PRIOR])
+@each("name", [name for name in SMALL if name not in WITHOUT_PRIOR])
 def test_a_normal_posterior_is_found_by_every_rung(name):
     here = problem(line)
     found = answer(SMALL[name], here)
@@ -88,7 +89,7 @@ def test_a_point_fit_has_the_width_of_its_standard_errors():
     np.testing.assert_allclose(draws.mean(axis=(1, 2)), [level, slope], atol=0.02)
 
 
-@pytest.mark.parametrize("name", ["importance", "tempered"])
+@each("name", ["importance", "tempered"])
 def test_both_modes_are_weighed_alike(name):
     here = problem(squared)
     found = answer(SMALL[name], here)
@@ -198,7 +199,7 @@ def test_tempered_answers_have_as_many_draws_as_are_asked_for():
     assert rungs["importance"].draws == 16 * needed
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "said"),
     [
         (lambda: pb.Importance(draws=10), "draws is 10"),

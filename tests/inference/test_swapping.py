@@ -6,6 +6,7 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.reparam import LocScaleReparam
@@ -124,7 +125,7 @@ def test_by_reparam_the_posterior_stays(plates: xr.Dataset) -> None:
         assert abs(one.mean() - other.mean()) < 4.0 * np.sqrt(2.0 / 450.0) * one.std()
 
 
-@pytest.mark.parametrize("handler", [handlers.substitute, handlers.do])
+@each("handler", [handlers.substitute, handlers.do])
 def test_handlers_that_would_be_lost_are_refused(capture: xr.Dataset, handler) -> None:
     model = handler(per_material, data={"refractive_index": np.float64(1.45)})
     with pytest.raises(pb.FitError, match=r"use numpyro\.handlers\.condition"):
@@ -153,7 +154,7 @@ def with_counter(data, scene, priors, links):
     per_material(data, scene, priors, links)
 
 
-@pytest.mark.parametrize(
+@each(
     ("model", "said"),
     [
         (

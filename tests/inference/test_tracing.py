@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from compilations import compilations
 from plates import plate_capture
 from toy_models import line
@@ -209,7 +210,7 @@ def test_a_program_that_the_memory_cannot_hold_is_refused_and_not_run(
     assert JitOnce(lambda x: x + 1.0)(jnp.ones(3))[0] == 2.0
 
 
-@pytest.mark.parametrize("method", ["point", "laplace", pb.Importance()])
+@each("method", ["point", "laplace", pb.Importance()])
 def test_a_fit_is_refused_in_one_line_where_memory_is_short(
     method: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import distributions as dist
 from scipy import stats
 
@@ -84,7 +85,7 @@ def test_patches_find_their_coordinates(made) -> None:
     np.testing.assert_array_equal(alone.readings["q"][0], data.readings["q"][3])
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each("seed", range(5))
 def test_there_and_back_with_the_volume_of_the_map(made, seed: int) -> None:
     transport, data = made
     rng = np.random.default_rng(seed)

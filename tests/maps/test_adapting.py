@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import each
 from plate_images import NAMES, VIEWS, mapped, on_a_grid, planned, plate_image
 from scipy import stats
 
@@ -13,7 +14,7 @@ from polar_bayes.inference.psis import Points, normal_points
 WEAK = plate_image(3, 8, noise=0.15, views=VIEWS[[1, 4]], seed=7)
 
 
-@pytest.mark.parametrize("size", [1, 2, 5])
+@each("size", [1, 2, 5])
 def test_heavy_points_are_those_of_student(size: int) -> None:
     points = heavy_points(4096, size, seed=1)
     for column in points.places.T:

@@ -6,6 +6,7 @@ The programs are compiled as users compile them: rearranged arithmetic would sho
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plate_images import ASKED, NAMES, mapped, planned, plate_image
 
 from polar_bayes.inference.batch_fit import PixelLaplace
@@ -49,7 +50,7 @@ def assert_same_bits(one: xr.Dataset, other: xr.Dataset) -> None:
         assert values.values.tobytes() == other[name].values.tobytes(), name
 
 
-@pytest.mark.parametrize("block", [100, 43, 17])
+@each("block", [100, 43, 17])
 def test_blocks_of_any_size_give_the_same_bits(
     image: xr.Dataset, plan: Plan, whole: xr.Dataset, block: int
 ) -> None:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import handlers
 from plate_images import ASKED, plate_image
 from plates import PLATE
@@ -152,7 +153,7 @@ def readings(program: Program, z: jax.Array, data: Observations) -> jax.Array:
     return jnp.ravel(PLATE.predict(parameters, data.geometry)["q"])
 
 
-@pytest.mark.parametrize("name", ["known noise", "two colors"])
+@each("name", ["known noise", "two colors"])
 def test_scoring_of_normal_noise_is_that_of_gauss_and_newton(name: str) -> None:
     here = case(name)
 

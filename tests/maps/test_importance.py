@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
@@ -30,8 +31,8 @@ TAILS = {
 }
 
 
-@pytest.mark.parametrize("count", [64, 128, 256, 1024])
-@pytest.mark.parametrize("tail", TAILS)
+@each("count", [64, 128, 256, 1024])
+@each("tail", TAILS)
 def test_weights_are_those_of_arviz(tail: str, count: int) -> None:
     log_ratios = TAILS[tail](np.random.default_rng(count), (5, count)) + 300.0
     ours = smooth(log_ratios)
@@ -86,7 +87,7 @@ def test_draws_where_the_posterior_is_zero_weigh_nothing() -> None:
     assert found.pareto_k[[0, 2]] == pytest.approx(k, rel=1e-6)
 
 
-@pytest.mark.parametrize("nothing", [-np.inf, np.nan, np.inf])
+@each("nothing", [-np.inf, np.nan, np.inf])
 def test_no_weights_where_no_ratio_is_finite(nothing: float) -> None:
     log_ratios = np.zeros((2, 128))
     log_ratios[0] = nothing
@@ -98,7 +99,7 @@ def test_no_weights_where_no_ratio_is_finite(nothing: float) -> None:
     assert np.isfinite(found.pareto_k[1])
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@each("dtype", [np.float32, np.float64])
 def test_an_exact_approximation_has_even_weights_and_no_tail(dtype: type) -> None:
     rng = np.random.default_rng(5)
     rounding = 0.2 * np.finfo(dtype).eps * rng.normal(size=(2, 256))
@@ -160,7 +161,7 @@ def test_one_draw_with_all_the_weight_is_the_answer() -> None:
     assert quantiles[0, 0] == pytest.approx(draws[0, 17])
 
 
-@pytest.mark.parametrize(("center", "spread"), [(0.0, 0.5), (0.4, 0.7), (-0.3, 0.9)])
+@each(("center", "spread"), [(0.0, 0.5), (0.4, 0.7), (-0.3, 0.9)])
 def test_weighted_draws_of_a_wide_normal_are_a_narrow_one(center: float, spread: float) -> None:
     draws = normal_points(4096, 1, seed=10).places.T
     log_ratios = stats.norm(center, spread).logpdf(draws) - stats.norm().logpdf(draws)
@@ -181,8 +182,8 @@ def test_weighted_draws_of_a_wide_normal_are_a_narrow_one(center: float, spread:
 # --- the points -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [64, 256, 1024])
-@pytest.mark.parametrize("size", [1, 2, 4, 7])
+@each("count", [64, 256, 1024])
+@each("size", [1, 2, 4, 7])
 def test_points_are_standard_normal(count: int, size: int) -> None:
     points = normal_points(count, size, seed=11).places
     assert points.shape == (count, size)
@@ -202,7 +203,7 @@ def test_the_same_seed_gives_the_same_points() -> None:
     assert not np.isclose(one, other).all(axis=0).any()
 
 
-@pytest.mark.parametrize("size", [1, 2, 5])
+@each("size", [1, 2, 5])
 def test_turns_keep_lengths_and_favor_no_direction(size: int) -> None:
     keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(12), 4000)))
     found = turns(keys, size)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import handlers
 from numpyro.infer.autoguide import AutoLaplaceApproximation
 from plate_images import ASKED, NAMES, mapped, planned, plate_image, stacked
@@ -129,7 +130,7 @@ HARD = {
 }
 
 
-@pytest.mark.parametrize("hard", HARD)
+@each("hard", HARD)
 def test_hard_pixels_have_them_too(plan: Plan, guide: Callable, hard: str) -> None:
     image = plate_image(2, 5, **HARD[hard], seed=4)
     assert assert_modes_agree(plan, stacked(image, plan), guide) == 10
@@ -256,7 +257,7 @@ def masked(image: xr.Dataset) -> xr.Dataset:
     return image.assign(valid=(("y", "x", "view"), valid))
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "settings", "says"),
     [
         (lambda c: c.isel(y=0, x=0), {}, r"plates: it has no axis y or x; give an image"),
@@ -277,7 +278,7 @@ def test_what_cannot_be_mapped_is_refused_with_the_mend(change, settings: dict, 
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
+@each(
     ("build", "says"),
     [
         (lambda: PixelLaplace(draws=100), r"PixelLaplace: draws is 100; give 64, 128, 256 or so"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plate_images import ASKED, plate_image
 from synthetic_maps import make_maps
 from zarr.codecs import Crc32cCodec, ZstdCodec
@@ -132,7 +133,7 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
+@each("damage", DAMAGE)
 def test_a_damaged_capture_is_one_line(tmp_path: Path, damage: str) -> None:
     source = tmp_path / "plates.zarr"
     plate_image(3, 4).to_zarr(source, consolidated=False)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -76,7 +77,7 @@ def test_a_coordinate_that_repeats_itself_keeps_an_inverse() -> None:
     assert np.asarray(found.score(found.place(u)[0])) == pytest.approx(np.asarray(u), abs=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@each("dtype", [np.float32, np.float64])
 def test_knots_are_at_the_quantiles_of_the_draws(dtype: type) -> None:
     draws = DRAWS.astype(dtype)
     values = np.asarray(jax.jit(normal_scores)(draws).values)

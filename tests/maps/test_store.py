@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plate_images import ASKED, plate_image
 
 import polar_bayes as pb
@@ -186,7 +187,7 @@ def test_what_is_the_users_own_is_never_touched(
         assert ledger_of(other).read_text() == "shopping list"
 
 
-@pytest.mark.parametrize("resume", [False, True])
+@each("resume", [False, True])
 def test_the_capture_is_never_written_to(capture: Path, tmp_path: Path, resume: bool) -> None:
     source = copied(capture, tmp_path / "in" / "plates.zarr")
     (tmp_path / "link.zarr").symlink_to(source)
@@ -216,7 +217,7 @@ def test_an_unfinished_map_is_not_opened_with_or_without_its_ledger(
     xr.testing.assert_identical(found.load(), pb.open_map(finished).load())
 
 
-@pytest.mark.parametrize("damage", ["lost", "altered"])
+@each("damage", ["lost", "altered"])
 def test_a_block_whose_files_are_lost_or_altered_is_fitted_again(
     capture: Path, begun: Path, finished: Path, tmp_path: Path, damage: str
 ) -> None:
@@ -295,7 +296,7 @@ def test_a_capture_that_changed_since_is_not_mixed_with_what_is_done(
     assert not ledger_of(ended).exists()
 
 
-@pytest.mark.parametrize("what", ["store", "ledger"])
+@each("what", ["store", "ledger"])
 def test_what_another_process_took_away_is_one_line(
     capture: Path, tmp_path: Path, what: str
 ) -> None:

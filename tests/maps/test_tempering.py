@@ -10,6 +10,7 @@ import numpy as np
 import numpyro
 import pytest
 import scipy.stats
+from cases import each
 from numpyro import distributions as dist
 from plate_images import VIEWS, on_a_grid, planned, plate_image, stacked
 from plates import plate_capture
@@ -173,7 +174,7 @@ def test_chains_begin_in_every_mode_and_tempered_draws_stay_where_they_do_not_mi
     assert (np.abs(sides[~sampled] - 0.5) < 0.3).all()
 
 
-@pytest.mark.parametrize("chains", [False, True])
+@each("chains", [False, True])
 def test_skewed_pixels_have_the_posteriors_of_a_grid(chains: bool) -> None:
     plan = planned(WEAK)
     settings = PixelNuts(draws=1000, start=SETTINGS) if chains else SETTINGS
@@ -198,7 +199,7 @@ def test_skewed_pixels_have_the_posteriors_of_a_grid(chains: bool) -> None:
             assert (error < 0.1 * sd).all()
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "said"),
     [
         ({"walks": 4}, "walks is 4; give 16 or more"),

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from arviz_stats.base import array_stats
+from cases import each
 from jax.flatten_util import ravel_pytree
 from polar_bayes.models.gp_spectral import gp_spectral
 from scipy import stats
@@ -55,7 +56,7 @@ def held_out(material: Mapping[float, float], held: float, seed: int) -> tuple[f
 
 
 @pytest.mark.thorough  # benchmarks/spectrum.py does the same with NUTS
-@pytest.mark.parametrize("held", [550.0, 633.0])
+@each("held", [550.0, 633.0])
 def test_real_materials_lie_in_the_bands_of_a_color_that_was_not_measured(held: float) -> None:
     """Five materials. If bands were exact, two misses of five have chance .023.
 
@@ -192,8 +193,8 @@ HARD_COLORS = {
 }
 
 
-@pytest.mark.parametrize("precision", ["double", "single"])
-@pytest.mark.parametrize("colors", HARD_COLORS.values(), ids=HARD_COLORS)
+@each("precision", ["double", "single"])
+@each("colors", HARD_COLORS.values(), ids=HARD_COLORS)
 def test_density_and_gradient_are_finite(colors: np.ndarray, precision: str) -> None:
     capture = spectral_plate((colors, smooth_index(colors)), error=0.01, seed=5, views=FEW_VIEWS)
     request = resolve(capture, INDEX_ONLY, "laplace", PLATE, None, LINKS, None, 0, precision)
@@ -333,7 +334,7 @@ def test_absorption_and_index_are_coupled_at_once() -> None:
 # --- what is refused ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "message"),
     [
         ({"coupled": ()}, r"coupled=\(\) names no spectra.*refractive_index, absorption"),
@@ -360,7 +361,7 @@ def test_a_scene_without_the_spectrum_is_refused() -> None:
         fit(THREE, model)
 
 
-@pytest.mark.parametrize("wavelengths", [[], [-500.0], [np.nan], [[500.0]], ["green"], None])
+@each("wavelengths", [[], [-500.0], [np.nan], [[500.0]], ["green"], None])
 def test_what_is_no_wavelength_is_refused(wavelengths: Any) -> None:
     with pytest.raises(pb.FitError, match=r"is no list of wavelengths.*above zero in nm"):
         pb.predict_spectrum(xr.DataTree(), wavelengths)

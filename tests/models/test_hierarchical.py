@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from arviz_stats.base import array_stats
+from cases import each
 from numpyro import distributions as dist
 from numpyro import handlers
 from patches import patch_capture
@@ -46,7 +47,7 @@ class LogitNormal:
         return stats.norm(self.center, self.spread).cdf(np.log(x / (1.0 - x)))
 
 
-@pytest.mark.parametrize("name", ALL)
+@each("name", ALL)
 def test_members_are_drawn_from_the_population(name: str) -> None:
     capture = patch_capture(np.full(400, 1.45), views=2)
     location, spread = {"refractive_index": (1.3, 0.2)}.get(name, (0.3, 0.6))
@@ -164,7 +165,7 @@ CASES = {
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("case", CASES)
+@each("case", CASES)
 def test_every_degree_of_pooling_samples_without_divergences(case: str) -> None:
     index, error = CASES[case]
     result = fit(plates(index, error, seed=5), seed=1)

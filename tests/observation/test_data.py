@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.observation.data import ANGLES, READINGS, observe
@@ -44,8 +45,8 @@ def make_capture(*leading, wavelength=False, level=None, **replaced):
     return validate(capture)
 
 
-@pytest.mark.parametrize("leading", [(), ("material",), ("patch",), ("y", "x")], ids=str)
-@pytest.mark.parametrize("wavelength", [False, True])
+@each("leading", [(), ("material",), ("patch",), ("y", "x")], ids=str)
+@each("wavelength", [False, True])
 def test_axes_are_leading_then_wavelength_then_view(leading, wavelength):
     capture = make_capture(*leading, wavelength=wavelength)
     data = observe(capture)
@@ -77,7 +78,7 @@ def test_a_single_wavelength_left_by_selection_is_no_axis():
     assert data.dims == (("view", 4),)
 
 
-@pytest.mark.parametrize("name", READINGS)
+@each("name", READINGS)
 def test_only_the_recorded_variables_appear(name):
     absent = dict.fromkeys([*READINGS, "q_error", "intensity_error"], None)
     kept = {"q": np.full(4, 0.1)} if name == "u" else {}  # u means nothing without q
@@ -89,7 +90,7 @@ def test_only_the_recorded_variables_appear(name):
 # --- what is missing ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("junk", [np.nan, np.inf, -np.inf, -7.0, 1e300])
+@each("junk", [np.nan, np.inf, -np.inf, -7.0, 1e300])
 def test_what_a_masked_entry_holds_reaches_nothing(junk):
     valid = np.array([True, False, True, True])
     plain = make_capture(valid=valid)
@@ -205,7 +206,7 @@ def trusted(dims, value, *leading, **options):
     return validate(make_capture(*leading, **options).assign(normal_confidence=(dims, value)))
 
 
-@pytest.mark.parametrize("leading", [(), ("material",), ("patch",), ("y", "x")], ids=str)
+@each("leading", [(), ("material",), ("patch",), ("y", "x")], ids=str)
 def test_trust_stands_beside_the_readings_and_broadcasts_with_them(leading):
     for dims in (leading, ("view",), (*leading, "view")):
         value = np.random.default_rng(1).uniform(0.1, 1.0, [SIZES[dim] for dim in dims])

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
-import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -86,10 +86,8 @@ def test_as_much_passes_upwards_as_downwards(theta: float, first: float, second:
             np.testing.assert_allclose(one, other, rtol=1e-14)
 
 
-@pytest.mark.parametrize("theta", [0.0, 1e-6, 1.0, 40.0, 56.3, 75.0, 89.0, 89.999])
-@pytest.mark.parametrize(
-    "indexes", [(1.0, 1.5), (1.0, 1.0 + 1e-6), (1.4, 1.6), (1.6, 1.4), (1.5, 1.5001), (2.4, 1.0)]
-)
+@each("theta", [0.0, 1e-6, 1.0, 40.0, 56.3, 75.0, 89.0, 89.999])
+@each("indexes", [(1.0, 1.5), (1.0, 1.0 + 1e-6), (1.4, 1.6), (1.6, 1.4), (1.5, 1.5001), (2.4, 1.0)])
 def test_no_digit_is_lost_against_eighty(theta: float, indexes: tuple[float, float]) -> None:
     """Contrast and shortfall are quotients of differences; here they are taken in 80 digits.
 
@@ -125,7 +123,7 @@ def test_no_p_light_at_the_brewster_angle_of_two_media() -> None:
     assert abs(p) < 1e-17
 
 
-@pytest.mark.parametrize("n", [1.0, 1.5])
+@each("n", [1.0, 1.5])
 def test_alike_media_have_no_boundary(n: float) -> None:
     b = sin_degrees(50.0) ** 2
     above, below = media(50.0, n, n)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from scipy.integrate import quad
 
 from polar_bayes.errors import SceneError
@@ -89,7 +90,7 @@ def test_a_coat_adds_its_parameters_to_the_scene() -> None:
     assert named.parameters == ("lacquer_index", "lacquer_absorbance")
 
 
-@pytest.mark.parametrize("surface", [SmoothSurface(), RoughSurface()], ids=["smooth", "rough"])
+@each("surface", [SmoothSurface(), RoughSurface()], ids=["smooth", "rough"])
 def test_known_numbers_and_parameters_of_that_value_are_alike(surface: object) -> None:
     fitted = Scene(surface, coat=CoatStack((ThinFilm(), ClearCoat())))
     known = Scene(surface, coat=CoatStack((ThinFilm(1.38, 230.0), ClearCoat(1.45, 0.3))))
@@ -98,7 +99,7 @@ def test_known_numbers_and_parameters_of_that_value_are_alike(surface: object) -
     )
 
 
-@pytest.mark.parametrize(
+@each(
     "coat",
     [
         ClearCoat(1.0, 0.0),
@@ -165,7 +166,7 @@ def test_fringes_move_with_color_and_angle() -> None:
     assert np.all(np.abs(found[:, 2:, 0] / bare[None, 2:, 0] - 1.0) > 1e-3)
 
 
-@pytest.mark.parametrize("coat", [ThinFilm(), CoatStack((ClearCoat(), ThinFilm()))], ids=str)
+@each("coat", [ThinFilm(), CoatStack((ClearCoat(), ThinFilm()))], ids=str)
 def test_a_film_needs_a_wavelength(coat: AbstractCoat) -> None:
     scene = Scene(SmoothSurface(), coat=coat)
     with pytest.raises(SceneError, match=r"ThinFilm: fringes .*; give the geometry a wavelength"):
@@ -184,7 +185,7 @@ def test_simpler_coats_leave_one_out() -> None:
     assert CoatStack((film,)).simpler() == (None,)
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "message"),
     [
         (lambda: ClearCoat(0.5), "ClearCoat: refractive_index: 0.5 is neither a number from 1 to"),

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.dispersion import AbstractDispersion, Cauchy, Sellmeier
@@ -37,7 +38,7 @@ PARTS = (RoughSurface(), Depolarizer(), StokesMixing())
 predict = jax.jit(Scene.predict, static_argnums=0)
 
 
-@pytest.mark.parametrize(
+@each(
     ("glass", "wavelength", "index"),
     [
         (BK7, 587.5618, 1.51680),
@@ -78,7 +79,7 @@ def test_named_coefficients_are_read_from_the_parameters() -> None:
     assert Cauchy("a", 0.0, "c").parameters == ("a", "c")
 
 
-@pytest.mark.parametrize("law", [Cauchy(), Sellmeier()], ids=["Cauchy", "Sellmeier"])
+@each("law", [Cauchy(), Sellmeier()], ids=["Cauchy", "Sellmeier"])
 def test_a_law_is_one_index_for_each_wavelength(law: AbstractDispersion) -> None:
     index = law.index({k: jnp.asarray(v) for k, v in MATERIAL.items()}, COLORS)[:, 0]
     assert np.all(np.diff(index) < 0.0)
@@ -109,7 +110,7 @@ def test_a_law_needs_a_wavelength() -> None:
         scene.stokes(MATERIAL, VIEWS._replace(wavelength=None))
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "message"),
     [
         (lambda: Cauchy(a=0.9), "Cauchy: a: 0.9 is neither a number from 1 to 3"),

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from cases import each
 
 from polar_bayes.physics import fresnel
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
@@ -19,7 +19,7 @@ VIEWS = Geometry(ZENITHS, jnp.full(4, 20.0), ZENITHS, jnp.full(4, 200.0))
 MATERIAL = {"roughness": jnp.array([0.3]), "roughness_across": jnp.array([0.1])}
 BARE = Stack(jnp.array([1.5]))
 COATED = Stack(jnp.array([1.5]), (Layer(jnp.array([1.4]), jnp.array([0.2])),))
-stacks = pytest.mark.parametrize("stack", [BARE, COATED], ids=["bare", "coated"])
+stacks = each("stack", [BARE, COATED], ids=["bare", "coated"])
 
 
 def test_through_a_plane_it_is_fresnels_law() -> None:
@@ -54,7 +54,7 @@ def test_a_rough_way_out_tends_to_the_plane(stack: Stack) -> None:
 
 
 @stacks
-@pytest.mark.parametrize("way_out", [RoughExit(), SmoothExit()], ids=["rough", "smooth"])
+@each("way_out", [RoughExit(), SmoothExit()], ids=["rough", "smooth"])
 def test_no_more_leaves_than_there_is_and_it_is_polarized_along_the_plane(
     way_out: object, stack: Stack
 ) -> None:

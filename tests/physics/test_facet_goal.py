@@ -8,7 +8,7 @@ import functools
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from cases import each
 from facet_quadrature import INTEGRALS, ROUGHNESS, TRUTH, cases, measure, ours
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,8 +25,8 @@ BEYOND = (0.003, 0.5, 0.8)
 # The largest error of the default that the documentation states.
 STATED = {Beckmann(): 2e-4, GGX(): 8e-4}
 
-of_every_integral = pytest.mark.parametrize("integral", INTEGRALS)
-of_both = pytest.mark.parametrize("distribution", STATED, ids=repr)
+of_every_integral = each("integral", INTEGRALS)
+of_both = each("distribution", STATED, ids=repr)
 
 
 @functools.cache
@@ -100,7 +100,7 @@ def test_rules_are_inside_and_whole(nodes: int) -> None:
 
 
 @of_both
-@pytest.mark.parametrize("roughness", [1e-5, 0.01, 0.3, 1.5])
+@each("roughness", [1e-5, 0.01, 0.3, 1.5])
 def test_samples_reach_from_border_to_border(
     distribution: AbstractMicrofacet, roughness: float
 ) -> None:

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -69,7 +70,7 @@ def test_light_inside_meets_the_same_interface(theta: float, n: float) -> None:
     )
 
 
-@pytest.mark.parametrize("n", [1.0, 1.2, 1.333, 1.5, 2.0])
+@each("n", [1.0, 1.2, 1.333, 1.5, 2.0])
 def test_no_p_light_at_the_brewster_angle(n: float) -> None:
     theta = np.rad2deg(np.arctan(n))
     assert fresnel.reflection_polarization(*at(theta), n) == pytest.approx(1.0, abs=1e-14)
@@ -94,9 +95,7 @@ def test_internal_reflection_of_common_indices() -> None:
     np.testing.assert_allclose(found, [0.0, 0.472, 0.596, 0.696], atol=5e-4)
 
 
-@pytest.mark.parametrize(
-    ("n", "bound"), [(1.00001, 3e-9), (1.0001, 3e-9), (1.01, 1e-13), (1.2, 2e-15), (2.0, 2e-15)]
-)
+@each(("n", "bound"), [(1.00001, 3e-9), (1.0001, 3e-9), (1.01, 1e-13), (1.2, 2e-15), (2.0, 2e-15)])
 def test_hemisphere_has_enough_nodes(n: float, bound: float) -> None:
     def integrand(cosine: mp.mpf) -> mp.mpf:
         inner = mp.sqrt((n - 1) * (n + 1) + cosine**2)

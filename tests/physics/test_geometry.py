@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -55,7 +55,7 @@ def test_on_the_normal_the_frame_comes_from_the_light() -> None:
     np.testing.assert_array_equal(geometry.view_azimuth, [200.0, 77.0])
 
 
-@pytest.mark.parametrize("angle", [0.0, 30.0, 45.0, 60.0, 89.0, 89.9999999])
+@each("angle", [0.0, 30.0, 45.0, 60.0, 89.0, 89.9999999])
 def test_sine_and_cosine_in_degrees(angle: float) -> None:
     complement = np.float64(90.0 - angle)
     np.testing.assert_allclose(sin_degrees(angle), np.sin(np.deg2rad(angle)), rtol=3e-16)
@@ -145,7 +145,7 @@ def test_turn_between_frames_agrees_with_vectors(
         np.testing.assert_allclose([cos, -sin], stokes[1:], atol=1e-9)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 30.0, 89.0])
+@each("angle", [0.0, 1e-9, 30.0, 89.0])
 def test_frames_turn_smoothly_where_viewer_and_light_coincide(angle: float) -> None:
     here, there = (
         np.ravel(turn_between_frames(at(angle, angle, difference))) for difference in (0.0, 1e-7)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature
@@ -14,7 +15,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
-DISTRIBUTIONS = pytest.mark.parametrize(
+DISTRIBUTIONS = each(
     ("code", "distribution"), [(0, Beckmann()), (1, GGX())], ids=["Beckmann", "GGX"]
 )
 
@@ -70,7 +71,7 @@ def test_uniform_sky_agrees_with_the_renderer(
 
 
 @DISTRIBUTIONS
-@pytest.mark.parametrize("half_width", [1.0, 5.0, 15.0])
+@each("half_width", [1.0, 5.0, 15.0])
 def test_disc_agrees_with_the_renderer(
     disc_source: np.ndarray, code: int, distribution: Beckmann | GGX, half_width: float
 ) -> None:
@@ -87,7 +88,7 @@ def test_disc_agrees_with_the_renderer(
     np.testing.assert_allclose(light.intensity[:, 0], rows[:, 5], rtol=1e-3)
 
 
-@pytest.mark.parametrize(("zenith", "half_width"), [(60.0, 5.0), (85.0, 15.0), (30.0, 15.0)])
+@each(("zenith", "half_width"), [(60.0, 5.0), (85.0, 15.0), (30.0, 15.0)])
 def test_disc_agrees_with_brute_force(zenith: float, half_width: float) -> None:
     """A sum of point sources over the disc, 600 x 600 directions, cut at the horizon."""
     steps = 600
@@ -146,7 +147,7 @@ def test_a_small_disc_is_a_point() -> None:
     np.testing.assert_allclose(disc / solid_angle, point, rtol=1e-4, atol=1e-9)
 
 
-@pytest.mark.parametrize("source", [UniformSky(), Disc(15.0)])
+@each("source", [UniformSky(), Disc(15.0)])
 def test_a_smooth_surface_mirrors_an_extended_source(source: UniformSky | Disc) -> None:
     material = {"roughness": 0.0, "refractive_index": 1.5}
     geometry = viewed(np.array([1.0, 30.0, 56.0, 70.0]))
@@ -164,7 +165,7 @@ def test_a_narrow_disc_takes_in_what_a_beam_does() -> None:
     np.testing.assert_allclose(disc, beam, rtol=1e-4)
 
 
-@pytest.mark.parametrize("half_width", [0.0, -1.0, 91.0, float("nan")])
+@each("half_width", [0.0, -1.0, 91.0, float("nan")])
 def test_half_width_is_checked(half_width: float) -> None:
     with pytest.raises(SceneError, match=r"Disc: half_width=.* give degrees from 0.01 to 90"):
         Disc(half_width)

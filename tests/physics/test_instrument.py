@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.discrepancy import Discrepancy
@@ -82,7 +83,7 @@ def test_dark_level_adds_unpolarized_light() -> None:
         )
 
 
-@pytest.mark.parametrize("level", [0.0, -0.1, -5.0])
+@each("level", [0.0, -0.1, -5.0])
 def test_dark_level_survives_darkness(level: float) -> None:
     dark = Light(jnp.zeros(1), jnp.full(1, 0.5), jnp.zeros(1))
     recorded = DarkLevel().record({"dark_level": jnp.array([level])}, GEOMETRY, dark)
@@ -111,7 +112,7 @@ def test_discrepancy_scales_the_ratio_of_channels_smoothly() -> None:
     np.testing.assert_allclose(s_new * p, factor * s * p_new, rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize(("basis", "length"), [(4, 25.0), (8, 15.0), (1, 60.0)])
+@each(("basis", "length"), [(4, 25.0), (8, 15.0), (1, 60.0)])
 def test_discrepancy_has_the_amplitude_it_says(basis: int, length: float) -> None:
     functions = Discrepancy(basis, length).functions(jnp.linspace(0.0, 90.0, 400))
     np.testing.assert_allclose(np.mean(np.sum(functions**2, axis=0)), 1.0, rtol=5e-3)
@@ -135,7 +136,7 @@ def test_weights_may_have_leading_axes() -> None:
     assert Discrepancy().record(parameters, GEOMETRY, LIGHT).q.shape == (2, 3, 4)
 
 
-@pytest.mark.parametrize("terms", [DolpGain(), [DolpGain()], (DolpGain,), ("DolpGain",)])
+@each("terms", [DolpGain(), [DolpGain()], (DolpGain,), ("DolpGain",)])
 def test_only_terms_make_an_instrument(terms: object) -> None:
     with pytest.raises(SceneError, match=r"Instrument: .* is no tuple of instrument terms; write"):
         Instrument(terms)
@@ -146,7 +147,7 @@ def test_a_term_acts_once() -> None:
         Instrument((DolpGain(), DolpGain()))
 
 
-@pytest.mark.parametrize("bad", [{"basis": 0}, {"basis": 2.5}, {"length": 0.0}])
+@each("bad", [{"basis": 0}, {"basis": 2.5}, {"length": 0.0}])
 def test_discrepancy_is_checked(bad: dict) -> None:
     with pytest.raises(SceneError, match=r"Discrepancy: .* make no smooth function"):
         Discrepancy(**bad)
@@ -176,7 +177,7 @@ def test_overlap_takes_nothing_from_steep_views_and_the_cosine_from_grazing_ones
     assert np.all(np.diff(shares) <= 0.0)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@each("dtype", [np.float64, np.float32])
 def test_overlap_and_its_derivatives_are_finite_up_to_grazing(dtype: type) -> None:
     def share(inputs: jax.Array) -> jax.Array:
         geometry = Geometry(inputs[:1], *(jnp.zeros(1, dtype) for _ in range(3)))
@@ -202,7 +203,7 @@ def test_an_analyzer_obeys_malus() -> None:
     np.testing.assert_array_equal(recorded.q, light.q)
 
 
-@pytest.mark.parametrize("angle", [0.0, 17.0, 45.0, -120.0])
+@each("angle", [0.0, 17.0, 45.0, -120.0])
 def test_two_crossed_analyzers_share_the_light(angle: float) -> None:
     one, other = (Analyzer(a).record({}, GEOMETRY, TILTED) for a in (angle, angle + 90.0))
     np.testing.assert_allclose(one.intensity + other.intensity, TILTED.intensity, rtol=1e-14)
@@ -235,14 +236,14 @@ def test_light_meets_the_terms_in_their_order() -> None:
     np.testing.assert_allclose(last.intensity, [0.05, 0.14, 0.3, 0.105], rtol=1e-14)
 
 
-@pytest.mark.parametrize(
+@each(
     "term", [*TERMS, BeamOverlap(), Analyzer(30.0), Saturation(1.0)], ids=lambda t: type(t).__name__
 )
 def test_every_term_can_be_left_out(term: AbstractInstrumentTerm) -> None:
     assert term.simpler() == (None,)
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "message"),
     [
         (lambda: Analyzer("angle"), "Analyzer: 'angle' is no angle; give degrees, or a tuple"),

@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 import vector_optics as twin
+from cases import each
 
 from polar_bayes.physics.facets import FacetQuadrature, seen
 from polar_bayes.physics.geometry import Geometry, mirror_facet
@@ -18,7 +18,7 @@ from polar_bayes.physics.microfacet import (
 from polar_bayes.physics.microsurface import Microsurface
 
 DISTRIBUTIONS = {"Beckmann": Beckmann(), "GGX": GGX()}
-named = pytest.mark.parametrize("name", DISTRIBUTIONS)
+named = each("name", DISTRIBUTIONS)
 
 
 def surface(name: str, quadrature: FacetQuadrature | None = None) -> Microsurface:
@@ -37,7 +37,7 @@ def towards(rays: np.ndarray) -> Geometry:
 
 
 @named
-@pytest.mark.parametrize(("along", "across"), [(0.3, 0.3), (0.4, 0.1), (0.1, 1.0)])
+@each(("along", "across"), [(0.3, 0.3), (0.4, 0.1), (0.1, 1.0)])
 def test_facets_cover_the_surface(name: str, along: float, across: float) -> None:
     """The integral of D cos(m) over the hemisphere is one, grooves or not."""
     node, weight = np.polynomial.legendre.leggauss(200)
@@ -89,7 +89,7 @@ def test_visible_shares_of_grooves_agree_with_vectors(name: str) -> None:
 
 
 @named
-@pytest.mark.parametrize("view", [0.0, 40.0, 80.0])
+@each("view", [0.0, 40.0, 80.0])
 def test_seen_facets_show_the_area_of_the_plane(name: str, view: float) -> None:
     """The weights sum to cos(v)/G1(v); Beckmann's G1 is a fit within .6 %."""
     geometry = Geometry.from_degrees(

@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polar_bayes.physics.mixing import AbstractMixing, DopMixing, StokesMixing
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization
 
-RULES = pytest.mark.parametrize("rule", [DopMixing(), DopMixing(signed=True), StokesMixing()])
+RULES = each("rule", [DopMixing(), DopMixing(signed=True), StokesMixing()])
 component = st.floats(-0.7, 0.7)
 
 
@@ -82,8 +83,8 @@ def test_no_mixture_is_more_than_polarized(bright: float, angle: float, fraction
         assert np.hypot(mixture.q, mixture.u)[0] <= 1.0 + 1e-11
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("dark", [0.0, 1e-30, 1e-12])
+@each("dtype", [np.float64, np.float32])
+@each("dark", [0.0, 1e-30, 1e-12])
 def test_a_dark_surface_keeps_its_polarization(dark: float, dtype: type) -> None:
     """At fraction 0 the reading is the surface's, however dark, and has finite derivatives."""
 

@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat
@@ -20,7 +21,7 @@ from polar_bayes.physics.part import (
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@each("dtype", [np.float32, np.float64])
 def test_a_number_takes_the_precision_of_the_parameters(dtype: type) -> None:
     parameters = {"albedo": jnp.asarray(0.25, dtype)}
     assert value_of(0.5, parameters).dtype == dtype
@@ -34,14 +35,12 @@ def test_names_come_once_and_in_order() -> None:
     assert both == ("a", "b", "c")
 
 
-@pytest.mark.parametrize("value", [0.0, 1, 0.5, "albedo"])
+@each("value", [0.0, 1, 0.5, "albedo"])
 def test_settings_in_range_and_names_pass(value: object) -> None:
     check_setting(value, "here", 0.0, 1.0)
 
 
-@pytest.mark.parametrize(
-    "value", [-0.1, 1.1, float("nan"), True, None, "two words", "", np.array([0.5])]
-)
+@each("value", [-0.1, 1.1, float("nan"), True, None, "two words", "", np.array([0.5])])
 def test_other_settings_are_refused_with_what_to_give(value: object) -> None:
     message = r"here: .* is neither a number from 0 to 1 nor a parameter's name; give the number"
     with pytest.raises(SceneError, match=message):

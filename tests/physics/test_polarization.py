@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -178,7 +179,7 @@ def test_in_the_plane_of_incidence_diagonal_light_keeps_its_share(
     np.testing.assert_allclose(found, expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("v", [0.0, 1e-3, 40.0, 85.0])
+@each("v", [0.0, 1e-3, 40.0, 85.0])
 def test_nothing_jumps_where_viewer_and_light_coincide(v: float) -> None:
     """The mirror facet looks at both: its s axis is undefined there, but no reading is."""
     here = mirrored((v, 20.0), (v, 20.0), 1.5, 0.8, 25.0)
@@ -188,8 +189,8 @@ def test_nothing_jumps_where_viewer_and_light_coincide(v: float) -> None:
         np.testing.assert_allclose(near, here, atol=1e-8)
 
 
-@pytest.mark.parametrize("view", [(0.0, 20.0), (40.0, 20.0), (85.0, 20.0), (40.0, 200.0)], ids=str)
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@each("view", [(0.0, 20.0), (40.0, 20.0), (85.0, 20.0), (40.0, 200.0)], ids=str)
+@each("dtype", [np.float64, np.float32])
 def test_derivatives_exist_where_viewer_and_light_coincide(view: tuple, dtype: type) -> None:
     """The gradient over both directions, the polarization and the index; and it is a limit."""
 
@@ -243,7 +244,7 @@ def test_polarization_adds_its_parameters_and_can_be_left_out() -> None:
     assert LinearPolarization().simpler() == (None,)
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "message"),
     [
         (lambda: LinearPolarization(1.5), "LinearPolarization: degree: 1.5 is neither a number fr"),

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
@@ -85,7 +86,7 @@ def test_named_scenes_read_these_parameters() -> None:
     )
 
 
-@pytest.mark.parametrize("name", SCENES)
+@each("name", SCENES)
 def test_leading_axes_of_parameters_and_geometry_broadcast(name: str) -> None:
     """Patches by wavelengths, each with its own parameters, seen in the same views."""
     scene = SCENES[name]
@@ -101,7 +102,7 @@ def test_leading_axes_of_parameters_and_geometry_broadcast(name: str) -> None:
         np.testing.assert_allclose(found[reading][1, 2], one[reading], rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@each("name", SCENES)
 def test_turning_everything_around_the_normal_changes_nothing(name: str) -> None:
     turned = VIEWS._replace(
         view_azimuth=VIEWS.view_azimuth + 123.0, light_azimuth=VIEWS.light_azimuth + 123.0
@@ -111,7 +112,7 @@ def test_turning_everything_around_the_normal_changes_nothing(name: str) -> None
         np.testing.assert_allclose(here[reading], there[reading], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@each("name", SCENES)
 def test_single_precision_stays_single_and_agrees(name: str) -> None:
     single = jax.tree.map(lambda angle: angle.astype(jnp.float32), VIEWS)
     small = {key: np.float32(value) for key, value in PARAMETERS.items()}
@@ -142,7 +143,7 @@ def operations(scene: Scene) -> list[str]:
     return [str(equation.primitive) for equation in program.eqns]
 
 
-@pytest.mark.parametrize("term", SCENES["goniometer"].instrument.terms, ids=lambda t: str(t)[:9])
+@each("term", SCENES["goniometer"].instrument.terms, ids=lambda t: str(t)[:9])
 def test_a_term_removed_is_absent_from_the_program(term: AbstractInstrumentTerm) -> None:
     scene = SCENES["goniometer"]
     rest = tuple(part for part in scene.instrument.terms if part != term)
@@ -214,7 +215,7 @@ def test_figures_of_the_specification() -> None:
     np.testing.assert_allclose(found.T, list(table.values()), atol=1.2e-3)
 
 
-@pytest.mark.parametrize(
+@each(
     ("parts", "message"),
     [
         ({"surface": GGX()}, r"surface: GGX\(\) is no such part; give SmoothSurface\(\) or Ro"),

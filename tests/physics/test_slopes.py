@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -41,9 +42,7 @@ def scene(source: object, slopes: object, distribution: object = None, **parts: 
 
 
 POINT = scene(PointSource(), ALONG)
-SOURCES = pytest.mark.parametrize(
-    "source", [PointSource(), Disc(20.0), UniformSky()], ids=["point", "disc", "sky"]
-)
+SOURCES = each("source", [PointSource(), Disc(20.0), UniformSky()], ids=["point", "disc", "sky"])
 VIEWS = {
     "view_zenith": np.array([0.0, 30.0, 60.0, 80.0]),
     "view_azimuth": np.array([0.0, 20.0, -70.0, 160.0]),
@@ -70,7 +69,7 @@ def material(along: float, across: float, turn: float = 0.0) -> dict[str, float]
     }
 
 
-@pytest.mark.parametrize(
+@each(
     ("source", "name"),
     [(PointSource(), "Beckmann"), (Disc(20.0), "GGX"), (UniformSky(), "GGX")],
     ids=["point", "disc", "sky"],
@@ -144,7 +143,7 @@ GROOVES = np.array(
 )
 
 
-@pytest.mark.parametrize("name", DISTRIBUTIONS)
+@each("name", DISTRIBUTIONS)
 def test_sky_and_way_out_agree_with_brute_force(name: str) -> None:
     """360,000 facets by vectors, to 1e-5, against 30 x 30; and what the default of 30 costs.
 

@@ -5,8 +5,8 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
@@ -69,8 +69,8 @@ THICK = {
 }
 
 
-@pytest.mark.parametrize("theta", [0.0, 35.0, 60.0, 84.0])
-@pytest.mark.parametrize("name", THICK)
+@each("theta", [0.0, 35.0, 60.0, 84.0])
+@each("name", THICK)
 def test_thick_layers_agree_with_every_bounce_followed(name: str, theta: float) -> None:
     """1,000 bounces leave nothing inside; s, p and the product of their fields, both ways."""
     indexes, absorbances = THICK[name]
@@ -196,10 +196,8 @@ def escape_by_brute_force(indexes: list, absorbances: list) -> float:
     return total / body**2
 
 
-@pytest.mark.parametrize("absorbance", [0.0, 1e-3, 0.3, 50.0])
-@pytest.mark.parametrize(
-    ("coat", "body"), [(1.3, 1.5), (1.7, 1.5), (1.5, 1.5), (1.01, 1.5), (1.5, 1.01), (1.3, 2.4)]
-)
+@each("absorbance", [0.0, 1e-3, 0.3, 50.0])
+@each(("coat", "body"), [(1.3, 1.5), (1.7, 1.5), (1.5, 1.5), (1.01, 1.5), (1.5, 1.01), (1.3, 2.4)])
 def test_escape_through_a_coat_agrees_with_brute_force(
     coat: float, body: float, absorbance: float
 ) -> None:
@@ -214,7 +212,7 @@ def test_escape_through_a_coat_agrees_with_brute_force(
     np.testing.assert_allclose(escape(thick(indexes, absorbances)), truth, rtol=bound)
 
 
-@pytest.mark.parametrize(
+@each(
     ("indexes", "bound"),
     [
         ([1.0, 1.7, 1.3, 1.6], 1e-9),

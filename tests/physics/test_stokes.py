@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.physics.stokes import (
     TIP,
@@ -21,7 +22,7 @@ def test_stokes_vector_stands_on_the_last_axis() -> None:
     np.testing.assert_allclose(stokes[1, 1], [4.0, -1.0, 0.4])
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@each("dtype", [np.float64, np.float32])
 def test_unpolarized_light_has_finite_derivatives(dtype: type) -> None:
     zero = jnp.zeros(2, dtype)
 
@@ -37,7 +38,7 @@ def test_above_the_tip_the_length_is_exact() -> None:
     np.testing.assert_allclose(degree_of_linear_polarization(3e-7, 4e-7), 5e-7, rtol=1e-10)
 
 
-@pytest.mark.parametrize(
+@each(
     ("q", "u", "angle"),
     [(0.3, 0.0, 0.0), (0.0, 0.3, 45.0), (-0.3, 0.0, 90.0), (0.0, -0.3, -45.0), (0.0, 0.0, 0.0)],
 )

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics import fresnel
@@ -116,8 +117,8 @@ def test_absorption_has_a_floor() -> None:
     assert half_space_loss(jnp.array(0.0)) == half_space_loss(jnp.array(CLEAREST))
 
 
-@pytest.mark.parametrize("part", [Lambertian, Unpolarized])
-@pytest.mark.parametrize("albedo", [-0.1, 1.5, float("nan")])
+@each("part", [Lambertian, Unpolarized])
+@each("albedo", [-0.1, 1.5, float("nan")])
 def test_albedo_is_checked(part: type, albedo: float) -> None:
     with pytest.raises(SceneError, match=r"albedo: .* is neither a number from 0 to 1 nor a para"):
         part(albedo=albedo)

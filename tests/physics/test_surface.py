@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -48,7 +49,7 @@ def test_the_other_side_of_the_plane_is_a_mirror_image(
     np.testing.assert_allclose(left.u, -right.u, atol=1e-12)
 
 
-@pytest.mark.parametrize("distribution", [Beckmann(), GGX()])
+@each("distribution", [Beckmann(), GGX()])
 def test_roughness_does_not_change_what_one_facet_polarizes(
     distribution: Beckmann | GGX,
 ) -> None:
@@ -63,7 +64,7 @@ def test_roughness_does_not_change_what_one_facet_polarizes(
         np.testing.assert_allclose(light.u, mirror.u, rtol=1e-14)
 
 
-@pytest.mark.parametrize("distribution", [Beckmann(), GGX()])
+@each("distribution", [Beckmann(), GGX()])
 def test_a_smooth_exit_is_the_limit_of_a_rough_one(distribution: Beckmann | GGX) -> None:
     """GGX keeps a tail of steep facets at any roughness: its limit is reached more slowly."""
     views = Geometry(*(jnp.array([0.0, 30.0, 60.0, 80.0]) for _ in range(4)))
@@ -104,7 +105,7 @@ def test_rough_reflection_is_near_the_truth(height_field_sky: np.ndarray) -> Non
     assert np.all(np.abs(light.q - rows[:, 5] / rows[:, 4]) <= bound)
 
 
-@pytest.mark.parametrize(
+@each(
     ("part", "hint"),
     [
         ({"distribution": UniformSky()}, r"Beckmann\(\) or GGX\(\)"),

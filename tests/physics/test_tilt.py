@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
@@ -67,7 +68,7 @@ LEVEL = {
 COMPILER_OPTIONS = Scene(
     RoughSurface(Beckmann(), BEAM, way_out=SmoothExit()), Lambertian(), StokesMixing()
 )  # compiles in no time
-EVERY_SCENE = pytest.mark.parametrize("name", LEVEL)
+EVERY_SCENE = each("name", LEVEL)
 
 
 def at(view: tuple[float, float], light: tuple[float, float]) -> Geometry:
@@ -172,7 +173,7 @@ def test_a_mirror_facet_does_not_care_where_the_normal_is(
     np.testing.assert_allclose(found, expected, atol=1e-11 * sum(np.real(powers[:2])))
 
 
-@pytest.mark.parametrize("tilts", [(0.0, 12.0), (-9.0, 4.0), (20.0, -20.0)])
+@each("tilts", [(0.0, 12.0), (-9.0, 4.0), (20.0, -20.0)])
 def test_brightness_and_way_out_are_those_of_a_leaning_population(tilts: tuple) -> None:
     """Against a dense grid of facets around the true normal, in and out of the plane."""
     index, roughness = 1.5, 0.25
@@ -204,7 +205,7 @@ def test_brightness_and_way_out_are_those_of_a_leaning_population(tilts: tuple) 
 # --- no lean ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["grooves, polarized beam, body", "sky", "goniometer"])
+@each("name", ["grooves, polarized beam, body", "sky", "goniometer"])
 def test_without_a_lean_nothing_changes(name: str) -> None:
     scene = (LEVEL | SCENES)[name]
     zenith = np.array([0.0, 1e-8, 1e-3, 30.0, 45.0, 80.0, 89.9, 89.9999999, 45.0])
@@ -367,7 +368,7 @@ def test_the_ledger_of_effects_finds_it() -> None:
     assert found["TiltedNormal"].apply(leaning(SCENES["camera"])) == SCENES["camera"]
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "message"),
     [
         (lambda: TiltedNormal(tilt_x=61.0), "TiltedNormal: tilt_x: 61.0 is neither a number from"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browsers import WIDTHS, browser, faults, open_page, printed
+from cases import each
 from pages import EVIL
 from selenium import webdriver
 from selenium.webdriver.common.by import By
@@ -60,8 +61,8 @@ def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: pb.report(make(), folder / name) for name, make in REPORTS.items()}
 
 
-@pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("name", REPORTS)
+@each("width", WIDTHS)
+@each("name", REPORTS)
 def test_a_report_opens_without_a_fault(driver, reports, name: str, width: int) -> None:
     open_page(driver, reports[name], width)
     assert faults(driver) == []
@@ -69,14 +70,14 @@ def test_a_report_opens_without_a_fault(driver, reports, name: str, width: int) 
     assert driver.execute_script("return document.images.length") > 0
 
 
-@pytest.mark.parametrize("name", [name for name in REPORTS if name != "evil"])
+@each("name", [name for name in REPORTS if name != "evil"])
 def test_the_verdict_is_on_the_first_screen_of_a_phone(driver, reports, name: str) -> None:
     open_page(driver, reports[name], WIDTHS[0])
     place = driver.find_element(By.CSS_SELECTOR, "#verdict h2").rect["y"]
     assert place < 500
 
 
-@pytest.mark.parametrize("name", ["fit", "comparison"])
+@each("name", ["fit", "comparison"])
 def test_a_table_scrolls_in_its_own_box(driver, reports, name: str) -> None:
     open_page(driver, reports[name], WIDTHS[0])
     boxes = driver.execute_script(
@@ -104,7 +105,7 @@ def test_a_table_comes_down_as_a_file_without_network(driver, reports, tmp_path:
     assert [float(row["mean"]) for row in rows] == expected["mean"].tolist()  # every digit
 
 
-@pytest.mark.parametrize("name", ["fit", "comparison"])
+@each("name", ["fit", "comparison"])
 def test_a_report_can_be_printed(driver, reports, name: str) -> None:
     open_page(driver, reports[name], WIDTHS[1])
     assert printed(driver).startswith(b"%PDF")

@@ -5,6 +5,7 @@ import functools
 import matplotlib
 import numpy as np
 import pytest
+from cases import each
 from clipping import clipped
 from matplotlib.figure import Figure
 from synthetic_results import edit_provenance, make_result, replace
@@ -34,7 +35,7 @@ def result_of(case: str):
     return make_result(**{"draws": 50, "views": 10, **CASES[case]})
 
 
-@pytest.mark.parametrize("case", CASES)
+@each("case", CASES)
 def test_readings_of_every_layout(case: str) -> None:
     result = result_of(case)
     for draw, name in ((plot_readings, "dop"), (plot_residuals, "intensity")):
@@ -43,7 +44,7 @@ def test_readings_of_every_layout(case: str) -> None:
         assert figure.legends[0].get_texts()
 
 
-@pytest.mark.parametrize(
+@each(
     "draw",
     [
         plots_fit.plot_pairs,
@@ -52,7 +53,7 @@ def test_readings_of_every_layout(case: str) -> None:
         plots_fit.plot_pit,
     ],
 )
-@pytest.mark.parametrize(
+@each(
     "case",
     [
         "three wavelengths, four azimuths",
@@ -114,7 +115,7 @@ def test_a_point_fit_has_a_curve_and_no_bands() -> None:
     assert not figure.axes[0].collections
 
 
-@pytest.mark.parametrize(
+@each(
     ("draw", "needed"),
     [
         (plots_fit.plot_pairs, "two material parameters with draws"),

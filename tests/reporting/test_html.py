@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from cases import each
 from pages import EVIL, Page
 from synthetic_results import edit_provenance, make_result, replace
 
@@ -73,7 +74,7 @@ def test_every_section_of_a_sampled_fit(small) -> None:
         assert words in small[1].text
 
 
-@pytest.mark.parametrize(
+@each(
     ("method", "absent", "present"),
     [
         ("laplace", ["R-hat"], ["Approximation", "Pareto k-hat", "What the prior said"]),
@@ -100,7 +101,7 @@ def test_a_failed_fit_says_so_first_and_claims_nothing_about_the_material() -> N
     assert "The data determine" not in text
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace"])
+@each("method", ["nuts", "laplace"])
 def test_a_fit_without_a_single_finite_draw_still_has_a_page(method: str) -> None:
     result = make_result(**SMALL, method=method)
     for group in ("posterior", "posterior_predictive", "noise_free", "log_likelihood"):
@@ -199,7 +200,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
         assert str(place) in str(error.value)
 
 
-@pytest.mark.parametrize("wrong", [None, xr.DataTree(), "fit.nc"])
+@each("wrong", [None, xr.DataTree(), "fit.nc"])
 def test_what_is_no_result_leaves_no_folder(tmp_path: Path, wrong: object) -> None:
     with pytest.raises(FitError, match="it holds no fit"):
         report(wrong, tmp_path / "report")

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from synthetic_maps import make_maps
 from synthetic_results import make_result
 
@@ -150,8 +151,8 @@ def test_a_map_that_was_not_checked_says_so_and_an_empty_one_fails() -> None:
         assert not re.search(r"\bnan\b", text_of(page))
 
 
-@pytest.mark.parametrize("name", ["roughness", "roughness_sd", "concentration_scale_quantile"])
-@pytest.mark.parametrize("number", [np.nan, np.inf])
+@each("name", ["roughness", "roughness_sd", "concentration_scale_quantile"])
+@each("number", [np.nan, np.inf])
 def test_a_pixel_that_is_called_good_without_numbers_is_not(name: str, number: float) -> None:
     maps = make_maps(MEANS)
     assert map_tables.headline(map_tables.count_cases(maps))[0].startswith("Every pixel")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from clipping import clipped
 
 import polar_bayes as pb
@@ -31,7 +32,7 @@ def maps(rows: int = 20, columns: int = 30, wavelengths: tuple[float, ...] = ())
     return xr.Dataset(found, coords=coords)
 
 
-@pytest.mark.parametrize("wavelengths", [(), (450.0, 650.0)])
+@each("wavelengths", [(), (450.0, 650.0)])
 def test_every_parameter_has_its_mean_and_its_width(wavelengths: tuple[float, ...]) -> None:
     figure = pb.plot_maps(maps(wavelengths=wavelengths))
     assert clipped(figure) == []

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from clipping import clipped
 from synthetic_results import edit_provenance, make_result, pool
 
@@ -23,7 +24,7 @@ def pooled(count, *parameters, names=None, **settings):
     return pool(make_result(materials=materials, **chosen), *(parameters or ("refractive_index",)))
 
 
-@pytest.mark.parametrize("count", [2, 12, 35, 75])
+@each("count", [2, 12, 35, 75])
 def test_members_of_every_number_are_drawn(count: int) -> None:
     figure = plot_shrinkage(pooled(count, views=4), "refractive_index")
     assert clipped(figure) == []
@@ -170,7 +171,7 @@ def test_tables_have_a_cell_for_every_head() -> None:
 # --- what was swapped -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("swapped", "said"),
     [
         ([], "Nothing was swapped: all parts and priors are as shipped."),

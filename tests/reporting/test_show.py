@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import each
 from pages import EVIL, Page
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import make_calibration
@@ -22,7 +23,7 @@ RESULTS = {
 }
 
 
-@pytest.mark.parametrize("make", RESULTS.values(), ids=RESULTS)
+@each("make", RESULTS.values(), ids=RESULTS)
 def test_every_result_has_a_card(make) -> None:
     result = make()
     before = result.copy(deep=True)

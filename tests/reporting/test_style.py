@@ -5,7 +5,7 @@ import hashlib
 import matplotlib
 import matplotlib.style
 import numpy as np
-import pytest
+from cases import each
 from matplotlib import rcParams
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -42,7 +42,7 @@ def pooled():
     return pool(make_result(**SMALL, materials=("leaf", "fruit", "stone")), "roughness")
 
 
-every_plot = pytest.mark.parametrize("draw", DRAWN.values(), ids=DRAWN)
+every_plot = each("draw", DRAWN.values(), ids=DRAWN)
 
 
 def test_every_public_plot_is_tested_here() -> None:

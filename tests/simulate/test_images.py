@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.stats
 import xarray as xr
+from cases import each
 
 import polar_bayes as pb
 from polar_bayes.capture.schema import validate
@@ -42,7 +43,7 @@ def compiled_in_haste() -> Iterator[None]:
 # --- dims and truth -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("parameters", "noise"),
     [
         ({"refractive_index": INDEX}, {}),
@@ -51,7 +52,7 @@ def compiled_in_haste() -> Iterator[None]:
         ({"subsurface_fraction": FRACTION}, {"concentration_scale": 200.0 * LIGHT}),
     ],
 )
-@pytest.mark.parametrize("protocol", [GRAY, COLORED])
+@each("protocol", [GRAY, COLORED])
 def test_one_value_of_that_shape_makes_an_image(protocol, parameters, noise):
     capture = simulate("glass", scene=PLATE, protocol=protocol, parameters=parameters, noise=noise)
     xr.testing.assert_identical(validate(capture), capture)
@@ -94,9 +95,7 @@ TERMS = {
 }
 
 
-@pytest.mark.parametrize(
-    "setup", ["paper", pytest.param("camera", marks=pytest.mark.thorough), "goniometer"]
-)
+@each("setup", TERMS)
 def test_a_pixel_is_predicted_from_its_own_truth(setup):
     scene = SETUPS[setup].scene
     weights = {"discrepancy_weights": np.array([1.0, -1.0, 0.5, 0.2])}
@@ -224,7 +223,7 @@ HOLED = INDEX.copy()
 HOLED[1, 2] = np.nan
 
 
-@pytest.mark.parametrize(
+@each(
     ("parameters", "noise", "message"),
     [
         (

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import CaptureError
 from polar_bayes.priors import PRIORS, RANGES
 from polar_bayes.simulate import PRESETS, REFERENCE_WAVELENGTHS, Material, find_preset
 
-EVERY_PRESET = pytest.mark.parametrize("name", PRESETS)
+EVERY_PRESET = each("name", PRESETS)
 
 
 @EVERY_PRESET
@@ -53,7 +54,7 @@ def test_colors_between_the_reference_wavelengths_are_interpolated_and_the_ends_
     assert values["roughness"].shape == values["subsurface_fraction"].shape == ()
 
 
-@pytest.mark.parametrize("name", ["leave", "", 3, None, ["leaf"]])
+@each("name", ["leave", "", 3, None, ["leaf"]])
 def test_an_unknown_name_is_answered_with_the_known_ones(name):
     with pytest.raises(CaptureError) as caught:
         find_preset(name)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import CaptureError
 from polar_bayes.simulate import Protocol
@@ -40,7 +41,7 @@ def test_more_azimuths_than_views_are_not_all_used():
     np.testing.assert_array_equal(angles["view_azimuth"], [180.0, 90.0])
 
 
-@pytest.mark.parametrize(
+@each(
     ("field", "value"),
     [
         ("views", 1),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.stats
 import xarray as xr
+from cases import each
 from numpyro import distributions as dist
 
 from polar_bayes.capture.schema import validate
@@ -37,7 +38,7 @@ default_capture = functools.cache(simulate)
 # --- every material, every set-up -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@each("setup", SETUPS)
 def test_every_preset_in_every_setup_is_a_valid_capture(setup):
     for name in PRESETS:
         capture = simulate(name, scene=setup, seed=2)
@@ -97,7 +98,7 @@ def test_a_capture_does_not_depend_on_the_precision_of_the_caller():
 # --- the sensor -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["leaf", "glass"])
+@each("name", ["leaf", "glass"])
 def test_saturated_means_at_full_scale_and_nothing_else(name):
     capture = simulate(name, seed=3)
     full_scale = capture["intensity"].attrs["saturation_level"]
@@ -123,7 +124,7 @@ def test_a_stated_exposure_is_kept():
     np.testing.assert_allclose(bright["intensity"] / dark["intensity"], 2.0, rtol=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@each("seed", range(3))
 def test_strong_noise_stays_possible(seed):
     stokes = simulate("leaf", scene="camera", noise={"stokes_scale": 0.5}, seed=seed)
     assert float((stokes["q"] ** 2 + stokes["u"] ** 2).max()) <= 1.0 + 1e-15
@@ -206,7 +207,7 @@ def test_simulated_intensity_scatters_as_the_student_t_link_says():
     uniform(share)
 
 
-@pytest.mark.parametrize("link", [StokesLink(), StokesLink(4.0, stated_errors=True), NormalLink()])
+@each("link", [StokesLink(), StokesLink(4.0, stated_errors=True), NormalLink()])
 def test_simulated_stokes_parameters_scatter_as_their_link_says(link):
     capture = simulate("glass", scene=PLATE, links={"q": link}, protocol=MANY, seed=14)
     data, found = at_the_truth(capture, PLATE, link, "q")
@@ -237,7 +238,7 @@ class OwnLink(AbstractLink):
         return dist.Normal(prediction[name], noise["own_scale"])
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "kind", "message"),
     [
         ({"preset": "leave"}, CaptureError, "^preset='leave': no such material; give one of leaf"),
