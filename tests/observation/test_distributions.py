@@ -145,6 +145,7 @@ def test_the_log_survival_agrees_with_fifty_digits(degrees_of_freedom, dtype):
     assert_accurate(np.asarray(values), truth, distances, dtype)
 
 
+@pytest.mark.thorough
 @PRECISIONS
 def test_the_slope_of_the_log_survival_is_minus_the_hazard(dtype):
     distances = np.array([-50.0, -1.0, -1e-9, 0.0, 1e-9, 1.0, 50.0, 1e8], dtype)
@@ -177,6 +178,7 @@ def assert_finite(results, rows, dtype):
         assert not wrong.any(), f"{what} is not finite at {rows[wrong][:5]}"
 
 
+@pytest.mark.thorough
 @PRECISIONS
 def test_the_beta_is_finite_with_its_derivatives_up_to_the_margins(dtype):
     means = (1e-6, *MEANS, 1 - 1e-6)
@@ -184,6 +186,7 @@ def test_the_beta_is_finite_with_its_derivatives_up_to_the_margins(dtype):
     assert_finite(value_gradient_hessian(beta_log_density, rows), rows, dtype)
 
 
+@pytest.mark.thorough
 @PRECISIONS
 def test_the_sensor_is_finite_with_its_derivatives_at_the_stops_and_far_away(dtype):
     rows = sensor_cases(dtype)
@@ -193,6 +196,7 @@ def test_the_sensor_is_finite_with_its_derivatives_at_the_stops_and_far_away(dty
     assert_finite(results, rows, dtype)
 
 
+@pytest.mark.thorough
 def test_the_beta_equals_numpyros_at_moderate_values():
     means, concentrations, readings = np.meshgrid([0.1, 0.5, 0.9], [2.0, 30.0], [0.2, 0.5, 0.8])
     ours = MeanConcentrationBeta(means, concentrations)
@@ -204,6 +208,7 @@ def test_the_beta_equals_numpyros_at_moderate_values():
     np.testing.assert_allclose(ours.variance, theirs.variance, rtol=1e-14)
 
 
+@pytest.mark.thorough
 def test_the_sensor_equals_numpyros_student_t_between_the_stops():
     readings = np.linspace(0.1, 0.9, 9)
     ours = SensorStudentT(5.0, 0.4, 0.05, np.zeros(9, bool), 1.0)
@@ -261,6 +266,7 @@ def assert_moments(draws, mean, variance):
         assert np.all(np.abs(values.mean(axis=0) - expected) <= SIGMAS * error)
 
 
+@pytest.mark.thorough
 def test_beta_draws_have_the_stated_mean_and_variance():
     mean, concentration = (grid.ravel() for grid in np.meshgrid([0.1, 0.5, 0.9], [1e-3, 5.0, 1e5]))
     distribution = MeanConcentrationBeta(mean, concentration)
@@ -270,6 +276,7 @@ def test_beta_draws_have_the_stated_mean_and_variance():
     assert_moments(draws, np.asarray(distribution.mean), np.asarray(distribution.variance))
 
 
+@pytest.mark.thorough
 def test_sensor_draws_have_the_mean_and_variance_of_student_t_far_from_the_stops():
     distribution = SensorStudentT(5.0, jnp.array([0.5, 0.8]), 0.002, False, jnp.inf)
     draws = sample(distribution, 2)

@@ -108,6 +108,7 @@ def test_density_and_gradient_are_finite_and_compiling_changes_nothing(name, lin
         np.testing.assert_allclose(total(*arguments)[1], density, rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.thorough
 @EVERY_LINK
 def test_draws_scatter_around_the_center(name, link):
     center = link.center(name, make_prediction(), make_noise(link))
@@ -135,6 +136,7 @@ def test_a_link_is_a_constant_of_a_compiled_program(name, link):
         link.margin = 0.5
 
 
+@pytest.mark.thorough
 @EVERY_LINK
 def test_brightness_and_angle_of_one_view_do_not_reach_another(name, link):
     prediction, noise, reading = make_prediction(), make_noise(link), draw(name, link)[0]
@@ -187,6 +189,7 @@ def test_trust_of_one_view_is_its_precision(name, link):
         )
 
 
+@pytest.mark.thorough
 @EVERY_LINK
 @each("dtype", [np.float64, np.float32])
 def test_density_and_slopes_stay_finite_down_to_no_trust_at_all(name, link, dtype):
@@ -282,6 +285,7 @@ class LaplaceLink(AbstractLink):
         return dist.Laplace(prediction[name], noise["laplace_scale"])
 
 
+@pytest.mark.thorough
 def test_a_link_of_a_users_own_simulates_and_fits_in_a_model():
     links = {"q": LaplaceLink(), "u": LaplaceLink()}
     scene = Scene(SmoothSurface(), Unpolarized(), StokesMixing())

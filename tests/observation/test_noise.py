@@ -38,6 +38,7 @@ def test_scale_is_the_papers_formula_away_from_its_bounds():
     assert slack[1] < 1e-12
 
 
+@pytest.mark.thorough
 @each("exponent", [0.0, 0.5, 1.0])
 def test_a_dark_view_keeps_the_least_concentration(exponent):
     schedule = ConcentrationSchedule(brightness_exponent=exponent)
@@ -73,6 +74,7 @@ def test_the_bound_at_full_scale_has_no_corner():
     assert np.max(np.abs(np.diff(second))) < 0.05 * np.ptp(second)
 
 
+@pytest.mark.thorough
 @each("schedule", [ConcentrationSchedule, ScaleSchedule])
 def test_a_schedule_follows_the_precision_of_its_inputs(schedule):
     method = "concentration" if schedule is ConcentrationSchedule else "scale"

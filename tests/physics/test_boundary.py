@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
+import pytest
 import vector_optics as twin
 from cases import each
 from hypothesis import given, settings
@@ -75,6 +76,7 @@ def test_what_is_not_reflected_passes(theta: float, first: float, second: float)
     np.testing.assert_allclose(s_and_p(reflected) + s_and_p(passed), 1.0, atol=3e-14)
 
 
+@pytest.mark.thorough
 @given(theta=zenith, first=index, second=index)
 @RUN
 def test_as_much_passes_upwards_as_downwards(theta: float, first: float, second: float) -> None:
@@ -157,6 +159,7 @@ def test_a_film_turns_passing_light_as_its_fields_do(
     np.testing.assert_allclose(passed.cross, cross.real, atol=1e-12)
 
 
+@pytest.mark.thorough
 @given(theta=zenith, layers=st.lists(film, min_size=1, max_size=3), body=index)
 @RUN
 def test_clear_films_lose_no_light(theta: float, layers: list, body: float) -> None:
@@ -175,6 +178,7 @@ def test_a_film_without_thickness_is_not_there(theta: float, n: float, body: flo
         np.testing.assert_allclose(found.cross, law(air, below, b).cross, atol=1e-13)
 
 
+@pytest.mark.thorough
 @given(theta=zenith, thickness=st.floats(0.0, 30.0), body=index)
 @RUN
 def test_a_film_like_the_body_or_like_the_air_is_not_there(
@@ -195,6 +199,7 @@ def test_a_quarter_wave_of_the_mean_index_reflects_nothing() -> None:
     np.testing.assert_allclose(half.mean, (0.7 / 2.7) ** 2, rtol=1e-13)
 
 
+@pytest.mark.thorough
 def test_trapped_light_next_to_does_not_pass() -> None:
     """Squared sines in air beyond 1 belong to light that a boundary turns back as a whole."""
     beyond = jnp.asarray(1.2)

@@ -90,6 +90,7 @@ def test_a_coat_adds_its_parameters_to_the_scene() -> None:
     assert named.parameters == ("lacquer_index", "lacquer_absorbance")
 
 
+@pytest.mark.thorough
 @each("surface", [SmoothSurface(), RoughSurface()], ids=["smooth", "rough"])
 def test_known_numbers_and_parameters_of_that_value_are_alike(surface: object) -> None:
     fitted = Scene(surface, coat=CoatStack((ThinFilm(), ClearCoat())))
@@ -99,6 +100,7 @@ def test_known_numbers_and_parameters_of_that_value_are_alike(surface: object) -
     )
 
 
+@pytest.mark.thorough
 @each(
     "coat",
     [
@@ -118,6 +120,7 @@ def test_a_coat_without_effect_is_no_coat(coat: AbstractCoat) -> None:
     np.testing.assert_allclose(coated, bare, rtol=1e-8, atol=1e-14)
 
 
+@pytest.mark.thorough
 def test_a_body_under_a_coat_of_its_own_index() -> None:
     """T+(l) e^(-tau/mu_l) [T+, T-](v) e^(-tau/mu_v) A/(pi n^2 (1 - A Fi_tau)).
 
@@ -178,6 +181,7 @@ def test_a_clear_coat_has_no_filter_in_the_program() -> None:
     assert ClearCoat(1.5, 0.1).layers({}, None)[0].absorbance is not None
 
 
+@pytest.mark.thorough
 def test_simpler_coats_leave_one_out() -> None:
     film, lacquer = ThinFilm(), ClearCoat()
     assert ClearCoat().simpler() == (None,)

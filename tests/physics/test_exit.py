@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from cases import each
 
 from polar_bayes.physics import fresnel
@@ -32,6 +33,7 @@ def test_through_a_plane_it_is_fresnels_law() -> None:
     np.testing.assert_array_equal(leaving.u, 0.0)
 
 
+@pytest.mark.thorough
 @stacks
 def test_a_smooth_way_out_of_a_rough_surface_is_that_of_a_plane(stack: Stack) -> None:
     plane = SmoothSurface().exit(MATERIAL, VIEWS, stack)
@@ -40,6 +42,7 @@ def test_a_smooth_way_out_of_a_rough_surface_is_that_of_a_plane(stack: Stack) ->
         jax.tree.map(np.testing.assert_array_equal, rough, plane)
 
 
+@pytest.mark.thorough
 @stacks
 def test_a_rough_way_out_tends_to_the_plane(stack: Stack) -> None:
     """Its difference falls with the square of the roughness."""
@@ -85,6 +88,7 @@ def test_a_scene_takes_its_way_out_from_the_surface() -> None:
     assert np.all(np.abs(rough.q[1:]) < np.abs(smooth.q[1:]))
 
 
+@pytest.mark.thorough
 def test_only_the_rough_way_out_has_something_simpler() -> None:
     assert RoughExit().simpler() == (SmoothExit(),)
     assert SmoothExit().simpler() == ()

@@ -8,6 +8,7 @@ import functools
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from cases import each
 from facet_quadrature import INTEGRALS, ROUGHNESS, TRUTH, cases, measure, ours
 from hypothesis import given, settings
@@ -52,6 +53,7 @@ def largest_error(
     return np.max(np.abs(found - truth(distribution, integral, roughness)))
 
 
+@pytest.mark.thorough
 @of_every_integral
 @of_both
 def test_thirty_two_facets_reach_a_thousandth(
@@ -63,6 +65,7 @@ def test_thirty_two_facets_reach_a_thousandth(
     assert largest_error(distribution, small, integral, ROUGHNESS) < 1e-3
 
 
+@pytest.mark.thorough
 @of_every_integral
 @of_both
 def test_the_default_holds_for_smoother_and_rougher_surfaces(
@@ -99,6 +102,7 @@ def test_rules_are_inside_and_whole(nodes: int) -> None:
         np.testing.assert_allclose(np.sum(weight), 1.0, rtol=1e-12)
 
 
+@pytest.mark.thorough
 @of_both
 @each("roughness", [1e-5, 0.01, 0.3, 1.5])
 def test_samples_reach_from_border_to_border(

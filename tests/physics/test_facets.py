@@ -36,6 +36,7 @@ def polarization(surface: RoughSurface, views: Geometry) -> np.ndarray:
     return np.stack(both(MATERIAL))
 
 
+@pytest.mark.thorough
 @each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 def test_thirty_facets_are_enough(distribution: Beckmann | GGX) -> None:
     """The default, 6 x 5, is within .001 in degree of polarization; 16 x 16 within 3e-5."""
@@ -64,6 +65,7 @@ def test_no_facet_turns_its_back(zenith: float, side: float) -> None:
     np.testing.assert_allclose(facets.cos_incidence**2 + facets.sin_squared, 1.0, rtol=1e-13)
 
 
+@pytest.mark.thorough
 @each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 def test_both_sides_of_the_normal_are_alike(distribution: Beckmann | GGX) -> None:
     surface = RoughSurface(distribution, UniformSky())

@@ -303,6 +303,7 @@ def test_absorption_has_a_floor_and_nothing_may_be_turned_back() -> None:
     assert light(0.3, None)[0] < light(0.3, 1.5)[0]
 
 
+@pytest.mark.thorough
 def test_materials_broadcast_against_views() -> None:
     view, azimuth = np.array([0.0, 30.0, 60.0]), np.array([180.0, 90.0, 30.0])
     absorption, n = np.array([[0.1], [2.0]]), np.array([[1.4], [1.6]])

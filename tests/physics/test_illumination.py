@@ -88,6 +88,7 @@ def test_disc_agrees_with_the_renderer(
     np.testing.assert_allclose(light.intensity[:, 0], rows[:, 5], rtol=1e-3)
 
 
+@pytest.mark.thorough
 @each(("zenith", "half_width"), [(60.0, 5.0), (85.0, 15.0), (30.0, 15.0)])
 def test_disc_agrees_with_brute_force(zenith: float, half_width: float) -> None:
     """A sum of point sources over the disc, 600 x 600 directions, cut at the horizon."""
@@ -115,6 +116,7 @@ def test_disc_agrees_with_brute_force(zenith: float, half_width: float) -> None:
     np.testing.assert_allclose(found[1] / found[0], total[1] / total[0], atol=1e-4)
 
 
+@pytest.mark.thorough
 def test_light_entering_agrees_with_the_renderer(
     uniform_sky: np.ndarray, disc_source: np.ndarray
 ) -> None:
@@ -147,6 +149,7 @@ def test_a_small_disc_is_a_point() -> None:
     np.testing.assert_allclose(disc / solid_angle, point, rtol=1e-4, atol=1e-9)
 
 
+@pytest.mark.thorough
 @each("source", [UniformSky(), Disc(15.0)])
 def test_a_smooth_surface_mirrors_an_extended_source(source: UniformSky | Disc) -> None:
     material = {"roughness": 0.0, "refractive_index": 1.5}
@@ -157,6 +160,7 @@ def test_a_smooth_surface_mirrors_an_extended_source(source: UniformSky | Disc) 
     np.testing.assert_allclose(found, mirror, rtol=1e-4, atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_a_narrow_disc_takes_in_what_a_beam_does() -> None:
     stack, geometry = Stack(jnp.array([[1.5]])), viewed(np.array([40.0]))
     solid_angle = 2.0 * np.pi * (1.0 - np.cos(np.deg2rad(0.5)))

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from cases import each
 
 from polar_bayes.physics import fresnel
@@ -27,6 +28,7 @@ INTERFACE = Interface(SmoothSurface(), Stack(MATERIAL["refractive_index"]))
 BODIES = each("body", [Lambertian, Unpolarized])
 
 
+@pytest.mark.thorough
 @BODIES
 @each("albedo", [0.0, 0.3, 0.9, 1.0])
 def test_light_comes_out_after_any_number_of_round_trips(body: type, albedo: float) -> None:
@@ -77,6 +79,7 @@ def test_without_it_a_depolarizer_keeps_what_a_half_space_loses() -> None:
     )
 
 
+@pytest.mark.thorough
 def test_the_part_can_be_left_out() -> None:
     assert InternalReflection().simpler() == (None,)
     assert isinstance(Lambertian(0.5, InternalReflection()), DiffuseBody)
@@ -85,6 +88,7 @@ def test_the_part_can_be_left_out() -> None:
     )
 
 
+@pytest.mark.thorough
 def test_a_simpler_lambertian_keeps_its_round_trips() -> None:
     assert Lambertian(0.5, InternalReflection()).simpler() == (
         Unpolarized(0.5, InternalReflection()),

@@ -228,6 +228,7 @@ def test_a_surface_reflects_no_more_than_it_gets(name: str) -> None:
                     assert share > 0.98
 
 
+@pytest.mark.thorough
 @each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 @each("coat", [None, ClearCoat(1.3, 0.2)], ids=["bare", "coated"])
 @each("light", [0.0, 40.0, 70.0])
@@ -300,6 +301,7 @@ def test_a_mirror_image_has_the_other_sign_of_u(name: str, values: dict, directi
 # --- limits ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 @each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 @each("coat", [None, ThinFilm(1.38, 120.0)], ids=["bare", "filmed"])
 def test_a_smooth_surface_under_a_sky_obeys_fresnel(

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from cases import each
 
 from polar_bayes.physics.microfacet import GGX, SMOOTHEST, Beckmann
@@ -21,6 +22,7 @@ def test_facets_cover_the_surface(distribution: Beckmann | GGX, roughness: float
     np.testing.assert_allclose(np.sum(density * measure), 1.0, rtol=1e-5)
 
 
+@pytest.mark.thorough
 @DISTRIBUTIONS
 @each("roughness", [0.0, 0.02, 0.3, 1.0])
 def test_sampled_slopes_cover_the_surface(distribution: Beckmann | GGX, roughness: float) -> None:
@@ -73,6 +75,7 @@ def test_shadowing_falls_towards_grazing(distribution: Beckmann | GGX) -> None:
     assert shadowing[-1] < 0.05
 
 
+@pytest.mark.thorough
 @DISTRIBUTIONS
 def test_roughness_has_a_floor(distribution: Beckmann | GGX) -> None:
     assert distribution.density(0.0, 0.0) == distribution.density(0.0, SMOOTHEST)

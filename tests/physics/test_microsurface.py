@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import vector_optics as twin
 from cases import each
 
@@ -88,6 +89,7 @@ def test_visible_shares_of_grooves_agree_with_vectors(name: str) -> None:
     np.testing.assert_allclose(found, population.visible(rays), rtol=1e-12)
 
 
+@pytest.mark.thorough
 @named
 @each("view", [0.0, 40.0, 80.0])
 def test_seen_facets_show_the_area_of_the_plane(name: str, view: float) -> None:
@@ -105,6 +107,7 @@ def test_seen_facets_show_the_area_of_the_plane(name: str, view: float) -> None:
         np.testing.assert_allclose(area * shares / np.cos(np.deg2rad(view)), 1.0, rtol=bound)
 
 
+@pytest.mark.thorough
 @named
 def test_equal_roughnesses_have_the_isotropic_density_and_share(name: str) -> None:
     geometry = Geometry(*(jnp.asarray(x) for x in ([30.0], [0.0], [60.0], [140.0])))

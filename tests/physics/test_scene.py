@@ -102,6 +102,7 @@ def test_leading_axes_of_parameters_and_geometry_broadcast(name: str) -> None:
         np.testing.assert_allclose(found[reading][1, 2], one[reading], rtol=1e-12, atol=1e-15)
 
 
+@pytest.mark.thorough
 @each("name", SCENES)
 def test_turning_everything_around_the_normal_changes_nothing(name: str) -> None:
     turned = VIEWS._replace(
@@ -174,6 +175,7 @@ def test_a_part_switched_off_costs_no_operation() -> None:
     assert flops(emptied) == flops(Scene(whole.surface, whole.subsurface, whole.mixing))
 
 
+@pytest.mark.thorough
 def test_the_instrument_is_not_in_the_optics() -> None:
     camera = SCENES["camera"]
     stokes, readings = stokes_of(camera, PARAMETERS, VIEWS), predict(camera, PARAMETERS, VIEWS)
@@ -182,6 +184,7 @@ def test_the_instrument_is_not_in_the_optics() -> None:
     np.testing.assert_array_equal(stokes_of(camera, optics_only, VIEWS), stokes)
 
 
+@pytest.mark.thorough
 def test_angle_zero_moves_the_geometry() -> None:
     scene = Scene(SmoothSurface(), instrument=Instrument((AngleZero(),)))
     shifted = scene.predict({**PARAMETERS, "angle_zero": 2.0}, VIEWS)
@@ -195,6 +198,7 @@ def test_angle_zero_moves_the_geometry() -> None:
     )
 
 
+@pytest.mark.thorough
 def test_figures_of_the_specification() -> None:
     """Two digits and a half of the degree of polarization under a uniform sky, n 1.5, Beckmann."""
     table = {
@@ -240,6 +244,7 @@ def test_missing_parameters_are_named() -> None:
         SCENES["camera"].predict({k: 1.5 for k in SCENES["paper"].parameters}, VIEWS)
 
 
+@pytest.mark.thorough
 def test_only_terms_that_are_there_can_be_removed() -> None:
     with pytest.raises(SceneError, match="no DarkLevel; name one of its instrument terms: DolpG"):
         SCENES["camera"].without(DarkLevel)
@@ -282,6 +287,7 @@ def test_parameters_are_the_materials_in_their_order_then_the_light_then_the_ins
     assert len(set(MATERIAL_PARAMETERS)) == len(MATERIAL_PARAMETERS)
 
 
+@pytest.mark.thorough
 def test_a_scene_of_everything_is_static_data_and_predicts() -> None:
     copy = pickle.loads(pickle.dumps(EVERYTHING))
     assert copy == EVERYTHING

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from cases import each
 
 from polar_bayes.physics.facets import FacetQuadrature
@@ -14,6 +15,7 @@ from polar_bayes.physics.scene import SCENES
 ZENITHS = np.linspace(2.0, 85.0, 43)
 
 
+@pytest.mark.thorough
 @each("name", ["paper", "camera"])
 def test_twenty_facets_are_as_good_as_four_hundred(name: str) -> None:
     """The errors stated in `scenes.py`: far below the noise of any reading."""

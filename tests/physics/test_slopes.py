@@ -69,6 +69,7 @@ def material(along: float, across: float, turn: float = 0.0) -> dict[str, float]
     }
 
 
+@pytest.mark.thorough
 @each(
     ("source", "name"),
     [(PointSource(), "Beckmann"), (Disc(20.0), "GGX"), (UniformSky(), "GGX")],
@@ -106,6 +107,7 @@ def test_a_mirror_image_has_the_other_sign_of_u(source: object) -> None:
     assert np.max(np.abs(here[:, 2] / here[:, 0])) > 0.01
 
 
+@pytest.mark.thorough
 @SOURCES
 def test_along_an_axis_of_symmetry_there_is_no_u(source: object) -> None:
     """The viewer, the light and the grooves in one plane."""
@@ -143,6 +145,7 @@ GROOVES = np.array(
 )
 
 
+@pytest.mark.thorough
 @each("name", DISTRIBUTIONS)
 def test_sky_and_way_out_agree_with_brute_force(name: str) -> None:
     """360,000 facets by vectors, to 1e-5, against 30 x 30; and what the default of 30 costs.

@@ -5,6 +5,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import vector_optics as twin
 from cases import each
 from hypothesis import given, settings
@@ -131,6 +132,7 @@ def test_a_coat_without_effect_is_not_there(
     )
 
 
+@pytest.mark.thorough
 def test_splitting_a_coat_in_two_changes_nothing() -> None:
     c, b = at(jnp.array([0.0, 40.0, 80.0]))
     whole, halves = thick([1.0, 1.4, 1.7], [0.4]), thick([1.0, 1.4, 1.4, 1.7], [0.1, 0.3])
@@ -140,6 +142,7 @@ def test_splitting_a_coat_in_two_changes_nothing() -> None:
         )
 
 
+@pytest.mark.thorough
 def test_a_film_on_a_coat_adds_fields_then_powers() -> None:
     """The coat's upper boundary is the film; what comes back through it is added as power."""
     film, coat, body, absorbance = (1.38, 2.0), 1.5, 1.8, 0.2
@@ -212,6 +215,7 @@ def test_escape_through_a_coat_agrees_with_brute_force(
     np.testing.assert_allclose(escape(thick(indexes, absorbances)), truth, rtol=bound)
 
 
+@pytest.mark.thorough
 @each(
     ("indexes", "bound"),
     [
@@ -250,6 +254,7 @@ def test_absorption_in_a_coat_never_brings_light_back() -> None:
     assert shares[-1] <= 1.0
 
 
+@pytest.mark.thorough
 def test_shapes_broadcast_over_facets() -> None:
     stack = Stack(
         jnp.array([1.5, 1.6]), (Layer(jnp.array([1.3, 1.4]), jnp.asarray(0.1)),)

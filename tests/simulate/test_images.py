@@ -73,6 +73,7 @@ def test_one_value_of_that_shape_makes_an_image(protocol, parameters, noise):
             assert truth.dims == ()
 
 
+@pytest.mark.thorough
 def test_stated_errors_are_there_for_every_pixel():
     links = {"q": StokesLink(stated_errors=True)}
     capture = simulate(
@@ -142,6 +143,7 @@ class Repeated(Protocol):
         return {name: np.tile(angle, self.views // 5) for name, angle in GRAY.angles().items()}
 
 
+@pytest.mark.thorough
 def test_a_pixel_scatters_like_a_capture_of_its_truth():
     given = {"scene": PLATE, "links": LINKS, "noise": {"exposure": 0.7}}
     truth = {"refractive_index": columns(1.35, 1.65)}
@@ -177,6 +179,7 @@ def test_one_exposure_serves_the_whole_image():
     np.testing.assert_allclose(ratio.min(), ratio.max(), rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_shadow_is_noisier_in_dop():
     noise = {"exposure": columns(1.0, 0.02), "concentration_scale": 3000.0}
     capture = simulate("glass", scene=PLATE, links=LINKS, protocol=GRAY, noise=noise, seed=4)
@@ -196,6 +199,7 @@ def test_a_highlight_is_saturated_and_said_to_be():
     assert int(capture["saturated"].sum()) == capture["saturated"][1, 2].size
 
 
+@pytest.mark.thorough
 def test_noise_may_differ_from_pixel_to_pixel():
     given = {"scene": PLATE, "links": {"q": NormalLink()}, "protocol": GRAY}
     scales = (0.005, 0.02)  # none reaches the ends of q
@@ -280,17 +284,20 @@ def test_what_is_no_image_is_told_in_one_line(parameters, noise, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.thorough
 def test_without_color_no_wavelength_is_spoken_of():
     with pytest.raises(CaptureError, match=r"give one number, or an image \(y, x\)$"):
         simulate("leaf", scene=PLATE, protocol=GRAY, parameters={"refractive_index": [1.4, 1.5]})
 
 
+@pytest.mark.thorough
 def test_weights_of_a_basis_are_the_same_for_all_pixels():
     weights = np.zeros((ROWS, COLUMNS))
     with pytest.raises(CaptureError, match=r"its shape is \(2, 4\); give one number for each"):
         simulate("leaf", scene="goniometer", parameters={"discrepancy_weights": weights})
 
 
+@pytest.mark.thorough
 def test_noise_that_no_link_reads_is_refused_as_an_image_too():
     with pytest.raises(FitError, match="no link reads normal_scale"):
         simulate(

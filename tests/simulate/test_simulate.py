@@ -58,6 +58,7 @@ def test_the_default_capture_follows_the_papers_protocol():
     np.testing.assert_array_equal(capture["wavelength"], [450.0, 550.0, 650.0])
 
 
+@pytest.mark.thorough
 def test_without_wavelengths_there_is_no_color():
     capture = simulate("glass", scene=PLATE, protocol=MANY)
     assert dict(capture.sizes) == {"view": 3000}
@@ -65,6 +66,7 @@ def test_without_wavelengths_there_is_no_color():
     assert float(capture["true_refractive_index"]) == PRESETS["glass"].refractive_index[1]
 
 
+@pytest.mark.thorough
 def test_stated_errors_come_with_the_links_that_read_them():
     capture = simulate("glass", scene="goniometer")
     np.testing.assert_array_equal(capture["q_error"], np.full((40, 3), STATED_ERROR))
@@ -113,6 +115,7 @@ def test_the_bright_views_come_to_60_percent_of_full_scale():
     assert float(default_capture()["intensity"].quantile(0.9)) == pytest.approx(0.6, rel=0.05)
 
 
+@pytest.mark.thorough
 def test_a_stated_exposure_is_kept():
     arguments = {"scene": PLATE, "protocol": MANY, "links": {"intensity": StudentTLink()}}
     bright, dark = (
@@ -124,6 +127,7 @@ def test_a_stated_exposure_is_kept():
     np.testing.assert_allclose(bright["intensity"] / dark["intensity"], 2.0, rtol=1e-3)
 
 
+@pytest.mark.thorough
 @each("seed", range(3))
 def test_strong_noise_stays_possible(seed):
     stokes = simulate("leaf", scene="camera", noise={"stokes_scale": 0.5}, seed=seed)
@@ -146,6 +150,7 @@ def test_the_truth_of_the_preset_rides_along():
     assert capture["true_absorption"].dims == ("wavelength",)
 
 
+@pytest.mark.thorough
 def test_replaced_parameters_and_a_material_of_ones_own_ride_along_too():
     scene = Scene(SmoothSurface(), Unpolarized(), StokesMixing(), None, Instrument((DolpGain(),)))
     material = Material(0.1, 0.2, (0.3, 0.3, 0.3), (1.5, 1.5, 1.5))
@@ -158,6 +163,7 @@ def test_replaced_parameters_and_a_material_of_ones_own_ride_along_too():
     assert capture.attrs["name"] == "simulated"
 
 
+@pytest.mark.thorough
 def test_the_truth_of_an_angle_is_in_degrees():
     capture = simulate("glass", scene="goniometer")
     assert capture["true_angle_zero"].attrs["units"] == "degree"
@@ -194,6 +200,7 @@ def test_simulated_dop_scatters_as_the_beta_link_says():
     uniform(scipy.stats.beta.cdf(data.readings["dop"], first, second))
 
 
+@pytest.mark.thorough
 def test_simulated_intensity_scatters_as_the_student_t_link_says():
     link = StudentTLink()
     links, noise = {"intensity": link}, {"exposure": 1.0}
@@ -207,6 +214,7 @@ def test_simulated_intensity_scatters_as_the_student_t_link_says():
     uniform(share)
 
 
+@pytest.mark.thorough
 @each("link", [StokesLink(), StokesLink(4.0, stated_errors=True), NormalLink()])
 def test_simulated_stokes_parameters_scatter_as_their_link_says(link):
     capture = simulate("glass", scene=PLATE, links={"q": link}, protocol=MANY, seed=14)
@@ -214,6 +222,7 @@ def test_simulated_stokes_parameters_scatter_as_their_link_says(link):
     uniform(np.asarray(found.cdf(data.readings["q"])))
 
 
+@pytest.mark.thorough
 def test_simulated_dop_scatters_as_the_logit_normal_link_says():
     link = LogitNormalLink()
     capture = simulate("glass", scene=PLATE, links={"dop": link}, protocol=MANY, seed=15)
