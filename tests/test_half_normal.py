@@ -80,6 +80,7 @@ def test_scores_of_draws_are_standard_normal() -> None:
     assert (np.abs(below - shares) < 4.0 * np.sqrt(shares * (1 - shares) / 20_000)).all()
 
 
+@pytest.mark.thorough
 def test_the_table_samples_leakage_so() -> None:
     assert PRIORS["leakage"].support.eq(HalfNormal(SCALE).support)
     assert not PRIORS["leakage"].support.eq(HalfNormal(0.02).support)

@@ -80,6 +80,7 @@ def test_every_row_can_be_drawn_from(name):
     assert np.all(np.isfinite(draws))
 
 
+@pytest.mark.thorough
 def test_the_tables_beta_is_numpyros():
     values = jnp.array([1e-6, 0.3, 1.0 - 1e-6])
     ours, theirs = PRIORS["subsurface_fraction"], dist.Beta(2.0, 2.0)
@@ -123,6 +124,7 @@ def test_a_distribution_of_the_right_support_is_taken(name, prior):
     assert resolve_priors([name], {name: prior})[name] is prior
 
 
+@pytest.mark.thorough
 def test_a_parameter_of_a_users_own_takes_its_prior_from_the_caller():
     own = dist.Normal(0.0, 1.0).expand([3]).to_event(1)
     assert resolve_priors(["tilt"], {"tilt": own}) == {"tilt": own}
@@ -139,6 +141,7 @@ def test_a_misspelled_name_gets_a_suggestion_and_the_list():
     assert "the parameters are roughness, subsurface_fraction, absorption" in message
 
 
+@pytest.mark.thorough
 def test_a_name_of_another_model_is_refused_without_a_wild_guess():
     message = refused("zzz", dist.Normal(0.0, 1.0), MATERIAL)
     assert "did you mean" not in message
@@ -253,6 +256,7 @@ def test_a_prior_reads_as_it_would_be_typed(prior, text):
     assert describe_prior(prior) == text
 
 
+@pytest.mark.thorough
 def test_a_prior_that_fails_to_describe_itself_still_has_a_name():
     class Broken(dist.Normal):
         @property
@@ -264,6 +268,7 @@ def test_a_prior_that_fails_to_describe_itself_still_has_a_name():
     assert describe_prior(broken) == "Broken"
 
 
+@pytest.mark.thorough
 @each("name", PRIORS)
 def test_every_row_is_described_in_one_line(name):
     text = describe_prior(PRIORS[name])

@@ -101,6 +101,7 @@ def test_a_counting_bar_names_what_it_counts(notebook) -> None:
     assert notebook[0]["text/plain"] == "pixels: 1 of 2"
 
 
+@pytest.mark.thorough
 def test_a_stage_is_text_and_nothing_else(notebook) -> None:
     with stages() as show:
         show("<script>alert(1)</script>", 0.5)
@@ -116,6 +117,7 @@ def test_what_a_run_calls_adds_no_bars_of_its_own(notebook) -> None:
     assert len(notebook) == 5
 
 
+@pytest.mark.thorough
 def test_bars_go_where_a_run_breaks_off(notebook) -> None:
     @with_progress
     def breaks(*, progress=None) -> None:

@@ -18,6 +18,7 @@ def test_the_table_has_the_worst_parameter_of_every_row():
     assert list(table["resolved"]) == [True, True, True, True, False]
 
 
+@pytest.mark.thorough
 def test_the_larger_of_mean_and_sd_counts():
     study = make_accuracy()
     study["accuracy"]["sd_error"][1, 0] = -0.7
@@ -30,6 +31,7 @@ def test_the_front_holds_what_nothing_beats():
     assert list(pareto_front(seconds, error)) == [True, True, False, False, False, False]
 
 
+@pytest.mark.thorough
 def test_two_rows_that_are_alike_are_both_on_the_front():
     assert pareto_front(np.array([1.0, 1.0]), np.array([0.2, 0.2])).all()
 
@@ -41,10 +43,12 @@ def test_a_cheap_method_is_advised_for_all_but_what_it_gets_wrong():
     )
 
 
+@pytest.mark.thorough
 def test_without_first_times_the_next_ones_count():
     assert "60 times faster than nuts" in pb.accuracy_advice(make_accuracy(fresh=False))
 
 
+@pytest.mark.thorough
 def test_a_cheap_method_that_is_good_for_all_is_advised_without_reserve():
     rows = ROWS | {("laplace", "as given"): ([0.08, 0.06, 0.02], 3.0, 0.1)}
     assert pb.accuracy_advice(make_accuracy(rows)) == (
@@ -52,6 +56,7 @@ def test_a_cheap_method_that_is_good_for_all_is_advised_without_reserve():
     )
 
 
+@pytest.mark.thorough
 def test_times_that_hardly_differ_are_alike():
     rows = ROWS | {("nuts long", "as given"): ([0.02, 0.01, 0.01], 31.0, 9.0)}
     rows |= {("nuts", "as given"): ([0.05, 0.02, 0.02], 30.0, 9.0)}
@@ -61,6 +66,7 @@ def test_times_that_hardly_differ_are_alike():
     )
 
 
+@pytest.mark.thorough
 def test_a_smaller_tolerance_asks_for_more():
     assert pb.accuracy_advice(make_accuracy(), tolerance=0.03) == (
         "nuts is within 0.03 sd here and 3.3 times faster than nuts long, but for "
@@ -80,6 +86,7 @@ def test_a_doubtful_reference_is_told_with_the_advice():
     assert said.endswith("Take it with care: of the reference itself, its R-hat is 1.300.")
 
 
+@pytest.mark.thorough
 def test_rows_without_an_answer_are_neither_advised_nor_on_the_front():
     rows = {("laplace", "as given"): ([np.nan] * 3, np.nan, np.nan)}
     study = make_accuracy(rows)
@@ -93,6 +100,7 @@ def test_what_holds_no_study_is_refused():
         pb.accuracy_table(study.drop_vars("mean_error"))
 
 
+@pytest.mark.thorough
 def test_a_tolerance_of_nothing_is_refused():
     with pytest.raises(pb.FitError, match="tolerance is 0"):
         pb.accuracy_advice(make_accuracy(), tolerance=0.0)

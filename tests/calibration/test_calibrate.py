@@ -90,6 +90,7 @@ def test_readings_of_a_right_model_pass(corrected: xr.DataTree) -> None:
     assert np.bincount(views, minlength=6).min() > 60  # all six, equally likely
 
 
+@pytest.mark.thorough
 def test_readings_see_a_wrong_noise(capture: xr.Dataset) -> None:
     truth = {"model": handlers.condition(per_material, data={"stokes_error_factor": 2.0})}
     table = pb.calibration_readings(pb.calibrate(capture, simulations=200, truth=truth, **ASKED))
@@ -97,6 +98,7 @@ def test_readings_see_a_wrong_noise(capture: xr.Dataset) -> None:
     assert (table["rank_spread"] > 1.1).all()
 
 
+@pytest.mark.thorough
 def test_what_is_off_leaves_no_trace(capture: xr.Dataset, corrected: xr.DataTree) -> None:
     bare = pb.calibrate(capture, simulations=64, readings=False, **ASKED)
     assert set(bare.children) == {"prior_sbc", "truth", "marginals", "fits"}
@@ -106,6 +108,7 @@ def test_what_is_off_leaves_no_trace(capture: xr.Dataset, corrected: xr.DataTree
         xr.testing.assert_identical(bare[name].to_dataset(), some)
 
 
+@pytest.mark.thorough
 def test_a_simulation_does_not_depend_on_how_many_there_are(capture, corrected) -> None:
     few = pb.calibrate(capture, simulations=150, **ASKED)
     some = corrected["truth"].to_dataset().isel(simulation=slice(150))
@@ -116,6 +119,7 @@ def test_a_simulation_does_not_depend_on_how_many_there_are(capture, corrected) 
     )
 
 
+@pytest.mark.thorough
 def test_fits_that_fail_are_counted(capture: xr.Dataset) -> None:
     method = pb.PixelNuts(chains=2, warmup=10, draws=50, largest_r_hat=1.01)
     calibration = pb.calibrate(capture, simulations=40, method=method, **ASKED)

@@ -32,6 +32,7 @@ def test_what_is_not_uniform_is_found_and_told(shape, is_low, is_narrow) -> None
         assert (found.spread > 1.0) == is_narrow
 
 
+@pytest.mark.thorough
 def test_a_lump_that_keeps_mean_and_spread_is_found() -> None:
     """Moments alone would not see it."""
     random = np.random.default_rng(2)
@@ -41,6 +42,7 @@ def test_a_lump_that_keeps_mean_and_spread_is_found() -> None:
     assert uniformity(sample).p_value < 0.001
 
 
+@pytest.mark.thorough
 def test_numbers_at_both_ends_are_counted() -> None:
     assert uniformity(np.zeros(50)).p_value == pytest.approx(1e-4)
     assert uniformity(np.ones(50)).p_value == pytest.approx(1e-4)

@@ -32,6 +32,7 @@ def test_a_round_trip_is_identical(make_capture, tmp_path, leading, spectral):
     assert os.listdir(tmp_path) == ["leaf.nc"]
 
 
+@pytest.mark.thorough
 def test_a_round_trip_keeps_labels_gaps_and_odd_text(make_capture, tmp_path):
     capture = make_capture("material", spectral=True)
     capture = capture.assign_coords(material=["../x", "<script>", "Öl 油"])
@@ -51,6 +52,7 @@ def test_a_capture_is_named_after_its_file_unless_it_has_a_name(make_capture, tm
     assert load_capture(tmp_path / "beech.nc").attrs["name"] == "beech"
 
 
+@pytest.mark.thorough
 def test_a_loaded_capture_needs_its_file_no_more(make_capture, tmp_path):
     path = tmp_path / "leaf.nc"
     save_capture(make_capture(), path)
@@ -59,6 +61,7 @@ def test_a_loaded_capture_needs_its_file_no_more(make_capture, tmp_path):
     assert np.isfinite(capture["dop"].values).all()
 
 
+@pytest.mark.thorough
 @each("name", ["a b.nc", "x#mode=zarr.nc", "<script>.nc", "http:", "Öl\n.nc"])
 def test_odd_file_names_are_file_names(make_capture, tmp_path, name):
     save_capture(make_capture(), tmp_path / name)
@@ -71,6 +74,7 @@ def test_an_older_capture_is_replaced(make_capture, tmp_path):
     assert_same(load_capture(tmp_path / "leaf.nc"), validate(make_capture(seed=2)))
 
 
+@pytest.mark.thorough
 def test_errors_name_the_file_and_the_view(make_capture, tmp_path):
     capture = make_capture()
     capture["dop"][3] = 1.5
@@ -111,6 +115,7 @@ def test_packed_integers_are_unpacked_and_gaps_are_seen(foreign):
     assert capture["valid"].dtype == bool
 
 
+@pytest.mark.thorough
 def test_time_units_do_nothing(foreign):
     foreign.createVariable("intensity", "f8", ("view",))[:] = 1.0
     foreign["intensity"].units = "days since 2000-01-01"
@@ -123,12 +128,14 @@ def test_text_is_no_reading(foreign):
         load_foreign(foreign)
 
 
+@pytest.mark.thorough
 def test_characters_are_no_reading(foreign):
     foreign.createVariable("dop", "S1", ("view",))[:] = np.array(list("01234"), dtype="S1")
     with pytest.raises(CaptureError, match="dop: it"):
         load_foreign(foreign)
 
 
+@pytest.mark.thorough
 def test_lists_of_unequal_length_are_no_reading(foreign):
     kind = foreign.createVLType(np.float64, "ragged")
     dop = foreign.createVariable("dop", kind, ("view",))
@@ -138,6 +145,7 @@ def test_lists_of_unequal_length_are_no_reading(foreign):
         load_foreign(foreign)
 
 
+@pytest.mark.thorough
 def test_records_are_no_reading(foreign):
     pair = np.dtype([("a", "f8"), ("b", "f8")])
     kind = foreign.createCompoundType(pair, "pair")
@@ -146,6 +154,7 @@ def test_records_are_no_reading(foreign):
         load_foreign(foreign)
 
 
+@pytest.mark.thorough
 def test_attributes_of_arrays_are_kept_as_text(foreign):
     foreign.createVariable("dop", "f8", ("view",))[:] = 0.5
     foreign["dop"].valid_range = np.array([0.0, 1.0])
@@ -165,6 +174,7 @@ def test_wrong_packing_is_a_clear_error(foreign):
 # --- files that cannot be read or written -----------------------------------------------------
 
 
+@pytest.mark.thorough
 @each("path", [None, 3, "", "a\0b", b"leaf.nc"])
 def test_what_is_no_path_is_refused(make_capture, path):
     with pytest.raises(CaptureError, match=r"capture: .* is not a path; give the path of a file"):
@@ -193,6 +203,7 @@ def test_what_is_not_netcdf_is_refused(tmp_path, content):
         load_capture(path)
 
 
+@pytest.mark.thorough
 def test_a_file_without_rights_is_named(make_capture, tmp_path, monkeypatch):
     path = tmp_path / "leaf.nc"
     save_capture(make_capture(), path)
@@ -253,6 +264,7 @@ def test_a_flipped_bit_is_an_error_and_no_value(make_capture, tmp_path, part):
         load_capture(damaged)
 
 
+@pytest.mark.thorough
 def test_a_file_edited_elsewhere_has_no_checksum(make_capture, tmp_path):
     save_capture(make_capture(), tmp_path / "leaf.nc")
     with xr.open_dataset(tmp_path / "leaf.nc", engine="netcdf4") as opened:
@@ -320,6 +332,7 @@ except OutputError as error:
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on file sizes")
 def test_a_full_disk_is_an_error_and_leaves_the_older_capture(make_capture, tmp_path):
     """In a process of its own, since the netCDF library is left in disorder."""

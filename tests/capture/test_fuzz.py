@@ -89,6 +89,7 @@ def test_a_damaged_table_is_refused_or_all_numbers(tmp_path, seed):
     assert 100 < passed < 400
 
 
+@pytest.mark.thorough
 @each("seed", range(4))
 def test_odd_readings_are_refused_or_inside_the_contract(seed):
     random = np.random.default_rng([3, seed])
@@ -146,6 +147,7 @@ FRAMES = [
 ]  # fmt: skip
 
 
+@pytest.mark.thorough
 @each("seed", range(2))
 def test_a_damaged_header_is_refused_or_of_the_same_size(tmp_path, seed):
     random = np.random.default_rng([4, seed])
@@ -179,6 +181,7 @@ def test_a_whole_npy_file_is_read_as_it_was_saved(tmp_path, frame):
     np.testing.assert_array_equal(found, frame, strict=True)
 
 
+@pytest.mark.thorough
 @each(
     ("shape", "what"),
     [
@@ -199,6 +202,7 @@ def test_a_size_that_is_not_that_of_the_file_is_refused(tmp_path, shape, what):
         read_array(path, "frame")
 
 
+@pytest.mark.thorough
 def test_several_arrays_are_no_frame(tmp_path):
     np.savez(tmp_path / "frames.npz", np.zeros(3))
     (tmp_path / "frame.npy").write_bytes((tmp_path / "frames.npz").read_bytes())

@@ -38,6 +38,7 @@ def test_a_valid_capture_comes_out_canonical_and_stays_so(make_capture, leading,
     xr.testing.assert_identical(validate(capture), capture)
 
 
+@pytest.mark.thorough
 def test_the_given_dataset_is_left_alone(make_capture):
     given = make_capture()
     before = given.copy(deep=True)
@@ -53,6 +54,7 @@ def test_one_signal_is_enough(make_capture, signal):
     assert signal in validate(make_capture()[[*geometry, signal]])
 
 
+@pytest.mark.thorough
 def test_geometry_may_differ_from_pixel_to_pixel(make_capture):
     capture = make_capture("y", "x")
     zenith = capture["view_zenith"].broadcast_like(capture["dop"])
@@ -78,11 +80,13 @@ def test_masked_entries_may_hold_anything(make_capture):
     np.testing.assert_array_equal(validate(capture)["dop"], capture["dop"])
 
 
+@pytest.mark.thorough
 def test_wavelengths_may_repeat_and_fall(make_capture):
     capture = make_capture(spectral=True).assign_coords(wavelength=[633.0, 633.0])
     np.testing.assert_array_equal(validate(capture)["wavelength"], [633.0, 633.0])
 
 
+@pytest.mark.thorough
 def test_labels_left_by_selection_are_kept(make_capture):
     capture = make_capture("material", spectral=True).assign_coords(material=["oak", "ash", "elm"])
     chosen = validate(capture.isel(material=1, wavelength=0))
@@ -101,6 +105,7 @@ def test_noise_may_carry_the_polarization_a_little_past_one(make_capture):
     assert "mark it valid=False" in message
 
 
+@pytest.mark.thorough
 def test_the_truth_may_be_unknown_but_not_infinite(make_capture):
     capture = make_capture("material")
     capture["true_roughness"][1] = np.nan
@@ -109,6 +114,7 @@ def test_the_truth_may_be_unknown_but_not_infinite(make_capture):
     assert "NaN where the truth is not known" in refused(capture, "true_roughness: .*infinite")
 
 
+@pytest.mark.thorough
 def test_the_units_of_a_truth_are_text(make_capture):
     capture = make_capture()
     capture["true_roughness"].attrs |= {"units": 1, "long_name": "slope"}
@@ -116,6 +122,7 @@ def test_the_units_of_a_truth_are_text(make_capture):
     assert attributes == {"units": "1", "long_name": "slope"}
 
 
+@pytest.mark.thorough
 def test_an_error_takes_the_units_of_the_intensity(make_capture):
     capture = make_capture()
     del capture["intensity_error"].attrs["units"]
@@ -148,6 +155,7 @@ def test_trust_in_the_normal_may_be_of_patches_of_views_or_of_both(make_capture,
     assert message.endswith(f"or ({', '.join((*leading, 'view'))})")
 
 
+@pytest.mark.thorough
 @each("value", [0.0, -0.1, 1.0001, np.nan, np.inf])
 def test_trust_in_the_normal_is_a_share_above_none(make_capture, value):
     capture = make_capture("patch")
@@ -185,6 +193,7 @@ def test_a_number_outside_its_range_is_named(make_capture, name, value, what, hi
     assert hint in message
 
 
+@pytest.mark.thorough
 def test_the_first_offending_pixel_is_named(make_capture):
     capture = make_capture("y", "x", spectral=True)
     capture["dop"][1, 2, 3, 0] = 7.0
@@ -237,6 +246,7 @@ def test_an_unknown_variable_gets_the_nearest_name(make_capture, name, near):
         assert f"nearest known name: {near})" in message
 
 
+@pytest.mark.thorough
 @each("name", ["true_<script>", "true_../x", "true_", "true_a\nb", "true_ä"])
 def test_a_truth_has_a_plain_name(make_capture, name):
     message = refused(make_capture().assign({name: 1.0}), "no such variable")
@@ -260,6 +270,7 @@ def test_wrong_units_are_refused(make_capture, name, units, wanted):
     assert f"convert it to units {wanted}" in message
 
 
+@pytest.mark.thorough
 @each("units", ["degree", "degrees", "deg", " degree "])
 def test_other_spellings_of_a_unit_are_understood(make_capture, units):
     capture = make_capture()
@@ -285,6 +296,7 @@ def test_every_reading_has_the_same_dims(make_capture):
     assert message.endswith("give it (patch, view)")
 
 
+@pytest.mark.thorough
 def test_geometry_has_no_dim_of_its_own(make_capture):
     capture = make_capture("patch", spectral=True)
     capture["view_zenith"] = capture["view_zenith"].expand_dims(wavelength=2)
@@ -292,6 +304,7 @@ def test_geometry_has_no_dim_of_its_own(make_capture):
     assert message.endswith("give it (view) or (patch, view)")
 
 
+@pytest.mark.thorough
 def test_a_truth_has_no_dim_of_its_own(make_capture):
     capture = make_capture().assign(true_roughness=("leaf", [1.0, 2.0]))
     assert "any of (view)" in refused(capture, re.escape("true_roughness: its dims are (leaf)"))
@@ -320,6 +333,7 @@ def test_a_wavelength_is_above_zero(make_capture, value):
     assert "give nanometers above zero" in refused(capture, r"wavelength\[wavelength=1\]: ")
 
 
+@pytest.mark.thorough
 def test_a_wavelength_without_its_dim_is_one_number(make_capture):
     assert validate(make_capture().assign_coords(wavelength=633))["wavelength"].item() == 633.0
     capture = make_capture().assign_coords(wavelength=[633.0, 500.0])
@@ -342,6 +356,7 @@ def test_only_real_numbers_are_readings(make_capture, name, values, what):
     assert "store floating-point numbers" in message
 
 
+@pytest.mark.thorough
 @each(
     ("labels", "what"),
     [
@@ -358,6 +373,7 @@ def test_labels_tell_materials_apart(make_capture, labels, what):
     assert "or drop the coordinate" in refused(capture, f"material: .*{what}")
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:rename 'one' to 'view'")
 def test_one_label_cannot_stand_for_many_views(make_capture):
     capture = make_capture().assign_coords(one=1.0).rename(one="view")
@@ -400,6 +416,7 @@ def test_other_attributes_are_refused(make_capture, value):
     assert "give a number or text" in message
 
 
+@pytest.mark.thorough
 @each("name", ["_FillValue", "scale_factor", "a/b", "", "a b", 3, "x" * 101])
 def test_attribute_names_that_no_file_holds_are_refused(make_capture, name):
     capture = make_capture()
@@ -413,6 +430,7 @@ def test_only_a_dataset_is_a_capture(thing):
     assert "give an xarray.Dataset" in message
 
 
+@pytest.mark.thorough
 def test_an_interval_knows_its_ends():
     half_open = Interval(0.0, 90.0, open_high=True)
     assert str(half_open) == "0 <= value < 90"

@@ -52,6 +52,7 @@ def test_every_form_of_a_table_is_read_alike(write, form):
     np.testing.assert_array_equal(table.columns["level"], [1.5, 2.5])
 
 
+@pytest.mark.thorough
 def test_columns_without_names_are_numbered(write):
     assert read_table(write("1 2 3\n")).names == ("column_1", "column_2", "column_3")
     assert read_table(write("a,,c\n1,2,3\n")).names == ("a", "column_2", "c")
@@ -63,6 +64,7 @@ def test_columns_are_chosen_by_name_in_the_order_asked(write):
     assert table.columns["c"] == [3.0]
 
 
+@pytest.mark.thorough
 def test_the_printed_digits_and_lines_are_kept(write):
     table = read_table(write("# head\nlevel,other\n1.20,239\n\n-3e2,1.5e-3\n"))
     np.testing.assert_allclose(table.steps["level"], [0.01, 100.0], rtol=1e-15)
@@ -70,6 +72,7 @@ def test_the_printed_digits_and_lines_are_kept(write):
     assert table.lines == (3, 5)
 
 
+@pytest.mark.thorough
 def test_a_header_of_another_time_is_read(write):
     assert read_table(write(b"Winkel (\xb0)\tI\n1\t2\n")).names == ("Winkel (°)", "I")
 
@@ -134,6 +137,7 @@ def test_a_path_that_holds_no_table_is_named(tmp_path):
         read_table(None)
 
 
+@pytest.mark.thorough
 def test_a_table_without_rights_is_named(write, monkeypatch):
     path = write("1 2\n")
 
@@ -145,6 +149,7 @@ def test_a_table_without_rights_is_named(write, monkeypatch):
         read_table(path)
 
 
+@pytest.mark.thorough
 def test_a_long_table_is_read_in_reasonable_time(write):
     rows = 100_000
     table = read_table(write("angle,level\n" + "45.0,1.25\n" * rows))

@@ -38,6 +38,7 @@ def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys
     assert "Error against time" in (report / "index.html").read_text()
 
 
+@pytest.mark.thorough
 def test_rungs_and_dials_are_chosen_and_json_is_json(plate, tmp_path, capsys, studied):
     words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--json", "--no-dials"]
     assert main([*words, "--rung", "laplace", "--rung", "nuts", "--tolerance", "0.001"]) == 0
@@ -54,6 +55,7 @@ def test_a_rung_that_is_not_there_is_refused(plate, tmp_path, capsys):
     assert "rung='magic': no such rung; give one of point, laplace" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 @each(
     ("words", "said"),
     [
@@ -67,6 +69,7 @@ def test_wishes_that_do_not_fit_the_method_are_refused(plate, tmp_path, capsys, 
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_the_automatic_choice_says_what_it_did(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:

@@ -157,6 +157,7 @@ def script(text: str, folder: Path) -> subprocess.Popen:
     return begun
 
 
+@pytest.mark.thorough
 def test_cleanups_run_and_their_sentences_are_said_in_one_line(tmp_path: Path) -> None:
     text = """
         def work():
@@ -171,6 +172,7 @@ def test_cleanups_run_and_their_sentences_are_said_in_one_line(tmp_path: Path) -
     assert not left_in(tmp_path)
 
 
+@pytest.mark.thorough
 def test_a_thread_that_still_writes_leaves_nothing_behind(tmp_path: Path) -> None:
     ends = threading.Event()
 
@@ -206,6 +208,7 @@ def hanging(limit: float) -> str:
     """
 
 
+@pytest.mark.thorough
 @each("number", BOTH)
 def test_a_second_signal_ends_at_once_what_hangs_while_it_cleans_up(
     tmp_path: Path, number: int
@@ -217,6 +220,7 @@ def test_a_second_signal_ends_at_once_what_hangs_while_it_cleans_up(
     assert stopped(process, number) == ""
 
 
+@pytest.mark.thorough
 def test_a_cleanup_that_hangs_is_given_up(tmp_path: Path) -> None:
     process = script(hanging(0.2), tmp_path)
     process.send_signal(signal.SIGTERM)
@@ -224,6 +228,7 @@ def test_a_cleanup_that_hangs_is_given_up(tmp_path: Path) -> None:
     assert (output, said, process.returncode) == ("cleaning\n", "", 143)
 
 
+@pytest.mark.thorough
 def test_a_signal_that_the_process_was_started_to_ignore_stays_ignored(tmp_path: Path) -> None:
     text = """
         import signal
@@ -237,6 +242,7 @@ def test_a_signal_that_the_process_was_started_to_ignore_stays_ignored(tmp_path:
     stopped(process, signal.SIGINT)
 
 
+@pytest.mark.thorough
 def test_the_process_ends_though_a_thread_is_still_busy(tmp_path: Path) -> None:
     text = """
         import sys, threading, time
@@ -261,6 +267,7 @@ def test_what_the_command_returns_or_raises_is_passed_on_and_handlers_are_put_ba
     assert [signal.getsignal(number) for number in SIGNALS] == before
 
 
+@pytest.mark.thorough
 def test_an_interrupt_ends_the_process_of_a_trial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -96,6 +96,7 @@ def test_output_that_nobody_reads_ends_quietly(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.thorough
 def test_output_that_has_no_room_is_one_line(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         done = python(HELP, tmp_path, stdout=full.fileno())
@@ -122,6 +123,7 @@ NOISY = """
 """
 
 
+@pytest.mark.thorough
 def test_libraries_say_nothing_and_damaged_compiled_programs_are_one_line(tmp_path: Path) -> None:
     done = python(NOISY, tmp_path)
     assert done.returncode == 1

@@ -85,6 +85,7 @@ def test_no_path_is_one_line(words, out, inputs, monkeypatch, capsys):
     assert told.count("\n") == 1
 
 
+@pytest.mark.thorough
 @each("name", ["index.html", "result.nc"])
 def test_a_report_replaces_only_a_report(name, tmp_path):
     (tmp_path / name).write_text("mine")
@@ -93,6 +94,7 @@ def test_a_report_replaces_only_a_report(name, tmp_path):
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine")]
 
 
+@pytest.mark.thorough
 def test_a_report_is_made_again_in_its_folder_beside_what_is_there(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     page = pb.report(make_result(), tmp_path)
@@ -106,6 +108,7 @@ def test_a_report_is_made_again_in_its_folder_beside_what_is_there(tmp_path):
     ]  # fmt: skip
 
 
+@pytest.mark.thorough
 @each("held", [{"capture.nc": "plate"}, {"fit.nc": "text"}, {"photo.png": "x"}])
 def test_a_demo_writes_in_no_folder_of_anothers(held, plate, tmp_path, capsys):
     for name, kind in held.items():

@@ -52,6 +52,7 @@ def test_frames_behind_a_polarizer(
     assert "480 views" in said
 
 
+@pytest.mark.thorough
 def test_a_mosaic_with_another_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
     frame = rng.integers(300, 600, pictures.SHAPE).astype(np.uint16)

@@ -51,6 +51,7 @@ def test_it_is_the_mean_square_of_scores(case: str) -> None:
     assert (np.abs(products.mean(axis=0) - told.information) < slack).all()
 
 
+@pytest.mark.thorough
 @each("location", [0.95, 1.0, 1.05])
 def test_a_saturated_reading_tells_less(location: float) -> None:
     """Readings are stopped at 1: simulated as the sensor does, the flag set where it stopped."""
@@ -71,6 +72,7 @@ def test_a_saturated_reading_tells_less(location: float) -> None:
     assert told[0, 0] < whole[0, 0]
 
 
+@pytest.mark.thorough
 def test_views_masks_and_plates_keep_their_place() -> None:
     mean = jnp.linspace(0.1, 0.9, 6).reshape(2, 3)
     plain = MeanConcentrationBeta(mean, jnp.asarray(50.0))

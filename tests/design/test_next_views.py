@@ -89,6 +89,7 @@ def test_a_rig_says_what_it_can_take() -> None:
     assert np.abs(zeniths[:, None] - START).min() >= 12.0 - 1e-6
 
 
+@pytest.mark.thorough
 def test_light_and_viewer_keep_apart() -> None:
     rig = pb.Rig(from_light=10.0)
     there = np.array([[45.0, 0.0, 45.0, 0.0], [45.0, 180.0, 45.0, 0.0], [56.0, 0.0, 45.0, 0.0]])
@@ -109,6 +110,7 @@ def lamp(data, scene, priors, links):
         numpyro.sample("q", noise, obs=data.readings["q"])
 
 
+@pytest.mark.thorough
 def test_new_views_are_as_bright_as_predicted_and_old_ones_as_recorded() -> None:
     capture = line_capture(START)
     capture["intensity"] = ("view", [0.3, 0.6], {"saturation_level": 1.0})
@@ -121,6 +123,7 @@ def test_new_views_are_as_bright_as_predicted_and_old_ones_as_recorded() -> None
         on_a_line(readings={"q": None, "intensity": pb.StudentTLink()})
 
 
+@pytest.mark.thorough
 def test_a_fit_may_say_what_the_parameters_may_be() -> None:
     """A line tells the same of its parameters wherever they are, so only the draws differ."""
     drawn = np.random.default_rng(0).normal(0.0, 0.1, (2, 1, 30))
@@ -137,6 +140,7 @@ def test_a_fit_may_say_what_the_parameters_may_be() -> None:
         on_a_line(result=xr.DataTree.from_dict({"posterior": xr.Dataset(group)}))
 
 
+@pytest.mark.thorough
 def test_the_choice_is_said_in_words() -> None:
     found = on_a_line(count=2)
     assert pb.next_views_sentences(found)[0] == (
@@ -206,6 +210,7 @@ def test_what_is_expected_is_what_a_larger_capture_gives(plate: xr.Dataset) -> N
     assert (after < before).all()
 
 
+@pytest.mark.thorough
 def test_another_reading_can_be_added_even_at_the_ends(plate: xr.Dataset) -> None:
     """Brightness brings an exposure and a noise of its own, which the capture knows nothing of."""
     found = pb.next_views(
@@ -224,6 +229,7 @@ def test_another_reading_can_be_added_even_at_the_ends(plate: xr.Dataset) -> Non
     assert pb.next_views_sentences(found)[0].count(", intensity") == 3
 
 
+@pytest.mark.thorough
 def test_one_wavelength_at_a_time(plate: xr.Dataset) -> None:
     two = xr.concat([plate, plate], dim="wavelength", data_vars=["q", "q_error"])
     two = two.assign_coords(wavelength=[450.0, 650.0])

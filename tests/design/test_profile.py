@@ -55,6 +55,7 @@ def test_the_interval_is_that_of_the_normal_distribution(slope: xr.Dataset) -> N
     ]
 
 
+@pytest.mark.thorough
 def test_a_grid_of_ones_own_keeps_its_values() -> None:
     found = pb.profile(line_capture(ZENITHS), "level", model=line, values=[0.19, 0.21], **ASKED)
     assert {0.19, 0.21} < set(found["value"].to_numpy().round(12))
@@ -63,6 +64,7 @@ def test_a_grid_of_ones_own_keeps_its_values() -> None:
     assert said[0].startswith("level is flat: the data exclude nothing below as far as the grid")
 
 
+@pytest.mark.thorough
 def test_what_is_known_beside_the_readings_is_of_the_likelihood() -> None:
     question = pose(line_capture(ZENITHS), line, ASKED["scene"], None, None, None, 0)
     z = jnp.array([0.3, -0.2])
@@ -74,6 +76,7 @@ def test_what_is_known_beside_the_readings_is_of_the_likelihood() -> None:
     np.testing.assert_allclose(sum(told), sum(bare), rtol=1e-5)
 
 
+@pytest.mark.thorough
 def test_a_gap_is_left_out_and_counted(slope: xr.Dataset) -> None:
     broken = slope.copy(deep=True)
     broken["converged"][1, 2] = False

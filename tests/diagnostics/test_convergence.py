@@ -42,6 +42,7 @@ def test_table_agrees_with_arviz() -> None:
     np.testing.assert_allclose(ours.to_numpy(float), theirs.to_numpy(float), rtol=1e-10)
 
 
+@pytest.mark.thorough
 def test_material_parameters_come_first_and_vectors_last() -> None:
     labels = list(summary(make_result(discrepancy=True, wavelengths=(450.0, 532.5))).index)
     assert labels == [
@@ -56,11 +57,13 @@ def test_material_parameters_come_first_and_vectors_last() -> None:
     ]
 
 
+@pytest.mark.thorough
 def test_materials_are_named() -> None:
     labels = summary(make_result(materials=("leaf", "fruit"), wavelengths=(450.0,), views=6)).index
     assert "refractive_index[fruit, 450]" in labels
 
 
+@pytest.mark.thorough
 def test_two_readings_at_one_wavelength_keep_two_rows() -> None:
     table = summary(make_result(wavelengths=(450.0, 450.0), views=6))
     assert table.index.is_unique
@@ -82,6 +85,7 @@ def test_a_stuck_chain_is_named() -> None:
     assert any("R-hat above 1.01: roughness" in p and "sample longer" in p for p in judged.problems)
 
 
+@pytest.mark.thorough
 def test_a_parameter_that_never_moves_fails() -> None:
     tree = make_result(discrepancy=True)
     draws = np.full_like(posterior_of(tree, "exposure"), 0.7)
@@ -102,6 +106,7 @@ def test_too_few_effective_draws_fail() -> None:
     assert any("ESS below 400" in p and "most_draws" in p for p in judged.problems)
 
 
+@pytest.mark.thorough
 def test_long_lists_are_cut() -> None:
     problems = verdict(make_result(draws=60, discrepancy=True)).problems
     problem = next(problem for problem in problems if problem.startswith("Bulk ESS"))
@@ -118,6 +123,7 @@ def test_one_divergence_fails() -> None:
     assert "target_acceptance" in judged.problems[0]
 
 
+@pytest.mark.thorough
 @each("method", ["nuts", "laplace", "point"])
 @each("bad", [np.nan, np.inf])
 def test_one_draw_that_is_not_finite_fails(method: str, bad: float) -> None:
@@ -139,6 +145,7 @@ def test_what_the_fit_noted_itself_fails(method: str) -> None:
     assert judged.problems == ("It never ended.",)
 
 
+@pytest.mark.thorough
 @each(
     ("change", "words"),
     [
@@ -153,6 +160,7 @@ def test_cautions_do_not_fail(change: dict, words: str) -> None:
     assert any(words in caution for caution in judged.cautions)
 
 
+@pytest.mark.thorough
 @each(
     ("method", "words"),
     [
@@ -172,6 +180,7 @@ def test_another_mode_is_told_as_the_method_sees_it(method: str, words: str) -> 
     assert ("use method='nuts'" in caution) == (method in ("laplace", "variational"))
 
 
+@pytest.mark.thorough
 def test_the_method_is_called_as_it_was_stated() -> None:
     tree = make_result(method="laplace")
     assert method_of(tree) == "laplace"
@@ -181,6 +190,7 @@ def test_the_method_is_called_as_it_was_stated() -> None:
     assert method_of(edit_provenance(make_result(), method=None)) == "nuts"
 
 
+@pytest.mark.thorough
 def test_deep_trees_are_a_caution_once_they_are_many() -> None:
     tree = make_result()
     deep = np.zeros((4, 250), bool)
@@ -220,12 +230,14 @@ def test_a_guide_is_judged_by_its_weights_as_laplace_is() -> None:
     assert not verdict(edit_provenance(tree, method="tempered")).cautions
 
 
+@pytest.mark.thorough
 @each(("value", "cautious"), [(0.0, False), (np.nan, True), (np.inf, True), (-np.inf, True)])
 def test_k_hat_of_weights_that_are_all_alike(value: float, cautious: bool) -> None:
     judged = verdict(laplace_tree(np.full((4, 1000), value)))
     assert bool(judged.cautions) == cautious
 
 
+@pytest.mark.thorough
 def test_a_few_weights_of_zero_are_no_reason_to_worry() -> None:
     log_weight = np.random.default_rng(0).normal(0.0, 0.01, (4, 1000))
     log_weight[0, :3] = -np.inf
@@ -263,6 +275,7 @@ def test_json_is_valid_json(method: str) -> None:
         assert key in said
 
 
+@pytest.mark.thorough
 def test_a_file_gives_the_same_table(tmp_path) -> None:
     tree = make_result(discrepancy=True)
     tree.to_netcdf(tmp_path / "r.nc", engine="netcdf4")

@@ -94,6 +94,7 @@ def test_estimates_alone_are_what_the_readings_say(spreads, rng) -> None:
         assert alone.leaning == pytest.approx(expected, abs=5.0 * of_precision * error**2)
 
 
+@pytest.mark.thorough
 def test_a_member_without_readings_says_nothing(rng) -> None:
     no_progress = 1e6
     value, mu, spread = exact_draws(READINGS, np.append(ERRORS[:-1], no_progress), [0.06, 0.1], rng)
@@ -103,6 +104,7 @@ def test_a_member_without_readings_says_nothing(rng) -> None:
     assert alone.leaning > 0.95
 
 
+@pytest.mark.thorough
 def test_a_member_that_does_not_move_has_no_estimate() -> None:
     assert np.isnan(estimate_alone(np.ones(9), np.zeros(9), np.ones(9))).all()
 
@@ -136,6 +138,7 @@ def test_pooling_factor_of_a_known_population(rng) -> None:
     assert row["meaning"] == "members differ by about 0.08"
 
 
+@pytest.mark.thorough
 @each(("error", "low", "high"), [(1e-3, 0.0, 0.01), (10.0, 0.99, 1.0)])
 def test_pooling_factor_from_none_to_all(error, low, high, rng) -> None:
     value, mu, s = exact_draws(READINGS, np.full(6, error), [0.1], rng, location=1.45)
@@ -153,6 +156,7 @@ def test_a_new_member_is_drawn_from_the_population(name) -> None:
     assert [row["new_q2.5"], row["new_q97.5"]] == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.thorough
 def test_a_new_member_is_cut_not_heaped_up_at_the_bounds() -> None:
     flat = np.zeros(CHAINS * DRAWS)
     value = np.array([[1.22], [1.25]]) + flat
@@ -167,6 +171,7 @@ def test_a_new_member_is_cut_not_heaped_up_at_the_bounds() -> None:
     assert np.array_equal(population.new_members(), population.new_members())
 
 
+@pytest.mark.thorough
 @each(
     ("said", "bounds"),
     [(None, (1.0, np.inf)), ((1.2, None), (1.2, np.inf)), ((1.25, 10), (1.25, 10))],
@@ -197,6 +202,7 @@ def test_what_a_spread_means_in_the_unit_of_the_parameter(name, expected) -> Non
     assert ("a factor of about 1.11" in row["meaning"]) == (name == "roughness")
 
 
+@pytest.mark.thorough
 def test_every_wavelength_is_a_population_of_its_own() -> None:
     result = pool(
         make_result(materials=("a", "b", "c"), wavelengths=(450.0, 550.0), draws=50),
@@ -213,6 +219,7 @@ def test_every_wavelength_is_a_population_of_its_own() -> None:
     assert len(shrinkage(result)) == 9
 
 
+@pytest.mark.thorough
 @each(
     "result",
     [

@@ -151,6 +151,7 @@ def test_a_scene_with_everything_off_is_the_bare_formula_and_nothing_else(plain:
     assert plain == pytest.approx(operations(by_hand, PLAIN.parameters), rel=SAME)
 
 
+@pytest.mark.thorough
 @each("name", ON)
 def test_an_effect_costs_when_it_is_on_and_leaves_nothing_when_it_is_off(
     name: str, plain: float
@@ -162,6 +163,7 @@ def test_an_effect_costs_when_it_is_on_and_leaves_nothing_when_it_is_off(
     assert operations(scene.predict, scene.parameters) > (1.0 + SAME) * plain
 
 
+@pytest.mark.thorough
 def test_an_index_of_its_own_costs_less_than_a_law_of_dispersion(plain: float) -> None:
     scene = dataclasses.replace(PLAIN, dispersion=pb.Cauchy())
     assert operations(scene.predict, scene.parameters) > plain

@@ -98,6 +98,7 @@ def test_a_part_of_the_user_s_own_takes_part() -> None:
     assert effects["Fog"].instrument == pb.Instrument((pb.DolpGain(),))
 
 
+@pytest.mark.thorough
 def test_what_holds_nothing_any_more_is_left_out_too() -> None:
     bare = simplify(ROUGH, [e for e in effects_of(ROUGH) if e.path.startswith(("inst", "coat"))])
     assert bare.instrument is None
@@ -114,6 +115,7 @@ def test_a_part_and_what_is_inside_it_go_together() -> None:
     )
 
 
+@pytest.mark.thorough
 @each("scene", [ROUGH, *FULL_SCENES.values()])
 def test_no_two_effects_share_a_name_or_a_scene(scene: pb.Scene) -> None:
     effects = effects_of(scene)
@@ -122,6 +124,7 @@ def test_no_two_effects_share_a_name_or_a_scene(scene: pb.Scene) -> None:
     assert scene not in {effect.apply(scene) for effect in effects}
 
 
+@pytest.mark.thorough
 def test_equal_names_get_their_place() -> None:
     coats = (pb.ClearCoat("upper", "lacquer"), pb.ClearCoat())
     scene = pb.Scene(pb.SmoothSurface(), coat=pb.CoatStack(coats))
@@ -153,5 +156,6 @@ def test_an_unknown_effect_is_refused_with_the_names() -> None:
         find_effects("Fogg", effects_of(ROUGH), "drop")
 
 
+@pytest.mark.thorough
 def test_every_set_up_has_a_scene_with_everything_on() -> None:
     assert set(FULL_SCENES) == set(SETUPS)

@@ -80,6 +80,7 @@ def test_a_ball_comes_back_in_the_plane_of_the_model():
         assert np.asarray(said[name])[valid].max() > 0.02
 
 
+@pytest.mark.thorough
 @each("width", [2, 4, 8])
 def test_the_noise_that_is_left_is_the_stated_one(width):
     """Scores of q over a frame of even light; neighbors share a little noise.
@@ -104,6 +105,7 @@ def test_the_noise_that_is_left_is_the_stated_one(width):
     assert capture.attrs["median_misfit"] < 3.0
 
 
+@pytest.mark.thorough
 def test_noise_below_the_dark_level_is_kept():
     """Cut off at zero, dark pixels would look brighter than they are."""
     rng = np.random.default_rng(5)
@@ -125,6 +127,7 @@ def test_a_full_pixel_masks_all_that_is_filled_in_from_it():
     assert not capture["valid"].values[capture["saturated"].values].any()
 
 
+@pytest.mark.thorough
 def test_a_frame_in_a_file(tmp_path):
     raw = np.rint(mosaic(sloping()) * 0.5).astype(np.uint8)
     Image.fromarray(raw).save(tmp_path / "plate.png")

@@ -68,6 +68,7 @@ def test_a_wrong_sense_of_the_angles_does_not_pass():
         check_same_light(capture)
 
 
+@pytest.mark.thorough
 def test_light_and_camera_may_stand_near():
     """Off the axis the lens turns the camera's axes with each ray."""
     camera, lamp = pb.Position(3.0, -2.0, 60.0), pb.Position(-30.0, 50.0, 45.0)
@@ -122,6 +123,7 @@ def test_surroundings_stand_where_each_place_mirrors_them():
     np.testing.assert_array_equal(capture["q"].values[both], lamp["q"].values[both])
 
 
+@pytest.mark.thorough
 def test_views_of_a_window_are_the_readings_next_to_each_other():
     known = {"shape": ball_normals(), "light": LAMP, "detector": QUIET}
     one = from_polarizer(frames(FOUR), FOUR, window=1, **known)
@@ -131,6 +133,7 @@ def test_views_of_a_window_are_the_readings_next_to_each_other():
     assert four["y"].values[:2].tolist() == [0.5, 2.5]
 
 
+@pytest.mark.thorough
 def test_what_fills_no_square_is_counted():
     capture = from_polarizer(
         frames(FOUR), FOUR, shape=ball_normals(), light=LAMP, detector=QUIET, bin=3, window=3
@@ -164,6 +167,7 @@ def test_dark_and_flat_frames_are_taken_out():
     assert np.nanmax(np.abs(spoiled["q"] - clean["q"])) > 0.05
 
 
+@pytest.mark.thorough
 def test_every_masked_reading_has_one_reason():
     raw = frames(FOUR)
     lamp = pb.Direction(1.0, 0.0, 0.2)  # from the side, so that a part lies in its own shadow
@@ -187,6 +191,7 @@ def test_every_masked_reading_has_one_reason():
     assert np.isnan(capture["q"].where(~capture["valid"])).all()
 
 
+@pytest.mark.thorough
 def test_errors_are_those_of_many_exposures():
     """Scores of q and u of 6,000 readings with three unequal angles, whose errors go together.
 
@@ -220,6 +225,7 @@ def test_errors_are_those_of_many_exposures():
     assert "median_misfit" not in capture.attrs
 
 
+@pytest.mark.thorough
 def test_averaging_pixels_lowers_the_noise_but_not_what_stays_unknown():
     known = {"shape": ball_normals(), "light": LAMP, "window": 1}
     noisy = pb.Detector(saturation_level=FULL, read_noise=20.0, gain=0.0001, relative_error=0.0)
@@ -252,6 +258,7 @@ def test_files_hold_the_same_as_arrays(tmp_path, suffix):
     assert validate(files).identical(files)
 
 
+@pytest.mark.thorough
 def test_frames_of_8_bits_are_full_at_255():
     raw = np.rint(frames(FOUR, full=400.0))
     raw[1, 15, 24] = 255.0
@@ -337,6 +344,7 @@ def test_dark_and_flat_frames_are_checked(field, said):
         with_defaults(detector=pb.Detector(saturation_level=FULL, **field))
 
 
+@pytest.mark.thorough
 def test_a_picture_in_color_is_refused(tmp_path):
     path = tmp_path / "color.png"
     Image.new("RGB", (48, 40)).save(path)
@@ -347,6 +355,7 @@ def test_a_picture_in_color_is_refused(tmp_path):
         with_defaults(frames=[tmp_path / "broken.png"] * 4)
 
 
+@pytest.mark.thorough
 def test_files_that_hold_something_else_than_one_frame_of_counts_are_refused(tmp_path, monkeypatch):
     pages = [Image.fromarray(np.full((8, 8), 100 + k, np.uint8)) for k in range(4)]
     stacked, lossy = tmp_path / "angles.tif", tmp_path / "ball.jpg"

@@ -101,12 +101,14 @@ def test_a_damaged_fit_is_refused_in_one_line_or_works(seed):
     assert 15 < check_mutations(RESULTS, OF_FITS, random, 50) < 45
 
 
+@pytest.mark.thorough
 @each("seed", range(2))
 def test_a_damaged_calibration_is_refused_in_one_line_or_works(seed):
     random = np.random.default_rng([12, seed])
     assert 20 < check_mutations([CALIBRATION], OF_CALIBRATIONS, random, 40) < 40
 
 
+@pytest.mark.thorough
 def test_a_damaged_study_is_refused_in_one_line_or_works():
     random = np.random.default_rng([13])
     assert 40 < check_mutations([make_accuracy()], OF_STUDIES, random, 120) < 120
@@ -140,6 +142,7 @@ def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
 # --- provenance -------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 @each("odd", ODD_ATTRIBUTES, ids=lambda odd: str(odd)[:9])
 def test_provenance_that_is_no_mapping_is_refused(odd):
     tree = RESULTS[1].copy()
@@ -168,6 +171,7 @@ def test_provenance_of_the_wrong_type_is_refused(change, what):
         pb.json_summary(tree)
 
 
+@pytest.mark.thorough
 def test_provenance_may_lack_anything():
     tree = RESULTS[0].copy()
     tree.attrs = {}
@@ -214,6 +218,7 @@ def test_a_posterior_that_does_not_hold_together_is_refused(change, what):
         pb.verdict(_edited(change))
 
 
+@pytest.mark.thorough
 @each("dim", ["row", "parameter"])
 def test_a_study_of_nothing_is_refused(dim):
     study = make_accuracy()
@@ -231,6 +236,7 @@ def test_a_group_that_xarray_cannot_read_is_refused(number):
         pb.summary(tree)
 
 
+@pytest.mark.thorough
 def test_readings_and_predictions_belong_together():
     tree = _edited(lambda x: x.isel(view=slice(2)), "observed_data")
     with pytest.raises(pb.FitError, match="its view has 4 entries, that of observed_data 2"):
@@ -240,6 +246,7 @@ def test_readings_and_predictions_belong_together():
         pb.stack_readings(tree)
 
 
+@pytest.mark.thorough
 def test_other_kinds_of_tree_are_named(tmp_path):
     for function in (pb.summary, pb.stack_readings, pb.auto_sentences, pb.population_summary):
         for wrong in (CALIBRATION, xr.Dataset(), None, "fit.nc"):
@@ -283,6 +290,7 @@ def test_a_tree_that_arviz_made_is_summed_up():
 OPTIONAL = sorted(set(RESULTS[1].children) - {"posterior"})
 
 
+@pytest.mark.thorough
 @each("group", OPTIONAL)
 def test_any_group_but_the_posterior_may_be_missing(group):
     tree = RESULTS[1].copy()
@@ -294,6 +302,7 @@ def test_any_group_but_the_posterior_may_be_missing(group):
             pb.plot_readings(tree, "dop")
 
 
+@pytest.mark.thorough
 def test_a_report_leaves_out_what_a_result_lacks(tmp_path):
     tree = RESULTS[2].copy()
     for group in ("noise_free", "constant_data", "prior"):
@@ -303,6 +312,7 @@ def test_a_report_leaves_out_what_a_result_lacks(tmp_path):
     assert "roughness" in page
 
 
+@pytest.mark.thorough
 def test_comparisons_have_the_labels_of_the_fit():
     program = SimpleNamespace(
         auxiliary=(),
@@ -358,6 +368,7 @@ def test_a_flipped_bit_is_an_error_and_no_value(tmp_path, part):
         pb.load_result(tmp_path / "damaged.nc")
 
 
+@pytest.mark.thorough
 def test_a_result_edited_elsewhere_has_no_checksum(tmp_path):
     pb.save_result(RESULTS[1], tmp_path / "fit.nc")
     with xr.open_datatree(tmp_path / "fit.nc", engine="netcdf4") as opened:
@@ -382,6 +393,7 @@ def _with_draws(method, name, values, **provenance):
     return replace(tree, "posterior", name, draws + values)
 
 
+@pytest.mark.thorough
 @each("method", ["nuts", "laplace", "importance", "tempered"])
 def test_draws_that_are_all_equal_are_a_problem(method):
     kind = "nuts" if method == "nuts" else "laplace"
@@ -407,6 +419,7 @@ def test_draws_that_their_prior_rules_out_are_a_problem(method, name, value, pro
     assert re.search(words, problem)
 
 
+@pytest.mark.thorough
 def test_one_draw_beyond_the_end_is_a_problem_and_rounding_is_none():
     tree = make_result(wavelengths=())
     draws = tree["posterior"]["roughness"].to_numpy().copy()
@@ -418,6 +431,7 @@ def test_one_draw_beyond_the_end_is_a_problem_and_rounding_is_none():
     assert not pb.verdict(replace(tree, "posterior", "roughness", draws)).converged
 
 
+@pytest.mark.thorough
 def test_a_name_that_the_users_own_model_declares_means_what_it_wants():
     tree = make_result(wavelengths=())
     tree = replace(tree, "posterior", "roughness", tree["posterior"]["roughness"].to_numpy() - 0.4)

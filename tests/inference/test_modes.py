@@ -1,6 +1,7 @@
 """Peaks are found, told apart, weighed, and never invented."""
 
 import numpy as np
+import pytest
 from cases import each
 from scipy.stats import multivariate_normal
 
@@ -44,6 +45,7 @@ def test_a_normal_peak_is_found_with_its_width() -> None:
     np.testing.assert_allclose(end.covariance, SPREAD, rtol=1e-7)
 
 
+@pytest.mark.thorough
 def test_curvature_of_a_cubic_is_accurate_to_the_stated_error() -> None:
     def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
         return float(np.sum(np.exp(z))), np.exp(z)
@@ -73,6 +75,7 @@ def test_a_saddle_is_never_called_a_peak() -> None:
     assert distinct([end]) is None
 
 
+@pytest.mark.thorough
 def test_a_wall_of_nan_ends_a_climb_without_a_peak() -> None:
     def nowhere(z: np.ndarray) -> tuple[float, np.ndarray]:
         return np.nan, np.full(z.size, np.nan)

@@ -113,6 +113,7 @@ def test_what_was_compiled_for_others_gives_the_same_draws() -> None:
     xr.testing.assert_equal(before[name].to_dataset(), again[name].to_dataset())
 
 
+@pytest.mark.thorough
 def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
     """`fit` splits a round number of keys; the first of them must be those of any number."""
     key = jax.random.key(5)
@@ -122,6 +123,7 @@ def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
     assert np.array_equal(many[:1234], few)
 
 
+@pytest.mark.thorough
 def test_any_number_of_prior_draws_is_served_by_one_program(
     compiled: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -207,6 +209,7 @@ def test_the_same_question_shares_what_is_compiled(what: str) -> None:
     assert compiled_model(one(1), **first) is compiled_model(one(2), **second)
 
 
+@pytest.mark.thorough
 def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -231,11 +234,13 @@ def test_another_question_shares_nothing(what: str) -> None:
     assert compiled_model(one(1), **first) is not compiled_model(one(1), **second)
 
 
+@pytest.mark.thorough
 def test_another_layout_shares_nothing() -> None:
     longer = plate_capture(np.linspace(30.0, 75.0, 7), 0.02, 1)
     assert compiled_model(one(1)) is not compiled_model(longer)
 
 
+@pytest.mark.thorough
 def test_how_a_scene_was_chosen_does_not_count() -> None:
     parts = {field.name: getattr(PLATE, field.name) for field in dataclasses.fields(PLATE)}
     chosen = [ChosenScene(**parts) for _ in range(2)]
@@ -260,6 +265,7 @@ def test_a_model_that_is_edited_and_loaded_again_is_another(
     del sys.modules["model_of_mine"]
 
 
+@pytest.mark.thorough
 def test_the_last_few_are_kept() -> None:
     made: list[str] = []
     kept: LRUCache[str] = LRUCache(2)
@@ -272,6 +278,7 @@ def test_the_last_few_are_kept() -> None:
     assert made == ["a", "b", "c", "b"]  # c took the place of b, which was asked for before a
 
 
+@pytest.mark.thorough
 def test_fits_side_by_side_leave_warnings_as_they_were() -> None:
     """The first ends before the second does: neither may undo what the other needs."""
     first_ended, second_began = threading.Event(), threading.Event()

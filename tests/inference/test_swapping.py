@@ -42,6 +42,7 @@ def test_by_keyword(capture: xr.Dataset) -> None:
     assert "prior of refractive_index" in provenance_of(result)["swapped"]
 
 
+@pytest.mark.thorough
 def test_by_an_edited_file(capture: xr.Dataset, tmp_path: Path) -> None:
     text = (MODELS / "per_material.py").read_text()
     edited = text.replace(
@@ -84,6 +85,7 @@ def test_a_model_reads_priors_by_any_name(capture: xr.Dataset) -> None:
         fit(capture, model=index_above_one)
 
 
+@pytest.mark.thorough
 def test_by_condition(capture: xr.Dataset) -> None:
     held = handlers.condition(per_material, data={"refractive_index": np.float64(1.45)})
     result = fit(capture, model=held)
@@ -172,6 +174,7 @@ def test_a_model_that_cannot_work_is_refused(capture: xr.Dataset, model, said: s
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.thorough
 def test_a_prior_that_the_model_does_not_read_is_refused(capture: xr.Dataset) -> None:
     with pytest.raises(pb.FitError, match="no such parameter in this model"):
         fit(capture, priors={"refractive_index_spread": dist.HalfNormal(0.1)})

@@ -75,6 +75,7 @@ def anchors(rng: np.random.Generator, *, exact: np.ndarray | None = None) -> Anc
     return Anchors(*map(jnp.asarray, parts))
 
 
+@pytest.mark.thorough
 def test_patches_find_their_coordinates(made) -> None:
     transport, data = made
     assert transport.groups.axis == "patch"
@@ -122,6 +123,7 @@ def test_where_readings_are_normal_members_are_independent_of_their_population(
     np.testing.assert_allclose(difference, difference[0], atol=1e-7)
 
 
+@pytest.mark.thorough
 def test_a_prior_that_differs_between_patches_keeps_them_together(made, capture) -> None:
     def uneven(data, scene, priors, links):
         width = jnp.linspace(0.1, 0.5, MEMBERS)[:, None]

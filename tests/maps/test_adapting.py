@@ -27,12 +27,14 @@ def test_heavy_points_are_those_of_student(size: int) -> None:
     np.testing.assert_array_equal(points.places[::2], -points.places[1::2])
 
 
+@pytest.mark.thorough
 def test_points_follow_the_seed() -> None:
     one, two, other = (heavy_points(128, 3, seed).places for seed in (1, 1, 2))
     assert (one == two).all()
     assert (one != other).all()
 
 
+@pytest.mark.thorough
 def test_parts_of_points_are_the_points() -> None:
     whole = normal_points(256, 2, seed=3)
     parts = whole.split(4)
@@ -55,6 +57,7 @@ def test_moments_are_those_of_the_weighted_draws() -> None:
     assert np.cov(drawn[0].T) == pytest.approx(found.half[0].T @ found.half[0], rel=0.02, abs=0.01)
 
 
+@pytest.mark.thorough
 def test_draws_without_a_volume_propose_nothing() -> None:
     places = np.random.default_rng(6).normal(size=(3, 64, 2))
     weights = np.full((3, 64), 1.0 / 64.0)
@@ -69,6 +72,7 @@ def test_draws_without_a_volume_propose_nothing() -> None:
     assert np.isnan(line).any() or np.abs(np.linalg.det(line)) < 1e-6
 
 
+@pytest.mark.thorough
 def test_where_a_normal_distribution_fails_the_posterior_of_a_grid_is_found() -> None:
     """Largest error of 4 Monte Carlo errors: 6e-5 a comparison, 1e-3 over all of them."""
     method = PixelLaplace(sampler=None)

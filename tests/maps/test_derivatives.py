@@ -121,6 +121,7 @@ def test_expanding_is_what_jax_does_backwards(name: str) -> None:
     assert_close(ours.curvature, hessian)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", EVERY)
 def test_scoring_has_the_same_value_and_gradient(name: str) -> None:
     here = case(name)
@@ -167,6 +168,7 @@ def test_scoring_of_normal_noise_is_that_of_gauss_and_newton(name: str) -> None:
     assert_close(ours.curvature, everywhere(expected, here))
 
 
+@pytest.mark.thorough
 def test_scoring_of_noise_of_unknown_scale_bends_in_both_arguments() -> None:
     here = case("noise of unknown scale")
 

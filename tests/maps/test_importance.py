@@ -41,6 +41,7 @@ def test_weights_are_those_of_arviz(tail: str, count: int) -> None:
     assert ours.pareto_k == pytest.approx(k, rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.thorough
 @given(seed=st.integers(0, 2**32 - 1), spread=st.floats(0.05, 20.0), shift=st.floats(-1e3, 1e3))
 @settings(max_examples=50, deadline=None)
 def test_weights_of_any_draws_are_those_of_arviz(seed: int, spread: float, shift: float) -> None:
@@ -63,6 +64,7 @@ def test_a_pixel_does_not_depend_on_its_neighbors() -> None:
         assert alone.pareto_k[0].tobytes() == together.pareto_k[number].tobytes()
 
 
+@pytest.mark.thorough
 def test_the_order_of_draws_does_not_matter() -> None:
     rng = np.random.default_rng(2)
     log_ratios = rng.normal(size=(1, 256))
@@ -111,6 +113,7 @@ def test_an_exact_approximation_has_even_weights_and_no_tail(dtype: type) -> Non
     assert effective_draws(found.weights) == pytest.approx(256.0)
 
 
+@pytest.mark.thorough
 def test_single_precision_ratios_give_the_same_weights() -> None:
     log_ratios = np.random.default_rng(6).normal(size=(4, 256))
     one, two = smooth(log_ratios), smooth(log_ratios.astype(np.float32))
@@ -132,12 +135,14 @@ def test_even_weights_give_the_mean_the_sd_and_the_quantiles_of_the_draws() -> N
     assert quantiles == pytest.approx(np.quantile(draws, LEVELS, axis=-1, method="hazen"))
 
 
+@pytest.mark.thorough
 def test_a_level_beyond_the_outermost_middle_is_the_outermost_draw() -> None:
     draws = np.array([[3.0, 1.0, 2.0]])
     _, _, quantiles = summarize(draws, np.full((1, 3), 1.0 / 3.0), (0.0, 0.1, 0.9, 1.0))
     assert quantiles[:, 0].tolist() == [1.0, 1.0, 3.0, 3.0]
 
 
+@pytest.mark.thorough
 def test_draws_without_weight_change_nothing() -> None:
     rng = np.random.default_rng(8)
     draws, weights = rng.normal(size=(2, 100)), rng.dirichlet(np.ones(100), 2)
@@ -151,6 +156,7 @@ def test_draws_without_weight_change_nothing() -> None:
     assert np.abs(told[2] - plain[2]).max() <= gap
 
 
+@pytest.mark.thorough
 def test_one_draw_with_all_the_weight_is_the_answer() -> None:
     weights = np.zeros((1, 64))
     weights[0, 17] = 1.0
@@ -197,6 +203,7 @@ def test_points_are_standard_normal(count: int, size: int) -> None:
         assert stats.kstest(column, stats.norm.cdf).pvalue > 0.5  # spread more evenly than chance
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_points() -> None:
     one, two, other = (normal_points(128, 3, seed).places for seed in (1, 1, 2))
     assert one.tobytes() == two.tobytes()
@@ -215,6 +222,7 @@ def test_turns_keep_lengths_and_favor_no_direction(size: int) -> None:
     assert turns(keys[7:8], size)[0].tobytes() == found[7].tobytes()
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("compiled_in_haste")
 def test_turns_do_not_depend_on_how_many_there_are_or_how_they_were_compiled() -> None:
     keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(15), 13)))
@@ -224,6 +232,7 @@ def test_turns_do_not_depend_on_how_many_there_are_or_how_they_were_compiled() -
         assert turns(keys[:count], 3).tobytes() == in_haste[:count].tobytes()
 
 
+@pytest.mark.thorough
 def test_what_few_points_get_wrong_of_a_quantile_averages_out_over_pixels() -> None:
     """Without turns a half interval holds some percent less, or more, in all pixels alike."""
     size, pixels = 4, 2000

@@ -43,6 +43,7 @@ def test_tempered_maps_are_those_of_a_grid(image: xr.Dataset, tempered: xr.Datas
     assert np.abs(apart).max() < 4.0
 
 
+@pytest.mark.thorough
 def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, tempered: xr.Dataset) -> None:
     chains = pb.fit_pixels(image.isel(y=[0], x=[0, 1]), method=pb.PixelNuts(), **ASKED)
     assert (chains["approach"] == Approach.NUTS).all()
@@ -64,6 +65,7 @@ def test_the_map_says_how_it_was_made(tempered: xr.Dataset, tmp_path: Path) -> N
     assert "all by tempered draws" in page
 
 
+@pytest.mark.thorough
 def test_files_give_the_same_map(image: xr.Dataset, tempered: xr.Dataset, tmp_path: Path) -> None:
     image.to_zarr(tmp_path / "image.zarr", consolidated=False)
     stored = pb.map_file(tmp_path / "image.zarr", tmp_path / "map.zarr", method=TEMPERING, **ASKED)

@@ -130,12 +130,14 @@ HARD = {
 }
 
 
+@pytest.mark.thorough
 @each("hard", HARD)
 def test_hard_pixels_have_them_too(plan: Plan, guide: Callable, hard: str) -> None:
     image = plate_image(2, 5, **HARD[hard], seed=4)
     assert assert_modes_agree(plan, stacked(image, plan), guide) == 10
 
 
+@pytest.mark.thorough
 def test_on_a_bent_ridge_some_arrive_and_the_others_say_that_they_did_not(
     plan: Plan, guide: Callable
 ) -> None:

@@ -54,6 +54,7 @@ def test_a_skewed_pixel_has_the_posterior_of_a_grid(sampled) -> None:
     assert skewest > 0.5  # or a normal distribution would have done
 
 
+@pytest.mark.thorough
 def test_draws_follow_the_number_of_a_pixel_not_its_place(made, sampled) -> None:
     engine, pixels, settled = made
     order = np.array([2, 0])
@@ -72,6 +73,7 @@ def test_keys_differ_by_number_and_by_seed() -> None:
     assert (_keys(0, numbers[::-1]) == one[::-1]).all()
 
 
+@pytest.mark.thorough
 def test_the_two_chains_of_a_pixel_are_not_the_same(sampled) -> None:
     chains = sampled[0][NAMES[0]].reshape(3, CHAINS.chains, CHAINS.draws)
     assert (chains[:, 0] != chains[:, 1]).any(axis=-1).all()

@@ -38,6 +38,7 @@ def test_factors_and_inverses_are_those_of_numpy(size: int, dtype: type) -> None
     assert (np.triu(half, 1) == 0.0).all()
 
 
+@pytest.mark.thorough
 @each("size", [2, 4, 7])
 @each("condition", [1e6, 1e10, 1e13])
 def test_ill_conditioned_matrices_are_factored_to_rounding(size: int, condition: float) -> None:
@@ -95,6 +96,7 @@ def test_what_has_no_factor_gets_nan_and_no_repair(case: str, dtype: type) -> No
     assert np.isfinite(half[1]).all()
 
 
+@pytest.mark.thorough
 def test_one_by_one_is_the_square_root() -> None:
     factor = cholesky(jnp.array([[4.0]]))
     assert factor.tolist() == [[2.0]]

@@ -218,6 +218,7 @@ def test_density_and_gradient_are_finite(colors: np.ndarray, precision: str) -> 
                 assert np.isfinite(gradient).all()
 
 
+@pytest.mark.thorough
 def test_two_equal_wavelengths_are_fitted_in_single_precision() -> None:
     colors = HARD_COLORS["two equal"]
     capture = spectral_plate((colors, np.array([1.51, 1.51])), error=0.01, seed=6)
@@ -233,6 +234,7 @@ def test_two_equal_wavelengths_are_fitted_in_single_precision() -> None:
     assert predicted.std(("chain", "draw"))[1] > index[..., 0].std()
 
 
+@pytest.mark.thorough
 def test_one_wavelength_has_the_prior_of_one_wavelength() -> None:
     """Without neighbors the model is `per_material`."""
     capture = spectral_plate({550.0: 1.51}, error=0.01, seed=6)
@@ -280,6 +282,7 @@ def patches() -> xr.Dataset:
     return xr.concat(parts, "patch", data_vars=["q", "q_error"], coords="minimal", compat="equals")
 
 
+@pytest.mark.thorough
 def test_every_patch_has_its_own_curve_around_a_pooled_level() -> None:
     model = dataclasses.replace(INDEX_ONLY, pooled=("refractive_index",))
     result = fit(patches(), model)
@@ -313,6 +316,7 @@ def test_a_law_of_dispersion_takes_the_place_of_a_process() -> None:
         pb.predict_spectrum(result, [500.0])
 
 
+@pytest.mark.thorough
 def test_absorption_and_index_are_coupled_at_once() -> None:
     protocol = pb.Protocol(views=6, wavelengths=(450.0, 500.0, 550.0, 600.0))
     scene = pb.Scene(pb.SmoothSurface(), pb.Depolarizer(), pb.DopMixing())
@@ -367,6 +371,7 @@ def test_what_is_no_wavelength_is_refused(wavelengths: Any) -> None:
         pb.predict_spectrum(xr.DataTree(), wavelengths)
 
 
+@pytest.mark.thorough
 def test_a_result_without_ties_between_colors_is_refused() -> None:
     result = fit(THREE, "per_material")
     with pytest.raises(pb.FitError, match="'per_material': the fit ties no color to another"):

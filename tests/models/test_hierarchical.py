@@ -133,6 +133,7 @@ def twin_draws(capture: xr.Dataset) -> tuple[dict[str, np.ndarray], float]:
     return {name: each.ravel() for name, each in draws.items()}, chain[..., 0].size / steps
 
 
+@pytest.mark.thorough
 def test_the_posterior_is_that_of_another_density_and_another_sampler() -> None:
     capture = plates([1.46, 1.5, 1.53], TWIN_ERROR, TWIN_VIEWS, seed=2)
     theirs, independent = twin_draws(capture)

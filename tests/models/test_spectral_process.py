@@ -43,6 +43,7 @@ def test_standard_weights_have_the_covariance_of_the_kernel(length: float) -> No
     np.testing.assert_allclose(found, kernel_matrix(length, IRREGULAR, IRREGULAR), atol=1e-9)
 
 
+@pytest.mark.thorough
 @each(("length", "error"), [(60.0, 1e-3), (100.0, 1e-7), (300.0, 1e-8)])
 def test_twenty_knots_stand_for_two_hundred_wavelengths(length: float, error: float) -> None:
     many = np.linspace(400.0, 800.0, 200)
@@ -50,6 +51,7 @@ def test_twenty_knots_stand_for_two_hundred_wavelengths(length: float, error: fl
     np.testing.assert_allclose(found, kernel_matrix(length, many, many), atol=error)
 
 
+@pytest.mark.thorough
 def test_equal_wavelengths_have_equal_values() -> None:
     process, wavelength = SpectralProcess(), jnp.array([450.0, 550.0, 450.0, 650.0])
     weights = jax.random.normal(jax.random.key(0), (5, 4))
@@ -74,6 +76,7 @@ def test_prediction_is_that_of_tinygp(kernel: str) -> None:
     np.testing.assert_allclose(factor @ factor.T, theirs.covariance, atol=2e-8)
 
 
+@pytest.mark.thorough
 def test_bands_widen_away_from_the_knots() -> None:
     process, places = SpectralProcess(), jnp.array([450.0, 550.0, 650.0])
     new = jnp.array([450.0, 500.0, 660.0, 700.0, 800.0, 3000.0])
@@ -112,6 +115,7 @@ def test_values_and_gradients_are_finite_at_hard_points(
             assert all(np.isfinite(part).all() for part in gradient), (name, length)
 
 
+@pytest.mark.thorough
 def test_what_the_knots_leave_is_finite_at_hard_points() -> None:
     remainder = jax.jit(SpectralProcess().remainder)
     for name in ("two equal", "two hundred equal", "a thousandth apart", "two hundred"):

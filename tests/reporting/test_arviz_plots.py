@@ -81,6 +81,7 @@ def test_arviz_draws_the_draws_of_every_method(name: str, plot: str, fitted) -> 
     assert drawn.viz["figure"].item().get_axes()
 
 
+@pytest.mark.thorough
 @each("plot", OF_AN_ESTIMATE)
 def test_arviz_draws_an_estimate(plot: str, fitted) -> None:
     assert getattr(arviz_plots, plot)(result_of("point", fitted))
@@ -99,6 +100,7 @@ def masked() -> xr.DataTree:
     return make_result(views=14, materials=("leaf", "fruit"), masked=(2, 5), limit=80.0)
 
 
+@pytest.mark.thorough
 @each("plot", ["plot_ppc_pit", "plot_loo_pit", "plot_ppc_dist"])
 @each("name", ["dop", "intensity"])
 def test_masked_readings_are_set_aside_for_arviz(masked, plot: str, name: str) -> None:

@@ -70,6 +70,7 @@ def test_a_report_opens_without_a_fault(driver, reports, name: str, width: int) 
     assert driver.execute_script("return document.images.length") > 0
 
 
+@pytest.mark.thorough
 @each("name", [name for name in REPORTS if name != "evil"])
 def test_the_verdict_is_on_the_first_screen_of_a_phone(driver, reports, name: str) -> None:
     open_page(driver, reports[name], WIDTHS[0])
@@ -77,6 +78,7 @@ def test_the_verdict_is_on_the_first_screen_of_a_phone(driver, reports, name: st
     assert place < 500
 
 
+@pytest.mark.thorough
 @each("name", ["fit", "comparison"])
 def test_a_table_scrolls_in_its_own_box(driver, reports, name: str) -> None:
     open_page(driver, reports[name], WIDTHS[0])
@@ -88,6 +90,7 @@ def test_a_table_scrolls_in_its_own_box(driver, reports, name: str) -> None:
     assert all("scroll" in kind and right <= WIDTHS[0] for kind, right in boxes)
 
 
+@pytest.mark.thorough
 def test_a_table_comes_down_as_a_file_without_network(driver, reports, tmp_path: Path) -> None:
     driver.execute_cdp_cmd(
         "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)}
@@ -105,6 +108,7 @@ def test_a_table_comes_down_as_a_file_without_network(driver, reports, tmp_path:
     assert [float(row["mean"]) for row in rows] == expected["mean"].tolist()  # every digit
 
 
+@pytest.mark.thorough
 @each("name", ["fit", "comparison"])
 def test_a_report_can_be_printed(driver, reports, name: str) -> None:
     open_page(driver, reports[name], WIDTHS[1])
@@ -124,6 +128,7 @@ def test_a_report_can_be_printed(driver, reports, name: str) -> None:
     assert cut == 0
 
 
+@pytest.mark.thorough
 def test_a_fault_is_found(driver, tmp_path: Path) -> None:
     page = tmp_path / "bad.html"
     page.write_text(
@@ -136,6 +141,7 @@ def test_a_fault_is_found(driver, tmp_path: Path) -> None:
         assert words in found
 
 
+@pytest.mark.thorough
 def test_cards_run_nothing_in_a_notebook(driver, tmp_path: Path) -> None:
     page = tmp_path / "cards.html"
     cards = [pb.show(REPORTS["evil"]()), pb.SETUPS["goniometer"].scene, pb.PRIORS]

@@ -44,6 +44,7 @@ def test_readings_of_every_layout(case: str) -> None:
         assert figure.legends[0].get_texts()
 
 
+@pytest.mark.thorough
 @each(
     "draw",
     [
@@ -92,6 +93,7 @@ def test_saturated_masked_and_set_aside_views_are_marked() -> None:
     assert len(lines["x"]) == 1 + 4  # one masked, four beyond 78 degrees
 
 
+@pytest.mark.thorough
 def test_bands_hold_their_share_of_new_readings() -> None:
     curve = curves(make_result(wavelengths=(), draws=1000), "dop")[0]
     assert np.all(np.diff(curve.levels, axis=0) > 0.0)
@@ -101,6 +103,7 @@ def test_bands_hold_their_share_of_new_readings() -> None:
     np.testing.assert_allclose(moved.observed + curve.center, curve.observed)
 
 
+@pytest.mark.thorough
 def test_no_band_where_the_scatter_is_not_known() -> None:
     """A masked view has no stated error, so its predicted scatter means nothing."""
     result = make_result(wavelengths=(), limit=70.0, draws=100)
@@ -110,6 +113,7 @@ def test_no_band_where_the_scatter_is_not_known() -> None:
     assert axes.lines[0].get_xdata().max() > 80.0
 
 
+@pytest.mark.thorough
 def test_a_point_fit_has_a_curve_and_no_bands() -> None:
     figure = plot_readings(result_of("point"), "dop")
     assert not figure.axes[0].collections
@@ -129,6 +133,7 @@ def test_nothing_to_draw_is_an_error_of_one_line(draw, needed: str) -> None:
         draw(result_of("point"))
 
 
+@pytest.mark.thorough
 def test_parameters_that_do_not_move_are_left_out() -> None:
     result = make_result(draws=100, discrepancy=True)
     result = replace(result, "posterior", "roughness", np.full((4, 100), 0.2))
@@ -140,6 +145,7 @@ def test_parameters_that_do_not_move_are_left_out() -> None:
     assert clipped(plots_fit.plot_pairs(result)) == []
 
 
+@pytest.mark.thorough
 def test_figures_need_no_provenance() -> None:
     result = edit_provenance(make_result(draws=100, wavelengths=()))
     result.attrs.clear()

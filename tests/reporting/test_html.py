@@ -32,6 +32,7 @@ def small() -> tuple[xr.DataTree, Page]:
     return result, Page(render(result))
 
 
+@pytest.mark.thorough
 def test_a_method_of_ones_own_has_its_own_name(small) -> None:
     result = edit_provenance(make_result(**SMALL, method="laplace"), method="my <b>own</b>")
     page = Page(render(result))
@@ -74,6 +75,7 @@ def test_every_section_of_a_sampled_fit(small) -> None:
         assert words in small[1].text
 
 
+@pytest.mark.thorough
 @each(
     ("method", "absent", "present"),
     [
@@ -101,6 +103,7 @@ def test_a_failed_fit_says_so_first_and_claims_nothing_about_the_material() -> N
     assert "The data determine" not in text
 
 
+@pytest.mark.thorough
 @each("method", ["nuts", "laplace"])
 def test_a_fit_without_a_single_finite_draw_still_has_a_page(method: str) -> None:
     result = make_result(**SMALL, method=method)
@@ -140,6 +143,7 @@ def test_the_fit_without_discrepancy_is_called_overconfident(page: Page) -> None
     assert "Do not quote the numbers without the discrepancy term" in page.text
 
 
+@pytest.mark.thorough
 def test_it_is_not_called_narrower_where_it_is_not() -> None:
     result = make_result(**SMALL, discrepancy=True)
     plain = result["without_discrepancy"].to_dataset()
@@ -159,6 +163,7 @@ def test_it_is_not_called_narrower_where_it_is_not() -> None:
     assert said[3] == "Do not quote the numbers without the discrepancy term."
 
 
+@pytest.mark.thorough
 def test_a_comparison_that_failed_is_told() -> None:
     failed = {"without_discrepancy": "Fit: no mode was found; add views"}
     result = edit_provenance(make_result(**SMALL), comparisons_failed=failed)
@@ -173,6 +178,7 @@ def test_it_says_whether_intervals_can_be_trusted(small) -> None:
     assert "Trust the intervals with care" in scattered
 
 
+@pytest.mark.thorough
 def test_no_comparison_without_one(small) -> None:
     assert "Without the discrepancy" not in small[1].text
     assert "trusting the instrument" not in small[1].text
@@ -191,6 +197,7 @@ def test_the_folder_holds_page_and_result_and_nothing_else(tmp_path: Path) -> No
     assert render(read) == (folder / "index.html").read_text()
 
 
+@pytest.mark.thorough
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     for place in (tmp_path / "file", tmp_path / "file" / "below"):
@@ -207,6 +214,7 @@ def test_what_is_no_result_leaves_no_folder(tmp_path: Path, wrong: object) -> No
     assert not (tmp_path / "report").exists()
 
 
+@pytest.mark.thorough
 def test_two_readings() -> None:
     assert "Predictive checks" in Page(render(make_result(**{**SMALL, "views": 2}))).text
 

@@ -78,6 +78,7 @@ def test_tables_count_pixels_by_status_and_approach(page: str) -> None:
     assert "laplace the normal approximation as it is 2 1.0% 0" in text
 
 
+@pytest.mark.thorough
 def test_parameters_are_described_over_the_good_pixels(page: str) -> None:
     # Good are the first 160 of 200 values from 0.2 to 0.4; the width of 95% is 0.95.
     assert "subsurface_fraction 0.28 0.21 0.35 0.29 0.95" in text_of(page)
@@ -104,6 +105,7 @@ def test_coverage_stands_beside_that_of_a_map_that_was_not_corrected(page: str) 
     assert "concentration_scale 95%" not in text
 
 
+@pytest.mark.thorough
 def test_without_a_truth_nothing_is_said_of_coverage() -> None:
     page = render_map(mixed())
     assert 'id="coverage"' not in page
@@ -111,6 +113,7 @@ def test_without_a_truth_nothing_is_said_of_coverage() -> None:
     assert "Map report: map" in page
 
 
+@pytest.mark.thorough
 def test_what_is_named_like_markup_is_text() -> None:
     page = render_map(
         mixed(scene=EVIL, model=EVIL, priors={EVIL: EVIL}, settings={EVIL: EVIL}), truth(EVIL)
@@ -120,6 +123,7 @@ def test_what_is_named_like_markup_is_text() -> None:
     assert "default-src 'none'" in page
 
 
+@pytest.mark.thorough
 def test_every_parameter_is_drawn_four_at_a_time_and_a_few_wavelengths() -> None:
     colors = (400.0, 500.0, 600.0, 700.0)
     names = ("refractive_index", "roughness", "subsurface_fraction", "angle_zero", "dark_level")
@@ -138,6 +142,7 @@ def test_every_parameter_is_drawn_four_at_a_time_and_a_few_wavelengths() -> None
     assert all(b"<svg" in base64.b64decode(source) for source, _ in pictures)
 
 
+@pytest.mark.thorough
 def test_a_map_that_was_not_checked_says_so_and_an_empty_one_fails() -> None:
     unchecked = text_of(render_map(mixed(weighted=False)))
     assert "The approximation was taken as it is (weighted=False)" in unchecked
@@ -151,6 +156,7 @@ def test_a_map_that_was_not_checked_says_so_and_an_empty_one_fails() -> None:
         assert not re.search(r"\bnan\b", text_of(page))
 
 
+@pytest.mark.thorough
 @each("name", ["roughness", "roughness_sd", "concentration_scale_quantile"])
 @each("number", [np.nan, np.inf])
 def test_a_pixel_that_is_called_good_without_numbers_is_not(name: str, number: float) -> None:
@@ -173,6 +179,7 @@ def test_a_pixel_that_is_called_good_without_numbers_is_not(name: str, number: f
     assert "Every pixel" not in page
 
 
+@pytest.mark.thorough
 def test_a_status_without_a_meaning_is_refused() -> None:
     maps = make_maps(MEANS)
     maps["status"][1, 1] = 77
@@ -180,6 +187,7 @@ def test_a_status_without_a_meaning_is_refused() -> None:
         pb.show(maps)
 
 
+@pytest.mark.thorough
 def test_shares_are_never_rounded_to_all_or_nothing() -> None:
     assert map_tables.share(99_999, 100_000) == "above 99.9%"
     assert map_tables.share(9_960, 10_000) == "above 99.5%"

@@ -42,6 +42,7 @@ def test_every_parameter_has_its_mean_and_its_width(wavelengths: tuple[float, ..
     assert ("absorption a, 450 nm" in titles) == bool(wavelengths)
 
 
+@pytest.mark.thorough
 def test_a_pixel_without_numbers_is_not_drawn_as_good() -> None:
     image = maps()
     image["status"][:] = 0
@@ -53,6 +54,7 @@ def test_a_pixel_without_numbers_is_not_drawn_as_good() -> None:
     assert drawn[0, 0] == drawn[3, 4] == 5
 
 
+@pytest.mark.thorough
 def test_a_large_image_is_drawn_smaller() -> None:
     figure = pb.plot_maps(maps(1700, 10))
     assert max(image.get_array().shape[0] for axes in figure.axes for image in axes.images) <= 800

@@ -41,6 +41,7 @@ def test_the_verdict_comes_before_the_numbers() -> None:
     assert "refractive_index" in text.partition("parameter")[2]
 
 
+@pytest.mark.thorough
 def test_a_failed_fit_says_so_and_claims_nothing() -> None:
     result = make_result(**SMALL)
     draws = result["posterior"].to_dataset()["roughness"].to_numpy().copy()
@@ -57,6 +58,7 @@ def test_names_run_nothing() -> None:
     assert not {"script", "img"} & set(page.tags)
 
 
+@pytest.mark.thorough
 def test_a_long_table_is_cut_and_says_so() -> None:
     result = make_result(**{**SMALL, "views": 4}, materials=tuple(map(str, range(30))))
     assert "The first 40 of 121 rows." in repr(pb.show(result))

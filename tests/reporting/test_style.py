@@ -5,6 +5,7 @@ import hashlib
 import matplotlib
 import matplotlib.style
 import numpy as np
+import pytest
 from cases import each
 from matplotlib import rcParams
 from matplotlib.colors import to_hex
@@ -70,6 +71,7 @@ def test_it_takes_the_style_that_is_chosen(draw) -> None:
     assert {to_hex(text.get_color()) for text in labels if text.get_text()} <= {"#ffffff"}
 
 
+@pytest.mark.thorough
 def test_single_settings_are_taken_too() -> None:
     with matplotlib.rc_context({"xtick.labelsize": 5.0, "axes.grid": True}):
         axes = DRAWN["plot_readings"]().axes[0]
@@ -77,6 +79,7 @@ def test_single_settings_are_taken_too() -> None:
     assert axes.get_xgridlines()[0].get_visible()
 
 
+@pytest.mark.thorough
 def test_a_style_of_arviz_is_taken() -> None:
     with matplotlib.style.context("arviz-variat"):
         figure = DRAWN["plot_pairs"]()
@@ -85,12 +88,14 @@ def test_a_style_of_arviz_is_taken() -> None:
     assert figure._repr_png_()
 
 
+@pytest.mark.thorough
 def test_names_stay_text_in_every_style() -> None:
     result = make_result(**SMALL, materials=("$x_{", "b"))
     with matplotlib.rc_context({"text.parse_math": True}):
         assert pb.plot_readings(result, "dop")._repr_png_()
 
 
+@pytest.mark.thorough
 def test_a_report_is_the_same_in_every_style(tmp_path) -> None:
     result = make_result(**SMALL, method="point")
     with matplotlib.style.context("dark_background"):

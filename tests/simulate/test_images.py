@@ -96,6 +96,7 @@ TERMS = {
 }
 
 
+@pytest.mark.thorough
 @each("setup", TERMS)
 def test_a_pixel_is_predicted_from_its_own_truth(setup):
     scene = SETUPS[setup].scene
