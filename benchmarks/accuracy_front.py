@@ -46,7 +46,7 @@ def study(name: str, case: Case, number: int, keep: Path, quick: bool) -> xr.Dat
             **asked,
         )
         pb.save_result(found, file)
-    return pb.load_accuracy(file)
+    return pb.benchmark.load_accuracy(file)
 
 
 def tried(case: Case, found: xr.DataTree, number: int, keep: Path) -> tuple[str, float]:
@@ -60,13 +60,15 @@ def tried(case: Case, found: xr.DataTree, number: int, keep: Path) -> tuple[str,
             case.capture(seed=2),
             scene=case.scene,
             links=case.links,
-            rungs={rung: pb.LADDER[rung]},
+            rungs={rung: pb.methods.LADDER[rung]},
             dials=(),
             fresh=False,
             seed=1,
         )
         pb.save_result(again, file)
-    return rung, float(pb.accuracy_table(pb.load_accuracy(file))["error"].iloc[0])
+    return rung, float(
+        pb.benchmark.accuracy_table(pb.benchmark.load_accuracy(file))["error"].iloc[0]
+    )
 
 
 @styled
@@ -87,19 +89,19 @@ def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]])
     """Errors and times of the rungs, and the advice, in Markdown."""
     lines = [f"Measured on {platform.machine()}, {os.cpu_count()} cores.", ""]
     lines += [
-        "| scene | " + " | ".join(pb.LADDER) + " | reference |",
-        "|---" * (len(pb.LADDER) + 2) + "|",
+        "| scene | " + " | ".join(pb.methods.LADDER) + " | reference |",
+        "|---" * (len(pb.methods.LADDER) + 2) + "|",
     ]
     for name, found in studies.items():
-        rows = pb.accuracy_table(found)
+        rows = pb.benchmark.accuracy_table(found)
         noise = float(accuracy_of(found).attrs["reference_error"])
-        cells = [_cell(rows, rung) for rung in pb.LADDER]
+        cells = [_cell(rows, rung) for rung in pb.methods.LADDER]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {noise:.2g} |")
     lines += ["", "| scene | advice | the advised method on another capture |", "|---|---|---|"]
     for name, found in studies.items():
         rung, error = trials[name]
         seen = "" if np.isnan(error) else f"{rung}: {error:.2g} sd"
-        lines.append(f"| {name} | {pb.accuracy_advice(found, TOLERANCE)} | {seen} |")
+        lines.append(f"| {name} | {pb.benchmark.accuracy_advice(found, TOLERANCE)} | {seen} |")
     return "\n".join(lines)
 
 

@@ -17,11 +17,11 @@ from one_material import SCENE
 import polar_bayes as pb
 
 PLATE = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
-SIGNED = {"q": pb.StokesLink(stated_errors=True)}
+SIGNED = {"q": pb.links.StokesLink(stated_errors=True)}
 
 
 @dataclasses.dataclass(frozen=True)
-class Mirror(pb.Protocol):
+class Mirror(pb.simulation.Protocol):
     """Every view in the mirror direction of the light, between two zeniths.
 
     Args:
@@ -55,7 +55,7 @@ class Case:
 
     preset: str
     scene: pb.Scene
-    protocol: pb.Protocol
+    protocol: pb.simulation.Protocol
     links: Mapping[str, Any] | None = None
     keep: tuple[str, ...] = ()
     truth: Mapping[str, float] = MappingProxyType({})
@@ -86,11 +86,11 @@ CASES: Mapping[str, Case] = MappingProxyType(
         "smooth glass, 6 views": Case(
             "glass", PLATE, Mirror(views=6, largest_view_zenith=78.0, **ONE_COLOR), SIGNED
         ),
-        "leaf, 40 views": Case("leaf", SCENE, pb.Protocol(views=40, **ONE_COLOR)),
+        "leaf, 40 views": Case("leaf", SCENE, pb.simulation.Protocol(views=40, **ONE_COLOR)),
         "glossy, fraction near 0": Case(
             "plastic",
             SCENE,
-            pb.Protocol(views=24, **ONE_COLOR),
+            pb.simulation.Protocol(views=24, **ONE_COLOR),
             truth=MappingProxyType({"subsurface_fraction": 0.01}),
         ),
         "few grazing views, DoP alone": Case(

@@ -27,12 +27,12 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.inference.run_method import answer
 
 LAYOUTS = ("smooth glass, 6 views", "leaf, 40 views")
-REFERENCE = pb.Reference(error=0.02)
+REFERENCE = pb.benchmark.Reference(error=0.02)
 CHUNK = 10
 RUNGS = ("importance", "tempered", "nuts")
 
 
-def fit_some(case: Case, numbers: np.ndarray, auto: pb.Auto) -> list[dict[str, Any]]:
+def fit_some(case: Case, numbers: np.ndarray, auto: pb.methods.Auto) -> list[dict[str, Any]]:
     """The automatic choice and the reference of some simulated captures."""
     layout = case.capture(seed=0)
     request = resolve(layout, "per_material", auto, case.scene, None, case.links, None, 0, "double")
@@ -49,7 +49,7 @@ def fit_some(case: Case, numbers: np.ndarray, auto: pb.Auto) -> list[dict[str, A
     return found
 
 
-def _judged(problem: Problem, auto: pb.Auto) -> dict[str, Any]:
+def _judged(problem: Problem, auto: pb.methods.Auto) -> dict[str, Any]:
     begin = time.perf_counter()
     told = answer(auto, problem)
     seconds = time.perf_counter() - begin
@@ -70,7 +70,7 @@ def _judged(problem: Problem, auto: pb.Auto) -> dict[str, Any]:
     }
 
 
-def kept(folder: Path, name: str, count: int, auto: pb.Auto) -> list[dict[str, Any]]:
+def kept(folder: Path, name: str, count: int, auto: pb.methods.Auto) -> list[dict[str, Any]]:
     """All fits of a layout: those of the folder, and those that are still missing."""
     file = folder / f"{name.split(',')[0].replace(' ', '_')}.jsonl"
     there = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
@@ -103,7 +103,7 @@ def main(count: int, keep: Path, tolerance: float, seconds: float) -> None:
     """Fit what is missing, and print the table."""
     jax.config.update("jax_enable_x64", True)
     keep.mkdir(parents=True, exist_ok=True)
-    auto = pb.Auto(tolerance=tolerance, seconds=seconds)
+    auto = pb.methods.Auto(tolerance=tolerance, seconds=seconds)
     each = -(-count // len(LAYOUTS))
     every = {name: kept(keep, name, each, auto) for name in LAYOUTS}
     print("\n| layout | sound reference | within | flagged | missed unflagged | taken | median s |")

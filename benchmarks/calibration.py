@@ -117,7 +117,7 @@ def main(count: int, methods: Sequence[str]) -> None:
                 capture, simulations=count, method=method, scene=SCENE, readings=readings
             )
             took.append(time.perf_counter() - start)
-        table, fits = pb.calibration_table(found), found["fits"].to_dataset()
+        table, fits = pb.calibration.calibration_table(found), found["fits"].to_dataset()
         end = f"{int(np.sum(fits['status'] != 0)):7d} {table['p_value'].min():8.4f}"
         line(method, took, count / took[-1], fits["effective_draws"].to_numpy(), end)
 

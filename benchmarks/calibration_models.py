@@ -10,7 +10,7 @@
 intensity, by tempered draws. `links`: the same, 16 views, each way in which readings may scatter,
 by tempered draws and by chains. `hierarchical`: 4 smooth plates, 6 views of q with stated errors,
 indices and fractions from one population. `spectral`: a smooth plate in 4 colors, 6 views of q,
-index a Gaussian process over wavelength. Both by `pb.Nuts()`. `rough-hierarchical` and
+index a Gaussian process over wavelength. Both by `pb.methods.Nuts()`. `rough-hierarchical` and
 `rough-spectral`: the same axes by the paper's scene, 16 views; minutes for each fit. `goniometer`:
 a plate by the scene of that name, 23 views of q, eleven unknowns, by both methods. The paper's
 scene has four facets on the way out here; priors are the default ones. Prints the joint verdict,
@@ -41,23 +41,23 @@ from polar_bayes.inference.batch_result import Status
 
 VIEWS, COLORS, ERROR = 16, (450.0, 550.0, 650.0, 750.0), 0.02
 FEW = np.linspace(35.0, 75.0, 6)
-ROUGH: dict[str, Any] = {"method": pb.Nuts(), "scene": SCENE}
-SMOOTH: dict[str, Any] = {"method": pb.Nuts(), "scene": PLATE, "links": LINKS}
+ROUGH: dict[str, Any] = {"method": pb.methods.Nuts(), "scene": SCENE}
+SMOOTH: dict[str, Any] = {"method": pb.methods.Nuts(), "scene": PLATE, "links": LINKS}
 DOP = {
-    "Beta": pb.BetaLink(),
-    "logit-normal": pb.LogitNormalLink(),
-    "normal": pb.NormalLink(),
+    "Beta": pb.links.BetaLink(),
+    "logit-normal": pb.links.LogitNormalLink(),
+    "normal": pb.links.NormalLink(),
 }
 STOKES = {
-    "Stokes, normal": pb.StokesLink(),
-    "Stokes, Student-t": pb.StokesLink(degrees_of_freedom=5.0),
-    "Stokes, stated errors": pb.StokesLink(stated_errors=True),
-    "Stokes, normal of one scale": pb.NormalLink(),
+    "Stokes, normal": pb.links.StokesLink(),
+    "Stokes, Student-t": pb.links.StokesLink(degrees_of_freedom=5.0),
+    "Stokes, stated errors": pb.links.StokesLink(stated_errors=True),
+    "Stokes, normal of one scale": pb.links.NormalLink(),
 }
 
 
 def one_material(wavelengths: tuple[float, ...] = ()) -> xr.Dataset:
-    protocol = pb.Protocol(views=VIEWS, wavelengths=wavelengths)
+    protocol = pb.simulation.Protocol(views=VIEWS, wavelengths=wavelengths)
     return pb.simulate("leaf", seed=1, protocol=protocol)
 
 
@@ -80,7 +80,7 @@ def material() -> Asked:
 
 
 def links() -> Asked:
-    intensity = pb.SETUPS["paper"].links["intensity"]
+    intensity = pb.setups.SETUPS["paper"].links["intensity"]
     for ways, capture in ((DOP, one_material()), (STOKES, stokes())):
         read = [name for name in ("dop", "q", "u") if name in capture]
         for title, link in ways.items():
@@ -102,7 +102,7 @@ def spectral() -> Asked:
 
 def goniometer() -> Asked:
     capture = plate_capture(GONIOMETER_VIEWS, ERROR, seed=1)
-    for name, method in {"tempered": "tempered", "pb.Nuts()": pb.Nuts()}.items():
+    for name, method in {"tempered": "tempered", "pb.methods.Nuts()": pb.methods.Nuts()}.items():
         yield f"a plate on a goniometer, {name}", capture, GONIOMETER | {"method": method}
 
 
@@ -128,7 +128,7 @@ EVERY = {
 
 def said(found: xr.DataTree) -> str:
     """Table and verdict of one calibration."""
-    table = pb.calibration_table(found)
+    table = pb.calibration.calibration_table(found)
     shown = pd.DataFrame({"p": table["p_value"].map("{:.3f}".format)})
     for percent in (50, 80, 95):
         name = f"held_{percent}"
@@ -145,7 +145,7 @@ def said(found: xr.DataTree) -> str:
     worth = fits["effective_draws"].to_numpy()
     worth = worth[np.isfinite(worth)]
     lines = [
-        *pb.calibration_verdict(found),
+        *pb.calibration.calibration_verdict(found),
         shown.to_string(),
         f"fits: {', '.join(f'{count} {name}' for name, count in counts.items() if count)}",
     ]

@@ -20,7 +20,7 @@ from one_material import SCENE
 import polar_bayes as pb
 from polar_bayes.inference import compile
 
-PROTOCOL = pb.Protocol(views=40, wavelengths=())
+PROTOCOL = pb.simulation.Protocol(views=40, wavelengths=())
 LEVELS = ("all", "2", "1", "0")
 
 

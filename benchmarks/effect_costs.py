@@ -25,36 +25,38 @@ ROUGH = pb.Scene(
         pb.Beckmann(),
         pb.Disc(5.0),
         MANY_FACETS,
-        pb.AnisotropicSlopes(),
-        pb.HeightCorrelatedShadowing(),
+        pb.physics.AnisotropicSlopes(),
+        pb.physics.HeightCorrelatedShadowing(),
     ),
-    subsurface=pb.Lambertian(internal_reflection=pb.InternalReflection()),
+    subsurface=pb.Lambertian(internal_reflection=pb.physics.InternalReflection()),
     mixing=pb.StokesMixing(),
-    coat=pb.CoatStack((FILM, COAT)),
-    instrument=pb.Instrument(
+    coat=pb.physics.CoatStack((FILM, COAT)),
+    instrument=pb.instrument.Instrument(
         (
-            pb.AngleZero(),
-            pb.BeamOverlap(),
-            pb.DolpGain(),
-            pb.ChannelGain(),
-            pb.Leakage(),
-            pb.DarkLevel(),
-            pb.Discrepancy(),
+            pb.instrument.AngleZero(),
+            pb.instrument.BeamOverlap(),
+            pb.instrument.DolpGain(),
+            pb.instrument.ChannelGain(),
+            pb.instrument.Leakage(),
+            pb.instrument.DarkLevel(),
+            pb.physics.Discrepancy(),
         )
     ),
 )
 POLARIZED = pb.Scene(
     surface=pb.RoughSurface(
-        illumination=pb.PointSource(pb.LinearPolarization(0.5, 30.0)),
-        quadrature=pb.FacetQuadrature(5, 4),
-        way_out=pb.SmoothExit(),
+        illumination=pb.PointSource(pb.physics.LinearPolarization(0.5, 30.0)),
+        quadrature=pb.physics.FacetQuadrature(5, 4),
+        way_out=pb.physics.SmoothExit(),
     ),
     subsurface=pb.Unpolarized(),
     mixing=pb.StokesMixing(),
 )
 
 TURBID = pb.Scene(
-    surface=pb.RoughSurface(quadrature=pb.FacetQuadrature(5, 4), way_out=pb.SmoothExit()),
+    surface=pb.RoughSurface(
+        quadrature=pb.physics.FacetQuadrature(5, 4), way_out=pb.physics.SmoothExit()
+    ),
     subsurface=pb.TurbidMedium(internal_reflection=None),
     mixing=pb.StokesMixing(),
 )

@@ -21,23 +21,25 @@ from polar_bayes.effects.choose import ledger_table
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.physics.scene import FULL_SCENES, MANY_FACETS
 
-METHOD = pb.Nuts(draws=1000, most_draws=4000, effective_draws=1500)
+METHOD = pb.methods.Nuts(draws=1000, most_draws=4000, effective_draws=1500)
 
 PAINT = pb.Scene(
     surface=pb.RoughSurface(
         pb.Beckmann(),
         pb.PointSource(),
         MANY_FACETS,
-        shadowing=pb.HeightCorrelatedShadowing(),
+        shadowing=pb.physics.HeightCorrelatedShadowing(),
     ),
-    subsurface=pb.Lambertian(internal_reflection=pb.InternalReflection()),
+    subsurface=pb.Lambertian(internal_reflection=pb.physics.InternalReflection()),
     mixing=pb.StokesMixing(),
     coat=pb.ClearCoat(1.49, 0.05),  # the lacquer of a data sheet
-    instrument=pb.Instrument((pb.AngleZero(), pb.DolpGain(), pb.DarkLevel())),
+    instrument=pb.instrument.Instrument(
+        (pb.instrument.AngleZero(), pb.instrument.DolpGain(), pb.instrument.DarkLevel())
+    ),
 )
 
 
-class Plate(pb.Protocol):
+class Plate(pb.simulation.Protocol):
     """A goniometer: the detector follows the mirror direction."""
 
     @override
@@ -62,7 +64,7 @@ class Case:
     preset: str
     setup: str
     scene: pb.Scene
-    protocol: pb.Protocol
+    protocol: pb.simulation.Protocol
     truth: dict[str, Any]
 
     def capture(self) -> xr.Dataset:
@@ -70,7 +72,7 @@ class Case:
         captured = pb.simulate(
             self.preset,
             scene=self.scene,
-            links=pb.SETUPS[self.setup].links,
+            links=pb.setups.SETUPS[self.setup].links,
             protocol=self.protocol,
             parameters=self.truth,
             seed=1,
@@ -78,7 +80,7 @@ class Case:
         return captured.assign_attrs(setup=self.setup)
 
 
-ONE_COLOR = pb.Protocol(wavelengths=())
+ONE_COLOR = pb.simulation.Protocol(wavelengths=())
 CASES = {
     "glass": Case(
         "glass",

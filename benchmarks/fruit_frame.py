@@ -24,7 +24,7 @@ from fruit import APPLE, ORANGE, SPOTS, mean_stokes, regions
 def fruit_capture(frame: Path, bin_: int = 16, window: int = 1) -> xr.Dataset:
     """The frame as a capture of two spheres."""
     spheres = (APPLE, ORANGE)
-    light = pb.Surroundings()
+    light = pb.importers.Surroundings()
     return pb.from_mosaic(frame, shape=spheres, light=light, bin=bin_, window=window, name="fruit")
 
 
@@ -79,9 +79,9 @@ def main() -> None:
             f"highlight of the {name}: incidence {incidence:.0f} degrees, DoP {dop:.2f} at "
             f"{angle:.0f} degrees from horizontal; unpolarized light would have {bound:.2f}"
         )
-    maps = None if asked.map is None else pb.open_map(asked.map)
+    maps = None if asked.map is None else pb.maps.open_map(asked.map)
     if maps is not None:
-        print(pb.count_pixels(maps))
+        print(pb.maps.count_pixels(maps))
         for name, where in regions(maps).items():
             share, factor = (
                 maps[each].values[where] for each in ("subsurface_fraction", "stokes_error_factor")

@@ -111,7 +111,7 @@ def memory(folder: Path) -> Case:
 
     def case(random: Random) -> str:
         whole = plate_capture(np.linspace(20.0, 75.0, 6), 0.01, seed=int(random.integers(99)))
-        return contract(pb.validate(mutate(whole, random)))
+        return contract(pb.capture.validate(mutate(whole, random)))
 
     return case
 
@@ -155,9 +155,9 @@ def frames(folder: Path) -> Case:
         (folder / name).write_bytes(content)
         capture = pb.from_mosaic(
             folder / name,
-            shape=pb.Sphere(4.0, 4.0, 4.0),
-            light=pb.Direction(0.0, 0.0, 1.0),
-            detector=pb.Detector(saturation_level=4095.0),
+            shape=pb.importers.Sphere(4.0, 4.0, 4.0),
+            light=pb.importers.Direction(0.0, 0.0, 1.0),
+            detector=pb.importers.Detector(saturation_level=4095.0),
         )
         return contract(capture)
 
@@ -200,8 +200,8 @@ def zarr(folder: Path) -> Case:
     source, maps = folder / "capture.zarr", folder / "maps.zarr"
     image = plate_image(8, 8, seed=3)
     image.chunk({"y": 4, "x": 4}).to_zarr(source, zarr_format=3, consolidated=False)
-    pb.map_file(source, maps, **ASKED)
-    good = pb.open_map(maps).load()
+    pb.maps.map_file(source, maps, **ASKED)
+    good = pb.maps.open_map(maps).load()
     place = folder / "case.zarr"
 
     def case(random: Random) -> str:
@@ -230,13 +230,13 @@ def of_source(store: Path) -> str:
     out = store.with_name("out.zarr")
     shutil.rmtree(out, ignore_errors=True)
     out.with_name("out.zarr.progress").unlink(missing_ok=True)
-    return of_maps(out, None) if pb.map_file(store, out, **ASKED) is not None else "refused"
+    return of_maps(out, None) if pb.maps.map_file(store, out, **ASKED) is not None else "refused"
 
 
 def of_maps(store: Path, good: xr.Dataset | None) -> str:
     """A map: every pixel that is counted as good has finite numbers, the right ones if known."""
-    found = pb.open_map(store)
-    counts = pb.count_pixels(found)
+    found = pb.maps.open_map(store)
+    counts = pb.maps.count_pixels(found)
     found = found.load()
     names = [str(name) for name in found if f"{name}_sd" in found]
     finite = np.all([np.isfinite(found[name].to_numpy()) for name in names], axis=0)
@@ -264,9 +264,9 @@ def results(folder: Path) -> Case:
                 posterior[name] = xr.full_like(posterior[name], value)
                 impossible = True
         pb.summary(tree)
-        json.dumps(pb.json_summary(tree), allow_nan=False)
+        json.dumps(pb.diagnostics.json_summary(tree), allow_nan=False)
         str(pb.show(tree))
-        pb.auto_sentences(tree)
+        pb.inference.auto_sentences(tree)
         return "IMPOSSIBLE" if impossible and pb.verdict(tree).converged else "accepted"
 
     return case

@@ -17,9 +17,9 @@ from plate_images import ASKED, plate_image
 
 SIDE = 100
 METHODS = {
-    "normal approximation": pb.PixelLaplace(weighted=False),
-    "corrected, 256 draws": pb.PixelLaplace(),
-    "corrected, 1024 draws": pb.PixelLaplace(draws=1024),
+    "normal approximation": pb.methods.PixelLaplace(weighted=False),
+    "corrected, 256 draws": pb.methods.PixelLaplace(),
+    "corrected, 1024 draws": pb.methods.PixelLaplace(draws=1024),
 }
 
 
@@ -28,8 +28,8 @@ def main() -> None:
     image = plate_image(SIDE, SIDE, noise=noise, seed=12)
     for name, method in METHODS.items():
         maps = pb.fit_pixels(image, method=method, **ASKED)
-        print(f"{name}: {pb.count_pixels(maps)}")
-        print(pb.map_coverage(maps, image)[["held_50", "held_80", "held_95"]].round(3))
+        print(f"{name}: {pb.maps.count_pixels(maps)}")
+        print(pb.diagnostics.map_coverage(maps, image)[["held_50", "held_80", "held_95"]].round(3))
 
 
 if __name__ == "__main__":

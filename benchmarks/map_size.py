@@ -57,9 +57,9 @@ def timed(count: int, workers: int) -> tuple[float, float]:
             if workers:
                 cluster = distributed.LocalCluster(n_workers=workers, threads_per_worker=1)
                 address = stack.enter_context(cluster).scheduler_address
-            pb.map_file(small, here / "first.zarr", scheduler=address, **ASKED)
+            pb.maps.map_file(small, here / "first.zarr", scheduler=address, **ASKED)
             start = time.perf_counter()
-            maps = pb.map_file(large, here / "map.zarr", scheduler=address, **ASKED)
+            maps = pb.maps.map_file(large, here / "map.zarr", scheduler=address, **ASKED)
             seconds = time.perf_counter() - start
         pixels = maps.sizes["y"] * maps.sizes["x"]
         good = int((maps["status"] == 0).sum())

@@ -21,7 +21,7 @@ from polar_bayes.calibration.calibrate import planned
 from polar_bayes.calibration.runner import Plan, fit_block
 from polar_bayes.inference.request import resolve
 
-LARGE = pb.PixelTempering(walks=4096, draws=16384)
+LARGE = pb.methods.PixelTempering(walks=4096, draws=16384)
 
 
 def large(seed: int) -> Plan:

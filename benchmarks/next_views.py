@@ -148,7 +148,7 @@ def seen_by(picks: np.ndarray, views: int) -> np.ndarray:
 
 def main(count: int) -> None:
     begun = time.perf_counter()
-    capture, links = layout(), {"dop": pb.BetaLink()}
+    capture, links = layout(), {"dop": pb.links.BetaLink()}
     views = capture.sizes["view"]
     with jax.enable_x64(True):
         request = resolve(capture, "per_material", "laplace", SCENE, None, links, None, 0, "double")
@@ -170,8 +170,8 @@ def main(count: int) -> None:
         }
         promised = {}
         for label, criterion in (
-            ("D-optimal", pb.DOptimal()),
-            ("for the index", pb.SingleParameter("refractive_index")),
+            ("D-optimal", pb.design.DOptimal()),
+            ("for the index", pb.design.SingleParameter("refractive_index")),
         ):
             picks[label] = picks["random"].copy()
             promised[label] = np.full((count, len(NAMES)), np.nan)

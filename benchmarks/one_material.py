@@ -10,11 +10,12 @@ import xarray as xr
 
 import polar_bayes as pb
 
-FACETS = pb.FacetQuadrature(along=2, across=2)
+FACETS = pb.physics.FacetQuadrature(along=2, across=2)
 SCENE = dataclasses.replace(
-    pb.SETUPS["paper"].scene, surface=pb.RoughSurface(pb.Beckmann(), pb.PointSource(), FACETS)
+    pb.setups.SETUPS["paper"].scene,
+    surface=pb.RoughSurface(pb.Beckmann(), pb.PointSource(), FACETS),
 )
 
 
 def layout() -> xr.Dataset:
-    return pb.simulate("leaf", seed=1, protocol=pb.Protocol(views=40, wavelengths=()))
+    return pb.simulate("leaf", seed=1, protocol=pb.simulation.Protocol(views=40, wavelengths=()))

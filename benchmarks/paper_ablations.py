@@ -39,7 +39,7 @@ from polar_bayes.observation.data import Observations
 from polar_bayes.observation.distributions import SensorStudentT
 from polar_bayes.observation.links import AbstractLink
 
-BETA, HEAVY = pb.BetaLink(), pb.StudentTLink(degrees_of_freedom=3.0)
+BETA, HEAVY = pb.links.BetaLink(), pb.links.StudentTLink(degrees_of_freedom=3.0)
 PATCHES, SPREAD, ERROR, REPETITIONS = 6, 0.02, 0.05, 12
 
 
@@ -55,7 +55,7 @@ class SensorNormal(SensorStudentT):
 
 
 @dataclasses.dataclass(frozen=True)
-class NormalSensorLink(pb.StudentTLink):
+class NormalSensorLink(pb.links.StudentTLink):
     """The intensity as `StudentTLink` has it, with normal noise of the same scale."""
 
     @override
@@ -72,8 +72,8 @@ def ablations(study: Study) -> None:
     noise(
         study,
         "DoP told with Beta noise",
-        told={"dop": BETA, "intensity": pb.StudentTLink()},
-        fitted={"Beta": {}, "Normal": {"dop": pb.NormalLink()}},
+        told={"dop": BETA, "intensity": pb.links.StudentTLink()},
+        fitted={"Beta": {}, "Normal": {"dop": pb.links.NormalLink()}},
     )
     noise(
         study,

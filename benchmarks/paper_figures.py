@@ -61,7 +61,7 @@ def dop(study: Study) -> Picture:
         capture = pb.simulate(
             name,
             scene=SCENE,
-            protocol=pb.Protocol(wavelengths=()),
+            protocol=pb.simulation.Protocol(wavelengths=()),
             seed=study.seed + at,
         )
         result = pb.fit(capture, method="laplace", scene=SCENE, seed=study.seed)
@@ -148,7 +148,7 @@ def calibration(study: Study) -> Picture:
 
 
 def _say(method: str, tree: xr.DataTree) -> None:
-    table = pb.calibration_table(tree)
+    table = pb.calibration.calibration_table(tree)
     for name in NAMES:
         told = table.loc[name]
         shares = (

@@ -77,7 +77,7 @@ class LeastSquares:
             key = jax.random.key(study.seed)
             # The captures that `calibrate` draws for this seed.
             self.drawn = draw_captures(story, data, study.simulations, jax.random.fold_in(key, 1))
-            starts = from_prior(self.program, key, pb.Point().starts, data)
+            starts = from_prior(self.program, key, pb.methods.Point().starts, data)
         self._run = jax.jit(lambda own, shared: _each(self.program, own, shared, starts))
 
     def __call__(self) -> Found:

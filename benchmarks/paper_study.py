@@ -21,9 +21,9 @@ from polar_bayes.models.sites import declare_readings, draw_own, material_parame
 
 import polar_bayes as pb
 from polar_bayes.observation.data import Observations
-from polar_bayes.simulate import BRIGHT_LEVEL, BRIGHT_QUANTILE, NOISE
+from polar_bayes.simulation import BRIGHT_LEVEL, BRIGHT_QUANTILE, NOISE
 
-CLASSES = tuple(pb.PRESETS)
+CLASSES = tuple(pb.simulation.PRESETS)
 NAMES = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
 INDEX = "refractive_index"
 COLOR = 550.0
@@ -61,13 +61,13 @@ class Study:
 
 def layout(largest_view_zenith: float = LARGEST) -> xr.Dataset:
     """The protocol of 40 views, one color. Full scale is stated: it never depends on the views."""
-    protocol = pb.Protocol(largest_view_zenith=largest_view_zenith, wavelengths=())
+    protocol = pb.simulation.Protocol(largest_view_zenith=largest_view_zenith, wavelengths=())
     return pb.simulate("leaf", scene=SCENE, protocol=protocol)
 
 
 def center(name: str) -> dict[str, float]:
     """The middle of a class, in the parameters' own units."""
-    material = pb.PRESETS[name].at(np.array([COLOR]))
+    material = pb.simulation.PRESETS[name].at(np.array([COLOR]))
     return {each: float(np.ravel(material[each])[0]) for each in NAMES}
 
 
@@ -111,7 +111,7 @@ def around(middle: Mapping[str, Any]) -> dict[str, dist.Distribution]:
 
 def exposure(parameters: Mapping[str, Any], scene: pb.Scene = SCENE) -> Array:
     """As `simulate` would choose it for the whole protocol, whichever views are taken of it."""
-    geometry = pb.Geometry.from_degrees(**pb.Protocol(wavelengths=()).angles())
+    geometry = pb.Geometry.from_degrees(**pb.simulation.Protocol(wavelengths=()).angles())
     seen = scene.predict({n: jnp.asarray(x) for n, x in parameters.items()}, geometry)
     return BRIGHT_LEVEL / jnp.quantile(seen["intensity"], BRIGHT_QUANTILE)
 

@@ -56,22 +56,22 @@ RANGES = {
     "absorption": (0.1, 0.8),
     "refractive_index": (1.35, 1.6),
 }
-FEW_FACETS = pb.FacetQuadrature(along=2, across=2)
-PAPER = pb.SETUPS["paper"].scene
+FEW_FACETS = pb.physics.FacetQuadrature(along=2, across=2)
+PAPER = pb.setups.SETUPS["paper"].scene
 SCENE = dataclasses.replace(
     PAPER, surface=pb.RoughSurface(pb.Beckmann(), pb.PointSource(), FEW_FACETS)
 )
 ASKED = {
     "model": handlers.condition(per_material, data={"normal_scale": NOISE}),
     "scene": SCENE,
-    "links": pb.NormalLink(),
+    "links": pb.links.NormalLink(),
 }
 
 
 def image(side: int) -> xr.Dataset:
     """A square image whose pixels have nothing in common but the directions."""
     rng = np.random.default_rng(3)
-    view = pb.simulate("leaf", seed=1, protocol=pb.Protocol(views=VIEWS, wavelengths=()))
+    view = pb.simulate("leaf", seed=1, protocol=pb.simulation.Protocol(views=VIEWS, wavelengths=()))
     angles = [f"{body}_{angle}" for body in ("view", "light") for angle in ("zenith", "azimuth")]
     truth = {name: rng.uniform(*ends, (side, side)) for name, ends in RANGES.items()}
     with jax.enable_x64(True):
@@ -251,7 +251,7 @@ def main(count: int) -> None:
         f"{np.mean(higher > 1e-6):.3f}, at a better one in {np.mean(higher < -1e-6):.3f}\n"
         f"single precision converged {near.converged.mean():.4f}; its modes are off by "
         f"{np.median(off):.1e} sd (99%: {np.quantile(off, 0.99):.1e}), its sds by "
-        f"{np.median(np.abs(narrow / sd - 1.0)):.1e}\n{pb.count_pixels(maps)}"
+        f"{np.median(np.abs(narrow / sd - 1.0)):.1e}\n{pb.maps.count_pixels(maps)}"
     )
     roofline(engine, pixels)
 

@@ -47,15 +47,24 @@ BROKEN: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     "link": (
         "DoP with normal noise on the log odds",
-        {"links": {"dop": pb.LogitNormalLink(), "intensity": pb.StudentTLink()}},
+        {"links": {"dop": pb.links.LogitNormalLink(), "intensity": pb.links.StudentTLink()}},
     ),
     "tails": (
         "intensity with longer tails (3 degrees of freedom, not 5)",
-        {"links": {"dop": pb.BetaLink(), "intensity": pb.StudentTLink(degrees_of_freedom=3.0)}},
+        {
+            "links": {
+                "dop": pb.links.BetaLink(),
+                "intensity": pb.links.StudentTLink(degrees_of_freedom=3.0),
+            }
+        },
     ),
     "gain": (
         "an instrument that records DoP too low or too high",
-        {"scene": dataclasses.replace(SCENE, instrument=pb.Instrument((pb.DolpGain(),)))},
+        {
+            "scene": dataclasses.replace(
+                SCENE, instrument=pb.instrument.Instrument((pb.instrument.DolpGain(),))
+            )
+        },
     ),
     "coat": (
         "a clear coat that the fit does not know",
@@ -66,8 +75,11 @@ BROKEN: dict[str, tuple[str, dict[str, Any]]] = {
 
 def fails(calibration: xr.DataTree) -> tuple[bool, bool]:
     """Whether the test of the parameters fails, and that of the readings."""
-    tables = pb.calibration_table(calibration), pb.calibration_readings(calibration)
-    return not pb.is_calibrated(tables[0]), not pb.is_calibrated(tables[1])
+    tables = (
+        pb.calibration.calibration_table(calibration),
+        pb.calibration.calibration_readings(calibration),
+    )
+    return not pb.calibration.is_calibrated(tables[0]), not pb.calibration.is_calibrated(tables[1])
 
 
 def subsets(calibration: xr.DataTree, size: int) -> Iterator[xr.DataTree]:

@@ -40,7 +40,7 @@ def three_colors(seed: int) -> xr.Dataset:
     return spectral_plate(COLORS, error=0.01, seed=seed)
 
 
-SPECTRAL = pb.GpSpectral(coupled=("refractive_index",))
+SPECTRAL = pb.models.GpSpectral(coupled=("refractive_index",))
 FITS: dict[str, tuple[Callable[[int], xr.Dataset], Any, str]] = {
     "per_material, point": (one, "per_material", "point"),
     "per_material, laplace": (one, "per_material", "laplace"),

@@ -30,7 +30,7 @@ from one_material import SCENE, layout
 import polar_bayes as pb
 from polar_bayes.inference.result import provenance_of
 
-PROTOCOL = pb.Protocol(views=40, wavelengths=())
+PROTOCOL = pb.simulation.Protocol(views=40, wavelengths=())
 CACHE: dict[str, Any] = {
     "jax_persistent_cache_min_compile_time_secs": 0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
@@ -39,15 +39,15 @@ CACHE: dict[str, Any] = {
 
 def warm(count: int) -> None:
     """Fits of other readings, one after the other."""
-    pb.fit(layout(), method=pb.Nuts(), scene=SCENE)
+    pb.fit(layout(), method=pb.methods.Nuts(), scene=SCENE)
     print(f"{'warm':<10}{'s':>7}{'modes':>7}{'draws':>7}{'predict':>8}", end="")
     print(f"{'gradients of each':>22}{'ESS':>7}{'R-hat':>8}{'diverged':>9}")
     for seed in range(1, count + 1):
         capture = pb.simulate("leaf", seed=seed + 1, protocol=PROTOCOL)
         start = time.perf_counter()
-        found = pb.fit(capture, method=pb.Nuts(), scene=SCENE, seed=seed)
+        found = pb.fit(capture, method=pb.methods.Nuts(), scene=SCENE, seed=seed)
         seconds = time.perf_counter() - start
-        said, rows = provenance_of(found), pb.json_summary(found)["parameters"].values()
+        said, rows = provenance_of(found), pb.diagnostics.json_summary(found)["parameters"].values()
         stats, took = found["sample_stats"], said["timings"]
         before = int(stats["warmup_steps"].isel(draw=0).sum())
         gradients = f"{said['modes']['gradients']} {before} {int(stats['n_steps'].sum())}"

@@ -17,7 +17,7 @@ from spectral_plates import LINKS, PLATE, spectral_plate, tabulated
 import polar_bayes as pb
 from polar_bayes.inference.result import provenance_of
 
-MODEL = pb.GpSpectral(coupled=("refractive_index",))
+MODEL = pb.models.GpSpectral(coupled=("refractive_index",))
 VIEWS = np.linspace(30.0, 78.0, 24)
 ERROR = 0.002
 HELD_OUT = (550.0, 633.0)
@@ -31,7 +31,7 @@ def band(material: Mapping[float, float], held: float, method: str, seed: int) -
     result = pb.fit(capture, model=MODEL, scene=PLATE, links=LINKS, method=method, seed=seed)
     if method == "nuts" and not pb.verdict(result).converged:
         print("not converged:", pb.verdict(result).problems)
-    draws = pb.predict_spectrum(result, held, seed=seed)["refractive_index"].to_numpy()
+    draws = pb.inference.predict_spectrum(result, held, seed=seed)["refractive_index"].to_numpy()
     return np.quantile(draws, (0.025, 0.975))
 
 

@@ -113,7 +113,7 @@ def main(names: list[str], lengths: list[int], seeds: int) -> None:
         for length in lengths:
             start = time.perf_counter()
             found = [
-                look(pb.fit(make(seed), method=pb.Nuts(warmup=length), seed=seed, **asked))
+                look(pb.fit(make(seed), method=pb.methods.Nuts(warmup=length), seed=seed, **asked))
                 for seed in range(1, seeds + 1)
             ]
             first = first or found

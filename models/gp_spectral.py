@@ -3,7 +3,7 @@
 The refractive index, the logarithm of the absorption, or both are smooth functions of wavelength:
 a level, and a departure from it whose size (amplitude) and smoothness (length) are inferred with
 it. What one color cannot tell, its neighbors can, and wavelengths that were not measured have a
-posterior too (`polar_bayes.predict_spectrum`).
+posterior too (`polar_bayes.inference.predict_spectrum`).
 """
 
 import dataclasses

@@ -209,7 +209,7 @@ def check_members(pooled: tuple[str, ...], data: Observations, scene: Scene) -> 
         raise FitError(
             "a population needs several members, and the capture has no axis patch or material",
             where="model",
-            hint="give captures joined by polar_bayes.combine, or use model='per_material'",
+            hint="give captures joined by polar_bayes.capture.combine, or use model='per_material'",
         )
 
 

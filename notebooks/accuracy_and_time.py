@@ -19,7 +19,7 @@ import polar_bayes as pb
 
 # %%
 plate = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
-links = {"q": pb.StokesLink(stated_errors=True)}
+links = {"q": pb.links.StokesLink(stated_errors=True)}
 zenith = np.linspace(35.0, 75.0, 6)
 directions = {
     "view_zenith": zenith,
@@ -49,16 +49,16 @@ study = pb.accuracy(
     capture,
     scene=plate,
     links=links,
-    rungs={name: pb.LADDER[name] for name in names},
+    rungs={name: pb.methods.LADDER[name] for name in names},
     dials=(),
     fresh=False,
-    reference=pb.Reference(error=0.03),
+    reference=pb.benchmark.Reference(error=0.03),
 )
 columns = ["error", "worst", "resolved", "effective_draws", "gradients", "seconds_again"]
-pb.accuracy_table(study)[columns].round(3)
+pb.benchmark.accuracy_table(study)[columns].round(3)
 
 # %%
-pb.plot_accuracy(study)
+pb.plots.plot_accuracy(study)
 
 # %% [markdown]
 # `error` is the largest error of any mean or standard deviation, in posterior standard deviations;
@@ -74,7 +74,7 @@ pb.plot_accuracy(study)
 # The same as a sentence:
 
 # %%
-print(pb.accuracy_advice(study))
+print(pb.benchmark.accuracy_advice(study))
 
 # %% [markdown]
 # That is said of this capture. With more readings a posterior comes closer to a normal
@@ -87,8 +87,10 @@ print(pb.accuracy_advice(study))
 # diagnostics say that it is good enough: here within a quarter of a posterior standard deviation.
 
 # %%
-result = pb.fit(capture, scene=plate, links=links, method=pb.Auto(tolerance=0.25, seconds=600.0))
-print(*pb.auto_sentences(result), sep="\n")
+result = pb.fit(
+    capture, scene=plate, links=links, method=pb.methods.Auto(tolerance=0.25, seconds=600.0)
+)
+print(*pb.inference.auto_sentences(result), sep="\n")
 pb.summary(result).round(3)
 
 # %% [markdown]

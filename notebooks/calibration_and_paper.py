@@ -38,13 +38,17 @@ layout = xr.Dataset(
     },
     attrs={"name": "plate"},
 )
-asked = {"scene": plate, "links": {"q": pb.StokesLink(stated_errors=True)}, "simulations": 200}
+asked = {
+    "scene": plate,
+    "links": {"q": pb.links.StokesLink(stated_errors=True)},
+    "simulations": 200,
+}
 calibration = pb.calibrate(layout, **asked, seed=0)
-pb.calibration_table(calibration).transpose()
+pb.calibration.calibration_table(calibration).transpose()
 
 # %%
-print(*pb.calibration_verdict(calibration), sep="\n")
-pb.plot_calibration(calibration)
+print(*pb.calibration.calibration_verdict(calibration), sep="\n")
+pb.plots.plot_calibration(calibration)
 
 # %% [markdown]
 # `held_95` is the share of the simulations whose 95% interval holds the truth, between
@@ -65,8 +69,8 @@ pb.plot_calibration(calibration)
 # %%
 elsewhere = {"priors": {"refractive_index": dist.Uniform(1.2, 2.0)}}
 broken = pb.calibrate(layout, **asked, truth=elsewhere, seed=0)
-print(*pb.calibration_verdict(broken), sep="\n")
-pb.calibration_table(broken).transpose()
+print(*pb.calibration.calibration_verdict(broken), sep="\n")
+pb.calibration.calibration_table(broken).transpose()
 
 # %% [markdown]
 # It noticed: the 95% intervals of the index hold about 82% of such truths, and the ranks say in
@@ -82,13 +86,13 @@ pb.calibration_table(broken).transpose()
 # takes seconds where [the tables](../paper.md) take minutes.)
 
 # %%
-paper = pb.SETUPS["paper"].scene
-scene = dataclasses.replace(paper, surface=pb.RoughSurface(way_out=pb.SmoothExit()))
+paper = pb.setups.SETUPS["paper"].scene
+scene = dataclasses.replace(paper, surface=pb.RoughSurface(way_out=pb.physics.SmoothExit()))
 rows = []
 for seed in range(5):
     widths = {}
     for largest in (75.0, 85.0):
-        protocol = pb.Protocol(views=40, largest_view_zenith=largest, wavelengths=())
+        protocol = pb.simulation.Protocol(views=40, largest_view_zenith=largest, wavelengths=())
         glass = pb.simulate("glass", scene=scene, protocol=protocol, seed=seed)
         draws = pb.fit(glass, scene=scene, method="laplace")["posterior"]["refractive_index"]
         low, high = draws.quantile([0.025, 0.975]).to_numpy()

@@ -17,9 +17,9 @@ import matplotlib.pyplot as plt
 import polar_bayes as pb
 from polar_bayes.diagnostics.sensitivity import sensitivity
 
-paper = pb.SETUPS["paper"].scene
-scene = dataclasses.replace(paper, surface=pb.RoughSurface(way_out=pb.SmoothExit()))
-protocol = pb.Protocol(views=24, wavelengths=())
+paper = pb.setups.SETUPS["paper"].scene
+scene = dataclasses.replace(paper, surface=pb.RoughSurface(way_out=pb.physics.SmoothExit()))
+protocol = pb.simulation.Protocol(views=24, wavelengths=())
 capture = pb.simulate("plastic", scene=scene, protocol=protocol, seed=0)
 
 # %% [markdown]

@@ -33,17 +33,17 @@ truth = {
 shadow = np.hypot(y - 16.0, x - 8.0) < 4.0
 highlight = np.hypot(y - 8.0, x - 24.0) < 4.0
 scene = pb.Scene(pb.SmoothSurface(), pb.Lambertian(), pb.StokesMixing())
-links = {"q": pb.StokesLink(), "intensity": pb.StudentTLink()}
+links = {"q": pb.links.StokesLink(), "intensity": pb.links.StudentTLink()}
 image = pb.simulate(
     "plastic",
     scene=scene,
     links=links,
-    protocol=pb.Protocol(views=12, largest_view_zenith=75.0, wavelengths=()),
+    protocol=pb.simulation.Protocol(views=12, largest_view_zenith=75.0, wavelengths=()),
     parameters=truth,
     noise={"exposure": np.where(shadow, 0.08, np.where(highlight, 120.0, 4.0))},
     seed=0,
 )
-print(pb.count(image))
+print(pb.capture.count(image))
 
 # %% [markdown]
 # A camera whose channels stopped knows no polarization there. Readings at full scale are marked as
@@ -60,12 +60,12 @@ image = image.assign(valid=~image["saturated"])
 
 # %%
 model = numpyro.handlers.condition(per_material, data={"stokes_scale": 0.01})
-fitted = {"model": model, "scene": scene, "links": {"q": pb.StokesLink()}}
+fitted = {"model": model, "scene": scene, "links": {"q": pb.links.StokesLink()}}
 maps = pb.fit_pixels(image, **fitted)
-print(pb.count_pixels(maps))
+print(pb.maps.count_pixels(maps))
 
 # %%
-pb.plot_maps(maps)
+pb.plots.plot_maps(maps)
 
 # %% [markdown]
 # 723 pixels are good; the 45 of the highlight are masked, say so, and have no number. The index
@@ -77,10 +77,12 @@ pb.plot_maps(maps)
 # Beside the corrected map, one that takes the normal approximation at its word:
 
 # %%
-bare = pb.fit_pixels(image, method=pb.PixelLaplace(weighted=False), **fitted)
+bare = pb.fit_pixels(image, method=pb.methods.PixelLaplace(weighted=False), **fitted)
 held = ["held_50", "held_80", "held_95", "held_95_low", "held_95_high", "unanswered"]
 both = {"corrected": maps, "normal approximation": bare}
-pd.concat({name: pb.map_coverage(some, image)[held] for name, some in both.items()}).round(3)
+pd.concat(
+    {name: pb.diagnostics.map_coverage(some, image)[held] for name, some in both.items()}
+).round(3)
 
 # %% [markdown]
 # Both hold the truth about as often as they say; the correction changes little, because with twelve
@@ -116,8 +118,8 @@ for name, region in regions.items():
 # %%
 bold = numpyro.handlers.condition(per_material, data={"stokes_scale": 0.005})
 overconfident = pb.fit_pixels(image, **(fitted | {"model": bold}))
-print(pb.count_pixels(overconfident))
-pb.map_coverage(overconfident, image)[held].round(3)
+print(pb.maps.count_pixels(overconfident))
+pb.diagnostics.map_coverage(overconfident, image)[held].round(3)
 
 # %% [markdown]
 # The 95% intervals now hold two thirds of the truths, and every pixel still calls itself good: its

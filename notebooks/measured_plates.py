@@ -43,7 +43,7 @@ capture = pb.from_goniometer(
     wavelength=633.0,
     name="glass",
 )
-print(pb.count(capture))
+print(pb.capture.count(capture))
 plt.errorbar(capture["view_zenith"], capture["q"], capture["q_error"], fmt=".")
 plt.xlabel("angle of incidence (degree)")
 plt.ylabel("q")
@@ -103,7 +103,7 @@ white = xr.Dataset(
     },
     attrs={"name": "PTFE"},
 )
-print(pb.count(white))
+print(pb.capture.count(white))
 
 # %% [markdown]
 # Two ways to add up surface and body. The paper's equation 1 mixes degrees of polarization by one
@@ -111,14 +111,14 @@ print(pb.count(white))
 # that the surface counts more where it is brighter; that needs to know how rough it is.
 
 # %%
-rough = pb.RoughSurface(pb.GGX(), way_out=pb.SmoothExit())
+rough = pb.RoughSurface(pb.GGX(), way_out=pb.physics.SmoothExit())
 scenes = {
     "one fraction for all views": pb.Scene(
         pb.SmoothSurface(), pb.Unpolarized(), pb.DopMixing(signed=True)
     ),
     "light adds up": pb.Scene(rough, pb.Unpolarized(), pb.StokesMixing()),
 }
-links = {"q": pb.StokesLink(degrees_of_freedom=4.0, stated_errors=True)}
+links = {"q": pb.links.StokesLink(degrees_of_freedom=4.0, stated_errors=True)}
 fits = {name: pb.fit(white, scene=scene, links=links) for name, scene in scenes.items()}
 rows = {}
 for name, fit in fits.items():

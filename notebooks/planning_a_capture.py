@@ -12,9 +12,9 @@ import matplotlib.pyplot as plt
 
 import polar_bayes as pb
 
-paper = pb.SETUPS["paper"].scene
-scene = dataclasses.replace(paper, surface=pb.RoughSurface(way_out=pb.SmoothExit()))
-protocol = pb.Protocol(views=8, largest_view_zenith=60.0, wavelengths=())
+paper = pb.setups.SETUPS["paper"].scene
+scene = dataclasses.replace(paper, surface=pb.RoughSurface(way_out=pb.physics.SmoothExit()))
+protocol = pb.simulation.Protocol(views=8, largest_view_zenith=60.0, wavelengths=())
 capture = pb.simulate("leaf", scene=scene, protocol=protocol, seed=0)
 
 # %% [markdown]
@@ -25,10 +25,10 @@ capture = pb.simulate("leaf", scene=scene, protocol=protocol, seed=0)
 
 # %%
 found = pb.identify(capture, scene=scene)
-pb.identifiability_table(found).round(3)
+pb.design.identifiability_table(found).round(3)
 
 # %%
-print(*pb.identifiability_sentences(found), sep="\n")
+print(*pb.design.identifiability_sentences(found), sep="\n")
 
 # %% [markdown]
 # `expected_sd` is what the posterior will be like, `prior_share` how much of its variance is still
@@ -45,7 +45,7 @@ print(*pb.identifiability_sentences(found), sep="\n")
 
 # %%
 curve = pb.profile(capture, "refractive_index", scene=scene)
-print(*pb.profile_sentences(curve), sep="\n")
+print(*pb.design.profile_sentences(curve), sep="\n")
 curve["profile"].sel(kind="likelihood").plot.line("o-", x="value")
 plt.axhline(-1.92, color="0.7")
 plt.axvline(float(capture["true_refractive_index"]), color="k", linestyle=":")
@@ -72,12 +72,12 @@ others.transpose("value", ...).to_pandas().round(3)
 # the refractive index.
 
 # %%
-rig = pb.Rig(view_zenith=(0.0, 80.0), minimum_separation=5.0, from_light=8.0)
+rig = pb.design.Rig(view_zenith=(0.0, 80.0), minimum_separation=5.0, from_light=8.0)
 views = pb.next_views(
-    capture, count=3, rig=rig, criterion=pb.SingleParameter("refractive_index"), scene=scene
+    capture, count=3, rig=rig, criterion=pb.design.SingleParameter("refractive_index"), scene=scene
 )
-print(*pb.next_views_sentences(views), sep="\n")
-pb.next_views_table(views)
+print(*pb.design.next_views_sentences(views), sep="\n")
+pb.design.next_views_table(views)
 
 # %% [markdown]
 # Two steep views on the mirror side, as the paper would take them, and one at 25 degrees. The index

@@ -15,7 +15,7 @@ import xarray as xr
 import polar_bayes as pb
 
 plate = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
-links = {"q": pb.StokesLink(stated_errors=True)}
+links = {"q": pb.links.StokesLink(stated_errors=True)}
 zenith = np.linspace(35.0, 75.0, 6)
 directions = {
     "view_zenith": zenith,
@@ -49,11 +49,11 @@ def read(index, error, seed, axis):
 index = 1.50 + 0.02 * np.random.default_rng(0).normal(size=8)
 batch = read(index, error=0.06, seed=1, axis="patch")
 common = {"scene": plate, "links": links, "seed": 0}
-apart = pb.fit(batch, method=pb.Laplace(), **common)
-pooled = pb.fit(batch, model="hierarchical", method=pb.Laplace(), **common)
+apart = pb.fit(batch, method=pb.methods.Laplace(), **common)
+pooled = pb.fit(batch, model="hierarchical", method=pb.methods.Laplace(), **common)
 for name, fit in {"apart": apart, "pooled": pooled}.items():
     print(name, pb.verdict(fit).problems, pb.verdict(fit).cautions)
-pb.population_summary(pooled).round(3)
+pb.diagnostics.population_summary(pooled).round(3)
 
 # %%
 colors = {"each alone": ("tab:gray", -0.12, apart), "pooled": ("tab:blue", 0.12, pooled)}
@@ -96,15 +96,15 @@ pd.DataFrame(rows).T.round(3)
 wavelength = np.array([450.0, 550.0, 650.0])
 table = np.array([1.501, 1.494, 1.490])  # PMMA, to 0.002
 colored = read(table, error=0.005, seed=2, axis="wavelength").assign_coords(wavelength=wavelength)
-model = pb.GpSpectral(coupled=("refractive_index",))
-coupled = pb.fit(colored, model=model, method=pb.Laplace(), **common)
-alone = pb.fit(colored, method=pb.Laplace(), **common)
+model = pb.models.GpSpectral(coupled=("refractive_index",))
+coupled = pb.fit(colored, model=model, method=pb.methods.Laplace(), **common)
+alone = pb.fit(colored, method=pb.methods.Laplace(), **common)
 for name, fit in {"alone": alone, "coupled": coupled}.items():
     print(name, pb.verdict(fit).problems, pb.verdict(fit).cautions)
 
 # %%
 asked = np.linspace(400.0, 800.0, 41)
-bands = pb.predict_spectrum(coupled, asked)["refractive_index"]
+bands = pb.inference.predict_spectrum(coupled, asked)["refractive_index"]
 low, middle, high = bands.quantile([0.025, 0.5, 0.975], ("chain", "draw")).to_numpy()
 plt.fill_between(asked, low, high, color="tab:blue", alpha=0.2)
 plt.plot(asked, middle, color="tab:blue", label="coupled")
@@ -121,7 +121,7 @@ plt.show()
 
 # %%
 colors = [450.0, 550.0, 600.0, 650.0, 800.0]
-at = pb.predict_spectrum(coupled, colors)["refractive_index"]
+at = pb.inference.predict_spectrum(coupled, colors)["refractive_index"]
 width = at.quantile(0.975, ("chain", "draw")) - at.quantile(0.025, ("chain", "draw"))
 alone_width = pd.Series(most - least, index=wavelength)
 pd.DataFrame({"coupled": pd.Series(width.to_numpy(), index=colors), "alone": alone_width}).round(4)

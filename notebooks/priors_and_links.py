@@ -55,8 +55,8 @@ capture = xr.Dataset(
 
 # %%
 links = {
-    "normal": pb.StokesLink(stated_errors=True),
-    "Student's t": pb.StokesLink(degrees_of_freedom=4.0, stated_errors=True),
+    "normal": pb.links.StokesLink(stated_errors=True),
+    "Student's t": pb.links.StokesLink(degrees_of_freedom=4.0, stated_errors=True),
 }
 fits = {
     name: pb.fit(capture, scene=plate, links={"q": link}, method="laplace")

@@ -12,7 +12,7 @@ import xarray as xr
 
 import polar_bayes as pb
 
-APPLE, ORANGE = pb.Sphere(632.0, 732.0, 552.0), pb.Sphere(536.0, 1804.0, 400.0)
+APPLE, ORANGE = pb.importers.Sphere(632.0, 732.0, 552.0), pb.importers.Sphere(536.0, 1804.0, 400.0)
 SPOTS = {"apple": (456.0, 744.0), "orange": (400.0, 1820.0)}
 """Row and column of the brightest polarized light of each fruit."""
 

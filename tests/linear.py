@@ -12,12 +12,14 @@ from numpyro import distributions as dist
 import polar_bayes as pb
 
 NOISE = 0.2
-LINKS = {"q": pb.NormalLink()}
+LINKS = {"q": pb.links.NormalLink()}
 SCENE = pb.Scene(
     surface=pb.SmoothSurface(),
     subsurface=pb.Unpolarized(),
     mixing=pb.StokesMixing(),
-    instrument=pb.Instrument((pb.AngleZero(), pb.DarkLevel(), pb.DolpGain())),
+    instrument=pb.instrument.Instrument(
+        (pb.instrument.AngleZero(), pb.instrument.DarkLevel(), pb.instrument.DolpGain())
+    ),
 )
 
 

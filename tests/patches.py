@@ -36,7 +36,7 @@ def patch_capture(
         "absorption": rng.lognormal(-1.0, 0.4, index.shape),
         "refractive_index": index,
     }
-    protocol = pb.Protocol(
+    protocol = pb.simulation.Protocol(
         views=views, largest_view_zenith=largest_view_zenith, wavelengths=tuple(wavelengths)
     )
     dims = ("patch", *(("wavelength",) if len(wavelengths) else ()), "view")
@@ -46,9 +46,9 @@ def patch_capture(
         coords={"wavelength": np.asarray(wavelengths, float)} if len(wavelengths) else {},
         attrs={"name": "patches", "setup": setup},
     )
-    links = pb.SETUPS[setup].links
+    links = pb.setups.SETUPS[setup].links
     levels = {name: jnp.asarray(x) for name, x in {**NOISE, **(noise or {})}.items()}
-    scene = pb.SETUPS[setup].scene
+    scene = pb.setups.SETUPS[setup].scene
     with jax.enable_x64(True):
         parameters = {
             name: jnp.asarray(value.reshape(value.shape + (1,) * (len(dims) - 1 - value.ndim)))
@@ -56,7 +56,7 @@ def patch_capture(
             if name in scene.parameters
         }
         empty = blank.assign({name: (dims, np.full(shape, 0.5)) for name in links})
-        data = observe(pb.validate(empty))
+        data = observe(pb.capture.validate(empty))
         prediction = scene.predict(parameters, data.geometry)
         keys = dict(zip(links, jax.random.split(jax.random.key(seed), len(links)), strict=True))
         order = sorted(links, key=lambda name: name != "intensity")  # noise depends on brightness
@@ -66,7 +66,7 @@ def patch_capture(
             blank[name] = (dims, np.clip(np.broadcast_to(drawn, shape), low, 1.0))
             if name == "intensity":
                 blank[name].attrs["saturation_level"] = 1.0
-                data = observe(pb.validate(empty.assign({name: blank[name]})))
+                data = observe(pb.capture.validate(empty.assign({name: blank[name]})))
     for name, value in truth.items():
         blank[f"true_{name}"] = (dims[: value.ndim], value)
-    return pb.validate(blank)
+    return pb.capture.validate(blank)

@@ -10,14 +10,14 @@ import numpy as np
 import polar_bayes as pb
 
 SCENE = pb.Scene(
-    surface=pb.RoughSurface(pb.GGX(), way_out=pb.SmoothExit()),
+    surface=pb.RoughSurface(pb.GGX(), way_out=pb.physics.SmoothExit()),
     subsurface=pb.Lambertian(),
     mixing=pb.StokesMixing(),
 )
 TRUTH = {"roughness": 0.4, "subsurface_fraction": 0.1, "refractive_index": 1.5}
 SHAPE = (40, 48)
-BALL = pb.Sphere(19.3, 23.8, 17.5)  # no pixel faces the camera exactly
-LAMP = pb.Direction(0.4, 0.7, 0.8)
+BALL = pb.importers.Sphere(19.3, 23.8, 17.5)  # no pixel faces the camera exactly
+LAMP = pb.importers.Direction(0.4, 0.7, 0.8)
 FULL = 1000.0
 
 

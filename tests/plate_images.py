@@ -24,7 +24,7 @@ NAMES = ("refractive_index", "subsurface_fraction")
 ASKED = {
     "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
     "scene": PLATE,
-    "links": {"q": pb.StokesLink(stated_errors=True)},
+    "links": {"q": pb.links.StokesLink(stated_errors=True)},
 }
 
 

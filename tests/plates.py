@@ -7,9 +7,9 @@ from textbook import plate_q
 import polar_bayes as pb
 
 PLATE = pb.Scene(surface=pb.SmoothSurface(), subsurface=pb.Unpolarized(), mixing=pb.StokesMixing())
-LINKS = {"q": pb.StokesLink(stated_errors=True)}
+LINKS = {"q": pb.links.StokesLink(stated_errors=True)}
 
-GONIOMETER = {"scene": "goniometer", "links": pb.SETUPS["goniometer"].links}
+GONIOMETER = {"scene": "goniometer", "links": pb.setups.SETUPS["goniometer"].links}
 GONIOMETER_VIEWS = np.arange(12.0, 79.0, 3.0)
 """How and where a plate on a goniometer is read, with all that is unknown of the instrument."""
 

@@ -11,7 +11,7 @@ import polar_bayes as pb
 
 # The plate of tests/plates.py: one color more.
 PLATE = pb.Scene(surface=pb.SmoothSurface(), subsurface=pb.Unpolarized(), mixing=pb.StokesMixing())
-LINKS = {"q": pb.StokesLink(stated_errors=True)}
+LINKS = {"q": pb.links.StokesLink(stated_errors=True)}
 FRACTION = 0.02
 VIEWS = np.linspace(30.0, 78.0, 12)
 

@@ -10,6 +10,7 @@ ROOT = Path(__file__).parents[1]
 # The layers, first to last: a file may import from its own layer and from those before it.
 LAYERS = (
     (
+        "polar_bayes.namespace",
         "polar_bayes.errors",
         "polar_bayes.interrupts",
         "polar_bayes.paths",
@@ -20,9 +21,9 @@ LAYERS = (
     ("polar_bayes.importers",),
     ("polar_bayes.physics",),
     ("polar_bayes.observation",),
-    ("polar_bayes.priors", "polar_bayes.setups", "polar_bayes.prior_table"),
+    ("polar_bayes.priors", "polar_bayes.setups", "polar_bayes.setups.prior_table"),
     ("polar_bayes.models",),
-    ("polar_bayes.simulate",),
+    ("polar_bayes.simulation",),
     ("polar_bayes.inference",),
     ("polar_bayes.maps",),
     ("polar_bayes.diagnostics",),
@@ -37,7 +38,7 @@ LAYERS = (
 SEPARATE = (
     ("polar_bayes.physics", "polar_bayes.capture"),
     ("polar_bayes.observation", "polar_bayes.capture"),
-    ("polar_bayes.inference", "polar_bayes.simulate"),
+    ("polar_bayes.inference", "polar_bayes.simulation"),
 )
 
 # Packages that only these layers may import; all others may be imported anywhere.

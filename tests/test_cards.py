@@ -10,15 +10,15 @@ import polar_bayes as pb
 from polar_bayes.repr_html import Card, Grid, HTMLRepr
 
 VALUES = {
-    "scene": pb.SETUPS["goniometer"].scene,
-    "set-up": pb.SETUPS["paper"],
+    "scene": pb.setups.SETUPS["goniometer"].scene,
+    "set-up": pb.setups.SETUPS["paper"],
     "part": pb.RoughSurface(pb.GGX(), illumination=pb.Disc(half_width=5.0)),
-    "coats": pb.CoatStack((pb.ClearCoat(), pb.ThinFilm())),
-    "link": pb.StokesLink(stated_errors=True),
-    "method": pb.Nuts(draws=700),
-    "rung": pb.Importance(),
-    "model": pb.Hierarchical(),
-    "pixels": pb.PixelLaplace(),
+    "coats": pb.physics.CoatStack((pb.ClearCoat(), pb.ThinFilm())),
+    "link": pb.links.StokesLink(stated_errors=True),
+    "method": pb.methods.Nuts(draws=700),
+    "rung": pb.methods.Importance(),
+    "model": pb.models.Hierarchical(),
+    "pixels": pb.methods.PixelLaplace(),
     "priors": pb.PRIORS,
 }
 
@@ -42,15 +42,15 @@ def test_a_scene_shows_its_parts_and_parameters() -> None:
 
 @pytest.mark.thorough
 def test_a_chosen_scene_is_shown_as_a_scene() -> None:
-    scene = pb.SETUPS["paper"].scene
-    chosen = pb.ChosenScene(
+    scene = pb.setups.SETUPS["paper"].scene
+    chosen = pb.effects.ChosenScene(
         **{f.name: getattr(scene, f.name) for f in dataclasses.fields(pb.Scene)}
     )
     assert "ledger" not in Page(chosen._repr_html_()).text
 
 
 def test_a_link_shows_what_it_reads() -> None:
-    assert "reads concentration_scale" in Page(pb.BetaLink()._repr_html_()).text
+    assert "reads concentration_scale" in Page(pb.links.BetaLink()._repr_html_()).text
 
 
 def test_priors_show_their_numbers() -> None:
@@ -89,8 +89,8 @@ def test_a_card_in_a_terminal() -> None:
 
 @pytest.mark.thorough
 def test_the_priors_of_a_set_up_are_those_that_its_fit_reads() -> None:
-    table = pb.prior_table("goniometer")
-    setup = pb.SETUPS["goniometer"]
+    table = pb.setups.prior_table("goniometer")
+    setup = pb.setups.SETUPS["goniometer"]
     assert set(table.index) == {*setup.scene.parameters, "stokes_error_factor"}
     row = table.loc["refractive_index"]
     assert (row["symbol"], row["unit"]) == ("n", "1")
@@ -101,8 +101,9 @@ def test_the_priors_of_a_set_up_are_those_that_its_fit_reads() -> None:
 def test_a_replaced_prior_stands_in_the_table() -> None:
     mine = {"roughness": pb.PRIORS["leakage"]}
     assert (
-        pb.prior_table("paper", priors=mine).loc["roughness", "prior"] == "HalfNormal(scale=0.01)"
+        pb.setups.prior_table("paper", priors=mine).loc["roughness", "prior"]
+        == "HalfNormal(scale=0.01)"
     )
-    assert set(pb.prior_table().index) == set(pb.PRIORS)
+    assert set(pb.setups.prior_table().index) == set(pb.PRIORS)
     with pytest.raises(pb.FitError, match="no such parameter in this model"):
-        pb.prior_table(pb.Scene(pb.SmoothSurface()), priors=mine)
+        pb.setups.prior_table(pb.Scene(pb.SmoothSurface()), priors=mine)

@@ -27,14 +27,14 @@ TIGHT, SAMPLED = 1e-5, 5.0
 
 
 def capture(views: int = 16, wavelengths: tuple[float, ...] = (), seed: int = 3):
-    protocol = pb.Protocol(views=views, wavelengths=wavelengths)
+    protocol = pb.simulation.Protocol(views=views, wavelengths=wavelengths)
     return pb.simulate("leaf", seed=seed, protocol=protocol)
 
 
 def image():
     one = capture(12)
     rows = [
-        pb.simulate("leaf", seed=s, protocol=pb.Protocol(views=12, wavelengths=()))
+        pb.simulate("leaf", seed=s, protocol=pb.simulation.Protocol(views=12, wavelengths=()))
         for s in range(6)
     ]
     whole = xr.concat(
@@ -48,7 +48,7 @@ def image():
 def numbers_of(result) -> dict[str, tuple[float, float]]:
     """Mean and standard deviation of every parameter, each with its Monte Carlo standard error."""
     found = {}
-    for name, row in pb.json_summary(result)["parameters"].items():
+    for name, row in pb.diagnostics.json_summary(result)["parameters"].items():
         error = (row["sd"] or 0.0) / max(row.get("ess_bulk") or 400.0, 1.0) ** 0.5
         found[f"{name} mean"] = (row["mean"], error)
         if row["sd"] is not None:
@@ -161,19 +161,19 @@ def effects():
     return numbers
 
 
-QUICK_NUTS = pb.Nuts(warmup=200, draws=500, most_draws=500, chains=2)
+QUICK_NUTS = pb.methods.Nuts(warmup=200, draws=500, most_draws=500, chains=2)
 CASES: dict[str, Callable] = {
     "point": of_fit(method="point"),
     "laplace": of_fit(method="laplace"),
     "nuts": of_fit(method=QUICK_NUTS),
-    "importance": of_fit(method=pb.Importance()),
+    "importance": of_fit(method=pb.methods.Importance()),
     "tempered": of_fit(method="tempered"),
     "auto": of_fit(method="auto"),
-    "normal guide": of_fit(method=pb.NormalGuide(steps=500)),
+    "normal guide": of_fit(method=pb.methods.NormalGuide(steps=500)),
     "hierarchical": of_groups("hierarchical", (), material=True, method=QUICK_NUTS),
     "gp_spectral": of_groups("gp_spectral", (450.0, 550.0, 650.0), method=QUICK_NUTS),
     "map laplace": map_of(),
-    "map tempered": map_of(method=pb.PixelTempering()),
+    "map tempered": map_of(method=pb.methods.PixelTempering()),
     "calibration": calibration,
     "identify": identification,
     "profile": curve,

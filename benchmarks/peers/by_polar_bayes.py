@@ -12,7 +12,7 @@ class Peer(AbstractPeer):
     packages = ("polar_bayes",)
 
     def rounds(self, seed: int) -> Iterator[Round]:
-        found = pb.fit(self.posterior.capture, method=pb.Nuts(), scene=SCENE, seed=seed)
+        found = pb.fit(self.posterior.capture, method=pb.methods.Nuts(), scene=SCENE, seed=seed)
         parameters = {name: found["posterior"][name].values for name in found["prior"].data_vars}
         steps = found["sample_stats"]
         evaluations = int(steps["n_steps"].sum() + steps["warmup_steps"].isel(draw=0).sum())

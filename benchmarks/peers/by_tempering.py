@@ -13,7 +13,7 @@ from polar_bayes.inference.batching import Stack, stack
 from polar_bayes.inference.program import Values
 from polar_bayes.observation.data import observe
 
-SETTINGS = pb.PixelTempering(effective_draws=400.0)
+SETTINGS = pb.methods.PixelTempering(effective_draws=400.0)
 CANDIDATES = 32
 
 

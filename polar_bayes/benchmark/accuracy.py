@@ -79,7 +79,7 @@ def accuracy(
 
     Args:
         capture: A Dataset of the capture schema; validated here.
-        rungs: Methods by name; by default `polar_bayes.LADDER`.
+        rungs: Methods by name; by default `polar_bayes.methods.LADDER`.
         dials: What else is turned, one at a time, on every rung; `()` for the rungs alone.
         reference: How well the posterior that all are judged by must be known.
         fresh: True runs every trial in a process of its own, so that the first time includes all
@@ -96,7 +96,7 @@ def accuracy(
     Returns:
         A tree whose group `accuracy` has a row for each rung and dial (coordinates `rung` and
         `dial`), and by row and parameter the distances from the reference; see the attribute
-        `long_name` of each variable. `polar_bayes.accuracy_table`, `accuracy_advice` and
+        `long_name` of each variable. `polar_bayes.benchmark.accuracy_table`, `accuracy_advice` and
         `plot_accuracy` read it.
 
     Raises:
@@ -187,7 +187,7 @@ def _trials(
             raise FitError(
                 f"a {type(method).__name__} is not a method",
                 where=f"accuracy: rungs[{name!r}]",
-                hint="give settings such as polar_bayes.Nuts()",
+                hint="give settings such as polar_bayes.methods.Nuts()",
             )
         trials[str(name), AS_GIVEN] = Trial(request, method, request.seed)
     for dial in dials:

@@ -45,7 +45,7 @@ def simulate(
     seed: int,
 ) -> None:
     """Draw a capture of a known material, by the paper's protocol."""
-    protocol = pb.Protocol(
+    protocol = pb.simulation.Protocol(
         views=views, largest_view_zenith=largest_view_zenith, wavelengths=wavelengths
     )
     capture = pb.simulate(preset, scene=scene, protocol=protocol, seed=seed)
@@ -71,7 +71,7 @@ def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Pa
                 hint="import or simulate one of the two again under another --name or file name",
             )
         named[label] = capture
-    capture = pb.combine(named, dim=dim, drop=drop)
+    capture = pb.capture.combine(named, dim=dim, drop=drop)
     pb.save_capture(capture, out)
     print_counts(capture, out)
 
@@ -143,7 +143,10 @@ def table(
     **settings: Any,
 ) -> None:
     """Any readings, listed a line each with their directions."""
-    given = {"columns": _once(columns, "--column"), "constants": _once(constants, "--constant")}
+    given: dict[str, Any] = {
+        "columns": _once(columns, "--column"),
+        "constants": _once(constants, "--constant"),
+    }
     _write(pb.from_table(table, **given, **settings), out)
 
 
@@ -239,24 +242,24 @@ def _write(capture: Any, out: Path) -> None:
 def _setting(options: dict[str, Any]) -> dict[str, Any]:
     """Arguments of an import from the options of a command."""
     take = options.pop
-    spheres = tuple(pb.Sphere(*each) for each in take("spheres"))
-    spheres += tuple(pb.fit_sphere(rim) for rim in take("rims"))
+    spheres = tuple(pb.importers.Sphere(*each) for each in take("spheres"))
+    spheres += tuple(pb.importers.fit_sphere(rim) for rim in take("rims"))
     normals = take("normals")
     shape = _one({"--sphere or --rim": spheres or None, "--normals": normals})
     light = _one(
         {
-            "--light": _made(pb.Direction, take("light")),
-            "--light-position": _made(pb.Position, take("light_position")),
-            "--highlight": _made(pb.Highlight, take("highlight")),
-            "--surroundings": pb.Surroundings() if take("surroundings") else None,
+            "--light": _made(pb.importers.Direction, take("light")),
+            "--light-position": _made(pb.importers.Position, take("light_position")),
+            "--highlight": _made(pb.importers.Highlight, take("highlight")),
+            "--surroundings": pb.importers.Surroundings() if take("surroundings") else None,
         }
     )
-    view = _made(pb.Position, take("view_position"))
+    view = _made(pb.importers.Position, take("view_position"))
     dark, dark_level = take("dark"), take("dark_level")
     if dark is not None and dark_level is not None:
         raise click.UsageError("--dark and --dark-level exclude each other")
     dark = dark_level if dark is None else dark
-    detector = pb.Detector(
+    detector = pb.importers.Detector(
         dark=0.0 if dark is None else dark,
         **{
             name: take(name)

@@ -51,9 +51,12 @@ def calibrate(
     settings |= {"readings": not no_readings, "store": store, "resume": resume}
     calibration = pb.calibrate(data, **settings)
     pb.save_result(calibration, out)
-    table, said = pb.calibration_table(calibration), pb.calibration_verdict(calibration)
+    table, said = (
+        pb.calibration.calibration_table(calibration),
+        pb.calibration.calibration_verdict(calibration),
+    )
     is_ranked = "predictive_pit" in calibration.children
-    readings = pb.calibration_readings(calibration) if is_ranked else None
+    readings = pb.calibration.calibration_readings(calibration) if is_ranked else None
     if as_json:
         tables = {"parameters": table} | ({} if readings is None else {"readings": readings})
         rows = {name: json.loads(each.to_json(orient="index")) for name, each in tables.items()}
@@ -65,7 +68,7 @@ def calibrate(
             shown = readings.drop(columns=["reading", "test"])
             click.echo(f"\n{shown.to_string(float_format=lambda x: f'{x:.3g}', na_rep='')}")
         click.echo("\n".join(["", *said]))
-    return 0 if pb.is_calibrated(table) else NOT_CONVERGED
+    return 0 if pb.calibration.is_calibrated(table) else NOT_CONVERGED
 
 
 @command()
@@ -108,22 +111,22 @@ def identify(
     tables, said = {}, {}
     with stages() as progress:
         found = pb.identify(data, progress=progress, **settings)
-        tables["parameters"] = pb.identifiability_table(found)
-        said["said"] = pb.identifiability_sentences(found)
+        tables["parameters"] = pb.design.identifiability_table(found)
+        said["said"] = pb.design.identifiability_sentences(found)
         for name in profiled:
             curve = pb.profile(data, name, progress=progress, **settings)
-            tables[f"profile of {name}"] = pb.profile_table(curve)
-            said[f"profile of {name}"] = pb.profile_sentences(curve)
+            tables[f"profile of {name}"] = pb.design.profile_table(curve)
+            said[f"profile of {name}"] = pb.design.profile_sentences(curve)
         if count is not None:
             views = pb.next_views(
                 data, count=count, criterion=_criterion(criterion), progress=progress, **settings
             )
-            tables["next views"] = pb.next_views_table(views)
-            said["next views"] = pb.next_views_sentences(views)
+            tables["next views"] = pb.design.next_views_table(views)
+            said["next views"] = pb.design.next_views_sentences(views)
     if as_json:
         told = {name: json.loads(table.to_json(orient="index")) for name, table in tables.items()}
-        sentences = {"said": said.pop("said"), **{f"{name}: said": x for name, x in said.items()}}
-        click.echo(json.dumps({**told, **sentences}, indent=2, allow_nan=False))
+        every = {"said": said.pop("said"), **{f"{name}: said": x for name, x in said.items()}}
+        click.echo(json.dumps({**told, **every}, indent=2, allow_nan=False))
         return
     for (name, table), sentences in zip(tables.items(), said.values(), strict=True):
         if name != "parameters":
@@ -157,11 +160,14 @@ def accuracy(
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
     data = pb.load_capture(capture)
-    settings["rungs"] = {name: pb.LADDER[name] for name in rungs or pb.LADDER}
+    settings["rungs"] = {name: pb.methods.LADDER[name] for name in rungs or pb.methods.LADDER}
     settings |= {"dials": ()} if no_dials else {}
     study = pb.accuracy(data, **settings)
     pb.save_result(study, out)
-    table, advice = pb.accuracy_table(study), pb.accuracy_advice(study, tolerance)
+    table, advice = (
+        pb.benchmark.accuracy_table(study),
+        pb.benchmark.accuracy_advice(study, tolerance),
+    )
     if as_json:
         rows = json.loads(table.to_json(orient="index"))
         click.echo(json.dumps({"rows": rows, "advice": advice}, indent=2, allow_nan=False))
@@ -174,8 +180,8 @@ def accuracy(
 
 def _criterion(name: str) -> Any:
     """The criterion of that letter, or the one of that parameter alone."""
-    letters = {"D": pb.DOptimal, "A": pb.AOptimal}
-    return letters[name]() if name in letters else pb.SingleParameter(name)
+    letters = {"D": pb.design.DOptimal, "A": pb.design.AOptimal}
+    return letters[name]() if name in letters else pb.design.SingleParameter(name)
 
 
 COMMANDS = (calibrate, identify, accuracy)

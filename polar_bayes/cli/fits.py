@@ -86,14 +86,14 @@ def fit(
             options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             scene = pb.choose_effects(data, progress=progress, **options)
-            click.echo(pb.ledger_sentence(scene.ledger), err=True)
+            click.echo(pb.effects.ledger_sentence(scene.ledger), err=True)
         wish: dict[str, Any] = {"tolerance": tolerance} if is_auto else {}
         result = pb.fit(data, scene=scene, progress=progress, **wish, **settings)
     pb.save_result(result, out)
-    for sentence in pb.auto_sentences(result):
+    for sentence in pb.inference.auto_sentences(result):
         click.echo(sentence, err=True)
     if as_json:
-        click.echo(json.dumps(pb.json_summary(result), indent=2, allow_nan=False))
+        click.echo(json.dumps(pb.diagnostics.json_summary(result), indent=2, allow_nan=False))
     else:
         print_table(result)
     return status(result)
@@ -121,10 +121,14 @@ def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: A
     """Fit every pixel of an image."""
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
-    asked = {} if draws is None else {"draws": draws}
-    chosen = pb.PixelLaplace(**asked) if method == "laplace" else pb.PixelTempering()
-    maps = pb.map_file(capture, out, method=chosen, **settings)
-    counts = ", ".join(f"{count} {what}" for what, count in pb.count_pixels(maps).items() if count)
+    asked: dict[str, Any] = {} if draws is None else {"draws": draws}
+    chosen = (
+        pb.methods.PixelLaplace(**asked) if method == "laplace" else pb.methods.PixelTempering()
+    )
+    maps = pb.maps.map_file(capture, out, method=chosen, **settings)
+    counts = ", ".join(
+        f"{count} {what}" for what, count in pb.maps.count_pixels(maps).items() if count
+    )
     click.echo(f"{out}: {counts}")
 
 
@@ -146,13 +150,13 @@ def effects(
     """What each effect changes and costs; which of them this capture can see."""
     data = _in_setup(pb.load_capture(capture), scene)
     with stages() as progress:
-        ledger = pb.choose_effects(data, progress=progress, **settings).ledger
+        ledger: Any = pb.choose_effects(data, progress=progress, **settings).ledger
     if out is not None:
         pb.save_result(ledger, out)
     if as_json:
-        click.echo(json.dumps(pb.ledger_summary(ledger), indent=2, allow_nan=False))
+        click.echo(json.dumps(pb.effects.ledger_summary(ledger), indent=2, allow_nan=False))
     else:
-        click.echo(f"{pb.ledger_table(ledger)}\n\n{pb.ledger_sentence(ledger)}")
+        click.echo(f"{pb.effects.ledger_table(ledger)}\n\n{pb.effects.ledger_sentence(ledger)}")
 
 
 @command()
@@ -171,9 +175,9 @@ def report(
     fit: Path, out: Path, truth: Path | None, uncorrected: Path | None, beside: tuple[Path, ...]
 ) -> None:
     """Write the standardized report of a fit, calibration, accuracy study, or map (.zarr)."""
-    others = {
-        "truth": None if truth is None else pb.open_capture(truth),
-        "uncorrected": None if uncorrected is None else pb.open_map(uncorrected),
+    others: dict[str, Any] = {
+        "truth": None if truth is None else pb.maps.open_capture(truth),
+        "uncorrected": None if uncorrected is None else pb.maps.open_map(uncorrected),
         "beside": _by_name(beside) or None,
     }
     page = pb.report(_opened(fit), out, **others)
@@ -188,12 +192,12 @@ def compare(fits: tuple[Path, ...], out: Path) -> int:
     if len({path.stem for path in fits}) < len(fits):
         raise click.UsageError("two of the files have the same name")
     results = {path.stem: pb.load_result(path) for path in fits}
-    comparison = pb.compare_fits(results)
+    comparison = pb.diagnostics.compare_fits(results)
     page = pb.report(results, out)
     if not comparison.loo.empty:
         shown = comparison.loo.rename(columns={"elpd_diff": "difference", "dse": "error"})
         click.echo(shown.to_string(float_format=lambda x: f"{x:.4g}") + "\n")
-    for sentence in pb.comparison_of_fits_sentences(comparison):
+    for sentence in pb.reporting.comparison_of_fits_sentences(comparison):
         click.echo(sentence)
     click.echo(f"report: {page}")
     good = all(verdict.converged for verdict in comparison.verdicts.values())
@@ -225,16 +229,20 @@ def _by_name(paths: tuple[Path, ...]) -> dict[str, Any]:
     """Calibrations by the names of their files."""
     if len({path.stem for path in paths}) < len(paths):
         raise click.UsageError("two files of --beside have the same name")
-    return {path.stem: pb.load_calibration(path) for path in paths}
+    return {path.stem: pb.calibration.load_calibration(path) for path in paths}
 
 
 def _opened(path: Path) -> Any:
     """A map, an accuracy study, a calibration or a fit."""
     if path.suffix == ".zarr":
-        return pb.open_map(path)
-    if pb.holds_accuracy(path):
-        return pb.load_accuracy(path)
-    return pb.load_calibration(path) if pb.holds_calibration(path) else pb.load_result(path)
+        return pb.maps.open_map(path)
+    if pb.benchmark.holds_accuracy(path):
+        return pb.benchmark.load_accuracy(path)
+    return (
+        pb.calibration.load_calibration(path)
+        if pb.calibration.holds_calibration(path)
+        else pb.load_result(path)
+    )
 
 
 COMMANDS = (demo, fit, map_, effects, report, compare)

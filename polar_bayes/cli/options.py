@@ -152,7 +152,7 @@ def status(result: Any) -> int:
 
 def print_table(result: Any) -> None:
     """A row per parameter."""
-    rows = pb.json_summary(result)["parameters"]
+    rows = pb.diagnostics.json_summary(result)["parameters"]
     columns = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
     titles = ("mean", "sd", "2.5%", "97.5%", "R-hat", "ESS")
     width = max(map(len, rows))
@@ -167,7 +167,7 @@ def print_table(result: Any) -> None:
 
 def print_counts(capture: Any, out: Path) -> None:
     """What a capture holds, in one line."""
-    counts = ", ".join(f"{number} {what}" for what, number in pb.count(capture).items())
+    counts = ", ".join(f"{number} {what}" for what, number in pb.capture.count(capture).items())
     click.echo(f"{out}: {counts}")
 
 

@@ -1,1 +1,5 @@
 """Captures from instruments: tables, goniometers and cameras."""
+
+from polar_bayes.namespace import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -3,9 +3,13 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from polar_bayes.inference.auto import Auto
+from polar_bayes.inference.batch_fit import PixelLaplace
+from polar_bayes.inference.batch_nuts import PixelNuts
 from polar_bayes.inference.laplace import Laplace, Point
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.request import Method
+from polar_bayes.inference.smc import PixelTempering
 from polar_bayes.inference.variational import FlowGuide, NormalGuide
 from polar_bayes.inference.weighted import Importance, Tempered
 
@@ -23,3 +27,18 @@ LADDER: Mapping[str, Method] = MappingProxyType(
     }
 )
 """Rungs by name. One more is one more value: `{**LADDER, "mine": Mine()}`."""
+
+__all__ = [
+    "LADDER",
+    "Auto",
+    "FlowGuide",
+    "Importance",
+    "Laplace",
+    "NormalGuide",
+    "Nuts",
+    "PixelLaplace",
+    "PixelNuts",
+    "PixelTempering",
+    "Point",
+    "Tempered",
+]

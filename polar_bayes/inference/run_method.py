@@ -34,7 +34,7 @@ def answer(method: Method, problem: Problem) -> PosteriorDraws:
     raise FitError(
         f"a {type(method).__name__} is not a method",
         where="method",
-        hint="give settings such as polar_bayes.Nuts()",
+        hint="give settings such as polar_bayes.methods.Nuts()",
     )
 
 

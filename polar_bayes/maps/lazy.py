@@ -85,10 +85,10 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
     """The maps of a Zarr store, their values read when they are needed.
 
     Args:
-        path: What `polar_bayes.map_file` or `polar-bayes map` wrote.
+        path: What `polar_bayes.maps.map_file` or `polar-bayes map` wrote.
 
     Returns:
-        The maps. Where a chunk is lost, pixels are not fitted (`polar_bayes.count_pixels`).
+        The maps. Where a chunk is lost, pixels are not fitted (`polar_bayes.maps.count_pixels`).
 
     Raises:
         CaptureError: It is no path.

@@ -29,6 +29,16 @@ from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorS
 from polar_bayes.physics.geometry import cos_degrees
 from polar_bayes.repr_html import HTMLRepr
 
+__all__ = [
+    "BetaLink",
+    "ConcentrationSchedule",
+    "LogitNormalLink",
+    "NormalLink",
+    "ScaleSchedule",
+    "StokesLink",
+    "StudentTLink",
+]
+
 # --- How noise depends on brightness and view angle: the schedules of the paper's section 2 -------
 
 

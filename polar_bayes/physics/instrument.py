@@ -21,6 +21,19 @@ from polar_bayes.physics.part import Part, Setting, check_setting, names_in, val
 from polar_bayes.physics.stokes import Light, in_turned_frame
 from polar_bayes.repr_html import HTMLRepr
 
+__all__ = [
+    "Analyzer",
+    "AngleZero",
+    "BeamOverlap",
+    "ChannelGain",
+    "DarkLevel",
+    "DolpGain",
+    "Instrument",
+    "Leakage",
+    "Saturation",
+    "TiltedNormal",
+]
+
 # Nearest to grazing, in degrees, that a shifted angle may come.
 STEEPEST_ZENITH = 89.999
 

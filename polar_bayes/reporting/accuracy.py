@@ -83,7 +83,7 @@ def plot_accuracy(
 
     Args:
         result: What `polar_bayes.accuracy` returns, or one read back from a file.
-        times: Columns of `polar_bayes.accuracy_table`, a panel each: "seconds_first",
+        times: Columns of `polar_bayes.benchmark.accuracy_table`, a panel each: "seconds_first",
             "seconds_again"; by default both, where they were measured.
 
     Returns:

@@ -41,7 +41,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
     """Means and 95% intervals of each parameter by every fit that has it.
 
     Args:
-        comparison: Of `polar_bayes.compare_fits`.
+        comparison: Of `polar_bayes.diagnostics.compare_fits`.
 
     Returns:
         The figure, a panel for each of the first 12 parameters. Point fits have twice their
@@ -163,7 +163,7 @@ def comparison_of_fits_sentences(comparison: FitComparison) -> list[str]:
     """What the fits say about the readings, and on which parameters they disagree.
 
     Args:
-        comparison: Of `polar_bayes.compare_fits`.
+        comparison: Of `polar_bayes.diagnostics.compare_fits`.
 
     Returns:
         Sentences.

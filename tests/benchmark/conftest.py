@@ -11,7 +11,9 @@ PLATE = pb.Scene(
     surface=pb.SmoothSurface(),
     subsurface=pb.Unpolarized(),
     mixing=pb.StokesMixing(),
-    instrument=pb.Instrument((pb.AngleZero(), pb.BeamOverlap(), pb.Leakage())),
+    instrument=pb.instrument.Instrument(
+        (pb.instrument.AngleZero(), pb.instrument.BeamOverlap(), pb.instrument.Leakage())
+    ),
 )
 
 
@@ -21,7 +23,7 @@ def plate() -> xr.Dataset:
 
 
 @pytest.fixture(scope="package")
-def chosen(plate: xr.Dataset) -> pb.ChosenScene:
+def chosen(plate: xr.Dataset) -> pb.effects.ChosenScene:
     """No brightness was recorded: the overlap of the beam cannot matter, the others do."""
     return pb.choose_effects(plate, scene=PLATE, links=LINKS)
 

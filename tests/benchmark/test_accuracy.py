@@ -25,8 +25,8 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.inference.resampling import choose
 from polar_bayes.inference.run_method import draws_of
 
-LINKS = {"q": pb.StokesLink()}
-ROUGHLY = pb.Reference(error=0.05, longer=0)
+LINKS = {"q": pb.links.StokesLink()}
+ROUGHLY = pb.benchmark.Reference(error=0.05, longer=0)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -82,7 +82,12 @@ def study() -> xr.DataTree:
         model=line,
         links=LINKS,
         rungs={"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()},
-        dials=(pb.DrawsDial(0.1), pb.FacetsDial(2.0), pb.PrecisionDial(), Stuck()),
+        dials=(
+            pb.benchmark.DrawsDial(0.1),
+            pb.benchmark.FacetsDial(2.0),
+            pb.benchmark.PrecisionDial(),
+            Stuck(),
+        ),
         reference=ROUGHLY,
         fresh=False,
     )
@@ -113,7 +118,7 @@ def test_the_reference_states_its_own_error(study):
 
 
 def test_a_rung_that_fails_is_a_row_that_says_why(study):
-    table = pb.accuracy_table(study)
+    table = pb.benchmark.accuracy_table(study)
     assert "it cannot be" in table.loc["broken", "problems"]
     assert np.isnan(table.loc["broken", "error"])
     assert not table.loc["broken", "on_front"]
@@ -121,7 +126,7 @@ def test_a_rung_that_fails_is_a_row_that_says_why(study):
 
 @pytest.mark.thorough
 def test_a_dial_that_fails_is_a_row_that_says_why(study):
-    table = pb.accuracy_table(study)
+    table = pb.benchmark.accuracy_table(study)
     for rung in ("biased", "right", "broken"):
         assert "it is rusty" in table.loc[f"{rung}, stuck", "problems"]
         assert np.isnan(table.loc[f"{rung}, stuck", "error"])
@@ -137,9 +142,9 @@ def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
 
     monkeypatch.setattr(run, "choose_effects", refuse)
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    for method in (pb.Laplace(), pb.Nuts()):
+    for method in (pb.methods.Laplace(), pb.methods.Nuts()):
         with pytest.raises(pb.FitError, match="no peak"):
-            pb.EffectsDial().turn(request, method)
+            pb.benchmark.EffectsDial().turn(request, method)
     assert len(tries) == 1
 
 
@@ -150,13 +155,13 @@ def test_dials_turn_what_they_can_and_leave_the_rest_out(study):
     assert ("biased", "draws / 10") in pairs
     assert ("broken", "draws / 10") not in pairs  # it has no draws
     assert ("right", "single precision") in pairs
-    table = pb.accuracy_table(study)
+    table = pb.benchmark.accuracy_table(study)
     assert table.loc["right, draws / 10", "effective_draws"] == 400
 
 
 @pytest.mark.thorough
 def test_without_processes_of_their_own_first_times_and_memory_are_not_told(study):
-    table = pb.accuracy_table(study)
+    table = pb.benchmark.accuracy_table(study)
     assert table["seconds_first"].isna().all()
     assert table["peak_memory"].isna().all()
     assert (table.loc[["biased", "right"], "seconds_again"] > 0.0).all()
@@ -167,34 +172,36 @@ def test_without_processes_of_their_own_first_times_and_memory_are_not_told(stud
 @pytest.mark.thorough
 def test_facets_are_turned_where_there_are_any():
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    turned, method = pb.FacetsDial(0.5).turn(request, pb.Nuts())
+    turned, method = pb.benchmark.FacetsDial(0.5).turn(request, pb.methods.Nuts())
     before, after = (
-        [part for _, part in parts_of(scene) if isinstance(part, pb.FacetQuadrature)]
+        [part for _, part in parts_of(scene) if isinstance(part, pb.physics.FacetQuadrature)]
         for scene in (request.scene, turned.scene)
     )
     assert len(before) == len(after) > 0
     for one, other in zip(before, after, strict=True):
         assert other.along == round(0.5 * one.along)
         assert other.across == round(0.5 * one.across)
-    assert method == pb.Nuts()
+    assert method == pb.methods.Nuts()
     smooth = dataclasses.replace(request, scene=pb.Scene(pb.SmoothSurface()))
-    assert pb.FacetsDial(0.5).turn(smooth, pb.Nuts()) is None
+    assert pb.benchmark.FacetsDial(0.5).turn(smooth, pb.methods.Nuts()) is None
     single = dataclasses.replace(request, precision="single")
-    assert pb.PrecisionDial().turn(single, pb.Nuts()) is None
+    assert pb.benchmark.PrecisionDial().turn(single, pb.methods.Nuts()) is None
 
 
 def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    quarter = pb.DrawsDial(0.25)
-    for name, method in pb.LADDER.items():
+    quarter = pb.benchmark.DrawsDial(0.25)
+    for name, method in pb.methods.LADDER.items():
         turned = quarter.turn(request, method)
         assert (turned is None) == (name in ("point", "nuts short"))  # no draws, or too few
         if turned is not None:
             assert draws_of(turned[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
     # A crowd and a half, of which half would be three quarters: fewer than the crowd.
-    few = pb.Tempered(pb.PixelTempering(draws=1536))
-    assert pb.DrawsDial(0.5).turn(request, few) is None
-    enough = pb.DrawsDial(0.5).turn(request, pb.Tempered(pb.PixelTempering(draws=3072)))
+    few = pb.methods.Tempered(pb.methods.PixelTempering(draws=1536))
+    assert pb.benchmark.DrawsDial(0.5).turn(request, few) is None
+    enough = pb.benchmark.DrawsDial(0.5).turn(
+        request, pb.methods.Tempered(pb.methods.PixelTempering(draws=3072))
+    )
     assert enough is not None
     assert draws_of(enough[1]) == 3072
 
@@ -202,9 +209,11 @@ def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
 @pytest.mark.thorough
 def test_every_dial_has_a_name_of_its_own():
     every: list[AbstractDial] = [
-        pb.DrawsDial(0.25), pb.DrawsDial(4.0), pb.FacetsDial(0.5), pb.FacetsDial(2.0),
-        pb.EffectsDial(), pb.PrecisionDial(),
-    ]  # fmt: skip
+        *(pb.benchmark.DrawsDial(factor) for factor in (0.25, 4.0)),
+        *(pb.benchmark.FacetsDial(factor) for factor in (0.5, 2.0)),
+        pb.benchmark.EffectsDial(),
+        pb.benchmark.PrecisionDial(),
+    ]
     names = [dial.name for dial in every]
     assert names[:3] == ["draws / 4", "draws x 4", "facets / 2"]
     assert len(set(names)) == len(names)
@@ -257,7 +266,7 @@ def test_draws_chosen_by_weight_have_the_error_of_their_weights_too():
 
 @pytest.mark.thorough
 def test_the_tempered_reference_draws_what_its_own_error_takes():
-    settings = pb.Reference(error=0.02).tempered.settings
+    settings = pb.benchmark.Reference(error=0.02).tempered.settings
     assert settings.effective_draws == pytest.approx(4.0 / 0.02**2)
     least = 4 * settings.effective_draws
     assert least <= settings.answer_draws < least + settings.crowd
@@ -278,11 +287,11 @@ def test_what_cannot_be_studied_is_refused(asked, said):
 
 def test_settings_out_of_range_are_refused():
     with pytest.raises(pb.FitError, match="error is 0"):
-        pb.Reference(error=0.0)
+        pb.benchmark.Reference(error=0.0)
     with pytest.raises(pb.FitError, match="factor is 0"):
-        pb.DrawsDial(0.0)
+        pb.benchmark.DrawsDial(0.0)
     with pytest.raises(pb.FitError, match="factor is -1"):
-        pb.FacetsDial(-1.0)
+        pb.benchmark.FacetsDial(-1.0)
 
 
 @pytest.mark.thorough
@@ -296,7 +305,7 @@ def test_a_process_of_its_own_finds_no_compiled_programs(monkeypatch):
 @pytest.mark.thorough
 def test_a_trial_runs_in_a_process_of_its_own():
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    found = run_fresh(Trial(request, pb.Laplace(draws=50), 0))
+    found = run_fresh(Trial(request, pb.methods.Laplace(draws=50), 0))
     assert found.labels == ("level", "slope")
     assert found.draws.shape == (2, 4, 50)
     assert found.seconds_first > 0.0

@@ -9,7 +9,7 @@ from polar_bayes.benchmark.advice import parameter_errors, pareto_front
 
 
 def test_the_table_has_the_worst_parameter_of_every_row():
-    table = pb.accuracy_table(make_accuracy())
+    table = pb.benchmark.accuracy_table(make_accuracy())
     assert list(table.index) == ["point", "laplace", "laplace, draws x 4", "nuts", "nuts long"]
     np.testing.assert_allclose(table["error"], [0.9, 0.4, 0.4, 0.05, 0.02])
     assert set(table["worst"]) == {"subsurface_fraction"}
@@ -37,7 +37,7 @@ def test_two_rows_that_are_alike_are_both_on_the_front():
 
 
 def test_a_cheap_method_is_advised_for_all_but_what_it_gets_wrong():
-    assert pb.accuracy_advice(make_accuracy()) == (
+    assert pb.benchmark.accuracy_advice(make_accuracy()) == (
         "laplace is within 0.08 sd here and 6 times faster than nuts, but for "
         "subsurface_fraction; use nuts for it."
     )
@@ -45,13 +45,13 @@ def test_a_cheap_method_is_advised_for_all_but_what_it_gets_wrong():
 
 @pytest.mark.thorough
 def test_without_first_times_the_next_ones_count():
-    assert "60 times faster than nuts" in pb.accuracy_advice(make_accuracy(fresh=False))
+    assert "60 times faster than nuts" in pb.benchmark.accuracy_advice(make_accuracy(fresh=False))
 
 
 @pytest.mark.thorough
 def test_a_cheap_method_that_is_good_for_all_is_advised_without_reserve():
     rows = ROWS | {("laplace", "as given"): ([0.08, 0.06, 0.02], 3.0, 0.1)}
-    assert pb.accuracy_advice(make_accuracy(rows)) == (
+    assert pb.benchmark.accuracy_advice(make_accuracy(rows)) == (
         "laplace is within 0.08 sd here and 6 times faster than nuts; use it."
     )
 
@@ -61,28 +61,28 @@ def test_times_that_hardly_differ_are_alike():
     rows = ROWS | {("nuts long", "as given"): ([0.02, 0.01, 0.01], 31.0, 9.0)}
     rows |= {("nuts", "as given"): ([0.05, 0.02, 0.02], 30.0, 9.0)}
     rows |= {("laplace", "as given"): ([0.4, 0.3, 0.3], 30.0, 9.0)}
-    assert pb.accuracy_advice(make_accuracy(rows)) == (
+    assert pb.benchmark.accuracy_advice(make_accuracy(rows)) == (
         "nuts is within 0.05 sd here and as fast as nuts long; use it."
     )
 
 
 @pytest.mark.thorough
 def test_a_smaller_tolerance_asks_for_more():
-    assert pb.accuracy_advice(make_accuracy(), tolerance=0.03) == (
+    assert pb.benchmark.accuracy_advice(make_accuracy(), tolerance=0.03) == (
         "nuts is within 0.03 sd here and 3.3 times faster than nuts long, but for "
         "subsurface_fraction; use nuts long for it."
     )
 
 
 def test_where_nothing_is_good_enough_the_nearest_is_named():
-    assert pb.accuracy_advice(make_accuracy(), tolerance=0.001) == (
+    assert pb.benchmark.accuracy_advice(make_accuracy(), tolerance=0.001) == (
         "No method is within 0.001 sd here; nuts long comes nearest, and is off by 0.02 sd for "
         "subsurface_fraction."
     )
 
 
 def test_a_doubtful_reference_is_told_with_the_advice():
-    said = pb.accuracy_advice(make_accuracy(doubts="its R-hat is 1.300"))
+    said = pb.benchmark.accuracy_advice(make_accuracy(doubts="its R-hat is 1.300"))
     assert said.endswith("Take it with care: of the reference itself, its R-hat is 1.300.")
 
 
@@ -90,30 +90,30 @@ def test_a_doubtful_reference_is_told_with_the_advice():
 def test_rows_without_an_answer_are_neither_advised_nor_on_the_front():
     rows = {("laplace", "as given"): ([np.nan] * 3, np.nan, np.nan)}
     study = make_accuracy(rows)
-    assert not pb.accuracy_table(study)["on_front"].any()
-    assert pb.accuracy_advice(study) == "No method has an answer here."
+    assert not pb.benchmark.accuracy_table(study)["on_front"].any()
+    assert pb.benchmark.accuracy_advice(study) == "No method has an answer here."
 
 
 def test_what_holds_no_study_is_refused():
     study = make_accuracy()["accuracy"].to_dataset()
     with pytest.raises(pb.FitError, match="accuracy/mean_error: it is missing; give the tree as"):
-        pb.accuracy_table(study.drop_vars("mean_error"))
+        pb.benchmark.accuracy_table(study.drop_vars("mean_error"))
 
 
 @pytest.mark.thorough
 def test_a_tolerance_of_nothing_is_refused():
     with pytest.raises(pb.FitError, match="tolerance is 0"):
-        pb.accuracy_advice(make_accuracy(), tolerance=0.0)
+        pb.benchmark.accuracy_advice(make_accuracy(), tolerance=0.0)
 
 
 def test_a_study_survives_a_file(tmp_path):
     study = make_accuracy()
     pb.save_result(study, tmp_path / "accuracy.nc")
-    assert pb.holds_accuracy(tmp_path / "accuracy.nc")
-    again = pb.load_accuracy(tmp_path / "accuracy.nc")
-    assert pb.accuracy_table(again).equals(pb.accuracy_table(study))
+    assert pb.benchmark.holds_accuracy(tmp_path / "accuracy.nc")
+    again = pb.benchmark.load_accuracy(tmp_path / "accuracy.nc")
+    assert pb.benchmark.accuracy_table(again).equals(pb.benchmark.accuracy_table(study))
     with pytest.raises(pb.FitError, match="it holds no fit"):
         pb.load_result(tmp_path / "accuracy.nc")
     pb.save_result(study["accuracy"].to_dataset(), tmp_path / "other.nc")
     with pytest.raises(pb.FitError, match="it holds no accuracy study"):
-        pb.load_accuracy(tmp_path / "other.nc")
+        pb.benchmark.load_accuracy(tmp_path / "other.nc")

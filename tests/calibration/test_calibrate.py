@@ -35,9 +35,9 @@ def test_what_is_right_passes(method: str, capture: xr.Dataset, corrected: xr.Da
     calibration = corrected
     if method != "importance":
         calibration = pb.calibrate(capture, simulations=COUNT, method=method, **ASKED)
-    table = pb.calibration_table(calibration)
-    assert pb.is_calibrated(table)
-    assert pb.calibration_verdict(calibration)[0].startswith("Calibrated: ")
+    table = pb.calibration.calibration_table(calibration)
+    assert pb.calibration.is_calibrated(table)
+    assert pb.calibration.calibration_verdict(calibration)[0].startswith("Calibrated: ")
     for percent in (50, 80, 95):
         share = percent / 100.0
         error = np.sqrt(share * (1.0 - share) / COUNT)
@@ -54,7 +54,7 @@ def test_what_is_right_passes(method: str, capture: xr.Dataset, corrected: xr.Da
             "subsurface_fraction",
         ),
         (
-            {"links": {"q": pb.StokesLink(stated_errors=True, degrees_of_freedom=2.1)}},
+            {"links": {"q": pb.links.StokesLink(stated_errors=True, degrees_of_freedom=2.1)}},
             "subsurface_fraction",
         ),
     ],
@@ -62,10 +62,10 @@ def test_what_is_right_passes(method: str, capture: xr.Dataset, corrected: xr.Da
 )
 def test_what_is_broken_on_purpose_is_caught(capture, truth, parameter) -> None:
     calibration = pb.calibrate(capture, simulations=COUNT, truth=truth, **ASKED)
-    table = pb.calibration_table(calibration)
-    assert not pb.is_calibrated(table)
+    table = pb.calibration.calibration_table(calibration)
+    assert not pb.calibration.is_calibrated(table)
     assert table.loc[parameter, "p_value"] < 0.025
-    verdict = pb.calibration_verdict(calibration)
+    verdict = pb.calibration.calibration_verdict(calibration)
     assert verdict[0].startswith("Not calibrated: ")
     assert any(line.startswith(f"{parameter}: ") for line in verdict[1:])
 
@@ -82,10 +82,13 @@ def test_the_tree_holds_every_fit(corrected: xr.DataTree) -> None:
 
 
 def test_readings_of_a_right_model_pass(corrected: xr.DataTree) -> None:
-    table = pb.calibration_readings(corrected)
+    table = pb.calibration.calibration_readings(corrected)
     assert list(table.index) == ["q, fresh", "q, left out"]
-    assert pb.is_calibrated(table)
-    assert "Readings (q; fresh ones and ones left out) pass" in pb.calibration_verdict(corrected)[1]
+    assert pb.calibration.is_calibrated(table)
+    assert (
+        "Readings (q; fresh ones and ones left out) pass"
+        in pb.calibration.calibration_verdict(corrected)[1]
+    )
     views = corrected["readings"]["q_view"].to_numpy()
     assert np.bincount(views, minlength=6).min() > 60  # all six, equally likely
 
@@ -93,7 +96,9 @@ def test_readings_of_a_right_model_pass(corrected: xr.DataTree) -> None:
 @pytest.mark.thorough
 def test_readings_see_a_wrong_noise(capture: xr.Dataset) -> None:
     truth = {"model": handlers.condition(per_material, data={"stokes_error_factor": 2.0})}
-    table = pb.calibration_readings(pb.calibrate(capture, simulations=200, truth=truth, **ASKED))
+    table = pb.calibration.calibration_readings(
+        pb.calibrate(capture, simulations=200, truth=truth, **ASKED)
+    )
     assert (table["p_value"] < 1e-3).all()
     assert (table["rank_spread"] > 1.1).all()
 
@@ -102,7 +107,7 @@ def test_readings_see_a_wrong_noise(capture: xr.Dataset) -> None:
 def test_what_is_off_leaves_no_trace(capture: xr.Dataset, corrected: xr.DataTree) -> None:
     bare = pb.calibrate(capture, simulations=64, readings=False, **ASKED)
     assert set(bare.children) == {"prior_sbc", "truth", "marginals", "fits"}
-    assert not any("eadings" in line for line in pb.calibration_verdict(bare))
+    assert not any("eadings" in line for line in pb.calibration.calibration_verdict(bare))
     for name in bare.children:
         some = corrected[name].to_dataset().isel(simulation=slice(64))
         xr.testing.assert_identical(bare[name].to_dataset(), some)
@@ -121,14 +126,14 @@ def test_a_simulation_does_not_depend_on_how_many_there_are(capture, corrected) 
 
 @pytest.mark.thorough
 def test_fits_that_fail_are_counted(capture: xr.Dataset) -> None:
-    method = pb.PixelNuts(chains=2, warmup=10, draws=50, largest_r_hat=1.01)
+    method = pb.methods.PixelNuts(chains=2, warmup=10, draws=50, largest_r_hat=1.01)
     calibration = pb.calibrate(capture, simulations=40, method=method, **ASKED)
-    table = pb.calibration_table(calibration)
+    table = pb.calibration.calibration_table(calibration)
     failed = int(table["failed"].iloc[0])
     assert 0 < failed < 40
     assert (table["answered"] + table["failed"] == 40).all()
     assert (table["held_95"] <= 1.0 - failed / 40).all()
-    assert f"{failed} of 40 fits: not trusted." in pb.calibration_verdict(calibration)
+    assert f"{failed} of 40 fits: not trusted." in pb.calibration.calibration_verdict(calibration)
 
 
 def test_mistakes_are_told(capture: xr.Dataset) -> None:
@@ -141,4 +146,4 @@ def test_mistakes_are_told(capture: xr.Dataset) -> None:
     with pytest.raises(pb.FitError, match="seed cannot differ"):
         pb.calibrate(capture, truth={"seed": 1}, **ASKED)
     with pytest.raises(pb.FitError, match="it holds no calibration; give the tree"):
-        pb.calibration_table(xr.DataTree())
+        pb.calibration.calibration_table(xr.DataTree())

@@ -19,7 +19,7 @@ def compared():
         ),
         "importance": make_calibration(),
     }
-    return pb.compare_calibrations(calibrations)
+    return pb.calibration.compare_calibrations(calibrations)
 
 
 def test_each_parameter_by_each_method(compared) -> None:
@@ -40,13 +40,15 @@ def test_scores_are_compared_fit_by_fit(compared) -> None:
         row = compared.loc[(label, "importance")]
         assert row["score_change"] < -2.0 * row["score_change_error"]
     assert compared.loc[("subsurface_fraction", "importance"), "score_change"] == 0.0
-    others = pb.compare_calibrations({"a": make_calibration(), "b": make_calibration(seed=1)})
+    others = pb.calibration.compare_calibrations(
+        {"a": make_calibration(), "b": make_calibration(seed=1)}
+    )
     assert others.xs("b", level="method")["score_change"].isna().all()
 
 
 @pytest.mark.thorough
 def test_sentences_name_what_fails_and_what_mends_it(compared) -> None:
-    said = pb.comparison_sentences(compared)
+    said = pb.calibration.comparison_sentences(compared)
     assert said[0] == "Of 3 parameters 2 fail by laplace, none fails by importance."
     assert said[1].startswith("roughness: by laplace intervals are too narrow (p = 0.0001, 95%")
     assert "; by importance the ranks pass (95% intervals hold 9" in said[1]
@@ -57,16 +59,16 @@ def test_sentences_name_what_fails_and_what_mends_it(compared) -> None:
 def test_a_shift_alone_is_not_called_a_width() -> None:
     for shift in (-1.0, -0.4, 0.4, 1.0):
         tree = make_calibration(shifted={"roughness": shift}, count=4000)
-        way = pb.compare_calibrations({"a": tree})["ways"].iloc[0]
+        way = pb.calibration.compare_calibrations({"a": tree})["ways"].iloc[0]
         assert way == f"the posterior is too {'high' if shift > 0.0 else 'low'}"
 
 
 def test_what_cannot_be_compared_is_refused() -> None:
     with pytest.raises(pb.FitError, match="nothing to compare"):
-        pb.compare_calibrations({})
+        pb.calibration.compare_calibrations({})
     few = make_calibration(names=("roughness",))
     with pytest.raises(pb.FitError, match="b: it has other parameters than a; calibrate the same"):
-        pb.compare_calibrations({"a": make_calibration(), "b": few})
+        pb.calibration.compare_calibrations({"a": make_calibration(), "b": few})
 
 
 def test_calibrations_come_back_from_files(tmp_path: Path) -> None:
@@ -74,17 +76,20 @@ def test_calibrations_come_back_from_files(tmp_path: Path) -> None:
     pb.save_result(tree, tmp_path / "sbc.nc")
     pb.save_result(fit, tmp_path / "fit.nc")
     (tmp_path / "text.nc").write_text("nothing")
-    read = pb.load_calibration(tmp_path / "sbc.nc")
+    read = pb.calibration.load_calibration(tmp_path / "sbc.nc")
     xr.testing.assert_identical(read["prior_sbc"].to_dataset(), tree["prior_sbc"].to_dataset())
     assert np.isnan(read["prior_sbc"]["roughness"].to_numpy()[1])
-    held = {name: pb.holds_calibration(tmp_path / f"{name}.nc") for name in ("sbc", "fit", "text")}
+    held = {
+        name: pb.calibration.holds_calibration(tmp_path / f"{name}.nc")
+        for name in ("sbc", "fit", "text")
+    }
     assert held == {"sbc": True, "fit": False, "text": False}
-    assert not pb.holds_calibration(tmp_path / "nowhere.nc")
+    assert not pb.calibration.holds_calibration(tmp_path / "nowhere.nc")
     for name, what in {
         "fit": "it holds no calibration",
         "text": "cannot be read as netCDF",
     }.items():
         with pytest.raises(pb.FitError, match=f"{what}; give the file that `polar-bayes calibr"):
-            pb.load_calibration(tmp_path / f"{name}.nc")
+            pb.calibration.load_calibration(tmp_path / f"{name}.nc")
     with pytest.raises(pb.CaptureError, match="there is no such file"):
-        pb.load_calibration(tmp_path / "nowhere.nc")
+        pb.calibration.load_calibration(tmp_path / "nowhere.nc")

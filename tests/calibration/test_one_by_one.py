@@ -25,7 +25,7 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 
 COUNT, PATCHES, VIEWS, NOISE = 80, 3, 4, 0.5
-SHORT = pb.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
+SHORT = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
 
 
 def population(data, scene, priors, links) -> None:
@@ -66,14 +66,14 @@ def capture() -> xr.Dataset:
 
 @pytest.fixture(scope="module")
 def exact(capture: xr.Dataset) -> xr.DataTree:
-    laplace = pb.Laplace(draws=200, chains=1)
+    laplace = pb.methods.Laplace(draws=200, chains=1)
     return pb.calibrate(capture, simulations=COUNT, model=population, method=laplace, **ASKED)
 
 
 def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
-    table = pb.calibration_table(exact)
+    table = pb.calibration.calibration_table(exact)
     assert sorted(table.index) == ["level[0]", "level[1]", "level[2]", "location"]
-    assert pb.is_calibrated(table)
+    assert pb.calibration.is_calibrated(table)
     assert (table["answered"] == COUNT).all()
     for percent in (50, 80, 95):
         share = percent / 100.0
@@ -86,10 +86,10 @@ def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
 
 @pytest.mark.thorough
 def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
-    laplace, told = pb.Laplace(draws=200, chains=1), {"model": population}
+    laplace, told = pb.methods.Laplace(draws=200, chains=1), {"model": population}
     asked = {"model": too_sure, "method": laplace, "truth": told, **ASKED}
-    table = pb.calibration_table(pb.calibrate(capture, simulations=40, **asked))
-    assert not pb.is_calibrated(table)
+    table = pb.calibration.calibration_table(pb.calibrate(capture, simulations=40, **asked))
+    assert not pb.calibration.is_calibrated(table)
     assert (table["rank_spread"].drop("location") > 1.0).all()
 
 
@@ -97,7 +97,7 @@ def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
 def test_a_fit_does_not_depend_on_how_many_there_are(
     capture: xr.Dataset, exact: xr.DataTree
 ) -> None:
-    laplace = pb.Laplace(draws=200, chains=1)
+    laplace = pb.methods.Laplace(draws=200, chains=1)
     few = pb.calibrate(capture, simulations=22, model=population, method=laplace, **ASKED)
     for group in ("truth", "prior_sbc", "marginals"):
         some = exact[group].to_dataset().isel(simulation=slice(22))
@@ -112,7 +112,7 @@ def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Datase
     assert (fits["approach"] == Approach.NUTS).all()
     assert (fits["effective_draws"] < 400.0).all()
     assert np.isfinite(found["prior_sbc"]["level"]).all()
-    said = pb.calibration_verdict(found)
+    said = pb.calibration.calibration_verdict(found)
     assert "20 of 20 fits: not trusted." in said
     assert any("the ranks judge the method, not the model" in sentence for sentence in said)
 
@@ -138,12 +138,12 @@ def test_fits_without_draws_are_counted(
     monkeypatch.setattr(
         runner.CompiledModel, "initializer", property(lambda self: Refusing(inner(self)))
     )
-    laplace = pb.Laplace(draws=50, chains=1)
+    laplace = pb.methods.Laplace(draws=50, chains=1)
     found = pb.calibrate(capture, simulations=24, model=population, method=laplace, **ASKED)
     lost = found["fits"]["status"].to_numpy() == Status.NOT_CONVERGED
     assert 0 < lost.sum() == len(refused) < 24
     assert np.array_equal(np.isnan(found["prior_sbc"]["location"].to_numpy()), lost)
-    table = pb.calibration_table(found)
+    table = pb.calibration.calibration_table(found)
     assert (table["failed"] == lost.sum()).all()
 
 
@@ -161,7 +161,7 @@ def test_chains_are_those_of_a_fit_where_weighted_draws_do_not_reach(capture: xr
     assert taken(None, one) == METHODS["tempered"]
     assert taken("nuts", one) == METHODS["nuts"]
     for many in ((capture,), (colors,), (one, "goniometer")):
-        assert taken(None, *many) == taken("nuts", *many) == pb.Nuts()
+        assert taken(None, *many) == taken("nuts", *many) == pb.methods.Nuts()
         assert taken("tempered", *many) == METHODS["tempered"]
     assert taken(SHORT, one) == SHORT
 
@@ -171,7 +171,7 @@ def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
     request = resolve(capture, population, SHORT, PLATE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
     compiled_model = compile_model(request, PLATE, data)
-    settings = pb.Laplace(draws=4000, chains=1)
+    settings = pb.methods.Laplace(draws=4000, chains=1)
     told = runner._fit(
         compiled_model.initializer, compiled_model.program, settings, data, jax.random.key(1)
     )

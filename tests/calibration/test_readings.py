@@ -106,15 +106,17 @@ def test_a_model_whose_draws_do_not_say_all_is_told() -> None:
 def test_readings_are_judged_by_themselves() -> None:
     good, bad = make_calibration(readings={}), make_calibration(readings={"dop": 0.7})
     for tree in (good, bad):
-        table = pb.calibration_readings(tree)
+        table = pb.calibration.calibration_readings(tree)
         assert list(table.index) == [
             "dop, fresh", "dop, left out", "intensity, fresh", "intensity, left out"
         ]  # fmt: skip
-        assert pb.calibration_verdict(tree)[0].startswith("Calibrated: the ranks of 3 parameters")
-        assert pb.is_calibrated(pb.calibration_table(tree))
-    said = pb.calibration_verdict(good)
+        assert pb.calibration.calibration_verdict(tree)[0].startswith(
+            "Calibrated: the ranks of 3 parameters"
+        )
+        assert pb.calibration.is_calibrated(pb.calibration.calibration_table(tree))
+    said = pb.calibration.calibration_verdict(good)
     assert "Readings (dop, intensity; fresh ones and ones left out) pass a joint test" in said[1]
-    said = pb.calibration_verdict(bad)
+    said = pb.calibration.calibration_verdict(bad)
     assert " fail a joint test of their own that a right model fails 5%" in said[1]
     assert "dop, fresh: predictions are too narrow (p = 0.0001)." in said
     assert not any(line.startswith("intensity") and "too narrow" in line for line in said)
@@ -124,7 +126,10 @@ def test_readings_are_judged_by_themselves() -> None:
 def test_what_was_not_ranked_is_told() -> None:
     tree = make_calibration(readings=None)
     with pytest.raises(pb.FitError, match="no ranks of readings; give what polar_bayes"):
-        pb.calibration_readings(tree)
-    assert not any("eadings" in line for line in pb.calibration_verdict(tree))
+        pb.calibration.calibration_readings(tree)
+    assert not any("eadings" in line for line in pb.calibration.calibration_verdict(tree))
     why = make_calibration(readings=None, **{"readings_told": "draws do not hold place"})
-    assert pb.calibration_verdict(why)[-1] == "Readings were not ranked: draws do not hold place."
+    assert (
+        pb.calibration.calibration_verdict(why)[-1]
+        == "Readings were not ranked: draws do not hold place."
+    )

@@ -131,10 +131,13 @@ def test_a_damaged_block_is_fitted_again(capture, whole, begun, tmp_path) -> Non
     ("other", "topic"),
     [
         ({"seed": 1}, "seed"),
-        ({"method": pb.PixelTempering(walks=32)}, "method"),
+        ({"method": pb.methods.PixelTempering(walks=32)}, "method"),
         ({"priors": {"refractive_index": dist.Uniform(1.2, 2.0 + 1e-9)}}, "priors"),
         ({"truth": {"priors": {"refractive_index": dist.Uniform(1.2, 2.0)}}}, "truth"),
-        ({"links": {"q": pb.StokesLink(degrees_of_freedom=5.0, stated_errors=True)}}, "links"),
+        (
+            {"links": {"q": pb.links.StokesLink(degrees_of_freedom=5.0, stated_errors=True)}},
+            "links",
+        ),
         ({"model": handlers.condition(per_material, data={"stokes_error_factor": 1.1})}, "model"),
         ({"largest_view_zenith": 70.0}, "capture, another largest_view_zenith"),
         ({"readings": False}, "readings"),
@@ -285,7 +288,7 @@ def test_a_killed_calibration_goes_on_to_the_bits_of_one_that_was_not(whole, tmp
         assert process.stdout is not None
         assert int(process.stdout.readline()) > 12
         assert process.wait() == 0
-    assert_same_bits(pb.load_calibration(out), whole)
+    assert_same_bits(pb.calibration.load_calibration(out), whole)
 
 
 @pytest.mark.thorough
@@ -308,5 +311,5 @@ def test_workers_of_a_cluster_make_the_same_bits(tmp_path: Path) -> None:
         ) as process,
     ):
         assert process.wait() == 0
-    whole = pb.load_calibration(tmp_path / "sbc.nc")
-    assert_same_bits(pb.load_calibration(tmp_path / "cluster.nc"), whole)
+    whole = pb.calibration.load_calibration(tmp_path / "sbc.nc")
+    assert_same_bits(pb.calibration.load_calibration(tmp_path / "cluster.nc"), whole)

@@ -32,7 +32,7 @@ def test_repeats_that_scatter_as_they_say_raise_few_alarms() -> None:
     random, runs, alarms, pairs = np.random.default_rng(0), 200, 0, []
     for _ in range(runs):
         means = {name: 0.3 + SD * random.standard_normal(5) for name in ("roughness", "absorption")}
-        table = pb.retest(fits(means))
+        table = pb.calibration.retest(fits(means))
         alarms += table["words"].str.contains("more than the intervals say").any()
         pairs.append(table["agreeing"].mean())
     assert alarms <= stats.binom.ppf(0.9999, runs, 0.05)
@@ -41,7 +41,7 @@ def test_repeats_that_scatter_as_they_say_raise_few_alarms() -> None:
 
 def test_repeats_that_scatter_more_are_told_by_how_much() -> None:
     means = 1.5 + 3.0 * SD * stats.norm.ppf((np.arange(12) + 0.5) / 12)
-    row = pb.retest(fits({"refractive_index": means})).loc["refractive_index"]
+    row = pb.calibration.retest(fits({"refractive_index": means})).loc["refractive_index"]
     assert row["scatter"] == pytest.approx(means.std(ddof=1), rel=1e-9)
     assert row["expected"] == pytest.approx(SD, rel=0.01)
     assert row["chi_square"] == pytest.approx(np.sum((means - means.mean()) ** 2) / SD**2, rel=0.02)
@@ -54,15 +54,17 @@ def test_repeats_that_scatter_more_are_told_by_how_much() -> None:
 @pytest.mark.thorough
 def test_repeats_that_scatter_less_are_no_alarm() -> None:
     means = 1.5 + 0.1 * SD * stats.norm.ppf((np.arange(12) + 0.5) / 12)
-    words = pb.retest(fits({"refractive_index": means})).loc["refractive_index", "words"]
+    words = pb.calibration.retest(fits({"refractive_index": means})).loc[
+        "refractive_index", "words"
+    ]
     assert "the rest of the intervals is what all repeats share" in words
 
 
 @pytest.mark.thorough
 def test_failed_repeats_are_counted() -> None:
-    row = pb.retest(fits({"roughness": np.array([0.3, np.nan, 0.31, 0.29])})).iloc[0]
+    row = pb.calibration.retest(fits({"roughness": np.array([0.3, np.nan, 0.31, 0.29])})).iloc[0]
     assert (row["repeats"], row["failed"], row["pairs"]) == (3, 1, 3)
-    alone = pb.retest(fits({"roughness": np.array([0.3, np.nan])})).iloc[0]
+    alone = pb.calibration.retest(fits({"roughness": np.array([0.3, np.nan])})).iloc[0]
     assert alone["words"] == "too few repeats have an answer"
 
 
@@ -70,19 +72,19 @@ def test_what_are_no_repeats_is_refused() -> None:
     with pytest.raises(
         pb.FitError, match="a single fit has nothing to agree with; give two or more"
     ):
-        pb.retest(fits({"roughness": np.array([0.3])}))
+        pb.calibration.retest(fits({"roughness": np.array([0.3])}))
     strangers = [*fits({"roughness": np.zeros(1)}), *fits({"absorption": np.zeros(1)})]
     with pytest.raises(pb.FitError, match="share no parameter"):
-        pb.retest(strangers)
+        pb.calibration.retest(strangers)
     with pytest.raises(pb.FitError, match="it holds no fit"):
-        pb.retest([xr.DataTree(), xr.DataTree()])
+        pb.calibration.retest([xr.DataTree(), xr.DataTree()])
 
 
 def test_intervals_hold_proxies_as_often_as_they_say() -> None:
     """Each share within 3.9 standard errors: one run in 10,000 strays further by chance."""
     random, count = np.random.default_rng(1), 300
     found = fits({"roughness": 0.3 + SD * random.standard_normal(count)}, true=0.3)
-    row = pb.proxy_coverage(found).loc["roughness"]
+    row = pb.calibration.proxy_coverage(found).loc["roughness"]
     for percent in (50, 80, 95):
         share = percent / 100.0
         assert abs(row[f"held_{percent}"] - share) < 3.9 * np.sqrt(share * (1 - share) / count)
@@ -94,12 +96,14 @@ def test_intervals_hold_proxies_as_often_as_they_say() -> None:
 @pytest.mark.thorough
 def test_proxies_may_be_given_and_failed_fits_miss_them() -> None:
     found = fits({"roughness": np.array([0.3, 0.34, np.nan]), "absorption": np.zeros(3)})
-    table = pb.proxy_coverage(found, {"roughness": 0.3})
+    table = pb.calibration.proxy_coverage(found, {"roughness": 0.3})
     assert list(table.index) == ["roughness"]
     row = table.loc["roughness"]
     assert (row["fits"], row["failed"]) == (3, 1)
     assert row["held_50"] == row["held_80"] == pytest.approx(1.0 / 3.0)
-    each = pb.proxy_scores(found, [{"roughness": 0.3}, {"roughness": 0.32}, {"absorption": 0.0}])
+    each = pb.calibration.proxy_scores(
+        found, [{"roughness": 0.3}, {"roughness": 0.32}, {"absorption": 0.0}]
+    )
     assert list(each["fit"]) == [0, 1, 2]
     assert each["z"].to_numpy()[:2] == pytest.approx([0.0, -1.0], abs=0.01)
     assert each["below"].to_numpy()[1] == pytest.approx(stats.norm.cdf(-1.0), abs=0.01)
@@ -113,15 +117,15 @@ def test_one_entry_of_a_spectrum_may_have_a_proxy_of_its_own() -> None:
         {"wavelength": [450.0, 650.0]},
     )
     tree = xr.DataTree.from_dict({"posterior": posterior})
-    scores = pb.proxy_scores([tree], {"refractive_index[650]": 1.52})
+    scores = pb.calibration.proxy_scores([tree], {"refractive_index[650]": 1.52})
     assert list(scores["parameter"]) == ["refractive_index[650]"]
-    assert len(pb.proxy_scores([tree], {"refractive_index": 1.52})) == 2
+    assert len(pb.calibration.proxy_scores([tree], {"refractive_index": 1.52})) == 2
 
 
 def test_proxies_that_do_not_fit_are_refused() -> None:
     found = fits({"roughness": np.zeros(2)})
     for proxies in (None, {"gloss": 1.0}):
         with pytest.raises(pb.FitError, match="no proxy is known of any parameter"):
-            pb.proxy_coverage(found, proxies)
+            pb.calibration.proxy_coverage(found, proxies)
     with pytest.raises(pb.FitError, match="1 mappings do not go with 2 fits"):
-        pb.proxy_scores(found, [{"roughness": 0.0}])
+        pb.calibration.proxy_scores(found, [{"roughness": 0.0}])

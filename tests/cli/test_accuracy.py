@@ -29,10 +29,12 @@ def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys
     assert main(["accuracy", str(plate), "--out", str(out)]) == 0
     told = capsys.readouterr().out
     assert told.splitlines()[0].split()[:2] == ["error", "worst"]
-    assert told.splitlines()[-1] == pb.accuracy_advice(make_accuracy())
-    assert set(studied["rungs"]) == set(pb.LADDER)
+    assert told.splitlines()[-1] == pb.benchmark.accuracy_advice(make_accuracy())
+    assert set(studied["rungs"]) == set(pb.methods.LADDER)
     assert "dials" not in studied
-    assert pb.accuracy_table(pb.load_accuracy(out)).equals(pb.accuracy_table(make_accuracy()))
+    assert pb.benchmark.accuracy_table(pb.benchmark.load_accuracy(out)).equals(
+        pb.benchmark.accuracy_table(make_accuracy())
+    )
     report = tmp_path / "report"
     assert main(["report", str(out), "--out", str(report)]) == 0
     assert "Error against time" in (report / "index.html").read_text()
@@ -43,7 +45,7 @@ def test_rungs_and_dials_are_chosen_and_json_is_json(plate, tmp_path, capsys, st
     words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--json", "--no-dials"]
     assert main([*words, "--rung", "laplace", "--rung", "nuts", "--tolerance", "0.001"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert set(said["rows"]) == set(pb.accuracy_table(make_accuracy()).index)
+    assert set(said["rows"]) == set(pb.benchmark.accuracy_table(make_accuracy()).index)
     assert said["advice"].startswith("No method is within 0.001 sd")
     assert list(studied["rungs"]) == ["laplace", "nuts"]
     assert studied["dials"] == ()

@@ -34,7 +34,7 @@ def test_a_fit_whose_diagnostics_fail_is_written_and_exits_with_2(
 ) -> None:
     from polar_bayes.inference import request
 
-    short = pb.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
+    short = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
     monkeypatch.setitem(request.METHODS, "nuts", short)
     out = tmp_path / "fit.nc"
     assert main(["fit", str(plate), "--out", str(out)]) == 2

@@ -69,8 +69,8 @@ def test_the_map_of_the_fruit_separates_surface_from_body(
     capture = imported(frame, tmp_path / "f.nc", "--bin", "32", "--window", "2")
     store = tmp_path / "f.zarr"
     assert main(["map", str(capture), "--draws", "128", "--out", str(store)]) == 0
-    maps = pb.open_map(store)
-    counts = pb.count_pixels(maps)
+    maps = pb.maps.open_map(store)
+    counts = pb.maps.count_pixels(maps)
     assert counts["good"] > 0.9 * (sum(counts.values()) - counts["masked"])
     share = maps["subsurface_fraction"].values
     found = {name: np.nanmedian(share[where]) for name, where in regions(maps).items()}

@@ -126,11 +126,11 @@ def test_names_of_options_are_those_of_the_tables():
 
     known = {
         cli_options.MODEL: MODELS,
-        cli_options.SCENE: pb.SETUPS,
-        cli_options.MATERIAL: pb.PRESETS,
+        cli_options.SCENE: pb.setups.SETUPS,
+        cli_options.MATERIAL: pb.simulation.PRESETS,
         cli_options.FIT_METHOD: METHODS,
         cli_options.CALIBRATION_METHOD: CALIBRATION_METHODS,
-        cli_options.RUNG: pb.LADDER,
+        cli_options.RUNG: pb.methods.LADDER,
     }
     for kind, table in known.items():
         assert kind.names == tuple(table), kind.kind

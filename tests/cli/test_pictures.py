@@ -41,7 +41,7 @@ def test_frames_behind_a_polarizer(
     words += ["--wavelength", "550", "--name", "ball"]
     assert main(["import", "polarizer", *words, "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    detector = pb.Detector(
+    detector = pb.importers.Detector(
         saturation_level=1000.0, dark=1.0, gain=0.2, read_noise=2.0, relative_error=0.0
     )
     known = {"shape": BALL, "light": LAMP, "detector": detector, "bin": 2, "window": 1}
@@ -62,19 +62,26 @@ def test_a_mosaic_with_another_layout(tmp_path: Path, capsys: pytest.CaptureFixt
     layout = ["--layout", "0", "45", "135", "90"]
     out = tmp_path / "ball.nc"
     command = ["import", "mosaic", str(tmp_path / "frame.npy"), *FULL, *layout, "--out", str(out)]
-    asked = {"layout": ((0, 45), (135, 90)), "detector": pb.Detector(saturation_level=1000.0)}
+    asked = {
+        "layout": ((0, 45), (135, 90)),
+        "detector": pb.importers.Detector(saturation_level=1000.0),
+    }
     for words, known in (
         (
             ["--normals", str(tmp_path / "normals.npy"), "--highlight", "15", "25"],
-            {"shape": pictures.ball_normals(), "light": pb.Highlight(15.0, 25.0)},
+            {"shape": pictures.ball_normals(), "light": pb.importers.Highlight(15.0, 25.0)},
         ),
         (
             ["--rim", str(tmp_path / "rim.csv"), "--light-position", "5", "6", "90"],
-            {"shape": BALL, "light": pb.Position(5.0, 6.0, 90.0)},
+            {"shape": BALL, "light": pb.importers.Position(5.0, 6.0, 90.0)},
         ),
         (
             [*SPHERE, "--surroundings", "--view-position", "0", "0", "70"],
-            {"shape": BALL, "light": pb.Surroundings(), "view": pb.Position(0.0, 0.0, 70.0)},
+            {
+                "shape": BALL,
+                "light": pb.importers.Surroundings(),
+                "view": pb.importers.Position(0.0, 0.0, 70.0),
+            },
         ),
     ):
         assert main([*command, *words]) == 0

@@ -53,7 +53,7 @@ def test_what_is_told_has_small_shares_of_the_prior(plate: xr.Dataset) -> None:
     assert (plate["prior_share"] < 0.05).all()
     assert (np.diff(plate["information"]) >= 0.0).all()
     np.testing.assert_allclose(np.diag(plate["correlation"]), 1.0)
-    assert pb.identifiability_sentences(plate) == [
+    assert pb.design.identifiability_sentences(plate) == [
         "Every parameter of the material is determined by the data."
     ]
 
@@ -61,7 +61,7 @@ def test_what_is_told_has_small_shares_of_the_prior(plate: xr.Dataset) -> None:
 def test_without_information_the_prior_is_all_there_is() -> None:
     found = pb.identify(plate_capture(VIEWS, 50.0, seed=0), **ASKED)
     assert found["prior_share"].to_numpy() == pytest.approx(1.0, abs=0.01)
-    said = pb.identifiability_sentences(found)
+    said = pb.design.identifiability_sentences(found)
     assert any(line.startswith("refractive_index is not determined: ") for line in said)
 
 
@@ -93,15 +93,15 @@ def glass() -> xr.Dataset:
 
 @pytest.fixture(scope="module")
 def of_glass(glass: xr.Dataset) -> xr.Dataset:
-    return pb.identify(glass, scene=POLISHED, links={"dop": pb.BetaLink()})
+    return pb.identify(glass, scene=POLISHED, links={"dop": pb.links.BetaLink()})
 
 
 @pytest.mark.thorough
 def test_glass_does_not_tell_its_absorption(glass: xr.Dataset, of_glass: xr.Dataset) -> None:
-    said = pb.identifiability_sentences(of_glass)
+    said = pb.design.identifiability_sentences(of_glass)
     assert any(line.startswith("absorption is not determined: ") for line in said)
     asked = ASKED | {"scene": POLISHED, "points": 5}
-    flat = pb.profile_sentences(pb.profile(glass, "absorption", **asked))
+    flat = pb.design.profile_sentences(pb.profile(glass, "absorption", **asked))
     assert flat[0].startswith("absorption is flat: the data exclude nothing below, down to 0.0")
 
 
@@ -158,14 +158,14 @@ def test_the_weakest_direction_is_said_where_its_parts_would_be_seen() -> None:
             "name": ("parameter", ["roughness", "absorption"]),
         },
     )
-    said = pb.identifiability_sentences(found)
+    said = pb.design.identifiability_sentences(found)
     assert said[2] == (
         "The weakest direction moves roughness by +0.7, absorption by +0.7 prior sds together: "
         "the readings move by 0.01 sds of their noise, though roughness alone would move them "
         "by 21."
     )
     found["information"][0] = 4.0
-    assert not any("weakest" in line for line in pb.identifiability_sentences(found))
+    assert not any("weakest" in line for line in pb.design.identifiability_sentences(found))
 
 
 @pytest.mark.thorough
@@ -181,4 +181,4 @@ def test_a_prior_that_bends_the_other_way_stays_a_precision() -> None:
 
 def test_something_else_is_refused() -> None:
     with pytest.raises(pb.FitError, match="it says nothing of identifiability"):
-        pb.identifiability_table(xr.Dataset())
+        pb.design.identifiability_table(xr.Dataset())

@@ -50,7 +50,7 @@ def test_the_interval_is_that_of_the_normal_distribution(slope: xr.Dataset) -> N
     assert not found["open_below"]
     assert not found["open_above"]
     low, high = (float(slope[end].sel(kind="likelihood")) for end in ("low", "high"))
-    assert pb.profile_sentences(slope) == [
+    assert pb.design.profile_sentences(slope) == [
         f"slope is between {low:.4g} and {high:.4g} (95% interval of the likelihood ratio)."
     ]
 
@@ -60,7 +60,7 @@ def test_a_grid_of_ones_own_keeps_its_values() -> None:
     found = pb.profile(line_capture(ZENITHS), "level", model=line, values=[0.19, 0.21], **ASKED)
     assert {0.19, 0.21} < set(found["value"].to_numpy().round(12))
     assert found["open_below"].all()
-    said = pb.profile_sentences(found)
+    said = pb.design.profile_sentences(found)
     assert said[0].startswith("level is flat: the data exclude nothing below as far as the grid")
 
 
@@ -80,7 +80,7 @@ def test_what_is_known_beside_the_readings_is_of_the_likelihood() -> None:
 def test_a_gap_is_left_out_and_counted(slope: xr.Dataset) -> None:
     broken = slope.copy(deep=True)
     broken["converged"][1, 2] = False
-    assert pb.profile_sentences(broken)[1].startswith(
+    assert pb.design.profile_sentences(broken)[1].startswith(
         "At 1 of 18 points of the two profiles no fit"
     )
 
@@ -109,4 +109,4 @@ def test_what_cannot_be_profiled_is_told() -> None:
     with pytest.raises(pb.FitError, match="values of slope: nan is not inside its prior"):
         pb.profile(capture, "slope", model=line, values=[np.nan], **ASKED)
     with pytest.raises(pb.FitError, match="it is no profile"):
-        pb.profile_sentences(xr.Dataset())
+        pb.design.profile_sentences(xr.Dataset())

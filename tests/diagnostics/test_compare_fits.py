@@ -23,7 +23,7 @@ def off(result: xr.DataTree, by: float) -> xr.DataTree:
 
 def test_parameters_stand_side_by_side() -> None:
     fits = {"a": make_result(**SMALL), "b": make_result(**SMALL, method="laplace")}
-    table = pb.compare_fits(fits).parameters
+    table = pb.diagnostics.compare_fits(fits).parameters
     for name, fit in fits.items():
         own = table.xs(name, level="fit")
         assert list(own.index) == list(summary(fit).index)
@@ -33,7 +33,7 @@ def test_parameters_stand_side_by_side() -> None:
 
 def test_predictions_are_those_of_the_reports_and_of_arviz() -> None:
     good, bad = make_result(**SMALL), off(make_result(**SMALL), 1.0)
-    loo = pb.compare_fits({"bad": bad, "good": good}).loo
+    loo = pb.diagnostics.compare_fits({"bad": bad, "good": good}).loo
     assert list(loo.index) == ["good", "bad"]
     assert loo.loc["good", "elpd"] == pytest.approx(predictive_checks(good)["dop"].loo.elpd)
     assert loo.loc["bad", "elpd_diff"] == pytest.approx(-15.0)
@@ -46,7 +46,7 @@ def test_predictions_are_those_of_the_reports_and_of_arviz() -> None:
 def test_all_variables_count_together() -> None:
     two = {**SMALL, "variables": ("dop", "intensity")}
     fit = make_result(**two)
-    loo = pb.compare_fits({"a": fit, "b": make_result(**two, method="laplace")}).loo
+    loo = pb.diagnostics.compare_fits({"a": fit, "b": make_result(**two, method="laplace")}).loo
     parts = [check.loo.elpd for check in predictive_checks(fit).values()]
     assert loo.loc["a", "elpd"] == pytest.approx(sum(parts))
 
@@ -54,7 +54,7 @@ def test_all_variables_count_together() -> None:
 def test_a_point_fit_has_parameters_and_no_predictions() -> None:
     point = make_result(**SMALL, method="point")
     fits = {"a": make_result(**SMALL), "b": make_result(**SMALL, method="laplace"), "p": point}
-    compared = pb.compare_fits(fits)
+    compared = pb.diagnostics.compare_fits(fits)
     assert list(compared.left_out) == ["p"]
     assert set(compared.loo.index) == {"a", "b"}
     assert "p" in compared.parameters.index.get_level_values("fit")
@@ -63,13 +63,13 @@ def test_a_point_fit_has_parameters_and_no_predictions() -> None:
 def test_another_capture_is_refused() -> None:
     one, other = make_result(**SMALL), make_result(**SMALL, seed=1)
     with pytest.raises(FitError, match="other: it is of another capture than one: dop differs"):
-        pb.compare_fits({"one": one, "other": other})
+        pb.diagnostics.compare_fits({"one": one, "other": other})
     turned = make_result(**SMALL, azimuths=(90.0,))
     with pytest.raises(FitError, match="view_azimuth differs"):
-        pb.compare_fits({"one": one, "other": turned})
+        pb.diagnostics.compare_fits({"one": one, "other": turned})
     fewer = make_result(**{**SMALL, "views": 15})
     with pytest.raises(FitError, match="view_zenith differs"):
-        pb.compare_fits({"one": one, "other": fewer})
+        pb.diagnostics.compare_fits({"one": one, "other": fewer})
 
 
 @pytest.mark.thorough
@@ -78,13 +78,13 @@ def test_other_views_or_variables_are_not_compared_by_predictions() -> None:
     masked = replace(
         make_result(**SMALL), "constant_data", "valid", [0, *[1] * (SMALL["views"] - 1)]
     )
-    compared = pb.compare_fits({"whole": whole, "part": masked})
+    compared = pb.diagnostics.compare_fits({"whole": whole, "part": masked})
     assert compared.loo.empty
     assert "set aside different views" in compared.left_out[""]
     both = make_result(**{**SMALL, "variables": ("dop", "q")})
     also = both.copy()
     also["observed_data"] = xr.DataTree(both["observed_data"].to_dataset()[["dop"]])
-    compared = pb.compare_fits({"both": both, "dop alone": also})
+    compared = pb.diagnostics.compare_fits({"both": both, "dop alone": also})
     assert "They predict different readings" in compared.left_out[""]
 
 
@@ -92,4 +92,4 @@ def test_other_views_or_variables_are_not_compared_by_predictions() -> None:
 @each("fits", [{}, {"a": make_result(**SMALL)}, None])
 def test_one_fit_is_not_compared(fits) -> None:
     with pytest.raises(FitError, match="there is nothing to compare"):
-        pb.compare_fits(fits)
+        pb.diagnostics.compare_fits(fits)

@@ -35,7 +35,7 @@ def wilson(share: float, count: int) -> tuple[float, float]:
 
 
 def test_a_truth_that_is_spread_like_the_posterior_is_held_as_often_as_the_interval_says() -> None:
-    found = pb.map_coverage(make_maps({"roughness": HALF}), known(roughness=SPREAD))
+    found = pb.diagnostics.map_coverage(make_maps({"roughness": HALF}), known(roughness=SPREAD))
     row = found.loc["roughness"]
     assert row[["unknown", "masked", "unanswered", "answered"]].tolist() == [0, 0, 0, 2000]
     for claimed in (50, 80, 95):
@@ -45,9 +45,9 @@ def test_a_truth_that_is_spread_like_the_posterior_is_held_as_often_as_the_inter
 
 
 def test_intervals_half_as_wide_hold_half_as_many() -> None:
-    row = pb.map_coverage(make_maps({"roughness": HALF}, width=0.5), known(roughness=SPREAD)).loc[
-        "roughness"
-    ]
+    row = pb.diagnostics.map_coverage(
+        make_maps({"roughness": HALF}, width=0.5), known(roughness=SPREAD)
+    ).loc["roughness"]
     assert [row[f"held_{each}"] for each in (50, 80, 95)] == [0.25, 0.4, 0.475]
 
 
@@ -56,7 +56,9 @@ def test_ends_count_as_inside_in_the_precision_of_the_map() -> None:
     """0.3 in double precision lies below 0.3 in single precision."""
     maps = make_maps({"roughness": np.array([[0.3]])}, width=0.0)
     assert float(maps["roughness"][0, 0]) > 0.3
-    assert pb.map_coverage(maps, known(roughness=0.3)).loc["roughness", "held_50"] == 1.0
+    assert (
+        pb.diagnostics.map_coverage(maps, known(roughness=0.3)).loc["roughness", "held_50"] == 1.0
+    )
 
 
 def test_pixels_without_an_answer_are_counted_and_never_held() -> None:
@@ -64,7 +66,7 @@ def test_pixels_without_an_answer_are_counted_and_never_held() -> None:
     true = np.full((2, 6), 0.5)
     true[1, 4:] = 9.0, np.nan
     maps = make_maps({"roughness": np.full((2, 6), 0.5)}, status=status)
-    row = pb.map_coverage(maps, known(roughness=true)).loc["roughness"]
+    row = pb.diagnostics.map_coverage(maps, known(roughness=true)).loc["roughness"]
     # Good: one of the first row and five of the second, one of whose truths lies outside.
     assert row[["unknown", "masked", "unanswered", "answered"]].tolist() == [1, 1, 4, 6]
     assert row["held_95"] == 5 / 6
@@ -74,7 +76,7 @@ def test_pixels_without_an_answer_are_counted_and_never_held() -> None:
 @pytest.mark.thorough
 def test_without_answers_there_is_no_share() -> None:
     maps = make_maps({"roughness": HALF}, status=np.full(HALF.shape, Status.NOT_CONVERGED))
-    row = pb.map_coverage(maps, known(roughness=0.5)).loc["roughness"]
+    row = pb.diagnostics.map_coverage(maps, known(roughness=0.5)).loc["roughness"]
     assert row["unanswered"] == HALF.size
     assert row[["held_50", "held_50_low", "held_50_high"]].isna().all()
     assert row["held_50_of_read"] == 0.0
@@ -94,7 +96,7 @@ def test_every_wavelength_has_a_row_and_truths_may_have_fewer_axes() -> None:
         },
         coords={"wavelength": [450.0, 650.0]},
     )
-    found = pb.map_coverage(maps, truth)
+    found = pb.diagnostics.map_coverage(maps, truth)
     assert list(found.index) == ["roughness", "refractive_index[450]", "refractive_index[650]"]
     assert found["held_95"].tolist() == [0.95, 1.0, 0.0]
 
@@ -102,9 +104,9 @@ def test_every_wavelength_has_a_row_and_truths_may_have_fewer_axes() -> None:
 @pytest.mark.thorough
 def test_the_image_may_be_read_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     maps, truth = make_maps({"roughness": HALF}), known(roughness=SPREAD)
-    whole = pb.map_coverage(maps, truth)
+    whole = pb.diagnostics.map_coverage(maps, truth)
     monkeypatch.setattr(coverage, "BLOCK", 333)
-    pd.testing.assert_frame_equal(pb.map_coverage(maps, truth), whole)
+    pd.testing.assert_frame_equal(pb.diagnostics.map_coverage(maps, truth), whole)
 
 
 @pytest.mark.thorough
@@ -121,19 +123,19 @@ def test_maps_that_are_still_to_be_computed_are_computed_once(
     lazy = maps.assign(
         roughness_quantile=(maps["roughness_quantile"].dims, chunks.map_blocks(late, meta=chunks))
     )
-    found = pb.map_coverage(lazy, known(roughness=SPREAD))
+    found = pb.diagnostics.map_coverage(lazy, known(roughness=SPREAD))
     assert found.loc["roughness", "held_95"] == 0.95
     assert calls == [(7, 20, 50)] * 2
     monkeypatch.setattr(opening, "MOST_BYTES", 1000)
     with pytest.raises(pb.FitError, match="in chunks and take 0 GB; write them with to_zarr"):
-        pb.map_coverage(lazy, known(roughness=SPREAD))
+        pb.diagnostics.map_coverage(lazy, known(roughness=SPREAD))
 
 
 def test_what_does_not_fit_is_refused() -> None:
     maps = make_maps({"roughness": HALF})
     with pytest.raises(pb.CaptureError, match="leaf: it knows the truth of no parameter"):
-        pb.map_coverage(maps, known(albedo=0.3))
+        pb.diagnostics.map_coverage(maps, known(albedo=0.3))
     with pytest.raises(pb.CaptureError, match="different axes \\(y 50 x x 40 and y 40 x x 50\\)"):
-        pb.map_coverage(maps, known(roughness=SPREAD.T))
+        pb.diagnostics.map_coverage(maps, known(roughness=SPREAD.T))
     with pytest.raises(pb.FitError, match="it holds no maps"):
-        pb.map_coverage(xr.Dataset(), known(roughness=0.5))
+        pb.diagnostics.map_coverage(xr.Dataset(), known(roughness=0.5))

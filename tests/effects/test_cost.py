@@ -24,7 +24,9 @@ GEOMETRY = pb.Geometry.from_degrees(
     wavelength=np.full(16, 550.0),
 )
 PLAIN = pb.Scene(
-    surface=pb.RoughSurface(quadrature=pb.FacetQuadrature(5, 4), way_out=pb.SmoothExit()),
+    surface=pb.RoughSurface(
+        quadrature=pb.physics.FacetQuadrature(5, 4), way_out=pb.physics.SmoothExit()
+    ),
     subsurface=pb.Unpolarized(),
     mixing=pb.StokesMixing(),
 )
@@ -62,34 +64,36 @@ def rough(**parts) -> pb.Scene:
 
 
 def recorded(term) -> pb.Scene:
-    return dataclasses.replace(PLAIN, instrument=pb.Instrument((term,)))
+    return dataclasses.replace(PLAIN, instrument=pb.instrument.Instrument((term,)))
 
 
 # One effect switched on in each.
 ON = {
-    "polarized light": rough(illumination=pb.PointSource(pb.LinearPolarization("degree", 0.0))),
-    "two roughnesses": rough(slopes=pb.AnisotropicSlopes()),
-    "rough way out": rough(way_out=pb.RoughExit()),
-    "correlated shadowing": rough(shadowing=pb.HeightCorrelatedShadowing()),
+    "polarized light": rough(
+        illumination=pb.PointSource(pb.physics.LinearPolarization("degree", 0.0))
+    ),
+    "two roughnesses": rough(slopes=pb.physics.AnisotropicSlopes()),
+    "rough way out": rough(way_out=pb.physics.RoughExit()),
+    "correlated shadowing": rough(shadowing=pb.physics.HeightCorrelatedShadowing()),
     "polarized body": dataclasses.replace(PLAIN, subsurface=pb.Lambertian()),
     "internal reflection": dataclasses.replace(
-        PLAIN, subsurface=pb.Unpolarized(internal_reflection=pb.InternalReflection())
+        PLAIN, subsurface=pb.Unpolarized(internal_reflection=pb.physics.InternalReflection())
     ),
     "clear coat": dataclasses.replace(PLAIN, coat=pb.ClearCoat()),
     "thin film": dataclasses.replace(PLAIN, coat=pb.ThinFilm()),
     **{
         term.__name__: recorded(term())
         for term in (
-            pb.AngleZero,
-            pb.BeamOverlap,
-            pb.ChannelGain,
-            pb.DarkLevel,
-            pb.Discrepancy,
-            pb.DolpGain,
-            pb.Leakage,
+            pb.instrument.AngleZero,
+            pb.instrument.BeamOverlap,
+            pb.instrument.ChannelGain,
+            pb.instrument.DarkLevel,
+            pb.physics.Discrepancy,
+            pb.instrument.DolpGain,
+            pb.instrument.Leakage,
         )
     },
-    "analyzer": recorded(pb.Analyzer(0.0)),
+    "analyzer": recorded(pb.instrument.Analyzer(0.0)),
 }
 
 
@@ -165,7 +169,7 @@ def test_an_effect_costs_when_it_is_on_and_leaves_nothing_when_it_is_off(
 
 @pytest.mark.thorough
 def test_an_index_of_its_own_costs_less_than_a_law_of_dispersion(plain: float) -> None:
-    scene = dataclasses.replace(PLAIN, dispersion=pb.Cauchy())
+    scene = dataclasses.replace(PLAIN, dispersion=pb.physics.Cauchy())
     assert operations(scene.predict, scene.parameters) > plain
 
 

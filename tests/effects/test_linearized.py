@@ -42,7 +42,7 @@ def test_in_a_linear_model_shift_and_width_are_exact(line: xr.Dataset) -> None:
     np.testing.assert_allclose(peak.z, mean, atol=1e-5)
     np.testing.assert_allclose(peak.covariance, covariance, rtol=1e-4, atol=1e-7)
 
-    fewer = density_of(line, linear.SCENE.without(pb.AngleZero), **options)
+    fewer = density_of(line, linear.SCENE.without(pb.instrument.AngleZero), **options)
     noise = full.noise_sd(peak.z)
     np.testing.assert_allclose(noise["q"], linear.NOISE)
     change, _ = compare(peak, noise, fewer)
@@ -63,7 +63,7 @@ def test_in_a_linear_model_shift_and_width_are_exact(line: xr.Dataset) -> None:
 def test_on_a_plate_they_are_those_of_climbs_with_exact_gradients(
     plate: xr.Dataset, full: pb.Scene
 ) -> None:
-    scenes = (full, full.without(pb.Leakage))
+    scenes = (full, full.without(pb.instrument.Leakage))
     densities = [density_of(plate, scene) for scene in scenes]
     peak = find_peak(densities[0], jax.random.key(1), no_progress)
     change, other = compare(peak, densities[0].noise_sd(peak.z), densities[1])
@@ -89,13 +89,13 @@ def test_on_a_plate_they_are_those_of_climbs_with_exact_gradients(
 @pytest.mark.thorough
 def test_labels_are_those_of_the_tables_of_a_fit() -> None:
     capture = pb.simulate(
-        "glass", scene="goniometer", protocol=pb.Protocol(wavelengths=(450.0, 550.0))
+        "glass", scene="goniometer", protocol=pb.simulation.Protocol(wavelengths=(450.0, 550.0))
     )
     scene = pb.Scene(
         pb.SmoothSurface(),
         pb.Unpolarized(),
         pb.StokesMixing(),
-        instrument=pb.Instrument((pb.Discrepancy(basis=4),)),
+        instrument=pb.instrument.Instrument((pb.physics.Discrepancy(basis=4),)),
     )
     request = request_of(capture, scene)
     data = observe(request.capture)
@@ -114,8 +114,8 @@ def test_labels_are_those_of_the_tables_of_a_fit() -> None:
 @pytest.mark.thorough
 def test_noise_is_known_of_links_without_a_variance_too() -> None:
     """Log odds have no stated variance; to first order it is that of the odds' slope."""
-    capture = pb.simulate("leaf", protocol=pb.Protocol(views=8, wavelengths=()), seed=1)
-    density = density_of(capture, pb.Scene(pb.SmoothSurface()), links=pb.LogitNormalLink())
+    capture = pb.simulate("leaf", protocol=pb.simulation.Protocol(views=8, wavelengths=()), seed=1)
+    density = density_of(capture, pb.Scene(pb.SmoothSurface()), links=pb.links.LogitNormalLink())
     z = np.zeros(density.program.size)
     z[density.labels.index("logit_scale")] = -2.0
     sd, center = density.noise_sd(z), density.noise_free(z)["dop"]

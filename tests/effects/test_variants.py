@@ -15,12 +15,15 @@ from polar_bayes.setups import SETUPS
 
 ROUGH = pb.Scene(
     surface=pb.RoughSurface(
-        pb.GGX(), pb.Disc(5.0), slopes=pb.AnisotropicSlopes(), shadowing=pb.NoShadowing()
+        pb.GGX(),
+        pb.Disc(5.0),
+        slopes=pb.physics.AnisotropicSlopes(),
+        shadowing=pb.physics.NoShadowing(),
     ),
-    subsurface=pb.Lambertian(internal_reflection=pb.InternalReflection()),
+    subsurface=pb.Lambertian(internal_reflection=pb.physics.InternalReflection()),
     mixing=pb.StokesMixing(),
-    coat=pb.CoatStack((pb.ThinFilm(), pb.ClearCoat())),
-    instrument=pb.Instrument((pb.AngleZero(), pb.DarkLevel())),
+    coat=pb.physics.CoatStack((pb.ThinFilm(), pb.ClearCoat())),
+    instrument=pb.instrument.Instrument((pb.instrument.AngleZero(), pb.instrument.DarkLevel())),
 )
 
 
@@ -53,7 +56,7 @@ class Body(pb.Unpolarized):
 
 
 @dataclasses.dataclass(frozen=True)
-class Mistaken(pb.NoShadowing):
+class Mistaken(pb.physics.NoShadowing):
     @override
     def simpler(self) -> tuple[Part | None, ...]:
         return (None,)
@@ -90,12 +93,14 @@ def test_each_changes_one_part_and_leaves_the_rest() -> None:
 
 def test_a_part_of_the_user_s_own_takes_part() -> None:
     fog = Fog(speckle=Speckle())
-    scene = pb.Scene(pb.SmoothSurface(), instrument=pb.Instrument((pb.DolpGain(), fog)))
+    scene = pb.Scene(
+        pb.SmoothSurface(), instrument=pb.instrument.Instrument((pb.instrument.DolpGain(), fog))
+    )
     effects = named(scene)
     assert list(effects) == ["DolpGain", "Fog -> Fog(density=0.5)", "Fog", "Speckle"]
     assert effects["Fog -> Fog(density=0.5)"].instrument.terms[1] == Fog(0.5, Speckle())
     assert effects["Speckle"].instrument.terms[1] == Fog()
-    assert effects["Fog"].instrument == pb.Instrument((pb.DolpGain(),))
+    assert effects["Fog"].instrument == pb.instrument.Instrument((pb.instrument.DolpGain(),))
 
 
 @pytest.mark.thorough
@@ -111,7 +116,7 @@ def test_a_part_and_what_is_inside_it_go_together() -> None:
     both = [effect for effect in effects_of(ROUGH) if effect.path.startswith("subsurface")]
     assert simplify(ROUGH, both).subsurface == pb.Unpolarized()
     assert simplify(ROUGH, both[:1]).subsurface == pb.Unpolarized(
-        internal_reflection=pb.InternalReflection()
+        internal_reflection=pb.physics.InternalReflection()
     )
 
 
@@ -127,10 +132,10 @@ def test_no_two_effects_share_a_name_or_a_scene(scene: pb.Scene) -> None:
 @pytest.mark.thorough
 def test_equal_names_get_their_place() -> None:
     coats = (pb.ClearCoat("upper", "lacquer"), pb.ClearCoat())
-    scene = pb.Scene(pb.SmoothSurface(), coat=pb.CoatStack(coats))
+    scene = pb.Scene(pb.SmoothSurface(), coat=pb.physics.CoatStack(coats))
     effects = named(scene)
     assert list(effects) == ["coat.coats[0]: ClearCoat", "coat.coats[1]: ClearCoat"]
-    assert effects["coat.coats[0]: ClearCoat"].coat == pb.CoatStack(coats[1:])
+    assert effects["coat.coats[0]: ClearCoat"].coat == pb.physics.CoatStack(coats[1:])
 
 
 def test_a_replacement_that_does_not_fit_is_refused() -> None:

@@ -15,7 +15,7 @@ import polar_bayes as pb
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.images import SONY, from_mosaic, from_polarizer
 
-QUIET = pb.Detector(saturation_level=FULL, gain=1e-6, read_noise=0.0, relative_error=0.0)
+QUIET = pb.importers.Detector(saturation_level=FULL, gain=1e-6, read_noise=0.0, relative_error=0.0)
 FOUR = (0.0, 45.0, 90.0, 135.0)
 FLAT = np.broadcast_to(pictures.unit(np.array([0.3, 0.5, 0.8])), (*pictures.SHAPE, 3))
 
@@ -62,7 +62,7 @@ def test_a_wrong_layout_does_not_pass():
 
 def test_a_ball_comes_back_in_the_plane_of_the_model():
     """Curved light is smeared by filling in: within .03 of the scene, and of both signs."""
-    shape, ball = (160, 160), pb.Sphere(80.2, 79.7, 74.0)
+    shape, ball = (160, 160), pb.importers.Sphere(80.2, 79.7, 74.0)
     normals = pictures.ball_normals(shape, ball)
     frames = pictures.frames(FOUR, normals=normals)
     capture = from_mosaic(mosaic(frames), shape=ball, light=LAMP, detector=QUIET, bin=4, window=1)
@@ -94,7 +94,9 @@ def test_the_noise_that_is_left_is_the_stated_one(width):
     rng = np.random.default_rng(width)
     clean = mosaic(frames)
     raw = clean + np.sqrt(9.0 + 0.2 * clean) * rng.normal(size=shape)
-    detector = pb.Detector(saturation_level=FULL, read_noise=3.0, gain=0.2, relative_error=0.0)
+    detector = pb.importers.Detector(
+        saturation_level=FULL, read_noise=3.0, gain=0.2, relative_error=0.0
+    )
     normals = np.broadcast_to(FLAT[0, 0], (*shape, 3))
     capture = from_mosaic(
         raw, shape=normals, light=LAMP, detector=detector, bin=width, window=1
@@ -112,7 +114,9 @@ def test_noise_below_the_dark_level_is_kept():
     frames = np.broadcast_to(np.array([6.0, 5.0, 4.0, 5.0])[:, None, None], (4, 256, 256))
     raw = mosaic(frames) + 100.0 + 8.0 * rng.normal(size=(256, 256))
     assert (raw < 100.0).mean() > 0.1
-    detector = pb.Detector(saturation_level=FULL, dark=100.0, read_noise=8.0, relative_error=0.0)
+    detector = pb.importers.Detector(
+        saturation_level=FULL, dark=100.0, read_noise=8.0, relative_error=0.0
+    )
     normals = np.broadcast_to(FLAT[0, 0], (256, 256, 3))
     capture = from_mosaic(raw, shape=normals, light=LAMP, detector=detector, bin=64, window=1)
     np.testing.assert_allclose(capture["intensity"].mean(), 5.0, atol=5.0 * 8.0 / 256.0)

@@ -104,7 +104,7 @@ def test_a_mirror_sends_light_from_where_it_says():
 
 
 def test_a_sphere_points_away_from_its_center():
-    shape = as_shape(pb.Sphere(50.0, 60.0, 40.0))
+    shape = as_shape(pb.importers.Sphere(50.0, 60.0, 40.0))
     rows, columns = np.array([50.0, 26.0, 50.0, 95.0]), np.array([60.0, 60.0, 84.0, 60.0])
     found = shape.normals(rows, columns, 1)
     np.testing.assert_allclose(found[0], [0.0, 0.0, 1.0])
@@ -115,7 +115,7 @@ def test_a_sphere_points_away_from_its_center():
 
 @pytest.mark.thorough
 def test_squares_that_the_outline_cuts_are_outside():
-    shape = as_shape((pb.Sphere(50.0, 60.0, 40.0),))
+    shape = as_shape((pb.importers.Sphere(50.0, 60.0, 40.0),))
     at = np.array([50.0]), np.array([98.0])
     assert np.isfinite(shape.normals(*at, 1)).all()
     assert np.isnan(shape.normals(*at, 8)).all()
@@ -174,13 +174,16 @@ def test_normals_over_a_square_are_averaged_and_gaps_spread():
 @each(
     ("make", "said"),
     [
-        (lambda: pb.Sphere(1.0, 2.0, 0.5), "Sphere: radius: it is 0.5; give 1 <= value"),
-        (lambda: pb.Sphere("a", 2.0, 5.0), "Sphere: row: it is 'a'"),
-        (lambda: pb.Spheres((3.0,)), "3.0 is no sphere; give Sphere(row, column, radius)"),
-        (lambda: pb.Direction(0.0, 0.0, 0.0), "it points nowhere"),
-        (lambda: pb.Direction(np.nan, 0.0, 0.0), "Direction: x: it is nan"),
-        (lambda: pb.Position(0.0, 0.0, -1.0), "it stands behind the surface"),
-        (lambda: pb.Highlight(-1.0, 2.0), "Highlight: row: it is -1.0"),
+        (lambda: pb.importers.Sphere(1.0, 2.0, 0.5), "Sphere: radius: it is 0.5; give 1 <= value"),
+        (lambda: pb.importers.Sphere("a", 2.0, 5.0), "Sphere: row: it is 'a'"),
+        (
+            lambda: pb.importers.Spheres((3.0,)),
+            "3.0 is no sphere; give Sphere(row, column, radius)",
+        ),
+        (lambda: pb.importers.Direction(0.0, 0.0, 0.0), "it points nowhere"),
+        (lambda: pb.importers.Direction(np.nan, 0.0, 0.0), "Direction: x: it is nan"),
+        (lambda: pb.importers.Position(0.0, 0.0, -1.0), "it stands behind the surface"),
+        (lambda: pb.importers.Highlight(-1.0, 2.0), "Highlight: row: it is -1.0"),
         (lambda: NormalMap(np.ones((2, 2, 2))), "normals: it holds float64 of shape (2, 2, 2)"),
         (lambda: NormalMap("none.npy"), "none.npy: there is no such file"),
     ],

@@ -14,7 +14,7 @@ from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.images import from_polarizer
 
-QUIET = pb.Detector(saturation_level=FULL, gain=1e-6, read_noise=0.0, relative_error=0.0)
+QUIET = pb.importers.Detector(saturation_level=FULL, gain=1e-6, read_noise=0.0, relative_error=0.0)
 FOUR = (0.0, 45.0, 90.0, 135.0)
 REASONS = ("outside", "turned_away", "in_shadow", "saturated", "too_dark", "overpolarized")
 
@@ -71,7 +71,7 @@ def test_a_wrong_sense_of_the_angles_does_not_pass():
 @pytest.mark.thorough
 def test_light_and_camera_may_stand_near():
     """Off the axis the lens turns the camera's axes with each ray."""
-    camera, lamp = pb.Position(3.0, -2.0, 60.0), pb.Position(-30.0, 50.0, 45.0)
+    camera, lamp = pb.importers.Position(3.0, -2.0, 60.0), pb.importers.Position(-30.0, 50.0, 45.0)
     view, light = pictures.near((3.0, -2.0, 60.0)), pictures.near((-30.0, 50.0, 45.0))
     capture = from_polarizer(
         frames(FOUR, view=view, light=light),
@@ -102,7 +102,9 @@ def test_a_sphere_is_its_normals():
 def test_a_highlight_tells_the_direction_of_the_light():
     half = pictures.unit(np.array([LAMP.x, LAMP.y, LAMP.z]))
     half = pictures.unit(half + np.array([0.0, 0.0, 1.0]))
-    spot = pb.Highlight(BALL.row - BALL.radius * half[1], BALL.column + BALL.radius * half[0])
+    spot = pb.importers.Highlight(
+        BALL.row - BALL.radius * half[1], BALL.column + BALL.radius * half[0]
+    )
     known = {"shape": BALL, "detector": QUIET}
     told = from_polarizer(frames(FOUR), FOUR, light=spot, **known)
     stated = from_polarizer(frames(FOUR), FOUR, light=LAMP, **known)
@@ -113,7 +115,7 @@ def test_a_highlight_tells_the_direction_of_the_light():
 
 def test_surroundings_stand_where_each_place_mirrors_them():
     capture = from_polarizer(
-        frames(FOUR), FOUR, shape=BALL, light=pb.Surroundings(), detector=QUIET, window=1
+        frames(FOUR), FOUR, shape=BALL, light=pb.importers.Surroundings(), detector=QUIET, window=1
     )
     assert capture.attrs["masked_in_shadow"] == 0
     np.testing.assert_allclose(capture["light_zenith"], capture["view_zenith"], atol=1e-6)
@@ -149,7 +151,7 @@ def test_dark_and_flat_frames_are_taken_out():
     flat = rng.uniform(0.5, 1.5, pictures.SHAPE)
     flat /= flat.mean()
     raw = frames(FOUR) * flat + dark
-    detector = pb.Detector(
+    detector = pb.importers.Detector(
         saturation_level=FULL,
         dark=dark,
         flat=7.0 * flat,
@@ -170,7 +172,9 @@ def test_dark_and_flat_frames_are_taken_out():
 @pytest.mark.thorough
 def test_every_masked_reading_has_one_reason():
     raw = frames(FOUR)
-    lamp = pb.Direction(1.0, 0.0, 0.2)  # from the side, so that a part lies in its own shadow
+    lamp = pb.importers.Direction(
+        1.0, 0.0, 0.2
+    )  # from the side, so that a part lies in its own shadow
     raw[0, 18:20, 24:26] = FULL  # one channel is full: the quotient is spoiled
     raw[:, 10, 24] = 0.0
     raw[0, 25, 24] = raw[0, 25, 24] + 300.0  # more than light can have
@@ -186,7 +190,7 @@ def test_every_masked_reading_has_one_reason():
     assert with_counter["saturated"] == 4
     assert with_counter["too_dark"] >= 1
     assert with_counter["overpolarized"] == 1
-    assert pb.count(capture)["saturated"] == 4
+    assert pb.capture.count(capture)["saturated"] == 4
     assert not capture["valid"].values[18:20, 24:26].any()
     assert np.isnan(capture["q"].where(~capture["valid"])).all()
 
@@ -205,7 +209,7 @@ def test_errors_are_those_of_many_exposures():
     clean = frames(angles, normals=normals)
     variance = read_noise**2 + gain * clean
     raw = np.rint(clean + np.sqrt(variance) * rng.normal(size=clean.shape))
-    detector = pb.Detector(
+    detector = pb.importers.Detector(
         saturation_level=FULL, gain=gain, read_noise=read_noise, relative_error=0.0
     )
     capture = from_polarizer(raw, angles, shape=normals, light=LAMP, detector=detector, window=1)
@@ -228,12 +232,16 @@ def test_errors_are_those_of_many_exposures():
 @pytest.mark.thorough
 def test_averaging_pixels_lowers_the_noise_but_not_what_stays_unknown():
     known = {"shape": ball_normals(), "light": LAMP, "window": 1}
-    noisy = pb.Detector(saturation_level=FULL, read_noise=20.0, gain=0.0001, relative_error=0.0)
+    noisy = pb.importers.Detector(
+        saturation_level=FULL, read_noise=20.0, gain=0.0001, relative_error=0.0
+    )
     fine = from_polarizer(frames(FOUR), FOUR, bin=1, detector=noisy, **known)
     coarse = from_polarizer(frames(FOUR), FOUR, bin=2, detector=noisy, **known)
     left = coarse["q_error"].isel(y=9, x=12) / fine["q_error"].isel(y=18, x=24)
     np.testing.assert_allclose(left, 0.5, rtol=0.1)
-    unsure = pb.Detector(saturation_level=FULL, read_noise=0.0, gain=1e-9, relative_error=0.05)
+    unsure = pb.importers.Detector(
+        saturation_level=FULL, read_noise=0.0, gain=1e-9, relative_error=0.05
+    )
     fine = from_polarizer(frames(FOUR), FOUR, bin=1, detector=unsure, **known)
     coarse = from_polarizer(frames(FOUR), FOUR, bin=2, detector=unsure, **known)
     left = coarse["q_error"].isel(y=9, x=12) / fine["q_error"].isel(y=18, x=24)
@@ -301,10 +309,10 @@ def with_defaults(**asked):
         ({"shape": ball_normals()[:-1]}, "normals: they are (39, 48), the frames (40, 48)"),
         ({"shape": 3.0}, "shape: a float is no shape"),
         ({"shape": ()}, "Spheres: there is no sphere"),
-        ({"shape": pb.Sphere(400.0, 10.0, 20.0)}, "it lies outside of frames of 40 rows"),
+        ({"shape": pb.importers.Sphere(400.0, 10.0, 20.0)}, "it lies outside of frames of 40 rows"),
         ({"light": "sun"}, "light: 'sun' is no place"),
-        ({"light": pb.Highlight(2.0, 2.0)}, "there is no surface; give row and column"),
-        ({"light": pb.Direction(0.0, 0.0, -1.0)}, "no reading is left"),
+        ({"light": pb.importers.Highlight(2.0, 2.0)}, "there is no surface; give row and column"),
+        ({"light": pb.importers.Direction(0.0, 0.0, -1.0)}, "no reading is left"),
         ({"view": 3}, "view: 3 is no place"),
         ({"bin": 0}, "bin: it is 0; give a whole number"),
         ({"window": 1.5}, "window: it is 1.5"),
@@ -328,7 +336,7 @@ def test_a_mistake_is_told_with_its_mend(asked, said):
 )
 def test_a_detector_is_checked(field, said):
     with pytest.raises(CaptureError, match=re.escape(said)):
-        pb.Detector(**field)
+        pb.importers.Detector(**field)
 
 
 @each(
@@ -341,7 +349,7 @@ def test_a_detector_is_checked(field, said):
 )
 def test_dark_and_flat_frames_are_checked(field, said):
     with pytest.raises(CaptureError, match=re.escape(said)):
-        with_defaults(detector=pb.Detector(saturation_level=FULL, **field))
+        with_defaults(detector=pb.importers.Detector(saturation_level=FULL, **field))
 
 
 @pytest.mark.thorough

@@ -23,7 +23,7 @@ from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.request import resolve
 
-LINKS = {"q": pb.StokesLink()}
+LINKS = {"q": pb.links.StokesLink()}
 
 
 @pytest.fixture(autouse=True)
@@ -104,7 +104,7 @@ class Handing(Made):
 
 
 @dataclasses.dataclass(frozen=True)
-class Given(pb.Auto):
+class Given(pb.methods.Auto):
     """An automatic choice among given rungs."""
 
     given: tuple[tuple[str, AbstractMethod], ...] = ()
@@ -131,7 +131,7 @@ def test_the_first_rung_that_is_good_enough_is_taken():
     assert said["auto"]["met"]
     assert said["method"] == "importance"
     assert pb.verdict(result).converged
-    (sentence,) = pb.auto_sentences(result)
+    (sentence,) = pb.inference.auto_sentences(result)
     assert "was taken: its means and standard deviations are expected within" in sentence
 
 
@@ -156,7 +156,7 @@ def test_a_rung_that_fails_its_own_diagnostics_is_climbed_over(rung, why):
     result, said = fitted(rung, Made())
     assert said["auto"]["chosen"] == "rung 1"
     assert why in said["auto"]["steps"][0]["why"]
-    assert why in pb.auto_sentences(result)[0]
+    assert why in pb.inference.auto_sentences(result)[0]
     assert pb.verdict(result).converged
 
 
@@ -178,7 +178,7 @@ def test_where_nothing_is_good_enough_the_nearest_is_returned_and_flagged():
     assert any(
         "no method met the tolerance of 0.01" in problem.lower() for problem in judged.problems
     )
-    assert "Nothing was good enough" in pb.auto_sentences(result)[-1]
+    assert "Nothing was good enough" in pb.inference.auto_sentences(result)[-1]
 
 
 @pytest.mark.thorough
@@ -238,7 +238,7 @@ def test_the_time_is_counted_from_when_the_fit_was_asked_for(monkeypatch: pytest
 def test_the_time_is_kept_on_a_busy_machine():
     """Two other processes want both cores, and two views are too few for the first rungs."""
     scene = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
-    links = {"q": pb.StokesLink(stated_errors=True)}
+    links = {"q": pb.links.StokesLink(stated_errors=True)}
     hard = plate_capture(np.array([55.0, 57.0]), 0.01, 0)
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
     seconds, begin = 20.0, time.perf_counter()
@@ -266,7 +266,9 @@ def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left()
 @pytest.mark.thorough
 def test_the_fit_beside_is_made_by_the_method_of_the_answer():
     """The instrument is told apart by comparing: never by choosing a method once more."""
-    scene = pb.Scene(pb.SmoothSurface(), instrument=pb.Instrument((pb.Discrepancy(),)))
+    scene = pb.Scene(
+        pb.SmoothSurface(), instrument=pb.instrument.Instrument((pb.physics.Discrepancy(),))
+    )
     result = pb.fit(capture(), model=line, links=LINKS, scene=scene, method=Handing())
     assert result["posterior"].sizes["draw"] == 1000
     assert result["without_discrepancy"].sizes["draw"] == 250
@@ -275,7 +277,9 @@ def test_the_fit_beside_is_made_by_the_method_of_the_answer():
 
 @pytest.mark.thorough
 def test_comparisons_that_are_stuck_are_abandoned_and_told():
-    scene = pb.Scene(pb.SmoothSurface(), instrument=pb.Instrument((pb.Discrepancy(),)))
+    scene = pb.Scene(
+        pb.SmoothSurface(), instrument=pb.instrument.Instrument((pb.physics.Discrepancy(),))
+    )
     asked = {"model": line, "links": LINKS, "scene": scene}
     late = pb.fit(capture(), method=Handing(seconds=-1.0), **asked)
     said = json.loads(late.attrs["polar_bayes"])["comparisons_failed"]
@@ -293,8 +297,8 @@ def test_comparisons_that_are_stuck_are_abandoned_and_told():
 @pytest.mark.thorough
 def test_tolerances_that_weighted_draws_cannot_meet_are_left_to_chains():
     here = problem(line)
-    assert list(pb.Auto(tolerance=0.03).rungs(here)) == ["importance", "tempered", "nuts"]
-    assert list(pb.Auto(tolerance=0.01).rungs(here)) == ["nuts"]
+    assert list(pb.methods.Auto(tolerance=0.03).rungs(here)) == ["importance", "tempered", "nuts"]
+    assert list(pb.methods.Auto(tolerance=0.01).rungs(here)) == ["nuts"]
 
 
 def test_where_every_rung_fails_the_fit_is_refused():
@@ -315,7 +319,7 @@ def test_a_normal_posterior_is_met_by_the_cheapest():
 
 @pytest.mark.thorough
 def test_a_funnel_is_left_to_higher_rungs():
-    result = pb.fit(capture(), model=funnel, links=LINKS, method=pb.Auto(0.5, 600.0))
+    result = pb.fit(capture(), model=funnel, links=LINKS, method=pb.methods.Auto(0.5, 600.0))
     steps = json.loads(result.attrs["polar_bayes"])["auto"]["steps"]
     assert not steps[0]["taken"]
     assert len(steps) > 1
@@ -325,7 +329,7 @@ def test_a_funnel_is_left_to_higher_rungs():
     ("asked", "said"),
     [
         ({"method": "nuts", "tolerance": 0.1}, "tolerance needs method='auto'"),
-        ({"method": pb.Auto(), "seconds": 3.0}, "seconds needs method='auto'"),
+        ({"method": pb.methods.Auto(), "seconds": 3.0}, "seconds needs method='auto'"),
         ({"method": "auto", "tolerance": 0.0}, "tolerance is 0.0"),
         ({"method": "auto", "seconds": -1.0}, "seconds is -1.0"),
         ({"method": "magic"}, "no such method"),

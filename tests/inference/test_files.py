@@ -64,23 +64,27 @@ def outcome(function, tree):
 OF_FITS = (
     pb.summary,
     pb.verdict,
-    lambda tree: json.dumps(pb.json_summary(tree), allow_nan=False),
+    lambda tree: json.dumps(pb.diagnostics.json_summary(tree), allow_nan=False),
     lambda tree: pb.show(tree)._repr_html_(),
-    pb.auto_sentences,
-    pb.population_summary,
-    pb.stack_readings,
+    pb.inference.auto_sentences,
+    pb.diagnostics.population_summary,
+    pb.diagnostics.stack_readings,
     predictive_checks,
     sensitivity,
-    lambda tree: pb.compare_fits({"this": tree, "that": RESULTS[1]}),
+    lambda tree: pb.diagnostics.compare_fits({"this": tree, "that": RESULTS[1]}),
 )
 OF_CALIBRATIONS = (
-    pb.calibration_table,
-    pb.calibration_verdict,
-    pb.calibration_readings,
+    pb.calibration.calibration_table,
+    pb.calibration.calibration_verdict,
+    pb.calibration.calibration_readings,
     lambda tree: pb.show(tree)._repr_html_(),
-    lambda tree: pb.compare_calibrations({"this": tree, "that": CALIBRATION}),
+    lambda tree: pb.calibration.compare_calibrations({"this": tree, "that": CALIBRATION}),
 )
-OF_STUDIES = (pb.accuracy_table, pb.accuracy_advice, lambda tree: pb.show(tree)._repr_html_())
+OF_STUDIES = (
+    pb.benchmark.accuracy_table,
+    pb.benchmark.accuracy_advice,
+    lambda tree: pb.show(tree)._repr_html_(),
+)
 
 
 def check_mutations(trees, functions, random, count):
@@ -122,20 +126,24 @@ def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
     random = np.random.default_rng([14, seed])
     figures = (
         lambda tree: pb.report(tree, tmp_path / "report"),
-        pb.plot_pairs,
-        pb.plot_ranks,
-        pb.plot_prior_posterior,
-        pb.plot_pit,
-        lambda tree: pb.plot_readings(tree, "dop"),
-        lambda tree: pb.plot_residuals(tree, "dop"),
-        lambda tree: pb.plot_shrinkage(tree, "roughness"),
-        lambda tree: pb.plot_spectrum(tree, "absorption"),
-        lambda tree: pb.predict_spectrum(tree, [500.0]),
+        pb.plots.plot_pairs,
+        pb.plots.plot_ranks,
+        pb.plots.plot_prior_posterior,
+        pb.plots.plot_pit,
+        lambda tree: pb.plots.plot_readings(tree, "dop"),
+        lambda tree: pb.plots.plot_residuals(tree, "dop"),
+        lambda tree: pb.plots.plot_shrinkage(tree, "roughness"),
+        lambda tree: pb.plots.plot_spectrum(tree, "absorption"),
+        lambda tree: pb.inference.predict_spectrum(tree, [500.0]),
     )
     check_mutations(RESULTS, (*OF_FITS, *figures), random, 100)
-    pages = (*OF_CALIBRATIONS, pb.plot_calibration, lambda t: pb.report(t, tmp_path / "report"))
+    pages = (
+        *OF_CALIBRATIONS,
+        pb.plots.plot_calibration,
+        lambda t: pb.report(t, tmp_path / "report"),
+    )
     check_mutations([CALIBRATION], pages, random, 30)
-    pages = (*OF_STUDIES, pb.plot_accuracy, lambda tree: pb.report(tree, tmp_path / "report"))
+    pages = (*OF_STUDIES, pb.plots.plot_accuracy, lambda tree: pb.report(tree, tmp_path / "report"))
     check_mutations([make_accuracy()], pages, random, 30)
 
 
@@ -168,7 +176,7 @@ def test_provenance_that_is_no_mapping_is_refused(odd):
 def test_provenance_of_the_wrong_type_is_refused(change, what):
     tree = edit_provenance(RESULTS[1].copy(), **change)
     with pytest.raises(pb.FitError, match=f"result: {what}|result: polar_bayes.{what}"):
-        pb.json_summary(tree)
+        pb.diagnostics.json_summary(tree)
 
 
 @pytest.mark.thorough
@@ -176,9 +184,9 @@ def test_provenance_may_lack_anything():
     tree = RESULTS[0].copy()
     tree.attrs = {}
     assert pb.summary(tree).equals(pb.summary(RESULTS[0]))
-    assert pb.auto_sentences(tree) == []
+    assert pb.inference.auto_sentences(tree) == []
     for name in json.loads(MANY.attrs["polar_bayes"]):
-        pb.json_summary(edit_provenance(MANY.copy(), **{name: None}))
+        pb.diagnostics.json_summary(edit_provenance(MANY.copy(), **{name: None}))
 
 
 # --- groups and variables ---------------------------------------------------------------------
@@ -224,7 +232,7 @@ def test_a_study_of_nothing_is_refused(dim):
     study = make_accuracy()
     study["accuracy"] = xr.DataTree(study["accuracy"].to_dataset().isel({dim: slice(0)}))
     with pytest.raises(pb.FitError, match="accuracy: it is empty"):
-        pb.accuracy_advice(study)
+        pb.benchmark.accuracy_advice(study)
 
 
 @each("number", [1596, 2340, 2419])
@@ -243,19 +251,24 @@ def test_readings_and_predictions_belong_together():
         pb.summary(tree)
     tree = _edited(lambda x: x.rename(view="angle"), "noise_free")
     with pytest.raises(pb.FitError, match=r"noise_free/dop: its dims are .*angle\), not .*view"):
-        pb.stack_readings(tree)
+        pb.diagnostics.stack_readings(tree)
 
 
 @pytest.mark.thorough
 def test_other_kinds_of_tree_are_named(tmp_path):
-    for function in (pb.summary, pb.stack_readings, pb.auto_sentences, pb.population_summary):
+    for function in (
+        pb.summary,
+        pb.diagnostics.stack_readings,
+        pb.inference.auto_sentences,
+        pb.diagnostics.population_summary,
+    ):
         for wrong in (CALIBRATION, xr.Dataset(), None, "fit.nc"):
             with pytest.raises(
                 pb.FitError, match=r"it holds no (fit|readings); give the tree that"
             ):
                 function(wrong)
     with pytest.raises(pb.FitError, match="calibration: it holds no calibration; give the tree"):
-        pb.calibration_table(MANY)
+        pb.calibration.calibration_table(MANY)
     pb.save_result(CALIBRATION, tmp_path / "sbc.nc")
     with pytest.raises(pb.FitError, match=r"sbc\.nc: it holds no fit; give the file that `polar"):
         pb.load_result(tmp_path / "sbc.nc")
@@ -266,7 +279,7 @@ def test_other_kinds_of_tree_are_named(tmp_path):
     with pytest.raises(pb.FitError, match=r"netCDF cannot hold it \(.*\); store numbers"):
         pb.save_result(odd, tmp_path / "fit.nc")
     with pytest.raises(pb.FitError, match="compare_fits: b: it holds no fit"):
-        pb.compare_fits({"a": MANY, "b": CALIBRATION})
+        pb.diagnostics.compare_fits({"a": MANY, "b": CALIBRATION})
 
 
 def test_a_tree_that_arviz_made_is_summed_up():
@@ -284,7 +297,7 @@ def test_a_tree_that_arviz_made_is_summed_up():
     assert list(pb.summary(tree).index) == ["mu", "tau[0]", "tau[1]", "tau[2]"]
     assert pb.verdict(tree).converged
     with pytest.raises(pb.FitError, match="no readings of dop to draw, for it has no observed_dat"):
-        pb.plot_readings(tree, "dop")
+        pb.plots.plot_readings(tree, "dop")
 
 
 OPTIONAL = sorted(set(RESULTS[1].children) - {"posterior"})
@@ -299,7 +312,7 @@ def test_any_group_but_the_posterior_may_be_missing(group):
         function(tree)
     if group in ("observed_data", "noise_free", "posterior_predictive", "constant_data"):
         with pytest.raises(pb.FitError, match=f"no readings of dop to draw, for it has no {group}"):
-            pb.plot_readings(tree, "dop")
+            pb.plots.plot_readings(tree, "dop")
 
 
 @pytest.mark.thorough
@@ -350,7 +363,9 @@ def test_a_file_gives_back_what_was_saved(tmp_path):
         with xr.open_datatree(path, engine="netcdf4", decode_times=False) as opened:
             assert set(opened.attrs) == {"polar_bayes"}
             read = opened.load()
-        load = (pb.load_result, pb.load_calibration, pb.load_accuracy)[max(0, number - 2)]
+        load = (pb.load_result, pb.calibration.load_calibration, pb.benchmark.load_accuracy)[
+            max(0, number - 2)
+        ]
         xr.testing.assert_identical(load(path), read)
         assert set(read.children) == set(tree.children)
 

@@ -20,7 +20,7 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.observation.data import observe
 
-SHORT = pb.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50)
+SHORT = pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50)
 GROUPS = {
     "posterior",
     "sample_stats",
@@ -58,7 +58,7 @@ def test_provenance_says_enough_to_repeat_the_fit(short: xr.DataTree, capture: x
     assert said["seed"] == 7
     assert said["swapped"] == ["scene", "links"]
     assert set(said["versions"]) >= {"polar_bayes", "jax", "numpyro", "arviz"}
-    settings = pb.Nuts(**said["settings"])
+    settings = pb.methods.Nuts(**said["settings"])
     again = pb.fit(capture, scene=PLATE, links=LINKS, method=settings, seed=said["seed"])
     xr.testing.assert_equal(short["posterior"].to_dataset(), again["posterior"].to_dataset())
 
@@ -73,7 +73,7 @@ def test_a_result_survives_a_file(short: xr.DataTree, tmp_path) -> None:
 
 @pytest.mark.thorough
 def test_threads_do_not_change_a_bit(short: xr.DataTree, capture: xr.Dataset) -> None:
-    alone = pb.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50, threads=1)
+    alone = pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50, threads=1)
     other = pb.fit(capture, scene=PLATE, links=LINKS, method=alone, seed=7)
     xr.testing.assert_equal(short["posterior"].to_dataset(), other["posterior"].to_dataset())
 
@@ -114,7 +114,7 @@ def test_single_precision_finds_the_same_posterior(capture: xr.Dataset) -> None:
 @pytest.mark.thorough
 def test_laplace_is_numpyros_guide(capture: xr.Dataset) -> None:
     """Mean and covariance against `AutoLaplaceApproximation` with its own exact Hessian."""
-    settings = pb.Laplace(draws=50_000, chains=1)
+    settings = pb.methods.Laplace(draws=50_000, chains=1)
     ours = pb.fit(capture, scene=PLATE, links=LINKS, method=settings, seed=1)
     request = resolve(capture, "per_material", settings, PLATE, None, LINKS, None, 1, "double")
     data = observe(request.capture)
@@ -193,10 +193,10 @@ def test_laplace_says_where_it_is_not_to_be_trusted(
 
 def test_least_squares_finds_the_plate(capture: xr.Dataset) -> None:
     result = pb.fit(capture, scene=PLATE, links=LINKS, method="point", seed=1)
-    said = pb.json_summary(result)["parameters"]["refractive_index"]
+    said = pb.diagnostics.json_summary(result)["parameters"]["refractive_index"]
     # Five standard errors: one false alarm in a million.
     assert abs(said["mean"] - 1.5) < 5.0 * said["sd"]
-    assert json.dumps(pb.json_summary(result), allow_nan=False)
+    assert json.dumps(pb.diagnostics.json_summary(result), allow_nan=False)
 
 
 def test_masked_views_are_counted_and_do_not_matter(capture: xr.Dataset) -> None:
@@ -226,7 +226,7 @@ def test_two_views_have_a_proper_posterior() -> None:
     """A scene can match two readings exactly; a noise of zero must not swallow the posterior."""
     capture = plate_capture(np.array([40.0, 70.0]), 0.02, seed=4)
     capture["intensity"] = ("view", [0.02, 0.06])
-    links = {**LINKS, "intensity": pb.StudentTLink()}
+    links = {**LINKS, "intensity": pb.links.StudentTLink()}
     result = pb.fit(capture, scene=PLATE, links=links, method="laplace", seed=1)
     assert pb.verdict(result).converged
     scale = result["posterior"]["intensity_scale"].to_numpy()
@@ -252,9 +252,9 @@ def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:
             r"scene='moon': no such scene; give one of paper, camera, picture, goniometer",
         ),
         ({"scene": 3}, r"a int is not a scene"),
-        ({"links": pb.BetaLink()}, r"no polarization that these links describe"),
-        ({"links": {"q": pb.BetaLink()}}, r"BetaLink does not describe q; it describes dop"),
-        ({"links": {"u": pb.StokesLink()}}, r"the capture has no variable u"),
+        ({"links": pb.links.BetaLink()}, r"no polarization that these links describe"),
+        ({"links": {"q": pb.links.BetaLink()}}, r"BetaLink does not describe q; it describes dop"),
+        ({"links": {"u": pb.links.StokesLink()}}, r"the capture has no variable u"),
         ({"links": "beta"}, r"a str is not a link; give a link such as BetaLink\(\)"),
         ({"priors": {"n": dist.Normal()}}, r"no such parameter in this model; .*refractive_index"),
         ({"priors": {"refractive_index": dist.Normal(1.5, 0.1)}}, r"allows values outside 1 to"),
@@ -293,7 +293,7 @@ def test_an_image_is_refused_with_the_way_out(capture: xr.Dataset) -> None:
 )
 def test_sampler_settings_are_checked(settings: dict, says: str) -> None:
     with pytest.raises(pb.FitError, match=says):
-        pb.Nuts(**settings)
+        pb.methods.Nuts(**settings)
 
 
 def test_progress_reports_every_stage(capture: xr.Dataset) -> None:

@@ -29,7 +29,7 @@ def test_how_draws_are_cut_into_blocks_changes_nothing() -> None:
     told = []
     with jax.enable_x64(True):
         for block in (60, 35):  # 60 divides the warm-up and the draws, 35 does neither
-            settings = pb.Nuts(chains=2, warmup=60, draws=120, most_draws=120, block=block)
+            settings = pb.methods.Nuts(chains=2, warmup=60, draws=120, most_draws=120, block=block)
             told.append(nuts.sample(target(3, 2), jax.random.key(1), settings))
     (z, stats, _), (again, others, _) = told
     assert z.shape == (2, 120, 3)

@@ -34,8 +34,10 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 
 # The goals let chains of other readings stop at another length.
-NUTS = pb.Nuts(chains=2, warmup=50, draws=50, most_draws=100, block=25, effective_draws=20.0)
-LAPLACE = pb.Laplace(draws=50, chains=2)
+NUTS = pb.methods.Nuts(
+    chains=2, warmup=50, draws=50, most_draws=100, block=25, effective_draws=20.0
+)
+LAPLACE = pb.methods.Laplace(draws=50, chains=2)
 COLORS = np.array([450.0, 650.0])
 
 
@@ -71,7 +73,7 @@ def compiled() -> Iterator[list[str]]:
         yield found
 
 
-SPECTRAL = pb.GpSpectral(coupled=("refractive_index",))
+SPECTRAL = pb.models.GpSpectral(coupled=("refractive_index",))
 
 
 @each(
@@ -79,7 +81,7 @@ SPECTRAL = pb.GpSpectral(coupled=("refractive_index",))
     [
         ("per_material", NUTS, one),
         ("per_material", LAPLACE, one),
-        ("per_material", pb.Point(starts=2), one),
+        ("per_material", pb.methods.Point(starts=2), one),
         ("hierarchical", NUTS, several),
         ("hierarchical", LAPLACE, several),
         (SPECTRAL, NUTS, colors),
@@ -197,7 +199,10 @@ OTHER: dict[str, tuple[dict, dict]] = {
         {"priors": {"refractive_index": dist.Uniform(1.3, 1.8)}},
         {"priors": {"refractive_index": dist.Uniform(1.3, 1.9)}},
     ),
-    "a link": ({}, {"links": {"q": pb.StokesLink(stated_errors=True, degrees_of_freedom=4.0)}}),
+    "a link": (
+        {},
+        {"links": {"q": pb.links.StokesLink(stated_errors=True, degrees_of_freedom=4.0)}},
+    ),
     "a scene": ({}, {"scene": pb.Scene(surface=pb.SmoothSurface())}),
     "the precision": ({}, {"precision": "single"}),
 }

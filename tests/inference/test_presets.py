@@ -11,13 +11,13 @@ COMPILER_OPTIONS = ("leaf",)
     "preset",
     [
         p if p in COMPILER_OPTIONS else pytest.param(p, marks=pytest.mark.thorough)
-        for p in pb.PRESETS
+        for p in pb.simulation.PRESETS
     ],
 )
 def test_every_preset_converges(preset: str) -> None:
     result = pb.fit(pb.simulate(preset, seed=0), seed=0)
     verdict = pb.verdict(result)
     assert verdict.converged, verdict.problems
-    rows = pb.json_summary(result)["parameters"]
+    rows = pb.diagnostics.json_summary(result)["parameters"]
     assert max(row["r_hat"] for row in rows.values()) <= 1.01
     assert min(row["ess_bulk"] for row in rows.values()) >= 400.0

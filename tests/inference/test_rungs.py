@@ -20,13 +20,13 @@ from polar_bayes.inference.run_method import answer, draws_of, with_answer_draws
 from polar_bayes.inference.weighted import _engine, _proposal
 
 SMALL = {
-    "point": pb.Point(starts=2),
-    "laplace": pb.Laplace(draws=1000),
-    "importance": pb.Importance(),
-    "tempered": pb.Tempered(pb.PixelTempering(draws=4096)),
-    "normal guide": pb.NormalGuide(steps=400, draws=1000),
-    "flow guide": pb.FlowGuide(steps=400, draws=1000),
-    "nuts": pb.Nuts(effective_draws=2000.0),
+    "point": pb.methods.Point(starts=2),
+    "laplace": pb.methods.Laplace(draws=1000),
+    "importance": pb.methods.Importance(),
+    "tempered": pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)),
+    "normal guide": pb.methods.NormalGuide(steps=400, draws=1000),
+    "flow guide": pb.methods.FlowGuide(steps=400, draws=1000),
+    "nuts": pb.methods.Nuts(effective_draws=2000.0),
 }
 WITHOUT_PRIOR = {"point"}
 
@@ -40,14 +40,16 @@ def compile_fast_rather_than_fast_code() -> Iterator[None]:
 
 def problem(model, seed: int = 0):
     request = resolve(
-        capture(), model, "nuts", "paper", None, {"q": pb.StokesLink()}, 90.0, 0, "double"
+        capture(), model, "nuts", "paper", None, {"q": pb.links.StokesLink()}, 90.0, 0, "double"
     )
     return problem_of(request, jax.random.key(seed))
 
 
 def test_the_ladder_holds_every_method_that_is_tested_here():
-    assert set(pb.LADDER) == {*SMALL, "nuts short", "nuts long"}
-    assert {type(method) for method in pb.LADDER.values()} == {type(m) for m in SMALL.values()}
+    assert set(pb.methods.LADDER) == {*SMALL, "nuts short", "nuts long"}
+    assert {type(method) for method in pb.methods.LADDER.values()} == {
+        type(m) for m in SMALL.values()
+    }
 
 
 @each("name", [name for name in SMALL if name not in WITHOUT_PRIOR])
@@ -72,7 +74,7 @@ def test_a_normal_posterior_is_found_by_every_rung(name):
 @pytest.mark.thorough
 def test_gradients_of_a_warm_up_are_counted_as_they_were_made():
     here = problem(line)
-    method = pb.Nuts(chains=2, warmup=60, draws=50, most_draws=50, block=50)
+    method = pb.methods.Nuts(chains=2, warmup=60, draws=50, most_draws=50, block=50)
     found = answer(method, here)
     climbing = here.initialization.said["gradients"]
     before = sum(found.stats["warmup_steps"][:, 0])
@@ -147,7 +149,7 @@ def test_the_expected_error_is_the_one_that_is_seen():
     for seed in range(40):
         other = dataclasses.replace(here, key=jax.random.key(seed))
         other.__dict__["initialization"] = here.initialization
-        found = answer(pb.Importance(draws=1024), other)
+        found = answer(pb.methods.Importance(draws=1024), other)
         _, draws = labeled(here.program, found.z, here.data)
         seen.append(np.max(np.abs(draws.mean(axis=(1, 2)) - mean) / sd))
         expected.append(expected_error(found, here.program, here.data))
@@ -180,26 +182,26 @@ def test_each_tempered_fit_counts_for_itself_with_the_same_programs():
 
 
 def test_draws_are_scaled_and_settings_kept():
-    assert with_draws(pb.Laplace(draws=500), 2.0) == pb.Laplace(draws=1000)
-    chains = with_draws(pb.Nuts(warmup=77), 2.0)
+    assert with_draws(pb.methods.Laplace(draws=500), 2.0) == pb.methods.Laplace(draws=1000)
+    chains = with_draws(pb.methods.Nuts(warmup=77), 2.0)
     assert (chains.draws, chains.most_draws, chains.effective_draws) == (1000, 16000, 900.0)
     assert chains.warmup == 77
-    tempered = with_draws(pb.Tempered(pb.PixelTempering(draws=4096)), 4.0).settings
+    tempered = with_draws(pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)), 4.0).settings
     assert (tempered.draws, tempered.effective_draws) == (16384, 800.0)
-    assert draws_of(pb.Tempered(tempered)) == tempered.answer_draws == 32768
-    fewer = with_draws(pb.Tempered(pb.PixelTempering(draws=4096)), 0.25).settings
+    assert draws_of(pb.methods.Tempered(tempered)) == tempered.answer_draws == 32768
+    fewer = with_draws(pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)), 0.25).settings
     assert (fewer.draws, fewer.effective_draws) == (1024, 50.0)
     with pytest.raises(FitError, match="512 draws are fewer than the crowd of 2048"):
-        with_draws(pb.Tempered(pb.PixelTempering(draws=1024)), 0.25)
-    assert with_draws(pb.Point(), 2.0) is None
+        with_draws(pb.methods.Tempered(pb.methods.PixelTempering(draws=1024)), 0.25)
+    assert with_draws(pb.methods.Point(), 2.0) is None
 
 
 @pytest.mark.thorough
 def test_tempered_answers_have_as_many_draws_as_are_asked_for():
-    settings = pb.PixelTempering()
+    settings = pb.methods.PixelTempering()
     for count, draws in ((1.0, 2048), (2048, 2048), (2049, 2050), (5000, 5000)):
         assert with_answer_draws(settings, count).answer_draws == draws
-    auto, here = pb.Auto(tolerance=0.1), problem(line)
+    auto, here = pb.methods.Auto(tolerance=0.1), problem(line)
     needed = draws_needed(0.1, 2)
     rungs = auto.rungs(here)
     assert 8 * needed <= rungs["tempered"].settings.answer_draws < 8 * needed + settings.crowd
@@ -210,9 +212,9 @@ def test_tempered_answers_have_as_many_draws_as_are_asked_for():
 @each(
     ("make", "said"),
     [
-        (lambda: pb.Importance(draws=10), "draws is 10"),
-        (lambda: pb.NormalGuide(steps=1), "steps is 1"),
-        (lambda: pb.FlowGuide(learning_rate=0.0), "learning_rate 0.0"),
+        (lambda: pb.methods.Importance(draws=10), "draws is 10"),
+        (lambda: pb.methods.NormalGuide(steps=1), "steps is 1"),
+        (lambda: pb.methods.FlowGuide(learning_rate=0.0), "learning_rate 0.0"),
     ],
 )
 def test_settings_out_of_range_are_refused(make, said):

@@ -19,7 +19,7 @@ import polar_bayes as pb
 from polar_bayes.inference.result import provenance_of
 
 MODELS = Path(__file__).parents[2] / "models"
-FEW = pb.Laplace(draws=100, chains=2)
+FEW = pb.methods.Laplace(draws=100, chains=2)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_by_reparam(plates: xr.Dataset) -> None:
 
 @pytest.mark.thorough
 def test_by_reparam_the_posterior_stays(plates: xr.Dataset) -> None:
-    careful = pb.Nuts(target_acceptance=0.99)
+    careful = pb.methods.Nuts(target_acceptance=0.99)
     two = [fit(plates, model=model, method=careful, seed=2) for model in (POOLED, MOVED)]
     assert all(pb.verdict(result).converged for result in two)
     for name in ("refractive_index", "subsurface_fraction_spread"):

@@ -18,7 +18,7 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 
 MEMBERS, VIEWS, NOISE = 5, 3, 0.4
-LINKS = {"q": pb.NormalLink()}
+LINKS = {"q": pb.links.NormalLink()}
 SCENE = pb.Scene(surface=pb.SmoothSurface())
 
 
@@ -41,7 +41,7 @@ def capture() -> xr.Dataset:
     geometry = {"view_zenith": zenith, "view_azimuth": np.full(3, 180.0)}
     geometry |= {"light_zenith": zenith, "light_azimuth": np.zeros(3)}
     readings = {name: ("view", angle) for name, angle in geometry.items()}
-    return pb.validate(xr.Dataset(readings | {"q": (("patch", "view"), q)}))
+    return pb.capture.validate(xr.Dataset(readings | {"q": (("patch", "view"), q)}))
 
 
 @pytest.fixture(scope="module")

@@ -25,13 +25,15 @@ from plate_images import ASKED
 from polar_bayes.pixels import store
 store.BLOCK = 512
 capture, out, resume, scheduler = sys.argv[1:]
-pb.map_file(
+pb.maps.map_file(
     capture,
     out,
     resume=resume == "resume",
     scheduler=scheduler if scheduler != "none" else None,
     progress=lambda done, every: print(done, flush=True),
-    method=pb.PixelLaplace(draws=64, sampler=pb.PixelNuts(warmup=20, draws=50, largest_r_hat=9.0)),
+    method=pb.methods.PixelLaplace(
+        draws=64, sampler=pb.methods.PixelNuts(warmup=20, draws=50, largest_r_hat=9.0)
+    ),
     **ASKED,
 )
 """

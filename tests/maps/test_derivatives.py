@@ -44,7 +44,9 @@ def brightness(**held: float) -> tuple[xr.Dataset, dict]:
     )
     capture["intensity"].attrs["saturation_level"] = 1.0
     asked["model"] = handlers.condition(per_material, data=held)
-    return capture, asked | {"links": {"dop": pb.BetaLink(), "intensity": pb.StudentTLink()}}
+    return capture, asked | {
+        "links": {"dop": pb.links.BetaLink(), "intensity": pb.links.StudentTLink()}
+    }
 
 
 def colors() -> tuple[xr.Dataset, dict]:
@@ -59,7 +61,7 @@ def colors() -> tuple[xr.Dataset, dict]:
 
 CASES: dict[str, tuple[Callable, int]] = {
     "known noise": (gray, 2),
-    "noise of unknown scale": (lambda: gray(model="per_material", links=pb.NormalLink()), 3),
+    "noise of unknown scale": (lambda: gray(model="per_material", links=pb.links.NormalLink()), 3),
     "two links": (lambda: brightness(concentration_scale=200.0, exposure=1.0), 3),
     "two links of unknown noise": (brightness, 5),
     "two colors": (colors, 3),

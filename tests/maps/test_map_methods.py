@@ -15,7 +15,7 @@ from polar_bayes.reporting.maps import APPROACHES
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
-TEMPERING = pb.PixelTempering(walks=64, draws=256, effective_draws=100.0)
+TEMPERING = pb.methods.PixelTempering(walks=64, draws=256, effective_draws=100.0)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_tempered_maps_are_those_of_a_grid(image: xr.Dataset, tempered: xr.Datas
 
 @pytest.mark.thorough
 def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, tempered: xr.Dataset) -> None:
-    chains = pb.fit_pixels(image.isel(y=[0], x=[0, 1]), method=pb.PixelNuts(), **ASKED)
+    chains = pb.fit_pixels(image.isel(y=[0], x=[0, 1]), method=pb.methods.PixelNuts(), **ASKED)
     assert (chains["approach"] == Approach.NUTS).all()
     assert (chains["status"] == Status.GOOD).all()
     for name in NAMES:
@@ -68,6 +68,8 @@ def test_the_map_says_how_it_was_made(tempered: xr.Dataset, tmp_path: Path) -> N
 @pytest.mark.thorough
 def test_files_give_the_same_map(image: xr.Dataset, tempered: xr.Dataset, tmp_path: Path) -> None:
     image.to_zarr(tmp_path / "image.zarr", consolidated=False)
-    stored = pb.map_file(tmp_path / "image.zarr", tmp_path / "map.zarr", method=TEMPERING, **ASKED)
+    stored = pb.maps.map_file(
+        tmp_path / "image.zarr", tmp_path / "map.zarr", method=TEMPERING, **ASKED
+    )
     for name in tempered.data_vars:
         np.testing.assert_array_equal(stored[name], tempered[name], err_msg=str(name))

@@ -155,7 +155,7 @@ def test_on_a_bent_ridge_some_arrive_and_the_others_say_that_they_did_not(
 @pytest.mark.thorough
 def test_rough_pixels_have_the_mode_and_the_curvature_there() -> None:
     surface = pb.RoughSurface(pb.Beckmann(), pb.PointSource(), FacetQuadrature(along=2, across=2))
-    scene = dataclasses.replace(pb.SETUPS["paper"].scene, surface=surface)
+    scene = dataclasses.replace(pb.setups.SETUPS["paper"].scene, surface=surface)
     shape = (3, 4)
     rng = np.random.default_rng(2)
     truth = {
@@ -164,7 +164,9 @@ def test_rough_pixels_have_the_mode_and_the_curvature_there() -> None:
         "absorption": rng.uniform(0.1, 0.8, shape),
         "refractive_index": rng.uniform(1.35, 1.6, shape),
     }
-    base = pb.simulate("leaf", seed=1, scene=scene, protocol=pb.Protocol(views=12, wavelengths=()))
+    base = pb.simulate(
+        "leaf", seed=1, scene=scene, protocol=pb.simulation.Protocol(views=12, wavelengths=())
+    )
     angles = ["view_zenith", "view_azimuth", "light_zenith", "light_azimuth"]
     geometry = pb.Geometry.from_degrees(**{name: base[name].to_numpy() for name in angles})
     predict = jax.jit(lambda truth: scene.predict(truth, geometry)["dop"])
@@ -172,7 +174,7 @@ def test_rough_pixels_have_the_mode_and_the_curvature_there() -> None:
     dop = np.clip(dop + 0.01 * rng.normal(size=dop.shape), 0.0, 1.0)
     image = base[angles].assign(dop=(("y", "x", "view"), dop))
     model = handlers.condition(per_material, data={"normal_scale": 0.01})
-    plan = planned(image, model=model, scene=scene, links=pb.NormalLink())
+    plan = planned(image, model=model, scene=scene, links=pb.links.NormalLink())
     assert_modes_agree(plan, stacked(image, plan))
 
 
@@ -182,7 +184,7 @@ def test_a_map_without_weights_is_the_laplace_fit_of_its_pixel() -> None:
     plan = planned(image, PixelLaplace(draws=4096, weighted=False))
     maps = mapped(image, plan).isel(y=0, x=1)
     pixel = image.isel(y=0, x=1, drop=True)
-    fit = pb.fit(pixel, method=pb.Laplace(draws=40_000, chains=1), seed=1, **ASKED)
+    fit = pb.fit(pixel, method=pb.methods.Laplace(draws=40_000, chains=1), seed=1, **ASKED)
     assert maps["approach"] == Approach.LAPLACE
     assert maps["status"] == Status.GOOD
     for name in NAMES:
@@ -264,7 +266,11 @@ def masked(image: xr.Dataset) -> xr.Dataset:
     [
         (lambda c: c.isel(y=0, x=0), {}, r"plates: it has no axis y or x; give an image"),
         (lambda c: c.isel(y=0), {}, r"plates: it has no axis y; give an image"),
-        (lambda c: c, {"method": pb.Nuts()}, r"fit_pixels: method: Nuts\(.*give settings such as"),
+        (
+            lambda c: c,
+            {"method": pb.methods.Nuts()},
+            r"fit_pixels: method: Nuts\(.*give settings such as",
+        ),
         (lambda c: c, {"method": "laplace"}, r"'laplace' is no way to fit pixels; give settings"),
         (masked, {}, r"plates: no pixel has 2 valid views; check `valid`"),
         (lambda c: c.assign(q=c["q"] * np.nan), {}, r"plates: no pixel has 2 valid views"),

@@ -20,42 +20,42 @@ from polar_bayes.inference.batch_result import Status
 def test_what_was_written_is_read_when_it_is_needed(tmp_path: Path) -> None:
     maps = make_maps({"roughness": np.full((4, 5), 0.3)})
     maps.to_zarr(tmp_path / "map.zarr", consolidated=False)
-    found = pb.open_map(tmp_path / "map.zarr")
+    found = pb.maps.open_map(tmp_path / "map.zarr")
     assert not found.chunks
-    assert pb.count_pixels(found)["good"] == 20
+    assert pb.maps.count_pixels(found)["good"] == 20
     assert found.attrs == maps.attrs
 
 
 def test_what_is_no_whole_map_is_refused(tmp_path: Path) -> None:
     store = tmp_path / "map.zarr"
     with pytest.raises(pb.FitError, match="there is no such store"):
-        pb.open_map(store)
+        pb.maps.open_map(store)
     store.mkdir()
     with pytest.raises(pb.FitError, match="cannot be read as Zarr"):
-        pb.open_map(store)
+        pb.maps.open_map(store)
     begun = tmp_path / "begun.zarr"
     maps = make_maps({"roughness": np.ones((1, 1))}).assign_attrs(request_sha256="0")
     maps.to_zarr(begun, consolidated=False)
     with pytest.raises(pb.FitError, match="not finished; wait, or go on with"):
-        pb.open_map(begun)
+        pb.maps.open_map(begun)
     other = tmp_path / "other.zarr"
     make_maps({"roughness": np.ones((1, 1))}).drop_vars("status").to_zarr(other, consolidated=False)
     with pytest.raises(pb.FitError, match="it holds no maps"):
-        pb.open_map(other)
+        pb.maps.open_map(other)
 
 
 def test_a_capture_may_be_a_zarr_store_or_a_file(tmp_path: Path) -> None:
     with pytest.raises(pb.CaptureError, match="there is no such store"):
-        pb.open_capture(str(tmp_path / "leaf.zarr"))
+        pb.maps.open_capture(str(tmp_path / "leaf.zarr"))
     with pytest.raises(pb.CaptureError, match="there is no such file"):
-        pb.open_capture(str(tmp_path / "leaf.nc"))
+        pb.maps.open_capture(str(tmp_path / "leaf.nc"))
 
 
 @pytest.mark.thorough
 def test_a_capture_in_a_store_can_be_cut_into_chunks(tmp_path: Path) -> None:
     image = plate_image(4, 6)
     image.to_zarr(tmp_path / "leaf.zarr", consolidated=False)
-    opened = pb.open_capture(tmp_path / "leaf.zarr")
+    opened = pb.maps.open_capture(tmp_path / "leaf.zarr")
     assert not opened["q"].variable._in_memory
     xr.testing.assert_equal(opened.chunk(y=2).compute(scheduler="threads"), image)
     xr.testing.assert_equal(pickle.loads(pickle.dumps(opened)).load(), image)
@@ -68,9 +68,9 @@ def test_a_capture_in_a_store_can_be_cut_into_chunks(tmp_path: Path) -> None:
 def test_what_a_user_has_not_written_yet_is_not_good(tmp_path: Path) -> None:
     maps = pb.fit_pixels(plate_image(4, 6).chunk(y=2), **ASKED)
     maps.to_zarr(tmp_path / "map.zarr", consolidated=False, compute=False)
-    found = pb.open_map(tmp_path / "map.zarr")
+    found = pb.maps.open_map(tmp_path / "map.zarr")
     assert (found["status"] == Status.NOT_FITTED).all()
-    counts = pb.count_pixels(found)
+    counts = pb.maps.count_pixels(found)
     assert {name: count for name, count in counts.items() if count} == {"not fitted": 24}
 
 
@@ -99,7 +99,7 @@ def test_a_broken_map_is_an_error_of_one_line(tmp_path: Path) -> None:
     said: list[str] = []
     for change in changes(store):
         try:
-            found = pb.open_map(store).load()
+            found = pb.maps.open_map(store).load()
         except pb.FitError as error:
             said.append(str(error))
             continue
@@ -142,7 +142,7 @@ def test_a_damaged_capture_is_one_line(tmp_path: Path, damage: str) -> None:
     spoil, says = DAMAGE[damage]
     spoil(source)
     with pytest.raises(pb.CaptureError, match=says) as error:
-        pb.map_file(source, tmp_path / "map.zarr", **ASKED)
+        pb.maps.map_file(source, tmp_path / "map.zarr", **ASKED)
     assert "\n" not in str(error.value)
     assert str(error.value).startswith(str(source))
     assert [path.name for path in tmp_path.iterdir()] == ["plates.zarr"]

@@ -23,7 +23,7 @@ from polar_bayes.maps import store as module
 from polar_bayes.maps.blocks import workers
 from polar_bayes.reporting.maps import render_map
 
-METHOD = pb.PixelLaplace(draws=64, sampler=None)
+METHOD = pb.methods.PixelLaplace(draws=64, sampler=None)
 ROWS = 2  # of a block of 40 pixels in an image 20 wide
 
 
@@ -57,7 +57,7 @@ def begun(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def mapped(capture: Path, out: Path, **asked) -> xr.Dataset:
-    return pb.map_file(capture, out, method=METHOD, **{**ASKED, **asked})
+    return pb.maps.map_file(capture, out, method=METHOD, **{**ASKED, **asked})
 
 
 class BrokenOff(BaseException):
@@ -103,8 +103,11 @@ def flip(file: Path, at: int = -6) -> None:
 def test_a_map_that_was_broken_off_goes_on_to_the_same_bits(
     capture: Path, finished: Path, begun: Path, tmp_path: Path
 ) -> None:
-    expected = pb.open_map(finished).load()
-    assert pb.count_pixels(expected)["good"] + pb.count_pixels(expected)["not trusted"] == 180
+    expected = pb.maps.open_map(finished).load()
+    assert (
+        pb.maps.count_pixels(expected)["good"] + pb.maps.count_pixels(expected)["not trusted"]
+        == 180
+    )
     assert [path.name for path in finished.parent.iterdir()] == ["map.zarr"]
     out = copied(begun, tmp_path / "map.zarr")
     with ledger_of(out).open("a") as file:
@@ -121,7 +124,7 @@ def test_a_map_that_was_broken_off_goes_on_to_the_same_bits(
 def test_the_maps_are_those_that_are_made_in_memory(capture: Path, finished: Path) -> None:
     image = xr.open_zarr(capture, consolidated=False).load()
     made = make_engine.cache_info().misses
-    found = pb.open_map(finished).load()
+    found = pb.maps.open_map(finished).load()
     xr.testing.assert_equal(found, pb.fit_pixels(image, method=METHOD, **ASKED))
     assert make_engine.cache_info().misses == made  # nothing is compiled a second time
 
@@ -141,7 +144,7 @@ def test_whoever_is_stopped_before_the_store_is_whole_can_go_on(
     assert [path.name for path in tmp_path.iterdir()] == ["map.zarr.progress"]
     ledger_of(out).write_bytes(ledger_of(out).read_bytes()[:20])  # the head was cut off as well
     found = mapped(capture, out, resume=True)
-    assert sum(pb.count_pixels(found).values()) == 180
+    assert sum(pb.maps.count_pixels(found).values()) == 180
     with pytest.raises(TypeError, match="unexpected keyword argument 'sceen'"):
         mapped(capture, tmp_path / "other.zarr", sceen="paper")
     assert [path.name for path in tmp_path.iterdir()] == ["map.zarr"]
@@ -211,13 +214,13 @@ def test_an_unfinished_map_is_not_opened_with_or_without_its_ledger(
     alone = copied(begun, tmp_path / "map.zarr", ledger=False)
     for store in (begun, alone):
         with pytest.raises(pb.FitError, match="not finished; wait, or go on with"):
-            pb.open_map(store)
+            pb.maps.open_map(store)
     unsaid = xr.open_zarr(begun, chunks=None, consolidated=False)
-    assert pb.count_pixels(unsaid)["not fitted"] in (40, 60, 100)
+    assert pb.maps.count_pixels(unsaid)["not fitted"] in (40, 60, 100)
     seen: list[int] = []
     found = mapped(capture, alone, resume=True, progress=lambda done, every: seen.append(done))
     assert len(seen) == 5  # no line says that a block is done
-    xr.testing.assert_identical(found.load(), pb.open_map(finished).load())
+    xr.testing.assert_identical(found.load(), pb.maps.open_map(finished).load())
 
 
 @each("damage", ["lost", "altered"])
@@ -230,19 +233,19 @@ def test_a_block_whose_files_are_lost_or_altered_is_fitted_again(
     seen: list[int] = []
     found = mapped(capture, out, resume=True, progress=lambda done, every: seen.append(done))
     assert len(seen) >= 3
-    xr.testing.assert_identical(found.load(), pb.open_map(finished).load())
+    xr.testing.assert_identical(found.load(), pb.maps.open_map(finished).load())
 
 
 @pytest.mark.thorough
 def test_a_chunk_that_a_finished_map_lost_is_not_good(
     capture: Path, finished: Path, tmp_path: Path
 ) -> None:
-    whole = pb.count_pixels(pb.open_map(finished))
+    whole = pb.maps.count_pixels(pb.maps.open_map(finished))
     for name in ("status", "refractive_index", "refractive_index_sd"):
         out = copied(finished, tmp_path / f"{name}.zarr")
         chunk_of(out, name, 1).unlink()
-        maps = pb.open_map(out)
-        counts = pb.count_pixels(maps)
+        maps = pb.maps.open_map(out)
+        counts = pb.maps.count_pixels(maps)
         lost = counts["not fitted"]
         assert lost == 40 if name == "status" else 0 < lost <= 40
         assert counts["good"] <= whole["good"] - (0 if name == "status" else lost)
@@ -256,24 +259,24 @@ def test_a_chunk_that_a_finished_map_lost_is_not_good(
     for name, says in (("y", "its values are missing"), ("quantile", "its levels are not those")):
         (out / name / "c" / "0").unlink()
         with pytest.raises(pb.FitError, match=rf"map\.zarr: {name}: {says}"):
-            pb.open_map(out)
+            pb.maps.open_map(out)
 
 
 def test_a_changed_byte_of_a_map_is_an_error(finished: Path, tmp_path: Path) -> None:
     out = copied(finished, tmp_path / "map.zarr")
-    names = [str(name) for name in pb.open_map(out).variables]
+    names = [str(name) for name in pb.maps.open_map(out).variables]
     for name in names:
         file = next(path for path in (out / name / "c").rglob("*") if path.is_file())
         for at in (0, -1):
             flip(file, at)
             with pytest.raises(pb.FitError, match="cannot be read") as error:
-                pb.open_map(out).load()
+                pb.maps.open_map(out).load()
             flip(file, at)
             assert str(out) in str(error.value)
             assert "\n" not in str(error.value)
     flip(chunk_of(out, "status", 1))
     with pytest.raises(pb.FitError, match=r"map\.zarr: status\[y=.*, x=0:20\]: it cannot be read"):
-        pb.count_pixels(pb.open_map(out))
+        pb.maps.count_pixels(pb.maps.open_map(out))
 
 
 def test_a_capture_that_changed_since_is_not_mixed_with_what_is_done(
@@ -296,7 +299,7 @@ def test_a_capture_that_changed_since_is_not_mixed_with_what_is_done(
     ended = copied(finished, tmp_path / "ended.zarr")
     shutil.copy(ledger_of(begun), ledger_of(ended))  # killed before the ledger was removed
     found = mapped(known, ended, resume=True)
-    xr.testing.assert_identical(found.load(), pb.open_map(finished).load())
+    xr.testing.assert_identical(found.load(), pb.maps.open_map(finished).load())
     assert not ledger_of(ended).exists()
 
 
@@ -335,14 +338,14 @@ def test_a_full_disk_is_one_line_and_loses_nothing(
         ):
             mapped(capture, out)
     found = mapped(capture, out, resume=True)
-    xr.testing.assert_identical(found.load(), pb.open_map(finished).load())
+    xr.testing.assert_identical(found.load(), pb.maps.open_map(finished).load())
 
 
 @pytest.mark.thorough
 def test_a_netcdf_file_is_read_once(
     capture: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pb.save_capture(pb.open_capture(capture), tmp_path / "plates.nc")
+    pb.save_capture(pb.maps.open_capture(capture), tmp_path / "plates.nc")
     loaded: list[Path] = []
 
     def load(path: Path) -> xr.Dataset:
@@ -351,7 +354,7 @@ def test_a_netcdf_file_is_read_once(
 
     monkeypatch.setattr(lazy, "load_capture", load)
     found = mapped(tmp_path / "plates.nc", tmp_path / "map.zarr")
-    xr.testing.assert_equal(found.load(), pb.open_map(finished).load())
+    xr.testing.assert_equal(found.load(), pb.maps.open_map(finished).load())
     assert loaded == [tmp_path / "plates.nc"]
 
 
@@ -370,7 +373,7 @@ def test_an_interrupt_does_not_wait_and_says_how_to_go_on(capture: Path, tmp_pat
     with pytest.raises(KeyboardInterrupt):
         mapped(capture, out, progress=interrupt)
     assert said == [f"{out}: what is done is kept; repeat the command with --resume to go on"]
-    assert pb.count_pixels(mapped(capture, out, resume=True))["not fitted"] == 0
+    assert pb.maps.count_pixels(mapped(capture, out, resume=True))["not fitted"] == 0
     running.result()
 
 

@@ -216,7 +216,7 @@ def test_skewed_pixels_have_the_posteriors_of_a_grid(chains: bool) -> None:
 )
 def test_mistakes_are_told(settings: dict, said: str) -> None:
     with pytest.raises(pb.FitError, match=said):
-        pb.PixelTempering(**settings)
+        pb.methods.PixelTempering(**settings)
 
 
 def test_two_mixtures_are_weighed_as_one() -> None:

@@ -26,8 +26,8 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 from polar_bayes.priors import PRIORS
 
-INDEX_ONLY = pb.GpSpectral(coupled=("refractive_index",))
-TINY = pb.Laplace(chains=2, draws=100)
+INDEX_ONLY = pb.models.GpSpectral(coupled=("refractive_index",))
+TINY = pb.methods.Laplace(chains=2, draws=100)
 MANY_VIEWS = np.linspace(30.0, 78.0, 24)
 FEW_VIEWS = np.linspace(40.0, 75.0, 4)
 
@@ -49,8 +49,8 @@ def held_out(material: Mapping[float, float], held: float, seed: int) -> tuple[f
     """Ends of the 95% band at a color that was not measured."""
     measured = {color: index for color, index in material.items() if color != held}
     capture = spectral_plate(measured, error=0.002, seed=seed, views=MANY_VIEWS)
-    result = fit(capture, method=pb.Laplace(chains=2, draws=500), seed=seed)
-    draws = pb.predict_spectrum(result, held, seed=seed)["refractive_index"].to_numpy()
+    result = fit(capture, method=pb.methods.Laplace(chains=2, draws=500), seed=seed)
+    draws = pb.inference.predict_spectrum(result, held, seed=seed)["refractive_index"].to_numpy()
     low, high = np.quantile(draws, (0.025, 0.975))
     return float(low), float(high)
 
@@ -165,7 +165,7 @@ def test_the_posterior_is_that_of_another_density_and_another_sampler() -> None:
     capture = spectral_plate(colors, error=TWIN_ERROR, seed=21, views=np.linspace(35.0, 75.0, 6))
     theirs, independent = twin_draws(capture)
     assert independent > 1000.0
-    settings = pb.Nuts(draws=1000, most_draws=2000, effective_draws=1000.0)
+    settings = pb.methods.Nuts(draws=1000, most_draws=2000, effective_draws=1000.0)
     result = fit(capture, method=settings, seed=4)
     assert pb.verdict(result).converged
     posterior = result["posterior"]
@@ -227,7 +227,7 @@ def test_two_equal_wavelengths_are_fitted_in_single_precision() -> None:
     assert index.dtype == np.float32
     assert np.isfinite(index).all()
     np.testing.assert_allclose(index[..., 0], index[..., 1], atol=1e-6)
-    predicted = pb.predict_spectrum(result, [550.0, 700.0])["refractive_index"]
+    predicted = pb.inference.predict_spectrum(result, [550.0, 700.0])["refractive_index"]
     assert predicted.dtype == np.float32
     apart = predicted.to_numpy()[..., 0] - index[..., 0]
     assert np.abs(apart).max() < 1e-3
@@ -263,15 +263,15 @@ THREE = spectral_plate({450.0: 1.525, 550.0: 1.5185, 650.0: 1.5145}, error=0.01,
     ],
 )
 def test_other_kernels_are_fitted_and_predict(kernel: Any, length: bool) -> None:
-    model = pb.GpSpectral(("refractive_index",), pb.SpectralProcess(kernel))
+    model = pb.models.GpSpectral(("refractive_index",), pb.models.SpectralProcess(kernel))
     result = fit(THREE, model)
     assert ("refractive_index_length" in result["posterior"]) is length
     given = None if isinstance(kernel, str) else model
-    band = pb.predict_spectrum(result, [500.0, 600.0], model=given)["refractive_index"]
+    band = pb.inference.predict_spectrum(result, [500.0, 600.0], model=given)["refractive_index"]
     assert np.isfinite(band).all()
     if given is not None:
         with pytest.raises(pb.FitError, match=r"kernel has no name.*give the model again"):
-            pb.predict_spectrum(result, [500.0])
+            pb.inference.predict_spectrum(result, [500.0])
 
 
 def patches() -> xr.Dataset:
@@ -290,7 +290,7 @@ def test_every_patch_has_its_own_curve_around_a_pooled_level() -> None:
     index = result["posterior"]["refractive_index"]
     assert set(index.dims) == {"chain", "draw", "patch", "wavelength"}
     assert result["posterior"]["refractive_index_amplitude"].dims == ("chain", "draw")
-    band = pb.predict_spectrum(result, [450.0, 500.0, 700.0])["refractive_index"]
+    band = pb.inference.predict_spectrum(result, [450.0, 500.0, 700.0])["refractive_index"]
     assert band.dims == ("chain", "draw", "patch", "wavelength")
     truth = smooth_index(np.array([450.0, 500.0])) + np.array([[-0.05], [0.1]])
     near = band.isel(wavelength=slice(2))
@@ -299,12 +299,12 @@ def test_every_patch_has_its_own_curve_around_a_pooled_level() -> None:
 
 
 def test_a_law_of_dispersion_takes_the_place_of_a_process() -> None:
-    scene = dataclasses.replace(PLATE, dispersion=pb.Cauchy())
+    scene = dataclasses.replace(PLATE, dispersion=pb.physics.Cauchy())
     result = pb.fit(THREE, model=gp_spectral, scene=scene, links=LINKS, method=TINY)
     assert "refractive_index_amplitude" not in result["posterior"]
-    band = pb.predict_spectrum(result, [450.0, 500.0])["refractive_index"]
+    band = pb.inference.predict_spectrum(result, [450.0, 500.0])["refractive_index"]
     xr.testing.assert_equal(
-        band, pb.predict_spectrum(result, [450.0, 500.0], scene=scene).refractive_index
+        band, pb.inference.predict_spectrum(result, [450.0, 500.0], scene=scene).refractive_index
     )
     a, b = (result["posterior"][name].to_numpy() for name in ("cauchy_a", "cauchy_b"))
     np.testing.assert_allclose(band.sel(wavelength=500.0), a + b / 0.5**2, rtol=1e-12)
@@ -313,26 +313,28 @@ def test_a_law_of_dispersion_takes_the_place_of_a_process() -> None:
     told["scene_parts"] = told["scene_parts"].replace("Cauchy(", "LawOfMyOwn(")
     result.attrs["polar_bayes"] = json.dumps(told)
     with pytest.raises(pb.FitError, match="not one of this package; give the same scene"):
-        pb.predict_spectrum(result, [500.0])
+        pb.inference.predict_spectrum(result, [500.0])
 
 
 @pytest.mark.thorough
 def test_absorption_and_index_are_coupled_at_once() -> None:
-    protocol = pb.Protocol(views=6, wavelengths=(450.0, 500.0, 550.0, 600.0))
+    protocol = pb.simulation.Protocol(views=6, wavelengths=(450.0, 500.0, 550.0, 600.0))
     scene = pb.Scene(pb.SmoothSurface(), pb.Depolarizer(), pb.DopMixing())
     capture = pb.simulate("leaf", scene=scene, protocol=protocol, seed=3)
-    processes = (pb.SpectralProcess("Matern32"), pb.SpectralProcess(knots=3))
-    model = pb.GpSpectral(("absorption", "refractive_index"), processes)
+    processes = (pb.models.SpectralProcess("Matern32"), pb.models.SpectralProcess(knots=3))
+    model = pb.models.GpSpectral(("absorption", "refractive_index"), processes)
     result = pb.fit(capture, model=model, scene=scene, method=TINY)
     assert result["unconstrained_posterior"]["refractive_index_weights"].shape[-1] == 3
     assert result["unconstrained_posterior"]["absorption_weights"].shape[-1] == 4
-    bands = pb.predict_spectrum(result, [450.0, 525.0, 525.0], seed=1)
+    bands = pb.inference.predict_spectrum(result, [450.0, 525.0, 525.0], seed=1)
     assert set(bands) == {"absorption", "refractive_index"}
     assert float(bands["absorption"].min()) > 0.0
     np.testing.assert_array_equal(bands["absorption"][..., 1], bands["absorption"][..., 2])
     again = result["posterior"]["absorption"].sel(wavelength=450.0)
     np.testing.assert_allclose(bands["absorption"].sel(wavelength=450.0), again, rtol=2e-3)
-    xr.testing.assert_identical(bands, pb.predict_spectrum(result, [450.0, 525.0, 525.0], seed=1))
+    xr.testing.assert_identical(
+        bands, pb.inference.predict_spectrum(result, [450.0, 525.0, 525.0], seed=1)
+    )
 
 
 # --- what is refused ------------------------------------------------------------------------------
@@ -344,14 +346,17 @@ def test_absorption_and_index_are_coupled_at_once() -> None:
         ({"coupled": ()}, r"coupled=\(\) names no spectra.*refractive_index, absorption"),
         ({"coupled": ("roughness",)}, "names no spectra"),
         ({"coupled": "absorption"}, "names no spectra"),
-        ({"process": (pb.SpectralProcess(),)}, "does not say what refractive_index and absorption"),
+        (
+            {"process": (pb.models.SpectralProcess(),)},
+            "does not say what refractive_index and absorption",
+        ),
         ({"process": "ExpSquared"}, "does not say what.*one SpectralProcess"),
         ({"pooled": ("n",)}, "'n' is no parameter of a material"),
     ],
 )
 def test_what_is_no_spectral_model_is_refused(settings: dict, message: str) -> None:
     with pytest.raises(pb.FitError, match=message):
-        pb.GpSpectral(**settings)
+        pb.models.GpSpectral(**settings)
 
 
 def test_a_capture_without_colors_is_refused() -> None:
@@ -360,7 +365,7 @@ def test_a_capture_without_colors_is_refused() -> None:
 
 
 def test_a_scene_without_the_spectrum_is_refused() -> None:
-    model = pb.GpSpectral(coupled=("absorption",))
+    model = pb.models.GpSpectral(coupled=("absorption",))
     with pytest.raises(pb.FitError, match="reads no absorption; couple one of refractive_index"):
         fit(THREE, model)
 
@@ -368,14 +373,14 @@ def test_a_scene_without_the_spectrum_is_refused() -> None:
 @each("wavelengths", [[], [-500.0], [np.nan], [[500.0]], ["green"], None])
 def test_what_is_no_wavelength_is_refused(wavelengths: Any) -> None:
     with pytest.raises(pb.FitError, match=r"is no list of wavelengths.*above zero in nm"):
-        pb.predict_spectrum(xr.DataTree(), wavelengths)
+        pb.inference.predict_spectrum(xr.DataTree(), wavelengths)
 
 
 @pytest.mark.thorough
 def test_a_result_without_ties_between_colors_is_refused() -> None:
     result = fit(THREE, "per_material")
     with pytest.raises(pb.FitError, match="'per_material': the fit ties no color to another"):
-        pb.predict_spectrum(result, 500.0)
+        pb.inference.predict_spectrum(result, 500.0)
 
 
 def test_the_truth_of_these_captures_is_inside_the_priors() -> None:

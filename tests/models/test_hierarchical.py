@@ -59,7 +59,7 @@ def test_members_are_drawn_from_the_population(name: str) -> None:
     }
     if name == "refractive_index":
         near[f"{name}_location"] = pb.PRIORS[f"{name}_location"]
-    model = pb.Hierarchical(pooled=(name,))
+    model = pb.models.Hierarchical(pooled=(name,))
     request = resolve(capture, model, "nuts", None, near, None, None, 0, "double")
     data = observe(request.capture)
     held = {f"{name}_location": np.float64(location)} if name == "refractive_index" else {}
@@ -138,7 +138,9 @@ def test_the_posterior_is_that_of_another_density_and_another_sampler() -> None:
     capture = plates([1.46, 1.5, 1.53], TWIN_ERROR, TWIN_VIEWS, seed=2)
     theirs, independent = twin_draws(capture)
     assert independent > 1000.0
-    result = fit(capture, method=pb.Nuts(draws=1000, most_draws=3000, effective_draws=1500.0))
+    result = fit(
+        capture, method=pb.methods.Nuts(draws=1000, most_draws=3000, effective_draws=1500.0)
+    )
     assert pb.verdict(result).converged
     posterior = result["posterior"]
     for label, other in theirs.items():
@@ -189,7 +191,7 @@ def test_many_members_keep_a_fixed_metric_and_converge() -> None:
 
 
 def test_coordinates_of_members_stand_apart_and_the_choice_is_recorded() -> None:
-    model = pb.Hierarchical(pooled=("refractive_index", "subsurface_fraction"))
+    model = pb.models.Hierarchical(pooled=("refractive_index", "subsurface_fraction"))
     capture = plates(np.linspace(1.45, 1.55, 12), 0.01, seed=7)
     result = fit(capture, model=model, method="laplace", seed=1)
     assert set(result["unconstrained_posterior"].data_vars) == {f"{n}_base" for n in model.pooled}
@@ -202,7 +204,7 @@ def test_coordinates_of_members_stand_apart_and_the_choice_is_recorded() -> None
 @pytest.mark.thorough
 def test_the_same_seed_gives_the_same_draws() -> None:
     capture = plates([1.45, 1.5, 1.55], 0.02)
-    short = pb.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
+    short = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
     one, two = (fit(capture, method=short, seed=3)["posterior"].to_dataset() for _ in range(2))
     xr.testing.assert_equal(one, two)
 
@@ -228,8 +230,8 @@ def test_wrong_choices_are_refused_with_a_mend() -> None:
         ((), "nothing is pooled"),
     ):
         with pytest.raises(pb.FitError, match=said):
-            pb.Hierarchical(pooled=pooled)
+            pb.models.Hierarchical(pooled=pooled)
     with pytest.raises(pb.FitError, match="the scene does not read roughness"):
-        fit(capture, model=pb.Hierarchical(pooled=("roughness",)))
+        fit(capture, model=pb.models.Hierarchical(pooled=("roughness",)))
     with pytest.raises(pb.FitError, match="no axis patch or material"):
         fit(capture.isel(patch=0))

@@ -31,7 +31,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.subsurface import Unpolarized
 from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.priors import PRIORS, RANGES, resolve_priors
-from polar_bayes.simulate import NOISE, Protocol, simulate
+from polar_bayes.simulation import NOISE, Protocol, simulate
 
 LINKS = [
     ("dop", BetaLink()),

@@ -48,7 +48,7 @@ def test_a_doubtful_reference_is_said_in_red():
 @pytest.mark.thorough
 def test_the_report_lies_beside_its_file(tmp_path):
     page = pb.report(make_accuracy(), tmp_path / "report")
-    again = pb.load_accuracy(page.parent / "accuracy.nc")
+    again = pb.benchmark.load_accuracy(page.parent / "accuracy.nc")
     assert page.read_text() == render_accuracy(again)
     with pytest.raises(pb.FitError, match="it goes with calibrations only"):
         pb.report(make_accuracy(), tmp_path / "other", beside={})
@@ -64,7 +64,7 @@ def test_a_fit_that_holds_a_study_shows_it():
 
 @pytest.mark.thorough
 def test_every_rung_as_given_is_named_and_nothing_is_cut_off():
-    figure = pb.plot_accuracy(make_accuracy())
+    figure = pb.plots.plot_accuracy(make_accuracy())
     assert len(figure.axes) == 2
     for axes in figure.axes:
         named = {text.get_text() for text in axes.texts}
@@ -77,7 +77,7 @@ def test_names_that_lie_close_do_not_cover_each_other():
     rows = {
         (f"method {at}", "as given"): ([0.1, 0.1, 0.1], 1.0 + 0.02 * at, 1.0) for at in range(4)
     }
-    figure = pb.plot_accuracy(make_accuracy(rows), times=["seconds_first"])
+    figure = pb.plots.plot_accuracy(make_accuracy(rows), times=["seconds_first"])
     figure.draw_without_rendering()
     boxes = [Text.get_window_extent(name) for name in figure.axes[0].texts]  # without its line
     for at, box in enumerate(boxes):
@@ -86,7 +86,7 @@ def test_names_that_lie_close_do_not_cover_each_other():
 
 @pytest.mark.thorough
 def test_the_front_falls_from_left_to_right():
-    (axes,) = pb.plot_accuracy(make_accuracy(), times=["seconds_again"]).axes
+    (axes,) = pb.plots.plot_accuracy(make_accuracy(), times=["seconds_again"]).axes
     front = next(line for line in axes.lines if line.get_drawstyle() == "steps-post")
     seconds, error = front.get_data()
     assert (np.diff(seconds) > 0).all()
@@ -96,10 +96,10 @@ def test_the_front_falls_from_left_to_right():
 
 @pytest.mark.thorough
 def test_without_first_times_one_panel_is_drawn():
-    assert len(pb.plot_accuracy(make_accuracy(fresh=False)).axes) == 1
+    assert len(pb.plots.plot_accuracy(make_accuracy(fresh=False)).axes) == 1
 
 
 @pytest.mark.thorough
 def test_a_column_that_is_no_time_is_refused():
     with pytest.raises(pb.FitError, match="there is no time gradients"):
-        pb.plot_accuracy(make_accuracy(), times=["gradients"])
+        pb.plots.plot_accuracy(make_accuracy(), times=["gradients"])

@@ -17,16 +17,16 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference import joint_fit as fitting
 
 METHODS = {
-    "nuts": pb.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50),
-    "laplace": pb.Laplace(chains=2, draws=100),
-    "importance": pb.Importance(),
-    "normal guide": pb.NormalGuide(steps=200, draws=200),
+    "nuts": pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50),
+    "laplace": pb.methods.Laplace(chains=2, draws=100),
+    "importance": pb.methods.Importance(),
+    "normal guide": pb.methods.NormalGuide(steps=200, draws=200),
     "flow guide": pytest.param("flow guide", marks=pytest.mark.thorough),
     "tempered": pytest.param("tempered", marks=pytest.mark.thorough),
 }
 DEAR = {
-    "flow guide": pb.FlowGuide(steps=200, draws=200),
-    "tempered": pb.Tempered(pb.PixelTempering(draws=4096)),
+    "flow guide": pb.methods.FlowGuide(steps=200, draws=200),
+    "tempered": pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)),
 }
 OF_DRAWS = (
     "plot_dist",
@@ -63,7 +63,7 @@ def result_of(name: str, fitted: dict[str, xr.DataTree]) -> xr.DataTree:
     """One fit for each method, as small as it goes."""
     if name not in fitted:
         capture = plate_capture(np.linspace(20.0, 80.0, 12), 0.02, seed=3)
-        method = {**METHODS, **DEAR, "point": pb.Point(starts=2)}[name]
+        method = {**METHODS, **DEAR, "point": pb.methods.Point(starts=2)}[name]
         jax.config.update("jax_disable_most_optimizations", True)
         few = {"STARTS": 4, "PRIOR_DRAWS": 100, "BLOCK": 100}
         with pytest.MonkeyPatch.context() as patch:
@@ -104,12 +104,12 @@ def masked() -> xr.DataTree:
 @each("plot", ["plot_ppc_pit", "plot_loo_pit", "plot_ppc_dist"])
 @each("name", ["dop", "intensity"])
 def test_masked_readings_are_set_aside_for_arviz(masked, plot: str, name: str) -> None:
-    stacked = pb.stack_readings(masked)
+    stacked = pb.diagnostics.stack_readings(masked)
     assert getattr(arviz_plots, plot)(stacked, var_names=name)
 
 
 def test_stacking_keeps_what_was_fitted_and_nothing_else(masked) -> None:
-    stacked = pb.stack_readings(masked)
+    stacked = pb.diagnostics.stack_readings(masked)
     kept = masked["constant_data"]["valid"].to_numpy() == 1
     observed = masked["observed_data"]["dop"].to_numpy()[kept]
     assert stacked["observed_data"]["dop"].dims == ("dop_reading",)
@@ -123,4 +123,4 @@ def test_stacking_keeps_what_was_fitted_and_nothing_else(masked) -> None:
 
 def test_what_holds_no_readings_is_refused() -> None:
     with pytest.raises(FitError, match="it holds no readings"):
-        pb.stack_readings(xr.DataTree())
+        pb.diagnostics.stack_readings(xr.DataTree())

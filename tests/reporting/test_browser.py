@@ -144,7 +144,7 @@ def test_a_fault_is_found(driver, tmp_path: Path) -> None:
 @pytest.mark.thorough
 def test_cards_run_nothing_in_a_notebook(driver, tmp_path: Path) -> None:
     page = tmp_path / "cards.html"
-    cards = [pb.show(REPORTS["evil"]()), pb.SETUPS["goniometer"].scene, pb.PRIORS]
+    cards = [pb.show(REPORTS["evil"]()), pb.setups.SETUPS["goniometer"].scene, pb.PRIORS]
     text = "".join(card._repr_html_() for card in cards)
     page.write_text(
         f'<!DOCTYPE html><meta name="viewport" content="width=device-width"><body>{text}'

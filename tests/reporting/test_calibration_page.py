@@ -52,7 +52,7 @@ def test_the_verdict_comes_first(page: Page, broken: xr.DataTree) -> None:
     assert "Not calibrated." in text
     assert "roughness: intervals are too narrow (p = " in text
     assert "refractive_index: the posterior is too high (p = " in text
-    table = pb.calibration_table(broken)
+    table = pb.calibration.calibration_table(broken)
     for label in ("roughness", "refractive_index"):
         said = f"the true {label.replace('_', ' ')} in {table.loc[label, 'held_95']:.1%}"
         assert said in text
@@ -60,7 +60,7 @@ def test_the_verdict_comes_first(page: Page, broken: xr.DataTree) -> None:
 
 
 def test_every_number_of_the_table_is_the_tree_s(page: Page, good: xr.DataTree) -> None:
-    for _, row in pb.calibration_table(good).iterrows():
+    for _, row in pb.calibration.calibration_table(good).iterrows():
         held = f"{row['held_80']:.1%} ({100 * row['held_80_low']:.1f}"
         assert held in page.text
         assert f"{row['crps']:.3g}" in page.text
@@ -180,7 +180,7 @@ def test_a_calibration_without_an_answer_has_a_page() -> None:
 def test_the_folder_holds_page_and_calibration(tmp_path: Path, broken: xr.DataTree) -> None:
     page = pb.report(broken, tmp_path / "report")
     assert sorted(path.name for path in page.parent.iterdir()) == ["calibration.nc", "index.html"]
-    read = pb.load_calibration(page.parent / "calibration.nc")
+    read = pb.calibration.load_calibration(page.parent / "calibration.nc")
     assert render_calibration(read) == page.read_text()
 
 
@@ -208,15 +208,15 @@ def test_arguments_that_do_not_apply_are_refused(tmp_path: Path, good: xr.DataTr
 
 @pytest.mark.thorough
 def test_a_row_for_each_parameter(broken: xr.DataTree) -> None:
-    figure = pb.plot_calibration(broken)
+    figure = pb.plots.plot_calibration(broken)
     assert clipped(figure) == []
     assert len(figure.axes) == 9
-    some = pb.plot_calibration(broken, parameters=["refractive_index"])
+    some = pb.plots.plot_calibration(broken, parameters=["refractive_index"])
     assert len(some.axes) == 3
     with pytest.raises(pb.FitError, match="no parameter gloss; give some of roughness, "):
-        pb.plot_calibration(broken, parameters=["gloss"])
+        pb.plots.plot_calibration(broken, parameters=["gloss"])
     with pytest.raises(pb.FitError, match="it holds no calibration; give the tree"):
-        pb.plot_calibration(xr.DataTree())
+        pb.plots.plot_calibration(xr.DataTree())
 
 
 @pytest.mark.thorough
@@ -224,7 +224,7 @@ def test_positive_parameters_of_many_sizes_have_logarithmic_axes() -> None:
     tree = make_calibration(names=("concentration_scale",), count=60)
     for group, name in (("truth", "concentration_scale"), ("marginals", "concentration_scale")):
         tree[group][name].to_numpy()[...] = 10.0 ** (8.0 * tree[group][name].to_numpy() - 1.0)
-    figure = pb.plot_calibration(tree)
+    figure = pb.plots.plot_calibration(tree)
     axes = figure.axes[2]
     assert axes.get_xscale() == axes.get_yscale() == "log"
     figure.canvas.draw()
@@ -235,7 +235,7 @@ def test_positive_parameters_of_many_sizes_have_logarithmic_axes() -> None:
 
 @pytest.mark.thorough
 def test_dots_mark_where_the_curve_leaves_its_band(broken: xr.DataTree) -> None:
-    figure = pb.plot_calibration(broken)
+    figure = pb.plots.plot_calibration(broken)
     marked = [any(line.get_marker() == "o" for line in axes.lines) for axes in figure.axes[::3]]
     assert marked == [not part.passes for part in parts_of(broken).values()]
     assert np.sum(marked) == 2

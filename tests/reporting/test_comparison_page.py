@@ -104,6 +104,6 @@ def test_the_command_refuses_another_capture(tmp_path: Path, capsys) -> None:
 def test_a_picture_needs_numbers() -> None:
     empty = make_result(**SMALL)
     empty["posterior"] = empty["posterior"] * np.nan
-    compared = pb.compare_fits({"a": empty, "b": empty})
+    compared = pb.diagnostics.compare_fits({"a": empty, "b": empty})
     with pytest.raises(FitError, match="there is nothing to draw"):
-        pb.plot_comparison(compared)
+        pb.plots.plot_comparison(compared)

@@ -163,7 +163,7 @@ def test_a_pixel_that_is_called_good_without_numbers_is_not(name: str, number: f
     maps = make_maps(MEANS)
     assert map_tables.headline(map_tables.count_cases(maps))[0].startswith("Every pixel")
     maps[name][{"y": 2, "x": slice(3, 10)}] = number
-    assert pb.count_pixels(maps) == dict.fromkeys(pb.count_pixels(maps), 0) | {
+    assert pb.maps.count_pixels(maps) == dict.fromkeys(pb.maps.count_pixels(maps), 0) | {
         "good": 193,
         "not fitted": 7,
     }

@@ -34,7 +34,7 @@ def maps(rows: int = 20, columns: int = 30, wavelengths: tuple[float, ...] = ())
 
 @each("wavelengths", [(), (450.0, 650.0)])
 def test_every_parameter_has_its_mean_and_its_width(wavelengths: tuple[float, ...]) -> None:
-    figure = pb.plot_maps(maps(wavelengths=wavelengths))
+    figure = pb.plots.plot_maps(maps(wavelengths=wavelengths))
     assert clipped(figure) == []
     titles = [axes.get_title("left") for axes in figure.axes if axes.get_title("left")]
     assert sum(title == "95% width" for title in titles) == 4
@@ -47,7 +47,7 @@ def test_a_pixel_without_numbers_is_not_drawn_as_good() -> None:
     image = maps()
     image["status"][:] = 0
     image["status"][3, 4] = -1
-    panel = pb.plot_maps(image).axes
+    panel = pb.plots.plot_maps(image).axes
     status = next(axes for axes in panel if axes.get_title("left") == "status")
     drawn = np.asarray(status.images[0].get_array())
     assert set(zip(*np.nonzero(drawn), strict=True)) == {(0, 0), (3, 4)}  # the first has no mean
@@ -56,12 +56,12 @@ def test_a_pixel_without_numbers_is_not_drawn_as_good() -> None:
 
 @pytest.mark.thorough
 def test_a_large_image_is_drawn_smaller() -> None:
-    figure = pb.plot_maps(maps(1700, 10))
+    figure = pb.plots.plot_maps(maps(1700, 10))
     assert max(image.get_array().shape[0] for axes in figure.axes for image in axes.images) <= 800
 
 
 def test_what_cannot_be_drawn_is_refused() -> None:
     with pytest.raises(pb.FitError, match="it holds no maps"):
-        pb.plot_maps(xr.Dataset())
+        pb.plots.plot_maps(xr.Dataset())
     with pytest.raises(pb.FitError, match="no wavelength 500 nm; give one of 450, 650"):
-        pb.plot_maps(maps(wavelengths=(450.0, 650.0)), wavelength=500.0)
+        pb.plots.plot_maps(maps(wavelengths=(450.0, 650.0)), wavelength=500.0)

@@ -30,7 +30,7 @@ def with_law(scene=None, **settings):
     index = a + b / (posterior["wavelength"] / 1e3) ** 2
     posterior["refractive_index"] = index.transpose("chain", "draw", "wavelength")
     result["posterior"] = xr.DataTree(posterior)
-    parts = pb.Scene(surface=pb.SmoothSurface(), dispersion=pb.Cauchy())
+    parts = pb.Scene(surface=pb.SmoothSurface(), dispersion=pb.physics.Cauchy())
     return edit_provenance(
         result, scene="custom", scene_parts=repr(parts) if scene is None else scene
     )

@@ -19,24 +19,26 @@ import polar_bayes as pb
 from polar_bayes.reporting.report import report
 
 DRAWN = {
-    "plot_accuracy": lambda: pb.plot_accuracy(make_accuracy()),
-    "plot_calibration": lambda: pb.plot_calibration(make_calibration()),
-    "plot_comparison": lambda: pb.plot_comparison(compared()),
-    "plot_maps": lambda: pb.plot_maps(make_maps({"roughness": np.eye(4)})),
-    "plot_pairs": lambda: pb.plot_pairs(make_result(**SMALL)),
-    "plot_pit": lambda: pb.plot_pit(make_result(**SMALL)),
-    "plot_prior_posterior": lambda: pb.plot_prior_posterior(make_result(**SMALL)),
-    "plot_ranks": lambda: pb.plot_ranks(make_result(**SMALL)),
-    "plot_readings": lambda: pb.plot_readings(make_result(**SMALL), "dop"),
-    "plot_residuals": lambda: pb.plot_residuals(make_result(**SMALL), "dop"),
-    "plot_shrinkage": lambda: pb.plot_shrinkage(pooled(), "roughness"),
-    "plot_spectrum": lambda: pb.plot_spectrum(make_result(views=12, draws=150), "absorption"),
+    "plot_accuracy": lambda: pb.plots.plot_accuracy(make_accuracy()),
+    "plot_calibration": lambda: pb.plots.plot_calibration(make_calibration()),
+    "plot_comparison": lambda: pb.plots.plot_comparison(compared()),
+    "plot_maps": lambda: pb.plots.plot_maps(make_maps({"roughness": np.eye(4)})),
+    "plot_pairs": lambda: pb.plots.plot_pairs(make_result(**SMALL)),
+    "plot_pit": lambda: pb.plots.plot_pit(make_result(**SMALL)),
+    "plot_prior_posterior": lambda: pb.plots.plot_prior_posterior(make_result(**SMALL)),
+    "plot_ranks": lambda: pb.plots.plot_ranks(make_result(**SMALL)),
+    "plot_readings": lambda: pb.plots.plot_readings(make_result(**SMALL), "dop"),
+    "plot_residuals": lambda: pb.plots.plot_residuals(make_result(**SMALL), "dop"),
+    "plot_shrinkage": lambda: pb.plots.plot_shrinkage(pooled(), "roughness"),
+    "plot_spectrum": lambda: pb.plots.plot_spectrum(make_result(views=12, draws=150), "absorption"),
 }
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 
 
 def compared():
-    return pb.compare_fits({"a": make_result(**SMALL), "b": make_result(**SMALL, method="point")})
+    return pb.diagnostics.compare_fits(
+        {"a": make_result(**SMALL), "b": make_result(**SMALL, method="point")}
+    )
 
 
 def pooled():
@@ -92,7 +94,7 @@ def test_a_style_of_arviz_is_taken() -> None:
 def test_names_stay_text_in_every_style() -> None:
     result = make_result(**SMALL, materials=("$x_{", "b"))
     with matplotlib.rc_context({"text.parse_math": True}):
-        assert pb.plot_readings(result, "dop")._repr_png_()
+        assert pb.plots.plot_readings(result, "dop")._repr_png_()
 
 
 @pytest.mark.thorough

@@ -20,7 +20,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.subsurface import Unpolarized
 from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.setups import SETUPS
-from polar_bayes.simulate import NEUTRAL, NOISE, PRESETS, Protocol, simulate
+from polar_bayes.simulation import NEUTRAL, NOISE, PRESETS, Protocol, simulate
 
 PLATE = Scene(SmoothSurface(), Unpolarized(), StokesMixing())  # the quickest optics
 GRAY = Protocol(views=5, wavelengths=())

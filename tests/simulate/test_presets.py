@@ -6,7 +6,7 @@ from cases import each
 
 from polar_bayes.errors import CaptureError
 from polar_bayes.priors import PRIORS, RANGES
-from polar_bayes.simulate import PRESETS, REFERENCE_WAVELENGTHS, Material, find_preset
+from polar_bayes.simulation import PRESETS, REFERENCE_WAVELENGTHS, Material, find_preset
 
 EVERY_PRESET = each("name", PRESETS)
 

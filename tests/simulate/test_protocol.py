@@ -5,7 +5,7 @@ import pytest
 from cases import each
 
 from polar_bayes.errors import CaptureError
-from polar_bayes.simulate import Protocol
+from polar_bayes.simulation import Protocol
 
 
 def test_the_default_is_the_papers():

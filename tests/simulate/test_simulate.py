@@ -27,7 +27,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.subsurface import Unpolarized
 from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.setups import SETUPS
-from polar_bayes.simulate import NOISE, PRESETS, STATED_ERROR, Material, Protocol, simulate
+from polar_bayes.simulation import NOISE, PRESETS, STATED_ERROR, Material, Protocol, simulate
 
 PLATE = Scene(SmoothSurface(), Unpolarized(), StokesMixing())  # the quickest optics
 MANY = Protocol(views=3000, wavelengths=())

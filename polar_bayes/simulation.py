@@ -26,6 +26,13 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import RANGES
 from polar_bayes.setups import SETUPS, Setup, find_setup
 
+__all__ = [
+    "PRESETS",
+    "Material",
+    "Protocol",
+    "simulate",
+]
+
 REFERENCE_WAVELENGTHS = (450.0, 550.0, 650.0)
 
 
@@ -371,7 +378,7 @@ def simulate(
         >>> image = pb.simulate(
         ...     "glass",
         ...     scene=pb.Scene(pb.SmoothSurface()),
-        ...     protocol=pb.Protocol(views=5, wavelengths=()),
+        ...     protocol=pb.simulation.Protocol(views=5, wavelengths=()),
         ...     parameters={"refractive_index": index},
         ...     noise={"exposure": light},
         ... )

@@ -1,0 +1,12 @@
+from .compare import (
+    compare_fits as compare_fits,
+    FitComparison as FitComparison,
+    stack_readings as stack_readings,
+)
+from .convergence import (
+    json_summary as json_summary,
+    summary as summary,
+    verdict as verdict,
+)
+from .coverage import map_coverage as map_coverage
+from .population import population_summary as population_summary

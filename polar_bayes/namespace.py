@@ -1,0 +1,46 @@
+"""Names of a package, each loaded when it is first used, as the stub beside it declares them."""
+
+import contextlib
+import random
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import lazy_loader
+
+Attached = tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]
+
+
+def attach(package: str, file: str) -> Attached:
+    """`__getattr__`, `__dir__` and `__all__` of a package from its `__init__.pyi` (PEP 562)."""
+    load, listed, names = lazy_loader.attach_stub(package, file)
+
+    def load_guarded(name: str) -> Any:
+        force_numpyro_import()
+        with _callers_random_state():
+            return load(name)
+
+    return load_guarded, listed, names
+
+
+def force_numpyro_import() -> None:
+    """Load NumPyro where ArviZ, imported first, has left a lazy stand-in for it."""
+    # `import numpyro.infer` on a stand-in runs NumPyro twice, and its modules no longer find each
+    # other. Reading any attribute of the stand-in loads it once.
+    stand_in = sys.modules.get("numpyro")
+    if stand_in is not None:
+        stand_in.__path__  # noqa: B018
+
+
+@contextlib.contextmanager
+def _callers_random_state() -> Iterator[None]:
+    """Undo what JAX (`numpy.random`) and Rich (`random`) draw from global states when imported."""
+    numpy_random = sys.modules.get("numpy.random")  # not there: nobody has seeded it
+    state = random.getstate()
+    numpy_state = None if numpy_random is None else numpy_random.get_state(legacy=False)
+    try:
+        yield
+    finally:
+        random.setstate(state)
+        if numpy_random is not None:
+            numpy_random.set_state(numpy_state)

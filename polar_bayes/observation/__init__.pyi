@@ -1,0 +1,1 @@
+from . import links as links

@@ -1,0 +1,57 @@
+from . import instrument as instrument
+from .coat import (
+    AbstractCoat as AbstractCoat,
+    ClearCoat as ClearCoat,
+    CoatStack as CoatStack,
+    ThinFilm as ThinFilm,
+)
+from .discrepancy import Discrepancy as Discrepancy
+from .dispersion import (
+    AbstractDispersion as AbstractDispersion,
+    Cauchy as Cauchy,
+    Sellmeier as Sellmeier,
+)
+from .facets import FacetQuadrature as FacetQuadrature
+from .geometry import Geometry as Geometry
+from .illumination import (
+    AbstractIllumination as AbstractIllumination,
+    Disc as Disc,
+    PointSource as PointSource,
+    UniformSky as UniformSky,
+)
+from .microfacet import (
+    AbstractMicrofacet as AbstractMicrofacet,
+    AbstractShadowing as AbstractShadowing,
+    AbstractSlopes as AbstractSlopes,
+    AnisotropicSlopes as AnisotropicSlopes,
+    Beckmann as Beckmann,
+    GGX as GGX,
+    HeightCorrelatedShadowing as HeightCorrelatedShadowing,
+    IsotropicSlopes as IsotropicSlopes,
+    NoShadowing as NoShadowing,
+    SeparableShadowing as SeparableShadowing,
+)
+from .mixing import (
+    AbstractMixing as AbstractMixing,
+    DopMixing as DopMixing,
+    StokesMixing as StokesMixing,
+)
+from .part import Part as Part
+from .scene import Scene as Scene
+from .stokes import LinearPolarization as LinearPolarization
+from .subsurface import (
+    AbstractSubsurface as AbstractSubsurface,
+    Depolarizer as Depolarizer,
+    Lambertian as Lambertian,
+    TurbidMedium as TurbidMedium,
+    Unpolarized as Unpolarized,
+)
+from .surface import (
+    AbstractExit as AbstractExit,
+    AbstractSurface as AbstractSurface,
+    InternalReflection as InternalReflection,
+    RoughExit as RoughExit,
+    RoughSurface as RoughSurface,
+    SmoothExit as SmoothExit,
+    SmoothSurface as SmoothSurface,
+)
