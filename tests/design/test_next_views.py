@@ -48,17 +48,12 @@ def test_a_line_is_best_seen_from_its_ends() -> None:
         np.testing.assert_allclose(row["interval_width"], 3.92 * row["expected_sd"], rtol=1e-4)
 
 
-<<<<<<< HEAD
-@each("criterion", [pb.DOptimal(), pb.AOptimal(), pb.SingleParameter("level")], ids=repr)
-def test_no_other_choice_is_better(criterion: pb.DOptimal) -> None:
-=======
-@pytest.mark.parametrize(
+@each(
     "criterion",
     [pb.design.DOptimal(), pb.design.AOptimal(), pb.design.SingleParameter("level")],
     ids=repr,
 )
 def test_no_other_choice_is_better(criterion: pb.design.DOptimal) -> None:
->>>>>>> house
     """Against all choices of three of eight, where greedy steps with exchange find the best."""
     base, rows = np.linalg.inv(np.cov(rows_of(START).T) + np.eye(2)), rows_of(GRID)
     each = rows[:, :, None] * rows[:, None, :] / 0.3**2

@@ -161,14 +161,10 @@ def test_a_scene_without_effects_is_returned_as_it_is(plate: xr.Dataset) -> None
     assert "no effect" in ledger_sentence(choice.ledger)
 
 
-<<<<<<< HEAD
 @pytest.mark.thorough
-def test_the_ledger_belongs_to_its_scene_alone(chosen: pb.ChosenScene, full: pb.Scene) -> None:
-=======
 def test_the_ledger_belongs_to_its_scene_alone(
     chosen: pb.effects.ChosenScene, full: pb.Scene
 ) -> None:
->>>>>>> house
     assert dataclasses.replace(chosen, coat=pb.ClearCoat()).ledger is None
     assert full.ledger is None
     assert repr(chosen).startswith("Scene(")
@@ -177,12 +173,8 @@ def test_the_ledger_belongs_to_its_scene_alone(
     assert again == chosen
 
 
-<<<<<<< HEAD
 @pytest.mark.thorough
-def test_the_ledger_can_be_saved(chosen: pb.ChosenScene, tmp_path) -> None:
-=======
 def test_the_ledger_can_be_saved(chosen: pb.effects.ChosenScene, tmp_path) -> None:
->>>>>>> house
     chosen.ledger.to_netcdf(tmp_path / "ledger.nc")
     with xr.open_dataset(tmp_path / "ledger.nc") as opened:
         assert opened.load().identical(chosen.ledger)
@@ -202,12 +194,8 @@ def test_a_fit_keeps_the_ledger(
     xr.testing.assert_equal(plain["posterior"].to_dataset(), result["posterior"].to_dataset())
 
 
-<<<<<<< HEAD
 @pytest.mark.thorough
-def test_the_report_shows_the_ledger(chosen: pb.ChosenScene) -> None:
-=======
 def test_the_report_shows_the_ledger(chosen: pb.effects.ChosenScene) -> None:
->>>>>>> house
     result = make_result(wavelengths=(), views=12, draws=100, variables=("dop",))
     assert 'id="effects"' not in render(result)
     result["effects"] = xr.DataTree(chosen.ledger)

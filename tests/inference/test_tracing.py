@@ -217,12 +217,8 @@ def test_a_program_that_the_memory_cannot_hold_is_refused_and_not_run(
     assert JitOnce(lambda x: x + 1.0)(jnp.ones(3))[0] == 2.0
 
 
-<<<<<<< HEAD
 @pytest.mark.thorough
-@each("method", ["point", "laplace", pb.Importance()])
-=======
-@pytest.mark.parametrize("method", ["point", "laplace", pb.methods.Importance()])
->>>>>>> house
+@each("method", ["point", "laplace", pb.methods.Importance()])
 def test_a_fit_is_refused_in_one_line_where_memory_is_short(
     method: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
