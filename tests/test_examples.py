@@ -39,6 +39,7 @@ DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [README, ROOT / "CONTRIBUTING.md", *DOCS]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"`([^`\n]+)`")
+RUN = ("README.md", "quickstart.md", "extending.md")
 TINY = pb.methods.Laplace(
     chains=2, draws=50
 )  # the sampler itself runs where a page states settings
@@ -117,9 +118,13 @@ def settings_of_jax() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("settings_of_jax")
-@each(
+@pytest.mark.parametrize(
     "page",
-    [page for page in PAGES if any(blocks(page, "python"))],
+    [
+        page if page.name in RUN else pytest.param(page, marks=pytest.mark.thorough)
+        for page in PAGES
+        if any(blocks(page, "python"))
+    ],
     ids=lambda page: page.name,
 )
 def test_the_python_of_a_page_runs(

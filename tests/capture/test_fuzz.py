@@ -27,6 +27,11 @@ from polar_bayes.importers.detector import read_array, read_frame
 from polar_bayes.importers.goniometer import from_goniometer
 
 
+def sample(count):
+    """Seeds, of which the first one is always run."""
+    return [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in range(1, count))]
+
+
 def outcome(function, *arguments, **options):
     """What comes out of a door: None after a refusal in one line, anything else is returned."""
     try:
@@ -40,7 +45,7 @@ def outcome(function, *arguments, **options):
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate dimension names", "ignore:.*rename", "ignore:.*cast")
-@each("seed", range(8))
+@pytest.mark.parametrize("seed", sample(8))
 def test_a_damaged_capture_is_refused_or_inside_the_contract(make_capture, tmp_path, seed):
     random = np.random.default_rng([1, seed])
     passed = 0
@@ -63,7 +68,7 @@ def test_a_damaged_capture_is_refused_or_inside_the_contract(make_capture, tmp_p
 # --- damaged tables ---------------------------------------------------------------------------
 
 
-@each("seed", range(4))
+@pytest.mark.parametrize("seed", sample(4))
 def test_a_damaged_table_is_refused_or_all_numbers(tmp_path, seed):
     random = np.random.default_rng([2, seed])
     path = tmp_path / "table.txt"
