@@ -52,6 +52,7 @@ def test_the_ladder_holds_every_method_that_is_tested_here():
     }
 
 
+@pytest.mark.thorough
 @each("name", [name for name in SMALL if name not in WITHOUT_PRIOR])
 def test_a_normal_posterior_is_found_by_every_rung(name):
     here = problem(line)
