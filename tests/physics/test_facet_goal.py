@@ -75,6 +75,7 @@ def test_the_default_holds_for_smoother_and_rougher_surfaces(
     assert largest_error(distribution, FacetQuadrature(), integral, BEYOND) < bound
 
 
+@pytest.mark.thorough
 @of_both
 def test_the_truth_is_the_renderers(
     uniform_sky: np.ndarray, distribution: AbstractMicrofacet

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import Array
@@ -314,7 +313,9 @@ def test_materials_broadcast_against_views() -> None:
     np.testing.assert_allclose(few, many, rtol=1e-12)
 
 
-@each("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize(
+    "dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.thorough)]
+)
 def test_value_gradient_and_hessian_are_finite(dtype: type) -> None:
     """At both ends of every input, together; a Hessian times a vector hides nothing.
 

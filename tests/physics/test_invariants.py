@@ -323,6 +323,7 @@ def test_a_smooth_surface_under_a_sky_obeys_fresnel(
     np.testing.assert_allclose(found, mirror, rtol=bound, atol=bound * 1e-2)
 
 
+@pytest.mark.thorough
 @each("name", list(SCENES)[1:3])
 @given(values=parameters, direction=directions)
 @settings(parent=RUN, max_examples=20)

@@ -193,6 +193,7 @@ def test_nothing_jumps_where_viewer_and_light_coincide(v: float) -> None:
         np.testing.assert_allclose(near, here, atol=1e-8)
 
 
+@pytest.mark.thorough
 @each("view", [(0.0, 20.0), (40.0, 20.0), (85.0, 20.0), (40.0, 200.0)], ids=str)
 @each("dtype", [np.float64, np.float32])
 def test_derivatives_exist_where_viewer_and_light_coincide(view: tuple, dtype: type) -> None:

@@ -86,6 +86,7 @@ def test_named_scenes_read_these_parameters() -> None:
     )
 
 
+@pytest.mark.thorough
 @each("name", SCENES)
 def test_leading_axes_of_parameters_and_geometry_broadcast(name: str) -> None:
     """Patches by wavelengths, each with its own parameters, seen in the same views."""
@@ -113,6 +114,7 @@ def test_turning_everything_around_the_normal_changes_nothing(name: str) -> None
         np.testing.assert_allclose(here[reading], there[reading], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.thorough
 @each("name", SCENES)
 def test_single_precision_stays_single_and_agrees(name: str) -> None:
     single = jax.tree.map(lambda angle: angle.astype(jnp.float32), VIEWS)
@@ -328,6 +330,7 @@ def test_an_analyzer_of_each_view_is_read_in_its_order() -> None:
     np.testing.assert_allclose(found["intensity"], share * plain["intensity"], rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_an_extended_source_needs_no_direction_of_the_light() -> None:
     moved = VIEWS._replace(light_zenith=VIEWS.light_zenith + 20.0, light_azimuth=VIEWS.view_azimuth)
     for source in (UniformSky(), Disc(10.0)):

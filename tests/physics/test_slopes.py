@@ -85,6 +85,7 @@ def test_equal_roughnesses_are_isotropic(source: object, name: str) -> None:
     np.testing.assert_allclose(both, one, rtol=1e-11, atol=1e-15)
 
 
+@pytest.mark.thorough
 @SOURCES
 def test_turning_sample_viewer_and_light_together_changes_nothing(source: object) -> None:
     still = stokes_of(scene(source, ALONG), material(0.4, 0.15, 25.0), seen())

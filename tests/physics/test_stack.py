@@ -70,6 +70,7 @@ THICK = {
 }
 
 
+@pytest.mark.thorough
 @each("theta", [0.0, 35.0, 60.0, 84.0])
 @each("name", THICK)
 def test_thick_layers_agree_with_every_bounce_followed(name: str, theta: float) -> None:

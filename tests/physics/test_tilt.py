@@ -122,6 +122,7 @@ def components(degree: float, angle: float) -> tuple[float, float]:
     return degree * np.cos(np.deg2rad(2 * angle)), degree * np.sin(np.deg2rad(2 * angle))
 
 
+@pytest.mark.thorough
 @EVERY_SCENE
 @given(view=direction, light=direction, tilts=tilt)
 @RUN
@@ -344,6 +345,7 @@ def test_the_tilts_are_of_the_material() -> None:
     assert {"normal_tilt_x", "normal_tilt_y"} <= set(scene.optical_parameters)
 
 
+@pytest.mark.thorough
 def test_every_patch_leans_by_itself() -> None:
     scene = leaning(SCENES["camera"])
     views = Geometry.from_degrees(

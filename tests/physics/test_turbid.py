@@ -126,6 +126,7 @@ def test_a_sky_agrees_with_a_renderer() -> None:
         assert np.all(np.abs(total - rows[:, [4, 5, 6]]) < 4.0 * rows[:, [8, 9, 10]])
 
 
+@pytest.mark.thorough
 def test_two_crossed_beams_are_an_unpolarized_one() -> None:
     pair = [
         stokes_of(
