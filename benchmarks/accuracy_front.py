@@ -1,7 +1,7 @@
 """Error against time of every method, for six captures from easy to hard.
 
     python benchmarks/accuracy_front.py --keep FOLDER            all six; takes hours
-    python benchmarks/accuracy_front.py --keep FOLDER --quick    rungs alone, no dials
+    python benchmarks/accuracy_front.py --keep FOLDER --quick    methods alone, no overrides
     python benchmarks/accuracy_front.py --keep FOLDER --only 1   the first alone
 
 Every trial runs in a process of its own, so nothing else should run beside. A finished scene is
@@ -22,7 +22,7 @@ from accuracy_scenes import CASES, Case
 from matplotlib.figure import Figure
 
 import polar_bayes as pb
-from polar_bayes.benchmark.advice import accuracy_of, advised
+from polar_bayes.benchmark.advice import accuracy_dataset, best_method
 from polar_bayes.reporting.accuracy import front_panel
 from polar_bayes.reporting.style import styled
 
@@ -37,7 +37,7 @@ def study(name: str, case: Case, number: int, keep: Path, quick: bool) -> xr.Dat
     """The study of one scene, measured now or kept."""
     file = keep / f"{number}{'-quick' if quick else ''}.nc"
     if not file.exists():
-        asked = {"dials": ()} if quick else {}
+        asked = {"overrides": ()} if quick else {}
         found = pb.accuracy(
             case.capture(seed=1),
             scene=case.scene,
@@ -50,23 +50,23 @@ def study(name: str, case: Case, number: int, keep: Path, quick: bool) -> xr.Dat
 
 
 def tried(case: Case, found: xr.DataTree, number: int, keep: Path) -> tuple[str, float]:
-    """The advised method on a capture that the advice has not seen, and its error there."""
-    rung = advised(found, TOLERANCE)
-    if rung is None:
+    """The best_method method on a capture that the advice has not seen, and its error there."""
+    method = best_method(found, TOLERANCE)
+    if method is None:
         return "none", np.nan
-    file = keep / f"{number}-tried-{rung.replace(' ', '-')}.nc"
+    file = keep / f"{number}-tried-{method.replace(' ', '-')}.nc"
     if not file.exists():
         again = pb.accuracy(
             case.capture(seed=2),
             scene=case.scene,
             links=case.links,
-            rungs={rung: pb.methods.LADDER[rung]},
-            dials=(),
+            methods={method: pb.methods.LADDER[method]},
+            overrides=(),
             fresh=False,
             seed=1,
         )
         pb.save_result(again, file)
-    return rung, float(
+    return method, float(
         pb.benchmark.accuracy_table(pb.benchmark.load_accuracy(file))["error"].iloc[0]
     )
 
@@ -79,14 +79,14 @@ def draw(studies: dict[str, xr.DataTree]) -> Figure:
     figure = Figure(figsize=(5.2 * columns, 3.7 * rows), layout="constrained")
     for at, (name, found) in enumerate(studies.items()):
         axes = figure.add_subplot(rows, columns, at + 1)
-        front_panel(axes, accuracy_of(found), "seconds_first")
+        front_panel(axes, accuracy_dataset(found), "seconds_first")
         axes.set_title(name, loc="left")
         axes.set_ylabel("largest error [posterior sd]" if at % columns == 0 else "")
     return figure
 
 
 def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]]) -> str:
-    """Errors and times of the rungs, and the advice, in Markdown."""
+    """Errors and times of the methods, and the advice, in Markdown."""
     lines = [f"Measured on {platform.machine()}, {os.cpu_count()} cores.", ""]
     lines += [
         "| scene | " + " | ".join(pb.methods.LADDER) + " | reference |",
@@ -94,21 +94,23 @@ def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]])
     ]
     for name, found in studies.items():
         rows = pb.benchmark.accuracy_table(found)
-        noise = float(accuracy_of(found).attrs["reference_error"])
-        cells = [_cell(rows, rung) for rung in pb.methods.LADDER]
+        noise = float(accuracy_dataset(found).attrs["reference_error"])
+        cells = [_cell(rows, method) for method in pb.methods.LADDER]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {noise:.2g} |")
-    lines += ["", "| scene | advice | the advised method on another capture |", "|---|---|---|"]
+    lines += ["", "| scene | advice | the best_method method on another capture |", "|---|---|---|"]
     for name, found in studies.items():
-        rung, error = trials[name]
-        seen = "" if np.isnan(error) else f"{rung}: {error:.2g} sd"
-        lines.append(f"| {name} | {pb.benchmark.accuracy_advice(found, TOLERANCE)} | {seen} |")
+        method, error = trials[name]
+        seen = "" if np.isnan(error) else f"{method}: {error:.2g} sd"
+        lines.append(
+            f"| {name} | {' '.join(pb.benchmark.accuracy_sentences(found, TOLERANCE))} | {seen} |"
+        )
     return "\n".join(lines)
 
 
-def _cell(rows, rung: str) -> str:
-    if rung not in rows.index or np.isnan(rows.loc[rung, "error"]):
+def _cell(rows, method: str) -> str:
+    if method not in rows.index or np.isnan(rows.loc[method, "error"]):
         return "none"
-    row = rows.loc[rung]
+    row = rows.loc[method]
     return f"{row['error']:.2g} ({row['seconds_first']:.0f}, {row['seconds_again']:.2g} s)"
 
 

@@ -54,9 +54,9 @@ def _judged(problem: Problem, auto: pb.methods.Auto) -> dict[str, Any]:
     told = answer(auto, problem)
     seconds = time.perf_counter() - begin
     other = dataclasses.replace(problem, key=jax.random.fold_in(problem.key, 9))
-    judge = run_reference(REFERENCE, other)
+    reference_run = run_reference(REFERENCE, other)
     _, draws = labeled(problem.program, told.z, problem.data)
-    flat, reference = (x.reshape(len(x), -1) for x in (draws, judge.draws))
+    flat, reference = (x.reshape(len(x), -1) for x in (draws, reference_run.draws))
     apart = distances(flat, reference)
     error = float(np.max(np.abs([apart.mean_error, apart.sd_error])))
     return {
@@ -65,8 +65,8 @@ def _judged(problem: Problem, auto: pb.methods.Auto) -> dict[str, Any]:
         "chosen": told.said["auto"]["chosen"],
         "said_met": told.said["auto"]["met"],
         "expected": told.said["auto"]["expected_error"],
-        "reference_error": judge.error,
-        "reference_doubts": list(judge.doubts),
+        "reference_error": reference_run.error,
+        "reference_doubts": list(reference_run.doubts),
     }
 
 

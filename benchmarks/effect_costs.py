@@ -85,15 +85,15 @@ def gradients(scenes: list[pb.Scene], data: xr.Dataset) -> list[Cost]:
 
 def plain_with(scene: pb.Scene, effect: Effect | None) -> pb.Scene:
     """The scene with all its effects off but one."""
-    off = {other.place: other for other in effects_of(scene)}
+    off = {other.key_path: other for other in effects_of(scene)}
     if effect is not None:
-        del off[effect.place]
+        del off[effect.key_path]
     return simplify(scene, off.values())
 
 
 def table(scene: pb.Scene, data: xr.Dataset) -> list[str]:
     """A row for the plain scene and one for each effect switched on."""
-    effects = list({effect.place: effect for effect in effects_of(scene)}.values())
+    effects = list({effect.key_path: effect for effect in effects_of(scene)}.values())
     costs = gradients([plain_with(scene, effect) for effect in (None, *effects)], data)
     plain = costs[0]
     lines = []

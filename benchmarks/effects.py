@@ -142,7 +142,7 @@ def run(name: str) -> None:
         fit(data, case.scene),
         fit(data, plain),
     )
-    print(f"\n### {name}\n\n```text\n{ledger_table(chosen.ledger)}\n```\n")
+    print(f"\n### {name}\n\n```text\n{ledger_table(chosen.ledger).to_string()}\n```\n")
     print("| parameter | shift [sd] | error of it | sd ratio |\n|---|---|---|---|")
     for label in full.index.intersection(less.index, sort=False):
         one, other = full.loc[label], less.loc[label]

@@ -289,7 +289,7 @@ def options(folder: Path) -> Case:
         "calibrate": ["--out", "--method", "--simulations", "--resume"],
         "effects": ["--keep", "--tolerance", "--scene"],
         "identify": ["--profile", "--next-views", "--criterion"],
-        "accuracy": ["--rung", "--out", "--tolerance"],
+        "accuracy": ["--method", "--out", "--tolerance"],
         "compare": ["--out"],
     }
 

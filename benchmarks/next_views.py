@@ -26,9 +26,14 @@ from one_material import SCENE
 
 import polar_bayes as pb
 from polar_bayes.calibration.simulations import draw_captures
-from polar_bayes.design.candidates import Chosen, choose
-from polar_bayes.design.fisher import information_of_each, prior_precision, sound_precision
-from polar_bayes.design.setup import flat_parameters, unconstrain
+from polar_bayes.design.fisher import (
+    information_by_view,
+    positive_definite,
+    prior_precision,
+    reading_information,
+)
+from polar_bayes.design.optimal_design import Selection, fedorov_exchange
+from polar_bayes.design.setup import parameter_vector, unconstrain
 from polar_bayes.inference.batch_fit import PixelLaplace, fit_stack
 from polar_bayes.inference.batch_programs import BatchEngine, EngineSpec, key_of, make_engine
 from polar_bayes.inference.batching import Stack
@@ -107,22 +112,23 @@ class Designer:
         self.prior = from_prior(program, jax.random.key(9), 500, data)
 
         def told(z: Any) -> Any:
-            slopes = jax.jacfwd(lambda z: flat_parameters(program, z, data))(z)
-            return information_of_each(program, z, data, 1)["dop"], slopes
+            readings = reading_information(program, z, data)
+            slopes = jax.jacfwd(lambda z: parameter_vector(program, z, data))(z)
+            return information_by_view(readings, data.shape[-1:])["dop"], slopes
 
         names = sorted(program.parameters(jnp.asarray(self.prior[0]), data))
         self.rows = [names.index(name) for name in NAMES]
         self.told = jax.jit(lambda z: jax.lax.map(told, z))
         self.curvature = jax.jit(lambda z: prior_precision(program, z, data))
-        values = jax.vmap(lambda z: flat_parameters(program, z, data))(self.prior)
+        values = jax.vmap(lambda z: parameter_vector(program, z, data))(self.prior)
         self.unit = np.asarray(values).std(axis=0)[self.rows]
 
-    def choose(self, z: np.ndarray, criterion: Any) -> tuple[Chosen, np.ndarray]:
+    def choose(self, z: np.ndarray, criterion: Any) -> tuple[Selection, np.ndarray]:
         """The views, and the sds that they promise."""
         each, slopes = (np.asarray(x) for x in self.told(jnp.asarray(z)))
         slopes = slopes[:, None, self.rows]
         center = np.asarray(self.curvature(jnp.asarray(np.median(z, axis=0))))
-        base = each[:, : self.measured].sum(axis=1) + sound_precision(center, self.prior)
+        base = each[:, : self.measured].sum(axis=1) + positive_definite(center, self.prior)
         new = each[:, self.measured :]
 
         def variances(information: np.ndarray) -> np.ndarray:
@@ -133,7 +139,7 @@ class Designer:
             return np.mean(criterion.loss(covariance, NAMES), axis=0)
 
         alone = np.eye(new.shape[1], dtype=bool)
-        chosen = choose(loss, base, new, np.ones(len(alone), bool), alone, ADDED)
+        chosen = fedorov_exchange(loss, base, new, np.ones(len(alone), bool), alone, ADDED)
         after = variances((base + new[:, chosen.picks].sum(axis=1))[:, None])[:, 0]
         return chosen, np.sqrt(np.diagonal(after, axis1=-2, axis2=-1).mean(axis=0))
 

@@ -30,7 +30,7 @@ from paper_study import (
 )
 
 import polar_bayes as pb
-from polar_bayes.design.fisher import expected_information, paper_information
+from polar_bayes.design.fisher import paper_information, reading_information, total_information
 from polar_bayes.design.setup import unconstrain
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import resolve
@@ -144,7 +144,8 @@ def _at(program: Program, z: Array, data: Observations) -> tuple[Array, Array, A
     data = dataclasses.replace(data, brightness=jnp.clip(seen, 0.0, 1.0))
     slopes = jax.jacfwd(program.constrain)(z)
     flat = jnp.sum(jnp.stack([slopes[name] for name in program.supports]), axis=0)
-    return paper_information(program, z, data)[0], expected_information(program, z, data), flat
+    readings = reading_information(program, z, data)
+    return paper_information(readings, program.size)[0], total_information(readings), flat
 
 
 def table2(study: Study) -> None:

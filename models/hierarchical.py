@@ -116,18 +116,7 @@ class CutScale(AbstractScale):
 
 
 def natural_scale(name: str, location: dist.Distribution) -> AbstractScale:
-    """The scale of a parameter, by its physical range.
-
-    Args:
-        name: The parameter.
-        location: The prior of its population's location; its bounds cut an index.
-
-    Returns:
-        The scale.
-
-    Raises:
-        Nothing.
-    """
+    """The scale of a parameter, by its physical range."""
     limits = RANGES.get(name, (-math.inf, math.inf))
     if limits == (0.0, math.inf):
         return LogScale()
@@ -149,18 +138,6 @@ def draw_pooled(
     $$ g(x_m) \sim Normal(g(\text{location}), \text{spread}) $$
 
     Over wavelengths, each has its own location; they share the spread.
-
-    Args:
-        name: The parameter.
-        data: The capture; its leading axes are what is pooled over.
-        priors: Priors of `<name>_location` and `<name>_spread`.
-        without: Axes over which the parameter does not change.
-
-    Returns:
-        The parameter, (patch[, wavelength]), in its own unit.
-
-    Raises:
-        FitError: A prior is missing.
 
     Source:
         The paper, section 2 (hierarchical extension).

@@ -21,14 +21,7 @@ def per_material(
     priors: Mapping[str, dist.Distribution],
     links: Mapping[str, AbstractLink],
 ) -> None:
-    """Declare the story of one capture.
-
-    Args:
-        data: The capture as arrays; a leading axis (material, patch) repeats the material.
-        scene: The optics; it says which parameters it reads.
-        priors: A distribution for every parameter of the scene and the links.
-        links: For each recorded variable, how it scatters.
-    """
+    """Declare the story of one capture."""
     parameters = {name: draw_own(name, data, priors) for name in material_parameters(scene)}
 
     declare_readings(parameters, data, scene, priors, links)

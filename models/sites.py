@@ -145,15 +145,7 @@ def declare_readings(
     priors: Mapping[str, dist.Distribution],
     links: Mapping[str, AbstractLink],
 ) -> None:
-    """Declare the instrument, the noise, and how the readings scatter around eq. 1.
-
-    Args:
-        parameters: The material's parameters by name, each (...[, wavelength]).
-        data: The capture as arrays.
-        scene: The optics; what it reads beyond `parameters` is sampled here.
-        priors: A distribution for every parameter.
-        links: For each recorded variable, how it scatters.
-    """
+    """Declare the instrument, the noise, and how the readings scatter around eq. 1."""
     # The instrument and the noise: one value for the whole capture, shared by all its patches.
     instrument = {
         name: numpyro.sample(name, priors[name])

@@ -123,9 +123,6 @@ class SpectralProcess(HTMLRepr):
 
         Returns:
             f. (..., wavelength), 1.
-
-        Raises:
-            Nothing.
         """
         return weights @ self._across(length, places, wavelength)
 
@@ -146,9 +143,6 @@ class SpectralProcess(HTMLRepr):
             A factor that standard normal numbers turn into what `values` lacks. (wavelength,
             wavelength), 1; near zero at a knot, the kernel's own far away from all. Give double
             precision: single has no digits left for it.
-
-        Raises:
-            Nothing.
         """
         across = self._across(length, places, wavelength)
         prior = self._matrix(length, wavelength, wavelength)
@@ -210,19 +204,6 @@ def around(
     them (of a, the geometric mean), which readings determine; one wavelength alone is its level.
     T is `Bent`: it bends what comes near the ends of the range of the index. It does not depend on
     the amplitude, which would tie the two together.
-
-    Args:
-        name: refractive_index or absorption.
-        level: l. (..., 1) or (), unit of the parameter.
-        amplitude: A; of the index in its unit, of the absorption in units of log a. ().
-        departure: f less its mean over the measured wavelengths. (..., wavelength).
-        bounds: The range of the index.
-
-    Returns:
-        The spectrum. (..., wavelength).
-
-    Raises:
-        Nothing.
     """
     if name == "absorption":
         return level * jnp.exp(amplitude * departure)
@@ -239,16 +220,6 @@ def widening_of(name: str, scales: Float[Array, " knots"]) -> Float[Array, " kno
     they do not, it is the standard normal weight. So neither case has a funnel. The last weight is
     the mean of f, which no reading knows apart from the level. The posterior does not depend on
     $\sigma$.
-
-    Args:
-        name: refractive_index or absorption.
-        scales: s, amplitude included. (knots,).
-
-    Returns:
-        (knots,), 1, at least 1.
-
-    Raises:
-        Nothing.
 
     Source:
         Papaspiliopoulos, Roberts and Skold 2007, A general framework for the parametrization of

@@ -39,9 +39,8 @@ capture = xr.Dataset(
 # %% [markdown]
 # ## The study
 #
-# Five rungs of the ladder, none of its dials, all in this process. (`fresh=True`, the default,
-# gives each its own process and measures memory and the time of a first fit, compilation included;
-# that takes minutes.)
+# Five methods, no overrides, all in this process. (`fresh=True`, the default, gives each its own
+# process and measures memory and the time of a first fit, compilation included, in minutes.)
 
 # %%
 names = ("point", "laplace", "importance", "nuts short", "nuts")
@@ -49,8 +48,8 @@ study = pb.accuracy(
     capture,
     scene=plate,
     links=links,
-    rungs={name: pb.methods.LADDER[name] for name in names},
-    dials=(),
+    methods={name: pb.methods.LADDER[name] for name in names},
+    overrides=(),
     fresh=False,
     reference=pb.benchmark.Reference(error=0.03),
 )
@@ -74,7 +73,7 @@ pb.plots.plot_accuracy(study)
 # The same as a sentence:
 
 # %%
-print(pb.benchmark.accuracy_advice(study))
+print("\n".join(pb.benchmark.accuracy_sentences(study)))
 
 # %% [markdown]
 # That is said of this capture. With more readings a posterior comes closer to a normal
@@ -83,7 +82,7 @@ print(pb.benchmark.accuracy_advice(study))
 #
 # ## Let it choose
 #
-# `method="auto"` needs no reference. It climbs the ladder and takes the first rung whose own
+# `method="auto"` needs no reference. It climbs the ladder and takes the first method whose own
 # diagnostics say that it is good enough: here within a quarter of a posterior standard deviation.
 
 # %%

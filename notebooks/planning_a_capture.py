@@ -67,14 +67,18 @@ others.transpose("value", ...).to_pandas().round(3)
 #
 # ## Where to look next
 #
-# Say what the rig can do, and what is to be learned. Here the arm reaches 80 degrees, two views are
-# at least 5 degrees apart, viewer and light hide each other within 8 degrees, and the question is
-# the refractive index.
+# State what the set-up can do, and what is to be learned. Here the arm reaches 80 degrees, two
+# views are at least 5 degrees apart, viewer and light hide each other within 8 degrees, and the
+# question is the refractive index.
 
 # %%
-rig = pb.design.Rig(view_zenith=(0.0, 80.0), minimum_separation=5.0, from_light=8.0)
+constraints = pb.design.Constraints(view_zenith=(0.0, 80.0), minimum_separation=5.0, from_light=8.0)
 views = pb.next_views(
-    capture, count=3, rig=rig, criterion=pb.design.SingleParameter("refractive_index"), scene=scene
+    capture,
+    count=3,
+    constraints=constraints,
+    criterion=pb.design.SingleParameter("refractive_index"),
+    scene=scene,
 )
 print(*pb.design.next_views_sentences(views), sep="\n")
 pb.design.next_views_table(views)

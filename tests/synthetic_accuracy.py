@@ -14,7 +14,7 @@ ROWS = {
     ("nuts", "as given"): ([0.03, 0.05, 0.02], 18.0, 6.0),
     ("nuts long", "as given"): ([0.01, 0.02, 0.01], 60.0, 40.0),
 }
-"""By rung and dial: errors of the means, and seconds of the first fit and the next."""
+"""By method and override: errors of the means, and seconds of the first fit and the next."""
 
 
 def make_accuracy(
@@ -54,8 +54,8 @@ def make_accuracy(
             "reference_wasserstein": ("parameter", [0.02, 0.02, 0.02]),
         },
         coords={
-            "rung": ("row", np.array([rung for rung, _ in rows], object)),
-            "dial": ("row", np.array([dial for _, dial in rows], object)),
+            "method": ("row", np.array([method for method, _ in rows], object)),
+            "override": ("row", np.array([override for _, override in rows], object)),
             "parameter": np.array(PARAMETERS, object),
         },
         attrs={

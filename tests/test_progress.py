@@ -49,7 +49,7 @@ def notebook(monkeypatch) -> list[dict[str, str]]:
     ipython = types.SimpleNamespace(get_ipython=lambda: shell)
     monkeypatch.setitem(sys.modules, "IPython", ipython)
     monkeypatch.setitem(sys.modules, "IPython.display", types.SimpleNamespace(display=display))
-    monkeypatch.setattr(progress, "PAUSE", 0.0)
+    monkeypatch.setattr(progress, "REFRESH_SECONDS", 0.0)
     return seen
 
 
@@ -87,18 +87,19 @@ def test_an_interrupt_gives_the_cursor_of_a_terminal_back(monkeypatch) -> None:
 
 def test_a_notebook_shows_bars_and_keeps_none(notebook) -> None:
     two_steps()
-    assert [picture["text/plain"] for picture in notebook] == [
-        "climbing: 50%",
-        "climbing: 100%",
-        "",
-    ]
-    assert '<progress value="0.5000"' in notebook[0]["text/html"]
+    first, half, full, last = notebook
+    for picture, share in ((first, "0%"), (half, "50%"), (full, "100%")):
+        assert "climbing" in picture["text/plain"]
+        assert share in picture["text/plain"]
+        assert share in picture["text/html"]
+    assert last["text/plain"] == ""
     assert notebook[-1]["text/html"] == ""
 
 
 def test_a_counting_bar_names_what_it_counts(notebook) -> None:
     two_pixels()
-    assert notebook[0]["text/plain"] == "pixels: 1 of 2"
+    assert "pixels" in notebook[1]["text/plain"]
+    assert "1/2" in notebook[1]["text/plain"]
 
 
 @pytest.mark.thorough
@@ -112,9 +113,9 @@ def test_what_a_run_calls_adds_no_bars_of_its_own(notebook) -> None:
     with counts("fits") as show:
         two_steps()
         show(1, 2)
-    assert [picture["text/plain"] for picture in notebook] == ["fits: 1 of 2", ""]
+    assert not any("climbing" in picture["text/plain"] for picture in notebook)
     two_steps()
-    assert len(notebook) == 5
+    assert any("climbing" in picture["text/plain"] for picture in notebook)
 
 
 @pytest.mark.thorough
@@ -128,7 +129,7 @@ def test_bars_go_where_a_run_breaks_off(notebook) -> None:
         breaks()
     assert notebook[-1]["text/plain"] == ""
     two_steps()  # and the next run has its own again
-    assert notebook[-2]["text/plain"] == "climbing: 100%"
+    assert "100%" in notebook[-2]["text/plain"]
 
 
 def test_a_progress_of_ones_own_is_called_instead(notebook) -> None:

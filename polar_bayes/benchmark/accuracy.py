@@ -1,22 +1,27 @@
-"""The public verb: what each method and setting gets wrong for one capture, and what it costs."""
+"""Accuracy study: errors of methods and settings for one capture, and what they cost."""
 
 import dataclasses
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
 
-from polar_bayes.benchmark.reference import Distances, Judge, Reference, distances, run_reference
+from polar_bayes.benchmark.reference import (
+    Distances,
+    Reference,
+    ReferenceRun,
+    distances,
+    run_reference,
+)
 from polar_bayes.benchmark.run import (
-    DIALS,
-    AbstractDial,
-    Measured,
+    OVERRIDES,
+    AbstractOverride,
     Trial,
     problem_of,
     run_fresh,
@@ -32,8 +37,13 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
 
 AS_GIVEN = "as given"
-FOLD = 7
-"""Folded into the key of the reference."""
+REFERENCE_FOLD = 7
+"""Folded into the key of the reference, which shares no random number with a trial."""
+
+DIAGNOSTICS = ("r_hat", "k_hat", "effective_draws", "gradients", "densities")
+COSTS = ("seconds_again",)
+COSTS_OF_PROCESS = ("seconds_first", "peak_memory", "memory_before")
+"""Costs that are known only where a trial has a process of its own."""
 
 DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
     "mean_error": ("posterior mean minus that of the reference, in its sds", "1"),
@@ -43,14 +53,14 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
     "wasserstein": ("Wasserstein distance from the reference, in its sds", "1"),
     "r_hat": ("largest R-hat of all coordinates", "1"),
     "k_hat": ("Pareto k-hat of the importance weights", "1"),
-    "effective_draws": ("independent draws that the draws are worth", "1"),
+    "effective_draws": ("effective number of independent draws", "1"),
     "gradients": ("evaluations of the log density with its gradient", "1"),
     "densities": ("evaluations of the log density alone", "1"),
     "seconds_first": ("time to the parameters of all draws in a fresh process", "s"),
     "seconds_again": ("time of the next fit of the same layout", "s"),
     "peak_memory": ("most memory that the process held", "MiB"),
     "memory_before": ("memory that the process held after its imports", "MiB"),
-    "problems": ("what the method itself objects to; or why it has no answer", "1"),
+    "problems": ("problems that the method reports, or the error that it ended with", "1"),
     "reference_mean": ("posterior mean of the reference", ""),
     "reference_sd": ("posterior sd of the reference", ""),
     "reference_mean_error": ("its Monte Carlo standard error, in its sds", "1"),
@@ -63,8 +73,8 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
 def accuracy(
     capture: xr.Dataset,
     *,
-    rungs: Mapping[str, Method] | None = None,
-    dials: Iterable[AbstractDial] = DIALS,
+    methods: Mapping[str, Method] | None = None,
+    overrides: Iterable[AbstractOverride] = OVERRIDES,
     reference: Reference | None = None,
     fresh: bool = True,
     model: str | Callable = "per_material",
@@ -75,13 +85,13 @@ def accuracy(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> xr.DataTree:
-    """Climb the ladder of methods on one capture, and measure every rung against the top.
+    """Compare methods on one capture with a reference posterior: their errors and their costs.
 
     Args:
         capture: A Dataset of the capture schema; validated here.
-        rungs: Methods by name; by default `polar_bayes.methods.LADDER`.
-        dials: What else is turned, one at a time, on every rung; `()` for the rungs alone.
-        reference: How well the posterior that all are judged by must be known.
+        methods: Methods by name; by default `polar_bayes.methods.LADDER`.
+        overrides: What else is changed, one at a time, on every method; `()` for the methods alone.
+        reference: How well the reference posterior must be known.
         fresh: True runs every trial in a process of its own, so that the first time includes all
             compilation and the memory is its own. False runs them here: much faster, but without
             first times and memory, which would not be theirs.
@@ -94,10 +104,10 @@ def accuracy(
         progress: Called with the name of a stage and the fraction of it that is done.
 
     Returns:
-        A tree whose group `accuracy` has a row for each rung and dial (coordinates `rung` and
-        `dial`), and by row and parameter the distances from the reference; see the attribute
-        `long_name` of each variable. `polar_bayes.benchmark.accuracy_table`, `accuracy_advice` and
-        `plot_accuracy` read it.
+        A tree whose group `accuracy` has a row for each method and override (coordinates `method`
+        and `override`), and by row and parameter the distances from the reference; see the
+        attribute `long_name` of each variable. `polar_bayes.benchmark.accuracy_table`,
+        `accuracy_sentences` and `plot_accuracy` read it.
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.
@@ -108,18 +118,18 @@ def accuracy(
         capture, model, "nuts", scene, priors, links, largest_view_zenith, seed, "double"
     )
     show = progress or no_progress
-    trials = _trials(request, LADDER if rungs is None else rungs, tuple(dials))
+    trials = _trials(request, LADDER if methods is None else methods, tuple(overrides))
     show("reference", 0.0)
     with jax.enable_x64(True):
-        key = jax.random.fold_in(jax.random.key(seed), FOLD)  # no random number of any trial
-        judge = run_reference(reference or Reference(), problem_of(request, key))
+        key = jax.random.fold_in(jax.random.key(seed), REFERENCE_FOLD)
+        reference_run = run_reference(reference or Reference(), problem_of(request, key))
     show("reference", 1.0)
     rows = []
-    for number, ((rung, dial), trial) in enumerate(trials.items()):
+    for number, trial in enumerate(trials.values()):
         show("trials", number / len(trials))
-        rows.append(_row(rung, dial, trial, judge, run_fresh if fresh else run_trial, fresh))
+        rows.append(_row(trial, reference_run, fresh=fresh))
     show("trials", 1.0)
-    about = {
+    provenance = {
         "accuracy": len(rows),
         "model": request.model_name,
         "scene": request.scene_name,
@@ -130,143 +140,114 @@ def accuracy(
         "fresh_processes": fresh,
         "versions": {name: version(name) for name in ("polar_bayes", "jax", "numpyro")},
     }
-    tree = xr.DataTree(children={"accuracy": xr.DataTree(_dataset(rows, judge))})
-    tree.attrs[PROVENANCE] = json.dumps(about, sort_keys=True)
+    dataset = _dataset(list(trials), rows, reference_run)
+    tree = xr.DataTree(children={"accuracy": xr.DataTree(dataset)})
+    tree.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
     return tree
 
 
-class Row(NamedTuple):
-    """One trial, judged."""
-
-    rung: str
-    dial: str
-    apart: Distances
-    measured: Measured | None
-    problems: str
-    fresh: bool
-
-    @property
-    def numbers(self) -> dict[str, float]:
-        """What it cost and says of itself, by name."""
-        if self.measured is None:
-            return dict.fromkeys(_NUMBERS, np.nan)
-        own, costs = self.measured.answer, self.measured
-        first = ("seconds_first", "peak_memory", "memory_before")
-        return {
-            name: np.nan
-            if name in first and not self.fresh
-            else float(getattr(own if hasattr(own, name) else costs, name))
-            for name in _NUMBERS
-        }
-
-
-_NUMBERS = (
-    "r_hat",
-    "k_hat",
-    "effective_draws",
-    "gradients",
-    "densities",
-    "seconds_first",
-    "seconds_again",
-    "peak_memory",
-    "memory_before",
-)
+Trials = dict[tuple[str, str], Trial | PolarBayesError]
+"""A trial, or why it cannot be run, by names of method and override."""
 
 
 def _trials(
-    request: Request, rungs: Mapping[str, Method], dials: tuple[AbstractDial, ...]
-) -> dict[tuple[str, str], Trial | PolarBayesError]:
-    """What is run, or why it cannot be, by rung and dial; all rungs as given come first."""
-    if not isinstance(rungs, Mapping) or not rungs:
+    request: Request, methods: Mapping[str, Method], overrides: tuple[AbstractOverride, ...]
+) -> Trials:
+    """Every method as given, then with every override that changes something."""
+    if not isinstance(methods, Mapping) or not methods:
         raise FitError(
-            "there is no rung", where="accuracy: rungs", hint="give methods by name, as in LADDER"
+            "there is no method",
+            where="accuracy: methods",
+            hint="give methods by name, as in LADDER",
         )
-    trials: dict[tuple[str, str], Trial | PolarBayesError] = {}
-    for name, method in rungs.items():
+    trials: Trials = {}
+    for name, method in methods.items():
         if not isinstance(method, Method):
             raise FitError(
                 f"a {type(method).__name__} is not a method",
-                where=f"accuracy: rungs[{name!r}]",
+                where=f"accuracy: methods[{name!r}]",
                 hint="give settings such as polar_bayes.methods.Nuts()",
             )
         trials[str(name), AS_GIVEN] = Trial(request, method, request.seed)
-    for dial in dials:
-        for name, method in rungs.items():
+    for override in overrides:
+        for name, method in methods.items():
             try:
-                turned = dial.turn(request, method)
-            except PolarBayesError as error:  # a dial that fails is a row of every rung
-                trials[str(name), dial.name] = error
+                changed = override.apply(request, method)
+            except PolarBayesError as error:  # an override that fails is a row of every method
+                trials[str(name), override.name] = error
                 continue
-            if turned is not None:
-                trials[str(name), dial.name] = Trial(*turned, request.seed)
+            if changed is not None:
+                trials[str(name), override.name] = Trial(*changed, request.seed)
     return trials
 
 
-def _row(
-    rung: str,
-    dial: str,
-    trial: Trial | PolarBayesError,
-    judge: Judge,
-    run: Callable[[Trial], Measured],
-    fresh: bool,
-) -> Row:
-    lost = np.full(len(judge.labels), np.nan)
-    nothing = Distances(*(lost.copy() for _ in Distances._fields))
-    if isinstance(trial, PolarBayesError):
-        return Row(rung, dial, nothing, None, str(trial), fresh)
-    try:
-        found = run(trial)
-    except PolarBayesError as error:  # a rung that fails is a row, too
-        return Row(rung, dial, nothing, None, str(error), fresh)
-    shared = [label for label in judge.labels if label in found.labels]
-    ours, theirs = (
-        np.stack([draws[labels.index(label)].ravel() for label in shared])
-        for labels, draws in ((found.labels, found.draws), (judge.labels, judge.draws))
-    )
-    at = [judge.labels.index(label) for label in shared]
-    for whole, part in zip(nothing, distances(ours, theirs), strict=True):
-        whole[at] = part
-    return Row(rung, dial, nothing, found, "; ".join(found.answer.problems), fresh)
-
-
-def _dataset(rows: list[Row], judge: Judge) -> xr.Dataset:
-    both, draws = ("row", "parameter"), judge.draws.reshape(len(judge.labels), -1)
-    columns: dict[str, tuple[Any, Any]] = {
-        name: (both, np.stack([getattr(row.apart, name) for row in rows]))
-        for name in Distances._fields
+def _row(trial: Trial | PolarBayesError, reference: ReferenceRun, *, fresh: bool) -> dict[str, Any]:
+    """Distances, diagnostics and costs of one trial by name; NaN where it failed."""
+    row: dict[str, Any] = {
+        **{name: np.full(len(reference.labels), np.nan) for name in Distances._fields},
+        **dict.fromkeys((*DIAGNOSTICS, *COSTS, *COSTS_OF_PROCESS), np.nan),
     }
-    columns |= {name: ("row", [row.numbers[name] for row in rows]) for name in _NUMBERS}
-    columns["problems"] = ("row", np.array([row.problems for row in rows], object))
+    try:
+        if isinstance(trial, PolarBayesError):
+            raise trial
+        found = run_fresh(trial) if fresh else run_trial(trial)
+    except PolarBayesError as error:  # a method that fails is a row, too
+        return row | {"problems": str(error)}
+    shared = [label for label in reference.labels if label in found.labels]
+    ours, theirs = (
+        [labels.index(label) for label in shared] for labels in (found.labels, reference.labels)
+    )
+    draws, expected = (
+        x.reshape(len(shared), -1) for x in (found.draws[ours], reference.draws[theirs])
+    )
+    for name, values in distances(draws, expected)._asdict().items():
+        row[name][theirs] = values
+    row |= {name: getattr(found.answer, name) for name in DIAGNOSTICS}
+    row |= {name: getattr(found, name) for name in COSTS + (COSTS_OF_PROCESS if fresh else ())}
+    return row | {"problems": "; ".join(found.answer.problems)}
+
+
+def _dataset(
+    names: list[tuple[str, str]], rows: list[dict[str, Any]], reference: ReferenceRun
+) -> xr.Dataset:
+    draws = reference.draws.reshape(len(reference.labels), -1)
+    columns: dict[str, tuple[Any, Any]] = {
+        name: ("row", np.array([row[name] for row in rows], float))
+        for name in (*DIAGNOSTICS, *COSTS, *COSTS_OF_PROCESS)
+    }
+    for name in Distances._fields:
+        columns[name] = ("row", "parameter"), np.stack([row[name] for row in rows])
+    columns["problems"] = ("row", np.array([row["problems"] for row in rows], object))
     columns |= {
         "reference_mean": ("parameter", draws.mean(axis=1)),
         "reference_sd": ("parameter", draws.std(axis=1)),
-        "reference_mean_error": ("parameter", judge.mean_error),
-        "reference_sd_error": ("parameter", judge.sd_error),
-        "reference_wasserstein": ("parameter", judge.halves.wasserstein),
+        "reference_mean_error": ("parameter", reference.mean_error),
+        "reference_sd_error": ("parameter", reference.sd_error),
+        "reference_wasserstein": ("parameter", reference.halves.wasserstein),
     }
-    names = ("long_name", "units")
+    methods, overrides = (np.array(texts, object) for texts in zip(*names, strict=True))
     return xr.Dataset(
         {
-            name: (dims, values, dict(zip(names, DESCRIPTIONS[name], strict=True)))
-            for name, (dims, values) in columns.items()
+            name: (*columns[name], {"long_name": long_name, "units": units})
+            for name, (long_name, units) in DESCRIPTIONS.items()
         },
         coords={
-            "rung": ("row", np.array([row.rung for row in rows], object)),
-            "dial": ("row", np.array([row.dial for row in rows], object)),
-            "parameter": np.array(judge.labels, object),
+            "method": ("row", methods),
+            "override": ("row", overrides),
+            "parameter": np.array(reference.labels, object),
         },
         attrs={
-            "reference": judge.made_by,
+            "reference": reference.method,
             "reference_draws": int(draws.shape[1]),
-            "reference_effective_draws": float(judge.answer.effective_draws),
-            "reference_r_hat": float(judge.answer.r_hat),
-            "reference_error": judge.error,
-            "reference_doubts": "; ".join(judge.doubts),
+            "reference_effective_draws": float(reference.posterior.effective_draws),
+            "reference_r_hat": float(reference.posterior.r_hat),
+            "reference_error": reference.error,
+            "reference_doubts": "; ".join(reference.doubts),
         },
     )
 
 
-# --- Accuracy studies in netCDF files, and what they hold -----------------------------------------
+# --- Accuracy studies in netCDF files -------------------------------------------------------------
 
 
 STUDY = Schema(

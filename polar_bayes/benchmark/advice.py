@@ -1,6 +1,4 @@
-"""What an accuracy study comes to: a table, the front, and one sentence of advice."""
-
-import math
+"""Table, Pareto front and sentences of an accuracy study."""
 
 import numpy as np
 import pandas as pd
@@ -11,30 +9,33 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.files import FIT
 
 RESOLVED = 2.0
-"""An error is told from nothing where it is so many standard errors of the reference."""
+"""Standard errors of the reference from which an error counts as different from 0."""
 
-MUCH = 2.0
-"""Times faster, from which a method is worth taking for most parameters alone."""
+MUCH_FASTER = 2.0
+"""Ratio of times from which a method is advised for most parameters alone."""
 
-ALIKE = 1.2
-"""Times faster, below which two times are the same: they differ so from run to run."""
+FASTER = 1.2
+"""Ratio of times below which they count as equal: times differ so from run to run."""
 
 TOLERANCE = 0.1
 TIMES = ("seconds_first", "seconds_again")
+NUMBERS = (
+    *("r_hat", "k_hat", "effective_draws", "gradients", "densities"),
+    *(*TIMES, "peak_memory"),
+)
+TEXTS = ("method", "override", "problems")
 
 
-def accuracy_of(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
+def accuracy_dataset(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
     """The group `accuracy` of a tree."""
     if isinstance(result, xr.Dataset):
         result = xr.DataTree(children={"accuracy": xr.DataTree(result)})
-    # A study may stand in the tree of a fit, which has checks of its own.
+    # The tree of a fit may hold a study, and has checks of its own.
     is_fit = isinstance(result, xr.DataTree) and FIT.describes(result)
     check = FIT.check if is_fit and "accuracy" in result.children else STUDY.check
     check(result, "accuracy")
     found = result["accuracy"].to_dataset().transpose("row", "parameter", ...)
-    pairs = (found[name].to_numpy().tolist() for name in ("rung", "dial"))
-    names = list(zip(*pairs, strict=True))
-    if len(set(names)) < len(names):
+    if pd.MultiIndex.from_arrays([found[name].to_numpy() for name in TEXTS[:2]]).has_duplicates:
         raise FitError(
             "two rows have one name",
             where="accuracy",
@@ -44,7 +45,7 @@ def accuracy_of(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
 
 
 def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
-    """One row for each rung and dial, the errors of the worst parameter.
+    """One row for each method and override, the errors of the worst parameter.
 
     Args:
         result: What `polar_bayes.accuracy` returns, or one read back from a file.
@@ -55,98 +56,98 @@ def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
         reference's own standard error), `interval` (the largest of both ends), `wasserstein`,
         `r_hat`, `k_hat`, `effective_draws`, `gradients`, `densities`, `seconds_first` and
         `seconds_again` [s], `peak_memory` [MiB], `on_front` (nothing is both faster and better),
-        `rung`, `dial` and `problems`.
+        `method`, `override` and `problems`.
 
     Raises:
         FitError: It holds no accuracy study.
     """
-    found = accuracy_of(result)
+    found = accuracy_dataset(result)
     errors = parameter_errors(found)
-    worst = [_worst(row) for row in errors.to_numpy()]
-    error = np.array([row[at] for row, at in zip(errors.to_numpy(), worst, strict=True)])
+    error = np.fmax.reduce(errors.to_numpy(), axis=1)
     ends = _larger(found, "low_error", "high_error")
-    alone = ("r_hat", "k_hat", "effective_draws", "gradients", "densities", *TIMES, "peak_memory")
     table = pd.DataFrame(
         {
             "error": error,
-            "worst": [str(errors.columns[at]) for at in worst],
+            "worst": errors.fillna(-np.inf).idxmax(axis=1),
             "resolved": error > RESOLVED * float(found.attrs["reference_error"]),
-            "interval": _largest(ends),
-            "wasserstein": _largest(found["wasserstein"].to_numpy()),
-            **{name: found[name].to_numpy() for name in alone},
-            "rung": [str(x) for x in found["rung"].to_numpy()],
-            "dial": [str(x) for x in found["dial"].to_numpy()],
-            "problems": [str(x) for x in found["problems"].to_numpy()],
+            "interval": np.fmax.reduce(ends, axis=1),
+            "wasserstein": np.fmax.reduce(np.abs(found["wasserstein"].to_numpy()), axis=1),
+            **{name: found[name].to_numpy() for name in NUMBERS},
+            **{name: [str(x) for x in found[name].to_numpy()] for name in TEXTS},
         },
         index=pd.Index(errors.index, name="row"),
     )
-    table["on_front"] = pareto_front(table[time_of(table)].to_numpy(), error)
+    table["on_front"] = pareto_front(table[time_column(table)].to_numpy(), error)
     return table
 
 
 def parameter_errors(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
     """The larger error of mean and sd of every parameter, in reference sds."""
-    found = accuracy_of(result)
-    values = _larger(found, "mean_error", "sd_error")
-    pairs = zip(found["rung"].to_numpy(), found["dial"].to_numpy(), strict=True)
-    names = [str(rung) if dial == AS_GIVEN else f"{rung}, {dial}" for rung, dial in pairs]
-    labels = [str(label) for label in found["parameter"].to_numpy()]
-    return pd.DataFrame(values, index=names, columns=labels)
+    found = accuracy_dataset(result)
+    rows = zip(found["method"].to_numpy(), found["override"].to_numpy(), strict=True)
+    return pd.DataFrame(
+        _larger(found, "mean_error", "sd_error"),
+        index=[str(name) if how == AS_GIVEN else f"{name}, {how}" for name, how in rows],
+        columns=[str(label) for label in found["parameter"].to_numpy()],
+    )
+
+
+def _larger(found: xr.Dataset, one: str, other: str) -> np.ndarray:
+    return np.fmax(np.abs(found[one].to_numpy()), np.abs(found[other].to_numpy()))
 
 
 def pareto_front(seconds: np.ndarray, error: np.ndarray) -> np.ndarray:
     """Which rows are such that no other is at least as fast and as good, and better in one."""
-    here = np.stack([seconds, error], axis=1)
-    known = np.isfinite(here).all(axis=1)
-    beaten = [
-        bool(known[at]) and any(_beats(here[other], here[at]) for other in np.flatnonzero(known))
-        for at in range(len(here))
-    ]
-    return known & ~np.array(beaten, bool)
+    costs = np.stack([seconds, error], axis=1)
+    known = np.isfinite(costs).all(axis=1)
+    no_worse = (costs[:, None] <= costs).all(axis=2)
+    better = (costs[:, None] < costs).any(axis=2)
+    return known & ~(no_worse & better & known[:, None]).any(axis=0)
 
 
-def time_of(table: pd.DataFrame) -> str:
+def time_column(table: pd.DataFrame) -> str:
     """The column of times that is filled in: of the first fit, where it was measured."""
     return TIMES[0] if table[TIMES[0]].notna().any() else TIMES[1]
 
 
-def accuracy_advice(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> str:
-    """Which method to use for this capture, in one sentence or two.
+def best_method(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> str | None:
+    """The fastest method as given that is good for every parameter."""
+    table = accuracy_table(result)
+    seconds = table[time_column(table)]
+    good = (table["override"] == AS_GIVEN) & (table["error"] <= tolerance) & seconds.notna()
+    return str(seconds[good].idxmin()) if good.any() else None
+
+
+def accuracy_sentences(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> list[str]:
+    """Which method to use for this capture.
 
     Args:
         result: What `polar_bayes.accuracy` returns, or one read back from a file.
         tolerance: Largest error of a mean or sd, in posterior sds, > 0.
 
     Returns:
-        `laplace is within 0.08 sd here and 60 times faster than nuts; ...`. Speed is that of the
-        first fit where it was measured (else of the next), among rungs as given.
+        The advice: `laplace is within 0.08 sd here and 60 times faster than nuts; ...`, and a
+        caution where there are doubts of the reference. Speed is that of the first fit where it
+        was measured (else of the next), among methods as given.
 
     Raises:
         FitError: It holds no accuracy study, or the tolerance is not above 0.
     """
     if not tolerance > 0.0:
         raise FitError(
-            f"tolerance is {tolerance}", where="accuracy_advice", hint="give a number above 0"
+            f"tolerance is {tolerance}", where="accuracy_sentences", hint="give a number above 0"
         )
-    found = accuracy_of(result)
-    every, errors = accuracy_table(found), parameter_errors(found)
-    given = every["dial"] == AS_GIVEN
-    told = _advice(every[given], errors[given.to_numpy()], tolerance)
-    if found.attrs["reference_doubts"]:
-        told += f" Take it with care: of the reference itself, {found.attrs['reference_doubts']}."
-    return told
-
-
-def advised(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> str | None:
-    """The fastest rung as given that is good for every parameter."""
-    table = accuracy_table(result)
-    seconds = table[time_of(table)]
-    good = (table["dial"] == AS_GIVEN) & (table["error"] <= tolerance) & seconds.notna()
-    return str(seconds[good].idxmin()) if good.any() else None
+    found = accuracy_dataset(result)
+    table, errors = accuracy_table(found), parameter_errors(found)
+    given = table["override"] == AS_GIVEN
+    sentences = [_advice(table[given], errors[given.to_numpy()], tolerance)]
+    if doubts := found.attrs["reference_doubts"]:
+        sentences.append(f"Take it with care: of the reference itself, {doubts}.")
+    return sentences
 
 
 def _advice(table: pd.DataFrame, errors: pd.DataFrame, tolerance: float) -> str:
-    seconds = table[time_of(table)]
+    seconds = table[time_column(table)]
     known = table["error"].notna() & seconds.notna()
     if not known.any():
         return "No method has an answer here."
@@ -166,14 +167,14 @@ def _advice(table: pd.DataFrame, errors: pd.DataFrame, tolerance: float) -> str:
         times = seconds[fastest] / seconds[quick]
         return (
             f"{quick} is within {rest:.2g} sd here and {times:.2g} times faster than {fastest}, "
-            f"but for {_spoken(missed)}; use {fastest} for {'it' if len(missed) == 1 else 'them'}."
+            f"but for {_listed(missed)}; use {fastest} for {'it' if len(missed) == 1 else 'them'}."
         )
     said = f"{fastest} is within {table['error'][fastest]:.2g} sd here"
     slower = table[good & table.index.str.startswith("nuts") & (seconds > seconds[fastest])]
     if len(slower):
         other = str(seconds[slower.index].idxmin())
         times = seconds[other] / seconds[fastest]
-        faster = f"{times:.2g} times faster than" if times >= ALIKE else "as fast as"
+        faster = f"{times:.2g} times faster than" if times >= FASTER else "as fast as"
         said += f" and {faster} {other}"
     return f"{said}; use it."
 
@@ -184,30 +185,12 @@ def _partly(
     """The fastest row good for most parameters, and what it misses, if it is much faster."""
     for name in seconds.sort_values(kind="stable").index:
         missed = [label for label, error in errors.loc[name].items() if not error <= tolerance]
-        if seconds[fastest] < MUCH * seconds[name]:
+        if seconds[fastest] < MUCH_FASTER * seconds[name]:
             return None
         if 0 < len(missed) <= errors.shape[1] / 2.0:
             return str(name), [str(label) for label in missed]
     return None
 
 
-def _beats(one: np.ndarray, other: np.ndarray) -> bool:
-    return bool((one <= other).all() and (one < other).any())
-
-
-def _worst(row: np.ndarray) -> int:
-    return int(np.argmax(np.where(np.isnan(row), -math.inf, row)))
-
-
-def _largest(values: np.ndarray) -> np.ndarray:
-    """Of every row; NaN where nothing is known."""
-    found = np.max(np.where(np.isnan(values), -np.inf, np.abs(values)), axis=1)
-    return np.where(np.isneginf(found), np.nan, found)
-
-
-def _larger(found: xr.Dataset, one: str, other: str) -> np.ndarray:
-    return np.fmax(np.abs(found[one].to_numpy()), np.abs(found[other].to_numpy()))
-
-
-def _spoken(names: list[str]) -> str:
+def _listed(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

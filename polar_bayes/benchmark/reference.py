@@ -1,4 +1,4 @@
-"""The posterior that others are judged by: long chains, and how far they can be trusted."""
+"""Reference posterior of an accuracy study: long chains, their errors, and distances from them."""
 
 import contextlib
 import dataclasses
@@ -22,7 +22,7 @@ from polar_bayes.inference.run_method import answer, with_answer_draws, with_dra
 from polar_bayes.inference.smc import PixelTempering
 from polar_bayes.inference.weighted import Tempered
 
-# --- How far draws are from those of a reference, in its standard deviations ----------------------
+# --- Distances from the reference -----------------------------------------------------------------
 
 
 INTERVAL = (0.025, 0.975)
@@ -42,19 +42,18 @@ def distances(
     draws: Float[np.ndarray, "parameter draw"], reference: Float[np.ndarray, "parameter many"]
 ) -> Distances:
     """Compare draws with those of a reference."""
-    whole = np.isfinite(draws).all(axis=1)
     found = np.full((len(Distances._fields), len(draws)), np.inf)
-    for at in np.flatnonzero(whole):
+    for at in np.flatnonzero(np.isfinite(draws).all(axis=1)):
         ours, theirs = draws[at], reference[at]
         unit = theirs.std()
         low, high = np.quantile(ours, INTERVAL) - np.quantile(theirs, INTERVAL)
-        apart = scipy.stats.wasserstein_distance(ours, theirs)
-        moved = np.array([ours.mean() - theirs.mean(), ours.std() - unit, low, high, apart])
-        found[:, at] = moved / unit
+        wasserstein = scipy.stats.wasserstein_distance(ours, theirs)
+        mean, sd = ours.mean() - theirs.mean(), ours.std() - unit
+        found[:, at] = np.array([mean, sd, low, high, wasserstein]) / unit
     return Distances(*found)
 
 
-# --- The posterior that others are judged by: long chains, and how far they can be trusted --------
+# --- The reference --------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +82,7 @@ class Reference:
 
     @property
     def chains(self) -> Nuts:
-        """The chains with which it begins."""
+        """The chains that are run first."""
         goal = 2.0 / self.error**2
         draws = int(np.ceil(goal / 4.0))
         return Nuts(
@@ -97,28 +96,28 @@ class Reference:
 
     @property
     def tempered(self) -> Tempered:
-        """What takes over where chains do not find each other's modes."""
+        """The method that is tried where chains do not agree."""
         goal = 4.0 / self.error**2  # half of it is lost where draws are chosen by weight
         settings = with_answer_draws(PixelTempering(walks=1024, draws=4096), 4.0 * goal)
         return Tempered(dataclasses.replace(settings, effective_draws=goal))
 
 
-class Judge(NamedTuple):
-    """A reference that was run."""
+class ReferenceRun(NamedTuple):
+    """A reference that was run; `biases` and `noise` are reasons to doubt it."""
 
     labels: tuple[str, ...]
     draws: np.ndarray
-    made_by: str
+    method: str
     mean_error: np.ndarray
     sd_error: np.ndarray
     halves: Distances
-    answer: PosteriorDraws
+    posterior: PosteriorDraws
     biases: tuple[str, ...]
     noise: str = ""
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Why it may be wrong; empty where nothing speaks against it."""
+        """All reasons to doubt it; empty where there are none."""
         return (*self.biases, self.noise) if self.noise else self.biases
 
     @property
@@ -127,47 +126,49 @@ class Judge(NamedTuple):
         return float(max(self.mean_error.max(), self.sd_error.max()))
 
 
-def run_reference(settings: Reference, problem: Problem) -> Judge:
-    """Chains that go on until their own error is small enough."""
-    # Where they do not agree, or some of them missed a mode, tempered draws take over, where the
-    # capture allows it. Where nothing is good enough, the best of it says so in its doubts.
-    tried = [_climb(settings, "NUTS", settings.chains, problem)]
-    if tried[0].doubts:
+def run_reference(settings: Reference, problem: Problem) -> ReferenceRun:
+    """Chains that are lengthened until their own error is small enough."""
+    # Where they do not agree, or some of them missed a mode, tempered draws are tried, where the
+    # capture allows it.
+    runs = [_run_until(settings, "NUTS", settings.chains, problem)]
+    if runs[0].doubts:
         with contextlib.suppress(FitError):  # several patches or colors
-            tried.append(_climb(settings, "tempered draws", settings.tempered, problem))
-    return nearest(tried)
+            runs.append(_run_until(settings, "tempered draws", settings.tempered, problem))
+    return best_reference(runs)
 
 
-def nearest(tried: Sequence[Judge]) -> Judge:
-    """The one that least can be said against: noise is told, and no reason to take a bias."""
-    return min(tried, key=lambda judge: (len(judge.biases), not judge.error < np.inf, judge.error))
+def best_reference(runs: Sequence[ReferenceRun]) -> ReferenceRun:
+    """The run of fewest biases, then of least error: a noisy reference is preferred to a biased."""
+    return min(runs, key=lambda run: (len(run.biases), not run.error < np.inf, run.error))
 
 
-def _climb(settings: Reference, name: str, method: Method, problem: Problem) -> Judge:
-    judge = _judge(settings, name, method, problem)
+def _run_until(settings: Reference, name: str, method: Method, problem: Problem) -> ReferenceRun:
+    """Four times the draws, until the error is as small as the settings ask."""
+    run = _run(settings, name, method, problem)
     for _ in range(settings.longer):
         longer = with_draws(method, 4.0)
-        if judge.error <= settings.error or longer is None:
+        if run.error <= settings.error or longer is None:
             break
         method = longer
-        judge = _judge(settings, name, method, problem)
-    return judge
+        run = _run(settings, name, method, problem)
+    return run
 
 
-def _judge(settings: Reference, name: str, method: Method, problem: Problem) -> Judge:
+def _run(settings: Reference, name: str, method: Method, problem: Problem) -> ReferenceRun:
     found = answer(method, problem)
     labels, draws = labeled(problem.program, found.z, problem.data)
     mean_error, sd_error = errors_of(found, lambda z: labeled(problem.program, z, problem.data)[1])
-    half = draws.shape[1] // 2
-    one, other = (part.reshape(len(draws), -1) for part in (draws[:, :half], draws[:, half:]))
+    first, second = (
+        half.reshape(len(draws), -1) for half in np.split(draws, [draws.shape[1] // 2], axis=1)
+    )
     biases = list(found.problems)
     if found.r_hat > LARGEST_R_HAT:
         biases.append(f"its R-hat is {found.r_hat:.3f}")
     if isinstance(method, Nuts) and (weight := missed_mode_weight(found.z, problem)) > 0.0:
         biases.append(f"a mode of weight {weight:.2g} was not visited by every chain")
-    judge = Judge(
-        labels, draws, name, mean_error, sd_error, distances(one, other), found, tuple(biases)
+    run = ReferenceRun(
+        labels, draws, name, mean_error, sd_error, distances(first, second), found, tuple(biases)
     )
-    if judge.error <= settings.error:
-        return judge
-    return judge._replace(noise=f"its own Monte Carlo error is {judge.error:.2g} posterior sd")
+    if run.error <= settings.error:
+        return run
+    return run._replace(noise=f"its own Monte Carlo error is {run.error:.2g} posterior sd")

@@ -169,18 +169,18 @@ def _work(given: Path, made: Path) -> None:
     made.write_bytes(cloudpickle.dumps(found))
 
 
-# --- What may be turned beside the method: facets, effects, precision, number of draws ------------
+# --- Overrides of the request or method: facets, effects, precision, number of draws --------------
 
 
-Turned = tuple[Request, Method]
+Overridden = tuple[Request, Method]
 
 NEARLY = 0.1
-"""Relative difference between the draws that a dial is called by and those that there are."""
+"""Relative difference between the draws that an override is called by and those that there are."""
 
 
 @dataclasses.dataclass(frozen=True)
-class AbstractDial(abc.ABC):
-    """One setting that is not the method, turned one way."""
+class AbstractOverride(abc.ABC):
+    """One setting that is not the method, changed one way."""
 
     @property
     @abc.abstractmethod
@@ -188,23 +188,23 @@ class AbstractDial(abc.ABC):
         """What it is called beside the method: `facets / 2`."""
 
     @abc.abstractmethod
-    def turn(self, request: Request, method: Method) -> Turned | None:
+    def apply(self, request: Request, method: Method) -> Overridden | None:
         """What is fitted then.
 
         Args:
             request: As it was asked.
-            method: The rung.
+            method: The method.
 
         Returns:
-            Both, turned; None where this dial changes nothing.
+            Both, changed; None where this override changes nothing.
 
         Raises:
-            FitError: It cannot be turned for this capture; other errors of the package likewise.
+            FitError: It cannot be changed for this capture; other errors of the package likewise.
         """
 
 
 @dataclasses.dataclass(frozen=True)
-class DrawsDial(AbstractDial):
+class DrawsOverride(AbstractOverride):
     """So many times the draws; left out where a method cannot have about as many.
 
     Args:
@@ -219,7 +219,7 @@ class DrawsDial(AbstractDial):
     def __post_init__(self) -> None:
         if not self.factor > 0.0:
             raise FitError(
-                f"factor is {self.factor}", where="DrawsDial", hint="give a number above 0"
+                f"factor is {self.factor}", where="DrawsOverride", hint="give a number above 0"
             )
 
     @property
@@ -228,21 +228,21 @@ class DrawsDial(AbstractDial):
         return _times("draws", self.factor)
 
     @override
-    def turn(self, request: Request, method: Method) -> Turned | None:
+    def apply(self, request: Request, method: Method) -> Overridden | None:
         try:
-            turned = with_draws(method, self.factor)
+            changed = with_draws(method, self.factor)
         except FitError:  # as few as the method allows
             return None
-        before, after = draws_of(method), None if turned is None else draws_of(turned)
-        if turned is None or not before or not after:
+        before, after = draws_of(method), None if changed is None else draws_of(changed)
+        if changed is None or not before or not after:
             return None
         # Numbers are rounded, or have a least: what is called so must be so.
         is_so = abs(after / before / self.factor - 1.0) < NEARLY
-        return (request, turned) if is_so and turned != method else None
+        return (request, changed) if is_so and changed != method else None
 
 
 @dataclasses.dataclass(frozen=True)
-class PrecisionDial(AbstractDial):
+class PrecisionOverride(AbstractOverride):
     """Single precision in place of double."""
 
     @property
@@ -251,14 +251,14 @@ class PrecisionDial(AbstractDial):
         return "single precision"
 
     @override
-    def turn(self, request: Request, method: Method) -> Turned | None:
+    def apply(self, request: Request, method: Method) -> Overridden | None:
         if request.precision == "single":
             return None
         return dataclasses.replace(request, precision="single"), method
 
 
 @dataclasses.dataclass(frozen=True)
-class FacetsDial(AbstractDial):
+class FacetsOverride(AbstractOverride):
     """So many times the facets in each direction.
 
     Args:
@@ -273,7 +273,7 @@ class FacetsDial(AbstractDial):
     def __post_init__(self) -> None:
         if not self.factor > 0.0:
             raise FitError(
-                f"factor is {self.factor}", where="FacetsDial", hint="give a number above 0"
+                f"factor is {self.factor}", where="FacetsOverride", hint="give a number above 0"
             )
 
     @property
@@ -282,13 +282,13 @@ class FacetsDial(AbstractDial):
         return _times("facets", self.factor)
 
     @override
-    def turn(self, request: Request, method: Method) -> Turned | None:
-        turned = [
-            Effect("", place, part, self._of(part))
-            for place, part in parts_of(request.scene)
+    def apply(self, request: Request, method: Method) -> Overridden | None:
+        changed = [
+            Effect("", key_path, part, self._of(part))
+            for key_path, part in parts_of(request.scene)
             if isinstance(part, FacetQuadrature)
         ]
-        scene = simplify(request.scene, turned)
+        scene = simplify(request.scene, changed)
         return None if scene == request.scene else (_with_scene(request, scene), method)
 
     def _of(self, rule: FacetQuadrature) -> FacetQuadrature:
@@ -299,7 +299,7 @@ class FacetsDial(AbstractDial):
 
 
 @dataclasses.dataclass(frozen=True)
-class EffectsDial(AbstractDial):
+class EffectsOverride(AbstractOverride):
     """Only the effects that `polar_bayes.choose_effects` keeps.
 
     Args:
@@ -314,7 +314,7 @@ class EffectsDial(AbstractDial):
         return "chosen effects"
 
     @override
-    def turn(self, request: Request, method: Method) -> Turned | None:
+    def apply(self, request: Request, method: Method) -> Overridden | None:
         choose = functools.partial(_chosen, request, self.tolerance)
         _, scene = _CHOSEN.of((id(request), self.tolerance), choose)
         if isinstance(scene, PolarBayesError):
@@ -322,22 +322,22 @@ class EffectsDial(AbstractDial):
         return None if scene == request.scene else (_with_scene(request, scene), method)
 
 
-DIALS: tuple[AbstractDial, ...] = (
-    DrawsDial(0.25),
-    DrawsDial(4.0),
-    FacetsDial(0.5),
-    FacetsDial(2.0),
-    EffectsDial(),
-    PrecisionDial(),
+OVERRIDES: tuple[AbstractOverride, ...] = (
+    DrawsOverride(0.25),
+    DrawsOverride(4.0),
+    FacetsOverride(0.5),
+    FacetsOverride(2.0),
+    EffectsOverride(),
+    PrecisionOverride(),
 )
-"""What every rung is crossed with, one turn at a time."""
+"""What every method is crossed with, one at a time."""
 
 PRIOR = "prior of "
 """How a request says that a prior is the user's own."""
 
 _CHOSEN: LRUCache[tuple[Request, Scene | PolarBayesError]] = LRUCache(2)
-"""Choices take minutes, and every rung asks; each stands beside the request that it is of. One that
-failed would fail again."""
+"""Choices take minutes and serve every method; each is stored with its request. One that failed
+would fail again."""
 
 
 def _chosen(request: Request, tolerance: float) -> tuple[Request, Scene | PolarBayesError]:

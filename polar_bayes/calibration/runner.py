@@ -34,7 +34,7 @@ from polar_bayes.inference.program import Program, Values, compile_program, para
 from polar_bayes.inference.psis import Marginals, smooth
 from polar_bayes.inference.request import Request
 from polar_bayes.observation.data import READINGS, Observations, observe
-from polar_bayes.physics.discrepancy import Discrepancy
+from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.progress import no_progress
 
 # --- Simulations fitted by what `polar_bayes.fit` runs: modes first, then chains or the guide ther

@@ -88,8 +88,8 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
     if np.mean(statuses == Status.NOT_TRUSTED) > MOST:
         said.append(
             "Most fits say themselves that they cannot be trusted: the ranks judge the method, not "
-            "the model. Another method or longer chains may do; chains of a fit "
-            "(pb.methods.Nuts()) are the slowest and the surest."
+            "the model. Another method or longer chains may do; chains of a fit (pb.methods.Nuts()) are "
+            "the slowest and the surest."
         )
     return said + readings_verdict(calibration)
 

@@ -1,4 +1,4 @@
-"""Several captures as one: materials or patches side by side, to be fitted together."""
+"""Several captures combined along a leading dim, material or patch, to be fitted together."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,17 +11,17 @@ from polar_bayes.errors import CaptureError
 
 DIMS = ("material", "patch")
 
-# What a capture that says nothing means, and what an entry holds that no capture measured. The
-# directions and the trust of such an entry are those of the last view: any would do.
-SILENT = {"valid": True, "saturated": False, "interpolated": False, "normal_confidence": 1.0}
-UNMEASURED = {"valid": False, "saturated": False, "interpolated": False}
-ANYTHING = tuple(row.name for row in CONTRACT if row.kind in ("geometry", "trust"))
+# The values of a variable that a capture lacks, and those of the views that pad a shorter capture.
+# Directions and confidence of such views are those of the last view; their values do not matter.
+DEFAULTS = {"valid": True, "saturated": False, "interpolated": False, "normal_confidence": 1.0}
+FLAGS = tuple(row.name for row in CONTRACT if row.kind == "flag")
+REPEATED = tuple(row.name for row in CONTRACT if row.kind in ("geometry", "trust"))
 
 
 def combine(
     captures: Mapping[str, xr.Dataset], *, dim: str = "material", drop: Sequence[str] = ()
 ) -> xr.Dataset:
-    """One capture that holds several, side by side along a leading dim.
+    """One capture that holds several, along a leading dim.
 
     All must have the same readings, wavelengths, units and saturation level: a fit shares the
     instrument and the noise among them. Directions may differ, and so may the number of views:
@@ -46,23 +46,18 @@ def combine(
     checked = _checked(captures, dim, drop)
     (first, pattern), *others = checked.items()
     for label, capture in others:
-        _check_alike(label, capture, first, pattern)
+        _check_variables(label, capture, first, pattern)
         _check_labels(label, capture, first, pattern)
-    together = list(checked.values())
-    longest = max(capture.sizes["view"] for capture in together)
-    variables = {
-        name: _side_by_side(name, together, dim, longest)
-        for name in dict.fromkeys(
-            ["valid", *(str(name) for each in together for name in each.data_vars)]
-        )
-    }
+    parts = list(checked.values())
+    names = dict.fromkeys(["valid", *(str(name) for part in parts for name in part.data_vars)])
     coordinates = {name: variable.variable for name, variable in pattern.coords.items()}
     coordinates[dim] = xr.Variable((dim,), np.array(list(checked), dtype=np.str_))
-    attributes = _shared([capture.attrs for capture in together]) | {"name": ", ".join(checked)}
+    attributes = _common([part.attrs for part in parts]) | {"name": ", ".join(checked)}
+    variables = {name: _stacked(name, parts, dim) for name in names}
     return validate(xr.Dataset(variables, coordinates, attributes), source="combine")
 
 
-# --- what fits together -------------------------------------------------------------------------
+# --- Checks ---------------------------------------------------------------------------------------
 
 
 def _checked(
@@ -95,53 +90,43 @@ def _checked(
     return checked
 
 
-def _check_alike(label: str, capture: xr.Dataset, first: str, pattern: xr.Dataset) -> None:
-    """Refuse a capture that does not stand beside the first."""
+def _check_variables(label: str, capture: xr.Dataset, first: str, pattern: xr.Dataset) -> None:
+    """Refuse a capture whose readings, directions or units are not those of the first."""
     where = f"combine: {label}"
-    for name in _required([pattern, capture]):
+    for name in dict.fromkeys(map(str, [*pattern.data_vars, *capture.data_vars])):
+        drop = f"leave it out of all with drop=[{name!r}], in a command --drop {name}"
         if (name in capture) != (name in pattern):
+            if name in DEFAULTS or TRUTH.fullmatch(name):
+                continue
             with_, without = (label, first) if name in capture else (first, label)
-            hint = f"add it there, or {_leave_out(name)}"
+            hint = f"add it there, or {drop}"
             raise CaptureError(f"{without} has no {name}, and {with_} has", where=where, hint=hint)
-    for name in map(str, pattern.data_vars):
-        for attribute in ("units", "saturation_level") if name in capture else ():
-            mine, its = (each[name].attrs.get(attribute) for each in (capture, pattern))
-            if mine != its:
+        for attribute in ("units", "saturation_level"):
+            own, other = (each[name].attrs.get(attribute) for each in (capture, pattern))
+            if own != other:
                 raise CaptureError(
-                    f"{attribute} of {name} is {_said(mine)}, that of {first} {_said(its)}",
+                    f"{attribute} of {name} is {_text(own)}, that of {first} {_text(other)}",
                     where=where,
-                    hint=f"bring both to one, or {_leave_out(name)}",
+                    hint=f"bring both to one, or {drop}",
                 )
 
 
 def _check_labels(label: str, capture: xr.Dataset, first: str, pattern: xr.Dataset) -> None:
     """Refuse other colors, and labels that cannot be those of both."""
     for name in dict.fromkeys(map(str, [*pattern.coords, *capture.coords])):
-        mine, its = (each.variables.get(name) for each in (capture, pattern))
-        if mine is None or its is None or not mine.equals(its):
+        own, other = (each.variables.get(name) for each in (capture, pattern))
+        if own is None or other is None or not own.equals(other):
             hint = f"drop the label with drop_vars({name!r})"
             if name == WAVELENGTH.name:
                 hint = "give captures of the same wavelengths, or select those that all have"
             raise CaptureError(
-                f"{name} is {_said(mine)}, that of {first} {_said(its)}",
+                f"{name} is {_text(own)}, that of {first} {_text(other)}",
                 where=f"combine: {label}",
                 hint=hint,
             )
 
 
-def _required(captures: Sequence[xr.Dataset]) -> list[str]:
-    """Readings and directions, which captures must have in common; each once."""
-    found = (str(name) for capture in captures for name in capture.data_vars)
-    return list(
-        dict.fromkeys(name for name in found if name not in SILENT and not TRUTH.fullmatch(name))
-    )
-
-
-def _leave_out(name: str) -> str:
-    return f"leave it out of all with drop=[{name!r}], in a command --drop {name}"
-
-
-def _said(value: Any) -> str:
+def _text(value: Any) -> str:
     if value is None:
         return "not stated"
     if isinstance(value, xr.Variable):
@@ -150,40 +135,35 @@ def _said(value: Any) -> str:
     return str(value)
 
 
-# --- side by side -------------------------------------------------------------------------------
+# --- Stacking -------------------------------------------------------------------------------------
 
 
-def _side_by_side(name: str, captures: list[xr.Dataset], dim: str, views: int) -> xr.Variable:
-    """One variable of all captures, in their order."""
-    there = [capture[name].variable for capture in captures if name in capture]
-    order = [*next(captures[0][signal].dims for signal in SIGNALS if signal in captures[0])]
-    if name in SILENT and name != "normal_confidence":
-        dims = order
-    else:
-        dims = [each for each in order if any(each in variable.dims for variable in there)]
-    rows = [_row(name, capture, dims, views) for capture in captures]
-    attributes = _shared([variable.attrs for variable in there])
-    return xr.Variable((dim, *dims), np.stack(rows), attributes)
+def _stacked(name: str, captures: list[xr.Dataset], dim: str) -> xr.Variable:
+    """One variable of all captures, in their order, each padded to the largest number of views."""
+    found = [capture[name].variable for capture in captures if name in capture]
+    dims = [*next(captures[0][signal].dims for signal in SIGNALS if signal in captures[0])]
+    if name not in FLAGS:
+        dims = [each for each in dims if any(each in variable.dims for variable in found)]
+    views = max(capture.sizes["view"] for capture in captures)
+    rows = [_padded(name, capture, dims, views) for capture in captures]
+    return xr.Variable((dim, *dims), np.stack(rows), _common([x.attrs for x in found]))
 
 
-def _row(name: str, capture: xr.Dataset, dims: list[Any], views: int) -> np.ndarray:
-    """One capture's part of a variable, filled up to a number of views."""
+def _padded(name: str, capture: xr.Dataset, dims: list[Any], views: int) -> np.ndarray:
+    """A variable of one capture, padded to a number of views."""
+    default = xr.Variable((), DEFAULTS.get(name, np.nan))
+    variable = capture[name].variable if name in capture else default
     sizes = {each: capture.sizes[each] for each in dims}
-    variable = capture[name].variable if name in capture else xr.Variable((), _silent(name))
     values = variable.set_dims(sizes).transpose(*dims).values
     if "view" not in sizes:
         return values
     widths = [(0, views - size if each == "view" else 0) for each, size in sizes.items()]
-    if name in ANYTHING:
+    if name in REPEATED:
         return np.pad(values, widths, mode="edge")
-    return np.pad(values, widths, constant_values=UNMEASURED.get(name, np.nan))
+    return np.pad(values, widths, constant_values=False if name in FLAGS else np.nan)
 
 
-def _silent(name: str) -> bool | float:
-    return SILENT.get(name, np.nan)
-
-
-def _shared(attributes: Sequence[Mapping[Any, Any]]) -> dict[Any, Any]:
+def _common(attributes: Sequence[Mapping[Any, Any]]) -> dict[Any, Any]:
     """The attributes that are equal in all."""
     first, *others = attributes or ({},)
     return {

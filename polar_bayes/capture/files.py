@@ -1,11 +1,10 @@
 """Captures in netCDF files: read whole, written whole or not at all.
 
 The last line of a file is the SHA-256 digest of all bytes before it; HDF5 does not read so far. It
-is verified before a library sees the file, since HDF5 crashes or hangs on some damages.
-Fletcher-32, the filter of HDF5, would not do: it applies neither to single numbers nor to text, and
-a flipped bit in the index of chunks that it needs gives fill values for a whole array. Whoever
-edits the file with netCDF, xarray or HDF5 drops the line; the file is then one from elsewhere,
-which has none.
+is verified before a library reads the file, since HDF5 crashes or hangs on some damages.
+Fletcher-32, the filter of HDF5, is not enough: it applies neither to single numbers nor to text,
+and a flipped bit in the index of chunks that it needs gives fill values for a whole array. Whoever
+edits the file with netCDF, xarray or HDF5 drops the line; a file without it is not verified.
 """
 
 import hashlib
@@ -19,14 +18,12 @@ from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, PolarBayesError
 from polar_bayes.paths import existing_file, replacing, system_error
 
-# --- netCDF files with a checksum: what is read is what was written, or an error says that it is n
-
-
 MARK = b"\npolar_bayes sha256 "
 TAIL = 4096
-"""Bytes at the end of a file in which the mark is looked for, should more have been added."""
+"""Bytes at the end of a file in which the mark is searched, in case more have been appended."""
 
-BLOCK = 2**20
+RESULT_ATTRIBUTES = ("polar_bayes", "chosen_scene")
+"""Root attributes of results: provenance, and that of a ledger of effects."""
 
 
 def read_netcdf[Data: (xr.Dataset, xr.DataTree)](
@@ -68,7 +65,7 @@ def open_netcdf(kind: type, file: Path) -> Any:
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether a file is what was written, as far as it says so."""
+    """Whether the checksum of a file is right, or missing."""
     size = path.stat().st_size
     with path.open("rb") as file:
         file.seek(max(0, size - TAIL))
@@ -83,17 +80,13 @@ def _digest(path: Path, size: int) -> str:
     """SHA-256 of the first bytes of a file."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
-        while size > 0 and (block := file.read(min(BLOCK, size))):
+        while size > 0 and (block := file.read(min(2**20, size))):
             digest.update(block)
             size -= len(block)
     return digest.hexdigest()
 
 
-# --- Captures in netCDF files: read whole, written whole or not at all ----------------------------
-
-
-OF_RESULTS = ("polar_bayes", "chosen_scene")
-"""Root attributes of results: provenance, and that of a ledger of effects."""
+# --- Captures -------------------------------------------------------------------------------------
 
 
 def load_capture(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -122,7 +115,7 @@ def load_capture(path: str | os.PathLike[str]) -> xr.Dataset:
 def save_capture(capture: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a capture to a netCDF-4 file.
 
-    It is written beside its place and then moved there, so a failure leaves what was there before
+    It is written to a temporary file that then replaces `path`, so a failure leaves the older file
     (`polar_bayes.paths.replacing`).
 
     Args:
@@ -140,20 +133,18 @@ def save_capture(capture: xr.Dataset, path: str | os.PathLike[str]) -> None:
 
 def is_capture(file: Path) -> bool:
     """Whether a file holds a capture; no value is read."""
-    opened = _opened(file)
-    return opened is not None and "view_zenith" in opened.variables
+    return "view_zenith" in _header(file).variables
 
 
 def is_result(file: Path) -> bool:
     """Whether a file holds a result that `save_result` wrote, of any kind; no value is read."""
-    opened = _opened(file)
-    return opened is not None and any(name in opened.attrs for name in OF_RESULTS)
+    return any(name in _header(file).attrs for name in RESULT_ATTRIBUTES)
 
 
-def _opened(file: Path) -> xr.Dataset | None:
-    """Names and attributes of a netCDF file; None of anything else."""
+def _header(file: Path) -> xr.Dataset:
+    """Names and attributes of a netCDF file; empty for anything else."""
     try:
         with open_netcdf(xr.Dataset, file) as opened:
             return opened
     except Exception:  # the libraries below raise nearly every type for what is no netCDF
-        return None
+        return xr.Dataset()

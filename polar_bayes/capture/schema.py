@@ -1,27 +1,26 @@
-"""The only door through which a capture enters: checked once, trusted afterwards.
+"""The contract of a capture, and its validation.
 
-A capture is an `xarray.Dataset`; `polar_bayes.capture.schema` lists its variables. *Readings*,
-their errors and flags share the dims (leading..., view[, wavelength]); *geometry* has (view) or
-(leading..., view); how far the stated normal is to be *trusted* has (leading...), (view) or both.
-Leading dims are none (one material), material, patch, or y and x. A dim may
-carry labels: a coordinate of its own name, or the single label that `isel` leaves behind; the dim
-wavelength must, in nanometers. Known truth rides along as `true_<anything>`, over any of the
-capture's dims, NaN where it is not known.
+A capture is an `xarray.Dataset`; `CONTRACT` lists its variables. Every capture is validated once,
+where it enters; later code relies on it. *Readings*, their errors and flags share the dims
+(leading..., view[, wavelength]); *geometry* has (view) or (leading..., view); the confidence in the
+stated normal has (leading...), (view) or both. Leading dims are none (one material), material,
+patch, or y and x. A dim may have labels: a coordinate of its own name, or the single label that
+`isel` leaves; the dim wavelength must, in nanometers. Known truth is stored as `true_<anything>`,
+over any of the capture's dims, NaN where it is not known.
 """
 
+import contextlib
 import dataclasses
 import difflib
 import re
 from collections.abc import Hashable, Mapping, Sequence
+from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
 
 from polar_bayes.errors import CaptureError
-
-# --- The capture contract as data: names, units, ranges and dims, each written once ---------------
-
 
 LEADING = ((), ("material",), ("patch",), ("y", "x"))
 LABELS = ("material", "patch", "y", "x", "view")
@@ -51,6 +50,12 @@ class Interval:
         above = values > self.low if self.open_low else values >= self.low
         below = values < self.high if self.open_high else values <= self.high
         return above & below
+
+    def check(self, value: object, where: str) -> float:
+        """A number given by the user, refused unless it lies inside."""
+        if isinstance(value, Real) and not isinstance(value, bool) and self.contains(value):
+            return float(value)
+        raise CaptureError(f"it is {value!r}", where=where, hint=f"give {self}")
 
     def __str__(self) -> str:
         """The interval as an inequality."""
@@ -120,7 +125,7 @@ WAVELENGTH = Variable("wavelength", "label", "nm", POSITIVE, "wavelength", NANOM
 
 
 def nearest_name(name: object, known: Sequence[str]) -> str | None:
-    """The known name that is most like this one; None where it is known, or tells a truth."""
+    """The known name most similar to this one; None where it is known, or names a truth."""
     if name in known or (isinstance(name, str) and TRUTH.fullmatch(name)):
         return None
     return difflib.get_close_matches(str(name), known, n=1, cutoff=0.0)[0]
@@ -149,7 +154,7 @@ class Layout:
         return (self.readings,)
 
 
-# --- Attributes that every file format can hold: text and numbers, nothing else -------------------
+# --- Attributes: text and numbers, which every file format can hold -------------------------------
 
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]{0,99}")
@@ -160,62 +165,47 @@ RESERVED = frozenset({"add_offset", "coordinates", "dtype", "missing_value", "sc
 
 def clean_attributes(attributes: Mapping[Any, Any], where: str) -> dict[str, str | int | float]:
     """Attributes as plain text and numbers, so that a file gives back what was saved."""
-    # Numbers become Python numbers, truth values 0 or 1; bytes and arrays of numbers or text are
-    # kept as text.
+    # Numbers become Python numbers, truth values 0 or 1; bytes and arrays of numbers or text
+    # become text.
+    for name in attributes:
+        if not isinstance(name, str) or not NAME.fullmatch(name) or name in RESERVED:
+            raise CaptureError(
+                f"the attribute name {name!r} cannot be stored",
+                where=where,
+                hint="rename it: a letter, then letters, digits or any of _ . + -",
+            )
     return {
-        _clean_name(name, where): _clean_value(value, f"{where}: attribute {name}")
+        name: _clean_value(value, f"{where}: attribute {name}")
         for name, value in attributes.items()
     }
 
 
-def _clean_name(name: object, where: str) -> str:
-    if isinstance(name, str) and NAME.fullmatch(name) and name not in RESERVED:
-        return name
-    raise CaptureError(
-        f"the attribute name {name!r} cannot be stored",
-        where=where,
-        hint="rename it: a letter, then letters, digits or any of _ . + -",
-    )
-
-
 def _clean_value(value: object, where: str) -> str | int | float:
-    if isinstance(value, bytes):
-        return _clean_text(value.decode("utf-8", "backslashreplace"))
-    if isinstance(value, str):
-        return _clean_text(value)
+    array = np.array(None)
+    if isinstance(value, str | bytes | bool | int | float | list | tuple | np.generic | np.ndarray):
+        with contextlib.suppress(ValueError):  # nested lists of unequal length
+            array = np.asarray(value)
     if isinstance(value, int) and not isinstance(value, bool):
         return int(value) if -(2**63) <= value < 2**63 else str(value)
-    if not isinstance(value, bool | float | list | tuple | np.generic | np.ndarray):
-        raise _not_storable(value, where)
-    try:
-        array = np.asarray(value)
-    except ValueError:  # nested lists of unequal length
-        raise _not_storable(value, where) from None
     if array.dtype.kind not in "biufSU":
-        raise _not_storable(value, where)
-    if array.ndim:
-        return _clean_text(str(array.tolist()))
-    item = array.astype(np.int64).item() if array.dtype.kind == "b" else array.item()
-    return _clean_value(item, where) if isinstance(item, str | bytes | int) else float(item)
+        raise CaptureError(
+            f"the value is a {type(value).__name__}, neither a number nor text",
+            where=where,
+            hint="give a number or text, for instance JSON",
+        )
+    item = value if isinstance(value, str | bytes) else array.tolist()
+    if isinstance(item, bytes):
+        item = item.decode("utf-8", "backslashreplace")
+    if isinstance(item, str | list):
+        # UTF-8 and C strings cannot hold lone surrogates and NUL, which are escaped.
+        text = str(item).encode("utf-8", "backslashreplace").decode("utf-8")
+        return text.replace("\0", "\\x00")
+    if isinstance(item, int):
+        return int(item) if item < 2**63 else str(item)
+    return float(item)
 
 
-def _clean_text(text: str) -> str:
-    """Text that UTF-8 and C strings can hold: lone surrogates and NUL are escaped."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8").replace("\0", "\\x00")
-
-
-def _not_storable(value: object, where: str) -> CaptureError:
-    return CaptureError(
-        f"the value is a {type(value).__name__}, neither a number nor text",
-        where=where,
-        hint="give a number or text, for instance JSON",
-    )
-
-
-# --- The only door through which a capture enters: checked once, trusted afterwards ---------------
-
-
-Attributes = dict[str, str | int | float]
+# --- Validation -----------------------------------------------------------------------------------
 
 
 def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
@@ -266,9 +256,6 @@ def count(capture: xr.Dataset) -> dict[str, int]:
 
     Returns:
         `views`: all entries; `masked`: those with `valid=False`; `saturated`: those flagged.
-
-    Raises:
-        Nothing.
     """
     signal = next(capture[name] for name in SIGNALS if name in capture)
     return {
@@ -276,9 +263,6 @@ def count(capture: xr.Dataset) -> dict[str, int]:
         "masked": int((~capture["valid"]).sum()) if "valid" in capture else 0,
         "saturated": int(capture["saturated"].sum()) if "saturated" in capture else 0,
     }
-
-
-# --- which variables, over which dims ---------------------------------------------------------
 
 
 def _check_names(dataset: xr.Dataset, source: str) -> None:
@@ -309,7 +293,7 @@ def _layout(dataset: xr.Dataset, source: str) -> Layout:
     leading = next((option for option in LEADING if _same_dims(rest, option)), None)
     if leading is None or "view" not in dims or len(set(dims)) != len(dims):
         raise CaptureError(
-            f"its dims are {_listed(dims)}",
+            f"its dims are {_dims_text(dims)}",
             where=f"{source}: {name}",
             hint="use view[, wavelength], alone or behind material, patch, or y and x together",
         )
@@ -330,9 +314,9 @@ def _ordered(variable: xr.Variable, row: Variable, layout: Layout, source: str) 
         if _same_dims(variable.dims, dims):
             return variable.transpose(*dims)
     raise CaptureError(
-        f"its dims are {_listed(variable.dims)}",
+        f"its dims are {_dims_text(variable.dims)}",
         where=f"{source}: {row.name}",
-        hint=f"give it {' or '.join(_listed(dims) for dims in options)}",
+        hint=f"give it {' or '.join(_dims_text(dims) for dims in options)}",
     )
 
 
@@ -340,11 +324,8 @@ def _same_dims(dims: Sequence[Hashable], wanted: Sequence[str]) -> bool:
     return len(dims) == len(wanted) and set(dims) == set(wanted)
 
 
-def _listed(dims: Sequence[Hashable]) -> str:
+def _dims_text(dims: Sequence[Hashable]) -> str:
     return f"({', '.join(map(str, dims))})"
-
-
-# --- what a variable holds --------------------------------------------------------------------
 
 
 def _flag(dataset: xr.Dataset, row: Variable, layout: Layout, source: str) -> xr.Variable:
@@ -422,8 +403,8 @@ def _truth(variable: xr.Variable, name: str, layout: Layout, source: str) -> xr.
     where = f"{source}: {name}"
     dims = [dim for dim in layout.readings if dim in variable.dims]
     if not _same_dims(variable.dims, dims):
-        hint = f"give it any of {_listed(layout.readings)}"
-        raise CaptureError(f"its dims are {_listed(variable.dims)}", where=where, hint=hint)
+        hint = f"give it any of {_dims_text(layout.readings)}"
+        raise CaptureError(f"its dims are {_dims_text(variable.dims)}", where=where, hint=hint)
     values = _floats(variable.transpose(*dims).values, where)
     if np.isinf(values).any():
         hint = "give a number, or NaN where the truth is not known"
@@ -439,9 +420,6 @@ def _floats(values: np.ndarray, where: str) -> np.ndarray:
         raise CaptureError(what, where=where, hint="store floating-point numbers")
     with np.errstate(over="ignore"):  # a wider float may become inf, which the range refuses
         return values.astype(np.float64)
-
-
-# --- labels, units and attributes -------------------------------------------------------------
 
 
 def _labels(dataset: xr.Dataset, layout: Layout, source: str) -> dict[str, xr.Variable]:
@@ -482,7 +460,7 @@ def _label_values(values: np.ndarray, where: str) -> np.ndarray:
     return labels.reshape(values.shape)
 
 
-def _attributes(variable: xr.Variable, row: Variable, source: str) -> Attributes:
+def _attributes(variable: xr.Variable, row: Variable, source: str) -> dict[str, str | int | float]:
     where = f"{source}: {row.name}"
     attributes = clean_attributes(variable.attrs, where)
     given = str(attributes.get("units", "")).strip()
@@ -518,8 +496,8 @@ def _check_intensity_units(numbers: dict[str, xr.Variable], source: str) -> None
 
 
 def _entry(name: str, dims: Sequence[Hashable], index: Sequence[int | np.intp]) -> str:
-    """A place in a variable, such as `dop[patch=2, view=3]`."""
+    """An entry of a variable, such as `dop[patch=2, view=3]`."""
     if not dims:
         return name
-    places = (f"{dim}={int(position)}" for dim, position in zip(dims, index, strict=True))
-    return f"{name}[{', '.join(places)}]"
+    positions = (f"{dim}={int(position)}" for dim, position in zip(dims, index, strict=True))
+    return f"{name}[{', '.join(positions)}]"

@@ -2,8 +2,8 @@
 
 The parser is our own and strict, since the well-kept ones guess: `csv.Sniffer` takes the separator
 from letter frequencies and fails on short tables; `pandas.read_csv` fills short rows, turns a
-surplus column into an index and names no line; `numpy.genfromtxt` turns words into NaN. None keeps
-the printed digits, which tell a reading's resolution.
+surplus column into an index and names no line; `numpy.genfromtxt` turns text into NaN. None keeps
+the printed digits, which give a reading's resolution.
 """
 
 import dataclasses
@@ -20,7 +20,6 @@ from polar_bayes.errors import CaptureError
 from polar_bayes.paths import existing_file, system_error
 
 LARGEST_FILE = 50_000_000  # bytes
-SEMICOLON, TABS, COMMA = re.compile(";"), re.compile(r"\t+"), re.compile(",")
 BLANKS = re.compile(r"[ \t]+")
 # A decimal comma stands between digits, so that in "10, 5" it separates.
 NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*|,[0-9]+)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?")
@@ -33,7 +32,7 @@ Row = tuple[int, list[str]]  # line of the file, cells
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Columns of numbers, with where they stood and how finely they were printed."""
+    """Columns of numbers, with their lines and the value of each last printed digit."""
 
     source: str
     columns: Mapping[str, np.ndarray]
@@ -51,27 +50,34 @@ def read_table(path: str | os.PathLike[str], columns: Sequence[str] | None = Non
     # Semicolons, tabs, commas or blanks separate the cells; runs of tabs or of blanks separate
     # once. The first line may name the columns. From a # to the end of its line is comment. Where
     # commas do not separate they may be decimal commas, in the whole table or not at all.
-    source, names, body = _parts(path)
-    if not body:
+    source, names, rows = _parts(path)
+    if not rows:
         raise CaptureError("it holds names but no rows", where=source, hint=EACH_READING)
-    for line, cells in body:
+    for line, cells in rows:
         if len(cells) != len(names):
             what = f"it has another number of cells ({len(cells)}) than the first ({len(names)})"
             hint = "give every line one cell for each column"
             raise CaptureError(what, where=f"{source}: line {line}", hint=hint)
-    _check_decimal_marks(body, source)
-    kept = _positions(columns, names, source)
-    pairs = {
-        name: np.array(
-            [_number(cells[k], f"{source}: line {line}, column {name}") for line, cells in body]
+    has_points = any("." in cell for _, cells in rows for cell in cells)
+    for line, cells in rows:
+        if has_points and any("," in cell for cell in cells):  # "1,234" could be 1.234 or 1234
+            what = "decimal commas stand beside decimal points"
+            hint = "use one of them, and no mark for thousands"
+            raise CaptureError(what, where=f"{source}: line {line}", hint=hint)
+    pairs = {}
+    for name in columns or names:
+        if name not in names:
+            hint = f"choose from {', '.join(names)}"
+            raise CaptureError(f"there is no column {name!r}", where=source, hint=hint)
+        k = names.index(name)
+        pairs[name] = np.array(
+            [_number(cells[k], f"{source}: line {line}, column {name}") for line, cells in rows]
         )
-        for name, k in kept.items()
-    }
     return Table(
         source=source,
         columns={name: pair[:, 0] for name, pair in pairs.items()},
         steps={name: pair[:, 1] for name, pair in pairs.items()},
-        lines=tuple(line for line, _ in body),
+        lines=tuple(line for line, _ in rows),
     )
 
 
@@ -83,9 +89,15 @@ def column_names(path: str | os.PathLike[str]) -> tuple[str, ...]:
 def _parts(path: str | os.PathLike[str]) -> tuple[str, list[str], list[Row]]:
     """Path, names of the columns, and the rows below them."""
     file = existing_file(path, "table")
-    rows = _split_rows(_rows(_text(file)))
-    if not rows:
+    lines = []
+    for number, line in enumerate(re.split("\r\n|\r|\n", _text(file)), 1):
+        if content := line.partition("#")[0].strip():
+            lines.append((number, content))
+    if not lines:
         raise CaptureError("it holds no rows", where=str(file), hint=EACH_READING)
+    # The second line holds numbers, whether or not the first one holds names.
+    separator = _separator(lines[min(1, len(lines) - 1)][1])
+    rows = [(number, [_unquoted(x) for x in separator.split(line)]) for number, line in lines]
     return str(file), *_take_header(rows, str(file))
 
 
@@ -105,32 +117,17 @@ def _text(file: Path) -> str:
         return content.decode("latin-1")
 
 
-def _rows(text: str) -> list[tuple[int, str]]:
-    """Lines that hold something, without comments, each with its number from 1."""
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    bare = ((number, line.partition("#")[0].strip()) for number, line in enumerate(lines, 1))
-    return [(number, line) for number, line in bare if line]
-
-
-def _split_rows(rows: list[tuple[int, str]]) -> list[Row]:
-    if not rows:
-        return []
-    # The second line holds numbers, whether or not the first one holds names.
-    separator = _separator(rows[min(1, len(rows) - 1)][1])
-    return [(line, [_bare(cell) for cell in separator.split(text)]) for line, text in rows]
-
-
 def _separator(line: str) -> re.Pattern[str]:
     if ";" in line:
-        return SEMICOLON
+        return re.compile(";")
     if "\t" in line:
-        return TABS
-    words = BLANKS.split(line)
-    decimal_commas = len(words) > 1 and all(map(_is_number, words))
-    return COMMA if "," in line and not decimal_commas else BLANKS
+        return re.compile(r"\t+")
+    cells = BLANKS.split(line)
+    decimal_commas = len(cells) > 1 and all(map(_is_number, cells))
+    return re.compile(",") if "," in line and not decimal_commas else BLANKS
 
 
-def _bare(cell: str) -> str:
+def _unquoted(cell: str) -> str:
     cell = cell.strip()
     quoted = len(cell) > 1 and cell[0] == cell[-1] == '"'
     return cell[1:-1].strip() if quoted else cell
@@ -153,31 +150,13 @@ def _take_header(rows: list[Row], source: str) -> tuple[list[str], list[Row]]:
 
 
 def _is_name(cell: str) -> bool:
-    """Words are names; what looks like a number gone wrong is not, lest a reading get lost."""
+    """Whether a cell is a name rather than a mistyped number, which must not be lost."""
     lettered = any(character.isalpha() for character in cell)
     return lettered and cell[0] not in "0123456789+-.," and cell.lower() not in MISSING
 
 
 def _is_number(cell: str) -> bool:
     return len(cell) <= LONGEST_NUMBER and NUMBER.fullmatch(cell) is not None
-
-
-def _check_decimal_marks(body: list[Row], source: str) -> None:
-    """Where both marks occur, "1,234" could be 1.234 or 1234."""
-    point = any("." in cell for _, cells in body for cell in cells)
-    for line, cells in body:
-        if point and any("," in cell for cell in cells):
-            what = "decimal commas stand beside decimal points"
-            hint = "use one of them, and no mark for thousands"
-            raise CaptureError(what, where=f"{source}: line {line}", hint=hint)
-
-
-def _positions(columns: Sequence[str] | None, names: list[str], source: str) -> dict[str, int]:
-    for name in columns or ():
-        if name not in names:
-            what = f"there is no column {name!r}"
-            raise CaptureError(what, where=source, hint=f"choose from {', '.join(names)}")
-    return {name: names.index(name) for name in columns or names}
 
 
 def _number(cell: str, where: str) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 """Commands that make captures."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,51 +16,48 @@ from polar_bayes.cli.options import (
     SCENE,
     Command,
     command,
-    print_counts,
-    print_masked,
+    option,
+    out_option,
+    seed_option,
 )
+
+out_capture = out_option(CAPTURE_FILE, "Capture to write.")
+name_option = option("--name", help="Name of the capture.")
+wavelength_option = option("--wavelength", type=float, help="Nanometers.")
+
+
+def _save(capture: Any, out: Path) -> None:
+    """Write a capture and print its counts."""
+    pb.save_capture(capture, out)
+    counts = ", ".join(f"{number} {what}" for what, number in pb.capture.count(capture).items())
+    click.echo(f"{out}: {counts}")
 
 
 @command()
-@click.option("--out", type=CAPTURE_FILE, required=True, help="Capture to write.")
-@click.option(
-    "--preset", type=MATERIAL, default="leaf", show_default=True, help="Material to simulate."
-)
-@click.option(
-    "--scene", type=SCENE, default="paper", show_default=True, help="Named scene to simulate."
-)
-@click.option("--views", type=int, default=40, show_default=True)
-@click.option("--largest-view-zenith", type=float, default=85.0, show_default=True, help="Degrees.")
-@click.option(
+@out_capture
+@option("--preset", type=MATERIAL, default="leaf", help="Material to simulate.")
+@option("--scene", type=SCENE, default="paper", help="Named scene to simulate.")
+@option("--views", type=int, default=40)
+@option("--largest-view-zenith", type=float, default=85.0, help="Degrees.")
+@option(
     "--wavelength", "wavelengths", type=float, multiple=True, default=(450.0, 550.0, 650.0),
-    show_default=True, help="Nanometers; give it once per wavelength.",
+    help="Nanometers; give it once per wavelength.",
 )  # fmt: skip
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-def simulate(
-    out: Path,
-    preset: str,
-    scene: str,
-    views: int,
-    largest_view_zenith: float,
-    wavelengths: tuple[float, ...],
-    seed: int,
-) -> None:
+@seed_option
+def simulate(out: Path, preset: str, scene: str, seed: int, **protocol: Any) -> None:
     """Draw a capture of a known material, by the paper's protocol."""
     protocol = pb.simulation.Protocol(
         views=views, largest_view_zenith=largest_view_zenith, wavelengths=wavelengths
     )
-    capture = pb.simulate(preset, scene=scene, protocol=protocol, seed=seed)
-    pb.save_capture(capture, out)
-    print_counts(capture, out)
 
 
 @command()
 @click.argument("captures", type=INPUT, nargs=-1, required=True)
-@click.option("--dim", default="material", show_default=True, help="material or patch.")
-@click.option("--drop", multiple=True, help="Variable to leave out; give it once per variable.")
-@click.option("--out", type=CAPTURE_FILE, required=True, help="Capture to write.")
+@option("--dim", default="material", help="material or patch.")
+@option("--drop", multiple=True, help="Variable to leave out; give it once per variable.")
+@out_capture
 def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Path) -> None:
-    """Put captures side by side, to be fitted together; each is labeled by its name."""
+    """Combine captures that are to be fitted together; each is labeled by its name."""
     named: dict[str, Any] = {}
     for path in captures:
         capture = pb.load_capture(path)
@@ -76,10 +74,7 @@ def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Pa
     print_counts(capture, out)
 
 
-COMMANDS = (simulate, combine)
-
-
-# --- Commands that turn raw measurements into a capture -------------------------------------------
+# --- Commands that import raw measurements --------------------------------------------------------
 
 
 @click.group(name="import")
@@ -88,141 +83,124 @@ def import_() -> None:
 
 
 @import_.command(cls=Command)
-@click.option(
-    "--s",
-    "s",
-    type=COLUMN_OR_INPUT,
-    required=True,
-    help="Table of s readings, or column name in --table.",
-)
-@click.option(
-    "--p",
-    "p",
-    type=COLUMN_OR_INPUT,
-    required=True,
-    help="Table of p readings, or column name in --table.",
-)
-@click.option("--table", type=INPUT, help="One table with both channels.")
-@click.option("--angle", help="Column of --table with the angle of incidence in degrees.")
-@click.option("--s-incident", type=float, help="Reading of the incident beam, s.")
-@click.option("--p-incident", type=float, help="Reading of the incident beam, p.")
-@click.option("--dark-level", type=float, default=0.0, show_default=True, help="Without light.")
-@click.option("--s-error", type=float, help="Absolute error of an s reading.")
-@click.option("--p-error", type=float, help="Absolute error of a p reading.")
-@click.option("--relative-error", type=float, default=0.01, show_default=True)
-@click.option("--wavelength", type=float, help="Nanometers.")
-@click.option("--name", help="Name of the sample.")
-@click.option("--out", type=CAPTURE_FILE, required=True, help="Capture to write.")
-def goniometer(s: str, p: str, table: Path | None, out: Path, **settings: Any) -> None:
-    """Tables of s and p readings against the angle of incidence, together or apart."""
-    capture = pb.from_goniometer(s, p, table=table, **settings)
-    pb.save_capture(capture, out)
-    print_counts(capture, out)
+@option("--s", "s", type=COLUMN_OR_INPUT, required=True, help="Table of s, or column of --table.")
+@option("--p", "p", type=COLUMN_OR_INPUT, required=True, help="Table of p, or column of --table.")
+@option("--table", type=INPUT, help="One table with both channels.")
+@option("--angle", help="Column of --table with the angle of incidence in degrees.")
+@option("--s-incident", type=float, help="Reading of the incident beam, s.")
+@option("--p-incident", type=float, help="Reading of the incident beam, p.")
+@option("--dark-level", type=float, default=0.0, help="Reading without light.")
+@option("--s-error", type=float, help="Absolute error of an s reading.")
+@option("--p-error", type=float, help="Absolute error of a p reading.")
+@option("--relative-error", type=float, default=0.01)
+@wavelength_option
+@name_option
+@out_capture
+def goniometer(out: Path, **settings: Any) -> None:
+    """Import s and p readings against the angle of incidence, from one table or two."""
+    _save(pb.from_goniometer(**settings), out)
 
 
 @import_.command(cls=Command)
 @click.argument("table", type=INPUT)
-@click.option(
+@option(
     "--column", "columns", type=(str, str), multiple=True, metavar="VARIABLE COLUMN",
     help="Column of a variable, where it has another name; give it once for each.",
 )  # fmt: skip
-@click.option(
+@option(
     "--constant", "constants", type=(str, float), multiple=True, metavar="VARIABLE NUMBER",
     help="A variable that is the same everywhere, such as light_zenith 45.",
 )  # fmt: skip
-@click.option("--ignore", "ignored", multiple=True, metavar="COLUMN", help="Leave it out.")
-@click.option("--setup", help="Set-up that a fit takes by default.")
-@click.option("--saturation-level", type=float, help="Intensity of a full pixel.")
-@click.option("--name", help="Name of the capture.")
-@click.option("--out", type=CAPTURE_FILE, required=True, help="Capture to write.")
-def table(
-    table: Path,
-    columns: tuple[tuple[str, str], ...],
-    constants: tuple[tuple[str, float], ...],
-    out: Path,
-    **settings: Any,
-) -> None:
-    """Any readings, listed a line each with their directions."""
-    given: dict[str, Any] = {
-        "columns": _once(columns, "--column"),
-        "constants": _once(constants, "--constant"),
-    }
-    _write(pb.from_table(table, **given, **settings), out)
+@option("--ignore", "ignored", multiple=True, metavar="COLUMN", help="Leave it out.")
+@option("--setup", help="Set-up that a fit takes by default.")
+@option("--saturation-level", type=float, help="Intensity of a full pixel.")
+@name_option
+@out_capture
+def table(table: Path, out: Path, columns: Any, constants: Any, **settings: Any) -> None:
+    """Import a table with a line for each reading and its directions."""
+    settings["columns"] = _mapping(columns, "--column")
+    settings["constants"] = _mapping(constants, "--constant")
+    _save(pb.from_table(table, **settings), out)
 
 
-def of_a_picture(command: Callable) -> Callable:
-    """The options that every import of pictures has."""
-    options = (
-        click.option(
-            "--sphere", "spheres", type=float, nargs=3, multiple=True, metavar="ROW COLUMN RADIUS",
-            help="A sphere in the frame [pixels]; give it once for each.",
-        ),
-        click.option(
-            "--rim", "rims", type=INPUT, multiple=True,
-            help="Table of points (row, column) on a sphere's outline; give it once for each.",
-        ),
-        click.option(
-            "--normals", type=INPUT, help="Unit normals in a .npy file."
-        ),
-        click.option("--light", type=float, nargs=3, metavar="X Y Z", help="Towards far light."),
-        click.option(
-            "--light-position", type=float, nargs=3, metavar="X Y Z",
-            help="Place of near light [pixels from the center of the frame].",
-        ),
-        click.option(
-            "--highlight", type=float, nargs=2, metavar="ROW COLUMN",
-            help="Where the surface mirrors the light [pixels].",
-        ),
-        click.option("--surroundings", is_flag=True, help="Light from everywhere."),
-        click.option(
-            "--view-position", type=float, nargs=3, metavar="X Y Z",
-            help="Place of a near camera [pixels]: 0 0 and its focal length.",
-        ),
-        click.option("--dark", type=INPUT, help="Frame without light."),
-        click.option("--dark-level", type=float, help="Count without light, in place of --dark."),
-        click.option("--flat", type=INPUT, help="Frame of even light."),
-        click.option("--saturation-level", type=float, help="Count of a full pixel."),
-        click.option("--gain", type=float, help="Counts per electron."),
-        click.option(
-            "--read-noise", type=float, default=1.0, show_default=True, help="In counts."
-        ),
-        click.option("--relative-error", type=float, default=0.01, show_default=True),
-        click.option("--window", type=int, default=2, show_default=True, help="Readings a side."),
-        click.option("--wavelength", type=float, help="Nanometers."),
-        click.option("--name", help="Name of the capture."),
-        click.option(
-            "--out", type=CAPTURE_FILE, required=True, help="Capture to write."
-        ),
-    )  # fmt: skip
-    for option in reversed(options):
-        command = option(command)
-    return command
+def _mapping(pairs: tuple[tuple[str, Any], ...], flag: str) -> dict[str, Any]:
+    """A mapping from an option that is given once for each variable."""
+    names = [name for name, _ in pairs]
+    if repeated := [name for name in names if names.count(name) > 1]:
+        raise click.UsageError(f"{flag} names {repeated[0]} twice")
+    return dict(pairs)
+
+
+IMAGE_OPTIONS = (
+    option(
+        "--sphere", "spheres", type=float, nargs=3, multiple=True, metavar="ROW COLUMN RADIUS",
+        help="A sphere in the frame [pixels]; give it once for each.",
+    ),
+    option(
+        "--rim", "rims", type=INPUT, multiple=True,
+        help="Table of points (row, column) on a sphere's outline; give it once for each.",
+    ),
+    option("--normals", type=INPUT, help="Unit normals in a .npy file."),
+    option("--light", type=float, nargs=3, metavar="X Y Z", help="Towards distant light."),
+    option(
+        "--light-position", type=float, nargs=3, metavar="X Y Z",
+        help="Position of near light [pixels from the center of the frame].",
+    ),
+    option(
+        "--highlight", type=float, nargs=2, metavar="ROW COLUMN",
+        help="Where the surface mirrors the light [pixels].",
+    ),
+    option("--surroundings", is_flag=True, help="Light from everywhere."),
+    option(
+        "--view-position", type=float, nargs=3, metavar="X Y Z",
+        help="Position of a near camera [pixels]: 0 0 and its focal length.",
+    ),
+    option("--dark", type=INPUT, help="Frame without light."),
+    option("--dark-level", type=float, help="Count without light, in place of --dark."),
+    option("--flat", type=INPUT, help="Frame of even light."),
+    option("--saturation-level", type=float, help="Count of a full pixel."),
+    option("--gain", type=float, help="Counts per electron."),
+    option("--read-noise", type=float, default=1.0, help="In counts."),
+    option("--relative-error", type=float, default=0.01),
+    option("--window", type=int, default=2, help="Readings a side."),
+    wavelength_option,
+    name_option,
+    out_capture,
+)  # fmt: skip
+
+
+def image_options(function: Callable) -> Callable:
+    """The options that every import of camera frames has."""
+    for decorator in reversed(IMAGE_OPTIONS):
+        function = decorator(function)
+    return function
 
 
 @import_.command(cls=Command)
-@click.option(
+@option(
     "--frame", "frames", type=(float, INPUT), multiple=True, required=True,
     metavar="ANGLE FILE", help="Angle of the polarizer [degrees], frame; give it once for each.",
 )  # fmt: skip
-@of_a_picture
-@click.option("--bin", type=int, default=1, show_default=True, help="Pixels averaged, a side.")
+@image_options
+@option("--bin", type=int, default=1, help="Pixels averaged, a side.")
 def polarizer(frames: tuple[tuple[float, Path], ...], out: Path, **options: Any) -> None:
-    """Frames behind a polarizer at three or more angles."""
+    """Import frames behind a polarizer at three or more angles."""
     angles, files = [angle for angle, _ in frames], [file for _, file in frames]
-    _write(pb.from_polarizer(files, angles, **_setting(options)), out)
+    _save_image(pb.from_polarizer(files, angles, **_image_arguments(**options)), out)
 
 
 @import_.command(cls=Command)
 @click.argument("frame", type=INPUT)
-@of_a_picture
-@click.option(
-    "--layout", type=float, nargs=4, default=(90.0, 45.0, 135.0, 0.0), show_default=True,
+@image_options
+@option(
+    "--layout", type=float, nargs=4, default=(90.0, 45.0, 135.0, 0.0),
     help="Angles of the four pixels, row by row [degrees].",
 )  # fmt: skip
-@click.option("--bin", type=int, default=2, show_default=True, help="Pixels averaged, a side.")
+@option("--bin", type=int, default=2, help="Pixels averaged, a side.")
 def mosaic(frame: Path, layout: tuple[float, ...], out: Path, **options: Any) -> None:
-    """One raw frame of a polarization camera."""
-    _write(pb.from_mosaic(frame, layout=(layout[:2], layout[2:]), **_setting(options)), out)
+    """Import one raw frame of a polarization camera."""
+    rows = layout[:2], layout[2:]
+    _save_image(pb.from_mosaic(frame, layout=rows, **_image_arguments(**options)), out)
 
 
 def _once(pairs: tuple[tuple[str, Any], ...], option: str) -> dict[str, Any]:
@@ -266,20 +244,34 @@ def _setting(options: dict[str, Any]) -> dict[str, Any]:
             for name in ("flat", "saturation_level", "gain", "read_noise", "relative_error")
         },
     )
-    found = {"shape": shape, "light": light, "detector": detector, **options}
-    return found if view is None else found | {"view": view}
+    detector = {
+        field.name: options.pop(field.name)
+        for field in dataclasses.fields(pb.importers.Detector)
+        if field.name != "dark"
+    }
+    if view_position:
+        options["view"] = pb.importers.Position(*view_position)
+    return {
+        "shape": _only_one({"--sphere or --rim": outlines, "--normals": normals}),
+        "light": _only_one(
+            {
+                "--light": light and pb.importers.Direction(*light),
+                "--light-position": light_position and pb.importers.Position(*light_position),
+                "--highlight": highlight and pb.importers.Highlight(*highlight),
+                "--surroundings": pb.importers.Surroundings() if surroundings else None,
+            }
+        ),
+        "detector": pb.importers.Detector(dark=dark or dark_level or 0.0, **detector),
+        **options,
+    }
 
 
-def _one(given: dict[str, Any]) -> Any:
-    """The one that was given of several options."""
-    there = {name: value for name, value in given.items() if value is not None}
-    if len(there) != 1:
+def _only_one(given: dict[str, Any]) -> Any:
+    """The value of the one option that was given."""
+    values = [value for value in given.values() if value]
+    if len(values) != 1:
         raise click.UsageError(f"give one of {', '.join(given)}")
-    return next(iter(there.values()))
+    return values[0]
 
 
-def _made(kind: Callable, numbers: tuple[float, ...] | None) -> Any:
-    return None if numbers is None else kind(*numbers)
-
-
-IMPORT_COMMANDS = (import_,)
+COMMANDS = (simulate, combine, import_)

@@ -1,6 +1,5 @@
-"""Commands that say how far a fit can be trusted."""
+"""Commands that measure how far a fit can be trusted."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -9,47 +8,56 @@ import click
 import polar_bayes as pb
 from polar_bayes.cli.options import (
     CALIBRATION_METHOD,
-    INPUT,
-    MODEL,
     NOT_CONVERGED,
     RESULT_FILE,
-    RUNG,
     SCENE,
+    STUDY_METHOD,
     command,
+    json_option,
+    json_rows,
+    model_option,
+    option,
+    out_option,
+    print_frame,
+    print_json,
+    scene_option,
+    scheduler_option,
+    seed_option,
+    view_limit_option,
 )
 from polar_bayes.progress import stages
 
 
 @command()
-@click.argument("capture", type=INPUT)
-@click.option("--out", type=RESULT_FILE, required=True, help="File to write.")
-@click.option("--model", type=MODEL, default="per_material", show_default=True)
-@click.option(
-    "--method",
-    type=CALIBRATION_METHOD,
+@capture_argument
+@out_option(RESULT_FILE, "File to write.")
+@model_option
+@option(
+    "--method", type=CALIBRATION_METHOD,
     help="laplace, importance, tempered or nuts; by default what suits the capture.",
-)
-@click.option("--simulations", type=int, default=1000, show_default=True)
-@click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
-@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-@click.option("--no-readings", is_flag=True, help="Rank parameters only.")
-@click.option("--scheduler", help="Address of a dask.distributed scheduler; default: threads.")
-@click.option(
-    "--resume", is_flag=True,
-    help="Go on with a calibration that was broken off, or with more simulations.",
 )  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the tables as JSON.")
+@option("--simulations", type=int, default=1000)
+@scene_option
+@view_limit_option
+@seed_option
+@option("--no-readings", is_flag=True, help="Rank parameters only.")
+@scheduler_option
+@option(
+    "--resume", is_flag=True,
+    help="Continue an interrupted calibration, or add simulations to a finished one.",
+)  # fmt: skip
+@json_option
 def calibrate(
     capture: Path, out: Path, no_readings: bool, resume: bool, as_json: bool, **settings: Any
 ) -> int:
-    """Simulate captures of this layout, fit each, and see whether the intervals hold."""
+    """Simulate captures of this layout, fit each, and test the coverage of the intervals."""
     data = pb.load_capture(capture)
     store = out.with_name(f"{out.name}.fits")
     if resume and out.exists() and not store.exists():
         raise pb.FitError("nothing is left to resume", where=str(out), hint="give another --out")
-    settings |= {"readings": not no_readings, "store": store, "resume": resume}
-    calibration = pb.calibrate(data, **settings)
+    calibration = pb.calibrate(
+        data, readings=not no_readings, store=store, resume=resume, **settings
+    )
     pb.save_result(calibration, out)
     table, said = (
         pb.calibration.calibration_table(calibration),
@@ -58,9 +66,8 @@ def calibrate(
     is_ranked = "predictive_pit" in calibration.children
     readings = pb.calibration.calibration_readings(calibration) if is_ranked else None
     if as_json:
-        tables = {"parameters": table} | ({} if readings is None else {"readings": readings})
-        rows = {name: json.loads(each.to_json(orient="index")) for name, each in tables.items()}
-        click.echo(json.dumps({**rows, "verdict": said}, indent=2, allow_nan=False))
+        rows = {name: json_rows(each) for name, each in tables.items()}
+        print_json({**rows, "verdict": verdict})
     else:
         shown = table[["answered", "failed", "p_value", "held_50", "held_80", "held_95", "crps"]]
         click.echo(shown.to_string(float_format=lambda x: f"{x:.3g}"))
@@ -72,32 +79,23 @@ def calibrate(
 
 
 @command()
-@click.argument("capture", type=INPUT)
-@click.option("--model", type=MODEL, default="per_material", show_default=True)
-@click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
-@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
-@click.option(
-    "--profile",
-    "profiled",
-    multiple=True,
-    metavar="PARAMETER",
-    help="Follow the likelihood while this parameter moves; give it once per parameter.",
-)
-@click.option(
-    "--next-views",
-    "count",
-    type=click.IntRange(min=1),
-    metavar="N",
+@capture_argument
+@scene_option
+@view_limit_option
+@option(
+    "--profile", "profiled", multiple=True, metavar="PARAMETER",
+    help="Profile likelihood of this parameter; give it once per parameter.",
+)  # fmt: skip
+@option(
+    "--next-views", "count", type=click.IntRange(min=1), metavar="N",
     help="Name the N views that would add most.",
-)
-@click.option(
-    "--criterion",
-    default="D",
-    show_default=True,
+)  # fmt: skip
+@option(
+    "--criterion", default="D",
     help="What they should narrow: D (all parameters together), A (each), or one parameter.",
-)
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Print the tables as JSON.")
+)  # fmt: skip
+@seed_option
+@json_option
 def identify(
     capture: Path,
     profiled: tuple[str, ...],
@@ -108,7 +106,7 @@ def identify(
 ) -> None:
     """Which parameters a capture determines, which trade off, and where to look next."""
     data = pb.load_capture(capture)
-    tables, said = {}, {}
+    found = {}
     with stages() as progress:
         found = pb.identify(data, progress=progress, **settings)
         tables["parameters"] = pb.design.identifiability_table(found)
@@ -124,14 +122,15 @@ def identify(
             tables["next views"] = pb.design.next_views_table(views)
             said["next views"] = pb.design.next_views_sentences(views)
     if as_json:
-        told = {name: json.loads(table.to_json(orient="index")) for name, table in tables.items()}
-        every = {"said": said.pop("said"), **{f"{name}: said": x for name, x in said.items()}}
-        click.echo(json.dumps({**told, **every}, indent=2, allow_nan=False))
+        rows: dict[str, Any] = {name: json_rows(table) for name, (table, _) in found.items()}
+        for name, (_, sentences) in found.items():
+            rows["said" if name == "parameters" else f"{name}: said"] = sentences
+        print_json(rows)
         return
-    for (name, table), sentences in zip(tables.items(), said.values(), strict=True):
+    for name, (table, sentences) in found.items():
         if name != "parameters":
             click.echo(f"\n{name}")
-        click.echo(table.to_string(float_format=lambda x: f"{x:.3g}", index_names=False))
+        print_frame(table)
         click.echo("\n".join(["", *sentences]))
 
 
@@ -142,39 +141,34 @@ def identify(
 @click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
 @click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
 @click.option(
-    "--rung", "rungs", type=RUNG, multiple=True,
+    "--method", "methods", type=STUDY_METHOD, multiple=True,
     help="Method to try; by default the whole ladder.",
 )  # fmt: skip
-@click.option("--no-dials", is_flag=True, help="Methods alone, nothing turned beside them.")
+@click.option("--no-overrides", is_flag=True, help="Methods alone, nothing else changed.")
 @click.option("--tolerance", type=float, default=0.1, show_default=True, help="Of the advice.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
 def accuracy(
     capture: Path,
     out: Path,
-    rungs: tuple[str, ...],
-    no_dials: bool,
+    methods: tuple[str, ...],
+    no_overrides: bool,
     tolerance: float,
     as_json: bool,
     **settings: Any,
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
     data = pb.load_capture(capture)
-    settings["rungs"] = {name: pb.methods.LADDER[name] for name in rungs or pb.methods.LADDER}
-    settings |= {"dials": ()} if no_dials else {}
+    settings["methods"] = {name: pb.methods.LADDER[name] for name in methods or pb.methods.LADDER}
+    settings |= {"overrides": ()} if no_overrides else {}
     study = pb.accuracy(data, **settings)
     pb.save_result(study, out)
-    table, advice = (
-        pb.benchmark.accuracy_table(study),
-        pb.benchmark.accuracy_advice(study, tolerance),
-    )
+    table = pb.benchmark.accuracy_table(study)
+    advice = " ".join(pb.benchmark.accuracy_sentences(study, tolerance))
     if as_json:
-        rows = json.loads(table.to_json(orient="index"))
-        click.echo(json.dumps({"rows": rows, "advice": advice}, indent=2, allow_nan=False))
+        print_json({"rows": json_rows(table), "advice": advice})
         return
-    columns = ["error", "worst", "k_hat", "r_hat", "seconds_first", "seconds_again"]
-    shown = table[columns].rename_axis(None)
-    click.echo(shown.to_string(float_format=lambda x: f"{x:.3g}", na_rep="-"))
+    print_frame(table[["error", "worst", "k_hat", "r_hat", "seconds_first", "seconds_again"]])
     click.echo(f"\n{advice}")
 
 

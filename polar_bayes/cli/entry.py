@@ -1,8 +1,8 @@
-"""One program with many commands.
+"""The program `polar-bayes`: its process, signals, exit status and commands.
 
 Exit status: 0 done; 1 the input or the options are wrong, or something broke (one line: where,
 what, the hint); 2 the fit ran but its diagnostics fail, with the result still written; 128 + n
-stopped by signal n: 130 Ctrl-C, 143 terminated, 141 nobody reads the output.
+stopped by signal n: 130 Ctrl-C, 143 terminated, 141 the reader of the output ended.
 
 Python runs signal handlers between two bytecodes of the main thread, which may be inside compiled
 code for minutes. The command therefore runs in a thread of its own, and the main thread waits for
@@ -23,7 +23,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any, NoReturn
@@ -31,16 +31,14 @@ from typing import Any, NoReturn
 import click
 import platformdirs
 
-from polar_bayes.cli.captures import COMMANDS as OF_CAPTURES
-from polar_bayes.cli.captures import IMPORT_COMMANDS as OF_IMPORTS
-from polar_bayes.cli.checks import COMMANDS as OF_CHECKS
-from polar_bayes.cli.fits import COMMANDS as OF_FITS
+from polar_bayes.cli.captures import COMMANDS as CAPTURE_COMMANDS
+from polar_bayes.cli.checks import COMMANDS as CHECK_COMMANDS
+from polar_bayes.cli.fits import COMMANDS as FIT_COMMANDS
 from polar_bayes.errors import PolarBayesError, one_line
 from polar_bayes.interrupts import clean_up
 from polar_bayes.paths import system_error
 
-# --- The process of a command: which signals end it, what libraries write to it, and how it ends
-
+# --- The process of a command ---------------------------------------------------------------------
 
 TRACEBACK = "POLAR_BAYES_TRACEBACK"
 """Environment variable: if it is set, tracebacks, warnings and logs of libraries are shown."""
@@ -50,12 +48,13 @@ SIGNALS = tuple(
 )
 
 POLL, CLEAN_UP, LEAVE = 0.1, 3.0, 0.5
-"""Seconds: between two looks for a signal; for all cleanups; for threads that are still alive."""
+"""Seconds: between two polls for a signal; for all cleanups; for threads that are still alive."""
 
 STACK = 16 * 2**20
 """Bytes of the stack of the command's thread: by default macOS gives threads 0.5 MiB."""
 
 DAMAGED = "Error reading persistent compilation cache entry"
+FOLDER = "JAX_COMPILATION_CACHE_DIR"
 
 
 def run_until_signal(command: Callable[[], int]) -> int:
@@ -70,30 +69,23 @@ def run_until_signal(command: Callable[[], int]) -> int:
         received.append(number)
 
     outcome: Future[int] = Future()
-    with _handled_by(receive):
-        _start(contextvars.copy_context(), command, outcome)
-        while not wait([outcome], timeout=POLL).done:
-            if received:
-                _stop(received[0])
-    return outcome.result()
-
-
-@contextlib.contextmanager
-def _handled_by(receive: Callable[[int, Any], None]) -> Iterator[None]:
-    """Signal handlers while the block runs."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
     handled = [number for number in SIGNALS if before[number] not in (signal.SIG_IGN, None)]
     for number in handled:
         signal.signal(number, receive)
     try:
-        yield
+        _start(contextvars.copy_context(), command, outcome)
+        while not wait([outcome], timeout=POLL).done:
+            if received:
+                _stop(received[0])
     finally:
         for number in handled:
             signal.signal(number, before[number])
+    return outcome.result()
 
 
 def _start(context: contextvars.Context, command: Callable[[], int], outcome: Future[int]) -> None:
-    """Start the thread of the command, whose end is that of `outcome`."""
+    """Run the command in a thread that sets `outcome`."""
 
     def work() -> None:
         try:
@@ -101,23 +93,23 @@ def _start(context: contextvars.Context, command: Callable[[], int], outcome: Fu
         except BaseException as error:
             outcome.set_exception(error)
 
-    others = threading.stack_size(STACK)
+    default_size = threading.stack_size(STACK)
     try:
         threading.Thread(target=work, name="polar-bayes command", daemon=True).start()
     finally:
-        threading.stack_size(others)
+        threading.stack_size(default_size)
 
 
 def _stop(number: int) -> NoReturn:
-    """Clean up and end the process; the main thread stays free for the next signal."""
+    """Clean up and end the process; the main thread can receive the next signal meanwhile."""
 
-    def say() -> None:
+    def work() -> None:
         text = ". ".join(["polar-bayes: stopped", *clean_up()])
-        with contextlib.suppress(OSError, ValueError):  # nobody reads any more
+        with contextlib.suppress(OSError, ValueError):  # the reader of the pipe has ended
             click.echo(text, err=True)
             sys.stdout.flush()
 
-    cleaning = threading.Thread(target=say, daemon=True)
+    cleaning = threading.Thread(target=work, daemon=True)
     cleaning.start()
     cleaning.join(CLEAN_UP)
     os._exit(128 + number)
@@ -142,37 +134,27 @@ def _leave(status: int) -> None:
 
 
 def quiet_libraries() -> None:
-    """Keep what libraries log and warn from the user of the command line, who cannot act on it."""
+    """Hide logs and warnings of libraries, on which users of the command line cannot act."""
     if os.environ.get(TRACEBACK):
         return
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA: slow compilation, other processors
     logging.getLogger().addHandler(logging.NullHandler())  # else Python writes them to stderr
-    warnings.showwarning = _Warnings().show
+    damaged: list[str] = []
 
-
-class _Warnings:
-    """One line about all damaged entries of the compilation cache; nothing about the rest."""
-
-    def __init__(self) -> None:
-        self._is_said = False
-
-    def show(self, message: Warning | str, *_: Any, **__: Any) -> None:
-        """Stands in for `warnings.showwarning`."""
-        if str(message).startswith(DAMAGED) and not self._is_said:
-            self._is_said = True
-            folder = os.environ.get("JAX_COMPILATION_CACHE_DIR", "JAX_COMPILATION_CACHE_DIR")
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        """Print one line about all damaged entries of the compilation cache, and nothing else."""
+        if str(message).startswith(DAMAGED) and not damaged:
+            damaged.append(str(message))
             click.echo(
-                f"{folder}: compiled programs there are damaged and are compiled again; "
-                "delete the folder to have them kept",
+                f"{os.environ.get(FOLDER, FOLDER)}: compiled programs there are damaged and are "
+                "compiled again; delete the folder to have them kept",
                 err=True,
             )
 
+    warnings.showwarning = show
 
-# --- Where compiled programs are kept between runs: a folder that nobody else can write to --------
 
-
-FOLDER = "JAX_COMPILATION_CACHE_DIR"
-OTHERS = stat.S_IWGRP | stat.S_IWOTH
+# --- The folder of compiled programs, to which no other user may write ----------------------------
 
 
 def keep_compiled_programs() -> None:
@@ -181,17 +163,16 @@ def keep_compiled_programs() -> None:
     # not used where other users could write to it; one line on stderr says so.
     if FOLDER not in os.environ:
         folder = platformdirs.user_cache_path("polar_bayes") / "compiled"
-        doubt = _doubt(folder)
-        if doubt:
-            hint = f"mend that, or set {FOLDER} to a folder of your own"
-            click.echo(f"{folder}: compiled programs are not kept: {doubt}; {hint}", err=True)
+        if problem := _folder_problem(folder):
+            hint = f"change that, or set {FOLDER} to a folder of your own"
+            click.echo(f"{folder}: compiled programs are not kept: {problem}; {hint}", err=True)
             return
         os.environ[FOLDER] = str(folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 
-def _doubt(folder: Path) -> str:
+def _folder_problem(folder: Path) -> str:
     """Why others could write to the folder, which is made if it is not there; empty if not."""
     ours = (folder.parent, folder)
     try:
@@ -205,22 +186,22 @@ def _doubt(folder: Path) -> str:
             shared = each not in ours and found.st_mode & stat.S_ISVTX  # such as /tmp
             if found.st_uid != os.getuid() and (each in ours or found.st_uid != 0):
                 return f"{each} belongs to another user"
-            if found.st_mode & OTHERS and not shared:
+            if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not shared:
                 return f"other users can write to {each}"
     except OSError as error:
         return f"it cannot be used ({(error.strerror or str(error)).lower()})"
     return ""
 
 
-# --- One program with many commands ---------------------------------------------------------------
+# --- Running a command ----------------------------------------------------------------------------
 
 
 BROKEN_PIPE = 141
-"""Exit status of a program whose output nobody reads: 128 + SIGPIPE."""
+"""Exit status of a program whose pipe is broken: 128 + SIGPIPE."""
 
 
 def console() -> NoReturn:
-    """The program `polar-bayes`: run the words of this process as a command, and end it."""
+    """The program `polar-bayes`: run the arguments of this process as a command, and end it."""
     end(main())
 
 
@@ -296,5 +277,5 @@ def commands() -> None:
     """From polarization captures to calibrated posteriors of layered dielectrics."""
 
 
-for _command in (*OF_CAPTURES, *OF_IMPORTS, *OF_FITS, *OF_CHECKS):
+for _command in (*CAPTURE_COMMANDS, *FIT_COMMANDS, *CHECK_COMMANDS):
     commands.add_command(_command)

@@ -1,6 +1,5 @@
-"""Commands that fit, and show what was found."""
+"""Commands that fit a capture, and show results."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,28 +10,31 @@ from polar_bayes.cli.options import (
     FIT_METHOD,
     FOLDER,
     INPUT,
-    MODEL,
     NOT_CONVERGED,
     RESULT_FILE,
-    SCENE,
     STORE,
+    capture_argument,
     command,
-    print_table,
-    status,
+    json_option,
+    model_option,
+    option,
+    out_option,
+    print_fit,
+    scene_option,
+    scheduler_option,
+    seed_option,
+    view_limit_option,
 )
 from polar_bayes.paths import written
 from polar_bayes.progress import stages
 
 DEMO = "polar-bayes demo"
-"""Attribute of the capture of a demo, by which the next one knows its folder."""
+"""Attribute of the capture of a demo, by which the next demo recognizes its folder."""
 
 
 @command()
-@click.option(
-    "--out", type=FOLDER, default=Path("polar-bayes-demo"),
-    show_default=True, help="Folder to write.",
-)  # fmt: skip
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@out_option(FOLDER, "Folder to write.", required=False, default=Path("polar-bayes-demo"))
+@seed_option
 def demo(out: Path, seed: int) -> int:
     """Capture, fit, diagnostics and report of an embedded example."""
     _make_folder(out)
@@ -44,26 +46,42 @@ def demo(out: Path, seed: int) -> int:
         progress("writing the report", 0.0)
         page = pb.report(result, out / "report")
         progress("writing the report", 1.0)
-    print_table(result)
+    status = print_fit(result)
     click.echo(f"report: {page}")
-    return status(result)
+    return status
+
+
+def _make_folder(folder: Path) -> None:
+    """The folder of a demo: new, empty, or that of an earlier demo."""
+    with written(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        names = {path.name for path in folder.iterdir()}
+    if not names:
+        return
+    made_by = ""
+    if "capture.nc" in names <= {"capture.nc", "fit.nc", "report"}:
+        made_by = pb.load_capture(folder / "capture.nc").attrs.get("made_by", "")
+    if made_by != DEMO:
+        raise pb.OutputError(
+            "it holds files that no demo made", where=str(folder), hint="give another --out"
+        )
 
 
 @command()
-@click.argument("capture", type=INPUT)
-@click.option("--out", type=RESULT_FILE, required=True, help="Result to write.")
-@click.option("--model", type=MODEL, default="per_material", show_default=True)
-@click.option(
-    "--method", type=FIT_METHOD, default="nuts", show_default=True,
+@capture_argument
+@out_option(RESULT_FILE, "Result to write.")
+@model_option
+@option(
+    "--method", type=FIT_METHOD, default="nuts",
     help="point, laplace, importance, tempered, nuts, or auto: the cheapest that is good enough.",
 )  # fmt: skip
-@click.option("--seconds", type=float, help="Of --method auto; 60 by default.")
-@click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
-@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
-@click.option("--choose-effects", "choose", is_flag=True, help="Fit what `effects` would keep.")
-@click.option("--tolerance", type=float, help="Of --choose-effects and --method auto; 0.1 sd.")
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
+@option("--seconds", type=float, help="Of --method auto; 60 by default.")
+@scene_option
+@view_limit_option
+@option("--choose-effects", "choose", is_flag=True, help="Fit what `effects` would keep.")
+@option("--tolerance", type=float, help="Of --choose-effects and --method auto; 0.1 sd.")
+@seed_option
+@json_option
 def fit(
     capture: Path,
     out: Path,
@@ -82,11 +100,11 @@ def fit(
     data = pb.load_capture(capture)
     with stages() as progress:
         if choose:
-            data = _in_setup(data, scene)
+            data = _with_setup(data, scene)
             options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             scene = pb.choose_effects(data, progress=progress, **options)
-            click.echo(pb.effects.ledger_sentence(scene.ledger), err=True)
+            click.echo(" ".join(pb.effects.ledger_sentences(scene.ledger)), err=True)
         wish: dict[str, Any] = {"tolerance": tolerance} if is_auto else {}
         result = pb.fit(data, scene=scene, progress=progress, **wish, **settings)
     pb.save_result(result, out)
@@ -100,28 +118,25 @@ def fit(
 
 
 @command(name="map")
-@click.argument("capture", type=INPUT)
-@click.option("--out", type=STORE, required=True, help="Zarr store to write.")
-@click.option("--model", type=MODEL, default="per_material", show_default=True)
-@click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
-@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
-@click.option(
-    "--method",
-    type=click.Choice(("laplace", "tempered")),
-    default="laplace",
-    show_default=True,
+@capture_argument
+@out_option(STORE, "Zarr store to write.")
+@model_option
+@scene_option
+@view_limit_option
+@option(
+    "--method", type=click.Choice(("laplace", "tempered")), default="laplace",
     help="One mode of each pixel, corrected; or all modes, many times slower.",
-)
-@click.option("--draws", type=int, help="Of laplace, weighted, in each pixel.  [default: 256]")
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-@click.option("--precision", default="double", show_default=True, help="double or single.")
-@click.option("--scheduler", help="Address of a dask.distributed scheduler; default: threads.")
-@click.option("--resume", is_flag=True, help="Go on with a map that was broken off.")
+)  # fmt: skip
+@option("--draws", type=int, help="Of laplace, weighted, in each pixel.  [default: 256]")
+@seed_option
+@option("--precision", default="double", help="double or single.")
+@scheduler_option
+@option("--resume", is_flag=True, help="Continue an interrupted map.")
 def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: Any) -> None:
     """Fit every pixel of an image."""
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
-    asked: dict[str, Any] = {} if draws is None else {"draws": draws}
+    asked = {} if draws is None else {"draws": draws}
     chosen = (
         pb.methods.PixelLaplace(**asked) if method == "laplace" else pb.methods.PixelTempering()
     )
@@ -133,22 +148,20 @@ def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: A
 
 
 @command()
-@click.argument("capture", type=INPUT)
-@click.option(
-    "--scene", type=SCENE, help="Named set-up; by default the one that the capture names."
-)
-@click.option("--tolerance", type=float, default=0.1, show_default=True, help="Posterior sd.")
-@click.option("--keep", multiple=True, help="Effect that stays; give it once per effect.")
-@click.option("--drop", multiple=True, help="Effect that goes; give it once per effect.")
-@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Print the ledger as JSON.")
-@click.option("--out", type=RESULT_FILE, help="Ledger to write.")
+@capture_argument
+@scene_option
+@option("--tolerance", type=float, default=0.1, help="Posterior sd.")
+@option("--keep", multiple=True, help="Effect that stays; give it once per effect.")
+@option("--drop", multiple=True, help="Effect that goes; give it once per effect.")
+@view_limit_option
+@seed_option
+@json_option
+@out_option(RESULT_FILE, "Ledger to write.", required=False)
 def effects(
     capture: Path, scene: str | None, as_json: bool, out: Path | None, **settings: Any
 ) -> None:
     """What each effect changes and costs; which of them this capture can see."""
-    data = _in_setup(pb.load_capture(capture), scene)
+    data = _with_setup(pb.load_capture(capture), scene)
     with stages() as progress:
         ledger: Any = pb.choose_effects(data, progress=progress, **settings).ledger
     if out is not None:
@@ -156,18 +169,18 @@ def effects(
     if as_json:
         click.echo(json.dumps(pb.effects.ledger_summary(ledger), indent=2, allow_nan=False))
     else:
-        click.echo(f"{pb.effects.ledger_table(ledger)}\n\n{pb.effects.ledger_sentence(ledger)}")
+        table = pb.effects.ledger_table(ledger)
+        table["result"] = table["result"].str.ljust(table["result"].str.len().max())
+        click.echo(table.to_string())
+        click.echo(f"\n{' '.join(pb.effects.ledger_sentences(ledger))}")
 
 
 @command()
 @click.argument("fit", type=INPUT)
-@click.option("--out", type=FOLDER, required=True, help="Folder to write.")
-@click.option("--truth", type=INPUT, help="Of a map: its simulated capture.")
-@click.option(
-    "--uncorrected", type=INPUT,
-    help="With --truth: the same map without weights, to stand beside.",
-)  # fmt: skip
-@click.option(
+@out_option(FOLDER, "Folder to write.")
+@option("--truth", type=INPUT, help="Of a map: its simulated capture.")
+@option("--uncorrected", type=INPUT, help="With --truth: the same map without weights, to compare.")
+@option(
     "--beside", type=INPUT, multiple=True,
     help="Of a calibration: another of the same layout; give it once for each.",
 )  # fmt: skip
@@ -175,7 +188,7 @@ def report(
     fit: Path, out: Path, truth: Path | None, uncorrected: Path | None, beside: tuple[Path, ...]
 ) -> None:
     """Write the standardized report of a fit, calibration, accuracy study, or map (.zarr)."""
-    others: dict[str, Any] = {
+    others = {
         "truth": None if truth is None else pb.maps.open_capture(truth),
         "uncorrected": None if uncorrected is None else pb.maps.open_map(uncorrected),
         "beside": _by_name(beside) or None,
@@ -186,7 +199,7 @@ def report(
 
 @command()
 @click.argument("fits", type=INPUT, nargs=-1, required=True)
-@click.option("--out", type=FOLDER, required=True, help="Folder to write.")
+@out_option(FOLDER, "Folder to write.")
 def compare(fits: tuple[Path, ...], out: Path) -> int:
     """Put fits of one capture side by side: predictions, parameters, and what the priors did."""
     if len({path.stem for path in fits}) < len(fits):
@@ -200,39 +213,18 @@ def compare(fits: tuple[Path, ...], out: Path) -> int:
     for sentence in pb.reporting.comparison_of_fits_sentences(comparison):
         click.echo(sentence)
     click.echo(f"report: {page}")
-    good = all(verdict.converged for verdict in comparison.verdicts.values())
-    return 0 if good else NOT_CONVERGED
+    converged = all(verdict.converged for verdict in comparison.verdicts.values())
+    return 0 if converged else NOT_CONVERGED
 
 
-def _in_setup(capture: Any, setup: str | None) -> Any:
-    """The capture as if it named that set-up, so that scene, links and limits fit together."""
-    return capture if setup is None else capture.assign_attrs(setup=setup)
-
-
-def _make_folder(folder: Path) -> None:
-    """The folder of a demo: new, empty, or that of an earlier demo."""
-    with written(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        held = {path.name for path in folder.iterdir()}
-    if not held:
-        return
-    made_by = ""
-    if held <= {"capture.nc", "fit.nc", "report"} and "capture.nc" in held:
-        made_by = pb.load_capture(folder / "capture.nc").attrs.get("made_by", "")
-    if made_by != DEMO:
-        raise pb.OutputError(
-            "it holds files that no demo made", where=str(folder), hint="give another --out"
-        )
-
-
-def _by_name(paths: tuple[Path, ...]) -> dict[str, Any]:
-    """Calibrations by the names of their files."""
+def _load_all(load: Any, paths: tuple[Path, ...]) -> dict[str, Any]:
+    """Results by the names of their files."""
     if len({path.stem for path in paths}) < len(paths):
         raise click.UsageError("two files of --beside have the same name")
     return {path.stem: pb.calibration.load_calibration(path) for path in paths}
 
 
-def _opened(path: Path) -> Any:
+def _load(path: Path) -> Any:
     """A map, an accuracy study, a calibration or a fit."""
     if path.suffix == ".zarr":
         return pb.maps.open_map(path)

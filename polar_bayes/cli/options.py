@@ -1,19 +1,29 @@
-"""Types of options, and what they refuse before anything is computed and before JAX is loaded."""
+"""Option types and options that several commands share, and what commands print.
+
+Option types refuse wrong values before anything is computed and before JAX is loaded.
+"""
 
 import functools
-from collections.abc import Iterator
+import json
+import sys
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, override
 
 import click
+from rich.console import Console
+from rich.table import Table
 
 import polar_bayes as pb
 from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
 from polar_bayes.paths import as_path, check_output, refuse_inputs
 
+NOT_CONVERGED = 2
+"""Exit status of a fit whose diagnostics fail."""
+
 
 class Name(click.ParamType):
-    """One of the names of a table of the package, which is not loaded to know them."""
+    """A key of a registry of the package, which is not imported for this check."""
 
     name = "text"
 
@@ -23,10 +33,9 @@ class Name(click.ParamType):
     @override
     def convert(self, value: Any, param: Any, ctx: Any) -> str:
         if value not in self.names:
-            option = param.name.rstrip("s")
             raise self.error(
                 f"no such {self.kind}",
-                where=f"{option}={value!r}",
+                where=f"{param.name.rstrip('s')}={value!r}",
                 hint=f"give one of {', '.join(self.names)}",
             )
         return str(value)
@@ -39,8 +48,8 @@ FIT_METHOD = Name(
     "method", ("nuts", "laplace", "point", "importance", "tempered", "auto"), FitError
 )
 CALIBRATION_METHOD = Name("method", ("laplace", "importance", "tempered", "nuts"), FitError)
-RUNG = Name(
-    "rung",
+STUDY_METHOD = Name(
+    "method",
     (
         *("point", "laplace", "importance", "tempered", "normal guide", "flow guide"),
         *("nuts short", "nuts", "nuts long"),
@@ -50,7 +59,7 @@ RUNG = Name(
 
 
 class Input(click.ParamType):
-    """The path of a file or folder that is read; `check` says that it must be there."""
+    """Path of a file or folder that is read; `check` refuses one that does not exist."""
 
     name = "path"
 
@@ -62,16 +71,16 @@ class Input(click.ParamType):
         return as_path(value, param.opts[0]) if self.is_path else str(value)
 
     def check(self, path: Path) -> None:
-        """Refuse what is not there, unless it may be the name of a column."""
+        """Refuse a path that does not exist, unless it may be the name of a column."""
         if self.is_path and not path.exists():
             what = "store" if path.suffix == ".zarr" else "file"
             raise CaptureError(f"there is no such {what}", where=str(path), hint="check the path")
 
 
 class Output(click.ParamType):
-    """The path of an output; it is checked when all inputs are known."""
+    """Path of an output; it is checked when all inputs are known."""
 
-    # A folder or store, of no `kind`, is checked further by what writes it.
+    # A folder or store has no `kind`; the function that writes it checks the rest.
 
     name = "path"
 
@@ -83,14 +92,13 @@ class Output(click.ParamType):
         return as_path(value, param.opts[0], OutputError)
 
     def check(self, path: Path, inputs: list[Path]) -> None:
-        """Refuse what must not be written."""
+        """Refuse a path that must not be written."""
         if self.kind is None:
             refuse_inputs(path, inputs)
             return
         from polar_bayes.capture.files import is_capture, is_result
 
-        kinds = {"capture": is_capture, "result": is_result}
-        check_output(path, kinds[self.kind], inputs)
+        check_output(path, is_capture if self.kind == "capture" else is_result, inputs)
 
 
 INPUT, COLUMN_OR_INPUT = Input(), Input(is_path=False)
@@ -104,7 +112,8 @@ class Command(click.Command):
     def invoke(self, ctx: click.Context) -> Any:
         inputs = []
         for param in self.params:
-            for kind in _inputs(param.type):
+            kinds = param.type.types if isinstance(param.type, click.Tuple) else [param.type]
+            for kind in (kind for kind in kinds if isinstance(kind, Input)):
                 for path in _paths(ctx.params[str(param.name)]):
                     kind.check(path)
                     inputs.append(path)
@@ -115,33 +124,93 @@ class Command(click.Command):
         return super().invoke(ctx)
 
 
-command = functools.partial(click.command, cls=Command)
-
-
-def _inputs(kind: click.ParamType) -> list[Input]:
-    """The types of an option that are paths to read."""
-    parts = kind.types if isinstance(kind, click.Tuple) else [kind]
-    return [part for part in parts if isinstance(part, Input)]
-
-
 def _paths(value: Any) -> Iterator[Path]:
     """Every path in the value of an option that may be given several times."""
     if isinstance(value, str | Path):
         yield Path(value)
     elif isinstance(value, tuple):
-        for each in value:
-            yield from _paths(each)
+        for item in value:
+            yield from _paths(item)
 
 
-# --- What commands print: tables and counts -------------------------------------------------------
+command = functools.partial(click.command, cls=Command)
+option = functools.partial(click.option, show_default=True)
+"""An option that states its default, where it has one."""
+
+capture_argument = click.argument("capture", type=INPUT)
+model_option = option("--model", type=MODEL, default="per_material")
+scene_option = option(
+    "--scene", type=SCENE, help="Named set-up; by default the one that the capture names."
+)
+view_limit_option = option(
+    "--largest-view-zenith", type=float, help="Set aside views beyond it [degrees]."
+)
+seed_option = option("--seed", type=click.IntRange(0, 2**32 - 1), default=0)
+scheduler_option = option(
+    "--scheduler", help="Address of a dask.distributed scheduler; default: threads."
+)
+json_option = option("--json", "as_json", is_flag=True, help="Print the tables as JSON.")
 
 
-NOT_CONVERGED = 2
-"""Exit status of a fit whose diagnostics fail."""
+def out_option(kind: Output, help_text: str, **settings: Any) -> Any:
+    """The option --out, required unless it has a default."""
+    return option("--out", type=kind, help=help_text, **{"required": True, **settings})
 
 
-def status(result: Any) -> int:
-    """Exit status of a fit; its problems and cautions go to the error stream."""
+# --- Printing -------------------------------------------------------------------------------------
+
+
+def print_json(value: object) -> None:
+    """Print a value as strict JSON."""
+    click.echo(json.dumps(value, indent=2, allow_nan=False))
+
+
+def json_rows(table: Any) -> dict[str, Any]:
+    """A row of a data frame by its label, as JSON has it."""
+    return json.loads(table.to_json(orient="index"))
+
+
+def print_frame(table: Any) -> None:
+    """Print a data frame."""
+    print_table(["", *table.columns], table.itertuples())
+
+
+def print_table(titles: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Print rows whose first cell is their label; numbers with four digits, missing ones as -."""
+    grid = Table(box=None, pad_edge=False)
+    for number, title in enumerate(titles):
+        grid.add_column(title, justify="right" if number else "left")
+    for label, *cells in rows:
+        grid.add_row(str(label), *map(_text, cells))
+    # Rich would cut the table to 80 columns where the output is no terminal.
+    width = None if sys.stdout.isatty() else 1000
+    console = Console(width=width, markup=False, highlight=False, emoji=False)
+    with console.capture() as printed:
+        console.print(grid)
+    click.echo(printed.get(), nl=False)
+
+
+def _text(cell: Any) -> str:
+    if cell is None or cell != cell:  # NaN
+        return "-"
+    if not isinstance(cell, float):
+        return str(cell)
+    return f"{cell:.0f}" if 1e4 <= abs(cell) < 1e7 else f"{cell:.4g}"
+
+
+def print_fit(result: Any) -> int:
+    """Print a row per parameter, and the problems on the error stream; returns the exit status."""
+    columns = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
+    rows = pb.diagnostics.json_summary(result)["parameters"]
+    print_table(
+        ["", "mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"],
+        [[name, *(row[column] for column in columns)] for name, row in rows.items()],
+    )
+    return print_verdict(result)
+
+
+def print_verdict(result: Any) -> int:
+    """Print problems and cautions of a fit on the error stream; returns the exit status."""
     verdict = pb.verdict(result)
     for problem in verdict.problems:
         click.echo(f"problem: {problem}", err=True)

@@ -1,9 +1,13 @@
-"""The public verb: where to look next, so that the posterior narrows most."""
+"""Optimal design of further views: which of them would narrow the posterior most.
+
+Fedorov exchange (Fedorov 1972) on a criterion of the expected covariance, averaged over draws of
+the posterior (Chaloner & Verdinelli 1995).
+"""
 
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,33 +18,37 @@ from jaxtyping import Array
 from numpyro import distributions as dist
 
 from polar_bayes.design.candidates import (
-    Chosen,
-    Rig,
-    Views,
-    choose,
+    CandidateViews,
+    Constraints,
+    candidate_links,
     default_candidates,
-    directions_of,
-    join,
-    links_of_new,
+    join_candidates,
+    view_directions,
 )
-from polar_bayes.design.criteria import AbstractCriterion, DOptimal
 from polar_bayes.design.fisher import (
-    distributions,
-    information_of_each,
+    information_by_view,
+    observation_distributions,
+    positive_definite,
     prior_precision,
-    sound_precision,
+    reading_information,
 )
-from polar_bayes.design.identify import provenance
+from polar_bayes.design.optimal_design import (
+    AbstractCriterion,
+    DOptimal,
+    Selection,
+    fedorov_exchange,
+)
 from polar_bayes.design.setup import (
     PRIOR_DRAWS,
-    Question,
-    draws_at,
-    draws_of,
-    embed,
-    find_peaks,
-    flat_parameters,
+    DesignProblem,
+    check_result,
+    coordinate_indices,
+    fit_draws,
     label_parameters,
-    pose,
+    laplace_draws,
+    make_design_problem,
+    parameter_vector,
+    posterior_modes,
 )
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
@@ -59,19 +67,34 @@ WIDTH = 2.0 * 1.959963984540054
 
 
 class Design(NamedTuple):
-    """All that a choice needs, averaged over draws of what the material may be."""
+    """Information of the capture with its prior, and of every candidate, at draws of the posterior.
+
+    `jacobian` (draw, parameter, size) is that of the parameters by the coordinates; the last three
+    say which view, wavelength and reading each candidate is, -1 and "" where it has them all.
+    """
 
     base: np.ndarray
     each: np.ndarray
-    slopes: np.ndarray
+    jacobian: np.ndarray
     view: np.ndarray
     wavelength: np.ndarray
     reading: np.ndarray
 
-    def variances(self, information: np.ndarray) -> np.ndarray:
+    def covariance(self, information: np.ndarray) -> np.ndarray:
         """Expected covariance of the parameters, (draw, option, parameter, parameter)."""
-        slopes = self.slopes[:, None]
-        return slopes @ np.linalg.inv(information) @ np.swapaxes(slopes, -1, -2)
+        jacobian = self.jacobian[:, None]
+        return jacobian @ np.linalg.inv(information) @ np.swapaxes(jacobian, -1, -2)
+
+    def conflicts(self, between_views: np.ndarray, repeatable: bool) -> np.ndarray:
+        """Which candidates exclude each other; wavelengths and readings of one view do not."""
+        same_view = self.view[:, None] == self.view
+        same = (
+            same_view
+            & (self.wavelength[:, None] == self.wavelength)
+            & (self.reading[:, None] == self.reading)
+        )
+        limited = ~same_view | (same & (not repeatable))
+        return between_views[np.ix_(self.view, self.view)] & limited
 
 
 @with_progress
@@ -81,7 +104,7 @@ def next_views(
     *,
     count: int = 3,
     criterion: AbstractCriterion | None = None,
-    rig: Rig | None = None,
+    constraints: Constraints | None = None,
     readings: Sequence[str] | Mapping[str, AbstractLink] | None = None,
     apart: Sequence[str] = (),
     result: xr.DataTree | None = None,
@@ -94,11 +117,11 @@ def next_views(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> xr.Dataset:
-    r"""Views that would add most to what a capture tells, and what to expect of them.
+    r"""Views that would narrow the posterior of a capture most, and the widths to expect.
 
     The information of the capture, of the prior and of every candidate is known for any value of
     the parameters; the criterion of the covariance $(P + F + \sum F_{picked})^{-1}$ is averaged
-    over draws of the posterior, so that the choice does not hang on one value. Candidates are
+    over draws of the posterior, so that the selection does not depend on one value. Candidates are
     picked greedily, then exchanged until no exchange of one helps.
 
     Args:
@@ -110,7 +133,7 @@ def next_views(
             else the capture's median.
         count: How many to pick, at least 1.
         criterion: `DOptimal()` (by default), `AOptimal()`, `SingleParameter(name)`, or your own.
-        rig: What the set-up can do.
+        constraints: Views that the set-up can take.
         readings: Variables that new views record, such as ("q", "u") where the capture has only q;
             or a mapping to their links. By default those of the capture.
         apart: "wavelength", "reading" or both, where one view at one wavelength, or in one
@@ -128,13 +151,14 @@ def next_views(
 
     Returns:
         By `pick`, the most useful first: `candidate` (its number), the four angles, and
-        `wavelength` and `reading` where they were apart. By `step` (0: as it is; then after each
-        pick): `criterion`, and by `parameter` of the material `expected_sd` (root of the variance
-        averaged over the draws) and `interval_width` of the 95% interval, in its own unit.
+        `wavelength` and `reading` where they were apart. By `step` (0: the capture alone; then
+        after each pick): `criterion`, and by `parameter` of the material `expected_sd` (root of
+        the variance averaged over the draws) and `interval_width` of the 95% interval, in its own
+        unit.
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.
-        FitError: Candidates, readings or a rig that cannot be used, or no mode was found.
+        FitError: Candidates, readings or constraints that cannot be used, or no mode was found.
 
     Source:
         Fedorov (1972), Theory of Optimal Experiments; Chaloner & Verdinelli (1995), Statistical
@@ -146,173 +170,162 @@ def next_views(
             where="next_views",
             hint="give whole numbers of at least 1",
         )
-    criterion, rig = criterion or DOptimal(), rig or Rig()
     if set(apart) - set(APART):
         raise FitError(
             f"apart is {tuple(apart)}",
             where="next_views",
             hint=f"give some of {', '.join(APART)}",
         )
+    criterion, constraints = criterion or DOptimal(), constraints or Constraints()
     with jax.enable_x64(True):
-        question = pose(capture, model, scene, priors, links, largest_view_zenith, seed)
-        request = question.request
-        new = links_of_new(question, readings)
+        problem = make_design_problem(
+            capture, model, scene, priors, links, largest_view_zenith, seed
+        )
+        request = problem.request
+        new = candidate_links(problem, readings)
         if candidates is None:
             candidates = default_candidates(request.capture, request.largest_view_zenith)
-        views = join(request.capture, candidates, [*request.links, *new])
-        wide = _widen(question, views, new, model, priors)
-        places = embed(question.program, wide.program)
+        views = join_candidates(request.capture, candidates, [*request.links, *new])
+        extended = _extended(problem, views, new, model, priors)
+        indices = coordinate_indices(problem.program, extended.program)
         if result is None:
-            z = draws_at(find_peaks(question, progress), draws, seed)
+            drawn = laplace_draws(posterior_modes(problem, progress), draws, seed)
         else:
-            z = draws_of(question, result, draws)
-        labels = label_parameters(wide)
-        rows = [i for i, one in enumerate(labels.scalars) if one.name in MATERIAL_PARAMETERS]
-        rows = rows or list(range(len(labels.scalars)))
-        design = _design(question, wide, views, z, places, tuple(new), tuple(apart))
-    design = design._replace(slopes=design.slopes[:, np.array(labels.rows)[rows]])
-    unit = labels.prior_sd[rows]
-    names = [labels.names[row] for row in rows]
+            drawn = fit_draws(problem, result, draws)
+        labels = label_parameters(extended)
+        design = _design(problem, extended, views, drawn, indices, tuple(new), tuple(apart))
+    rows = [i for i, one in enumerate(labels.scalars) if one.name in MATERIAL_PARAMETERS]
+    rows = rows or list(range(len(labels.scalars)))
+    names, unit = [labels.names[row] for row in rows], labels.prior_sd[rows]
+    design = design._replace(jacobian=design.jacobian[:, np.array(labels.rows)[rows]])
 
     def loss(information: np.ndarray) -> np.ndarray:
-        covariance = design.variances(information) / np.outer(unit, unit)
+        covariance = design.covariance(information) / np.outer(unit, unit)
         return np.mean(criterion.loss(covariance, names), axis=0)
 
-    within = views.directions[:, 0] <= request.largest_view_zenith
-    allowed = rig.allows(views.directions, directions_of(request.capture)) & within
+    allowed = constraints.allows(views.directions, view_directions(request.capture))
+    allowed &= views.directions[:, 0] <= request.largest_view_zenith
     useful = np.einsum("kvii->v", design.each) > 0.0  # a wavelength that is not measured adds none
-    clashes = rig.clashes(views.directions)[np.ix_(design.view, design.view)]
-    clashes &= _one_exposure(design, rig.repeatable)
-    chosen = choose(loss, design.base, design.each, allowed[design.view] & useful, clashes, count)
-    return _assemble(request.capture, views, design, chosen, names, (criterion, rig, wide))
+    conflicts = design.conflicts(constraints.conflicts(views.directions), constraints.repeatable)
+    selection = fedorov_exchange(
+        loss, design.base, design.each, allowed[design.view] & useful, conflicts, count
+    )
+    found = _assemble(request.capture, views, design, selection, names)
+    settings = {"criterion": repr(criterion), "constraints": repr(constraints)}
+    provenance = {**extended.provenance, **settings, "exchanges": selection.exchanges}
+    return found.assign_attrs({PROVENANCE: json.dumps(provenance, sort_keys=True)})
 
 
-def _widen(
-    question: Question,
-    views: Views,
+def _extended(
+    problem: DesignProblem,
+    views: CandidateViews,
     new: Mapping[str, AbstractLink],
     model: str | Callable,
     priors: Mapping[str, dist.Distribution] | None,
-) -> Question:
+) -> DesignProblem:
     """The model on measured views and candidates together."""
-    request = question.request
-    links = {**request.links, **new}
-    limit = request.largest_view_zenith
-    wide = resolve(
-        views.capture, model, "laplace", request.scene, priors, links, limit, request.seed, "double"
+    links = {**problem.request.links, **new}
+    limit, seed = problem.request.largest_view_zenith, problem.request.seed
+    request = resolve(
+        views.capture, model, "laplace", problem.request.scene, priors, links, limit, seed, "double"
     )
-    data = observe(wide.capture, largest_view_zenith=limit)
-    recorded = jnp.broadcast_to(question.data.brightness, question.data.shape)
+    data = observe(request.capture, largest_view_zenith=limit)
+    recorded = jnp.broadcast_to(problem.data.brightness, problem.data.shape)
     rest = jnp.full((*data.shape[:-1], data.shape[-1] - views.measured), jnp.median(recorded))
     data = dataclasses.replace(data, brightness=jnp.concatenate([recorded, rest], axis=-1))
-    program = compile_program(wide.bind(wide.scene), data)
-    unheard = [name for name in new if name not in program.observed]
-    if unheard:
+    program = compile_program(request.bind(request.scene), data)
+    unknown = [name for name in new if name not in program.observed]
+    if unknown:
         raise FitError(
-            f"the model does not observe {unheard[0]}",
+            f"the model does not observe {unknown[0]}",
             where="next_views: readings",
             hint=f"give some of {', '.join(program.observed)}",
         )
-    prior = question.prior
-    if program.size != question.program.size:
-        key = jax.random.key(request.seed)
-        prior = from_prior(program, key, PRIOR_DRAWS, data)
-    return Question(wide, data, program, prior)
+    prior = problem.prior
+    if program.size != problem.program.size:
+        prior = from_prior(program, jax.random.key(seed), PRIOR_DRAWS, data)
+    return DesignProblem(request, data, program, prior)
 
 
 def _design(
-    question: Question,
-    wide: Question,
-    views: Views,
+    problem: DesignProblem,
+    extended: DesignProblem,
+    views: CandidateViews,
     draws: np.ndarray,
-    places: np.ndarray,
+    indices: np.ndarray,
     new: tuple[str, ...],
     apart: tuple[str, ...],
 ) -> Design:
     """The information of every candidate at every draw, from one compiled program."""
-    program, count = wide.program, len(draws)
-    z = wide.prior[np.arange(count) % len(wide.prior)].copy()  # what only new readings bring in
-    z[:, places] = draws
-    center = np.median(wide.prior, axis=0)
-    center[places] = np.median(draws, axis=0)
-    kept = 2 if "wavelength" in apart else 1
-    if kept == 2 and [name for name, _ in wide.data.dims][-2:] != ["wavelength", "view"]:
+    program, data, count = extended.program, extended.data, len(draws)
+    z = extended.prior[np.arange(count) % len(extended.prior)].copy()  # for parameters of the new
+    z[:, indices] = draws
+    center = np.median(extended.prior, axis=0)
+    center[indices] = np.median(draws, axis=0)
+    by_wavelength = "wavelength" in apart
+    if by_wavelength and [name for name, _ in data.dims][-2:] != ["wavelength", "view"]:
         raise FitError(
             "the capture has no wavelengths to choose from",
             where="next_views: apart",
             hint="leave wavelength out",
         )
-    is_predicted = "intensity" in question.program.observed
+    axes = data.shape[-2:] if by_wavelength else data.shape[-1:]
+    is_predicted = "intensity" in problem.program.observed
 
-    def told(z: Array, data: Observations) -> tuple[dict[str, Array], Array]:
-        if is_predicted:  # a bright view is read more sharply; what was recorded stays
-            data = _with_prediction(wide, z, data, views.measured)
-        slopes = jax.jacfwd(lambda z: flat_parameters(program, z, data))(z)
-        return information_of_each(program, z, data, kept), slopes
+    def evaluate(z: Array, data: Observations) -> tuple[dict[str, Array], Array]:
+        if is_predicted:
+            data = _with_predicted_brightness(extended, z, data, views.measured)
+        jacobian = jax.jacfwd(lambda z: parameter_vector(program, z, data))(z)
+        return information_by_view(reading_information(program, z, data), axes), jacobian
 
-    run = compiled(lambda z, data: jax.lax.map(lambda one: told(one, data), z))
-    found, slopes = jax.tree.map(np.asarray, run(jnp.asarray(z), wide.data))
-    curvature = np.asarray(
-        compiled(lambda z, data: prior_precision(program, z, data))(center, wide.data)
+    run = compiled(lambda z, data: jax.lax.map(lambda one: evaluate(one, data), z))
+    information, jacobian = jax.tree.map(np.asarray, run(jnp.asarray(z), data))
+    hessian = compiled(lambda z, data: prior_precision(program, z, data))(center, data)
+    size, many = program.size, data.shape[-1]
+    by_view = {n: x.reshape(count, -1, many, size, size) for n, x in information.items()}
+    base = positive_definite(np.asarray(hessian), extended.prior) + sum(
+        by_view[n][:, :, : views.measured].sum(axis=(1, 2)) for n in problem.program.observed
     )
-    size, many = program.size, wide.data.shape[-1]
-    by_view = {n: x.reshape(count, -1, many, size, size) for n, x in found.items()}
-    base = sum(
-        by_view[n][:, :, : views.measured].sum(axis=(1, 2)) for n in question.program.observed
-    )
-    base = base + sound_precision(curvature, wide.prior)
     added = np.stack([by_view[name][:, :, views.measured :] for name in new], axis=1)
     if "reading" not in apart:
         added = added.sum(axis=1, keepdims=True)
-    numbers = np.indices(added.shape[1:4]).reshape(3, -1)
+    reading, wavelength, view = np.indices(added.shape[1:4]).reshape(3, -1)
     return Design(
         base=base,
         each=added.reshape(count, -1, size, size),
-        slopes=slopes,
-        view=numbers[2],
-        wavelength=numbers[1] if kept == 2 else np.full(numbers.shape[1], -1),
-        reading=np.array(new)[numbers[0]] if "reading" in apart else np.full(numbers.shape[1], ""),
+        jacobian=jacobian,
+        view=view,
+        wavelength=wavelength if by_wavelength else np.full(view.size, -1),
+        reading=np.array(new)[reading] if "reading" in apart else np.full(view.size, ""),
     )
 
 
-def _with_prediction(wide: Question, z: Array, data: Observations, measured: int) -> Observations:
-    """The same capture with candidates as bright as the model predicts them."""
-    sensor = distributions(wide.program, z, data)["intensity"]
-    seen = jnp.clip(jnp.broadcast_to(sensor.mean, data.shape), 0.0, 1.0)
-    brightness = jnp.where(jnp.arange(data.shape[-1]) < measured, data.brightness, seen)
+def _with_predicted_brightness(
+    extended: DesignProblem, z: Array, data: Observations, measured: int
+) -> Observations:
+    """The data with candidates as bright as the model predicts, which sets their noise."""
+    sensor = observation_distributions(extended.program, z, data)["intensity"]
+    predicted = jnp.clip(jnp.broadcast_to(sensor.mean, data.shape), 0.0, 1.0)
+    brightness = jnp.where(jnp.arange(data.shape[-1]) < measured, data.brightness, predicted)
     return dataclasses.replace(data, brightness=jax.lax.stop_gradient(brightness))
-
-
-def _one_exposure(design: Design, repeatable: bool) -> np.ndarray:
-    """Where the limits between two views hold: not between wavelengths and readings of one."""
-    same_view = design.view[:, None] == design.view[None, :]
-    same = (
-        same_view
-        & (design.wavelength[:, None] == design.wavelength[None, :])
-        & (design.reading[:, None] == design.reading[None, :])
-    )
-    return ~same_view | (same & (not repeatable))
 
 
 def _assemble(
     capture: xr.Dataset,
-    views: Views,
+    views: CandidateViews,
     design: Design,
-    chosen: Chosen,
+    selection: Selection,
     names: list[str],
-    about: tuple[AbstractCriterion, Rig, Question],
 ) -> xr.Dataset:
-    criterion, rig, wide = about
-    picks = np.array(chosen.picks)
-    known = design.base[:, None] + np.concatenate(
-        [np.zeros_like(design.each[:, :1]), np.cumsum(design.each[:, picks], axis=1)], axis=1
-    )
-    variance = np.diagonal(design.variances(known), axis1=-2, axis2=-1).mean(axis=0)
+    picks = np.array(selection.picks)
+    added = np.cumsum(design.each[:, picks], axis=1)
+    information = design.base[:, None] + np.insert(added, 0, 0.0, axis=1)
+    variance = np.diagonal(design.covariance(information), axis1=-2, axis2=-1).mean(axis=0)
     at = design.view[picks]
     found = xr.Dataset(
         {
             "candidate": ("pick", at),
-            "criterion": ("step", chosen.losses),
+            "criterion": ("step", selection.losses),
             "expected_sd": (("step", "parameter"), np.sqrt(variance)),
             "interval_width": (("step", "parameter"), WIDTH * np.sqrt(variance)),
         },
@@ -325,17 +338,14 @@ def _assemble(
         found["wavelength"] = ("pick", wavelengths, {"units": "nm"})
     if (design.reading != "").any():
         found["reading"] = ("pick", design.reading[picks])
-    told: dict[str, Any] = provenance(wide.request)
-    told |= {"criterion": repr(criterion), "rig": repr(rig), "exchanges": chosen.exchanges}
-    found.attrs[PROVENANCE] = json.dumps(told, sort_keys=True)
     return found
 
 
-# --- Where to look next and what it is worth, as a table and in words -----------------------------
+# --- Table and sentences --------------------------------------------------------------------------
 
 
-HARDLY = 0.9
-"""Width after over width before from which views hardly help."""
+SMALL_GAIN = 0.9
+"""Width after over width before above which views hardly help."""
 
 
 def next_views_table(found: xr.Dataset) -> pd.DataFrame:
@@ -350,14 +360,14 @@ def next_views_table(found: xr.Dataset) -> pd.DataFrame:
     Raises:
         FitError: It is something else.
     """
-    _check(found)
+    check_result(found, "interval_width", "next_views")
     table = found["interval_width"].transpose("parameter", "step").to_pandas()
     table.columns = ["now", *(f"after {step}" for step in table.columns[1:])]
     return table
 
 
 def next_views_sentences(found: xr.Dataset) -> list[str]:
-    """Where to look, and by how much the intervals narrow.
+    """Which views to take next, and by how much the intervals narrow.
 
     Args:
         found: What `polar_bayes.next_views` returns.
@@ -369,45 +379,33 @@ def next_views_sentences(found: xr.Dataset) -> list[str]:
     Raises:
         FitError: It is something else.
     """
-    _check(found)
+    check_result(found, "interval_width", "next_views")
     widths = found["interval_width"].transpose("step", "parameter")
     before, after = widths.isel(step=0).to_numpy(), widths.isel(step=-1).to_numpy()
     names = found["parameter"].to_numpy()
-    helped = after < HARDLY * before
-    said = [f"Look next at {'; then at '.join(_views_in_words(found))}."]
-    said += [
+    helped = after < SMALL_GAIN * before
+    sentences = [f"Look next at {'; then at '.join(_view_texts(found))}."]
+    sentences += [
         f"The 95% interval of {name} is expected to narrow from {old:.3g} to {new:.3g}."
         for name, old, new in zip(names[helped], before[helped], after[helped], strict=True)
     ]
     if not helped.all():
-        said.append(f"These views hardly help {', '.join(names[~helped])}.")
-    return said
+        sentences.append(f"These views hardly help {', '.join(names[~helped])}.")
+    return sentences
 
 
-def _views_in_words(found: xr.Dataset) -> list[str]:
-    light = any(np.ptp(found[f"light_{angle}"].to_numpy()) for angle in ("zenith", "azimuth"))
-    rows: list[Mapping[str, Any]] = [
-        {str(n): found[n].to_numpy()[pick] for n in found.data_vars if found[n].dims == ("pick",)}
-        for pick in range(found.sizes["pick"])
-    ]
-    return [_view_in_words(row, light) for row in rows]
-
-
-def _view_in_words(row: Mapping[str, Any], light: bool) -> str:
-    words = f"zenith {row['view_zenith']:g}, azimuth {row['view_azimuth']:g}"
-    if light:
-        words += f" (light at {row['light_zenith']:g}, {row['light_azimuth']:g})"
-    if "wavelength" in row:
-        words += f", {row['wavelength']:g} nm"
-    if "reading" in row:
-        words += f", {row['reading']}"
-    return words
-
-
-def _check(found: xr.Dataset) -> None:
-    if not isinstance(found, xr.Dataset) or "interval_width" not in found:
-        raise FitError(
-            "it names no views",
-            where="next_views",
-            hint="give what polar_bayes.next_views returns",
-        )
+def _view_texts(found: xr.Dataset) -> list[str]:
+    """Such as `zenith 10, azimuth 180`; with the light where it moves."""
+    light_moves = any(np.ptp(found[f"light_{angle}"].to_numpy()) for angle in ("zenith", "azimuth"))
+    texts = []
+    for pick in range(found.sizes["pick"]):
+        row = found.isel(pick=pick)
+        text = f"zenith {row['view_zenith'].item():g}, azimuth {row['view_azimuth'].item():g}"
+        if light_moves:
+            text += f" (light at {row['light_zenith'].item():g}, {row['light_azimuth'].item():g})"
+        if "wavelength" in row:
+            text += f", {row['wavelength'].item():g} nm"
+        if "reading" in row:
+            text += f", {row['reading'].item()}"
+        texts.append(text)
+    return texts

@@ -1,53 +1,55 @@
-"""The public verb: how far can one parameter move before the data object?"""
+r"""Profile likelihood (Murphy & van der Vaart 2000, On profile likelihood, JASA 95, 449-465).
+
+At every value of the coordinate $z_i$ of a parameter all others are optimized,
+
+$$ \max_{z_{-i}} [\log L(z) + w \log \pi(z)] $$
+
+by numerical continuation: BFGS starts where the value before ended. $w = 1$ gives the profile of
+the posterior, $w$ = `PRIOR_WEIGHT` that of the likelihood: a thousandth of the prior keeps
+coordinates that the data do not determine from diverging. The priors of the instrument's parameters
+belong to $L$ in both: a calibration determines them, and without it they trade for one another.
+"""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pandas as pd
 import xarray as xr
+from jaxtyping import Array, Float
 from numpyro import distributions as dist
+from numpyro.infer.util import log_density
 
-from polar_bayes.design.identify import provenance
-from polar_bayes.design.profile_curve import (
-    Curve,
-    compile_density,
-    draw_curve,
-    interval,
-    make_follow,
-    split_density,
-    widened,
-)
 from polar_bayes.design.setup import (
-    Question,
-    find_peaks,
-    flat_parameters,
+    Coordinate,
+    DesignProblem,
+    check_result,
+    label_coordinates,
     label_parameters,
-    pose,
-    with_labels,
+    make_design_problem,
+    parameter_vector,
+    posterior_modes,
 )
-from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
-from polar_bayes.inference.result import PROVENANCE, posterior_of
+from polar_bayes.inference.optimize import Modes
+from polar_bayes.inference.program import Program
+from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, with_progress
 
-KINDS = ("posterior", "likelihood")
+PRIOR_WEIGHT = 1e-3
+"""Share of the log prior that stays in the profile of the likelihood."""
 
-
-class Place(NamedTuple):
-    """One scalar parameter among the coordinates."""
-
-    label: str
-    site: str
-    entry: int
-    held: int
+KINDS = {"posterior": 1.0, "likelihood": PRIOR_WEIGHT}
+"""The weight of the log prior in either kind of profile."""
 
 
 @with_progress
@@ -71,11 +73,10 @@ def profile(
 
     over all other parameters, those of the noise included, from the mode outwards in both
     directions. The values of $\theta$ at which it has fallen by less than 1.92 are the 95%
-    interval of the likelihood ratio. What is known of the instrument belongs to the likelihood:
-    the priors of its parameters stay whole (but for the one that is followed). Of all others a
-    thousandth of the log prior stays, so that what the data do not determine stays where it can be
-    found; the profile of the posterior has all of it (as a density of the unconstrained
-    coordinates).
+    interval of the likelihood ratio. The priors of the instrument's parameters belong to the
+    likelihood, except that of the profiled parameter. Of all other log priors the profile of the
+    likelihood keeps a thousandth, so that parameters that the data do not determine stay finite;
+    the profile of the posterior has all of them (as a density of the unconstrained coordinates).
 
     Args:
         capture: As for `polar_bayes.fit`; model, scene, priors, links, largest_view_zenith too.
@@ -110,92 +111,91 @@ def profile(
     if points < 5:
         raise FitError(f"points is {points}", where="profile", hint="give 5 or more")
     with jax.enable_x64(True):
-        question = pose(capture, model, scene, priors, links, largest_view_zenith, seed)
-        place = _place_of(question, parameter)
-        given = None if values is None else _coordinates_of(question, place, values)
-        split = partial(split_density, question.program, _known_beside(question, place))
-        density = compile_density(split, question.data)
-        modes = find_peaks(question, progress, lambda z: density(z, 1.0))
-        follow = make_follow(split, place.held)
+        problem = make_design_problem(
+            capture, model, scene, priors, links, largest_view_zenith, seed
+        )
+        coordinate = _find_coordinate(problem, parameter)
+        index = coordinate.index
+        given = None if values is None else _unconstrained(problem, coordinate, values)
+        instrument = problem.request.scene.instrument
+        known = set() if instrument is None else {*instrument.parameters} - {coordinate.site}
+        parts = partial(log_density_parts, problem.program, known)
+        potential = compile_potential(parts, problem.data)
+        modes = posterior_modes(problem, progress, lambda z: potential(z, 1.0))
+        follow = compile_continuation(parts, index)
 
-        def draw(grid: np.ndarray) -> Curve:
-            return draw_curve(question, place.held, modes, density, follow, grid)
+        def on_grid(grid: np.ndarray) -> ProfileCurve:
+            return _trace_profile(problem, index, modes, potential, follow, grid)
 
         if given is not None:
-            curve = draw(np.sort(np.append(given, modes.z[0, place.held])))
+            curve = on_grid(np.sort(np.append(given, modes.z[0, index])))
         else:
-            curve = widened(draw, modes, place.held, question.prior[:, place.held], points)
-        return _assemble(question, place, curve)
+            curve = _on_default_grid(on_grid, modes, index, problem.prior[:, index], points)
+        return _assemble(problem, coordinate, curve)
 
 
-def _place_of(question: Question, parameter: str) -> Place:
-    """The coordinate of a parameter that is sampled."""
-    program, places = question.program, []
-    free = program.unravel(jnp.arange(float(program.size)))
-    constrained = program.constrain(jnp.zeros(program.size))
-    for name, positions in free.items():
-        flat = np.ravel(positions).astype(int)
-        shape = (*(program.plates[d] for d in program.dims[name]), *program.events[name])
-        if name in program.auxiliary or flat.size != np.size(constrained[name]):
-            continue  # a simplex, say, has fewer free coordinates than numbers
-        group = posterior_of(program, {name: flat.reshape(1, 1, *shape)})
-        for entry, scalar in enumerate(scalars(with_labels(group, question.request.capture))):
-            places.append(Place(scalar.label, name, entry, int(scalar.draws[0, 0])))
-    found = [place for place in places if parameter in (place.label, place.site)]
+def _find_coordinate(problem: DesignProblem, parameter: str) -> Coordinate:
+    """The coordinate of a scalar parameter that is sampled."""
+    known = [
+        each
+        for each in label_coordinates(problem.program, problem.request.capture)
+        if each.is_entry and each.site not in problem.program.auxiliary
+    ]
+    found = [each for each in known if parameter in (each.label, each.site)]
     if len(found) != 1:
-        said = f"it has {len(found)} values" if found else "no sampled parameter has that name"
         raise FitError(
-            said,
+            f"it has {len(found)} values" if found else "no sampled parameter has that name",
             where=f"parameter={parameter!r}",
-            hint=f"give one of {', '.join(place.label for place in (found or places)[:12])}",
+            hint=f"give one of {', '.join(each.label for each in (found or known)[:12])}",
         )
     return found[0]
 
 
-def _known_beside(question: Question, place: Place) -> tuple[str, ...]:
-    """Parameters of the instrument, but for the one that is followed."""
-    instrument = question.request.scene.instrument
-    told = () if instrument is None else instrument.parameters
-    return tuple(name for name in told if name != place.site)
-
-
-def _coordinates_of(question: Question, place: Place, values: Sequence[float]) -> np.ndarray:
+def _unconstrained(
+    problem: DesignProblem, coordinate: Coordinate, values: Sequence[float]
+) -> np.ndarray:
     """Values of a parameter as values of its coordinate."""
-    program = question.program
-    support = program.supports[place.site]
-    whole = np.asarray(program.constrain(jnp.zeros(program.size))[place.site])
+    program, entry = problem.program, coordinate.entry
+    support = program.supports[coordinate.site]
+    template = np.asarray(program.constrain(jnp.zeros(program.size))[coordinate.site])
     found = []
     for value in values:
-        trial = whole.copy()
-        trial.flat[place.entry] = value
-        inside = np.isfinite(value) and bool(np.all(support(jnp.asarray(trial))))
-        moved = np.ravel(dist.biject_to(support).inv(jnp.asarray(trial)))[place.entry]
-        if not inside or not np.isfinite(moved):
+        site = template.copy()
+        site.flat[entry] = value
+        inside = np.isfinite(value) and bool(np.all(support(jnp.asarray(site))))
+        z = float(np.ravel(dist.biject_to(support).inv(jnp.asarray(site)))[entry])
+        if not inside or not np.isfinite(z):
             raise FitError(
                 f"{value:g} is not inside its prior",
-                where=f"profile: values of {place.label}",
+                where=f"profile: values of {coordinate.label}",
                 hint="leave it out",
             )
-        found.append(float(moved))
+        found.append(z)
     if not found:
         raise FitError("there are no values", where="profile: values", hint="give at least one")
     return np.array(found)
 
 
-def _assemble(question: Question, place: Place, curve: Curve) -> xr.Dataset:
-    program, data = question.program, question.data
-    labels = label_parameters(question)
-    told = compiled(jax.vmap(lambda z: flat_parameters(program, z, data)))
-    others = np.asarray(told(curve.at.reshape(-1, program.size))).reshape(*curve.value.shape, -1)
-    others = others[..., labels.rows]
-    grid = jnp.asarray(np.where(np.arange(program.size) == place.held, curve.z[:, None], 0.0))
-    values = compiled(jax.vmap(lambda z: jnp.ravel(program.constrain(z)[place.site])[place.entry]))
-    theta = np.asarray(values(grid))
-    best = np.array([np.nanmax(row) if np.isfinite(row).any() else np.nan for row in curve.value])
+def _assemble(problem: DesignProblem, coordinate: Coordinate, curve: "ProfileCurve") -> xr.Dataset:
+    program, data = problem.program, problem.data
+    labels = label_parameters(problem)
+    vectors = compiled(jax.vmap(lambda z: parameter_vector(program, z, data)))
+    others = np.asarray(vectors(curve.best.reshape(-1, program.size)))
+    others = others.reshape(*curve.value.shape, -1)[..., labels.rows]
+    grid = jnp.asarray(
+        np.where(np.arange(program.size) == coordinate.index, curve.grid[:, None], 0.0)
+    )
+    sites = compiled(jax.vmap(lambda z: jnp.ravel(program.constrain(z)[coordinate.site])))
+    theta = np.asarray(sites(grid))[:, coordinate.entry]
+    highest = np.array([row[np.isfinite(row)].max(initial=-np.inf) for row in curve.value])
     order = np.argsort(theta)
-    theta, value, others = theta[order], (curve.value - best[:, None])[:, order], others[:, order]
-    low, high, open_below, open_above = zip(*(interval(theta, row) for row in value), strict=True)
-    prior = _prior_of(labels.scalars, place)
+    theta, others = theta[order], others[:, order]
+    value = (curve.value - highest[:, None])[:, order]
+    low, high, open_below, open_above = zip(
+        *(likelihood_interval(theta, row) for row in value), strict=True
+    )
+    prior = next(each.draws for each in labels.scalars if each.label == coordinate.label)
+    beyond = [float(np.mean(prior < theta[0])), float(np.mean(prior > theta[-1]))]
     return xr.Dataset(
         {
             "profile": (("kind", "value"), value),
@@ -205,10 +205,7 @@ def _assemble(question: Question, place: Place, curve: Curve) -> xr.Dataset:
             "high": ("kind", list(high)),
             "open_below": ("kind", list(open_below)),
             "open_above": ("kind", list(open_above)),
-            "prior_beyond": (
-                "side",
-                [float(np.mean(prior < theta[0])), float(np.mean(prior > theta[-1]))],
-            ),
+            "prior_beyond": ("side", beyond),
         },
         coords={
             "kind": list(KINDS),
@@ -217,21 +214,264 @@ def _assemble(question: Question, place: Place, curve: Curve) -> xr.Dataset:
             "side": ["below", "above"],
         },
         attrs={
-            "parameter": place.label,
-            PROVENANCE: json.dumps(provenance(question.request), sort_keys=True),
+            "parameter": coordinate.label,
+            PROVENANCE: json.dumps(problem.provenance, sort_keys=True),
         },
     )
 
 
-def _prior_of(found: list[Scalar], place: Place) -> np.ndarray:
-    return next(scalar.draws for scalar in found if scalar.label == place.label)
+# --- The log density in its parts -----------------------------------------------------------------
 
 
-# --- What a profile says, as a table and in words -------------------------------------------------
+class LogDensityParts(NamedTuple):
+    """Log likelihood, with the log prior of known parameters, and the log prior of all others."""
+
+    likelihood: Float[Array, ""]
+    prior: Float[Array, ""]
 
 
-ALMOST_ALL = 0.02
-"""Share of the prior beyond a grid that may be left out of sight."""
+Parts = Callable[[Array, Observations], LogDensityParts]
+Potential = Callable[[np.ndarray, float], tuple[float, np.ndarray]]
+
+
+def log_density_parts(
+    program: Program, known: Collection[str], z: Float[Array, " size"], data: Observations
+) -> LogDensityParts:
+    """The log posterior density of the unconstrained coordinates in its two parts."""
+    free = program.unravel(z)
+    bijections = {name: dist.biject_to(program.supports[name]) for name in free}
+    latent = {name: biject(free[name]) for name, biject in bijections.items()}
+    joint, trace = log_density(program.model, (data,), {}, latent)
+    jacobians = {
+        n: jnp.sum(biject.log_abs_det_jacobian(free[n], latent[n]))
+        for n, biject in bijections.items()
+    }
+    of_likelihood = [name for name in free if name in known]
+    terms = [
+        jnp.sum(trace[n]["fn"].log_prob(trace[n]["value"]))
+        for n in (*program.observed, *of_likelihood)
+    ]
+    likelihood = jnp.sum(jnp.stack([*terms, *(jacobians[n] for n in of_likelihood)]))
+    whole = joint + jnp.sum(jnp.stack([*jacobians.values()]))
+    return LogDensityParts(likelihood, whole - likelihood)
+
+
+def _weighted_potential(parts: Parts, z: Array, weight: Array, data: Observations) -> Array:
+    terms = parts(z, data)
+    return -(terms.likelihood + weight * terms.prior)
+
+
+def compile_potential(parts: Parts, data: Observations) -> Potential:
+    """Minus log likelihood and weighted log prior, with their gradient, as one program."""
+    run = compiled(jax.value_and_grad(partial(_weighted_potential, parts)))
+
+    def potential(z: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
+        value, gradient = run(jnp.asarray(z), jnp.asarray(weight), data)
+        return float(value), np.asarray(gradient, float)
+
+    return potential
+
+
+# --- Numerical continuation of the conditional modes ----------------------------------------------
+
+
+MAX_STEPS = 300
+MAX_GRADIENT = 0.03
+"""Largest gradient left, per posterior sd: a profile is then within half its square of its mode."""
+
+MAX_MODES = 3
+"""Modes from which a profile is followed, at most; the best of them counts."""
+
+Continuation = Callable[[Array, Array, Array, Array, Observations], Array]
+
+
+class ProfileCurve(NamedTuple):
+    """Profiles by kind on one grid of the coordinate, and their arguments; NaN where none ended."""
+
+    grid: np.ndarray
+    value: np.ndarray
+    best: np.ndarray
+
+
+def conditional_normal(
+    covariance: Float[np.ndarray, "size size"], index: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Regression of all coordinates on one, and the Cholesky factor of what it leaves."""
+    size = len(covariance)
+    slope = covariance[:, index] / covariance[index, index]
+    others = np.delete(np.arange(size), index)
+    factor = np.zeros((size, max(size - 1, 1)))
+    if size > 1:
+        residual = covariance - np.outer(slope, covariance[index])
+        factor[others] = np.linalg.cholesky(residual[np.ix_(others, others)])
+    return slope, factor
+
+
+def compile_continuation(parts: Parts, index: int) -> Continuation:
+    """Compile the conditional modes along the targets of every track, of both kinds."""
+    solver = optx.BFGS(rtol=1e-6, atol=1e-5)
+    weights = tuple(KINDS.values())
+
+    def evaluate(y: Array, guess: Array, weight: Array, factor: Array, data: Observations) -> Array:
+        value = _weighted_potential(parts, guess + factor @ y, weight, data)
+        return jnp.where(jnp.isfinite(value), value, jnp.inf)
+
+    # The solver linearizes the loss and transposes that. Giving it the gradient at once halves what
+    # is compiled; only y is differentiated.
+    loss = jax.custom_jvp(evaluate)
+
+    @loss.defjvp
+    def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+        value, gradient = jax.value_and_grad(evaluate)(*primals)
+        return value, gradient @ tangents[0]
+
+    def follow(
+        starts: Array, targets: Array, slope: Array, factor: Array, data: Observations
+    ) -> Array:
+        origin = jnp.zeros(factor.shape[1])
+
+        def objective(y: Array, args: tuple[Array, Array]) -> Array:
+            return loss(y, *args, factor, data)
+
+        def optimize(other: Array, args: tuple[Array, Array]) -> tuple[Array, Array]:
+            # The likelihood starts at the posterior's mode where that is better than its own guess.
+            own, weight = args
+            losses = jax.lax.map(lambda z: objective(origin, (z, weight)), jnp.stack([own, other]))
+            guess = jnp.where(losses[0] <= losses[1], own, other)
+            found = optx.minimise(
+                objective, solver, origin, (guess, weight), max_steps=MAX_STEPS, throw=False
+            )
+            # A start at the mode itself may give no finite step; the gradient is judged later.
+            y = jnp.where(jnp.isfinite(found.value).all(), found.value, origin)
+            z = guess + factor @ y
+            return z, z
+
+        def step(last: Array, target: Array) -> tuple[Array, Array]:
+            guesses = last + slope * (target - last[:, index, None])
+            found = jax.lax.scan(optimize, guesses[0], (guesses, jnp.asarray(weights)))[1]
+            return found, found
+
+        def track(pair: tuple[Array, Array]) -> Array:
+            start, along = pair
+            return jax.lax.scan(step, jnp.stack([start] * len(weights)), along)[1]
+
+        return jax.lax.map(track, (starts, targets))
+
+    return compiled(follow)
+
+
+def _trace_profile(
+    problem: DesignProblem,
+    index: int,
+    modes: Modes,
+    potential: Potential,
+    follow: Continuation,
+    grid: np.ndarray,
+) -> ProfileCurve:
+    """Follow both kinds from every mode to both ends of the grid, and keep the best."""
+    center = modes.z[0, index]
+    sides = [np.flatnonzero(grid <= center)[::-1], np.flatnonzero(grid > center)]
+    longest = max(map(len, sides))
+    # Both sides of one program have one length: the shorter one repeats its end.
+    targets = [
+        np.append(grid[side], np.full(longest - len(side), (*grid[side], center)[-1]))
+        for side in sides
+    ]
+    slope, factor = conditional_normal(modes.covariance[0], index)
+    tracks = [(start, side) for start in modes.z[:MAX_MODES] for side in (0, 1)]
+    ends = follow(
+        jnp.asarray(np.stack([start for start, _ in tracks])),
+        jnp.asarray(np.stack([targets[side] for _, side in tracks])),
+        jnp.asarray(slope),
+        jnp.asarray(factor),
+        problem.data,
+    )
+    value = np.full((len(KINDS), grid.size), np.nan)
+    best = np.full((len(KINDS), grid.size, problem.program.size), np.nan)
+    for (_, side), track in zip(tracks, np.asarray(ends), strict=True):
+        for point, found in zip(sides[side], track, strict=False):
+            for kind, (z, weight) in enumerate(zip(found, KINDS.values(), strict=True)):
+                height = _log_density_at(potential, z, weight, factor)
+                if height > np.nan_to_num(value[kind, point], nan=-np.inf):
+                    value[kind, point], best[kind, point] = height, z
+    return ProfileCurve(grid, value, best)
+
+
+def _log_density_at(
+    potential: Potential, z: np.ndarray, weight: float, factor: np.ndarray
+) -> float:
+    """The log density at the end of an optimization; NaN where it is no conditional mode."""
+    if not np.isfinite(z).all():
+        return np.nan
+    loss, gradient = potential(z, weight)
+    converged = np.linalg.norm(factor.T @ gradient) < MAX_GRADIENT
+    return -loss if converged and np.isfinite(loss) else np.nan
+
+
+# --- Grid and interval ----------------------------------------------------------------------------
+
+
+DROP = 1.92
+"""Half the 95% quantile of chi squared with one degree of freedom."""
+
+GRID_SDS = 4.0
+"""Half-width of the first grid, in posterior sds of the coordinate."""
+
+
+def _on_default_grid(
+    on_grid: Callable[[np.ndarray], ProfileCurve],
+    modes: Modes,
+    index: int,
+    prior: np.ndarray,
+    points: int,
+) -> ProfileCurve:
+    """Profiles four sds to either side, or over almost all of the prior where they stay open."""
+    center = modes.z[0, index]
+    reach = GRID_SDS * float(np.sqrt(modes.covariance[0][index, index]))
+    half = points // 2
+
+    def grid(low: float, high: float) -> np.ndarray:
+        below = np.linspace(low, center, half, endpoint=False)
+        return np.concatenate([below, np.linspace(center, high, points - half)])
+
+    low, high = center - reach, center + reach
+    curve = on_grid(grid(low, high))
+    ends = [likelihood_interval(curve.grid, value)[2:] for value in curve.value]
+    open_below, open_above = np.any(ends, axis=0)
+    lowest, highest = np.quantile(prior, [0.001, 0.999])
+    wider = (min(low, lowest) if open_below else low, max(high, highest) if open_above else high)
+    return curve if wider == (low, high) else on_grid(grid(*wider))
+
+
+def likelihood_interval(theta: np.ndarray, value: np.ndarray) -> tuple[float, float, bool, bool]:
+    """Ends of the values at which a profile has fallen by less than 1.92, and which are open."""
+    known = np.flatnonzero(np.isfinite(value))
+    if known.size == 0:
+        return np.nan, np.nan, True, True
+    drop = np.nanmax(value) - value
+    inside = known[drop[known] < DROP]
+
+    def end(at: int, beyond: np.ndarray) -> tuple[float, bool]:
+        """The interpolated end next to the last point inside; `beyond`: points outside of it."""
+        if beyond.size == 0:
+            return float(theta[at]), True
+        other = beyond[np.argmin(np.abs(beyond - at))]
+        if abs(other - at) > 1:  # points between them did not converge
+            return float(theta[other]), False
+        share = (DROP - drop[at]) / (drop[other] - drop[at])
+        return float(theta[at] + share * (theta[other] - theta[at])), False
+
+    first, last = int(inside[0]), int(inside[-1])
+    low, open_below = end(first, known[known < first])
+    high, open_above = end(last, known[known > last])
+    return low, high, open_below, open_above
+
+
+# --- Table and sentences --------------------------------------------------------------------------
+
+
+SMALL_SHARE = 0.02
+"""Share of the prior beyond the grid below which the grid counts as all of it."""
 
 
 def profile_table(found: xr.Dataset) -> pd.DataFrame:
@@ -247,14 +487,14 @@ def profile_table(found: xr.Dataset) -> pd.DataFrame:
     Raises:
         FitError: It is something else.
     """
-    _check(found)
+    check_result(found, "prior_beyond", "profile")
     table = found["profile"].transpose("value", "kind").to_pandas()
     table.index.name, table.columns.name = str(found.attrs["parameter"]), None
     return table
 
 
 def profile_sentences(found: xr.Dataset) -> list[str]:
-    """What the data exclude, where they are flat, and what was not found.
+    """What the data exclude, where the profile is flat, and where no fit converged.
 
     Args:
         found: What `polar_bayes.profile` returns.
@@ -266,49 +506,32 @@ def profile_sentences(found: xr.Dataset) -> list[str]:
     Raises:
         FitError: It is something else.
     """
-    _check(found)
-    name = str(found.attrs["parameter"])
-    row = found.sel(kind="likelihood")
+    check_result(found, "prior_beyond", "profile")
+    sentences = [_interval_sentence(str(found.attrs["parameter"]), found.sel(kind="likelihood"))]
     failed = int(np.sum(~found["converged"]))
-    said = [_interval_in_words(name, row)]
     if failed:
-        said.append(
+        sentences.append(
             f"At {failed} of {found['converged'].size} points of the two profiles no fit "
             f"converged; they are left out, not interpolated."
         )
-    return said
+    return sentences
 
 
-def _interval_in_words(name: str, row: xr.Dataset) -> str:
+def _interval_sentence(name: str, row: xr.Dataset) -> str:
     if not bool(row["converged"].any()):
         return f"{name}: no fit converged anywhere on the grid."
     low, high = float(row["low"]), float(row["high"])
-    below, above = bool(row["open_below"]), bool(row["open_above"])
-    ends = (
-        _end_in_words(row, "below", low) if below else "",
-        _end_in_words(row, "above", high) if above else "",
-    )
-    if below and above:
+    flat = {"below": low, "above": high}
+    flat = {side: end for side, end in flat.items() if bool(row[f"open_{side}"])}
+    if not flat:
+        return f"{name} is between {low:.4g} and {high:.4g} (95% interval of the likelihood ratio)."
+    ends = []
+    for side, end in flat.items():
+        way = "down" if side == "below" else "up"
+        covers_prior = float(row["prior_beyond"].sel(side=side)) <= SMALL_SHARE
+        reach = f", {way} to {end:.4g}" if covers_prior else f" as far as the grid goes ({end:.4g})"
+        ends.append(f"nothing {side}{reach}")
+    if len(ends) == 2:
         return f"{name} is flat: the data exclude {ends[0]} and {ends[1]}."
-    if below or above:
-        side = f"above {high:.4g}" if below else f"below {low:.4g}"
-        return f"{name} is flat to one side: the data exclude what is {side}, but {''.join(ends)}."
-    return f"{name} is between {low:.4g} and {high:.4g} (95% interval of the likelihood ratio)."
-
-
-def _end_in_words(row: xr.Dataset, side: str, end: float) -> str:
-    beyond = float(row["prior_beyond"].sel(side=side))
-    if beyond <= ALMOST_ALL:
-        return (
-            f"nothing {side}, down to {end:.4g}"
-            if side == "below"
-            else (f"nothing {side}, up to {end:.4g}")
-        )
-    return f"nothing {side} as far as the grid goes ({end:.4g})"
-
-
-def _check(found: xr.Dataset) -> None:
-    if not isinstance(found, xr.Dataset) or "prior_beyond" not in found:
-        raise FitError(
-            "it is no profile", where="profile", hint="give what polar_bayes.profile returns"
-        )
+    excluded = f"above {high:.4g}" if "below" in flat else f"below {low:.4g}"
+    return f"{name} is flat to one side: the data exclude what is {excluded}, but {ends[0]}."

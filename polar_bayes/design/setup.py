@@ -1,7 +1,8 @@
-"""Where identifiability is asked about: the heaviest mode of a capture's posterior."""
+"""Set-up of a design problem: model, capture, posterior modes, and the labels of coordinates."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from polar_bayes.inference.initialization import STARTS, CompiledPotential
 from polar_bayes.inference.optimize import Modes, ValueAndGradient, find_modes, from_prior
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request, resolve
-from polar_bayes.inference.result import posterior_of
+from polar_bayes.inference.result import posterior_of, shape_of
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -28,16 +29,28 @@ from polar_bayes.progress import Progress, no_progress
 PRIOR_DRAWS = 500
 
 
-class Question(NamedTuple):
-    """A model and a capture, ready to be asked."""
+class DesignProblem(NamedTuple):
+    """A model and a capture, compiled, with unconstrained draws from the prior (draw, size)."""
 
     request: Request
     data: Observations
     program: Program
     prior: np.ndarray
 
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Capture, model and settings, as far as JSON can hold them."""
+        return {
+            "model": self.request.model_name,
+            "scene": self.request.scene_name,
+            "scene_parts": repr(self.request.scene),
+            "links": {name: repr(link) for name, link in self.request.links.items()},
+            "seed": self.request.seed,
+            "capture": str(self.request.capture.attrs.get("name", "capture")),
+        }
 
-def pose(
+
+def make_design_problem(
     capture: xr.Dataset,
     model: str | Callable,
     scene: str | Scene | None,
@@ -45,35 +58,47 @@ def pose(
     links: AbstractLink | Mapping[str, AbstractLink] | None,
     largest_view_zenith: float | None,
     seed: int,
-) -> Question:
-    """Check what a caller asked for and compile it; to be called in double precision."""
+) -> DesignProblem:
+    """Check the arguments of a public function and compile the model; call it with x64 enabled."""
     request = resolve(
         capture, model, "laplace", scene, priors, links, largest_view_zenith, seed, "double"
     )
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     program = compile_program(request.bind(request.scene), data)
-    drawn = from_prior(program, jax.random.key(seed), PRIOR_DRAWS, data)
-    return Question(request, data, program, drawn)
+    prior = from_prior(program, jax.random.key(seed), PRIOR_DRAWS, data)
+    return DesignProblem(request, data, program, prior)
 
 
-def find_peaks(
-    question: Question, progress: Progress | None, potential: ValueAndGradient | None = None
+def posterior_modes(
+    problem: DesignProblem, progress: Progress | None, potential: ValueAndGradient | None = None
 ) -> Modes:
     """The modes of the posterior, heaviest first."""
-    potential = potential or CompiledPotential(question.program, question.data)
-    return find_modes(potential, question.prior[:STARTS], progress or no_progress)
+    potential = potential or CompiledPotential(problem.program, problem.data)
+    return find_modes(potential, problem.prior[:STARTS], progress or no_progress)
 
 
-def flat_parameters(
+def check_result(found: object, variable: str, function: str) -> None:
+    """Refuse what a function of this package did not return."""
+    if not isinstance(found, xr.Dataset) or variable not in found:
+        raise FitError(
+            f"it has no variable {variable}",
+            where=function,
+            hint=f"give what polar_bayes.{function} returns",
+        )
+
+
+# --- Names of parameters and coordinates ----------------------------------------------------------
+
+
+def parameter_vector(
     program: Program, z: Float[Array, " size"], data: Observations
 ) -> Float[Array, " parameter"]:
-    """All parameters in one row, by name."""
-    told = program.parameters(z, data)
-    return jnp.concatenate([jnp.ravel(told[name]) for name in sorted(told)])
+    """All parameters in one vector, by name."""
+    return ravel_pytree(program.parameters(z, data))[0]
 
 
-class Labels(NamedTuple):
-    """The scalar parameters as tables list them."""
+class ParameterLabels(NamedTuple):
+    """The scalar parameters in the order of tables, and the index of each in the vector."""
 
     scalars: list[Scalar]
     rows: list[int]
@@ -89,74 +114,96 @@ class Labels(NamedTuple):
         return np.array([scalar.draws.std() for scalar in self.scalars])
 
 
-def label_parameters(question: Question) -> Labels:
-    """Name every scalar parameter of a model, with its prior."""
-    program, data = question.program, question.data
-    told = compiled(jax.vmap(lambda z: program.parameters(z, data)))(question.prior)
-    draws = {name: np.asarray(x)[None] for name, x in told.items()}
-    found = scalars(with_labels(posterior_of(program, draws), question.request.capture))
-    begins, begin = {}, 0
-    for name in sorted(draws):
-        begins[name], begin = begin, begin + int(np.prod(draws[name].shape[2:], initial=1))
-    rows, seen = [], dict.fromkeys(draws, 0)
-    for scalar in found:  # the entries of one variable follow each other in row order
-        rows.append(begins[scalar.name] + seen[scalar.name])
-        seen[scalar.name] += 1
-    return Labels(found, rows)
+def label_parameters(problem: DesignProblem) -> ParameterLabels:
+    """Label every scalar parameter of a model, with its draws from the prior."""
+    program, data = problem.program, problem.data
+    draws = compiled(jax.vmap(lambda z: program.parameters(z, data)))(problem.prior)
+    flat, unravel = ravel_pytree({name: x[0] for name, x in draws.items()})
+    rows = unravel(jnp.arange(flat.size, dtype=flat.dtype))
+    by_draw, by_row = (
+        _scalars(program, problem.request.capture, values)
+        for values in (draws, {name: x[None] for name, x in rows.items()})
+    )
+    return ParameterLabels(by_draw, [int(scalar.draws.item()) for scalar in by_row])
 
 
-def with_labels(group: xr.Dataset, capture: xr.Dataset) -> xr.Dataset:
-    """A group of draws with the capture's own labels of its axes, such as wavelengths."""
-    known = {str(dim): capture[dim] for dim in group.dims if dim in capture.coords}
-    return group.assign_coords(known)
+@dataclasses.dataclass(frozen=True, order=True)
+class Coordinate:
+    """One unconstrained coordinate: its label in tables, its site, and its number in the site.
+
+    `is_entry` is False where the site has fewer coordinates than numbers, such as a simplex.
+    """
+
+    index: int
+    label: str
+    site: str
+    entry: int
+    is_entry: bool
 
 
-# --- Over which values of the parameters a design is averaged: draws of what the posterior allows
+def label_coordinates(program: Program, capture: xr.Dataset) -> list[Coordinate]:
+    """All unconstrained coordinates in their order."""
+    found = []
+    for site, positions in program.unravel(jnp.arange(float(program.size))).items():
+        flat = np.ravel(positions).astype(int)
+        is_entry = flat.size == np.prod(shape_of(program, site), initial=1)
+        named = _scalars(program, capture, {site: flat[None]}) if is_entry else []
+        labels = {int(scalar.draws.item()): scalar.label for scalar in named}
+        found += [
+            Coordinate(index, labels.get(index, f"{site}[{entry}]"), site, entry, is_entry)
+            for entry, index in enumerate(flat.tolist())
+        ]
+    return sorted(found)
 
 
-FOLD = 7
-"""Sets the key of these draws apart from that of the prior's."""
+def _scalars(program: Program, capture: xr.Dataset, draws: Mapping[str, Any]) -> list[Scalar]:
+    """Scalars of draws (draw, ...), with the capture's own labels of axes, such as wavelengths."""
+    group = posterior_of(program, {name: np.asarray(x)[None] for name, x in draws.items()})
+    labels = {str(dim): capture[dim] for dim in group.dims if dim in capture.coords}
+    return scalars(group.assign_coords(labels))
 
 
-def draws_at(modes: Modes, count: int, seed: int) -> Float[np.ndarray, "draw size"]:
-    """Draws of the normal approximation at the heaviest mode."""
-    key = jax.random.fold_in(jax.random.key(seed), FOLD)
+# --- Draws of the posterior, over which the criterion of a design is averaged ---------------------
+
+
+LAPLACE_FOLD = 7
+"""Folded into the key of the seed, which the draws from the prior use itself."""
+
+
+def laplace_draws(modes: Modes, count: int, seed: int) -> Float[np.ndarray, "draw size"]:
+    """Draws of the Laplace approximation at the heaviest mode."""
+    key = jax.random.fold_in(jax.random.key(seed), LAPLACE_FOLD)
     noise = np.asarray(jax.random.normal(key, (count, modes.z.shape[1])))
     return modes.z[0] + noise @ np.linalg.cholesky(modes.covariance[0]).T
 
 
-def draws_of(question: Question, result: xr.DataTree, count: int) -> Float[np.ndarray, "draw size"]:
-    """Draws of a fit, evenly spaced, as unconstrained vectors."""
-    check_fit(result, "next_views: result")
-    program = question.program
-    whole = program.constrain(jnp.zeros(program.size))
+def fit_draws(
+    problem: DesignProblem, result: xr.DataTree, count: int
+) -> Float[np.ndarray, "draw size"]:
+    """Finite draws of a fit, evenly spaced, as unconstrained vectors."""
+    where = "next_views: result"
+    check_fit(result, where)
+    program = problem.program
+    template = program.constrain(jnp.zeros(program.size))
     groups = [result.get(name) for name in ("posterior", "unconstrained_posterior")]
     sites = {}
     for name in program.supports:
         group = next((g for g in groups if g is not None and name in g.data_vars), None)
-        size = int(np.size(whole[name]))
-        if group is None or group[name].size % size or group[name].ndim < 2:
+        if group is None or group[name].size % template[name].size or group[name].ndim < 2:
             raise FitError(
                 f"it has no draws of {name} as this model has it",
-                where="next_views: result",
+                where=where,
                 hint="give a fit of the same capture, model, scene and links",
             )
         values = group[name].transpose("chain", "draw", ...).to_numpy()
-        sites[name] = values.reshape(-1, *whole[name].shape)
+        sites[name] = values.reshape(-1, *template[name].shape)
     number = min(len(x) for x in sites.values())
-    finite = np.all(
-        [np.isfinite(x.reshape(number, -1)).all(axis=1) for x in sites.values()], axis=0
-    )
-    kept = np.flatnonzero(finite)
-    if kept.size == 0:
-        raise FitError(
-            "none of its draws is finite",
-            where="next_views: result",
-            hint="give a fit that succeeded",
-        )
-    kept = kept[np.linspace(0, kept.size - 1, min(count, kept.size)).round().astype(int)]
-
-    return unconstrain(program, {name: x[kept] for name, x in sites.items()})
+    finite = [np.isfinite(x.reshape(number, -1)).all(axis=1) for x in sites.values()]
+    usable = np.flatnonzero(np.all(finite, axis=0))
+    if usable.size == 0:
+        raise FitError("none of its draws is finite", where=where, hint="give a fit that succeeded")
+    spaced = np.linspace(0, usable.size - 1, min(count, usable.size)).round().astype(int)
+    return unconstrain(program, {name: x[usable[spaced]] for name, x in sites.items()})
 
 
 def unconstrain(
@@ -164,27 +211,28 @@ def unconstrain(
 ) -> Float[np.ndarray, "draw size"]:
     """Draws of all latent sites as unconstrained vectors."""
 
-    def free(values: dict[str, Array]) -> Array:
-        moved = {n: dist.biject_to(s).inv(values[n]) for n, s in program.supports.items()}
-        return ravel_pytree(moved)[0]
+    def inverse(values: dict[str, Array]) -> Array:
+        return ravel_pytree(
+            {n: dist.biject_to(s).inv(values[n]) for n, s in program.supports.items()}
+        )[0]
 
     sites = {name: jnp.asarray(values[name]) for name in program.supports}
-    return np.asarray(compiled(jax.vmap(free))(sites))
+    return np.asarray(compiled(jax.vmap(inverse))(sites))
 
 
-def embed(program: Program, wide: Program) -> Int[np.ndarray, " size"]:
-    """Where the coordinates of a program stand in one with more readings."""
+def coordinate_indices(program: Program, extended: Program) -> Int[np.ndarray, " size"]:
+    """Indices of a program's coordinates in that of the same model with more views."""
     ours, theirs = (
         {n: np.asarray(x) for n, x in one.unravel(jnp.arange(float(one.size))).items()}
-        for one in (program, wide)
+        for one in (program, extended)
     )
-    places = np.zeros(program.size, int)
+    indices = np.zeros(program.size, int)
     for name, position in ours.items():
         if name not in theirs or theirs[name].shape != position.shape:
             raise FitError(
-                f"every view has its own {name}, which views not yet taken cannot tell",
+                f"{name} belongs to single views, and no reading of a new view determines it yet",
                 where="next_views: model",
                 hint="use a model whose parameters do not belong to single views",
             )
-        places[position.astype(int).ravel()] = theirs[name].astype(int).ravel()
-    return places
+        indices[position.astype(int).ravel()] = theirs[name].astype(int).ravel()
+    return indices

@@ -1,4 +1,8 @@
-"""The effects that a capture can see: everything on, weighed one by one, the rest left out."""
+"""Choice of effects: those of a full scene that one capture can see; the others are left out.
+
+Each effect is left out alone, then all that change little are left out together (backward
+elimination); while together they change too much, the effect that alone changes most is restored.
+"""
 
 import dataclasses
 import json
@@ -9,11 +13,19 @@ from typing import Any, override
 
 import jax
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpyro import distributions as dist
 
-from polar_bayes.effects.compare_scenes import Change, Cost, Reference, Scales
-from polar_bayes.effects.variants import Effect, Place, effects_of, find_effects, parts_of, simplify
+from polar_bayes.effects.compare_scenes import Baseline, Comparison, SceneDensities
+from polar_bayes.effects.variants import (
+    Effect,
+    KeyPath,
+    effects_of,
+    find_effects,
+    parts_of,
+    simplify,
+)
 from polar_bayes.errors import FitError, SceneError
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.links import AbstractLink
@@ -21,12 +33,12 @@ from polar_bayes.physics.scene import FULL_SCENES, Scene
 from polar_bayes.priors import resolve_priors
 from polar_bayes.progress import Progress, no_progress, with_progress
 
-# --- Which effects a scene keeps: each is weighed alone, then all that may go are weighed together
+# --- Selection of effects -------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
-class Wishes:
-    """What the user decided."""
+class UserChoice:
+    """Effects that the user decided to keep or to drop."""
 
     keep: tuple[Effect, ...] = ()
     drop: tuple[Effect, ...] = ()
@@ -34,169 +46,149 @@ class Wishes:
     @classmethod
     def of(
         cls, effects: Sequence[Effect], keep: str | Iterable[str], drop: str | Iterable[str]
-    ) -> "Wishes":
-        """The effects that words mean."""
-        kept, dropped = (
-            tuple(effect for word in words for effect in find_effects(word, effects, where))
-            for where, words in (("keep", _words(keep)), ("drop", _words(drop)))
-        )
-        for effect in dropped:
-            if effect in kept:
+    ) -> "UserChoice":
+        """The effects of these names."""
+
+        def find(names: str | Iterable[str], where: str) -> tuple[Effect, ...]:
+            names = (names,) if isinstance(names, str) else names
+            return tuple(effect for name in names for effect in find_effects(name, effects, where))
+
+        choice = cls(find(keep, "keep"), find(drop, "drop"))
+        for effect in choice.drop:
+            if effect in choice.keep:
                 raise SceneError(
                     "it is both to keep and to drop", where=effect.name, hint="name it in one only"
                 )
-        return cls(kept, dropped)
+        return choice
 
-    def hold(self, effect: Effect, full: Scene) -> bool:
-        """Whether leaving out the effect would take away something that is to be kept."""
+    def protects(self, effect: Effect, full: Scene) -> bool:
+        """Whether leaving out the effect would remove a part that is to be kept."""
         rest = [part for _, part in parts_of(effect.apply(full))]
         return any(kept.part not in rest for kept in self.keep)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Weighed:
-    """Each effect left out alone of the scene with everything on."""
+class SingleComparisons:
+    """The full scene compared with itself without each effect alone."""
 
-    whole: Reference
-    changes: dict[Effect, Change]
-    operations: dict[Effect, float]
+    densities: SceneDensities
+    full: Scene
+    tolerance: float
+    baseline: Baseline
+    comparisons: dict[Effect, Comparison]
 
-    def size(self, effect: Effect) -> float:
+    def change(self, effect: Effect) -> float:
         """The largest change of a judged parameter without the effect."""
-        return self.whole.size(self.changes[effect])
+        return self.baseline.largest_change(self.comparisons[effect])
 
-    def by_place(self, effects: Iterable[Effect]) -> dict[Place, list[Effect]]:
-        """Effects by the place of their part, the replacement of fewest operations first."""
-        places: dict[Place, list[Effect]] = {}
-        for effect in sorted(effects, key=self.operations.__getitem__):
-            places.setdefault(effect.place, []).append(effect)
-        return places
+    def operations(self, effect: Effect) -> float:
+        """Operations of one log density without the effect."""
+        return self.densities.density(effect.apply(self.full)).compiled.operations
+
+    def by_key_path(self, effects: Iterable[Effect]) -> dict[KeyPath, list[Effect]]:
+        """Effects by the key path of their part, the replacement of fewest operations first."""
+        groups: dict[KeyPath, list[Effect]] = {}
+        for effect in sorted(effects, key=self.operations):
+            groups.setdefault(effect.key_path, []).append(effect)
+        return groups
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Verdict:
-    """What the rule comes to."""
+class Selection:
+    """The scene with the effects that are kept, and the comparison without all others."""
 
     scene: Scene
-    base: Reference
-    combined: Change
+    baseline: Baseline
+    combined: Comparison
     kept: dict[Effect, bool]
     reasons: dict[Effect, str]
 
 
-def weigh(
-    scales: Scales, full: Scene, effects: Sequence[Effect], parameters: tuple[str, ...] | None
-) -> Weighed:
-    """Leave out each effect alone."""
-    whole = scales.reference(full, parameters)
-    _check_names(whole, parameters or ())
-    changes, operations = {}, {}
-    for number, effect in enumerate(effects):
-        density = scales.density(effect.apply(full))
-        changes[effect] = whole.compare(density)
-        operations[effect] = density.compiled.operations
-        scales.progress("weighing effects", (number + 1) / len(effects))
-    return Weighed(whole, changes, operations)
-
-
-def decide(
-    scales: Scales, full: Scene, weighed: Weighed, wishes: Wishes, tolerance: float
-) -> Verdict:
-    """Leave out together whatever may go."""
-    forced = [options[0] for options in weighed.by_place(wishes.drop).values()]
-    base = weighed.whole
-    if forced:
-        bare = simplify(full, forced)
-        base = base.beside(scales.density(bare))
-        if not base.peak.found:
-            base = scales.reference(bare, base.names)
-    free = [
-        effect
-        for effect in weighed.changes
-        if weighed.size(effect) <= tolerance
-        and effect.place not in {other.place for other in forced}
-        and not wishes.hold(effect, full)
-    ]
-    chosen, combined, put_back = _go_together(
-        lambda gone: base.compare(scales.density(simplify(full, [*forced, *gone]))),
-        base,
-        weighed,
-        free,
-        tolerance,
-    )
-    scene = simplify(full, [*forced, *chosen])
-    replaced = {effect.place: effect for effect in (*forced, *chosen)}
-    left = [part for _, part in parts_of(scene)]
-    kept = {e: e.place not in replaced and e.part in left for e in weighed.changes}
-    remarks = dict.fromkeys((*forced, *wishes.keep), "by your choice") | put_back
-    for effect in kept.keys() - remarks.keys() - set(chosen):
-        remarks[effect] = _remark(effect, replaced, kept[effect])
-    reasons = {e: _reason(weighed, e, tolerance, remarks.get(e), kept[e]) for e in kept}
-    return Verdict(scene, base, combined, kept, reasons)
-
-
-def _go_together(
-    without: Callable[[list[Effect]], Change],
-    base: Reference,
-    weighed: Weighed,
-    free: list[Effect],
+def compare_effects(
+    densities: SceneDensities,
+    full: Scene,
+    effects: Sequence[Effect],
+    parameters: tuple[str, ...] | None,
     tolerance: float,
-) -> tuple[list[Effect], Change, dict[Effect, str]]:
-    """The effects that may go together, what changes then, and why others came back."""
-    waiting = weighed.by_place(free)
-    put_back: dict[Effect, str] = {}
-    while True:
-        chosen = [options[0] for options in waiting.values() if options]
-        combined = without(chosen)
-        if base.size(combined) <= tolerance or not chosen:
-            return chosen, combined, put_back
-        worst = max(chosen, key=weighed.size)
-        waiting[worst.place].remove(worst)
-        put_back[worst] = f"with all others that could go, {base.says(combined)}"
-
-
-def _remark(effect: Effect, replaced: Mapping[Place, Effect], kept: bool) -> str:
-    """What decided about an effect that neither the user nor the rule picked."""
-    if effect.place in replaced:
-        return f"{replaced[effect.place].name} instead"
-    return "" if kept else "it goes with the part around it"
-
-
-def _reason(
-    weighed: Weighed, effect: Effect, tolerance: float, remark: str | None, kept: bool
-) -> str:
-    """Why an effect stays or goes: what decided beside the rule, and what the rule saw."""
-    size, change = weighed.size(effect), weighed.changes[effect]
-    seen = weighed.whole.says(change)
-    if size <= tolerance:
-        which = "parameter" if weighed.whole.names is None else "judged parameter"
-        seen = f"alone no {which} changes by more than {max(size, 0.001):.2g} sd"
-        remark = remark or ("a part of it stays by your choice" if kept else "")
-    lost = () if kept else weighed.whole.lost(change)
-    unfitted = f"not fitted then: {', '.join(lost)}" if lost else ""
-    return "; ".join(text for text in (remark, seen, unfitted) if text)
-
-
-def _check_names(whole: Reference, parameters: Iterable[str]) -> None:
-    density = whole.peak.density
-    for name in parameters:
-        if name not in density.labels and name not in density.sites:
+) -> SingleComparisons:
+    """Leave out each effect alone."""
+    baseline = densities.baseline(full, parameters)
+    density = baseline.fit.density
+    for name in parameters or ():
+        if name not in (*density.labels, *density.sites):
             raise FitError(
                 "the scene with everything on has no such parameter",
                 where=f"parameters: {name!r}",
                 hint=f"give any of {', '.join(dict.fromkeys(density.sites))}",
             )
+    comparisons = {}
+    for number, effect in enumerate(effects):
+        comparisons[effect], _ = baseline.compare(densities.density(effect.apply(full)))
+        densities.progress("comparing effects", (number + 1) / len(effects))
+    return SingleComparisons(densities, full, tolerance, baseline, comparisons)
 
 
-def _words(names: str | Iterable[str]) -> tuple[str, ...]:
-    return (names,) if isinstance(names, str) else tuple(names)
+def select_effects(single: SingleComparisons, choice: UserChoice) -> Selection:
+    """Leave out together all effects that change little, and those that the user drops."""
+    densities, full, baseline = single.densities, single.full, single.baseline
+    forced = [options[0] for options in single.by_key_path(choice.drop).values()]
+    if forced:
+        bare = simplify(full, forced)
+        _, fit = baseline.compare(densities.density(bare))
+        baseline = dataclasses.replace(baseline, fit=fit)
+        if not fit.found:
+            baseline = densities.baseline(bare, baseline.names)
+    forced_paths = {effect.key_path for effect in forced}
+    options = single.by_key_path(
+        effect
+        for effect in single.comparisons
+        if single.change(effect) <= single.tolerance
+        and effect.key_path not in forced_paths
+        and not choice.protects(effect, full)
+    )
+    reasons = dict.fromkeys((*forced, *choice.keep), "by your choice")
+    while True:
+        dropped = [*forced, *(effects[0] for effects in options.values() if effects)]
+        scene = simplify(full, dropped)
+        combined, _ = baseline.compare(densities.density(scene))
+        optional = dropped[len(forced) :]
+        if baseline.largest_change(combined) <= single.tolerance or not optional:
+            break
+        worst = max(optional, key=single.change)
+        options[worst.key_path].remove(worst)
+        reasons[worst] = f"with all others that could go, {baseline.describe(combined)}"
+    replaced = {effect.key_path: effect for effect in dropped}
+    left = [part for _, part in parts_of(scene)]
+    kept = {e: e.key_path not in replaced and e.part in left for e in single.comparisons}
+    for effect in kept.keys() - reasons.keys() - set(dropped):
+        if effect.key_path in replaced:
+            reasons[effect] = f"{replaced[effect.key_path].name} instead"
+        elif not kept[effect]:
+            reasons[effect] = "it goes with the part around it"
+    reasons = {e: _reason(single, e, reasons.get(e, ""), is_kept) for e, is_kept in kept.items()}
+    return Selection(scene, baseline, combined, kept, reasons)
 
 
-# --- The ledger of effects: what each changes and costs, kept or not and why, as one dataset ------
+def _reason(single: SingleComparisons, effect: Effect, remark: str, is_kept: bool) -> str:
+    """Why an effect is kept or dropped: the remark, the change, and the parameters that it adds."""
+    change, comparison = single.change(effect), single.comparisons[effect]
+    seen = single.baseline.describe(comparison)
+    if change <= single.tolerance:
+        which = "parameter" if single.baseline.names is None else "judged parameter"
+        seen = f"alone no {which} changes by more than {max(change, 0.001):.2g} sd"
+        remark = remark or ("a part of it stays by your choice" if is_kept else "")
+    missing = () if is_kept else single.baseline.missing(comparison)
+    unfitted = f"not fitted then: {', '.join(missing)}" if missing else ""
+    return "; ".join(text for text in (remark, seen, unfitted) if text)
+
+
+# --- The ledger: what each effect changes and costs -----------------------------------------------
 
 
 EFFECT, PARAMETER, BOTH = ("effect",), ("parameter",), ("effect", "parameter")
 COSTS = ("operations", "compile_seconds", "run_seconds")
+PACKAGES = ("polar_bayes", "jax", "numpyro")
+TABLE_COLUMNS = ["data", "shift", "sd", "operations", "time", "result"]
 
 DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
     "largest_move": ("largest change of a predicted reading, in sds of its noise", "1"),
@@ -217,85 +209,119 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
 
 
 def make_ledger(
-    full: Scene,
-    weighed: Weighed,
-    verdict: Verdict,
-    wishes: Wishes,
-    costs: Mapping[Scene, Cost],
+    single: SingleComparisons,
+    selection: Selection,
+    choice: UserChoice,
     settings: Mapping[str, str | float | int],
 ) -> xr.Dataset:
-    """Put a ledger together."""
-    whole, effects, changes = weighed.whole, tuple(weighed.changes), tuple(weighed.changes.values())
-    saved = [(costs[full], costs[effect.apply(full)]) for effect in effects]
-    labels = whole.peak.density.labels
+    """Comparisons, costs and the selection as one dataset."""
+    full, costs = single.full, single.densities.costs()
+    effects, comparisons = tuple(single.comparisons), tuple(single.comparisons.values())
+    labels = single.baseline.fit.density.labels
     shape = (len(effects), len(labels))
+
+    def of_all_labels(values: np.ndarray) -> list[float]:
+        """Values of the selection's baseline; NaN for parameters that the user dropped."""
+        known = dict(zip(selection.baseline.fit.density.labels, values, strict=True))
+        return [known.get(label, math.nan) for label in labels]
+
     columns: dict[str, tuple[tuple[str, ...], Any]] = {
-        "largest_move": (EFFECT, [change.largest_move for change in changes]),
-        "rms_move": (EFFECT, [change.rms_move for change in changes]),
-        "shift": (BOTH, np.reshape([change.shift for change in changes], shape)),
-        "sd_ratio": (BOTH, np.reshape([change.sd_ratio for change in changes], shape)),
-        "change": (EFFECT, [weighed.size(effect) for effect in effects]),
-        **{
-            name: (EFFECT, [getattr(on, name) - getattr(off, name) for on, off in saved])
-            for name in COSTS
-        },
-        "kept": (EFFECT, np.asarray([verdict.kept[effect] for effect in effects], bool)),
-        "forced": (EFFECT, [effect in (*wishes.keep, *wishes.drop) for effect in effects]),
-        "reason": (EFFECT, _texts(verdict.reasons[effect] for effect in effects)),
-        "judged": (PARAMETER, whole.judged),
-        "combined_shift": (PARAMETER, _by_label(labels, verdict, verdict.combined.shift)),
-        "combined_sd_ratio": (PARAMETER, _by_label(labels, verdict, verdict.combined.sd_ratio)),
+        "largest_move": (EFFECT, [each.largest_move for each in comparisons]),
+        "rms_move": (EFFECT, [each.rms_move for each in comparisons]),
+        "shift": (BOTH, np.reshape([each.shift for each in comparisons], shape)),
+        "sd_ratio": (BOTH, np.reshape([each.sd_ratio for each in comparisons], shape)),
+        "change": (EFFECT, [single.change(effect) for effect in effects]),
+        "kept": (EFFECT, np.asarray([selection.kept[effect] for effect in effects], bool)),
+        "forced": (EFFECT, [effect in (*choice.keep, *choice.drop) for effect in effects]),
+        "reason": (EFFECT, _texts(selection.reasons[effect] for effect in effects)),
+        "judged": (PARAMETER, single.baseline.judged),
+        "combined_shift": (PARAMETER, of_all_labels(selection.combined.shift)),
+        "combined_sd_ratio": (PARAMETER, of_all_labels(selection.combined.sd_ratio)),
     }
-    ledger = xr.Dataset(
+    attributes: dict[str, str | float | int] = {
+        **settings,
+        "combined_change": selection.baseline.largest_change(selection.combined),
+        "full_scene": repr(full),
+        "chosen_scene": repr(selection.scene),
+        "versions": json.dumps({name: version(name) for name in PACKAGES}),
+    }
+    without = [costs[effect.apply(full)] for effect in effects]
+    for name in COSTS:
+        whole = getattr(costs[full], name)
+        columns[name] = (EFFECT, [whole - getattr(cost, name) for cost in without])
+        attributes[f"full_{name}"] = whole
+        attributes[f"chosen_{name}"] = getattr(costs[selection.scene], name)
+    return xr.Dataset(
         {
-            name: (dims, values, dict(zip(("long_name", "units"), DESCRIPTIONS[name], strict=True)))
-            for name, (dims, values) in columns.items()
+            name: (*columns[name], {"long_name": long_name, "units": units})
+            for name, (long_name, units) in DESCRIPTIONS.items()
         },
         coords={
             "effect": _texts(effect.name for effect in effects),
             "path": (EFFECT, _texts(effect.path for effect in effects)),
             "parameter": _texts(labels),
         },
-        attrs=dict(settings) | {"combined_change": verdict.base.size(verdict.combined)},
+        attrs=attributes,
     )
-    for which, scene in (("full", full), ("chosen", verdict.scene)):
-        ledger.attrs[f"{which}_scene"] = repr(scene)
-        for name in COSTS:
-            ledger.attrs[f"{which}_{name}"] = getattr(costs[scene], name)
-    packages = ("polar_bayes", "jax", "numpyro")
-    ledger.attrs["versions"] = json.dumps({name: version(name) for name in packages})
-    return ledger
-
-
-def _by_label(labels: Iterable[str], verdict: Verdict, values: np.ndarray) -> list[float]:
-    """Values for the parameters of the full scene; NaN for what the user dropped."""
-    there = dict(zip(verdict.base.peak.density.labels, values, strict=True))
-    return [there.get(label, math.nan) for label in labels]
 
 
 def _texts(texts: Iterable[str]) -> np.ndarray:
     return np.asarray(list(texts), object)
 
 
-def ledger_table(ledger: xr.Dataset) -> str:
-    """The ledger as lines of text, one for each effect.
+def ledger_table(ledger: xr.Dataset) -> pd.DataFrame:
+    """One row for each effect, as text.
 
     Args:
         ledger: Of a scene that `polar_bayes.choose_effects` returned, or read back from a file.
 
     Returns:
-        A table: the largest move of a reading [noise sd]; the largest shift [posterior sd] and
-        the largest change of the sd of a judged parameter; the effect's share of the full scene's
-        operations and time; kept or dropped, and why.
+        By effect: `data`, the largest move of a reading [noise sd]; `shift` [posterior sd] and
+        `sd`, the largest shift and the largest change of the sd of a judged parameter; the effect's
+        share of the full scene's `operations` and `time`; and the `result`: kept or dropped, and
+        why.
     """
-    heads = ("effect", "data", "shift", "sd", "operations", "time", "")
-    rows = [heads, *((name, *cells) for name, cells in ledger_rows(ledger).items())]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(heads) - 1)]
-    lines = []
-    for name, *cells, verdict in rows:
-        right = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
-        lines.append("  ".join((name.ljust(widths[0]), *right, verdict)).rstrip())
-    return "\n".join(lines)
+    judged = ledger.isel(parameter=ledger["judged"].to_numpy().astype(bool))
+    rows = {}
+    for name in ledger["effect"].to_numpy():
+        row = judged.sel(effect=name)
+        rows[str(name)] = {
+            "data": f"{float(row['largest_move']):.2g}",
+            "shift": _largest(row["shift"].to_numpy(), "+.2f"),
+            "sd": _largest(row["sd_ratio"].to_numpy() - 1.0, "+.0%"),
+            "operations": _share(float(row["operations"]), ledger.attrs["full_operations"]),
+            "time": _share(float(row["run_seconds"]), ledger.attrs["full_run_seconds"]),
+            "result": f"{'kept' if bool(row['kept']) else 'dropped'}: {row['reason'].item()}",
+        }
+    return pd.DataFrame.from_dict(rows, orient="index", columns=TABLE_COLUMNS)
+
+
+def ledger_sentences(ledger: xr.Dataset) -> list[str]:
+    """How many effects are kept, what leaving out the others changes, and what it saves.
+
+    Args:
+        ledger: A ledger.
+
+    Returns:
+        One sentence on each of these, as far as they apply.
+    """
+    kept, forced = (ledger[name].to_numpy().astype(bool) for name in ("kept", "forced"))
+    if not kept.size:
+        return ["The scene has no effect that could be left out."]
+    sentences = [f"{np.sum(kept)} of {kept.size} effects are kept."]
+    if (~kept & ~forced).any():
+        which = "parameter" if bool(ledger["judged"].all()) else "judged parameter"
+        sentences.append(
+            f"Leaving out the others together changes no {which} by more than "
+            f"{max(float(ledger.attrs['combined_change']), 0.001):.2g} posterior sd."
+        )
+    if (~kept & forced).any():
+        names = ", ".join(map(str, ledger["effect"].to_numpy()[~kept & forced]))
+        sentences.append(f"By your choice {names} is left out.")
+    if not kept.all():
+        before, after = (1e3 * ledger.attrs[f"{which}_run_seconds"] for which in ("full", "chosen"))
+        sentences.append(f"One log density takes {after:.2g} ms in place of {before:.2g} ms.")
+    return sentences
 
 
 def ledger_summary(ledger: xr.Dataset) -> dict[str, Any]:
@@ -313,97 +339,42 @@ def ledger_summary(ledger: xr.Dataset) -> dict[str, Any]:
     effects = {}
     for name in ledger["effect"].to_numpy():
         row = ledger.sel(effect=name)
-        effects[str(name)] = {key: _plain(row[key].item()) for key in single} | {
-            key: dict(zip(labels, map(_plain, row[key].to_numpy().tolist()), strict=True))
+        effects[str(name)] = {key: _json_value(row[key].item()) for key in single} | {
+            key: dict(zip(labels, map(_json_value, row[key].to_numpy().tolist()), strict=True))
             for key in ("shift", "sd_ratio")
         }
     costs = {
-        which: {name: _plain(ledger.attrs[f"{which}_{name}"]) for name in COSTS}
+        which: {name: _json_value(ledger.attrs[f"{which}_{name}"]) for name in COSTS}
         for which in ("full", "chosen")
     }
-    said = {name: _plain(ledger.attrs[name]) for name in ("combined_change", "tolerance", "seed")}
-    return {"effects": effects, **costs, **said, "scene": ledger.attrs["chosen_scene"]}
+    names = ("combined_change", "tolerance", "seed")
+    settings = {name: _json_value(ledger.attrs[name]) for name in names}
+    return {"effects": effects, **costs, **settings, "scene": ledger.attrs["chosen_scene"]}
 
 
-def ledger_rows(ledger: xr.Dataset) -> dict[str, tuple[str, ...]]:
-    """The cells of each effect's row as text: data, shift, sd, operations, time, verdict."""
-    judged = ledger["judged"].to_numpy().astype(bool)
-    rows: dict[str, tuple[str, ...]] = {}
-    for index, name in enumerate(ledger["effect"].to_numpy()):
-        row = ledger.isel(effect=index)
-        shift = row["shift"].to_numpy()[judged]
-        width = row["sd_ratio"].to_numpy()[judged] - 1.0
-        shares = (
-            _ratio(float(row[cost]), ledger.attrs[f"full_{cost}"])
-            for cost in ("operations", "run_seconds")
-        )
-        verdict = "kept" if bool(row["kept"]) else "dropped"
-        rows[str(name)] = (
-            f"{float(row['largest_move']):.2g}",
-            _signed(_furthest(shift), ".2f"),
-            _signed(_furthest(width), ".0%"),
-            *(_signed(share, ".0%").removeprefix("+") for share in shares),
-            f"{verdict}: {row['reason'].item()}",
-        )
-    return rows
-
-
-def ledger_sentence(ledger: xr.Dataset) -> str:
-    """What the ledger comes to, in one sentence.
-
-    Args:
-        ledger: A ledger.
-
-    Returns:
-        How many effects stay, what leaving out the others changes, and what it saves.
-    """
-    kept, forced = (ledger[name].to_numpy().astype(bool) for name in ("kept", "forced"))
-    if not kept.size:
-        return "The scene has no effect that could be left out."
-    which = "parameter" if bool(ledger["judged"].all()) else "judged parameter"
-    said = [f"{np.sum(kept)} of {kept.size} effects are kept"]
-    if (~kept & ~forced).any():
-        said.append(
-            f"leaving out the others together changes no {which} by more than "
-            f"{max(float(ledger.attrs['combined_change']), 0.001):.2g} posterior sd"
-        )
-    if (~kept & forced).any():
-        said.append(f"by your choice {', '.join(_names(ledger, ~kept & forced))} is left out")
-    if not kept.all():
-        before, after = (ledger.attrs[f"{which}_run_seconds"] for which in ("full", "chosen"))
-        said.append(f"one log density takes {1e3 * after:.2g} ms in place of {1e3 * before:.2g} ms")
-    return f"{'; '.join(said)}."
-
-
-def _names(ledger: xr.Dataset, which: np.ndarray) -> list[str]:
-    return [str(name) for name in ledger["effect"].to_numpy()[which]]
-
-
-def _plain(value: Any) -> Any:
-    """What JSON knows: numbers of NumPy as Python's own, and None for what is not finite."""
+def _json_value(value: Any) -> Any:
+    """NumPy numbers as Python's own, and None for what is not finite."""
     value = value.item() if isinstance(value, np.generic) else value
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _furthest(values: np.ndarray) -> float:
+def _largest(values: np.ndarray, form: str) -> str:
+    """The finite value farthest from 0 as text."""
     known = values[np.isfinite(values)]
-    return float(known[np.argmax(np.abs(known))]) if known.size else math.nan
+    return f"{known[np.argmax(np.abs(known))]:{form}}" if known.size else "-"
 
 
-def _signed(value: float, form: str) -> str:
-    return f"{value:+{form}}" if math.isfinite(value) else "-"
+def _share(part: float, whole: float) -> str:
+    share = part / whole if whole > 0.0 else math.nan
+    return f"{share:.0%}" if math.isfinite(share) else "-"
 
 
-def _ratio(part: float, whole: float) -> float:
-    return part / whole if whole > 0.0 else math.nan
-
-
-# --- The effects that a capture can see: everything on, weighed one by one, the rest left out -----
+# --- The choice -----------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ChosenScene(Scene):
-    """A scene that knows why it is as it is.
+    """A scene with the ledger of the effects that it was chosen by.
 
     It is used as any other scene. A fit keeps the ledger in its group `effects`; a scene made from
     it by `dataclasses.replace` has none, because the ledger would no longer be true of it.
@@ -478,26 +449,22 @@ def choose_effects(
     named = not isinstance(scene, Scene)
     full = simplify(FULL_SCENES[request.scene_name] if named else request.scene, ())
     effects = effects_of(full)
-    wishes = Wishes.of(effects, keep, drop)
+    choice = UserChoice.of(effects, keep, drop)
     names = None if parameters is None else tuple(parameters)
-    with jax.enable_x64(True):
-        scales = Scales(request, priors, progress or no_progress)
-        # What is refused here is refused before minutes are spent.
-        resolve_priors(scales.priors(full).read, priors)
-        weighed = weigh(scales, full, effects, names)
-        verdict = decide(scales, full, weighed, wishes, float(tolerance))
-        costs = scales.costs()
     settings: dict[str, str | float | int] = {
         "tolerance": float(tolerance),
         "largest_view_zenith": request.largest_view_zenith,
         "seed": request.seed,
         "links": json.dumps({name: repr(link) for name, link in request.links.items()}),
     }
-    choice = ChosenScene(**_fields(verdict.scene))
-    ledger = make_ledger(full, weighed, verdict, wishes, costs, settings)
-    object.__setattr__(choice, "ledger", ledger)
-    return choice
-
-
-def _fields(scene: Scene) -> dict[str, Any]:
-    return {field.name: getattr(scene, field.name) for field in dataclasses.fields(Scene)}
+    with jax.enable_x64(True):
+        densities = SceneDensities(request, priors, progress or no_progress)
+        # Unknown priors are refused before minutes are spent.
+        resolve_priors(densities.priors(full).read, priors)
+        single = compare_effects(densities, full, effects, names, float(tolerance))
+        selection = select_effects(single, choice)
+        ledger = make_ledger(single, selection, choice, settings)
+    fields = (field.name for field in dataclasses.fields(Scene))
+    chosen = ChosenScene(**{name: getattr(selection.scene, name) for name in fields})
+    object.__setattr__(chosen, "ledger", ledger)
+    return chosen

@@ -1,7 +1,7 @@
-"""Every way to make a scene simpler by one effect, and scenes with several of them left out.
+"""The effects of a scene: every part with a simpler replacement, and scenes without some of them.
 
-There is no list of effects: whatever part says in `simpler` what may stand in its place takes
-part, wherever it sits in a scene and whoever wrote it.
+There is no list of effects: every part whose `simpler` gives replacements is one, wherever it is in
+a scene and whoever wrote it.
 """
 
 import dataclasses
@@ -12,23 +12,23 @@ from polar_bayes.errors import SceneError
 from polar_bayes.physics.part import Part
 from polar_bayes.physics.scene import Scene
 
-Place = tuple[str | int, ...]
-"""The way from a scene to a part: names of fields, and positions in tuples."""
+KeyPath = tuple[str | int, ...]
+"""Keys from a scene to a part: names of fields, and indices of tuples."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """One part of a scene, and one thing that may stand in its place."""
+    """One part of a scene, and one simpler replacement."""
 
     name: str
-    place: Place
+    key_path: KeyPath
     part: Part
     replacement: Part | None
 
     @property
     def path(self) -> str:
-        """Where the part sits, as text: `surface.shadowing`, `instrument.terms[0]`."""
-        return _path(self.place)
+        """The key path as text: `surface.shadowing`, `instrument.terms[0]`."""
+        return _path(self.key_path)
 
     def apply(self, scene: Scene) -> Scene:
         """The scene without this effect; see `simplify`."""
@@ -37,24 +37,27 @@ class Effect:
 
 def effects_of(scene: Scene) -> tuple[Effect, ...]:
     """Every effect of a scene, in the order of its fields."""
-    found: dict[Scene, tuple[Place, Part, Part | None]] = {}
-    for place, part in parts_of(scene):
+    found: dict[Scene, tuple[KeyPath, Part, Part | None]] = {}
+    for key_path, part in parts_of(scene):
         for replacement in part.simpler():
-            simpler = simplify(scene, [Effect("", place, part, replacement)])
-            if simpler != scene and len(place) >= len(found.get(simpler, ((),))[0]):
-                found[simpler] = place, part, replacement
+            simpler = simplify(scene, [Effect("", key_path, part, replacement)])
+            if simpler != scene and len(key_path) >= len(found.get(simpler, ((),))[0]):
+                found[simpler] = key_path, part, replacement
     short = [_name(part, replacement) for _, part, replacement in found.values()]
     return tuple(
         Effect(
-            name if short.count(name) == 1 else f"{_path(place)}: {name}", place, part, replacement
+            name if short.count(name) == 1 else f"{_path(key_path)}: {name}",
+            key_path,
+            part,
+            replacement,
         )
-        for name, (place, part, replacement) in zip(short, found.values(), strict=True)
+        for name, (key_path, part, replacement) in zip(short, found.values(), strict=True)
     )
 
 
 def simplify(scene: Scene, effects: Iterable[Effect]) -> Scene:
     """The scene without some of its effects."""
-    chosen = {effect.place: effect for effect in effects}
+    chosen = {effect.key_path: effect for effect in effects}
     parts = {
         field.name: _rebuilt(getattr(scene, field.name), (field.name,), chosen)
         for field in dataclasses.fields(Scene)
@@ -64,27 +67,26 @@ def simplify(scene: Scene, effects: Iterable[Effect]) -> Scene:
     return Scene(**parts)
 
 
-def find_effects(word: str, effects: Iterable[Effect], where: str) -> tuple[Effect, ...]:
-    """The effects that a user means by one word."""
+def find_effects(name: str, effects: Iterable[Effect], where: str) -> tuple[Effect, ...]:
+    """The effects of that name, class of the part or path."""
     effects = tuple(effects)
-    named = tuple(effect for effect in effects if effect.name == word)
-    meant = named or tuple(
-        effect for effect in effects if word in (type(effect.part).__name__, effect.path)
+    found = tuple(effect for effect in effects if effect.name == name) or tuple(
+        effect for effect in effects if name in (type(effect.part).__name__, effect.path)
     )
-    if not meant:
+    if not found:
         known = ", ".join(effect.name for effect in effects) or "none: nothing can be left out"
         raise SceneError(
-            "the scene has no such effect", where=f"{where}={word!r}", hint=f"give one of {known}"
+            "the scene has no such effect", where=f"{where}={name!r}", hint=f"give one of {known}"
         )
-    return meant
+    return found
 
 
-def parts_of(value: object, place: Place = ()) -> Iterator[tuple[Place, Part]]:
-    """Every part inside a value, itself included, outermost first, and where it sits."""
+def parts_of(value: object, key_path: KeyPath = ()) -> Iterator[tuple[KeyPath, Part]]:
+    """Every part inside a value, itself included, outermost first, with its key path."""
     if isinstance(value, Part):
-        yield place, value
+        yield key_path, value
     for step, inner in _inside(value):
-        yield from parts_of(inner, (*place, step))
+        yield from parts_of(inner, (*key_path, step))
 
 
 def _inside(value: object) -> Iterator[tuple[str | int, object]]:
@@ -96,15 +98,15 @@ def _inside(value: object) -> Iterator[tuple[str | int, object]]:
                 yield field.name, getattr(value, field.name)
 
 
-def _rebuilt(value: Any, place: Place, effects: Mapping[Place, Effect]) -> Any:
+def _rebuilt(value: Any, key_path: KeyPath, effects: Mapping[KeyPath, Effect]) -> Any:
     """The value with replacements put in, outermost first."""
-    effect = effects.get(place)
+    effect = effects.get(key_path)
     if effect is not None and value == effect.part:
         value = effect.replacement
     inner = dict(_inside(value))
     changed = {}
     for step, old in inner.items():
-        new = _rebuilt(old, (*place, step), effects)
+        new = _rebuilt(old, (*key_path, step), effects)
         if new is not old:
             changed[step] = new
     if not changed:
@@ -130,6 +132,6 @@ def _name(part: Part, replacement: Part | None) -> str:
     return f"{before} -> {after}({differing})"
 
 
-def _path(place: Place) -> str:
-    steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in place)
+def _path(key_path: KeyPath) -> str:
+    steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in key_path)
     return "".join(steps).removeprefix(".")

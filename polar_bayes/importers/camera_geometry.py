@@ -1,8 +1,8 @@
-r"""Where camera and light stand, and what a model must know of it for each piece of surface.
+r"""Positions of camera and light, and the local geometry of each piece of surface.
 
 Stokes parameters of a camera count from its own axes: from x (to the right) counterclockwise as
 the camera sees it. Models count from the s axis of each piece of surface,
-$e_s = (n \times v)/|n \times v|$ (docs/conventions.md), towards $v \times e_s$. The two are turned
+$e_s = (n \times v)/|n \times v|$ (docs/conventions.md), towards $v \times e_s$. The two are rotated
 by $\psi = atan2(e_s \cdot b, e_s \cdot a)$, where a and b are the camera's axes carried to the
 direction of view v: a lens bends each ray in the plane of ray and axis, so
 
@@ -17,7 +17,6 @@ import numpy as np
 
 from polar_bayes.capture.schema import Interval
 from polar_bayes.errors import CaptureError
-from polar_bayes.importers.detector import check_number
 
 ON_NORMAL = 1e-6
 """Sine of the zenith below which a direction is that of the normal itself."""
@@ -26,15 +25,14 @@ EDGE_ON = 1e-9
 """Cosine below which a surface no longer faces something; its zenith stays below 90 degrees."""
 
 COMPONENT = Interval(-1e9, 1e9)
-Z = np.array([0.0, 0.0, 1.0])
 
 
-class AbstractPlace(abc.ABC):
-    """Where something stands, as a surface sees it."""
+class AbstractLocation(abc.ABC):
+    """Location of a camera or light, as directions from points of the surface."""
 
     @abc.abstractmethod
     def towards(self, points: np.ndarray) -> np.ndarray:
-        """Unit vectors from points of the surface to it.
+        """Unit vectors from points of the surface to the location.
 
         Args:
             points: In the camera's axes, pixels from the center of the frame, (..., 3).
@@ -45,8 +43,8 @@ class AbstractPlace(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True)
-class Direction(AbstractPlace):
-    """Something far away: the same direction from everywhere.
+class Direction(AbstractLocation):
+    """A distant camera or light: the same direction from every point.
 
     Args:
         x: To the right, in any unit.
@@ -62,7 +60,7 @@ class Direction(AbstractPlace):
     z: float
 
     def __post_init__(self) -> None:
-        if _check(self) == 0.0:
+        if not any(_check_components(self)):
             hint = "give a vector that is not zero"
             raise CaptureError("it points nowhere", where=repr(self), hint=hint)
 
@@ -73,10 +71,10 @@ class Direction(AbstractPlace):
 
 
 @dataclasses.dataclass(frozen=True)
-class Position(AbstractPlace):
-    """Something near: a place in pixels of the frame, from its center, where z = 0 is the surface.
+class Position(AbstractLocation):
+    """A near camera or light, in pixels of the frame from its center; the surface is at z = 0.
 
-    A camera of focal length f pixels stands at (0, 0, f).
+    A camera of focal length f pixels is at (0, 0, f).
 
     Args:
         x: To the right.
@@ -92,10 +90,10 @@ class Position(AbstractPlace):
     z: float
 
     def __post_init__(self) -> None:
-        _check(self)
+        _check_components(self)
         if not self.z > 0.0:
             hint = "give z above 0, in pixels of the frame"
-            raise CaptureError("it stands behind the surface", where=repr(self), hint=hint)
+            raise CaptureError("it is behind the surface", where=repr(self), hint=hint)
 
     @override
     def towards(self, points: np.ndarray) -> np.ndarray:
@@ -105,7 +103,7 @@ class Position(AbstractPlace):
 
 @dataclasses.dataclass(frozen=True)
 class Highlight:
-    """Light from far away, told by where the surface mirrors it.
+    """Distant light, located by the point where the surface mirrors it.
 
     Args:
         row: Of the middle of the highlight, pixels.
@@ -119,22 +117,22 @@ class Highlight:
     column: float
 
     def __post_init__(self) -> None:
-        for name in ("row", "column"):
-            check_number(f"Highlight: {name}", getattr(self, name), Interval(0.0, 1e6))
+        Interval(0.0, 1e6).check(self.row, "Highlight: row")
+        Interval(0.0, 1e6).check(self.column, "Highlight: column")
 
 
 @dataclasses.dataclass(frozen=True)
 class Surroundings:
-    """Light from everywhere: each piece of surface mirrors what stands opposite to the camera.
+    """Light from everywhere: each piece of a smooth surface mirrors its surroundings.
 
-    So for smooth surfaces in a room, where no lamp need be known: the light's direction is the
-    mirror direction of each piece, in its plane of incidence.
+    No lamp need be known: the light's direction is the mirror direction of each piece, in its plane
+    of incidence.
     """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Directions:
-    """What a model must know of each piece of surface; all of one shape."""
+class LocalGeometry:
+    """Directions in the frame of each piece of surface, and the rotation of axes; of one shape."""
 
     view_zenith: np.ndarray
     view_azimuth: np.ndarray
@@ -147,8 +145,8 @@ class Directions:
     in_shadow: np.ndarray
 
 
-def directions(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> Directions:
-    """Zeniths, azimuths and the turn of axes from vectors in the camera's axes."""
+def local_geometry(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> LocalGeometry:
+    """Zeniths, azimuths and the rotation of axes, from vectors in the camera's axes."""
     outside = ~np.isfinite(normals).all(axis=-1)
     n = np.where(outside[..., None], view, normals)
     light = np.where(np.isfinite(light), light, view)
@@ -160,8 +158,8 @@ def directions(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> Dire
     sin_view = np.linalg.norm(across_view, axis=-1)
     sin_light = np.linalg.norm(across_light, axis=-1)
     upright, from_above = sin_view < ON_NORMAL, sin_light < ON_NORMAL
-    # On the normal the frame is the light's, as if the viewer stood opposite to it; where both
-    # stand there, any frame will do.
+    # On the normal the frame is the light's, as if the viewer were opposite to it; where both are
+    # on the normal, any frame will do.
     fallback = np.where(from_above[..., None], _first_axis(view), -across_light)
     s_axis = np.where(upright[..., None], fallback, across_view)
     s_axis = s_axis / np.linalg.norm(s_axis, axis=-1, keepdims=True)
@@ -173,10 +171,10 @@ def directions(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> Dire
     around = _dot(n, np.cross(across_light, across_view))
     azimuth = np.arctan2(around, _dot(across_light, across_view))
     azimuth = np.where(upright | from_above, np.pi, azimuth)
-    return Directions(
-        view_zenith=np.where(seen & ~upright, _zenith(sin_view, cos_view), 0.0),
+    return LocalGeometry(
+        view_zenith=np.where(seen & ~upright, np.rad2deg(np.arctan2(sin_view, cos_view)), 0.0),
         view_azimuth=np.where(seen, np.rad2deg(azimuth), 180.0),
-        light_zenith=np.where(seen, _zenith(sin_light, cos_light), 0.0),
+        light_zenith=np.where(seen, np.rad2deg(np.arctan2(sin_light, cos_light)), 0.0),
         light_azimuth=np.zeros_like(cos_view),
         cos_twice=cos**2 - sin**2,
         sin_twice=2.0 * cos * sin,
@@ -186,37 +184,32 @@ def directions(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> Dire
     )
 
 
-def mirrored(normals: np.ndarray, view: np.ndarray) -> np.ndarray:
+def mirror_direction(normals: np.ndarray, view: np.ndarray) -> np.ndarray:
     """The direction from which a mirror sends light to the viewer."""
     return 2.0 * _dot(normals, view)[..., None] * normals - view
 
 
-def as_place(place: Any, where: str) -> AbstractPlace:
-    """What a user gave for a place."""
-    if isinstance(place, AbstractPlace):
-        return place
-    if isinstance(place, list | tuple | np.ndarray) and len(place) == 3:
-        return Direction(*place)
+def as_location(location: Any, where: str) -> AbstractLocation:
+    """A location from a user's argument."""
+    if isinstance(location, AbstractLocation):
+        return location
+    if isinstance(location, list | tuple | np.ndarray) and len(location) == 3:
+        return Direction(*location)
     hint = "give Direction(x, y, z) or Position(x, y, z)"
-    raise CaptureError(f"{place!r} is no place", where=where, hint=hint)
+    raise CaptureError(f"{location!r} is neither direction nor position", where=where, hint=hint)
 
 
 def _first_axis(view: np.ndarray) -> np.ndarray:
     """The camera's x axis, carried to a direction of view."""
-    x = np.array([1.0, 0.0, 0.0])
-    return x - (view[..., :1] / (1.0 + view[..., 2:])) * (Z + view)
-
-
-def _zenith(sine: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    return np.rad2deg(np.arctan2(sine, cosine))
+    x, z = np.eye(3)[[0, 2]]
+    return x - (view[..., :1] / (1.0 + view[..., 2:])) * (z + view)
 
 
 def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.sum(first * second, axis=-1)
 
 
-def _check(place: Direction | Position) -> float:
-    """The largest component; each must be a number."""
-    name = type(place).__name__
-    parts = [check_number(f"{name}: {k}", getattr(place, k), COMPONENT) for k in ("x", "y", "z")]
-    return max(map(abs, parts))
+def _check_components(location: Direction | Position) -> list[float]:
+    """The components, each of which must be a number."""
+    name = type(location).__name__
+    return [COMPONENT.check(getattr(location, k), f"{name}: {k}") for k in ("x", "y", "z")]

@@ -1,14 +1,14 @@
-r"""What a camera does to light, and how well each of its numbers is known.
+r"""Camera frames, corrected for dark level and flat field, and their noise.
 
 A raw count R of a pixel with dark count D and relative sensitivity F (the flat field, of mean 1)
-stands for the signal and has the variance
+gives the signal, with the variance
 
 $$ s = (R - D)/F, \qquad
    \sigma^2 = \frac{\sigma_r^2 + 1/12 + g \max(s F, 0)}{F^2 N} + (\epsilon s)^2 $$
 
 with read noise $\sigma_r$ (counts), rounding to whole counts, photon noise of gain g (counts per
-electron), and N pixels averaged. What averaging does not reduce is $\epsilon$: analyzers that do
-not pass alike, light that flickers, a flat field of yesterday.
+electron), and N pixels averaged. Averaging does not reduce $\epsilon$: unequal transmission
+of the analyzers, light that flickers, a flat field that has changed.
 
 PNG and TIFF files go through Pillow, which every plotting library brings along; .npy files hold
 what a script saved. A frame in color is refused: its channels would have to be told apart first.
@@ -17,6 +17,7 @@ what a script saved. A frame in color is refused: its channels would have to be 
 import dataclasses
 import os
 import warnings
+from collections.abc import Sequence
 from numbers import Real
 from typing import Any
 
@@ -27,8 +28,7 @@ from polar_bayes.capture.schema import Interval
 from polar_bayes.errors import CaptureError
 from polar_bayes.paths import existing_file
 
-# --- Frames of a camera as arrays of numbers, from files or from memory; nothing is guessed -------
-
+# --- Reading frames -------------------------------------------------------------------------------
 
 Frame = str | os.PathLike[str] | np.ndarray
 
@@ -40,12 +40,13 @@ LARGEST_COUNT = 1e9
 
 
 def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
-    """One frame of gray values."""
+    """One frame of gray values, and the count of a full pixel where the format states it."""
     values = _array(frame, where)
+    where = str(frame) if isinstance(frame, str | os.PathLike) else where
     if values.dtype.kind not in "uif" or values.ndim != 2 or values.size == 0:
         raise CaptureError(
             f"it holds {values.dtype.name} of shape {values.shape}, not one frame of gray values",
-            where=_place(frame, where),
+            where=where,
             hint="give rows and columns of numbers; of a color frame, one channel",
         )
     counts = values.astype(np.float64)
@@ -53,7 +54,7 @@ def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
         row, column = np.argwhere(~(np.abs(counts) <= LARGEST_COUNT))[0]
         raise CaptureError(
             f"{counts[row, column]:g} is no reading",
-            where=f"{_place(frame, where)}[row={row}, column={column}]",
+            where=f"{where}[row={row}, column={column}]",
             hint=f"give finite counts up to {LARGEST_COUNT:g}",
         )
     return counts, 255.0 if values.dtype == np.uint8 else None
@@ -68,17 +69,15 @@ def read_array(path: str | os.PathLike[str], where: str) -> np.ndarray:
             warnings.simplefilter("ignore")  # what old versions of NumPy wrote can still be read
             # Mapped, so that a header that declares terabytes is compared with the file first.
             mapped = np.load(file, mmap_mode="r", allow_pickle=False)
-        if isinstance(mapped, np.memmap):
-            if mapped.offset + mapped.nbytes != file.stat().st_size:
-                what = f"its header says {mapped.nbytes} bytes of numbers, and it holds others"
-                raise CaptureError(what, where=str(file), hint=hint)
-            return np.array(mapped)
-        mapped.close()  # a .npz archive
-    except CaptureError:
-        raise
     except Exception as error:  # NumPy raises nearly every type for a broken header
         raise CaptureError("it cannot be read as .npy", where=str(file), hint=hint) from error
-    raise CaptureError("it holds several arrays", where=str(file), hint=hint)
+    if not isinstance(mapped, np.memmap):
+        mapped.close()  # a .npz archive
+        raise CaptureError("it holds several arrays", where=str(file), hint=hint)
+    if mapped.offset + mapped.nbytes != file.stat().st_size:
+        what = f"its header declares {mapped.nbytes} bytes of numbers, and the file holds others"
+        raise CaptureError(what, where=str(file), hint=hint)
+    return np.array(mapped)
 
 
 def _array(frame: Any, where: str) -> np.ndarray:
@@ -91,30 +90,24 @@ def _array(frame: Any, where: str) -> np.ndarray:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(file, formats=FORMATS) as image:
-                if image.mode not in GRAY_MODES:
-                    what = f"its pixels are {image.mode}, not gray values"
-                    hint = "save it with 8 or 16 bits of gray, or give one channel as .npy"
-                    raise CaptureError(what, where=str(file), hint=hint)
-                if (pages := getattr(image, "n_frames", 1)) > 1:
-                    hint = "save each page as a file of its own"
-                    raise CaptureError(f"it holds {pages} frames", where=str(file), hint=hint)
-                return np.asarray(image)
-    except CaptureError:
-        raise
+                mode, pages = image.mode, getattr(image, "n_frames", 1)
+                values = np.asarray(image) if mode in GRAY_MODES and pages == 1 else None
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         hint = "cut it to what matters, or give it as .npy"
         raise CaptureError("it is larger than any camera", where=str(file), hint=hint) from error
     except Exception as error:  # Pillow raises many types for a broken file
         hint = "give PNG, TIFF or .npy"
         raise CaptureError("it cannot be read as an image", where=str(file), hint=hint) from error
+    if values is not None:
+        return values
+    if mode not in GRAY_MODES:
+        hint = "save it with 8 or 16 bits of gray, or give one channel as .npy"
+        raise CaptureError(f"its pixels are {mode}, not gray values", where=str(file), hint=hint)
+    hint = "save each page as a file of its own"
+    raise CaptureError(f"it holds {pages} frames", where=str(file), hint=hint)
 
 
-def _place(frame: Any, where: str) -> str:
-    return str(frame) if isinstance(frame, str | os.PathLike) else where
-
-
-# --- What a camera does to light, and how well each of its numbers is known -----------------------
-
+# --- Correction and noise -------------------------------------------------------------------------
 
 FULL_WELL = 10_000.0
 """Electrons that fill a pixel of a machine-vision sensor, where the gain is not stated."""
@@ -123,13 +116,11 @@ ROUNDING = 1.0 / 12.0
 DARKEST_FLAT = 0.05
 
 POSITIVE = Interval(0.0, 1e9, open_low=True)
-NOISE = Interval(0.0, 1e9)
-FRACTION = Interval(0.0, 1.0, open_high=True)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Detector:
-    """How counts become light, and their noise.
+    """Camera model: how counts become light, and their noise.
 
     Args:
         saturation_level: Count at which a pixel is full, > 0; it may be left out for 8-bit frames,
@@ -155,31 +146,27 @@ class Detector:
     relative_error: float = 0.01
 
     def __post_init__(self) -> None:
-        for name, allowed, optional in (
-            ("saturation_level", POSITIVE, True),
-            ("gain", POSITIVE, True),
-            ("read_noise", NOISE, False),
-            ("relative_error", FRACTION, False),
-        ):
-            value = getattr(self, name)
-            if not (optional and value is None):
-                check_number(name, value, allowed)
+        for name in ("saturation_level", "gain"):
+            if getattr(self, name) is not None:
+                POSITIVE.check(getattr(self, name), name)
+        Interval(0.0, 1e9).check(self.read_noise, "read_noise")
+        Interval(0.0, 1.0, open_high=True).check(self.relative_error, "relative_error")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Signal:
-    """Frames with dark and flat field taken out."""
+    """Frames corrected for dark level and flat field, with the metadata of the correction."""
 
     light: np.ndarray
     variance: np.ndarray
     saturated: np.ndarray
     full_scale: float
-    said: dict[str, str | float]
+    metadata: dict[str, str | float]
 
 
-def signal_of(frames: list[np.ndarray], level: float | None, detector: Detector) -> Signal:
-    """Light from raw frames."""
-    full = detector.saturation_level if detector.saturation_level is not None else level
+def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detector) -> Signal:
+    """Light and its variance from raw frames."""
+    full = level if detector.saturation_level is None else detector.saturation_level
     if full is None:
         raise CaptureError(
             "the frames do not say at which count a pixel is full",
@@ -188,7 +175,10 @@ def signal_of(frames: list[np.ndarray], level: float | None, detector: Detector)
         )
     raw = np.stack(frames)
     shape = raw.shape[1:]
-    dark = _dark(detector.dark, shape)
+    if isinstance(detector.dark, Real):
+        dark = np.full(shape, Interval(-1e9, 1e9).check(detector.dark, "dark"))
+    else:
+        dark = _calibration_frame(detector.dark, shape, "dark")
     flat = _flat(detector.flat, shape)
     if not (dark < full).all():
         hint = "check it and the saturation level"
@@ -196,60 +186,50 @@ def signal_of(frames: list[np.ndarray], level: float | None, detector: Detector)
     gain = full / FULL_WELL if detector.gain is None else float(detector.gain)
     counts = raw - dark
     variance = detector.read_noise**2 + ROUNDING + gain * np.maximum(counts, 0.0)
-    said: dict[str, str | float] = {
-        "saturation_level": float(full),
-        "dark": _said(detector.dark),
-        "flat": _said(detector.flat),
-        "gain": gain,
-        "gain_is": "assumed" if detector.gain is None else "given",
-        "read_noise": float(detector.read_noise),
-        "relative_error": float(detector.relative_error),
-    }
     return Signal(
         light=counts / flat,
         variance=variance / flat**2,
         saturated=raw >= full,
         full_scale=float(np.max((full - dark) / flat)),
-        said=said,
+        metadata={
+            "saturation_level": float(full),
+            "dark": _source(detector.dark),
+            "flat": _source(detector.flat),
+            "gain": gain,
+            "gain_is": "assumed" if detector.gain is None else "given",
+            "read_noise": float(detector.read_noise),
+            "relative_error": float(detector.relative_error),
+        },
     )
 
 
-def check_number(name: str, value: Any, allowed: Interval) -> float:
-    """A number given by the user."""
-    if isinstance(value, Real) and not isinstance(value, bool) and allowed.contains(value):
-        return float(value)
-    raise CaptureError(f"it is {value!r}", where=name, hint=f"give {allowed}")
-
-
-def _dark(dark: Frame | float, shape: tuple[int, ...]) -> np.ndarray:
-    if isinstance(dark, Real):
-        return np.full(shape, check_number("dark", dark, Interval(-1e9, 1e9)))
-    return _matching(read_frame(dark, "dark")[0], shape, "dark")
-
-
 def _flat(flat: Frame | None, shape: tuple[int, ...]) -> np.ndarray:
+    """Relative sensitivity of each pixel, of mean 1."""
     if flat is None:
         return np.ones(shape)
-    values = _matching(read_frame(flat, "flat")[0], shape, "flat")
+    values = _calibration_frame(flat, shape, "flat")
     mean = float(values.mean())
     if not mean > 0.0 or not (values > DARKEST_FLAT * mean).all():
         row, column = np.unravel_index(np.argmin(values), shape)
         raise CaptureError(
             f"{values[row, column]:g} is less than a twentieth of its mean {mean:g}",
             where=f"flat[row={row}, column={column}]",
-            hint="take it less its dark frame, of even light; mend dead pixels",
+            hint="subtract its dark frame, use even light, and correct dead pixels",
         )
     return values / mean
 
 
-def _matching(values: np.ndarray, shape: tuple[int, ...], where: str) -> np.ndarray:
-    if values.shape == shape:
-        return values
-    hint = "take it with the same camera at the same size"
-    raise CaptureError(f"it is {values.shape}, the frames are {shape}", where=where, hint=hint)
+def _calibration_frame(frame: Frame | float, shape: tuple[int, ...], where: str) -> np.ndarray:
+    values, _ = read_frame(frame, where)
+    if values.shape != shape:
+        what = f"it is {values.shape}, the frames are {shape}"
+        hint = "take it with the same camera at the same size"
+        raise CaptureError(what, where=where, hint=hint)
+    return values
 
 
-def _said(frame: Frame | float | None) -> str | float:
+def _source(frame: Frame | float | None) -> str | float:
+    """Where a calibration frame comes from, as an attribute."""
     if frame is None:
         return "none"
     if isinstance(frame, Real):

@@ -1,7 +1,7 @@
-"""Where the surface in a picture points: normals from a file, or of spheres.
+"""Surface normals of an image: from a file, or of spheres.
 
-Axes of the camera, here and everywhere in pictures: x to the right, y up, z from the scene to the
-camera. Places in a frame are rows (down) and columns (to the right), counted from zero at the
+Axes of the camera, here and in all imports of images: x to the right, y up, z from the scene to the
+camera. Positions in a frame are rows (down) and columns (to the right), counted from zero at the
 center of the first pixel; lengths are in pixels.
 """
 
@@ -17,17 +17,17 @@ from scipy.optimize import least_squares
 from polar_bayes.capture.schema import Interval
 from polar_bayes.capture.table_reader import read_table
 from polar_bayes.errors import CaptureError
-from polar_bayes.importers.detector import check_number, os_name, read_array
+from polar_bayes.importers.detector import os_name, read_array
 
 FEWEST_RIM_POINTS = 4
-PLACE = Interval(-1e6, 1e6)
+CENTER = Interval(-1e6, 1e6)
 RADIUS = Interval(1.0, 1e6)
 UNIT_LENGTH = 0.05
 """How far the length of a normal may be from one."""
 
 
 class AbstractShape(abc.ABC):
-    """Normals of what a frame shows."""
+    """Surface normals of a frame."""
 
     @abc.abstractmethod
     def normals(self, rows: np.ndarray, columns: np.ndarray, width: int) -> np.ndarray:
@@ -48,8 +48,8 @@ class AbstractShape(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def said(self) -> str:
-        """What it is, as an attribute of the capture."""
+    def description(self) -> str:
+        """The shape as text, for an attribute of the capture."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,8 +70,8 @@ class Sphere:
     radius: float
 
     def __post_init__(self) -> None:
-        for name, allowed in (("row", PLACE), ("column", PLACE), ("radius", RADIUS)):
-            check_number(f"Sphere: {name}", getattr(self, name), allowed)
+        for name, allowed in (("row", CENTER), ("column", CENTER), ("radius", RADIUS)):
+            allowed.check(getattr(self, name), f"Sphere: {name}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Spheres(AbstractShape):
         for sphere in self.spheres:
             x = (columns - sphere.column) / sphere.radius
             y = (sphere.row - rows) / sphere.radius
-            # A square that the outline cuts reads something else beside the sphere.
+            # A square that the outline cuts also reads what is behind the sphere.
             reach = 0.5 * (width - 1) / sphere.radius
             whole = np.hypot(np.abs(x) + reach, np.abs(y) + reach) < 1.0
             z = np.sqrt(np.where(whole, 1.0 - x**2 - y**2, 1.0))
@@ -125,7 +125,7 @@ class Spheres(AbstractShape):
 
     @property
     @override
-    def said(self) -> str:
+    def description(self) -> str:
         return "; ".join(f"sphere {s.row:g} {s.column:g} {s.radius:g}" for s in self.spheres)
 
 
@@ -189,7 +189,7 @@ class NormalMap(AbstractShape):
 
     @property
     @override
-    def said(self) -> str:
+    def description(self) -> str:
         if isinstance(self.values, np.ndarray):
             return "normals: array"
         return f"normals: {os_name(self.values)}"
@@ -231,11 +231,11 @@ def fit_sphere(rim: Any) -> Sphere:
             where=where,
             hint="check for a swapped row and column, or give normals of another shape",
         )
-    return Sphere(*(float(x) for x in found))
+    return Sphere(*found.tolist())
 
 
 def as_shape(shape: Any) -> AbstractShape:
-    """What a user gave for a surface, as a shape."""
+    """A shape from a user's argument."""
     if isinstance(shape, AbstractShape):
         return shape
     if isinstance(shape, Sphere):

@@ -1,7 +1,7 @@
 r"""Stokes parameters from readings behind a linear polarizer, with their noise.
 
 A polarizer at angle $\chi$ lets pass $I(\chi) = (S_0 + S_1 \cos 2\chi + S_2 \sin 2\chi)/2$. Three
-angles or more tell S by least squares, $S = (A^T A)^{-1} A^T I = P I$, with the covariance
+angles or more determine S by least squares, $S = (A^T A)^{-1} A^T I = P I$, with the covariance
 $P\,\mathrm{diag}(\sigma^2) P^T$. Weights would take the noise from the noisy readings themselves,
 so that dark ones would count too much and bias S; with four angles there is little to gain.
 
@@ -45,8 +45,8 @@ class StokesImage:
     covariance: np.ndarray
     misfit: np.ndarray | None
 
-    def turned(self, cos: np.ndarray, sin: np.ndarray) -> "StokesImage":
-        """The same light in axes that are turned counterclockwise, as the camera sees it."""
+    def rotated(self, cos: np.ndarray, sin: np.ndarray) -> "StokesImage":
+        """The same light in axes rotated counterclockwise, as the camera sees it."""
         q_variance, u_variance, between = self.q_variance, self.u_variance, self.covariance
         mixed = 2.0 * cos * sin * between
         return dataclasses.replace(
@@ -104,7 +104,7 @@ def unbiased_dop(image: StokesImage) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_angles(angles: Any) -> np.ndarray:
-    """Angles of a polarizer that tell all three Stokes parameters."""
+    """Angles of a polarizer, refused unless they determine all three Stokes parameters."""
     try:
         degrees = np.asarray(angles, dtype=np.float64)
     except (TypeError, ValueError):
@@ -113,17 +113,17 @@ def check_angles(angles: Any) -> np.ndarray:
         hint = "give one number from -360 to 360 for each frame"
         raise CaptureError(f"{angles!r} are no angles", where="angles", hint=hint)
     different = np.unique(np.round(degrees % 180.0, 6) % 180.0)
-    told = ", ".join(f"{angle:g}" for angle in degrees)
+    listed = ", ".join(f"{angle:g}" for angle in degrees)
     if different.size < FEWEST_ANGLES:
         raise CaptureError(
-            f"the polarizer stood at {different.size} different angles ({told})",
+            f"the polarizer stood at {different.size} different angles ({listed})",
             where="angles",
             hint="give three or more; 0 and 180 are the same",
         )
     condition = float(np.linalg.cond(_design(degrees)))
     if condition > LARGEST_CONDITION:
         raise CaptureError(
-            f"{told} are so close that noise grows {condition:.0f}-fold",
+            f"{listed} are so close that noise grows {condition:.0f}-fold",
             where="angles",
             hint="spread them over 180 degrees, such as 0, 60 and 120",
         )
@@ -131,7 +131,7 @@ def check_angles(angles: Any) -> np.ndarray:
 
 
 def _design(degrees: np.ndarray) -> np.ndarray:
-    """What each angle reads of S0, S1 and S2: (angle, 3)."""
+    """Sensitivity of each angle to S0, S1 and S2: (angle, 3)."""
     twice = np.deg2rad(2.0 * degrees)
     return 0.5 * np.stack([np.ones_like(twice), np.cos(twice), np.sin(twice)], axis=-1)
 
@@ -139,7 +139,7 @@ def _design(degrees: np.ndarray) -> np.ndarray:
 def _misfit(
     light: np.ndarray, variance: np.ndarray, design: np.ndarray, solve: np.ndarray
 ) -> np.ndarray | None:
-    """Of the part of the readings that no Stokes vector makes."""
+    """Mean squared residual over its variance; None where three angles leave no residual."""
     beyond = np.linalg.svd(design)[0].T[FEWEST_ANGLES:]
     if not len(beyond):
         return None

@@ -1,41 +1,32 @@
-"""Any readings, listed a line each with their directions, as a capture.
+"""A capture from a table with one line for each reading and its directions.
 
     view_zenith, view_azimuth, dop, intensity
     10, 180, 0.021, 812
     20, 180, 0.043, 790
 
-A line is a view. Where a column `wavelength` is there, lines of the same directions are one view; a
-line that repeats both begins another. A column `patch` or `material` puts captures side by side, as
-`polar_bayes.capture.combine` does. What no line holds is not made up: it is `valid=False`.
+A line is a view. If there is a column `wavelength`, lines of the same directions are one view; a
+line that repeats both begins another view. A column `patch` or `material` combines captures as
+`polar_bayes.capture.combine` does. Entries that no line holds are `valid=False`.
 """
 
-import math
 import os
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 
 from polar_bayes.capture.combine import DIMS, combine
-from polar_bayes.capture.schema import CONTRACT, WAVELENGTH, Variable, nearest_name, validate
+from polar_bayes.capture.schema import CONTRACT, WAVELENGTH, Interval, nearest_name, validate
 from polar_bayes.capture.table_reader import column_names, read_table
 from polar_bayes.errors import CaptureError
 
 KNOWN = {row.name: row for row in (*CONTRACT, WAVELENGTH)}
-OF_A_VIEW = tuple(row.name for row in CONTRACT if row.kind in ("geometry", "trust"))
-REQUIRED = tuple(row.name for row in CONTRACT if row.kind == "geometry")
-
-
-class _Lines(NamedTuple):
-    """What a table says."""
-
-    values: dict[str, np.ndarray]
-    columns: dict[str, str]
-    numbers: np.ndarray
+PER_VIEW = tuple(row.name for row in CONTRACT if row.kind in ("geometry", "trust"))
+LARGEST = float(np.finfo(np.float64).max)
+FINITE = Interval(-LARGEST, LARGEST)
 
 
 def from_table(
@@ -68,162 +59,145 @@ def from_table(
         CaptureError: The column, or the line and number, that is wrong.
     """
     source = str(table)
-    lines = _read(source, dict(columns or {}), dict(constants or {}), ignored)
-    _check(lines, source)
-    attributes: dict[str, str] = {"source": Path(source).name}
-    if setup is not None:
-        attributes["setup"] = setup
-    leading = [dim for dim in DIMS if dim in lines.values]
+    columns = _columns(column_names(source), columns or {}, ignored, source)
+    constants = constants or {}
+    _check_constants(constants, columns, source)
+    read = read_table(source, list(columns.values()))
+    values = {variable: read.columns[column] for variable, column in columns.items()}
+    values |= {variable: np.full(len(read.lines), float(x)) for variable, x in constants.items()}
+    _check_values(values, columns, read.lines, source)
+    leading = [dim for dim in DIMS if dim in values]
     if len(leading) > 1:
         hint = "ignore one of both"
         raise CaptureError("it has materials and patches", where=source, hint=hint)
     if leading:
-        capture = _side_by_side(lines.values, leading[0], saturation_level)
+        labels = values.pop(leading[0])
+        parts = {
+            # All digits: two numbers never have one label. Adding zero turns -0.0 into 0.0.
+            repr(float(label) + 0.0).removesuffix(".0"): _capture(
+                {name: x[labels == label] for name, x in values.items()}, saturation_level
+            )
+            for label in np.unique(labels)
+        }
+        capture = combine(parts, dim=leading[0])
     else:
-        capture = _capture(lines.values, saturation_level)
-    named = attributes | {"name": name or Path(source).stem}
-    return validate(capture.assign_attrs(named), source=source)
+        capture = _capture(values, saturation_level)
+    capture = capture.assign_attrs(source=Path(source).name, name=name or Path(source).stem)
+    if setup is not None:
+        capture.attrs["setup"] = setup
+    return validate(capture, source=source)
 
 
-def _read(
-    source: str, columns: dict[str, str], constants: dict[str, float], ignored: Sequence[str]
-) -> _Lines:
-    """Values of each variable in each line."""
-    taken = _taken(column_names(source), columns, ignored, source)
-    for variable, value in constants.items():
-        _check_name(variable, None, source)
-        if not _is_finite(value):
-            hint = "give a finite number"
-            raise CaptureError(f"{variable} is {value!r}", where=source, hint=hint)
-        if variable in taken:
-            what = f"{variable} is a constant and the column {taken[variable]!r}"
-            raise CaptureError(what, where=source, hint="give one of both, or ignore the column")
-    for variable in REQUIRED:
-        if variable not in taken and variable not in constants:
-            hint = f"say which column it is, or give it as a constant: {KNOWN[variable].hint}"
-            raise CaptureError(f"nothing gives {variable}", where=source, hint=hint)
-    read = read_table(source, list(taken.values()))
-    values = {variable: read.columns[column] for variable, column in taken.items()}
-    count = len(read.lines)
-    values |= {variable: np.full(count, float(x)) for variable, x in constants.items()}
-    return _Lines(values, taken, np.array(read.lines))
+# --- Columns --------------------------------------------------------------------------------------
 
 
-def _is_finite(value: object) -> bool:
-    """Whether it is a real number that a float can hold."""
-    try:
-        return isinstance(value, Real) and math.isfinite(value)
-    except OverflowError:  # an integer beyond the largest float
-        return False
-
-
-def _taken(
-    names: Sequence[str], columns: dict[str, str], ignored: Sequence[str], source: str
+def _columns(
+    names: Sequence[str], columns: Mapping[str, str], ignored: Sequence[str], source: str
 ) -> dict[str, str]:
-    """The column of each variable; every column is one or is ignored."""
+    """The column of each variable; every column is used or ignored."""
     for column in (*columns.values(), *ignored):
         if column not in names:
             hint = f"choose from {', '.join(names)}"
             raise CaptureError(f"there is no column {column!r}", where=source, hint=hint)
     for variable, column in columns.items():
-        _check_name(variable, column, source)
-    taken = dict(columns)
+        _check_name(variable, f"{source}: column {column}")
+    used = dict(columns)
     for column in (name for name in names if name not in (*columns.values(), *ignored)):
-        _check_name(column, column, source)
-        if column in taken:
-            what = f"{column} is the column {taken[column]!r}, too"
-            where = f"{source}: column {column}"
+        where = f"{source}: column {column}"
+        _check_name(column, where)
+        if column in used:
+            what = f"{column} is the column {used[column]!r}, too"
             raise CaptureError(what, where=where, hint="ignore one of both")
-        taken[column] = column
-    return taken
+        used[column] = column
+    return used
 
 
-def _check_name(variable: str, column: str | None, source: str) -> None:
+def _check_constants(
+    constants: Mapping[str, float], columns: Mapping[str, str], source: str
+) -> None:
+    """Refuse constants that are no numbers or also columns, and missing directions."""
+    for variable, value in constants.items():
+        _check_name(variable, source)
+        if not (isinstance(value, Real) and FINITE.contains(value)):
+            hint = "give a finite number"
+            raise CaptureError(f"{variable} is {value!r}", where=source, hint=hint)
+        if variable in columns:
+            what = f"{variable} is a constant and the column {columns[variable]!r}"
+            raise CaptureError(what, where=source, hint="give one of both, or ignore the column")
+    for row in CONTRACT:
+        if row.kind == "geometry" and row.name not in {*columns, *constants}:
+            hint = f"say which column it is, or give it as a constant: {row.hint}"
+            raise CaptureError(f"nothing gives {row.name}", where=source, hint=hint)
+
+
+def _check_name(variable: str, where: str) -> None:
     if near := nearest_name(variable, [*KNOWN, *DIMS]):
         raise CaptureError(
             f"a capture has no variable {variable!r}",
-            where=source if column is None else f"{source}: column {column}",
+            where=where,
             hint=f"say what it is (nearest: {near}), call it true_<name> or ignore it",
         )
 
 
-def _check(lines: _Lines, source: str) -> None:
-    """Each number against the contract, by its line; what is not valid is not looked at."""
-    valid = lines.values.get("valid", np.ones(len(lines.numbers))) != 0.0
-    for variable, values in lines.values.items():
-        row = KNOWN.get(variable)
-        if row is None:
-            continue
-        wrong = np.flatnonzero(~row.range.contains(values) & (valid | (row.kind != "reading")))
-        if not wrong.size:
-            continue
-        first = wrong[0]
-        where = f"{source}: line {lines.numbers[first]}"
-        if variable in lines.columns:
-            where += f", column {lines.columns[variable]}"
-        what = f"{variable} is {values[first]:g}, which is outside {row.range}"
-        raise CaptureError(what, where=where, hint=row.hint)
+def _check_values(
+    values: Mapping[str, np.ndarray], columns: Mapping[str, str], lines: Sequence[int], source: str
+) -> None:
+    """Check each number against the contract, by its line; readings only where they are valid."""
+    valid = values.get("valid", np.ones(len(lines))) != 0.0
+    for variable in (name for name in values if name in KNOWN):
+        row, numbers = KNOWN[variable], values[variable]
+        wrong = ~row.range.contains(numbers) & (valid | (row.kind != "reading"))
+        if wrong.any():
+            first = int(np.argmax(wrong))
+            column = f", column {columns[variable]}" if variable in columns else ""
+            raise CaptureError(
+                f"{variable} is {numbers[first]:g}, which is outside {row.range}",
+                where=f"{source}: line {lines[first]}{column}",
+                hint=row.hint,
+            )
 
 
-def _side_by_side(
-    values: dict[str, np.ndarray], dim: str, saturation_level: float | None
-) -> xr.Dataset:
-    """The lines of each patch or material, by its number."""
-    rest = {name: x for name, x in values.items() if name != dim}
-    parts = {}
-    for number in np.unique(values[dim]):
-        own = {name: x[values[dim] == number] for name, x in rest.items()}
-        # All digits: two numbers never have one label.
-        # Adding zero turns -0.0 into 0.0, which is the same patch.
-        parts[repr(float(number) + 0.0).removesuffix(".0")] = _capture(own, saturation_level)
-    return combine(parts, dim=dim)
+# --- Lines of one material ------------------------------------------------------------------------
 
 
 def _capture(values: dict[str, np.ndarray], saturation_level: float | None) -> xr.Dataset:
-    """The lines of one patch, or of all."""
-    rest = {name: x for name, x in values.items() if name != "wavelength"}
-    waves = values.get("wavelength")
+    values = dict(values)
+    waves = values.pop("wavelength", None)
     if waves is None or len(np.unique(waves)) == 1:
-        capture = xr.Dataset({name: ("view", x) for name, x in rest.items()})
+        capture = xr.Dataset({name: ("view", x) for name, x in values.items()})
         capture = capture if waves is None else capture.assign_coords(wavelength=waves[0])
     else:
-        capture = _spectral(rest, waves)
+        capture = _spectral(values, waves)
     if "intensity" in capture and saturation_level is not None:
         capture["intensity"].attrs["saturation_level"] = saturation_level
     return capture
 
 
 def _spectral(values: dict[str, np.ndarray], waves: np.ndarray) -> xr.Dataset:
-    """Lines of several wavelengths; of a view that lacks one, its entry is not valid."""
+    """Lines of several wavelengths; the entry of a view that lacks one is not valid."""
     label, column = np.unique(waves, return_inverse=True)
-    row = _views(values, column)
-    first = np.unique(row, return_index=True)[1]
+    view = _views(values, column)
+    first = np.unique(view, return_index=True)[1]
     variables: dict[str, tuple] = {}
-    for name, x in {"valid": np.ones(len(row)), **values}.items():
-        if name in OF_A_VIEW:
+    for name, x in {"valid": np.ones(len(view)), **values}.items():
+        if name in PER_VIEW:
             variables[name] = ("view", x[first])
             continue
-        laid = np.full((len(first), len(label)), 0.0 if _is_flag(name) else np.nan)
-        laid[row, column] = x
-        variables[name] = (("view", "wavelength"), laid)
+        is_flag = name in KNOWN and KNOWN[name].kind == "flag"
+        filled = np.full((len(first), len(label)), 0.0 if is_flag else np.nan)
+        filled[view, column] = x
+        variables[name] = (("view", "wavelength"), filled)
     return xr.Dataset(variables, {"wavelength": label})
 
 
-def _is_flag(name: str) -> bool:
-    row: Variable | None = KNOWN.get(name)
-    return row is not None and row.kind == "flag"
-
-
 def _views(values: dict[str, np.ndarray], column: np.ndarray) -> np.ndarray:
-    """Number of the view of each line, in the order of their first lines."""
-    # One for each set of directions, and one more for each time that a wavelength is repeated
-    # there.
+    """The view of each line: one for each set of directions, and one more for each repetition."""
     numbers: dict[tuple, int] = {}
-    seen: dict[tuple, int] = defaultdict(int)
-    found = []
-    for at, wave in enumerate(column):
-        directions = tuple(values[name][at] for name in OF_A_VIEW if name in values)
-        again = seen[directions, int(wave)]
-        seen[directions, int(wave)] += 1
-        found.append(numbers.setdefault((directions, again), len(numbers)))
-    return np.array(found)
+    repetitions: Counter[tuple] = Counter()
+    views = []
+    directions = [values[name] for name in PER_VIEW if name in values]
+    for line in zip(*directions, column, strict=True):
+        key = (*line[:-1], repetitions[line])
+        repetitions[line] += 1
+        views.append(numbers.setdefault(key, len(numbers)))
+    return np.array(views)

@@ -367,7 +367,7 @@ LEDGER = Group(
 _OF_ACCURACY = {
     **dict.fromkeys(("mean_error", "sd_error", "low_error", "high_error"), (*_ROW, *_PARAMETER)),
     "wasserstein": (*_ROW, *_PARAMETER),
-    **dict.fromkeys(("rung", "dial", "problems", "r_hat", "k_hat", "effective_draws"), _ROW),
+    **dict.fromkeys(("method", "override", "problems", "r_hat", "k_hat", "effective_draws"), _ROW),
     **dict.fromkeys(("gradients", "densities", "seconds_first", "seconds_again"), _ROW),
     "peak_memory": _ROW,
     "parameter": _PARAMETER,
@@ -376,7 +376,7 @@ ACCURACY = Group(
     labeled=False,
     names=tuple(_OF_ACCURACY),
     variables=_OF_ACCURACY,
-    kinds=dict.fromkeys(("rung", "dial", "parameter", "problems"), TEXTS),
+    kinds=dict.fromkeys(("method", "override", "parameter", "problems"), TEXTS),
     attributes={
         "reference": TEXT,
         "reference_draws": COUNT,

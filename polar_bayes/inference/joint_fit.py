@@ -34,7 +34,7 @@ from polar_bayes.inference.request import MODELS, Method, Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
-from polar_bayes.physics.discrepancy import Discrepancy
+from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior, support_bounds
 from polar_bayes.progress import Progress, no_progress

@@ -1,7 +1,7 @@
-"""A capture as arrays: what a compiled program needs of it, and nothing else.
+"""A capture as arrays, for compiled programs.
 
-Labels end here and come back in `polar_bayes.inference.result`. Missing readings become
-harmless numbers beside `valid=False`, so that every shape is static and nothing is dropped.
+Labels are dropped here and restored in `polar_bayes.inference.result`. Missing readings become
+placeholders with `valid=False`, so that every shape is static and no entry is dropped.
 """
 
 import equinox as eqx
@@ -28,10 +28,10 @@ class Observations(eqx.Module):
         full_scale: Where the sensor saturates, in the unit of `readings["intensity"]`.
         intensity_unit: What an intensity reading of 1 is in the capture's own unit.
         valid: False where a view is missing or set aside.
-        saturated: True where the sensor stopped.
+        saturated: True where the reading is censored at full scale.
         dims: Names and lengths of all axes, outermost first, ending with the view.
-        confidence: Trust in the stated normal, in (0, 1], which broadcasts with the readings; None
-            where the capture states none, and then nothing of it is in the program.
+        confidence: Confidence in the stated normal, in (0, 1], which broadcasts with the readings;
+            None where the capture states none.
     """
 
     geometry: Geometry
@@ -58,25 +58,14 @@ class Observations(eqx.Module):
 def observe(
     capture: xr.Dataset, *, largest_view_zenith: float = 90.0, intensity_unit: float | None = None
 ) -> Observations:
-    """Turn a validated capture into the arrays of a model.
-
-    Args:
-        capture: A Dataset as `polar_bayes.capture.schema.validate` returns it.
-        largest_view_zenith: Views beyond it are set aside (`valid=False`). Unit degree.
-        intensity_unit: What an intensity of 1 is, for a part of a larger capture that states no
-            saturation level; by default the largest reading.
-
-    Returns:
-        The arrays, in double precision; intensity is in units of the capture's largest
-        (its saturation level, where stated), so that one prior serves every camera.
-    """
+    """Turn a validated capture into the arrays of a model."""
     names = [name for name in READINGS if name in capture]
     order = _axis_order(capture[names[0]])
     measured = np.asarray(_values(capture, "valid", order, default=True), bool)
     largest, full_scale = _intensity_range(capture, order, measured, intensity_unit)
     valid = measured & (_values(capture, "view_zenith", order) <= largest_view_zenith)
     saturated = np.asarray(_values(capture, "saturated", order, default=False), bool)
-    if np.isfinite(full_scale):  # a reading at the stop has stopped, flagged or not
+    if np.isfinite(full_scale):  # a reading at full scale is censored, flagged or not
         saturated = saturated | (_values(capture, "intensity", order) >= full_scale)
     shape = np.broadcast_shapes(
         valid.shape, *(_values(capture, name, order).shape for name in names)

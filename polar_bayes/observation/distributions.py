@@ -1,8 +1,8 @@
-"""Two distributions that stay accurate where the textbook forms lose their digits.
+"""Two distributions that stay accurate where the textbook forms lose digits.
 
 `MeanConcentrationBeta` is the Beta distribution by mean and concentration; its log density is
 written as a divergence plus Stirling remainders, so that concentrations of 1e8 cancel nothing.
-`SensorStudentT` is Student's t as a sensor records it, stopped at zero and at full scale.
+`SensorStudentT` is Student's t, censored at zero and at full scale.
 """
 
 import functools
@@ -89,17 +89,16 @@ class MeanConcentrationBeta(dist.Distribution):
 
 
 class SensorStudentT(dist.Distribution):
-    r"""Student's t noise, recorded by a sensor that stops at zero and at full scale.
+    r"""Student's t noise, censored at zero and at full scale.
 
-    A reading at either stop counts with the probability of landing beyond it, so that a
-    saturated view says "at least this bright" and nothing more.
+    The likelihood of a censored reading is the probability of a value beyond the limit.
 
     Args:
         degrees_of_freedom: $\nu$, unit 1, range > 0; a Python number.
         location: Noise-free intensity over full scale.
         scale: Noise over full scale, range > 0.
-        saturated: True where the reading stopped at full scale.
-        full_scale: Where the sensor stops, in the same unit; infinite where it never does.
+        saturated: True where the reading is censored at full scale.
+        full_scale: Upper limit of the sensor, in the same unit; infinite where it has none.
     """
 
     arg_constraints = {"location": constraints.real, "scale": constraints.positive}
@@ -137,27 +136,18 @@ class SensorStudentT(dist.Distribution):
         distance = (value - self.location) / self.scale
         inside = log_density(distance, self.degrees_of_freedom) - jnp.log(self.scale)
         beyond = jnp.where(self.saturated, distance, -distance)
-        stopped = log_survival(beyond, self.degrees_of_freedom)
-        return jnp.where(self.saturated | (value <= 0.0), stopped, inside)
+        censored = log_survival(beyond, self.degrees_of_freedom)
+        return jnp.where(self.saturated | (value <= 0.0), censored, inside)
 
     @property
     @override
     def mean(self) -> Array:
-        """The noise-free reading, stopped as the sensor stops it."""
+        """The noise-free reading, within the limits of the sensor."""
         return jnp.clip(self.location, 0.0, self.full_scale)
 
 
 def log_density(distance: Float[Array, "..."], degrees_of_freedom: float) -> Float[Array, "..."]:
-    """Log density of Student's t, in the precision of `distance`.
-
-    Args:
-        distance: In units of the scale.
-        degrees_of_freedom: A Python number > 0; NumPyro would turn it into an array of double
-            precision, and single precision would end there.
-
-    Returns:
-        The log density per unit of distance.
-    """
+    """Log density of Student's t, in the precision of `distance`."""
     half = 0.5 * (degrees_of_freedom + 1.0)
     constant = math.lgamma(half) - math.lgamma(0.5 * degrees_of_freedom)
     constant -= 0.5 * math.log(math.pi * degrees_of_freedom)
@@ -166,26 +156,17 @@ def log_density(distance: Float[Array, "..."], degrees_of_freedom: float) -> Flo
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def log_survival(distance: Float[Array, "..."], degrees_of_freedom: float) -> Float[Array, "..."]:
-    """Log probability that Student's t exceeds `distance`, finite far into the tail.
-
-    Args:
-        distance: In units of the scale.
-        degrees_of_freedom: A Python number > 0.
-
-    Returns:
-        The log probability; its derivative is minus the hazard, exact at 0 too, where the
-        incomplete beta function alone has none.
-    """
+    """Log probability that Student's t exceeds `distance`, finite far into the tail."""
     dtype = jnp.result_type(float, distance)
     # With tan(angle) = sqrt(nu) / |t| the tail is an integral of sin(phi) ** (nu - 1) over phi up
     # to the angle: half ** nu, with half = tan(angle / 2), times something so smooth in half ** 2
-    # that a short series tells its logarithm.
+    # that a short series gives its logarithm.
     away = jnp.abs(distance) / jnp.asarray(math.sqrt(degrees_of_freedom), dtype)
     half = 1.0 / (away + jnp.hypot(away, jnp.ones_like(away)))
-    place = 2.0 * half * half - 1.0
-    series = jnp.zeros_like(place)
+    x = 2.0 * half * half - 1.0
+    series = jnp.zeros_like(x)
     for coefficient in _tail_series(degrees_of_freedom):
-        series = series * place + coefficient
+        series = series * x + coefficient
     log_tail = degrees_of_freedom * jnp.log(half) + series
     return jnp.where(distance > 0.0, log_tail, jnp.log1p(-jnp.exp(log_tail)))
 
@@ -204,8 +185,8 @@ def _tail_series(degrees_of_freedom: float) -> tuple[float, ...]:
     nodes, weights = scipy.special.roots_jacobi(TAIL_NODES, 0.0, power)
     scale = 2.0**degrees_of_freedom * scipy.special.beta(0.5 * degrees_of_freedom, 0.5)
 
-    def log_mean(place: np.ndarray) -> np.ndarray:
-        half = np.sqrt(0.5 * (place + 1.0))
+    def log_mean(x: np.ndarray) -> np.ndarray:
+        half = np.sqrt(0.5 * (x + 1.0))
         angle = 2.0 * np.arctan(half)
         rise = np.sinc(angle[:, None] * 0.5 * (nodes + 1.0) / math.pi) ** power
         grown = np.where(half > 0.0, angle / np.where(half > 0.0, half, 1.0), 2.0)

@@ -1,16 +1,14 @@
-"""Likelihood links: how a recorded value scatters around the predicted one.
+"""Likelihood links: the distribution of a reading around its prediction.
 
-A link answers one question, `distribution`: given the prediction and what is known about each
-view, where may the reading fall? The simulator draws from the same object that the fit
-evaluates. Where a capture states how far its normals can be trusted (`normal_confidence`), the
-links here lower their precision by that. A link of your own is one frozen dataclass with that
-method (`polar_bayes.observation.links.trusted_scale` lowers its precision too); the noise
-parameters that it names in `parameters` get their priors from `polar_bayes.priors` or from the
-caller.
+A link has one method, `distribution`. The simulator draws from the distribution that the fit
+evaluates. Where a capture states the confidence in its normals (`normal_confidence`), the links
+multiply their precision by it. A user-defined link is a frozen dataclass with that method
+(`polar_bayes.observation.links.scale_by_confidence` lowers its precision too); the noise parameters
+in its `parameters` get their priors from `polar_bayes.priors` or from the caller.
 
-Both schedules are bounded, because the printed formulas are not: a pixel at full scale or a
-view along the surface would get infinite scale or no concentration at all. The bounds are
-fields, so that a user can see and move them.
+Both schedules are bounded, because the printed formulas are not: a pixel at full scale would get
+an infinite scale, and a view along the surface no concentration. The bounds are fields, which users
+can change.
 """
 
 import abc
@@ -39,7 +37,7 @@ __all__ = [
     "StudentTLink",
 ]
 
-# --- How noise depends on brightness and view angle: the schedules of the paper's section 2 -------
+# --- Noise against brightness and view angle (the paper's section 2) ------------------------------
 
 
 SMOOTHING = 0.5
@@ -146,44 +144,22 @@ class ScaleSchedule(HTMLRepr):
         spare = (1.0 - brightness - self.least_headroom) / width
         headroom = self.least_headroom + width * jax.nn.softplus(spare)
         cosine = jnp.maximum(cos_view, self.least_cosine)
-        # Not `headroom ** -exponent`: a power is computed number by number, these in bunches.
+        # Not `headroom ** -exponent`: powers are computed one by one, exp and log are vectorized.
         growth = jnp.exp(-self.headroom_exponent * jnp.log(headroom))
         return base * growth * cosine**-self.angle_exponent
 
 
-def trusted_precision(
+def precision_by_confidence(
     precision: Float[Array, "..."], confidence: Float[Array, "... view"] | None
 ) -> Float[Array, "..."]:
-    """A precision, less where the stated normal is less trusted: precision times confidence.
-
-    Args:
-        precision: Of a reading at directions that are sure, any unit, range > 0.
-        confidence: Trust in the stated normal, unit 1, range (0, 1]; None where it is sure.
-
-    Returns:
-        The precision that is left, broadcast; the same object where the normal is sure.
-
-    Raises:
-        Nothing.
-    """
+    """A precision, times the confidence in the stated normal."""
     return precision if confidence is None else precision * confidence
 
 
-def trusted_scale(
+def scale_by_confidence(
     scale: Float[Array, "..."], confidence: Float[Array, "... view"] | None
 ) -> Float[Array, "..."]:
-    """The same for the scale of noise, one over the root of a precision.
-
-    Args:
-        scale: Of a reading at directions that are sure, any unit, range > 0.
-        confidence: Trust in the stated normal, unit 1, range (0, 1]; None where it is sure.
-
-    Returns:
-        scale/sqrt(confidence), broadcast; the same object where the normal is sure.
-
-    Raises:
-        Nothing.
-    """
+    """A scale of noise, over the square root of the confidence in the stated normal."""
     return scale if confidence is None else scale / jnp.sqrt(confidence)
 
 
@@ -197,7 +173,7 @@ def _check_range(schedule: object, field: str, low: float, high: float) -> None:
         )
 
 
-# --- Likelihood links: how a recorded value scatters around the predicted one ---------------------
+# --- Links ----------------------------------------------------------------------------------------
 
 
 Prediction = Mapping[str, Float[Array, "... view"]]
@@ -206,7 +182,7 @@ Noise = Mapping[str, Float[Array, ""]]
 
 @dataclasses.dataclass(frozen=True)
 class AbstractLink(HTMLRepr, abc.ABC):
-    """How one recorded variable scatters around its prediction."""
+    """Distribution of one recorded variable around its prediction."""
 
     observables: ClassVar[tuple[str, ...]]
     """The capture's variables that this link can describe."""
@@ -290,7 +266,7 @@ class BetaLink(_DopLink):
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
     ) -> dist.Distribution:
         concentration = self.schedule.concentration(
-            trusted_precision(noise["concentration_scale"], data.confidence),
+            precision_by_confidence(noise["concentration_scale"], data.confidence),
             data.brightness,
             cos_degrees(data.geometry.view_zenith),
         )
@@ -318,7 +294,7 @@ class LogitNormalLink(_DopLink):
     ) -> dist.Distribution:
         mean = self._mean(prediction)
         log_odds = jnp.log(mean) - jnp.log1p(-mean)
-        scale = trusted_scale(noise["logit_scale"], data.confidence)
+        scale = scale_by_confidence(noise["logit_scale"], data.confidence)
         return dist.TransformedDistribution(
             dist.Normal(log_odds, scale), dist.transforms.SigmoidTransform()
         )
@@ -335,7 +311,7 @@ class NormalLink(AbstractLink):
     def distribution(
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
     ) -> dist.Distribution:
-        scale = trusted_scale(noise["normal_scale"], data.confidence)
+        scale = scale_by_confidence(noise["normal_scale"], data.confidence)
         return dist.Normal(prediction[name], scale)
 
 
@@ -398,7 +374,7 @@ class StokesLink(AbstractLink):
         else:
             brightness = jnp.maximum(data.brightness, self.least_brightness)
             scale = noise["stokes_scale"] / jnp.sqrt(brightness)
-        scale = trusted_scale(scale, data.confidence)
+        scale = scale_by_confidence(scale, data.confidence)
         if self.degrees_of_freedom is None:
             return dist.Normal(prediction[name], scale)
         # As a bare number it would become double precision whatever the rest of the program is.
@@ -449,7 +425,7 @@ class StudentTLink(AbstractLink):
         scale = self.schedule.scale(
             noise["intensity_scale"], location, cos_degrees(data.geometry.view_zenith)
         )
-        scale = trusted_scale(scale, data.confidence)
+        scale = scale_by_confidence(scale, data.confidence)
         return SensorStudentT(
             self.degrees_of_freedom, location, scale, data.saturated, data.full_scale
         )

@@ -5,7 +5,6 @@ from .coat import (
     CoatStack as CoatStack,
     ThinFilm as ThinFilm,
 )
-from .discrepancy import Discrepancy as Discrepancy
 from .dispersion import (
     AbstractDispersion as AbstractDispersion,
     Cauchy as Cauchy,
@@ -19,6 +18,7 @@ from .illumination import (
     PointSource as PointSource,
     UniformSky as UniformSky,
 )
+from .instrument import Discrepancy as Discrepancy
 from .microfacet import (
     AbstractMicrofacet as AbstractMicrofacet,
     AbstractShadowing as AbstractShadowing,

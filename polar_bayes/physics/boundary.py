@@ -1,7 +1,17 @@
-r"""One plane boundary between two media, bare or with thin films, for light that comes from air.
+r"""Polarized light at one plane boundary between two media, bare or with thin films.
 
-Media on one path share the squared sine B of the angle in air. With Q = n cos(angle inside)
-= sqrt((n-1)(n+1) + c^2) for each medium, A = Q_1 Q_2 and rho = (n_2^2 - n_1^2)/(Q_1 + Q_2)^2,
+The light comes from air. `Diattenuation` holds the effect of one interface, or of many, in numbers
+that lose no digits. Power reflected (or passed) is s along e_s and p across it, and the field
+components multiply by x = Re(r_s r_p^*). All interfaces on one path share the squared sine B of the
+angle in air, and
+
+    s = mean + contrast B,    p = mean - contrast B,    x = mean - shortfall B^2
+
+with contrast and shortfall regular at normal incidence. Sums, products and quotients of such
+triples are triples again, so layers can be stacked without ever subtracting s from p.
+
+With Q = n cos(angle inside) = sqrt((n-1)(n+1) + c^2) for each medium, A = Q_1 Q_2 and
+rho = (n_2^2 - n_1^2)/(Q_1 + Q_2)^2, a bare boundary reflects
 
     r_s = -rho,    r_p = -rho (A-B)/(A+B)
 
@@ -13,10 +23,69 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polar_bayes.physics.diattenuation import Diattenuation
-
 # Smallest squared cosine in a medium: light that cannot enter it is let in by 1e-6.
 EVANESCENT = 1e-12
+
+
+class Diattenuation(NamedTuple):
+    """Effect of one interface, or of many, on light that keeps to one path.
+
+    Args:
+        mean: Half the sum of s and p. Shape (..., view[, facet]), 1, in [0, 1].
+        contrast: Half their difference over B, the squared sine in air. Same shape, 1.
+        shortfall: (mean - x)/B^2. Same shape, 1.
+        sin_squared: B. Same shape, 1, in [0, 1].
+    """
+
+    mean: Array
+    contrast: Array
+    shortfall: Array
+    sin_squared: Array
+
+    @property
+    def cross(self) -> Array:
+        """x, the factor of light polarized at 45 degrees, in the sign of normal incidence."""
+        return self.mean - self.shortfall * self.sin_squared**2
+
+    def scaled(self, factor: Array) -> "Diattenuation":
+        """Followed by a filter that treats all light alike."""
+        return self._replace(
+            mean=factor * self.mean,
+            contrast=factor * self.contrast,
+            shortfall=factor * self.shortfall,
+        )
+
+    def plus(self, other: "Diattenuation") -> "Diattenuation":
+        """Both paths together."""
+        return self._replace(
+            mean=self.mean + other.mean,
+            contrast=self.contrast + other.contrast,
+            shortfall=self.shortfall + other.shortfall,
+        )
+
+    def times(self, other: "Diattenuation") -> "Diattenuation":
+        """One after the other."""
+        b = self.sin_squared
+        return self._replace(
+            mean=self.mean * other.mean + self.contrast * other.contrast * b**2,
+            contrast=self.mean * other.contrast + self.contrast * other.mean,
+            shortfall=self.contrast * other.contrast
+            + self.shortfall * other.mean
+            + self.mean * other.shortfall
+            - self.shortfall * other.shortfall * b**2,
+        )
+
+    def repeated(self) -> "Diattenuation":
+        """All round trips together, 1 + this + this^2 + ... = 1/(1 - this)."""
+        b = self.sin_squared
+        left = 1.0 - self.mean
+        s_and_p = (left - self.contrast * b) * (left + self.contrast * b)
+        crossed = left + self.shortfall * b**2
+        return self._replace(
+            mean=left / s_and_p,
+            contrast=self.contrast / s_and_p,
+            shortfall=(self.contrast**2 + left * self.shortfall) / (crossed * s_and_p),
+        )
 
 
 class Medium(NamedTuple):
@@ -74,11 +143,9 @@ class Amplitude(NamedTuple):
 
 
 def medium(refractive_index: Array, cos_squared: Array) -> Medium:
-    """The medium of an index, for light whose squared cosine in air is given.
-
-    Below zero it belongs to light that is trapped and would not reach the air; where it does not
-    reach this medium either, next to nothing passes.
-    """
+    """The medium of an index, for light whose squared cosine in air is given."""
+    # Below zero it belongs to light that is trapped and would not reach the air; where it does not
+    # reach this medium either, next to nothing passes.
     normal_squared = (refractive_index - 1.0) * (refractive_index + 1.0) + cos_squared
     # Light from the air reaches every medium, however close to grazing it comes.
     least = jnp.where(cos_squared > 0.0, 0.0, EVANESCENT)
@@ -91,19 +158,7 @@ def step(above: Medium, below: Medium) -> Array:
 
 
 def relative_reflection(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
-    """Power that a bare boundary reflects, without the factor `step`.
-
-    Args:
-        above: Medium that the light comes from.
-        below: Medium that it goes to.
-        sin_squared: B, the squared sine in air. Shape (..., view[, facet]), 1.
-
-    Returns:
-        Reflectance over `step`: regular, and not zero, where the media are alike.
-
-    Raises:
-        Nothing.
-    """
+    """Power that a bare boundary reflects, without the factor `step`."""
     a, b = above.normal * below.normal, sin_squared
     # Squared last: near grazing the derivatives of the whole would overflow single precision.
     return _of_shape((1.0 / ((above.normal + below.normal) ** 2 * (a + b))) ** 2, a, b)
@@ -116,19 +171,7 @@ def reflection(above: Medium, below: Medium, sin_squared: Array) -> Diattenuatio
 
 
 def transmission(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
-    """Power that a bare boundary lets pass, the same in both directions.
-
-    Args:
-        above: Medium that the light comes from.
-        below: Medium that it goes to.
-        sin_squared: B, the squared sine in air. Shape (..., view[, facet]), 1.
-
-    Returns:
-        Transmittance, in [0, 1].
-
-    Raises:
-        Nothing.
-    """
+    """Power that a bare boundary lets pass, the same in both directions."""
     a, b, total = above.normal * below.normal, sin_squared, above.normal + below.normal
     indexes = above.refractive_index * below.refractive_index
     p_like = indexes / (total * (a + b))
@@ -154,18 +197,6 @@ def filmed(
        T = \frac{T_1 T_2}{|1 + r_1 r_2 e^{2i\delta}|^2} $$
 
     from the deepest film upwards, where r_2 and T_2 are what lies below.
-
-    Args:
-        above: Medium that the light comes from.
-        films: From the top down; without absorption.
-        below: Medium that it goes to.
-        sin_squared: B, the squared sine in air. Shape (..., view[, facet]), 1.
-
-    Returns:
-        `(reflectance, transmittance)`.
-
-    Raises:
-        Nothing.
 
     Source:
         Born and Wolf, Principles of Optics, on a dielectric film; layers by recursion.

@@ -29,9 +29,6 @@ class AbstractDispersion(Part):
 
         Returns:
             n. Broadcast shape, 1.
-
-        Raises:
-            Nothing.
         """
 
 

@@ -1,4 +1,7 @@
-"""Averages over the facets that a viewer sees: where to look, and how much each look counts.
+"""Microfacet surfaces: quadrature over the facets that a viewer sees, and their light.
+
+A point source requires the one facet that mirrors it (`Microsurface.density`); an extended source
+and the exit from the body require a sample of the visible facets (`Microsurface.sample`).
 
 In slope coordinates (x towards the viewer, y across) all borders are simple curves:
 
@@ -21,8 +24,11 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.microfacet import AbstractMicrofacet, SlopeEllipse
+from polar_bayes.physics.boundary import Diattenuation
+from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_slopes, sin_degrees
+from polar_bayes.physics.microfacet import AbstractMicrofacet, AbstractShadowing, SlopeEllipse
 from polar_bayes.physics.part import Part
+from polar_bayes.physics.stokes import Light
 
 # Facets steeper than this are not met by any distribution in use.
 STEEPEST = 1e6
@@ -129,18 +135,7 @@ class Facets(NamedTuple):
 
 
 def seen(sin_view: Array, cos_view: Array) -> Window:
-    """Border of all facets that face the viewer.
-
-    Args:
-        sin_view: Sine of the view zenith; its sign says which side. Shape (..., view), 1.
-        cos_view: Its cosine. Same shape, 1, > 0.
-
-    Returns:
-        Window whose edges are the same for every slope across.
-
-    Raises:
-        Nothing.
-    """
+    """Border of all facets that face the viewer."""
 
     def edges(across: Array) -> tuple[Array, Array]:
         del across
@@ -152,18 +147,7 @@ def seen(sin_view: Array, cos_view: Array) -> Window:
 
 
 def above_horizon(sin_view: Array, cos_view: Array) -> Window:
-    """Border of the facets that mirror the viewer's ray into the sky: a circle of slopes.
-
-    Args:
-        sin_view: Sine of the view zenith; its sign says which side. Shape (..., view), 1.
-        cos_view: Its cosine. Same shape, 1, > 0.
-
-    Returns:
-        Window.
-
-    Raises:
-        Nothing.
-    """
+    """Border of the facets that mirror the viewer's ray into the sky: a circle of slopes."""
 
     def edges(across: Array) -> tuple[Array, Array]:
         forwards = sin_view >= 0.0
@@ -178,19 +162,7 @@ def above_horizon(sin_view: Array, cos_view: Array) -> Window:
 
 
 def inside_disc(sin_view: Array, cos_view: Array, sin_half: float) -> Window:
-    """Border of the facets that mirror the viewer's ray into a disc around the mirror direction.
-
-    Args:
-        sin_view: Sine of the view zenith; its sign says which side. Shape (..., view), 1.
-        cos_view: Its cosine. Same shape, 1, > 0.
-        sin_half: Sine of half the disc's half width, 1, in (0, 1).
-
-    Returns:
-        Window, cut at the horizon where the disc reaches below it.
-
-    Raises:
-        Nothing.
-    """
+    """Border of the facets that mirror the viewer's ray into a disc around the mirror direction."""
     sky = above_horizon(sin_view, cos_view)
     spare = (cos_view - sin_half) * (cos_view + sin_half)
     limit = sin_half / jnp.sqrt(jnp.maximum(spare, (sin_half * cos_view) ** 2))
@@ -217,20 +189,6 @@ def sample_facets(
 
     $$ \sum_i w_i f_i \approx \int f \, \frac{v\cdot m}{\cos m} D \cos m \, dm, \qquad
        \frac{v\cdot m}{\cos m} = c_v + s_v x $$
-
-    Args:
-        distribution: How facets tilt.
-        quadrature: How many facets.
-        ellipse: Slopes in the frame of each viewer. Broadcasts with (..., view).
-        sin_view: Sine of the view zenith. Shape (..., view), 1.
-        cos_view: Its cosine. Same shape, 1, > 0.
-        border: Window of a view, from its sine and cosine.
-
-    Returns:
-        Facets of shape (..., along * across, view); twice as many for a sheared ellipse.
-
-    Raises:
-        Nothing.
     """
     dtype = jnp.result_type(float, ellipse.across, cos_view)
     # Axes (..., across, along, view): what one of the two does not touch is found once for all of
@@ -295,13 +253,68 @@ def _crowded_gauss_legendre(nodes: int, crowding: float) -> tuple[np.ndarray, np
 # --- Nodes and weights of integrals from 0 to 1 ---------------------------------------------------
 
 
-def unit_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre nodes and weights on (0, 1)."""
-    node, weight = np.polynomial.legendre.leggauss(count)
-    return 0.5 * (node + 1.0), 0.5 * weight
+# --- The surface as a population of facets --------------------------------------------------------
 
 
-def squared_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same in the square root: denser at 0, where light meets an interface at grazing."""
-    node, weight = unit_rule(count)
-    return node**2, 2.0 * node * weight
+Border = Callable[[Array, Array], Window]
+
+
+@dataclasses.dataclass(frozen=True)
+class Microsurface:
+    """Facets of a surface.
+
+    Args:
+        distribution: How facets tilt.
+        shadowing: Which of them are seen.
+        quadrature: How many stand for all.
+    """
+
+    distribution: AbstractMicrofacet
+    shadowing: AbstractShadowing
+    quadrature: FacetQuadrature
+
+    def density(self, ellipse: SlopeEllipse, geometry: Geometry, tan_squared: Array) -> Array:
+        """Facet area per steradian around the facet that mirrors the light to the viewer."""
+        if ellipse.shear is None:
+            return self.distribution.density(tan_squared, ellipse.across)
+        # The slopes of an isotropic surface with the same peak that are met as often as these.
+        in_plane, out_of_plane = mirror_slopes(geometry)
+        w = out_of_plane / ellipse.across
+        u = (in_plane - ellipse.shear * w) / ellipse.along
+        peak = ellipse.across * ellipse.along
+        alike = peak * (u**2 + w**2)
+        stretch = (1.0 + tan_squared) / (1.0 + alike)
+        return self.distribution.density(alike, jnp.sqrt(peak)) * stretch**2
+
+    def visible(self, ellipse: SlopeEllipse, x: Array, y: Array) -> Array:
+        """G1, the share of facets that see one direction."""
+        if ellipse.shear is None:
+            return self.distribution.shadowing(x**2 + y**2, ellipse.across)
+        peak = ellipse.across * ellipse.along
+        steepness = (ellipse.along * x) ** 2 + (ellipse.shear * x + ellipse.across * y) ** 2
+        return self.distribution.shadowing(steepness / peak, jnp.sqrt(peak))
+
+    def sample(self, ellipse: SlopeEllipse, geometry: Geometry, border: Border) -> Facets:
+        """Facets inside a border, weighted by the area that they show to the viewer."""
+        return sample_facets(
+            self.distribution,
+            self.quadrature,
+            ellipse,
+            sin_degrees(geometry.view_zenith),
+            cos_degrees(geometry.view_zenith),
+            border,
+        )
+
+
+def gather(
+    sample: Facets, weight: Array, power: Diattenuation, *, least: float | None = None
+) -> Light:
+    """Light of all facets together."""
+    total = jnp.sum(weight * power.mean, axis=-2)
+    if least is not None:
+        total = jnp.maximum(total, least)
+    polarized = weight * power.contrast
+    q = jnp.sum(polarized * sample.along_s, axis=-2) / total
+    if sample.across_s is None:
+        return Light(total, q, jnp.zeros_like(q))
+    return Light(total, q, -jnp.sum(polarized * sample.across_s, axis=-2) / total)

@@ -10,10 +10,9 @@ angle A = B. Everything is regular at n = 1 and accurate up to grazing, in both 
 """
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.physics.facets import squared_rule
+from polar_bayes.physics.part import like, squared_rule
 
 # Cosines and weights for integrals over the hemisphere: 24 Gauss-Legendre nodes in the square root
 # of the cosine, because near n = 1 all reflection gathers at grazing. The error of Fe is 1e-15 from
@@ -24,19 +23,7 @@ HEMISPHERE_COSINES, HEMISPHERE_WEIGHTS = squared_rule(24)
 def reflection(
     cos_incidence: Array, sin_squared: Array, refractive_index: Array
 ) -> tuple[Array, Array]:
-    """Mean reflectance R+ and contrast K, where K times the squared sine is R-.
-
-    Args:
-        cos_incidence: c. Any shape, 1, in (0, 1].
-        sin_squared: B, the squared sine of incidence. Same shape, 1, in [0, 1).
-        refractive_index: n, inside over outside. Broadcasts, 1, >= 1.
-
-    Returns:
-        `(R+, K)`. Broadcast shape, 1; R+ in [0, 1].
-
-    Raises:
-        Nothing.
-    """
+    """Mean reflectance R+ and contrast K, where K times the squared sine is R-."""
     c, b, n = cos_incidence, sin_squared, refractive_index
     root = _inner(c, n)
     a = c * root
@@ -54,19 +41,7 @@ def index_step(refractive_index: Array) -> Array:
 def relative_reflection(
     cos_incidence: Array, sin_squared: Array, refractive_index: Array
 ) -> tuple[Array, Array]:
-    """R+ and K without the factor (n^2-1)^2, so that their ratio of sums exists at n = 1.
-
-    Args:
-        cos_incidence: c. Any shape, 1, in (0, 1].
-        sin_squared: B, the squared sine of incidence. Same shape, 1, in [0, 1).
-        refractive_index: n, inside over outside. Broadcasts, 1, >= 1.
-
-    Returns:
-        `(R+, K)` divided by `index_step`. Broadcast shape, 1, > 0.
-
-    Raises:
-        Nothing.
-    """
+    """R+ and K without the factor (n^2-1)^2, so that their ratio of sums exists at n = 1."""
     c, b = cos_incidence, sin_squared
     root = _inner(c, refractive_index)
     a = c * root
@@ -77,19 +52,7 @@ def relative_reflection(
 
 
 def polarizance(cos_incidence: Array, sin_squared: Array, refractive_index: Array) -> Array:
-    """Degree of polarization of reflected light divided by the squared sine: 2A/(A^2+B^2).
-
-    Args:
-        cos_incidence: c. Any shape, 1, in (0, 1].
-        sin_squared: B. Same shape, 1, in [0, 1).
-        refractive_index: n. Broadcasts, 1, >= 1.
-
-    Returns:
-        K/R+. Broadcast shape, 1, > 0; no limit has to be taken at normal incidence or n = 1.
-
-    Raises:
-        Nothing.
-    """
+    """Degree of polarization of reflected light divided by the squared sine: 2A/(A^2+B^2)."""
     a = cos_incidence * _inner(cos_incidence, refractive_index)
     return 2.0 * a / (a**2 + sin_squared**2)
 
@@ -97,56 +60,20 @@ def polarizance(cos_incidence: Array, sin_squared: Array, refractive_index: Arra
 def reflection_polarization(
     cos_incidence: Array, sin_squared: Array, refractive_index: Array
 ) -> Array:
-    """Degree of polarization of reflected light, 2AB/(A^2+B^2); exactly 1 at Brewster's angle.
-
-    Args:
-        cos_incidence: c. Any shape, 1, in (0, 1].
-        sin_squared: B. Same shape, 1, in [0, 1).
-        refractive_index: n. Broadcasts, 1, >= 1.
-
-    Returns:
-        Degree of linear polarization, along s. Broadcast shape, 1, in [0, 1].
-
-    Raises:
-        Nothing.
-    """
+    """Degree of polarization of reflected light, 2AB/(A^2+B^2); exactly 1 at Brewster's angle."""
     return polarizance(cos_incidence, sin_squared, refractive_index) * sin_squared
 
 
 def transmission(cos_incidence: Array, refractive_index: Array) -> Array:
-    """Mean transmittance T+ = 2cQ [1/(c+Q)^2 + n^2/(n^2 c+Q)^2], the same inwards and outwards.
-
-    Args:
-        cos_incidence: c, outside. Any shape, 1, in (0, 1].
-        refractive_index: n. Broadcasts, 1, >= 1.
-
-    Returns:
-        T+. Broadcast shape, 1, in [0, 1].
-
-    Raises:
-        Nothing.
-    """
+    """Mean transmittance T+ = 2cQ [1/(c+Q)^2 + n^2/(n^2 c+Q)^2], the same inwards and outwards."""
     c, n = cos_incidence, refractive_index
     root = _inner(c, n)
     return 2.0 * c * root * (1.0 / (c + root) ** 2 + (n / (n**2 * c + root)) ** 2)
 
 
 def exit_polarization(cos_exit: Array, sin_squared: Array, refractive_index: Array) -> Array:
-    """Degree of polarization, along p, of unpolarized light that leaves through the interface.
-
-    u(2-u)/(1+(1-u)^2) with u = (n-1)^2 (n+1) B/[n (c+Q)(Q+nc)]; at grazing (n^2-1)/(n^2+1).
-
-    Args:
-        cos_exit: c, outside. Any shape, 1, in (0, 1].
-        sin_squared: B, outside. Same shape, 1, in [0, 1).
-        refractive_index: n. Broadcasts, 1, >= 1.
-
-    Returns:
-        Degree of linear polarization. Broadcast shape, 1, in [0, 1).
-
-    Raises:
-        Nothing.
-    """
+    """Degree of polarization, along p, of unpolarized light that leaves through the interface."""
+    # u(2-u)/(1+(1-u)^2) with u = (n-1)^2 (n+1) B/[n (c+Q)(Q+nc)]; at grazing (n^2-1)/(n^2+1).
     c, n = cos_exit, refractive_index
     root = _inner(c, n)
     lost = (n - 1.0) ** 2 * (n + 1.0) * sin_squared / (n * (c + root) * (root + n * c))
@@ -154,26 +81,16 @@ def exit_polarization(cos_exit: Array, sin_squared: Array, refractive_index: Arr
 
 
 def hemispherical_reflection(refractive_index: Array) -> Array:
-    """Share of diffuse light that the interface turns back outside: Fe = int_0^1 2 mu R+(mu) dmu.
-
-    Args:
-        refractive_index: n. Any shape, 1, >= 1.
-
-    Returns:
-        Fe. Same shape, 1, in [0, 1).
-
-    Raises:
-        Nothing.
-    """
+    """Share of diffuse light that the interface reflects outside: Fe = int_0^1 2 mu R+(mu) dmu."""
     cosine = HEMISPHERE_COSINES
     sin_squared = (1.0 - cosine) * (1.0 + cosine)
     mean, _ = reflection(
-        _like(cosine, refractive_index),
-        _like(sin_squared, refractive_index),
+        like(cosine, refractive_index),
+        like(sin_squared, refractive_index),
         refractive_index[..., None],
     )
     # A sum, since matrix products of accelerators drop digits in single precision.
-    return jnp.sum(mean * _like(2.0 * cosine * HEMISPHERE_WEIGHTS, refractive_index), axis=-1)
+    return jnp.sum(mean * like(2.0 * cosine * HEMISPHERE_WEIGHTS, refractive_index), axis=-1)
 
 
 def escape(refractive_index: Array) -> Array:
@@ -191,8 +108,3 @@ def _inner(cos_incidence: Array, refractive_index: Array) -> Array:
     """Q, the index times the cosine inside."""
     n = refractive_index
     return jnp.sqrt((n - 1.0) * (n + 1.0) + cos_incidence**2)
-
-
-def _like(nodes: np.ndarray, array: Array) -> Array:
-    """Constants in the precision of the data."""
-    return jnp.asarray(nodes, jnp.result_type(float, array))

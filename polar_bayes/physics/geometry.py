@@ -60,9 +60,6 @@ class Geometry(NamedTuple):
 
         Returns:
             Geometry of shape (..., view); a lone angle counts as one view.
-
-        Raises:
-            Nothing: angles are checked where captures enter.
         """
         angles = [
             jnp.asarray(angle) for angle in (view_zenith, view_azimuth, light_zenith, light_azimuth)
@@ -131,15 +128,6 @@ def mirror_facet(geometry: Geometry) -> MirrorFacet:
 
     With X = s_v c_l - c_v s_l cos(phi) and Y = s_l sin(phi) the s axis of the facet is turned by
     psi, where tan(psi) = Y/X and X^2 + Y^2 = 4 sin^2 cos^2: so sin^2 cos(2 psi) needs no angle.
-
-    Args:
-        geometry: Directions. Shape (..., view), degree.
-
-    Returns:
-        MirrorFacet of shape (..., view).
-
-    Raises:
-        Nothing.
     """
     sin_half, cos_half = _half_azimuth(geometry.light_azimuth - geometry.view_azimuth)
     sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
@@ -167,17 +155,7 @@ def mirror_facet(geometry: Geometry) -> MirrorFacet:
 
 
 def mirror_slopes(geometry: Geometry) -> tuple[Array, Array]:
-    """Slopes of the mirror facet in the viewer's frame: towards it, and across.
-
-    Args:
-        geometry: Directions. Shape (..., view), degree.
-
-    Returns:
-        `(in_plane, out_of_plane)`, each (..., view), 1.
-
-    Raises:
-        Nothing.
-    """
+    """Slopes of the mirror facet in the viewer's frame: towards it, and across."""
     sin_half, cos_half = _half_azimuth(geometry.light_azimuth - geometry.view_azimuth)
     sin_light = sin_degrees(geometry.light_zenith)
     cosine_sum = cos_degrees(geometry.view_zenith) + cos_degrees(geometry.light_zenith)
@@ -194,15 +172,6 @@ def turn_between_frames(geometry: Geometry) -> tuple[Array, Array]:
        {\cos\frac{\theta_v+\theta_l}{2}} \cot\frac{\varphi}{2} $$
 
     Regular wherever viewer and light are above the surface, also where they coincide.
-
-    Args:
-        geometry: Directions. Shape (..., view), degree.
-
-    Returns:
-        `(cos, sin)` of 2 (psi_v + psi_l), each (..., view).
-
-    Raises:
-        Nothing.
 
     Source:
         Napier's analogies for the triangle of normal, viewer and light.

@@ -35,8 +35,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.physics.facets import squared_rule, unit_rule
 from polar_bayes.physics.geometry import cos_degrees, sin_degrees
+from polar_bayes.physics.part import squared_rule, unit_rule
 
 # Scattered light changes with the square root of absorption, whose slope at zero is infinite: less
 # absorption than this counts as this.
@@ -116,19 +116,7 @@ class _Turned(NamedTuple):
 
 
 def refract(sine: Array, cosine: Array, refractive_index: Array) -> Ray:
-    """Direction inside of light that meets a smooth interface.
-
-    Args:
-        sine: Sine of the zenith angle outside; its sign says which side. Shape (..., view), 1.
-        cosine: Its cosine. Same shape, 1, >= 0.
-        refractive_index: n. Broadcasts, 1, >= 1.
-
-    Returns:
-        Ray of shape (..., view).
-
-    Raises:
-        Nothing.
-    """
+    """Direction inside of light that meets a smooth interface."""
     n = refractive_index
     cosine = jnp.maximum(cosine, GRAZING)
     return Ray(jnp.sqrt((n - 1.0) * (n + 1.0) + cosine**2) / n, sine / n)
@@ -145,32 +133,10 @@ def scatter(
 ) -> tuple[Array, Array, Array]:
     r"""Light of a beam that is scattered towards the viewer, still inside the body.
 
-    The caller lets it out: with E0 and E1 half the sum and half the difference of the
-    transmittances for s and p, the Stokes vector outside is
-
     $$ [I E_0 + Q E_1,\; I E_1 + Q E_0,\; U \sqrt{E_0^2 - E_1^2}] / n^2 $$
-
-    Args:
-        light: Direction to the light, refracted. Shape (..., view).
-        view: Direction to the viewer, refracted. Shape (..., view).
-        azimuth: Azimuth of the light minus that of the viewer; 180 is the mirror side. Shape
-            (..., view), degree.
-        entering: Stokes parameters (I, Q, U) of the power per area that passes into the body, in
-            the frame e_s = (z x l)/|z x l|, e_p = e_s x l. Unpolarized light of unit irradiance
-            gives (T+(l), T-(l), 0). Shape (..., view).
-        absorption: a, relative to scattering: the albedo of single scattering is 1/(1+a). Bounded
-            below at 1e-4. Broadcasts with (..., view), 1, >= 0. Every entry of the three material
-            properties costs a solution: best give them a single view.
-        polarized_fraction: Share of Rayleigh's law. Same, 1, in [0, 1].
-        refractive_index: n. Same, 1, in [1, 3]; None where nothing is turned back.
-
-    Returns:
-        Stokes parameters (I, Q, U) of the radiance inside, in the frame e_s = (z x v)/|z x v|,
-        e_p = e_s x v. Shape (..., view), 1/sr.
-
-    Raises:
-        Nothing.
     """
+    # The caller lets it out: with E0 and E1 half the sum and half the difference of the
+    # transmittances for s and p, the Stokes vector outside is
     n = 1.0 if refractive_index is None else refractive_index
     a, p, n = _material(absorption, polarized_fraction, n)
     moments = _solve_h(a, p)

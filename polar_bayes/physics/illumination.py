@@ -11,11 +11,10 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.facets import Window, above_horizon, inside_disc, squared_rule, unit_rule
+from polar_bayes.physics.facets import Microsurface, Window, above_horizon, gather, inside_disc
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.microfacet import SlopeEllipse
-from polar_bayes.physics.microsurface import Microsurface, gather
-from polar_bayes.physics.part import Part, check_part, like, parameters_of
+from polar_bayes.physics.part import Part, check_part, like, parameters_of, squared_rule, unit_rule
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import (
     Light,
@@ -58,9 +57,6 @@ class AbstractIllumination(Part):
 
         Returns:
             Light per unit irradiance (point) or unit radiance (disc, sky). Shape (..., view).
-
-        Raises:
-            Nothing.
         """
 
     @abc.abstractmethod
@@ -75,9 +71,6 @@ class AbstractIllumination(Part):
         Returns:
             Power per area, for unit irradiance (point) or unit radiance (disc, sky), with its
             polarization in the light's own plane. Shape (..., view).
-
-        Raises:
-            Nothing.
         """
 
     @abc.abstractmethod
@@ -90,9 +83,6 @@ class AbstractIllumination(Part):
         Returns:
             `(geometry, irradiance)` with a ray axis: directions of shape (..., view, ray), and what
             each beam brings across itself. Broadcasts with them.
-
-        Raises:
-            Nothing.
         """
 
     def incident(
@@ -209,9 +199,6 @@ class AbstractExtendedSource(AbstractIllumination):
 
         Returns:
             Window of slopes.
-
-        Raises:
-            Nothing.
         """
 
     @override

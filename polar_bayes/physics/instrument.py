@@ -9,10 +9,12 @@ does not lean: the directions are then those that were stated, to the last bit o
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import ClassVar, NamedTuple, override
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
@@ -27,6 +29,7 @@ __all__ = [
     "BeamOverlap",
     "ChannelGain",
     "DarkLevel",
+    "Discrepancy",
     "DolpGain",
     "Instrument",
     "Leakage",
@@ -55,9 +58,6 @@ class AbstractInstrumentTerm(Part):
 
         Returns:
             Geometry of the same shape.
-
-        Raises:
-            Nothing.
         """
         del parameters
         return geometry
@@ -72,9 +72,6 @@ class AbstractInstrumentTerm(Part):
 
         Returns:
             Light of the same shape.
-
-        Raises:
-            Nothing.
         """
         del parameters, geometry
         return light
@@ -295,17 +292,6 @@ def diattenuate(light: Light, contrast: Array, balance: Array) -> Light:
     r"""Light seen by channels s and p of sensitivity 1 + t and 1 - t.
 
     $$ I' = I (1 + q t), \quad q' = \frac{q+t}{1+qt}, \quad u' = \frac{u\sqrt{1-t^2}}{1+qt} $$
-
-    Args:
-        light: Light that arrives. Shape (..., view).
-        contrast: t. Broadcasts, 1, in (-1, 1).
-        balance: sqrt(1 - t^2), from a form that keeps its digits. Broadcasts, 1, in (0, 1].
-
-    Returns:
-        Light as recorded. Broadcast shape.
-
-    Raises:
-        Nothing.
     """
     total = 1.0 + light.q * contrast
     return Light(light.intensity * total, (light.q + contrast) / total, light.u * balance / total)
@@ -384,9 +370,6 @@ class TiltedNormal(Part):
 
         Returns:
             The directions, and the turn of the viewer's frame as in `Direction`. Broadcast shape.
-
-        Raises:
-            Nothing.
         """
         slopes = self._slopes(parameters)
         view = lean(geometry.view_zenith, geometry.view_azimuth, *slopes)
@@ -405,9 +388,6 @@ class TiltedNormal(Part):
 
         Returns:
             Light of the same shape.
-
-        Raises:
-            Nothing.
         """
         cos, sin = turn
         return Light(light.intensity, *in_turned_frame(light.q, light.u, (cos, -sin)))
@@ -421,27 +401,14 @@ class TiltedNormal(Part):
 def lean(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direction:
     r"""A direction as the normal (slope_x, slope_y, 1)/N sees it.
 
-    With p and t the slopes along and across the plane of the direction, s and c its sine and
-    cosine, the true normal's cross product with the direction has the components
-
     $$ \frac{s - p c}{N}, \quad \frac{-t}{N} $$
 
     along the stated s axis and the one at right angles to it: their length is the sine of the
     angle from the true normal, and their angle is that between both s axes. The zenith is given
     as the stated one plus a difference, which is exactly zero without a lean.
-
-    Args:
-        zenith: Angle from the stated normal. Shape (..., view), degree.
-        azimuth: Around the stated normal. Shape (..., view), degree.
-        slope_x: Tangent of the lean towards azimuth 0. Broadcasts, 1.
-        slope_y: Tangent of the lean towards azimuth 90. Broadcasts, 1.
-
-    Returns:
-        The direction in the true frame.
-
-    Raises:
-        Nothing.
     """
+    # With p and t the slopes along and across the plane of the direction, s and c its sine and
+    # cosine, the true normal's cross product with the direction has the components
     sin, cos = sin_degrees(zenith), cos_degrees(zenith)
     sin_azimuth, cos_azimuth = sin_degrees(azimuth), cos_degrees(azimuth)
     towards = slope_x * cos_azimuth + slope_y * sin_azimuth
@@ -469,3 +436,74 @@ def lean(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direc
         azimuth + jnp.rad2deg(jnp.arctan2(y, x)),
         ((along_s - along_p) * (along_s + along_p) / squared, 2.0 * along_s * along_p / squared),
     )
+
+
+# --- Discrepancy: a smooth unknown factor between the channels, over angle ------------------------
+
+
+# View angles run over 0 to 90 degrees; the basis vanishes at the ends of a domain this much wider.
+MIDDLE, HALF_WIDTH, WIDER = 45.0, 45.0, 1.3
+
+
+@dataclasses.dataclass(frozen=True)
+class Discrepancy(AbstractInstrumentTerm):
+    r"""A smooth factor exp(f) on the ratio of channels s and p, over the view zenith.
+
+    $$ f(\theta) = \text{amplitude} \sum_j w_j \sqrt{S(\omega_j)}\,
+       \sin\!\Big(\frac{j\pi(x+L)}{2L}\Big), \qquad
+       q' = \frac{q+t}{1+qt}, \quad t = \tanh(f/2) $$
+
+    A Gaussian process with squared-exponential kernel, in its Hilbert-space approximation. With
+    standard normal weights the amplitude is the root mean square of f over 0 to 90 degrees.
+
+    Parameters are `discrepancy_amplitude` (...) and `discrepancy_weights` (..., basis).
+
+    Args:
+        basis: Number of basis functions, at least 1.
+        length: Length scale, degree, > 0.
+
+    Raises:
+        SceneError: The number or the length is not positive.
+
+    Source:
+        Solin and Sarkka 2020, Hilbert space methods for reduced-rank Gaussian process regression.
+    """
+
+    basis: int = 4
+    length: float = 25.0
+
+    parameters: ClassVar[tuple[str, ...]] = ("discrepancy_amplitude", "discrepancy_weights")
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.basis, int) and self.basis >= 1 and self.length > 0.0):
+            raise SceneError(
+                f"basis={self.basis!r} and length={self.length!r} make no smooth function",
+                where="Discrepancy",
+                hint="give a whole number of functions from 1 on and a length above 0 degrees",
+            )
+
+    @override
+    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+        # Weights come as (..., basis, 1): the scene's view axis stands last, as in the functions.
+        weights = parameters["discrepancy_weights"]
+        smooth = jnp.sum(weights * self.functions(geometry.view_zenith), axis=-2)
+        half_log_ratio = 0.5 * parameters["discrepancy_amplitude"] * smooth
+        return diattenuate(light, jnp.tanh(half_log_ratio), 1.0 / jnp.cosh(half_log_ratio))
+
+    def functions(self, view_zenith: Array) -> Array:
+        """Basis functions, scaled by the spectrum: (..., view) -> (..., basis, view)."""
+        frequency, scale = self._spectrum()
+        phase = view_zenith[..., None, :] + (HALF_WIDTH * WIDER - MIDDLE)
+        dtype = jnp.result_type(float, view_zenith)
+        return jnp.asarray(scale[:, None], dtype) * jnp.sin(
+            jnp.asarray(frequency[:, None], dtype) * phase
+        )
+
+    def _spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        """Frequencies, and amplitudes that make the mean variance over 0 to 90 degrees one."""
+        span = 2.0 * HALF_WIDTH * WIDER
+        frequency = math.pi * np.arange(1, self.basis + 1) / span
+        amplitude = np.exp(-((self.length * frequency) ** 2) / 4.0)
+        angle = np.linspace(0.0, 90.0, 181)[:, None] + (HALF_WIDTH * WIDER - MIDDLE)
+        variance = np.mean(np.sum((amplitude * np.sin(frequency * angle)) ** 2, axis=1))
+        return frequency, amplitude / math.sqrt(variance)

@@ -44,9 +44,6 @@ class AbstractMicrofacet(Part):
 
         Returns:
             D. Broadcast shape, 1/sr, > 0.
-
-        Raises:
-            Nothing.
         """
 
     @abc.abstractmethod
@@ -59,9 +56,6 @@ class AbstractMicrofacet(Part):
 
         Returns:
             G1. Broadcast shape, 1, in (0, 1].
-
-        Raises:
-            Nothing.
         """
 
     @abc.abstractmethod
@@ -76,9 +70,6 @@ class AbstractMicrofacet(Part):
         Returns:
             `(slope, weight)`: the mean over facets of f(|slope|) up to the limit is the
             integral of weight * f(slope) over share from 0 to 1.
-
-        Raises:
-            Nothing.
         """
 
     @abc.abstractmethod
@@ -96,9 +87,6 @@ class AbstractMicrofacet(Part):
 
         Returns:
             `(slope, weight)` of the conditional distribution, as in `across`.
-
-        Raises:
-            Nothing.
         """
 
 
@@ -249,9 +237,6 @@ class AbstractSlopes(Part):
 
         Returns:
             SlopeEllipse.
-
-        Raises:
-            Nothing.
         """
 
 
@@ -325,9 +310,6 @@ class AbstractShadowing(Part):
 
         Returns:
             G. Broadcast shape, 1, in (0, 1].
-
-        Raises:
-            Nothing.
         """
 
 

@@ -29,9 +29,6 @@ class AbstractMixing(Part):
 
         Returns:
             Light. Shape (..., view).
-
-        Raises:
-            Nothing.
         """
 
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from polar_bayes.errors import SceneError
@@ -31,9 +32,6 @@ class Part(HTMLRepr, abc.ABC):
 
         Returns:
             Replacements to be weighed, each alone; empty where there is nothing simpler.
-
-        Raises:
-            Nothing.
         """
         return ()
 
@@ -74,6 +72,18 @@ def check_setting(value: object, where: str, low: float, high: float) -> None:
             where=where,
             hint="give the number where it is known, or a name such as 'coat_absorbance' to fit it",
         )
+
+
+def unit_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Legendre nodes and weights on (0, 1)."""
+    node, weight = np.polynomial.legendre.leggauss(count)
+    return 0.5 * (node + 1.0), 0.5 * weight
+
+
+def squared_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same in the square root: denser at 0, where light meets an interface at grazing."""
+    node, weight = unit_rule(count)
+    return node**2, 2.0 * node * weight
 
 
 def like(values: ArrayLike, array: Array) -> Array:

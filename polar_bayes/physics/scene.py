@@ -9,7 +9,6 @@ from jaxtyping import Array, ArrayLike
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import AbstractCoat
-from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.dispersion import AbstractDispersion
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
@@ -20,6 +19,7 @@ from polar_bayes.physics.instrument import (
     BeamOverlap,
     ChannelGain,
     DarkLevel,
+    Discrepancy,
     DolpGain,
     Instrument,
     Leakage,
@@ -210,9 +210,6 @@ class Scene(HTMLRepr):
 
         Returns:
             False too where there is no instrument.
-
-        Raises:
-            Nothing.
         """
         return self.instrument is not None and any(
             isinstance(part, term) for part in self.instrument.terms

@@ -12,10 +12,8 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.physics import boundary, fresnel
-from polar_bayes.physics.boundary import EVANESCENT, Film, Medium
-from polar_bayes.physics.diattenuation import Diattenuation
-from polar_bayes.physics.facets import squared_rule
-from polar_bayes.physics.part import like
+from polar_bayes.physics.boundary import EVANESCENT, Diattenuation, Film, Medium
+from polar_bayes.physics.part import like, squared_rule
 
 # Squared sines of inner angles that reach a coat but not the air, crowded towards grazing.
 _FROM_END, TRAPPED_WEIGHT = squared_rule(24)
@@ -57,18 +55,7 @@ class Stack(NamedTuple):
         return jax.tree.map(lambda array: array[..., None] if array.ndim else array, self)
 
     def reflection(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
-        """Share of the light that comes back from the whole stack.
-
-        Args:
-            cos_incidence: Cosine of incidence in air. Shape (..., view[, facet]), 1, in (0, 1].
-            sin_squared: B, its squared sine. Same shape, 1.
-
-        Returns:
-            Reflectance.
-
-        Raises:
-            Nothing.
-        """
+        """Share of the light that comes back from the whole stack."""
         if not self.layers:
             air, body = self._bare(cos_incidence)
             return boundary.reflection(air, body, sin_squared)
@@ -112,12 +99,6 @@ class Stack(NamedTuple):
         $$ 1 - F_i = \frac{1}{n^2}\int_0^{n^2} (1 - R'(B))\, dB $$
 
         over the squared sine B in air: up to 1 light leaves, beyond it a coat may absorb it.
-
-        Returns:
-            Shape of the index, 1, in (0, 1].
-
-        Raises:
-            Nothing.
         """
         if not self.layers:
             return fresnel.escape(self.refractive_index)

@@ -21,7 +21,7 @@ from typing import NamedTuple, override
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polar_bayes.physics.diattenuation import Diattenuation
+from polar_bayes.physics.boundary import Diattenuation
 from polar_bayes.physics.geometry import (
     Geometry,
     MirrorFacet,
@@ -67,33 +67,12 @@ def degree_of_linear_polarization(q: Array, u: Array) -> Array:
 
     So unpolarized light has the value 1e-12, gradient zero and a finite Hessian; above 1e-7 the
     rounding changes the value by less than 1e-10 of itself.
-
-    Args:
-        q: Normalized Stokes component. Any shape, in [-1, 1].
-        u: Normalized Stokes component. Same shape, in [-1, 1].
-
-    Returns:
-        Degree of linear polarization. Same shape, > 0.
-
-    Raises:
-        Nothing.
     """
     return jnp.sqrt(q**2 + u**2 + TIP**2)
 
 
 def direction(q: Array, u: Array) -> tuple[Array, Array]:
-    """Unit vector along (q, u); along s where there is no polarization to point anywhere.
-
-    Args:
-        q: Normalized Stokes component. Any shape.
-        u: Normalized Stokes component. Same shape.
-
-    Returns:
-        `(cos, sin)` of twice the angle of polarization. Same shape.
-
-    Raises:
-        Nothing.
-    """
+    """Unit vector along (q, u); along s where there is no polarization to point anywhere."""
     polarized = q**2 + u**2 > TIP**2
     q, u = jnp.where(polarized, q, 1.0), jnp.where(polarized, u, 0.0)
     length = jnp.sqrt(q**2 + u**2)
@@ -104,35 +83,13 @@ def in_turned_frame(q: Array, u: Array, turn: tuple[Array, Array]) -> tuple[Arra
     r"""Components along an s axis that is turned by an angle, towards the second axis.
 
     $$ q' + i u' = (q + i u) e^{-2i\chi} $$
-
-    Args:
-        q: Normalized Stokes component. Any shape.
-        u: Normalized Stokes component. Same shape.
-        turn: Cosine and sine of twice the angle. Each broadcasts with them.
-
-    Returns:
-        `(q', u')`. Broadcast shape.
-
-    Raises:
-        Nothing.
     """
     cos, sin = turn
     return q * cos + u * sin, u * cos - q * sin
 
 
 def angle_of_linear_polarization(q: Array, u: Array) -> Array:
-    """Angle of polarization from the s axis, atan2(u, q)/2; 0 where there is none.
-
-    Args:
-        q: Normalized Stokes component. Any shape.
-        u: Normalized Stokes component. Same shape.
-
-    Returns:
-        Angle. Same shape, degree, in (-90, 90].
-
-    Raises:
-        Nothing.
-    """
+    """Angle of polarization from the s axis, atan2(u, q)/2; 0 where there is none."""
     cos_double, sin_double = direction(q, u)
     return 0.5 * jnp.rad2deg(jnp.arctan2(sin_double, cos_double))
 
@@ -182,20 +139,7 @@ def mirror_light(
     geometry: Geometry,
     incident: tuple[Array, Array] | None,
 ) -> Light:
-    """Light that one facet mirrors to the viewer.
-
-    Args:
-        stack: What the facet is made of. Broadcasts with (..., view).
-        facet: The facet that mirrors light to viewer. Shape (..., view).
-        geometry: Directions. Shape (..., view), degree.
-        incident: Components q and u of the light in its own frame; None for unpolarized light.
-
-    Returns:
-        Light whose intensity is the reflectance. Shape (..., view).
-
-    Raises:
-        Nothing.
-    """
+    """Light that one facet mirrors to the viewer."""
     power = stack.relative_reflection(facet.cos_incidence, facet.sin_squared)
     if incident is None:
         polarizance = power.contrast / power.mean
@@ -224,19 +168,7 @@ def mirror_light(
 
 
 def let_in(passing: Diattenuation, cos_light: Array, incident: tuple[Array, Array] | None) -> Light:
-    """Light that passes the surface into the body, in the frame of the light.
-
-    Args:
-        passing: What the surface lets in from the light's direction. Shape (..., view).
-        cos_light: Cosine of the light's zenith. Shape (..., view), 1.
-        incident: Components q and u of the light in its own frame; None for unpolarized light.
-
-    Returns:
-        Power per area for unit irradiance, with its polarization. Shape (..., view).
-
-    Raises:
-        Nothing.
-    """
+    """Light that passes the surface into the body, in the frame of the light."""
     contrast = passing.contrast * passing.sin_squared
     if incident is None:
         q = contrast / passing.mean

@@ -33,9 +33,6 @@ class AbstractSubsurface(Part):
 
         Returns:
             Light; q < 0 is polarized along the plane of the viewer. Shape (..., view).
-
-        Raises:
-            Nothing.
         """
 
 
@@ -168,15 +165,6 @@ def half_space_loss(absorption: Array) -> Array:
 
     Written as g (2.309 - 0.139 g)/(1 + 1.170 g), it keeps its digits for a clear body.
 
-    Args:
-        absorption: a, relative to reduced scattering. Any shape, 1, >= 0 (bounded at 1e-4).
-
-    Returns:
-        1 - Rd. Same shape, 1, in (0, 1).
-
-    Raises:
-        Nothing.
-
     Source:
         van de Hulst 1980, Multiple light scattering, the spherical albedo of a half space.
     """
@@ -190,16 +178,6 @@ def body_loss(absorption: Array, escape: Array | float) -> Array:
 
     $$ R_b = \frac{(1-F_i) R_d}{1 - F_i R_d}, \qquad
        1 - R_b = \frac{1-R_d}{(1-R_d) + R_d (1-F_i)} $$
-
-    Args:
-        absorption: a. Any shape, 1, >= 0.
-        escape: 1 - F_i, what the interface does not turn back. Broadcasts, 1, in (0, 1].
-
-    Returns:
-        1 - Rb. Broadcast shape, 1, in (0, 1).
-
-    Raises:
-        Nothing.
     """
     lost = half_space_loss(absorption)
     return lost / (lost + (1.0 - lost) * escape)

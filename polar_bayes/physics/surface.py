@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polar_bayes.physics.facets import FacetQuadrature, Facets, seen
+from polar_bayes.physics.facets import FacetQuadrature, Facets, Microsurface, gather, seen
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.illumination import AbstractIllumination, PointSource
 from polar_bayes.physics.microfacet import (
@@ -21,7 +21,6 @@ from polar_bayes.physics.microfacet import (
     SeparableShadowing,
     SlopeEllipse,
 )
-from polar_bayes.physics.microsurface import Microsurface, gather
 from polar_bayes.physics.part import Part, check_part, parameters_of
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, mirror_light
@@ -47,9 +46,6 @@ class AbstractExit(Part):
 
         Returns:
             Light whose intensity is the transmittance. Shape (..., view).
-
-        Raises:
-            Nothing.
         """
 
 
@@ -118,9 +114,6 @@ class AbstractSurface(Part):
 
         Returns:
             Light; q > 0 is polarized across the plane of the viewer. Shape (..., view).
-
-        Raises:
-            Nothing.
         """
 
     @abc.abstractmethod
@@ -135,9 +128,6 @@ class AbstractSurface(Part):
         Returns:
             Power per area for unit irradiance, or for unit radiance of a disc or sky, and its
             polarization in the plane of the light. Shape (..., view).
-
-        Raises:
-            Nothing.
         """
 
     @abc.abstractmethod
@@ -153,9 +143,6 @@ class AbstractSurface(Part):
 
         Returns:
             `(rays, light)`: directions and light of shape (..., view, ray).
-
-        Raises:
-            Nothing.
         """
 
     @abc.abstractmethod
@@ -169,9 +156,6 @@ class AbstractSurface(Part):
 
         Returns:
             Light whose intensity is the transmittance; q <= 0, along the plane of the viewer.
-
-        Raises:
-            Nothing.
         """
 
 

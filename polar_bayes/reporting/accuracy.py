@@ -20,8 +20,8 @@ from matplotlib.transforms import Bbox
 from polar_bayes.benchmark.accuracy import AS_GIVEN
 from polar_bayes.benchmark.advice import (
     RESOLVED,
-    accuracy_advice,
-    accuracy_of,
+    accuracy_dataset,
+    accuracy_sentences,
     accuracy_table,
     parameter_errors,
 )
@@ -79,7 +79,7 @@ TIME_LABELS = {
 def plot_accuracy(
     result: xr.DataTree | xr.Dataset, *, times: Sequence[str] | None = None
 ) -> Figure:
-    """Error against time of every rung and dial, with the Pareto front.
+    """Error against time of every method and override, with the Pareto front.
 
     Args:
         result: What `polar_bayes.accuracy` returns, or one read back from a file.
@@ -87,14 +87,14 @@ def plot_accuracy(
             "seconds_again"; by default both, where they were measured.
 
     Returns:
-        The figure. A color stands for a rung, a marker for what was turned; rungs as given are
+        The figure. A color stands for a method, a marker for the override; methods as given are
         filled and named. The line joins points than which none is both faster and better. In the
         gray area the reference itself does not tell errors from nothing.
 
     Raises:
         FitError: It holds no accuracy study, or no such column.
     """
-    found = accuracy_of(result)
+    found = accuracy_dataset(result)
     table = accuracy_table(found)
     shown = list(times) if times is not None else _measured(table)
     strange = [name for name in shown if name not in TIME_LABELS]
@@ -110,14 +110,20 @@ def plot_accuracy(
         front_panel(axes, found, name)
         if at == 0:
             axes.set_ylabel("largest error of a mean or sd [posterior sd]")
-    dials = list(dict.fromkeys(table["dial"]))
-    if len(dials) > 1:
+    overrides = list(dict.fromkeys(table["override"]))
+    if len(overrides) > 1:
         handles = [
             Line2D(
-                [], [], ls="", marker=marker, mfc=GRAY if at == 0 else "none", mec=GRAY, label=dial
+                [],
+                [],
+                ls="",
+                marker=marker,
+                mfc=GRAY if at == 0 else "none",
+                mec=GRAY,
+                label=override,
             )
-            for at, (dial, marker) in enumerate(
-                zip(dials, _repeat(MARKERS, len(dials)), strict=True)
+            for at, (override, marker) in enumerate(
+                zip(overrides, _repeat(MARKERS, len(overrides)), strict=True)
             )
         ]
         figure.legend(
@@ -135,24 +141,24 @@ def front_panel(axes: Axes, found: xr.Dataset, time: str) -> None:
     table, noise = accuracy_table(found), float(found.attrs["reference_error"])
     # Axes of logarithms have no place for a time of zero.
     known = table[np.isfinite(table["error"]) & np.isfinite(table[time]) & (table[time] > 0.0)]
-    rungs, dials = (list(dict.fromkeys(table[name])) for name in ("rung", "dial"))
-    colors = dict(zip(rungs, _repeat(COLORS, len(rungs)), strict=True))
-    markers = dict(zip(dials, _repeat(MARKERS, len(dials)), strict=True))
+    methods, overrides = (list(dict.fromkeys(table[name])) for name in ("method", "override"))
+    colors = dict(zip(methods, _repeat(COLORS, len(methods)), strict=True))
+    markers = dict(zip(overrides, _repeat(MARKERS, len(overrides)), strict=True))
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.axhspan(1e-9, RESOLVED * noise, color=lighten(GRAY, 0.85), lw=0, zorder=0)
     front = _front(known, time)
     axes.plot(front[time], front["error"], color=GRAY, lw=1.0, drawstyle="steps-post", zorder=1)
     for _, row in known.iterrows():
-        given = row["dial"] == AS_GIVEN
+        given = row["override"] == AS_GIVEN
         axes.plot(
             row[time],
             row["error"],
             ls="",
-            marker=markers[row["dial"]],
+            marker=markers[row["override"]],
             ms=6.5 if given else 4.5,
-            mfc=colors[row["rung"]] if given else "none",
-            mec=colors[row["rung"]],
+            mfc=colors[row["method"]] if given else "none",
+            mec=colors[row["method"]],
             zorder=3 if given else 2,
         )
     _limits(axes, known, time, noise)
@@ -182,14 +188,14 @@ def _limits(axes: Axes, known: pd.DataFrame, time: str, noise: float) -> None:
 
 
 def _name_points(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, str]) -> None:
-    """The name of each rung beside its point, where no other name or point stands."""
+    """The name of each method beside its point, where no other name or point stands."""
     figure = axes.get_figure()
     scale = 72.0 / (figure.dpi if figure is not None else 100.0)
     places = axes.transData.transform(known[[time, "error"]].to_numpy(float)) * scale
     taken = [Bbox.from_bounds(x - 3, y - 3, 6, 6) for x, y in places]
-    given = known[known["dial"] == AS_GIVEN]
-    own = places[(known["dial"] == AS_GIVEN).to_numpy()]
-    for (x, y), name in zip(own, given["rung"], strict=True):
+    given = known[known["override"] == AS_GIVEN]
+    own = places[(known["override"] == AS_GIVEN).to_numpy()]
+    for (x, y), name in zip(own, given["method"], strict=True):
         width = LETTER * len(name)
         for right, up in AROUND:
             box = Bbox.from_bounds(
@@ -200,7 +206,7 @@ def _name_points(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, s
         taken.append(box)
         axes.annotate(
             plain(name),
-            tuple(given.loc[given["rung"] == name, [time, "error"]].to_numpy(float)[0]),
+            tuple(given.loc[given["method"] == name, [time, "error"]].to_numpy(float)[0]),
             xytext=(right, up),
             textcoords="offset points",
             ha="left" if right > 0 else "right",
@@ -252,9 +258,9 @@ def render_accuracy(result: xr.DataTree) -> str:
 
 def accuracy_section(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
     """What a page says of a study: advice, reference, figure and tables."""
-    found = accuracy_of(result)
+    found = accuracy_dataset(result)
     return {
-        "advice": accuracy_advice(found),
+        "advice": " ".join(accuracy_sentences(found)),
         "is_sound": not found.attrs["reference_doubts"],
         "reference": reference_sentence(found),
         "picture": accuracy_picture(found),
@@ -268,7 +274,7 @@ def accuracy_picture(found: xr.Dataset) -> Picture:
     return picture(
         plot_accuracy(found),
         "Error against time of every method",
-        "Down is better, left is faster. A color stands for a method, a marker for what was turned "
+        "Down is better, left is faster. A color stands for a method, a marker for the override "
         "beside it; methods as given are filled and named. The line joins those than which nothing "
         "is both faster and better. In the gray area the reference itself cannot tell an error "
         "from nothing.",
@@ -277,7 +283,7 @@ def accuracy_picture(found: xr.Dataset) -> Picture:
 
 def reference_sentence(result: xr.DataTree | xr.Dataset) -> str:
     """What the reference is, and how well it is known."""
-    told = accuracy_of(result).attrs
+    told = accuracy_dataset(result).attrs
     sentence = (
         f"The reference is {told['reference_draws']:,} draws of {told['reference']}, worth "
         f"{told['reference_effective_draws']:,.0f} independent ones; its own Monte Carlo error is "
@@ -288,7 +294,7 @@ def reference_sentence(result: xr.DataTree | xr.Dataset) -> str:
 
 
 def study_table(found: xr.Dataset) -> Table:
-    """A row for each method and dial."""
+    """A row for each method and override."""
     noise = float(found.attrs["reference_error"])
     rows, table = [], accuracy_table(found)
     for name, row in table.iterrows():
@@ -315,7 +321,7 @@ def study_table(found: xr.Dataset) -> Table:
 
 def parameter_table(found: xr.Dataset) -> Table:
     """Errors of every parameter by the methods as given."""
-    errors = parameter_errors(found)[found["dial"].to_numpy() == AS_GIVEN]
+    errors = parameter_errors(found)[found["override"].to_numpy() == AS_GIVEN]
     rows = tuple(
         Row(str(name), str(name), tuple(or_dash(value, "{:.2g}") for value in row))
         for name, row in errors.iterrows()

@@ -18,7 +18,7 @@ from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scal
 from polar_bayes.diagnostics.population import population_summary, populations, shrinkage
 from polar_bayes.diagnostics.predictive import Check, predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
-from polar_bayes.effects.choose import ledger_sentence
+from polar_bayes.effects.choose import ledger_sentences
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.auto import auto_sentences
 from polar_bayes.inference.files import save_result
@@ -246,7 +246,7 @@ def _effects(result: xr.DataTree) -> dict[str, Any] | None:
     if "effects" not in result.children:
         return None
     ledger = result["effects"].to_dataset()
-    return {"table": tables.effect_table(ledger), "sentence": ledger_sentence(ledger)}
+    return {"table": tables.effect_table(ledger), "sentence": " ".join(ledger_sentences(ledger))}
 
 
 def _pictures(

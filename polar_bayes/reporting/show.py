@@ -10,7 +10,7 @@ from typing import Any
 import xarray as xr
 
 from polar_bayes.benchmark.accuracy import is_accuracy
-from polar_bayes.benchmark.advice import accuracy_advice, accuracy_of
+from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
 from polar_bayes.calibration.files import is_calibration
 from polar_bayes.calibration.verdict import calibration_table, calibration_verdict, how_ranks_stray
 from polar_bayes.diagnostics.convergence import judge, summary
@@ -89,8 +89,8 @@ def _of_calibration(calibration: xr.DataTree) -> Card:
 
 
 def _of_study(study: xr.DataTree) -> Card:
-    said = [accuracy_advice(study), reference_sentence(study)]
-    found = accuracy_of(study)
+    said = [*accuracy_sentences(study), reference_sentence(study)]
+    found = accuracy_dataset(study)
     is_sound = not found.attrs["reference_doubts"]
     return _card(_name(provenance_of(study), "accuracy"), said, study_table(found), is_sound)
 

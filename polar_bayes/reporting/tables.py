@@ -20,7 +20,7 @@ from polar_bayes.diagnostics.parameters import (
 from polar_bayes.diagnostics.population import Population
 from polar_bayes.diagnostics.predictive import PROBABILITIES, Check
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE
-from polar_bayes.effects.choose import ledger_rows
+from polar_bayes.effects.choose import ledger_table
 from polar_bayes.errors import one_line
 from polar_bayes.reporting.page import csv_link
 from polar_bayes.reporting.style import QUANTITIES, title_of
@@ -327,8 +327,8 @@ def effect_table(ledger: xr.Dataset) -> Table:
     """What each effect of the scene changes and costs, and whether it was kept."""
     paths = map(str, ledger["path"].to_numpy())
     rows = tuple(
-        Row(name, path, cells)
-        for path, (name, cells) in zip(paths, ledger_rows(ledger).items(), strict=True)
+        Row(name, path, tuple(cells))
+        for path, (name, *cells) in zip(paths, ledger_table(ledger).itertuples(), strict=True)
     )
     heads = ("effect", "data", "shift", "sd", "operations", "time", "kept or dropped, and why")
     caption = (

@@ -1,4 +1,4 @@
-"""The study of a posterior that is known: references, trials, dials, and processes of their own."""
+"""The study of a posterior that is known: references, trials, overrides, fresh processes."""
 
 import dataclasses
 import json
@@ -15,8 +15,8 @@ from toy_models import capture, line, of_line, squared
 import polar_bayes as pb
 from polar_bayes.benchmark import run
 from polar_bayes.benchmark.accuracy import AS_GIVEN
-from polar_bayes.benchmark.reference import Judge, nearest, run_reference
-from polar_bayes.benchmark.run import AbstractDial, Trial, problem_of, run_fresh
+from polar_bayes.benchmark.reference import ReferenceRun, best_reference, run_reference
+from polar_bayes.benchmark.run import AbstractOverride, Trial, problem_of, run_fresh
 from polar_bayes.effects.variants import parts_of
 from polar_bayes.inference.mcse import errors_of, standard_errors
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
@@ -62,8 +62,8 @@ class Broken(AbstractMethod):
 
 
 @dataclasses.dataclass(frozen=True)
-class Stuck(AbstractDial):
-    """A dial that cannot be turned."""
+class Stuck(AbstractOverride):
+    """An override that cannot be changed."""
 
     @property
     @override
@@ -71,7 +71,7 @@ class Stuck(AbstractDial):
         return "stuck"
 
     @override
-    def turn(self, request, method):
+    def apply(self, request, method):
         raise pb.FitError("it is rusty", where="Stuck", hint="oil it")
 
 
@@ -81,11 +81,11 @@ def study() -> xr.DataTree:
         capture(),
         model=line,
         links=LINKS,
-        rungs={"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()},
-        dials=(
-            pb.benchmark.DrawsDial(0.1),
-            pb.benchmark.FacetsDial(2.0),
-            pb.benchmark.PrecisionDial(),
+        methods={"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()},
+        overrides=(
+            pb.benchmark.DrawsOverride(0.1),
+            pb.benchmark.FacetsOverride(2.0),
+            pb.benchmark.PrecisionOverride(),
             Stuck(),
         ),
         reference=ROUGHLY,
@@ -117,7 +117,7 @@ def test_the_reference_states_its_own_error(study):
     assert told["reference_effective_draws"] > 400
 
 
-def test_a_rung_that_fails_is_a_row_that_says_why(study):
+def test_a_method_that_fails_is_a_row_that_says_why(study):
     table = pb.benchmark.accuracy_table(study)
     assert "it cannot be" in table.loc["broken", "problems"]
     assert np.isnan(table.loc["broken", "error"])
@@ -125,11 +125,11 @@ def test_a_rung_that_fails_is_a_row_that_says_why(study):
 
 
 @pytest.mark.thorough
-def test_a_dial_that_fails_is_a_row_that_says_why(study):
+def test_an_override_that_fails_is_a_row_that_says_why(study):
     table = pb.benchmark.accuracy_table(study)
-    for rung in ("biased", "right", "broken"):
-        assert "it is rusty" in table.loc[f"{rung}, stuck", "problems"]
-        assert np.isnan(table.loc[f"{rung}, stuck", "error"])
+    for method in ("biased", "right", "broken"):
+        assert "it is rusty" in table.loc[f"{method}, stuck", "problems"]
+        assert np.isnan(table.loc[f"{method}, stuck", "error"])
 
 
 @pytest.mark.thorough
@@ -144,13 +144,13 @@ def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
     for method in (pb.methods.Laplace(), pb.methods.Nuts()):
         with pytest.raises(pb.FitError, match="no peak"):
-            pb.benchmark.EffectsDial().turn(request, method)
+            pb.benchmark.EffectsOverride().apply(request, method)
     assert len(tries) == 1
 
 
 def test_dials_turn_what_they_can_and_leave_the_rest_out(study):
     found = study["accuracy"].to_dataset()
-    pairs = list(zip(found["rung"].to_numpy(), found["dial"].to_numpy(), strict=True))
+    pairs = list(zip(found["method"].to_numpy(), found["override"].to_numpy(), strict=True))
     assert pairs[:3] == [("biased", AS_GIVEN), ("right", AS_GIVEN), ("broken", AS_GIVEN)]
     assert ("biased", "draws / 10") in pairs
     assert ("broken", "draws / 10") not in pairs  # it has no draws
@@ -172,10 +172,10 @@ def test_without_processes_of_their_own_first_times_and_memory_are_not_told(stud
 @pytest.mark.thorough
 def test_facets_are_turned_where_there_are_any():
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    turned, method = pb.benchmark.FacetsDial(0.5).turn(request, pb.methods.Nuts())
+    changed, method = pb.benchmark.FacetsOverride(0.5).apply(request, pb.methods.Nuts())
     before, after = (
         [part for _, part in parts_of(scene) if isinstance(part, pb.physics.FacetQuadrature)]
-        for scene in (request.scene, turned.scene)
+        for scene in (request.scene, changed.scene)
     )
     assert len(before) == len(after) > 0
     for one, other in zip(before, after, strict=True):
@@ -183,23 +183,23 @@ def test_facets_are_turned_where_there_are_any():
         assert other.across == round(0.5 * one.across)
     assert method == pb.methods.Nuts()
     smooth = dataclasses.replace(request, scene=pb.Scene(pb.SmoothSurface()))
-    assert pb.benchmark.FacetsDial(0.5).turn(smooth, pb.methods.Nuts()) is None
+    assert pb.benchmark.FacetsOverride(0.5).apply(smooth, pb.methods.Nuts()) is None
     single = dataclasses.replace(request, precision="single")
-    assert pb.benchmark.PrecisionDial().turn(single, pb.methods.Nuts()) is None
+    assert pb.benchmark.PrecisionOverride().apply(single, pb.methods.Nuts()) is None
 
 
-def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
+def test_an_override_of_draws_turns_what_its_name_says_or_nothing():
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    quarter = pb.benchmark.DrawsDial(0.25)
+    quarter = pb.benchmark.DrawsOverride(0.25)
     for name, method in pb.methods.LADDER.items():
-        turned = quarter.turn(request, method)
-        assert (turned is None) == (name in ("point", "nuts short"))  # no draws, or too few
-        if turned is not None:
-            assert draws_of(turned[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
+        changed = quarter.apply(request, method)
+        assert (changed is None) == (name in ("point", "nuts short"))  # no draws, or too few
+        if changed is not None:
+            assert draws_of(changed[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
     # A crowd and a half, of which half would be three quarters: fewer than the crowd.
     few = pb.methods.Tempered(pb.methods.PixelTempering(draws=1536))
-    assert pb.benchmark.DrawsDial(0.5).turn(request, few) is None
-    enough = pb.benchmark.DrawsDial(0.5).turn(
+    assert pb.benchmark.DrawsOverride(0.5).apply(request, few) is None
+    enough = pb.benchmark.DrawsOverride(0.5).apply(
         request, pb.methods.Tempered(pb.methods.PixelTempering(draws=3072))
     )
     assert enough is not None
@@ -207,41 +207,41 @@ def test_a_dial_of_draws_turns_what_its_name_says_or_nothing():
 
 
 @pytest.mark.thorough
-def test_every_dial_has_a_name_of_its_own():
-    every: list[AbstractDial] = [
-        *(pb.benchmark.DrawsDial(factor) for factor in (0.25, 4.0)),
-        *(pb.benchmark.FacetsDial(factor) for factor in (0.5, 2.0)),
-        pb.benchmark.EffectsDial(),
-        pb.benchmark.PrecisionDial(),
-    ]
-    names = [dial.name for dial in every]
+def test_every_override_has_a_name_of_its_own():
+    every: list[AbstractOverride] = [
+        pb.benchmark.DrawsOverride(0.25), pb.benchmark.DrawsOverride(4.0),
+        pb.benchmark.FacetsOverride(0.5), pb.benchmark.FacetsOverride(2.0),
+        pb.benchmark.EffectsOverride(), pb.benchmark.PrecisionOverride(),
+    ]  # fmt: skip
+    names = [override.name for override in every]
     assert names[:3] == ["draws / 4", "draws x 4", "facets / 2"]
     assert len(set(names)) == len(names)
 
 
-def test_chains_that_miss_a_mode_hand_the_reference_over():
+def test_where_chains_miss_a_mode_tempered_draws_are_the_reference():
     request = resolve(capture(), squared, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    judge = run_reference(ROUGHLY, problem_of(request, jax.random.key(0)))
-    assert judge.made_by == "tempered draws"
-    assert not judge.doubts
+    reference = run_reference(ROUGHLY, problem_of(request, jax.random.key(0)))
+    assert reference.method == "tempered draws"
+    assert not reference.doubts
     # Its own error is that of the weights, too.
-    assert (judge.mean_error > 1.1 * standard_errors(judge.draws)[0]).all()
-    share = np.mean(judge.draws[judge.labels.index("root")] > 0.0)
+    assert (reference.mean_error > 1.1 * standard_errors(reference.draws)[0]).all()
+    share = np.mean(reference.draws[reference.labels.index("root")] > 0.0)
     assert abs(share - 0.5) < 5 * 0.5 * 0.05
 
 
-def judged(biases: tuple[str, ...], error: float) -> Judge:
+def judged(biases: tuple[str, ...], error: float) -> ReferenceRun:
     errors = np.array([error, 0.5 * error])
-    return Judge(("x", "y"), np.zeros((2, 4, 9)), "made", errors, errors, None, None, biases)
+    return ReferenceRun(("x", "y"), np.zeros((2, 4, 9)), "made", errors, errors, None, None, biases)
 
 
 @pytest.mark.thorough
 def test_noise_is_no_reason_to_take_a_biased_reference():
     noisy, biased = judged((), 0.03)._replace(noise="its error is 0.03"), judged(("R-hat",), 0.001)
     assert len(noisy.doubts) == len(biased.doubts) == 1
-    assert nearest([biased, noisy]) is noisy
-    assert nearest([judged(("R-hat", "a mode"), 0.001), biased]) is biased
-    assert nearest([judged((), np.nan), noisy]) is nearest([noisy, judged((), np.nan)]) is noisy
+    assert best_reference([biased, noisy]) is noisy
+    assert best_reference([judged(("R-hat", "a mode"), 0.001), biased]) is biased
+    unknown = judged((), np.nan)
+    assert best_reference([unknown, noisy]) is best_reference([noisy, unknown]) is noisy
 
 
 @pytest.mark.thorough
@@ -276,8 +276,8 @@ def test_the_tempered_reference_draws_what_its_own_error_takes():
 @each(
     ("asked", "said"),
     [
-        ({"rungs": {}}, "there is no rung"),
-        ({"rungs": {"mine": "nuts"}}, "a str is not a method"),
+        ({"methods": {}}, "there is no method"),
+        ({"methods": {"mine": "nuts"}}, "a str is not a method"),
     ],
 )
 def test_what_cannot_be_studied_is_refused(asked, said):
@@ -289,9 +289,9 @@ def test_settings_out_of_range_are_refused():
     with pytest.raises(pb.FitError, match="error is 0"):
         pb.benchmark.Reference(error=0.0)
     with pytest.raises(pb.FitError, match="factor is 0"):
-        pb.benchmark.DrawsDial(0.0)
+        pb.benchmark.DrawsOverride(0.0)
     with pytest.raises(pb.FitError, match="factor is -1"):
-        pb.benchmark.FacetsDial(-1.0)
+        pb.benchmark.FacetsOverride(-1.0)
 
 
 @pytest.mark.thorough

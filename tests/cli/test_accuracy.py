@@ -29,9 +29,9 @@ def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys
     assert main(["accuracy", str(plate), "--out", str(out)]) == 0
     told = capsys.readouterr().out
     assert told.splitlines()[0].split()[:2] == ["error", "worst"]
-    assert told.splitlines()[-1] == pb.benchmark.accuracy_advice(make_accuracy())
-    assert set(studied["rungs"]) == set(pb.methods.LADDER)
-    assert "dials" not in studied
+    assert told.splitlines()[-1] == " ".join(pb.benchmark.accuracy_sentences(make_accuracy()))
+    assert set(studied["methods"]) == set(pb.methods.LADDER)
+    assert "overrides" not in studied
     assert pb.benchmark.accuracy_table(pb.benchmark.load_accuracy(out)).equals(
         pb.benchmark.accuracy_table(make_accuracy())
     )
@@ -42,19 +42,19 @@ def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys
 
 @pytest.mark.thorough
 def test_rungs_and_dials_are_chosen_and_json_is_json(plate, tmp_path, capsys, studied):
-    words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--json", "--no-dials"]
-    assert main([*words, "--rung", "laplace", "--rung", "nuts", "--tolerance", "0.001"]) == 0
+    words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--json", "--no-overrides"]
+    assert main([*words, "--method", "laplace", "--method", "nuts", "--tolerance", "0.001"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert set(said["rows"]) == set(pb.benchmark.accuracy_table(make_accuracy()).index)
     assert said["advice"].startswith("No method is within 0.001 sd")
-    assert list(studied["rungs"]) == ["laplace", "nuts"]
-    assert studied["dials"] == ()
+    assert list(studied["methods"]) == ["laplace", "nuts"]
+    assert studied["overrides"] == ()
 
 
-def test_a_rung_that_is_not_there_is_refused(plate, tmp_path, capsys):
-    words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--rung", "magic"]
+def test_a_method_that_is_not_there_is_refused(plate, tmp_path, capsys):
+    words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--method", "magic"]
     assert main(words) == 1
-    assert "rung='magic': no such rung; give one of point, laplace" in capsys.readouterr().err
+    assert "method='magic': no such method; give one of point, laplace" in capsys.readouterr().err
 
 
 @pytest.mark.thorough

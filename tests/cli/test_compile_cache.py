@@ -58,7 +58,7 @@ def test_a_folder_that_others_can_write_to_is_not_used(
     assert not set(NAMES) & set(os.environ)
     assert capsys.readouterr().err == (
         f"{compiled}: compiled programs are not kept: other users can write to {base / part}; "
-        f"mend that, or set {FOLDER} to a folder of your own\n"
+        f"change that, or set {FOLDER} to a folder of your own\n"
     )
 
 

@@ -15,10 +15,10 @@ def test_effects_prints_the_ledger_and_writes_it(
 ) -> None:
     out = tmp_path / "ledger.nc"
     assert main(["effects", str(plate), "--keep", "BeamOverlap", "--out", str(out)]) == 0
-    head, *rows, space, sentence = capsys.readouterr().out.splitlines()
-    assert head.split()[:2] == ["effect", "data"]
+    head, *rows, space, sentences = capsys.readouterr().out.splitlines()
+    assert head.split()[:2] == ["data", "shift"]
     assert not space
-    assert f"of {len(rows)} effects are kept" in sentence
+    assert f"of {len(rows)} effects are kept" in sentences
     kept = next(row for row in rows if row.startswith("BeamOverlap"))
     assert "kept: by your choice; alone no parameter changes" in kept
     with xr.open_dataset(out) as ledger:

@@ -121,8 +121,7 @@ def test_a_demo_writes_in_no_folder_of_anothers(held, plate, tmp_path, capsys):
 
 def test_names_of_options_are_those_of_the_tables():
     from polar_bayes.calibration.calibrate import METHODS as CALIBRATION_METHODS
-    from polar_bayes.inference.joint_fit import METHODS
-    from polar_bayes.inference.request import MODELS
+    from polar_bayes.inference.request import METHODS, MODELS
 
     known = {
         cli_options.MODEL: MODELS,
@@ -130,7 +129,7 @@ def test_names_of_options_are_those_of_the_tables():
         cli_options.MATERIAL: pb.simulation.PRESETS,
         cli_options.FIT_METHOD: METHODS,
         cli_options.CALIBRATION_METHOD: CALIBRATION_METHODS,
-        cli_options.RUNG: pb.methods.LADDER,
+        cli_options.STUDY_METHOD: pb.methods.LADDER,
     }
     for kind, table in known.items():
         assert kind.names == tuple(table), kind.kind
@@ -151,7 +150,7 @@ assert not {"jax", "numpyro", "arviz", "matplotlib"} & set(sys.modules), "loaded
         ("fit", "x.nc", "--method", "nutz", "--out", "o.nc"),
         ("map", "x.nc", "--scene", "moon", "--out", "o.zarr"),
         ("calibrate", "x.nc", "--method", "magic", "--out", "o.nc"),
-        ("accuracy", "x.nc", "--rung", "magic", "--out", "o.nc"),
+        ("accuracy", "x.nc", "--method", "magic", "--out", "o.nc"),
         ("simulate", "--preset", "gold", "--out", "o.nc"),
         ("fit", "t.csv", "--out", "o.nc"),
         ("fit", "x.nc", "--out", "y.nc"),

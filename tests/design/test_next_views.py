@@ -1,4 +1,4 @@
-"""Designs against closed forms and brute force; what a rig and a capture allow."""
+"""Designs against closed forms and brute force; what constraints and a capture allow."""
 
 import itertools
 
@@ -24,7 +24,7 @@ from polar_bayes.models.per_material import per_material
 from synthetic_results import make_result
 
 import polar_bayes as pb
-from polar_bayes.design.candidates import choose
+from polar_bayes.design.optimal_design import fedorov_exchange
 
 START = np.array([40.0, 50.0])
 GRID = np.linspace(10.0, 80.0, 8)
@@ -38,7 +38,7 @@ def on_a_line(candidates=GRID, **asked) -> xr.Dataset:
 
 def test_a_line_is_best_seen_from_its_ends() -> None:
     """D-optimal for a straight line: half of the readings at either end (Atkinson, chapter 11)."""
-    found = on_a_line(count=4, rig=pb.design.Rig(repeatable=True))
+    found = on_a_line(count=4, constraints=pb.design.Constraints(repeatable=True))
     assert sorted(found["view_zenith"].to_numpy()) == [10.0, 10.0, 80.0, 80.0]
     for step in range(5):
         zeniths = [*START, *found["view_zenith"].to_numpy()[:step]]
@@ -62,7 +62,7 @@ def test_no_other_choice_is_better(criterion: pb.design.DOptimal) -> None:
         return criterion.loss(np.linalg.inv(information), ["level", "slope"])[0]
 
     apart = np.eye(len(GRID), dtype=bool)
-    chosen = choose(loss, base[None], each[None], np.ones(len(GRID), bool), apart, 3)
+    chosen = fedorov_exchange(loss, base[None], each[None], np.ones(len(GRID), bool), apart, 3)
     every = [base + each[list(three)].sum(axis=0) for three in itertools.combinations(range(8), 3)]
     assert chosen.losses[-1] == pytest.approx(loss(np.array(every)[None]).min())
     assert (np.diff(chosen.losses) < 0.0).all()
@@ -78,15 +78,17 @@ def test_exchange_mends_what_greed_got_wrong() -> None:
         return np.trace(np.linalg.inv(information), axis1=-2, axis2=-1)[0]
 
     greedy_first = int(np.argmin(loss((base + each)[None])))
-    chosen = choose(loss, base[None], each[None], np.ones(3, bool), np.eye(3, dtype=bool), 2)
+    chosen = fedorov_exchange(
+        loss, base[None], each[None], np.ones(3, bool), np.eye(3, dtype=bool), 2
+    )
     assert greedy_first == 0
     assert set(chosen.picks) == {1, 2}
     assert chosen.exchanges > 0
 
 
-def test_a_rig_says_what_it_can_take() -> None:
-    rig = pb.design.Rig(view_zenith=(0.0, 65.0), minimum_separation=12.0)
-    found = on_a_line(np.arange(5.0, 80.0, 2.5), count=3, rig=rig)
+def test_constraints_limit_the_views() -> None:
+    constraints = pb.design.Constraints(view_zenith=(0.0, 65.0), minimum_separation=12.0)
+    found = on_a_line(np.arange(5.0, 80.0, 2.5), count=3, constraints=constraints)
     zeniths = np.sort(found["view_zenith"].to_numpy())
     assert zeniths.max() <= 65.0
     assert np.diff(zeniths).min() >= 12.0 - 1e-6
@@ -95,11 +97,11 @@ def test_a_rig_says_what_it_can_take() -> None:
 
 @pytest.mark.thorough
 def test_light_and_viewer_keep_apart() -> None:
-    rig = pb.design.Rig(from_light=10.0)
+    constraints = pb.design.Constraints(from_light=10.0)
     there = np.array([[45.0, 0.0, 45.0, 0.0], [45.0, 180.0, 45.0, 0.0], [56.0, 0.0, 45.0, 0.0]])
-    assert rig.allows(there, there[:0]).tolist() == [False, True, True]
-    assert not rig.allows(there, there).any()  # measured already
-    assert pb.design.Rig(repeatable=True).allows(there, there).all()
+    assert constraints.allows(there, there[:0]).tolist() == [False, True, True]
+    assert not constraints.allows(there, there).any()  # measured already
+    assert pb.design.Constraints(repeatable=True).allows(there, there).all()
 
 
 def lamp(data, scene, priors, links):
@@ -151,7 +153,7 @@ def test_the_choice_is_said_in_words() -> None:
         "Look next at zenith 10, azimuth 180; then at zenith 80, azimuth 180."
     )
     assert list(pb.design.next_views_table(found)) == ["now", "after 1", "after 2"]
-    with pytest.raises(pb.FitError, match="it names no views"):
+    with pytest.raises(pb.FitError, match="next_views: it has no variable"):
         pb.design.next_views_table(xr.Dataset())
 
 
@@ -168,8 +170,8 @@ def test_the_choice_is_said_in_words() -> None:
             "no parameter of the material has that name",
         ),
         ({"readings": {"q": None, "dop": pb.links.BetaLink()}}, "would count twice"),
-        ({"readings": ("dop",)}, "nothing says how dop scatters"),
-        ({"readings": {"q": pb.links.NormalLink()}}, "new readings of q scatter otherwise"),
+        ({"readings": ("dop",)}, "the noise of dop is not known"),
+        ({"readings": {"q": pb.links.NormalLink()}}, "new readings of q have another link"),
         ({"readings": ("color",)}, "there is no such reading"),
         ({"readings": ()}, "new views record nothing"),
         ({"result": xr.DataTree()}, "next_views: result: it holds no fit"),
@@ -181,11 +183,11 @@ def test_what_cannot_be_is_told(asked, match) -> None:
         on_a_line(**asked)
 
 
-def test_limits_of_a_rig_are_checked() -> None:
+def test_constraints_are_checked() -> None:
     with pytest.raises(pb.FitError, match=r"view_zenith is \(50, 20\)"):
-        pb.design.Rig(view_zenith=(50.0, 20.0))
+        pb.design.Constraints(view_zenith=(50.0, 20.0))
     with pytest.raises(pb.FitError, match="minimum_separation is -1"):
-        pb.design.Rig(minimum_separation=-1.0)
+        pb.design.Constraints(minimum_separation=-1.0)
 
 
 # --- a plate: physics, other readings, the draws of a fit -----------------------------------------
@@ -227,7 +229,7 @@ def test_another_reading_can_be_added_even_at_the_ends(plate: xr.Dataset) -> Non
         apart=("reading",),
         count=3,
         draws=4,
-        rig=pb.design.Rig(repeatable=True),
+        constraints=pb.design.Constraints(repeatable=True),
         **PLATE_ASKED,
     )
     assert set(found["reading"].to_numpy()) == {"intensity"}

@@ -8,8 +8,8 @@ from cases import each
 from design_lines import ASKED, NOISE, PRIOR, line, line_capture, precision_of, rows_of
 
 import polar_bayes as pb
-from polar_bayes.design.profile_curve import FAINT, interval, split_density
-from polar_bayes.design.setup import pose
+from polar_bayes.design.profile import PRIOR_WEIGHT, likelihood_interval, log_density_parts
+from polar_bayes.design.setup import make_design_problem
 
 ZENITHS = np.array([20.0, 40.0, 60.0, 70.0])
 
@@ -29,7 +29,7 @@ def closed_form(capture, theta, weight):
     return height - 0.5 * weight * (level**2 + theta**2) / PRIOR**2, level
 
 
-@each(("kind", "weight"), [("posterior", 1.0), ("likelihood", FAINT)])
+@each(("kind", "weight"), [("posterior", 1.0), ("likelihood", PRIOR_WEIGHT)])
 def test_the_profile_of_a_line_is_its_parabola(slope: xr.Dataset, kind: str, weight: float) -> None:
     theta = slope["value"].to_numpy()
     height, level = closed_form(line_capture(ZENITHS), theta, weight)
@@ -66,11 +66,11 @@ def test_a_grid_of_ones_own_keeps_its_values() -> None:
 
 @pytest.mark.thorough
 def test_what_is_known_beside_the_readings_is_of_the_likelihood() -> None:
-    question = pose(line_capture(ZENITHS), line, ASKED["scene"], None, None, None, 0)
+    problem = make_design_problem(line_capture(ZENITHS), line, ASKED["scene"], None, None, None, 0)
     z = jnp.array([0.3, -0.2])
-    bare = split_density(question.program, (), z, question.data)
-    told = split_density(question.program, ("level", "dark_level"), z, question.data)
-    level = question.program.unravel(z)["level"]
+    bare = log_density_parts(problem.program, (), z, problem.data)
+    told = log_density_parts(problem.program, ("level", "dark_level"), z, problem.data)
+    level = problem.program.unravel(z)["level"]
     known = -0.5 * (level / PRIOR) ** 2 - np.log(PRIOR * np.sqrt(2.0 * np.pi))
     np.testing.assert_allclose(told.likelihood - bare.likelihood, known, rtol=1e-5)
     np.testing.assert_allclose(sum(told), sum(bare), rtol=1e-5)
@@ -95,7 +95,7 @@ def test_a_gap_is_left_out_and_counted(slope: xr.Dataset) -> None:
     ],
 )
 def test_where_a_profile_has_fallen(value, expected) -> None:
-    found = interval(np.arange(float(len(value))), np.asarray(value))
+    found = likelihood_interval(np.arange(float(len(value))), np.asarray(value))
     np.testing.assert_allclose(found[:2], expected[:2], atol=1e-9)
     assert found[2:] == expected[2:]
 
@@ -108,5 +108,5 @@ def test_what_cannot_be_profiled_is_told() -> None:
         pb.profile(capture, "slope", model=line, points=2, **ASKED)
     with pytest.raises(pb.FitError, match="values of slope: nan is not inside its prior"):
         pb.profile(capture, "slope", model=line, values=[np.nan], **ASKED)
-    with pytest.raises(pb.FitError, match="it is no profile"):
+    with pytest.raises(pb.FitError, match="profile: it has no variable"):
         pb.design.profile_sentences(xr.Dataset())

@@ -162,7 +162,7 @@ def test_an_effect_costs_when_it_is_on_and_leaves_nothing_when_it_is_off(
 ) -> None:
     """Left out, an effect gives the plain scene; multiplied by zero, it would show here."""
     scene = ON[name]
-    off = {effect.place: effect for effect in effects_of(scene)}.values()
+    off = {effect.key_path: effect for effect in effects_of(scene)}.values()
     assert simplify(scene, off) == PLAIN
     assert operations(scene.predict, scene.parameters) > (1.0 + SAME) * plain
 

@@ -8,7 +8,8 @@ import xarray as xr
 from plates import LINKS, plate_capture
 
 import polar_bayes as pb
-from polar_bayes.effects.compare_scenes import compare, compile_density, coordinates, find_peak
+from polar_bayes.design.setup import label_coordinates
+from polar_bayes.effects.compare_scenes import Baseline, compile_density, fit_laplace
 from polar_bayes.inference.optimize import climb
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
@@ -36,7 +37,7 @@ def line() -> xr.Dataset:
 def test_in_a_linear_model_shift_and_width_are_exact(line: xr.Dataset) -> None:
     options = {"links": linear.LINKS, "model": linear.model}
     full = density_of(line, linear.SCENE, **options)
-    peak = find_peak(full, jax.random.key(0), no_progress)
+    peak = fit_laplace(full, jax.random.key(0), no_progress)
     mean, covariance = linear.posterior(line["q"].to_numpy(), full.labels)
     sd = np.sqrt(np.diagonal(covariance))
     np.testing.assert_allclose(peak.z, mean, atol=1e-5)
@@ -45,7 +46,7 @@ def test_in_a_linear_model_shift_and_width_are_exact(line: xr.Dataset) -> None:
     fewer = density_of(line, linear.SCENE.without(pb.instrument.AngleZero), **options)
     noise = full.noise_sd(peak.z)
     np.testing.assert_allclose(noise["q"], linear.NOISE)
-    change, _ = compare(peak, noise, fewer)
+    change, _ = Baseline(peak, noise, None).compare(fewer)
     less, narrower = linear.posterior(line["q"].to_numpy(), fewer.labels)
     here = [full.labels.index(label) for label in fewer.labels]
     np.testing.assert_allclose(change.shift[here], (less - mean[here]) / sd[here], atol=1e-4)
@@ -65,8 +66,8 @@ def test_on_a_plate_they_are_those_of_climbs_with_exact_gradients(
 ) -> None:
     scenes = (full, full.without(pb.instrument.Leakage))
     densities = [density_of(plate, scene) for scene in scenes]
-    peak = find_peak(densities[0], jax.random.key(1), no_progress)
-    change, other = compare(peak, densities[0].noise_sd(peak.z), densities[1])
+    peak = fit_laplace(densities[0], jax.random.key(1), no_progress)
+    change, other = Baseline(peak, densities[0].noise_sd(peak.z), None).compare(densities[1])
     ends = []
     for density, start in zip(densities, (peak.z, other.z), strict=True):
         exact = jax.jit(jax.value_and_grad(density.program.potential))
@@ -99,7 +100,9 @@ def test_labels_are_those_of_the_tables_of_a_fit() -> None:
     )
     request = request_of(capture, scene)
     data = observe(request.capture)
-    labels, sites = coordinates(compile_program(request.bind(scene), data), request.capture, data)
+    program = compile_program(request.bind(scene), data)
+    coordinates = label_coordinates(program, request.capture)
+    labels, sites = zip(*((each.label, each.site) for each in coordinates), strict=True)
     assert set(labels) == {
         "discrepancy_amplitude",
         *(f"discrepancy_weights[{number}]" for number in range(4)),

@@ -13,7 +13,7 @@ from hard_cases.catalogue import MATERIALS, WAVELENGTH, Material, every_case
 from polar_bayes.physics import fresnel
 from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
-from polar_bayes.physics.facets import FacetQuadrature
+from polar_bayes.physics.facets import FacetQuadrature, Microsurface
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.illumination import PointSource
 from polar_bayes.physics.instrument import STEEPEST_ZENITH, BeamOverlap, lean
@@ -24,7 +24,6 @@ from polar_bayes.physics.microfacet import (
     HeightCorrelatedShadowing,
     SeparableShadowing,
 )
-from polar_bayes.physics.microsurface import Microsurface
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Layer, Stack

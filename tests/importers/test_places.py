@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import polar_bayes as pb
 from polar_bayes.errors import CaptureError
-from polar_bayes.importers.camera_geometry import directions, mirrored
+from polar_bayes.importers.camera_geometry import local_geometry, mirror_direction
 from polar_bayes.importers.normals import NormalMap, as_shape, fit_sphere
 
 COMPONENT = st.floats(-1.0, 1.0)
@@ -30,8 +30,8 @@ def test_turning_the_camera_turns_nothing_but_its_own_axes(normal, view, light, 
     n, v, ray = (unit(vector) for vector in (normal, view, light))
     cos, sin = np.cos(turn), np.sin(turn)
     around = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    before = directions(n[None], v[None], ray[None])
-    after = directions((around @ n)[None], (around @ v)[None], (around @ ray)[None])
+    before = local_geometry(n[None], v[None], ray[None])
+    after = local_geometry((around @ n)[None], (around @ v)[None], (around @ ray)[None])
     for name in ("view_zenith", "light_zenith"):
         np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-6)
     clear = min(np.linalg.norm(np.cross(n, v)), np.linalg.norm(np.cross(n, ray))) > 1e-3
@@ -45,22 +45,22 @@ def test_turning_the_camera_turns_nothing_but_its_own_axes(normal, view, light, 
 
 def test_the_s_axis_stands_across_the_plane_of_normal_and_view():
     """A wall that leans to the right, seen from the front: s is up in the frame, at 90 degrees."""
-    found = directions(unit((0.5, 0.0, 0.8))[None], Z[None], unit((0.1, 0.2, 0.9))[None])
+    found = local_geometry(unit((0.5, 0.0, 0.8))[None], Z[None], unit((0.1, 0.2, 0.9))[None])
     assert found.cos_twice[0] == pytest.approx(-1.0)
-    leaning = directions(unit((0.0, 0.5, 0.8))[None], Z[None], unit((0.1, 0.2, 0.9))[None])
+    leaning = local_geometry(unit((0.0, 0.5, 0.8))[None], Z[None], unit((0.1, 0.2, 0.9))[None])
     assert leaning.cos_twice[0] == pytest.approx(1.0)  # up: s lies along x
-    diagonal = directions(unit((0.5, 0.5, 0.8))[None], Z[None], unit((0.1, 0.2, 0.9))[None])
+    diagonal = local_geometry(unit((0.5, 0.5, 0.8))[None], Z[None], unit((0.1, 0.2, 0.9))[None])
     assert diagonal.sin_twice[0] == pytest.approx(-1.0)  # up right: s at 135 degrees
 
 
 def test_azimuths_count_counterclockwise_around_the_normal_from_the_light():
     """Light to the right, camera up in the frame of the surface: 90 degrees further."""
     light, view = unit((1.0, 0.0, 1.0)), unit((0.0, 0.3, 1.0))
-    found = directions(Z[None], view[None], light[None])
+    found = local_geometry(Z[None], view[None], light[None])
     assert found.view_azimuth[0] == pytest.approx(90.0)
     assert found.light_azimuth[0] == 0.0
     assert found.light_zenith[0] == pytest.approx(45.0)
-    behind = directions(Z[None], unit((-0.3, 0.0, 1.0))[None], light[None])
+    behind = local_geometry(Z[None], unit((-0.3, 0.0, 1.0))[None], light[None])
     assert behind.view_azimuth[0] == pytest.approx(180.0)  # the mirror side
 
 
@@ -69,11 +69,11 @@ def test_azimuths_count_counterclockwise_around_the_normal_from_the_light():
 def test_straight_on_the_frame_is_that_of_the_light(light):
     """Continuous with a camera opposite to the light, and finite where both are on the normal."""
     ray = unit(light)
-    found = directions(Z[None], Z[None], ray[None])
+    found = local_geometry(Z[None], Z[None], ray[None])
     assert found.view_zenith[0] == 0.0
     if light[0]:
         near = unit(Z - 1e-4 * np.array([ray[0], ray[1], 0.0]))
-        close = directions(Z[None], near[None], ray[None])
+        close = local_geometry(Z[None], near[None], ray[None])
         np.testing.assert_allclose(found.cos_twice, close.cos_twice, atol=1e-3)
         np.testing.assert_allclose(found.sin_twice, close.sin_twice, atol=1e-3)
     assert np.isfinite([found.cos_twice, found.sin_twice, found.view_azimuth]).all()
@@ -82,7 +82,7 @@ def test_straight_on_the_frame_is_that_of_the_light(light):
 @pytest.mark.thorough
 def test_what_is_seen_edge_on_is_not_seen():
     """No zenith reaches 90 degrees, which captures refuse."""
-    found = directions(
+    found = local_geometry(
         np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1e-12], [0.0, 0.6, 0.8]]),
         np.broadcast_to(Z, (3, 3)),
         np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.8, -0.6]]),
@@ -95,7 +95,7 @@ def test_what_is_seen_edge_on_is_not_seen():
 
 def test_a_mirror_sends_light_from_where_it_says():
     normal, view = unit((0.2, 0.3, 0.9)), Z
-    vector = mirrored(normal, view)
+    vector = mirror_direction(normal, view)
     np.testing.assert_allclose(np.cross(unit(vector + view), normal), 0.0, atol=1e-12)
     assert np.linalg.norm(vector) == pytest.approx(1.0)
 

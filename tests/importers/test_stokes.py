@@ -47,7 +47,7 @@ def test_turning_axes_is_a_rotation(q, u, degrees, correlation, ratio):
     """Turned by chi, light along chi lies along the first axis; lengths and determinants stay."""
     before = image(q, u, 1.0, ratio**2, correlation * ratio)
     twice = np.deg2rad(2.0 * degrees)
-    after = before.turned(np.cos(twice), np.sin(twice))
+    after = before.rotated(np.cos(twice), np.sin(twice))
     turn = np.array([[np.cos(twice), np.sin(twice)], [-np.sin(twice), np.cos(twice)]])
     matrix = np.array([[1.0, correlation * ratio], [correlation * ratio, ratio**2]])
     wanted = turn @ matrix @ turn.T
@@ -62,9 +62,9 @@ def test_turning_axes_is_a_rotation(q, u, degrees, correlation, ratio):
 @pytest.mark.thorough
 def test_light_along_an_angle_is_q_in_axes_turned_by_it():
     along = image(np.cos(np.deg2rad(60.0)), np.sin(np.deg2rad(60.0)), 1.0, 1.0, 0.0)  # at 30
-    turned = along.turned(np.cos(np.deg2rad(60.0)), np.sin(np.deg2rad(60.0)))
-    assert turned.q[0, 0] == pytest.approx(1.0)
-    assert turned.u[0, 0] == pytest.approx(0.0, abs=1e-12)
+    rotated = along.rotated(np.cos(np.deg2rad(60.0)), np.sin(np.deg2rad(60.0)))
+    assert rotated.q[0, 0] == pytest.approx(1.0)
+    assert rotated.u[0, 0] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_covariance_is_that_of_many_drawn_readings():

@@ -82,7 +82,7 @@ OF_CALIBRATIONS = (
 )
 OF_STUDIES = (
     pb.benchmark.accuracy_table,
-    pb.benchmark.accuracy_advice,
+    pb.benchmark.accuracy_sentences,
     lambda tree: pb.show(tree)._repr_html_(),
 )
 
@@ -232,7 +232,7 @@ def test_a_study_of_nothing_is_refused(dim):
     study = make_accuracy()
     study["accuracy"] = xr.DataTree(study["accuracy"].to_dataset().isel({dim: slice(0)}))
     with pytest.raises(pb.FitError, match="accuracy: it is empty"):
-        pb.benchmark.accuracy_advice(study)
+        pb.benchmark.accuracy_sentences(study)
 
 
 @each("number", [1596, 2340, 2419])

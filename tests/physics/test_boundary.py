@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polar_bayes.physics import boundary, fresnel
-from polar_bayes.physics.boundary import Film, Medium
-from polar_bayes.physics.diattenuation import Diattenuation
+from polar_bayes.physics.boundary import Diattenuation, Film, Medium
 from polar_bayes.physics.geometry import cos_degrees, sin_degrees
 
 RUN = settings(deadline=None, max_examples=60, derandomize=True)

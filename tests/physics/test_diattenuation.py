@@ -8,7 +8,7 @@ from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polar_bayes.physics.diattenuation import Diattenuation
+from polar_bayes.physics.boundary import Diattenuation
 
 RUN = settings(deadline=None, max_examples=80, derandomize=True)
 share = st.floats(-0.45, 0.45)

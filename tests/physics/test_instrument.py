@@ -7,7 +7,6 @@ import pytest
 from cases import each
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.instrument import (
     AbstractInstrumentTerm,
@@ -16,6 +15,7 @@ from polar_bayes.physics.instrument import (
     BeamOverlap,
     ChannelGain,
     DarkLevel,
+    Discrepancy,
     DolpGain,
     Instrument,
     Leakage,

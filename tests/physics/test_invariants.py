@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polar_bayes.physics.coat import AbstractCoat, ClearCoat, CoatStack, ThinFilm
-from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
@@ -21,6 +20,7 @@ from polar_bayes.physics.instrument import (
     BeamOverlap,
     ChannelGain,
     DarkLevel,
+    Discrepancy,
     DolpGain,
     Instrument,
     Leakage,

@@ -7,7 +7,7 @@ import pytest
 import vector_optics as twin
 from cases import each
 
-from polar_bayes.physics.facets import FacetQuadrature, seen
+from polar_bayes.physics.facets import FacetQuadrature, Microsurface, seen
 from polar_bayes.physics.geometry import Geometry, mirror_facet
 from polar_bayes.physics.microfacet import (
     GGX,
@@ -16,7 +16,6 @@ from polar_bayes.physics.microfacet import (
     IsotropicSlopes,
     SeparableShadowing,
 )
-from polar_bayes.physics.microsurface import Microsurface
 
 DISTRIBUTIONS = {"Beckmann": Beckmann(), "GGX": GGX()}
 named = each("name", DISTRIBUTIONS)

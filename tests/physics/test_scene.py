@@ -10,7 +10,6 @@ from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
-from polar_bayes.physics.discrepancy import Discrepancy
 from polar_bayes.physics.dispersion import Cauchy
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
@@ -20,6 +19,7 @@ from polar_bayes.physics.instrument import (
     AngleZero,
     BeamOverlap,
     DarkLevel,
+    Discrepancy,
     DolpGain,
     Instrument,
 )

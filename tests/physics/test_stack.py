@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from polar_bayes.physics import fresnel
-from polar_bayes.physics.diattenuation import Diattenuation
+from polar_bayes.physics.boundary import Diattenuation
 from polar_bayes.physics.geometry import cos_degrees, sin_degrees
 from polar_bayes.physics.stack import Layer, Stack
 

@@ -1,0 +1,174 @@
+"""Optimal design: criteria of an expected covariance, and Fedorov's exchange algorithm.
+
+Sources: Atkinson, Donev & Tobias (2007), Optimum Experimental Designs, chapters 10 and 12; Fedorov
+(1972), Theory of Optimal Experiments, chapter 3.
+"""
+
+import abc
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, override
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from polar_bayes.errors import FitError
+
+MIN_VARIANCE = 1e-14
+"""Variances below it, in squared prior sds, are rounding: one parameter follows from others."""
+
+MIN_GAIN = 1e-9
+"""Smallest relative gain for which an exchange is made: smaller ones are rounding."""
+
+# --- Criteria -------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class AbstractCriterion(abc.ABC):
+    """One number for an expected covariance: the smaller, the better."""
+
+    @abc.abstractmethod
+    def loss(
+        self, covariance: Float[np.ndarray, "... parameter parameter"], parameters: Sequence[str]
+    ) -> Float[np.ndarray, "..."]:
+        """The number that a choice of views makes small.
+
+        Args:
+            covariance: Expected covariance of the material's parameters, in their prior sds.
+            parameters: Their labels, such as `refractive_index[550]`.
+
+        Returns:
+            One number for each matrix.
+
+        Raises:
+            FitError: The criterion asks for a parameter that is not there.
+        """
+
+
+@dataclasses.dataclass(frozen=True)
+class DOptimal(AbstractCriterion):
+    r"""The volume of the joint credible region: $\tfrac12 \log\det$ of the covariance.
+
+    It does not depend on units, and counts what parameters share.
+
+    Source:
+        Atkinson, Donev & Tobias (2007), Optimum Experimental Designs, chapter 10.
+    """
+
+    @override
+    def loss(
+        self, covariance: Float[np.ndarray, "... parameter parameter"], parameters: Sequence[str]
+    ) -> Float[np.ndarray, "..."]:
+        values = np.linalg.eigvalsh(covariance)
+        return 0.5 * np.sum(np.log(np.maximum(values, MIN_VARIANCE)), axis=-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class AOptimal(AbstractCriterion):
+    """The sum of the variances of all parameters, each in squared prior sds.
+
+    Source:
+        Atkinson, Donev & Tobias (2007), Optimum Experimental Designs, chapter 10.
+    """
+
+    @override
+    def loss(
+        self, covariance: Float[np.ndarray, "... parameter parameter"], parameters: Sequence[str]
+    ) -> Float[np.ndarray, "..."]:
+        return np.trace(covariance, axis1=-2, axis2=-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class SingleParameter(AbstractCriterion):
+    """The variance of one parameter, in squared prior sds; all others are nuisance.
+
+    Args:
+        name: Such as "refractive_index" (summed over wavelengths or patches where it has several
+            values), or one of them, "refractive_index[550]".
+    """
+
+    name: str
+
+    @override
+    def loss(
+        self, covariance: Float[np.ndarray, "... parameter parameter"], parameters: Sequence[str]
+    ) -> Float[np.ndarray, "..."]:
+        rows = [
+            i for i, label in enumerate(parameters) if self.name in (label, label.split("[")[0])
+        ]
+        if not rows:
+            raise FitError(
+                "no parameter of the material has that name",
+                where=f"SingleParameter({self.name!r})",
+                hint=f"give one of {', '.join(parameters)}",
+            )
+        return np.sum(np.diagonal(covariance, axis1=-2, axis2=-1)[..., rows], axis=-1)
+
+
+# --- Fedorov's exchange algorithm -----------------------------------------------------------------
+
+
+Loss = Callable[[Float[np.ndarray, "draw option size size"]], Float[np.ndarray, " option"]]
+
+
+class Selection(NamedTuple):
+    """Candidates in the order in which each lowers the loss most, and the losses from none on."""
+
+    picks: list[int]
+    losses: list[float]
+    exchanges: int
+
+
+def fedorov_exchange(
+    loss: Loss,
+    base: Float[np.ndarray, "draw size size"],
+    each: Float[np.ndarray, "draw candidate size size"],
+    allowed: Bool[np.ndarray, " candidate"],
+    conflicts: Bool[np.ndarray, "candidate candidate"],
+    count: int,
+) -> Selection:
+    """Select candidates whose summed information has a small loss: greedily, then by exchange."""
+
+    def best_addition(picks: list[int]) -> tuple[int, float]:
+        free = np.flatnonzero(allowed & ~conflicts[picks].any(axis=0))
+        if free.size == 0:
+            return -1, np.inf
+        known = base + each[:, picks].sum(axis=1)
+        losses = loss(known[:, None] + each[:, free])
+        at = int(np.argmin(losses))
+        return int(free[at]), float(losses[at])
+
+    picks: list[int] = []
+    for number in range(count):
+        pick, reached = best_addition(picks)
+        if pick < 0:
+            raise FitError(
+                f"only {number} of {len(allowed)} candidates can be taken together",
+                where="next_views",
+                hint="ask for fewer, or give more candidates or wider constraints",
+            )
+        picks.append(pick)
+    exchanges, before = 0, -1
+    while exchanges > before:  # each exchange lowers the loss, so this ends
+        before = exchanges
+        for at in range(count):
+            pick, lower = best_addition(picks[:at] + picks[at + 1 :])
+            if lower < reached - MIN_GAIN * max(1.0, abs(reached)):
+                picks[at], reached, exchanges = pick, lower, exchanges + 1
+    ordered, losses = _ordered(loss, base, each, picks)
+    return Selection(ordered, losses, exchanges)
+
+
+def _ordered(
+    loss: Loss, base: np.ndarray, each: np.ndarray, picks: list[int]
+) -> tuple[list[int], list[float]]:
+    """The same candidates in greedy order, and the loss before the first and after each."""
+    remaining, ordered, known = list(picks), [], base
+    losses = [float(loss(known[:, None])[0])]
+    while remaining:
+        options = loss(known[:, None] + each[:, remaining])
+        at = int(np.argmin(options))
+        losses.append(float(options[at]))
+        ordered.append(remaining.pop(at))
+        known = known + each[:, ordered[-1]]
+    return ordered, losses
