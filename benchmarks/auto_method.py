@@ -21,7 +21,7 @@ from accuracy_scenes import CASES, Case
 import polar_bayes as pb
 from polar_bayes.benchmark.reference import distances, run_reference
 from polar_bayes.benchmark.run import labeled, problem_of
-from polar_bayes.calibration.simulations import draw_numbered
+from polar_bayes.calibration.simulations import draw_captures
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.run_method import answer
@@ -38,7 +38,7 @@ def fit_some(case: Case, numbers: np.ndarray, auto: pb.methods.Auto) -> list[dic
     request = resolve(layout, "per_material", auto, case.scene, None, case.links, None, 0, "double")
     key = jax.random.key(7)
     base = problem_of(request, key)
-    drawn = draw_numbered(base.program, base.data, np.resize(numbers, CHUNK), key)
+    drawn = draw_captures(base.program, base.data, np.resize(numbers, CHUNK), key)
     found = []
     for at, number in enumerate(numbers):
         data = drawn.captures.pixel(at)

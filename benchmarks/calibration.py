@@ -49,7 +49,7 @@ def by_loop(capture: xr.Dataset, count: int) -> Iterator[tuple[float, float]]:
         data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
         model = request.bind(SCENE)
         program = compile_program(model, data)
-        drawn = draw_captures(program, data, count, jax.random.key(1))
+        drawn = draw_captures(program, data, np.arange(count), jax.random.key(1))
         chain = MCMC(NUTS(model), progress_bar=False, **LENGTHS)
         for number in range(-1, count):  # the first compiles
             start = time.perf_counter()

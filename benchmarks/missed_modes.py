@@ -17,7 +17,7 @@ import numpy as np
 from one_material import SCENE, layout
 
 import polar_bayes as pb
-from polar_bayes.calibration.calibrate import planned
+from polar_bayes.calibration.calibrate import make_plan
 from polar_bayes.calibration.runner import Plan, fit_block
 from polar_bayes.inference.request import resolve
 
@@ -27,7 +27,7 @@ LARGE = pb.methods.PixelTempering(walks=4096, draws=16384)
 def large(seed: int) -> Plan:
     """The same simulations, fitted by the larger crowd."""
     request = resolve(layout(), "per_material", "laplace", SCENE, None, None, None, seed, "double")
-    return planned(request, None, LARGE, readings=False)
+    return make_plan(request, None, LARGE, readings=False)
 
 
 def main(count: int, keep: Path, name: str, share: float, seed: int, only: list[int]) -> None:

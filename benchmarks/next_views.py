@@ -161,7 +161,7 @@ def main(count: int) -> None:
         data = observe(request.capture)
         key = key_of(request, 32, request.largest_view_zenith)
         engine = make_engine(EngineSpec(request, lambda: data, 32, key))
-        drawn = draw_captures(engine.program, data, count, jax.random.key(1))
+        drawn = draw_captures(engine.program, data, np.arange(count), jax.random.key(1))
         before = np.arange(views) < len(MEASURED)
         first = fit_some(engine, drawn.captures, np.tile(before, (count, 1)))
         designer = Designer(engine, data)

@@ -25,7 +25,11 @@ from plates import LINKS, PLATE, plates
 
 import polar_bayes as pb
 from polar_bayes.inference.group_model import find_groups
-from polar_bayes.inference.hierarchical_reparam import Anchored, Anchors, Transport
+from polar_bayes.inference.hierarchical_reparam import (
+    ExpansionPoint,
+    HierarchicalReparam,
+    ReparamInputs,
+)
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import provenance_of
@@ -102,9 +106,9 @@ def gradient() -> None:
             program = compile_program(request.bind(request.scene), data)
             groups = find_groups(program, data)
             assert groups is not None
-            transport = Transport(program, groups)
+            transport = HierarchicalReparam(program, groups)
             local, common = groups.local.shape, groups.common.size
-            anchors = Anchors(
+            point = ExpansionPoint(
                 jnp.zeros(common),
                 jnp.eye(common),
                 jnp.zeros(local),
@@ -112,7 +116,7 @@ def gradient() -> None:
                 jnp.broadcast_to(jnp.eye(local[1]), (*local, local[1])),
                 jnp.zeros((*local, common)),
             )
-            given, w = Anchored(anchors, data), jnp.zeros(program.size)
+            given, w = ReparamInputs(point, data), jnp.zeros(program.size)
             both = jax.jit(jax.value_and_grad(transport.potential))
             jax.block_until_ready(both(w, given))
             times = []

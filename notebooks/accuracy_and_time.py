@@ -48,7 +48,7 @@ study = pb.accuracy(
     capture,
     scene=plate,
     links=links,
-    methods={name: pb.methods.LADDER[name] for name in names},
+    rungs={name: pb.methods.LADDER[name] for name in names},
     overrides=(),
     fresh=False,
     reference=pb.benchmark.Reference(error=0.03),
@@ -73,7 +73,7 @@ pb.plots.plot_accuracy(study)
 # The same as a sentence:
 
 # %%
-print("\n".join(pb.benchmark.accuracy_sentences(study)))
+print(pb.benchmark.accuracy_sentences(study))
 
 # %% [markdown]
 # That is said of this capture. With more readings a posterior comes closer to a normal

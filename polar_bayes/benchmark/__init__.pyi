@@ -4,13 +4,13 @@ from .accuracy import (
     load_accuracy as load_accuracy,
 )
 from .advice import (
-    accuracy_advice as accuracy_advice,
+    accuracy_sentences as accuracy_sentences,
     accuracy_table as accuracy_table,
 )
 from .reference import Reference as Reference
 from .run import (
-    DrawsDial as DrawsDial,
-    EffectsDial as EffectsDial,
-    FacetsDial as FacetsDial,
-    PrecisionDial as PrecisionDial,
+    DrawsOverride as DrawsOverride,
+    EffectsOverride as EffectsOverride,
+    FacetsOverride as FacetsOverride,
+    PrecisionOverride as PrecisionOverride,
 )

@@ -28,7 +28,7 @@ from polar_bayes.benchmark.run import (
     run_trial,
 )
 from polar_bayes.errors import FitError, PolarBayesError
-from polar_bayes.inference.files import ACCURACY, OF_ALL, Schema, holds, load_tree
+from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, Schema, holds, load_tree
 from polar_bayes.inference.methods import LADDER
 from polar_bayes.inference.request import Method, Request, resolve
 from polar_bayes.inference.result import PROVENANCE
@@ -254,8 +254,8 @@ STUDY = Schema(
     kind="accuracy study",
     made_by="polar_bayes.accuracy or load_accuracy",
     command="`polar-bayes accuracy`",
-    groups={"accuracy": dataclasses.replace(ACCURACY, needed=True)},
-    provenance=OF_ALL,
+    groups={"accuracy": dataclasses.replace(ACCURACY, required=True)},
+    provenance=COMMON_PROVENANCE,
 )
 
 

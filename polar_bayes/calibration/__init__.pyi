@@ -3,7 +3,6 @@ from .files import (
     holds_calibration as holds_calibration,
     load_calibration as load_calibration,
 )
-from .predictive import calibration_readings as calibration_readings
 from .replicates import (
     proxy_coverage as proxy_coverage,
     proxy_scores as proxy_scores,
@@ -11,6 +10,7 @@ from .replicates import (
 )
 from .scores import is_calibrated as is_calibrated
 from .verdict import (
+    calibration_readings as calibration_readings,
     calibration_table as calibration_table,
     calibration_verdict as calibration_verdict,
     compare_calibrations as compare_calibrations,

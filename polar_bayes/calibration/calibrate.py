@@ -1,4 +1,4 @@
-"""The public verb: draw from the prior, simulate, fit again, and see where the truth stands."""
+"""Simulation-based calibration (Talts et al. 2018): draw from the prior, simulate, fit, rank."""
 
 import contextlib
 import json
@@ -28,7 +28,7 @@ from polar_bayes.inference.batch_nuts import PixelNuts
 from polar_bayes.inference.batch_programs import key_of
 from polar_bayes.inference.batch_result import Approach, Status
 from polar_bayes.inference.nuts import Nuts
-from polar_bayes.inference.program import Program, Values
+from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LARGEST_TRUSTED, LEVELS
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE, dims_of, shape_of
@@ -43,103 +43,13 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior
 from polar_bayes.progress import Counter, no_progress, with_counter
 
-# --- A finished calibration as a tree: labels come back here --------------------------------------
-
-
-def assemble(
-    program: Program,
-    request: Request,
-    data: Observations,
-    found: Block,
-    about: Mapping[str, Any],
-) -> xr.DataTree:
-    """Put a calibration into one tree."""
-    dims = dims_of(program)
-    lengths = dict(data.dims)
-    captured = request.capture
-    axes = {
-        dim: captured[dim].to_numpy() if dim in captured.coords else np.arange(lengths[dim])
-        for name in found.truth
-        for dim in dims[name]
-        if dim in lengths
-    }
-    axes["simulation"] = found.numbers
-
-    def labeled(values: Values, ending: str = "") -> dict[str, xr.DataArray]:
-        first = ("quantile",) if ending == "_quantile" else ()
-        return {
-            f"{name}{ending}": xr.DataArray(
-                np.reshape(x, (*np.shape(x)[: len(first) + 1], *shape_of(program, name))),
-                dims=(*first, "simulation", *dims[name]),
-                attrs={"symbol": notation(name)[0], "units": notation(name)[2]},
-            )
-            for name, x in values.items()
-        }
-
-    flags = {"status": Status, "approach": Approach}
-    fits = {
-        name: (
-            "simulation",
-            x,
-            {"flag_meanings": " ".join(each.name.lower() for each in flags[name])}
-            if name in flags
-            else {},
-        )
-        for name, x in found.outcome._asdict().items()
-    }
-    quantiles = {name: np.moveaxis(x, 1, 0) for name, x in found.quantiles.items()}
-    whole = {
-        **labeled(found.mean),
-        **labeled(found.sd, "_sd"),
-        **labeled(quantiles, "_quantile"),
-        **labeled(found.crps, "_crps"),
-    }
-    simulation = {"simulation": found.numbers}
-    groups = {
-        "prior_sbc": xr.Dataset(labeled(found.pit), axes),
-        "truth": xr.Dataset(labeled(found.truth), axes),
-        "marginals": xr.Dataset(whole, {**axes, "quantile": list(LEVELS)}),
-        "fits": xr.Dataset(fits, simulation),
-    }
-    if found.place:
-        groups["predictive_pit"] = xr.Dataset(_of_readings(found.fresh), simulation)
-        groups["loo_pit"] = xr.Dataset(_of_readings(found.left_out), simulation)
-        groups["readings"] = xr.Dataset(_chosen(found, data), simulation)
-    tree = xr.DataTree.from_dict(groups)
-    tree.attrs[PROVENANCE] = json.dumps(about, sort_keys=True)
-    return tree
-
-
-def _of_readings(values: Values) -> dict[str, tuple]:
-    return {
-        name: ("simulation", x, {"symbol": notation(name)[0], "units": "1"})
-        for name, x in values.items()
-    }
-
-
-def _chosen(found: Block, data: Observations) -> dict[str, tuple]:
-    """Which entries were looked at, and how far leaving them out can be trusted."""
-    said = f"Pareto k of the weights without it; above {LARGEST_TRUSTED} they say little"
-    chosen: dict[str, tuple] = {}
-    for name, place in found.place.items():
-        chosen[f"{name}_pareto_k"] = ("simulation", found.left_out_k[name], {"long_name": said})
-        index = np.unravel_index(np.maximum(place, 0), data.shape)
-        for (dim, _), at in zip(data.dims, index, strict=True):
-            words = {"long_name": f"number of its {dim}, -1 where none is valid"}
-            chosen[f"{name}_{dim}"] = ("simulation", np.where(place < 0, -1, at), words)
-    return chosen
-
-
-# --- The public verb: draw from the prior, simulate, fit again, and see where the truth stands ----
-
-
 METHODS: dict[str, Method] = {
     "laplace": PixelLaplace(weighted=False),
     "importance": PixelLaplace(draws=512),
     "tempered": PixelTempering(),
     "nuts": PixelNuts(start=PixelTempering()),
 }
-FEWEST = 20
+MIN_SIMULATIONS = 20
 
 
 @with_counter("fits")
@@ -161,37 +71,37 @@ def calibrate(
     scheduler: str | None = None,
     progress: Counter | None = None,
 ) -> xr.DataTree:
-    """Simulation-based calibration: do the intervals of this fit hold?
+    """Simulation-based calibration: do the intervals of this fit have their nominal coverage?
 
     Parameters are drawn from the prior and captures from the likelihood, each is fitted, and the
     truth is ranked among the draws. Where model, prior and sampler are right the ranks are uniform
-    and intervals hold as often as they say.
+    and intervals have their nominal coverage.
 
     Args:
         capture: Only its layout is used: directions, wavelengths, which variables were read, stated
             errors and masks.
         simulations: How many, at least 20.
         model: As for `polar_bayes.fit`; scene, priors, links and largest_view_zenith too.
-        method: "tempered" (draws led from the prior to the posterior, which sees every mode: the
-            default for one material in one color), "nuts" (chains that begin at such draws), or
-            what begins at one mode: "importance" (the normal approximation, its draws weighed by
-            the posterior, corrected as in maps), "laplace" (the same unweighed). Where the capture
-            has patches, materials or wavelengths, or the scene a discrepancy, the default is
-            "nuts", and these chains are those of `polar_bayes.fit`. Or settings, those of
-            `polar_bayes.fit` (`Nuts`, `Laplace`) too.
+        method: "tempered" (sequential Monte Carlo from the prior to the posterior, which finds
+            every mode: the default for one material in one color), "nuts" (chains that start at
+            such draws), or a method that starts at one mode: "importance" (the normal
+            approximation, its draws weighted by the posterior, corrected as in maps), "laplace"
+            (the same unweighted). Where the capture has patches, materials or wavelengths, or the
+            scene a discrepancy, the default is "nuts", and these chains are those of
+            `polar_bayes.fit`. Or settings, those of `polar_bayes.fit` (`Nuts`, `Laplace`) too.
         scene: A name, a `Scene` or None.
         priors: Overrides.
         links: One link, a mapping or None.
         largest_view_zenith: Unit degree, or None for the set-up's own.
-        truth: Arguments (model, scene, priors, links) by which captures are simulated where they
-            differ from those that are fitted: a check that is broken on purpose.
-        seed: Of everything that is drawn.
-        readings: True ranks readings among what the fits predict, too: in every simulation one of
-            each recorded variable that is read afresh, and one that is left out of the fit.
-        store: A folder in which finished blocks of fits are kept, so that a calibration that was
-            broken off can go on; by default they are kept in memory alone. It stays.
-        resume: Go on with what is in the store: the same question, and as many simulations or
-            more, or fewer. The result is that of a calibration that was not broken off.
+        truth: Arguments (model, scene, priors, links) of the data-generating model where they
+            differ from those of the fitted model: a misspecification on purpose.
+        seed: Seed of all random numbers.
+        readings: True ranks readings among the predictions of the fits, too: in every simulation
+            one replicated reading of each recorded variable, and one that is left out of the fit.
+        store: A folder for finished blocks of fits, so that an interrupted calibration can be
+            resumed; by default they are in memory only. The folder is not deleted.
+        resume: Resume from the store: the same request, with any number of simulations. The result
+            is that of a calibration without interruption.
         scheduler: Address of a `dask.distributed` scheduler whose workers fit the blocks; by
             default threads of this process.
         progress: Called with the fits that are done, and all.
@@ -201,57 +111,62 @@ def calibrate(
         `arviz_plots.plot_ecdf_pit(tree, sample_dims=["simulation"])` shows), `truth`, `marginals`
         (mean, sd, quantiles and ranked score of every fit) and `fits` (status, approach, pareto_k,
         effective_draws, condition, steps). A fit that failed is NaN, and counted in `status`. Where
-        readings are ranked, `predictive_pit` (of fresh readings), `loo_pit` (of those left out)
-        and `readings` (which ones, and Pareto k) lie beside them; where they cannot be, the
-        attribute `polar_bayes` says why.
+        readings are ranked, there are also `predictive_pit` (of replicated readings), `loo_pit` (of
+        those left out) and `readings` (which ones, and Pareto k); where they cannot be, the
+        attribute `polar_bayes` states the reason.
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.
-        FitError: Something asked for cannot be used, the store is there already (or, to resume,
-            was begun with another question), or it cannot be written.
+        FitError: An argument cannot be used, the store exists already (or, to resume, belongs to
+            another request), or it cannot be written.
     """
     if resume and store is None:
         raise FitError(
             "there is no store to go on with", where="calibrate: resume", hint="give store="
         )
-    if simulations < FEWEST:
+    if simulations < MIN_SIMULATIONS:
         raise FitError(
-            f"simulations is {simulations}", where="calibrate", hint=f"give {FEWEST} or more"
+            f"simulations is {simulations}",
+            where="calibrate",
+            hint=f"give {MIN_SIMULATIONS} or more",
         )
-    asked = {"model": model, "scene": scene, "priors": priors, "links": links}
-    strange = set(truth or {}) - set(asked)
-    if strange:
+    arguments = {"model": model, "scene": scene, "priors": priors, "links": links}
+    unknown = set(truth or {}) - set(arguments)
+    if unknown:
         raise FitError(
-            f"{', '.join(sorted(strange))} cannot differ",
+            f"{', '.join(sorted(unknown))} cannot differ",
             where="calibrate: truth",
-            hint=f"give some of {', '.join(asked)}",
+            hint=f"give some of {', '.join(arguments)}",
         )
-    request, told = (
-        _resolved(capture, {**asked, **differing}, largest_view_zenith, seed)
-        for differing in ({}, truth or {})
-    )
+
+    def resolved(differing: Mapping[str, Any]) -> Request:
+        model, scene, priors, links = {**arguments, **differing}.values()
+        limit = largest_view_zenith
+        return resolve(capture, model, "laplace", scene, priors, links, limit, seed, "double")
+
+    request = resolved({})
     settings = _settings(method, request)
-    clock = time.perf_counter()
-    plan = planned(request, told if truth else None, settings, readings)
+    start = time.perf_counter()
+    plan = make_plan(request, resolved(truth) if truth else None, settings, readings)
     if not plan.shared:
         raise FitError(
-            "it has no parameter in common with what is fitted",
+            "the data-generating model and the fitted model share no parameter",
             where="calibrate: truth",
             hint="give models whose parameters have the same names and shapes",
         )
-    kept = None if store is None else Store(as_path(store, "store"), fingerprint_of(plan))
-    found = kept.begin(resume=resume) if kept is not None else []
-    missing = _missing(found, simulations)
-    show = progress or no_progress
-    with on_interrupt(kept.resume_hint) if kept is not None else contextlib.nullcontext():
-        found += _fit_all(plan, missing, simulations, kept, scheduler, show)
-    about = _provenance(request, settings, truth, simulations)
-    about["seconds"] = round(time.perf_counter() - clock, 3)
+    blocks = None if store is None else Store(as_path(store, "store"), fingerprint_of(plan))
+    done = blocks.begin(resume=resume) if blocks is not None else []
+    stored = np.concatenate([*(block.numbers for block in done), []])
+    missing = np.setdiff1d(np.arange(simulations), stored).astype(int)
+    with on_interrupt(blocks.resume_hint) if blocks is not None else contextlib.nullcontext():
+        done += _fit_all(plan, missing, simulations, blocks, scheduler, progress or no_progress)
+    provenance = _provenance(request, settings, truth, simulations)
+    provenance["seconds"] = round(time.perf_counter() - start, 3)
     if missing.size < simulations:
-        about["fits found in the store"] = simulations - missing.size
+        provenance["fits found in the store"] = simulations - missing.size
     if readings:
-        about["readings_told"] = plan.untold or "ranked"
-    return assemble(plan.program, request, plan.data, join(found, simulations), about)
+        provenance["readings_told"] = plan.unranked_reason or "ranked"
+    return _assemble(plan, join(done, simulations), request, provenance)
 
 
 def _settings(method: str | Method | None, request: Request) -> Method:
@@ -270,54 +185,38 @@ def _settings(method: str | Method | None, request: Request) -> Method:
     return METHODS[method]
 
 
-def _named(settings: Method) -> str:
-    names = (name for name, each in METHODS.items() if each == settings)
-    return next(names, type(settings).__name__)
-
-
-def _resolved(
-    capture: xr.Dataset, asked: Mapping[str, Any], limit: float | None, seed: int
-) -> Request:
-    model, scene, priors, links = (asked[name] for name in ("model", "scene", "priors", "links"))
-    return resolve(capture, model, "laplace", scene, priors, links, limit, seed, "double")
-
-
-def planned(request: Request, told: Request | None, settings: Method, readings: bool) -> Plan:
-    """What is done to every block."""
-    limit = request.largest_view_zenith
-    recipe_key = key_of(request, candidates_of(settings), limit)
-    told_key = "" if told is None else key_of(told)
-    key = tokenize(recipe_key, told_key, repr(settings), readings, tokenize(request.capture))
-    return Plan(request, told, settings, readings, recipe_key, key)
-
-
-def _missing(found: list[Block], simulations: int) -> np.ndarray:
-    """Numbers of the simulations that are still to be fitted."""
-    there = [block.numbers for block in found]
-    return np.setdiff1d(np.arange(simulations), np.concatenate([*there, []])).astype(int)
+def make_plan(
+    request: Request, generative_request: Request | None, settings: Method, readings: bool
+) -> Plan:
+    """What is done to every block; without a generative request, the fitted model simulates."""
+    spec_key = key_of(request, candidates_of(settings), request.largest_view_zenith)
+    generative_key = "" if generative_request is None else key_of(generative_request)
+    capture_key = tokenize(request.capture)
+    key = tokenize(spec_key, generative_key, repr(settings), readings, capture_key)
+    return Plan(request, generative_request, settings, readings, spec_key, key)
 
 
 def _fit_all(
     plan: Plan,
     missing: np.ndarray,
-    every: int,
-    kept: Store | None,
+    total: int,
+    store: Store | None,
     scheduler: str | None,
     progress: Counter,
 ) -> list[Block]:
-    """Blocks of fits on threads or workers; who fits what changes nothing."""
+    """Fit blocks on threads or workers; the result does not depend on which of them fits what."""
     found: list[Block] = []
     if not missing.size:
         return found
-    done = every - missing.size
+    done = total - missing.size
     with workers(scheduler) as (executor, count):
         tasks = ((plan, numbers) for numbers in cut(missing, plan.block))
         for _, block in as_completed(executor, count, fit_block, tasks):
-            if kept is not None:
-                kept.add(block)
+            if store is not None:
+                store.add(block)
             found.append(block)
             done += len(block.numbers)
-            progress(done, every)
+            progress(done, total)
     return found
 
 
@@ -327,10 +226,11 @@ def _provenance(
     truth: Mapping[str, Any] | None,
     simulations: int,
 ) -> dict[str, Any]:
+    names = (name for name, each in METHODS.items() if each == settings)
     return {
         "calibration": simulations,
         "model": request.model_name,
-        "method": _named(settings),
+        "method": next(names, type(settings).__name__),
         "settings": repr(settings),
         "scene": request.scene_name,
         "scene_parts": repr(request.scene),
@@ -340,3 +240,80 @@ def _provenance(
         "seed": request.seed,
         "capture": str(request.capture.attrs.get("name", "capture")),
     }
+
+
+# --- The finished calibration as a tree -----------------------------------------------------------
+
+
+def _assemble(
+    plan: Plan, simulated: Block, request: Request, provenance: Mapping[str, Any]
+) -> xr.DataTree:
+    """Put labels on the arrays of all simulations."""
+    program, data, captured = plan.program, plan.data, request.capture
+    dims, lengths = dims_of(program), dict(plan.data.dims)
+    axes = {
+        dim: captured[dim].to_numpy() if dim in captured.coords else np.arange(lengths[dim])
+        for name in simulated.truth
+        for dim in dims[name]
+        if dim in lengths
+    }
+    axes["simulation"] = simulated.numbers
+
+    def labeled(values: Values, suffix: str = "") -> dict[str, xr.DataArray]:
+        first = ("quantile",) if suffix == "_quantile" else ()
+        return {
+            f"{name}{suffix}": xr.DataArray(
+                np.reshape(x, (*np.shape(x)[: len(first) + 1], *shape_of(program, name))),
+                dims=(*first, "simulation", *dims[name]),
+                attrs={"symbol": notation(name)[0], "units": notation(name)[2]},
+            )
+            for name, x in values.items()
+        }
+
+    def pit_of_readings(values: Values) -> dict[str, tuple]:
+        return {
+            name: ("simulation", x, {"symbol": notation(name)[0], "units": "1"})
+            for name, x in values.items()
+        }
+
+    fits: dict[str, tuple] = {
+        name: ("simulation", x) for name, x in simulated.outcome._asdict().items()
+    }
+    for name, flags in {"status": Status, "approach": Approach}.items():
+        meanings = " ".join(flag.name.lower() for flag in flags)
+        fits[name] = (*fits[name], {"flag_meanings": meanings})
+    quantiles = {name: np.moveaxis(x, 1, 0) for name, x in simulated.quantiles.items()}
+    marginals = {
+        **labeled(simulated.mean),
+        **labeled(simulated.sd, "_sd"),
+        **labeled(quantiles, "_quantile"),
+        **labeled(simulated.crps, "_crps"),
+    }
+    simulation = {"simulation": simulated.numbers}
+    groups = {
+        "prior_sbc": xr.Dataset(labeled(simulated.pit), axes),
+        "truth": xr.Dataset(labeled(simulated.truth), axes),
+        "marginals": xr.Dataset(marginals, {**axes, "quantile": list(LEVELS)}),
+        "fits": xr.Dataset(fits, simulation),
+    }
+    if simulated.entry:
+        groups["predictive_pit"] = xr.Dataset(pit_of_readings(simulated.fresh), simulation)
+        groups["loo_pit"] = xr.Dataset(pit_of_readings(simulated.left_out), simulation)
+        groups["readings"] = xr.Dataset(_chosen_readings(simulated, data), simulation)
+    tree = xr.DataTree.from_dict(groups)
+    tree.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
+    return tree
+
+
+def _chosen_readings(simulated: Block, data: Observations) -> dict[str, tuple]:
+    """Axes of the readings that were ranked, and Pareto k of leaving them out."""
+    k_name = f"Pareto k of the weights without it; above {LARGEST_TRUSTED} they say little"
+    chosen: dict[str, tuple] = {}
+    for name, entry in simulated.entry.items():
+        k = simulated.left_out_k[name]
+        chosen[f"{name}_pareto_k"] = ("simulation", k, {"long_name": k_name})
+        index = np.unravel_index(np.maximum(entry, 0), data.shape)
+        for (dim, _), at in zip(data.dims, index, strict=True):
+            attributes = {"long_name": f"number of its {dim}, -1 where none is valid"}
+            chosen[f"{name}_{dim}"] = ("simulation", np.where(entry < 0, -1, at), attributes)
+    return chosen

@@ -7,9 +7,9 @@ import xarray as xr
 from polar_bayes.errors import FitError
 from polar_bayes.inference.files import (
     ANY,
+    COMMON_PROVENANCE,
     EACH,
     FLAGS,
-    OF_ALL,
     TEXT,
     Group,
     Like,
@@ -20,43 +20,45 @@ from polar_bayes.inference.files import (
 from polar_bayes.inference.psis import LEVELS
 
 _SIMULATION = ("simulation",)
-_RANKS = Group(_SIMULATION, others=False)
+_RANKS = Group(_SIMULATION, extra_dims=False)
 
 CALIBRATION = Schema(
     kind="calibration",
     made_by="polar_bayes.calibrate or load_calibration",
     command="`polar-bayes calibrate`",
     groups={
-        "prior_sbc": Group(_SIMULATION, needed=True),
-        "truth": Group(_SIMULATION, needed=True, like=Like("prior_sbc", {"": ()}, needed=True)),
+        "prior_sbc": Group(_SIMULATION, required=True),
+        "truth": Group(_SIMULATION, required=True, like=Like("prior_sbc", {"": ()}, required=True)),
         "marginals": Group(
             _SIMULATION,
-            needed=True,
+            required=True,
             variables={"quantile": ("quantile",)},
             like=Like(
                 "prior_sbc",
                 {"": (), "_sd": (), "_crps": (), "_quantile": ("quantile",)},
-                needed=True,
+                required=True,
             ),
         ),
         "fits": Group(
-            needed=True,
+            required=True,
             variables={"status": _SIMULATION},
             kinds={"status": FLAGS, "approach": FLAGS},
             names=("status", "approach", "effective_draws", "pareto_k"),
             dims=_SIMULATION,
-            others=False,
-            marks={"flag_meanings?": TEXT},
+            extra_dims=False,
+            variable_attributes={"flag_meanings?": TEXT},
         ),
         "predictive_pit": _RANKS,
         "loo_pit": Group(
-            _SIMULATION, others=False, like=Like("predictive_pit", {"": ()}, needed=True)
+            _SIMULATION, extra_dims=False, like=Like("predictive_pit", {"": ()}, required=True)
         ),
         "readings": Group(
-            _SIMULATION, others=False, like=Like("predictive_pit", {"_pareto_k": ()}, needed=True)
+            _SIMULATION,
+            extra_dims=False,
+            like=Like("predictive_pit", {"_pareto_k": ()}, required=True),
         ),
     },
-    provenance={**OF_ALL, "truth?": {EACH: ANY}, "readings_told?": TEXT},
+    provenance={**COMMON_PROVENANCE, "truth?": {EACH: ANY}, "readings_told?": TEXT},
 )
 
 

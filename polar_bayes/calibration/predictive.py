@@ -1,85 +1,71 @@
-"""Where readings stand in what the fits predict: a fresh one, and one that is left out.
+"""Predictive checks of a calibration: PIT of a replicated reading and of one that is left out.
 
-In every simulation one entry of each recorded variable is chosen at random among the valid ones:
-one, so that simulations stay independent of each other and the test of uniformity holds as it
-does for parameters. Readings of one capture share its posterior, and all of them together would
-not be uniform although each is.
+In every simulation one entry of each recorded variable is chosen at random among the valid ones.
+With one entry, simulations are independent of each other, which the test of uniformity needs;
+readings of one capture share its posterior.
+
+A replicated reading of the same truth, and the posterior's predictions of it, are exchangeable
+where model, prior and posterior are right. So are a reading that was fitted and what the posterior
+without it predicts: draws of the whole posterior, each weighted by one over the likelihood of that
+reading, the weights Pareto-smoothed.
+
+Source: Gelman et al. (2013), Bayesian Data Analysis, 3rd ed., section 6.3 (PIT of replicated
+readings and of those left out); Vehtari, Gelman & Gabry (2017), Stat. Comput. 27, 1413-1432
+(leave-one-out by smoothed weights).
 """
 
-import functools
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
-import xarray as xr
 from jaxtyping import Array
 from numpyro import handlers
 
-from polar_bayes.calibration.files import check_calibration
-from polar_bayes.calibration.scores import (
-    FALSE_ALARMS,
-    is_calibrated,
-    share_below,
-    uniformity,
-    which_stray,
-)
-from polar_bayes.errors import FitError
+from polar_bayes.calibration.scores import randomized_pit
 from polar_bayes.inference.batching import Stack, batched, batches
+from polar_bayes.inference.compile import LRUCache
 from polar_bayes.inference.program import Program, Values
-from polar_bayes.inference.psis import LARGEST_TRUSTED, smooth
-from polar_bayes.inference.result import provenance_of
+from polar_bayes.inference.psis import smooth
 from polar_bayes.observation.data import Observations
 
 Arrays = dict[str, np.ndarray]
 
 DRAWS = 128
-"""Of each fit: its weighted draws, thinned or repeated to so many that weigh the same."""
+"""Draws of each fit: its weighted draws resampled to this number of equally weighted ones."""
 
-LOOKED = 32
-"""Draws of a fit that are looked at side by side."""
+DRAW_BATCH = 32
+"""Draws of a fit that are evaluated at once."""
 
-FEW = 4
-"""Fits that one call of the program takes."""
+FIT_BATCH = 4
+"""Fits in one call of the compiled program."""
+
+_PREDICTORS: LRUCache[Callable] = LRUCache(4)
 
 
-class Readings:
-    """Probability integral transforms of readings, filled in as fits come; NaN where one failed."""
-
-    # A fresh reading of the same truth, and the posterior's predictions of it, are exchangeable
-    # where model, prior and posterior are right. So are a reading that was fitted and what the
-    # posterior without it predicts: draws of the whole posterior, each weighed by one over the
-    # likelihood of that reading, the weights smoothed. The noise of all readings of a view may
-    # follow its intensity, so without an intensity the whole view is left out.
-    # Source: Gelman et al. (2013), Bayesian Data Analysis, 3rd ed., section 6.3 (probability
-    # integral transforms of readings, and of those left out); Vehtari, Gelman & Gabry (2017), Stat.
-    # Comput. 27, 1413-1432 (leaving out by smoothed weights); Saeilynoja, Buerkner & Vehtari
-    # (2022), Stat. Comput. 32, 32 (the test).
+class PredictivePit:
+    """PIT values of readings, filled in fit by fit; NaN where a fit has failed."""
 
     def __init__(
-        self, program: Program, captures: Stack, again: Values, numbers: np.ndarray, seed: int
+        self, program: Program, captures: Stack, replicated: Values, numbers: np.ndarray, seed: int
     ) -> None:
         self._program, self._captures = program, captures.in_precision(np.float32)
-        self._names = tuple(sorted(again))
+        self._names = tuple(sorted(replicated))
         count = len(numbers)
         valid = np.asarray(captures.own.valid).reshape(count, -1)
-        chance = np.array(
-            [np.random.default_rng([seed, n, 1]).random(1 + 3 * len(again)) for n in numbers]
+        uniform = np.array(
+            [np.random.default_rng([seed, n, 1]).random(1 + 3 * len(replicated)) for n in numbers]
         )
-        self._first, chance = chance[:, 0], chance[:, 1:].reshape(count, 3, -1)
-        self.place = {name: _choose(valid, chance[:, 0, at]) for at, name in enumerate(self._names)}
-        self._chance = {name: chance[:, 1:, at] for at, name in enumerate(self._names)}
-        self._read = {
-            name: np.stack(
-                [
-                    _entry(np.asarray(values, np.float32), self.place[name])
-                    for values in (again[name], self._captures.own.readings[name])
-                ],
+        self._first, uniform = uniform[:, 0], uniform[:, 1:].reshape(count, 3, -1)
+        self.entry = {n: _choose(valid, uniform[:, 0, at]) for at, n in enumerate(self._names)}
+        self._uniform = {n: uniform[:, 1:, at] for at, n in enumerate(self._names)}
+        fitted = self._captures.own.readings
+        self._observed = {
+            n: np.stack(
+                [_take(np.asarray(x[n], np.float32), self.entry[n]) for x in (replicated, fitted)],
                 axis=-1,
             )
-            for name in self._names
+            for n in self._names
         }
         key = jax.random.fold_in(jax.random.key(seed), 2)
         draw_key = jax.vmap(lambda number: jax.random.fold_in(key, number))
@@ -89,55 +75,59 @@ class Readings:
         )
 
     def describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        """Take down some fits."""
+        """Fill in the fits at some positions from their weighted draws."""
         if not at.size:
             return
-        even = _resample(weights, self._first[at])
-        row = np.arange(at.size)[:, None]
+        chosen = _resample(weights, self._first[at])
+        rows = np.arange(at.size)[:, None]
         latent = {
-            name: np.asarray(parameters[name], np.float32)[row, even]
+            name: np.asarray(parameters[name], np.float32)[rows, chosen]
             for name in self._program.supports
         }
-        predicted, left = self._look(at, latent)
-        same = np.full((at.size, DRAWS), 1.0 / DRAWS)
+        predicted, log_likelihood = self._predict(at, latent)
+        equal = np.full((at.size, DRAWS), 1.0 / DRAWS)
         for name in self._names:
-            known = self.place[name][at] >= 0
-            read, chance = self._read[name][at], self._chance[name][at]
-            found, pareto_k = smooth(-np.asarray(left[name], float))
-            told = (
-                share_below(predicted[name], same, read[:, 0], chance[:, 0]),
-                share_below(predicted[name], found, read[:, 1], chance[:, 1]),
-                pareto_k,
+            is_valid = self.entry[name][at] >= 0
+            observed, uniform = self._observed[name][at], self._uniform[name][at]
+            without, pareto_k = smooth(-np.asarray(log_likelihood[name], float))
+            found = (
+                (self.fresh, randomized_pit(predicted[name], equal, observed[:, 0], uniform[:, 0])),
+                (
+                    self.left_out,
+                    randomized_pit(predicted[name], without, observed[:, 1], uniform[:, 1]),
+                ),
+                (self.left_out_k, pareto_k),
             )
-            kept = (self.fresh, self.left_out, self.left_out_k)
-            for whole, part in zip(kept, told, strict=True):
-                whole[name][at] = np.where(known, part, np.nan)
+            for values, part in found:
+                values[name][at] = np.where(is_valid, part, np.nan)
 
-    def _look(self, at: np.ndarray, latent: Values) -> tuple[Arrays, Arrays]:
-        """Run the program on all fits, a few at a time."""
-        looking = _looking(self._program, self._names)
+    def _predict(self, at: np.ndarray, latent: Values) -> tuple[Arrays, Arrays]:
+        """Predictions of the chosen entries and their log likelihoods: by name, (fit, draw)."""
+        predict = _PREDICTORS.of(
+            (self._program, self._names), lambda: _predictor(self._program, self._names)
+        )
         shared = jax.tree.map(jnp.asarray, self._captures.shared)
-        place = {name: np.maximum(x[at], 0).astype(np.int32) for name, x in self.place.items()}
-        states = (place, latent, self._keys[at])
+        entry = {name: np.maximum(x[at], 0).astype(np.int32) for name, x in self.entry.items()}
+        states = (entry, latent, self._keys[at])
         parts: list = []
-        for index in batches(at.size, FEW):
-            wanted = np.int32(min(FEW, at.size - len(parts) * FEW))
+        for index in batches(at.size, FIT_BATCH):
+            wanted = np.int32(min(FIT_BATCH, at.size - len(parts) * FIT_BATCH))
             own = self._captures.take(at[index])
             given = jax.tree.map(lambda x, i=index: x[i], states)
             with jax.enable_x64(False):
-                found = looking(wanted, own, shared, *given)
+                found = predict(wanted, own, shared, *given)
             parts.append(jax.tree.map(np.asarray, found))
         return jax.tree.map(lambda *x: np.concatenate(x)[: at.size], *parts)
 
 
-def why_untold(
+def unranked_reason(
     program: Program,
     generative_program: Program,
     data: Observations,
-    given: Mapping[str, tuple[int, ...]],
+    parameters: Mapping[str, tuple[int, ...]],
 ) -> str:
-    """Why readings of this model cannot be ranked."""
-    missing = [name for name in program.supports if name not in given]
+    """Why readings of this model cannot be ranked; empty where they can."""
+    missing = [name for name in program.supports if name not in parameters]
     if missing:
         return f"draws do not hold {', '.join(missing)}, without which the model predicts nothing"
     if not set(program.observed) & set(generative_program.observed):
@@ -153,163 +143,52 @@ def why_untold(
     return ""
 
 
-@functools.lru_cache(maxsize=4)
-def _looking(program: Program, names: tuple[str, ...]) -> Callable:
-    """What draws of one fit predict at the chosen entries, and how likely they hold them."""
+def _predictor(program: Program, names: tuple[str, ...]) -> Callable:
+    """Compiled: predictions of the chosen entries by draws of one fit, and log likelihoods."""
 
-    def look(data: Observations, place: dict, latent: Values, key: Array) -> tuple[Values, Values]:
-        keys = jax.random.split(key, DRAWS)
-
-        def one(given: tuple[Values, Array]) -> tuple[Values, Values]:
-            values, key = given
+    def predict(
+        data: Observations, entry: dict, latent: Values, key: Array
+    ) -> tuple[Values, Values]:
+        def of_draw(draw: tuple[Values, Array]) -> tuple[Values, Values]:
+            values, key = draw
             fixed = handlers.substitute(program.model, data=values)
             trace = handlers.trace(handlers.seed(fixed, key)).get_trace(data)
-            likely = {n: trace[n]["fn"].log_prob(trace[n]["value"]) for n in program.observed}
-            own = dict(zip(names, jax.random.split(key, len(names)), strict=True))
-            predicted = {n: trace[n]["fn"].sample(own[n]).reshape(-1)[place[n]] for n in names}
-            left = {
-                # The noise of a view's other readings may follow its intensity.
+            density = {n: trace[n]["fn"].log_prob(trace[n]["value"]) for n in program.observed}
+            keys = dict(zip(names, jax.random.split(key, len(names)), strict=True))
+            predicted = {n: trace[n]["fn"].sample(keys[n]).reshape(-1)[entry[n]] for n in names}
+            log_likelihood = {
+                # The noise of a view's other readings may follow its intensity, so without an
+                # intensity the whole view is left out.
                 n: sum(
-                    likely[m].reshape(-1)[place[n]]
+                    density[m].reshape(-1)[entry[n]]
                     for m in (program.observed if n == "intensity" else (n,))
                 )
                 for n in names
             }
-            return predicted, left
+            return predicted, log_likelihood
 
-        return jax.lax.map(one, (latent, keys), batch_size=LOOKED)
+        keys = jax.random.split(key, DRAWS)
+        return jax.lax.map(of_draw, (latent, keys), batch_size=DRAW_BATCH)
 
-    return batched(look, side_by_side=1)
+    return batched(predict, side_by_side=1)
 
 
-def _choose(valid: np.ndarray, chance: np.ndarray) -> np.ndarray:
-    """The number of one valid entry of each row, all equally likely; -1 where there is none."""
+def _choose(valid: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """The index of one valid entry of each row, all equally likely; -1 where there is none."""
     count = valid.sum(axis=-1)
-    rank = np.minimum((chance * count).astype(int), count - 1)
-    place = np.argmax(np.cumsum(valid, axis=-1) > rank[:, None], axis=-1)
-    return np.where(count > 0, place, -1)
+    rank = np.minimum((uniform * count).astype(int), count - 1)
+    entry = np.argmax(np.cumsum(valid, axis=-1) > rank[:, None], axis=-1)
+    return np.where(count > 0, entry, -1)
 
 
-def _entry(values: np.ndarray, place: np.ndarray) -> np.ndarray:
+def _take(values: np.ndarray, entry: np.ndarray) -> np.ndarray:
     flat = values.reshape(len(values), -1)
-    return flat[np.arange(len(flat)), np.maximum(place, 0)]
+    return flat[np.arange(len(flat)), np.maximum(entry, 0)]
 
 
 def _resample(weights: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Numbers of draws that weigh the same, by systematic resampling. (fit, DRAWS)."""
+    """Systematic resampling: indices of equally weighted draws, (fit, DRAWS)."""
     at = (np.arange(DRAWS) + first[:, None]) / DRAWS
-    below = np.cumsum(weights, axis=-1)
-    found = [np.searchsorted(*row, side="right") for row in zip(below, at, strict=True)]
+    cumulative = np.cumsum(weights, axis=-1)
+    found = [np.searchsorted(*row, side="right") for row in zip(cumulative, at, strict=True)]
     return np.minimum(found, weights.shape[-1] - 1)
-
-
-# --- What a calibration says of readings: a small table, and in words -----------------------------
-
-
-TESTS = {"predictive_pit": "fresh", "loo_pit": "left out"}
-"""What the groups of a calibration rank, in a word."""
-
-
-def holds_readings(calibration: xr.DataTree) -> bool:
-    """Whether readings were ranked in a calibration."""
-    return set(TESTS) <= set(calibration.children)
-
-
-def calibration_readings(calibration: xr.DataTree) -> pd.DataFrame:
-    """Two rows for each reading: a fresh one, and one that is left out of the fit.
-
-    Where model, prior, links and method are right, both stand uniformly among what the fits
-    predict. One entry is looked at in each simulation, so that simulations are independent and the
-    test that `calibration_table` makes of parameters holds here as it does there.
-
-    Args:
-        calibration: What `polar_bayes.calibrate` returns.
-
-    Returns:
-        Columns `reading` and `test` ("fresh" or "left out"); `answered` and `failed` (fits);
-        `p_value` of uniform ranks; `rank_mean` (above a half predictions are too low) and
-        `rank_spread` (above one they are too narrow, below too wide); `untrusted`, how many of
-        those left out have a Pareto k above 0.7 (of fresh ones none is needed, NaN): where they
-        are many, the weights are what strays.
-
-    Raises:
-        FitError: It is no calibration, or readings were not ranked.
-
-    Source:
-        See `polar_bayes.calibration.predictive.Readings`.
-    """
-    check_calibration(calibration)
-    if not holds_readings(calibration):
-        raise FitError(
-            "it holds no ranks of readings",
-            where="calibration",
-            hint="give what polar_bayes.calibrate returns with readings=True",
-        )
-    rows = {label: row for label, row, _ in _rows(calibration)}
-    return pd.DataFrame.from_dict(rows, orient="index")
-
-
-def reading_ranks(calibration: xr.DataTree) -> dict[str, np.ndarray]:
-    """Ranks of readings by their label in `calibration_readings`, NaN where a fit failed."""
-    return {label: ranks for label, _, ranks in _rows(calibration)}
-
-
-def readings_verdict(calibration: xr.DataTree) -> list[str]:
-    """What a calibration says of readings, in sentences."""
-    if not holds_readings(calibration):
-        why = provenance_of(calibration).get("readings_told", "")
-        return [f"Readings were not ranked: {why}."] if why else []
-    table = calibration_readings(calibration)
-    passed = is_calibrated(table)
-    names = list(dict.fromkeys(table["reading"]))
-    said = [
-        f"Readings ({', '.join(names)}; fresh ones and ones left out) "
-        f"{'pass' if passed else 'fail'} a joint test of their own that a right model fails "
-        f"{FALSE_ALARMS:.0%} of the time."
-    ]
-    said += which_stray(table, how_predictions_stray)
-    for label, row in table.iterrows():
-        if row["untrusted"] > 0:
-            said.append(
-                f"{label}: in {int(row['untrusted'])} of {int(row['answered'])} fits the weights "
-                f"without it say little (Pareto k above {LARGEST_TRUSTED:g})."
-            )
-    return said
-
-
-def how_predictions_stray(row: pd.Series) -> str:
-    """In which way the ranks of a reading stray."""
-    count = row["answered"]
-    if count < 2:
-        return "fewer than two fits have an answer"
-    shift = (row["rank_mean"] - 0.5) * math.sqrt(12.0 * count)
-    stretch = (row["rank_spread"] - 1.0) * math.sqrt(5.0 * count)  # sd of the spread: 1/sqrt(5 n)
-    ways = []
-    if abs(shift) > 2.5:
-        ways.append(f"predictions are too {'low' if shift > 0.0 else 'high'}")
-    if abs(stretch) > 2.5:
-        ways.append(f"predictions are too {'narrow' if stretch > 0.0 else 'wide'}")
-    return " and ".join(ways) or "the ranks have another shape than the uniform"
-
-
-def _rows(calibration: xr.DataTree) -> Iterator[tuple[str, dict, np.ndarray]]:
-    """Label, row of the table, and ranks."""
-    chosen = calibration["readings"].to_dataset()
-    for name in map(str, calibration["predictive_pit"].data_vars):
-        for group, test in TESTS.items():
-            pit = calibration[group][name].to_numpy()
-            answered = pit[np.isfinite(pit)]
-            told = uniformity(answered) if answered.size > 1 else (math.nan,) * 3
-            untrusted = math.nan
-            if group == "loo_pit":
-                pareto_k = chosen[f"{name}_pareto_k"].to_numpy()
-                untrusted = float(np.sum(pareto_k[np.isfinite(pit)] > LARGEST_TRUSTED))
-            row = {
-                "reading": name,
-                "test": test,
-                "answered": answered.size,
-                "failed": pit.size - answered.size,
-                **dict(zip(("p_value", "rank_mean", "rank_spread"), told, strict=True)),
-                "untrusted": untrusted,
-            }
-            yield f"{name}, {test}", row, pit

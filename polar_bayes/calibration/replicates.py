@@ -1,25 +1,37 @@
-"""Do intervals hold on real captures? Repeats of one object, and proxies of the truth."""
+"""Replicate consistency (Birge ratio), and coverage of proxies of the truth, for real captures."""
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 import scipy.stats
 import xarray as xr
 
-from polar_bayes.calibration.scores import FALSE_ALARMS
-from polar_bayes.diagnostics.coverage import INTERVALS
+from polar_bayes.calibration.scores import significance_level
+from polar_bayes.diagnostics.coverage import INTERVALS, coverage_columns
 from polar_bayes.diagnostics.parameters import Scalar, posterior_scalars, truth_of
 from polar_bayes.errors import FitError
 
-MOST_DRAWS = 4000
+MAX_DRAWS = 4000
 SEED = 31
+COLUMNS = (
+    "repeats",
+    "failed",
+    "mean",
+    "scatter",
+    "expected",
+    "ratio",
+    "chi_square",
+    "p_value",
+    "pairs",
+    "agreeing",
+)
 
 
 def retest(results: Sequence[xr.DataTree]) -> pd.DataFrame:
-    """Fits of repeated captures of one object: do they scatter as their intervals say?
+    """Replicate consistency: do fits of repeated captures scatter as their intervals predict?
 
     Where only the noise of the readings differs between repeats, posterior means m_i scatter about
     their common value with the posterior standard deviations s_i, and
@@ -27,8 +39,8 @@ def retest(results: Sequence[xr.DataTree]) -> pd.DataFrame:
         chi_square = sum (m_i - m)^2 / s_i^2,    m = sum(m_i / s_i^2) / sum(1 / s_i^2)
 
     follows the chi-square distribution with one degree of freedom less than repeats. Intervals also
-    hold what all repeats share (the prior, one setting of the instrument): they then scatter less,
-    and the test is too kind, never too strict.
+    contain the uncertainty that all repeats share (the prior, one setting of the instrument):
+    repeats then scatter less, and the test is conservative.
 
     Args:
         results: Two or more trees of `polar_bayes.fit`, of captures of the same object.
@@ -38,7 +50,7 @@ def retest(results: Sequence[xr.DataTree]) -> pd.DataFrame:
         ones; their weighted `mean`; `scatter`, the standard deviation of the means; `expected`, the
         root mean square of the posterior standard deviations; `ratio` of the two; `chi_square` and
         its `p_value` (small where repeats scatter more than the intervals say); `pairs` and
-        `agreeing`, the share of them whose 95% interval of the difference holds zero; `words`.
+        `agreeing`, the share of them whose 95% interval of the difference holds zero; `conclusion`.
 
     Raises:
         FitError: There are fewer than two, one holds no posterior, or they share no parameter.
@@ -58,10 +70,10 @@ def retest(results: Sequence[xr.DataTree]) -> pd.DataFrame:
             where="retest",
             hint="give fits of the same model to captures of the same layout",
         )
-    limit = FALSE_ALARMS / len(common)
     rows = {label: _compare([each[label].draws.ravel() for each in found]) for label in common}
-    table = pd.DataFrame.from_dict(rows, orient="index")
-    table["words"] = [_scattering(row, limit) for _, row in table.iterrows()]
+    table = pd.DataFrame.from_dict(rows, orient="index").reindex(columns=list(COLUMNS))
+    level = significance_level(table)
+    table["conclusion"] = [_conclusion(row, level) for _, row in table.iterrows()]
     return table
 
 
@@ -69,13 +81,13 @@ def proxy_scores(
     results: Sequence[xr.DataTree],
     proxies: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
 ) -> pd.DataFrame:
-    """Where the proxy of every parameter stands in its posterior, fit by fit.
+    """Position of the proxy of every parameter in its posterior, fit by fit.
 
     Args:
         results: Trees of `polar_bayes.fit`.
         proxies: Values by parameter (`refractive_index`, or one entry as `refractive_index[450]`),
-            for all fits or a mapping for each; None takes those that ride along in the captures as
-            `true_<parameter>`.
+            for all fits or a mapping for each; None takes the variables `true_<parameter>` of the
+            captures.
 
     Returns:
         A row for each fit and parameter whose proxy is known: `fit` (its number), `parameter`,
@@ -85,30 +97,20 @@ def proxy_scores(
     Raises:
         FitError: No proxy is known, or there is not one mapping for each fit.
     """
-    if isinstance(proxies, Sequence) and len(proxies) != len(results):
+    given = list(proxies) if isinstance(proxies, Sequence) else [proxies] * len(results)
+    if len(given) != len(results):
         raise FitError(
-            f"{len(proxies)} mappings do not go with {len(results)} fits",
+            f"{len(given)} mappings do not go with {len(results)} fits",
             where="proxies",
             hint="give one mapping for all fits, or one for each",
         )
     rows = []
-    for at, result in enumerate(results):
-        given = proxies[at] if isinstance(proxies, Sequence) else proxies
-        for scalar, proxy in _known(result, given):
-            draws = scalar.draws.ravel()
-            works = bool(np.isfinite(draws).all()) and draws.std() > 0.0
-            mean, sd = (draws.mean(), draws.std(ddof=1)) if works else (math.nan, math.nan)
-            rows.append(
-                {
-                    "fit": at,
-                    "parameter": scalar.label,
-                    "proxy": proxy,
-                    "mean": float(mean),
-                    "sd": float(sd),
-                    "z": float((proxy - mean) / sd),
-                    "below": float(np.mean(draws < proxy)) if works else math.nan,
-                }
-            )
+    for at, (result, values) in enumerate(zip(results, given, strict=True)):
+        for scalar in posterior_scalars(result):
+            proxy = truth_of(result, scalar) if values is None else _proxy(values, scalar)
+            if math.isfinite(proxy):
+                row = {"fit": at, "parameter": scalar.label, "proxy": proxy}
+                rows.append(row | _position(proxy, scalar.draws.ravel()))
     if not rows:
         raise FitError(
             "no proxy is known of any parameter",
@@ -125,7 +127,7 @@ def proxy_coverage(
     """How often the intervals of fits of real captures hold a proxy of the truth.
 
     A proxy, such as the index in a data sheet, has an error of its own that these numbers do not
-    know: where it is as large as the intervals, they hold it less often than they say.
+    include: where it is as large as the intervals, coverage is below the nominal one.
 
     Args:
         results: As for `proxy_scores`.
@@ -144,12 +146,12 @@ def proxy_coverage(
     rows = {}
     for label, own in scores.groupby("parameter", sort=False):
         below, z = own["below"].to_numpy(), own["z"].to_numpy()
+        held = {
+            percent: int(np.sum((low <= below) & (below <= high)))
+            for percent, (low, high) in INTERVALS.items()
+        }
         row: dict[str, float] = {"fits": len(own), "failed": int(np.isnan(below).sum())}
-        for percent, (low, high) in INTERVALS.items():
-            held = int(np.sum((low <= below) & (below <= high)))
-            sure = scipy.stats.binomtest(held, len(own)).proportion_ci(0.95, method="wilson")
-            row[f"held_{percent}"] = held / len(own)
-            row[f"held_{percent}_low"], row[f"held_{percent}_high"] = sure.low, sure.high
+        row |= coverage_columns(held, len(own))
         z = z[np.isfinite(z)]
         row["z_mean"] = float(z.mean()) if z.size else math.nan
         row["z_rms"] = float(np.sqrt(np.mean(z**2))) if z.size else math.nan
@@ -158,17 +160,22 @@ def proxy_coverage(
 
 
 def _compare(draws: Sequence[np.ndarray]) -> dict[str, float]:
-    works = [each for each in draws if np.isfinite(each).all() and each.std() > 0.0]
-    row = dict.fromkeys(("mean", "scatter", "expected", "ratio", "chi_square", "p_value"), math.nan)
-    row |= {"pairs": 0, "agreeing": math.nan}
-    row = {"repeats": len(works), "failed": len(draws) - len(works), **row}
-    if len(works) < 2:
+    finite = [each for each in draws if np.isfinite(each).all() and each.std() > 0.0]
+    row: dict[str, float] = {"repeats": len(finite), "failed": len(draws) - len(finite), "pairs": 0}
+    if len(finite) < 2:
         return row
-    means = np.array([each.mean() for each in works])
-    sds = np.array([each.std(ddof=1) for each in works])
+    means = np.array([each.mean() for each in finite])
+    sds = np.array([each.std(ddof=1) for each in finite])
     mean = np.sum(means / sds**2) / np.sum(1.0 / sds**2)
     chi_square = np.sum(((means - mean) / sds) ** 2)
-    agreeing = [_holds_zero(*pair) for pair in itertools.combinations(_thin(works), 2)]
+    # As many draws of every fit, each in a random order of its own: fits are independent.
+    random = np.random.default_rng(SEED)
+    count = min(MAX_DRAWS, *(each.size for each in finite))
+    shuffled = [random.permutation(each)[:count] for each in finite]
+    agreeing = []
+    for one, other in itertools.combinations(shuffled, 2):
+        low, high = np.quantile(one - other, INTERVALS[95])
+        agreeing.append(low <= 0.0 <= high)
     scatter, expected = means.std(ddof=1), np.sqrt(np.mean(sds**2))
     return row | {
         "mean": float(mean),
@@ -176,30 +183,18 @@ def _compare(draws: Sequence[np.ndarray]) -> dict[str, float]:
         "expected": float(expected),
         "ratio": float(scatter / expected),
         "chi_square": float(chi_square),
-        "p_value": float(scipy.stats.chi2.sf(chi_square, len(works) - 1)),
+        "p_value": float(scipy.stats.chi2.sf(chi_square, len(finite) - 1)),
         "pairs": len(agreeing),
         "agreeing": float(np.mean(agreeing)),
     }
 
 
-def _thin(draws: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
-    """As many draws of every fit, in an order of their own: fits know nothing of each other."""
-    random = np.random.default_rng(SEED)
-    count = min(MOST_DRAWS, *(each.size for each in draws))
-    return (random.permutation(each)[:count] for each in draws)
-
-
-def _holds_zero(one: np.ndarray, other: np.ndarray) -> bool:
-    low, high = np.quantile(one - other, INTERVALS[95])
-    return bool(low <= 0.0 <= high)
-
-
-def _scattering(row: pd.Series, limit: float) -> str:
+def _conclusion(row: pd.Series, level: float) -> str:
     if row["repeats"] < 2:
         return "too few repeats have an answer"
-    if row["p_value"] < limit:
+    if row["p_value"] < level:
         return f"repeats scatter {row['ratio']:.1f} times more than the intervals say"
-    if row["p_value"] > 1.0 - limit:
+    if row["p_value"] > 1.0 - level:
         return (
             f"repeats scatter only {row['ratio']:.2g} times as much as the intervals say: the rest "
             "of the intervals is what all repeats share"
@@ -207,13 +202,17 @@ def _scattering(row: pd.Series, limit: float) -> str:
     return "repeats scatter about as much as the intervals say"
 
 
-def _known(
-    result: xr.DataTree, given: Mapping[str, float] | None
-) -> Iterator[tuple[Scalar, float]]:
-    for scalar in posterior_scalars(result):
-        if given is None:
-            proxy = truth_of(result, scalar)
-        else:
-            proxy = float(given.get(scalar.label, given.get(scalar.name, math.nan)))
-        if math.isfinite(proxy):
-            yield scalar, proxy
+def _proxy(values: Mapping[str, float], scalar: Scalar) -> float:
+    return float(values.get(scalar.label, values.get(scalar.name, math.nan)))
+
+
+def _position(proxy: float, draws: np.ndarray) -> dict[str, float]:
+    if not np.isfinite(draws).all() or not draws.std() > 0.0:
+        return dict.fromkeys(("mean", "sd", "z", "below"), math.nan)
+    mean, sd = float(draws.mean()), float(draws.std(ddof=1))
+    return {
+        "mean": mean,
+        "sd": sd,
+        "z": (proxy - mean) / sd,
+        "below": float(np.mean(draws < proxy)),
+    }

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.calibration.predictive import Arrays, Readings, why_untold
+from polar_bayes.calibration.predictive import Arrays, PredictivePit, unranked_reason
 from polar_bayes.calibration.scores import PitCrps
-from polar_bayes.calibration.simulations import draw_fresh, draw_numbered
+from polar_bayes.calibration.simulations import draw_captures, redraw_readings
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT, SMALLEST_ESS
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_fit import PixelMethod, candidates_of, fit_stack
@@ -173,7 +173,7 @@ class Block(NamedTuple):
     fresh: Arrays
     left_out: Arrays
     left_out_k: Arrays
-    place: Arrays
+    entry: Arrays
     outcome: Outcome
 
 
@@ -182,7 +182,7 @@ class Plan:
     """What is done to every block of one calibration; it can be sent to another process."""
 
     request: Request
-    told: Request | None
+    generative_request: Request | None
     settings: Method
     readings: bool
     recipe_key: str
@@ -236,9 +236,9 @@ class Plan:
         return _shared_by(self)
 
     @property
-    def untold(self) -> str:
+    def unranked_reason(self) -> str:
         """Why readings cannot be ranked; empty where they can, or nobody asks."""
-        return _untold_of(self) if self.readings else ""
+        return _unranked_reason_of(self) if self.readings else ""
 
     def __eq__(self, other: object) -> bool:
         """The same blocks."""
@@ -255,12 +255,14 @@ def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
     seed, shared = plan.request.seed, plan.shared
     filled = np.resize(numbers, plan.block)  # so that all blocks run the same program
     wanted = np.arange(len(numbers))
-    is_ranked = plan.readings and not plan.untold
+    is_ranked = plan.readings and not plan.unranked_reason
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), 1)
-        drawn = draw_numbered(plan.generative_program, plan.data, filled, key)
+        drawn = draw_captures(plan.generative_program, plan.data, filled, key)
         fresh = (
-            draw_fresh(plan.generative_program, plan.data, drawn, filled, key) if is_ranked else {}
+            redraw_readings(plan.generative_program, plan.data, drawn, filled, key)
+            if is_ranked
+            else {}
         )
     truth = {name: np.asarray(drawn.truth[name])[wanted] for name in shared}
     captures = drawn.captures.subset(wanted)
@@ -268,7 +270,7 @@ def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
     ranked = None
     if is_ranked:
         again = {name: np.asarray(values)[wanted] for name, values in fresh.items()}
-        ranked = Readings(plan.rough, captures, again, numbers, seed)
+        ranked = PredictivePit(plan.rough, captures, again, numbers, seed)
     apart = _apart(plan.settings)
 
     def describe(at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
@@ -290,7 +292,7 @@ def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
         fresh=ranked.fresh if ranked else {},
         left_out=ranked.left_out if ranked else {},
         left_out_k=ranked.left_out_k if ranked else {},
-        place=ranked.place if ranked else {},
+        entry=ranked.entry if ranked else {},
         outcome=outcome,
     )
 
@@ -344,30 +346,30 @@ def _rough_of(plan: Plan) -> Program:
 
 @functools.lru_cache(maxsize=4)
 def _generative_program_of(plan: Plan) -> Program:
-    told = plan.told
-    if told is None:
+    request = plan.generative_request
+    if request is None:
         return plan.program
     with jax.enable_x64(True), TRACING_LOCK:
-        return compile_program(told.bind(told.scene), plan.data)
+        return compile_program(request.bind(request.scene), plan.data)
 
 
 @functools.lru_cache(maxsize=4)
 def _shared_by(plan: Plan) -> dict[str, tuple[int, ...]]:
-    fitted, told = (
+    fitted, simulated = (
         _shapes(program, plan.data) for program in (plan.program, plan.generative_program)
     )
-    return {name: shape for name, shape in told.items() if fitted.get(name) == shape}
+    return {name: shape for name, shape in simulated.items() if fitted.get(name) == shape}
 
 
 @functools.lru_cache(maxsize=4)
-def _untold_of(plan: Plan) -> str:
+def _unranked_reason_of(plan: Plan) -> str:
     given, program, generative_program = (
         _shapes(plan.program, plan.data),
         plan.program,
         plan.generative_program,
     )
     with jax.enable_x64(True), TRACING_LOCK:
-        return why_untold(program, generative_program, plan.data, given)
+        return unranked_reason(program, generative_program, plan.data, given)
 
 
 def _shapes(program: Program, data: Observations) -> dict[str, tuple[int, ...]]:

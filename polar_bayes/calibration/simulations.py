@@ -1,7 +1,6 @@
-"""Captures drawn from a model itself: parameters from the prior, readings from the links."""
+"""Captures drawn from a model: parameters from the prior, readings from the links."""
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -12,42 +11,40 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference.batching import Stack, together
-from polar_bayes.inference.compile import JitByShape
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.observation.data import Observations
 
+_SIMULATORS: LRUCache[Callable] = LRUCache(4)
+_READERS: LRUCache[Callable] = LRUCache(4)
+
 
 class Simulations(NamedTuple):
-    """Truths and what was recorded of them."""
+    """True parameters, and the captures simulated from them."""
 
     truth: Values
     captures: Stack
 
 
-def draw_captures(program: Program, data: Observations, count: int, key: Array) -> Simulations:
-    """Draw captures of one layout."""
-    # Directions, stated errors and masks are those of `data`. Where intensity is recorded, each
-    # capture's own brightness sets its noise, and readings at full scale are saturated.
-    return draw_numbered(program, data, np.arange(count), key)
-
-
-def draw_numbered(
+def draw_captures(
     program: Program, data: Observations, numbers: np.ndarray, key: Array
 ) -> Simulations:
-    """Draw the captures of some numbers."""
-    told = _drawing(program)(jnp.asarray(numbers, np.uint32), key, data)
-    truth, parts = jax.tree.map(np.asarray, told)
-    return Simulations(truth, _in_a_row(data, parts))
+    """Simulate captures by their numbers, with the layout, stated errors and masks of `data`."""
+    # Where intensity is recorded, each capture's own brightness sets its noise, and readings at
+    # full scale are saturated.
+    simulate = _SIMULATORS.of(program, lambda: _simulator(program))
+    found = simulate(jnp.asarray(numbers, np.uint32), key, data)
+    truth, recorded = jax.tree.map(np.asarray, found)
+    return Simulations(truth, _batch(data, recorded))
 
 
-def draw_fresh(
+def redraw_readings(
     program: Program, data: Observations, drawn: Simulations, numbers: np.ndarray, key: Array
 ) -> Values:
-    """Read the same truths once more."""
+    """Draw the readings of the same true parameters once more."""
+    read = _READERS.of(program, lambda: _reader(program))
     captures = drawn.captures
-    found = _reading_again(program)(
-        np.asarray(numbers, np.uint32), key, data, captures.own, captures.shared
-    )
+    found = read(np.asarray(numbers, np.uint32), key, data, captures.own, captures.shared)
     return jax.tree.map(np.asarray, found)
 
 
@@ -68,7 +65,7 @@ def _reading_again(program: Program) -> Callable[..., Values]:
     ) -> Values:
         return jax.lax.map(lambda at: read(at[0], key, data, at[1], shared), (numbers, own))
 
-    return JitByShape(read_all)
+    return JitOnce(read_all)
 
 
 @functools.lru_cache(maxsize=4)
@@ -78,47 +75,62 @@ def _drawing(program: Program) -> Callable[[Array, Array, Observations], tuple[V
     def simulate(number: Array, key: Array, data: Observations) -> tuple[Values, tuple]:
         key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
         z = program.from_prior(key_truth, data)
-        told = program.describe(key_noise, z, data)
-        seen = _recorded(data, told.predictive)
+        draw = program.describe(key_noise, z, data)
+        recorded = _recorded(data, draw.predictive)
         if "intensity" in program.observed:  # the noise of the other readings may follow it
-            again = program.describe(key_noise, z, seen).predictive
-            seen = _recorded(data, {**again, "intensity": told.predictive["intensity"]})
-        return told.parameters, (seen.readings, seen.brightness, seen.saturated)
+            others = program.describe(key_noise, z, recorded).predictive
+            recorded = _recorded(data, {**others, "intensity": draw.predictive["intensity"]})
+        return draw.parameters, (recorded.readings, recorded.brightness, recorded.saturated)
 
-    return JitByShape(
+    return JitOnce(
         lambda numbers, key, data: jax.lax.map(lambda at: simulate(at, key, data), numbers)
     )
 
 
+def _reader(program: Program) -> Callable[..., Values]:
+    """Compiled: further readings of the true parameters of many captures."""
+
+    def read_all(
+        numbers: Array, key: Array, data: Observations, own: Observations, shared: Observations
+    ) -> Values:
+        def read(at: tuple[Array, Observations]) -> Values:
+            number, capture = at
+            key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
+            z = program.from_prior(key_truth, data)
+            key_noise = jax.random.fold_in(key_noise, 1)
+            return program.describe(key_noise, z, together(capture, shared)).predictive
+
+        return jax.lax.map(read, (numbers, own))
+
+    return JitByShape(read_all)
+
+
 def _recorded(data: Observations, readings: Mapping[str, Any]) -> Observations:
-    """A capture with other readings; harmless numbers stay where a view is not valid."""
-    kept = {n: jnp.where(data.valid, x, data.readings[n]) for n, x in readings.items()}
-    whole = dataclasses.replace(data, readings={**data.readings, **kept})
-    if "intensity" not in kept:
-        return whole
+    """A capture with other readings; where a view is not valid, those of `data` remain."""
+    valid = {n: jnp.where(data.valid, x, data.readings[n]) for n, x in readings.items()}
+    capture = dataclasses.replace(data, readings={**data.readings, **valid})
+    if "intensity" not in valid:
+        return capture
     return dataclasses.replace(
-        whole,
-        brightness=jnp.clip(kept["intensity"], 0.0, 1.0),
-        saturated=data.valid & (kept["intensity"] >= data.full_scale),
+        capture,
+        brightness=jnp.clip(valid["intensity"], 0.0, 1.0),
+        saturated=data.valid & (valid["intensity"] >= data.full_scale),
     )
 
 
-def _in_a_row(data: Observations, parts: tuple) -> Stack:
-    """What was drawn is each capture's own, all else is shared."""
+def _batch(data: Observations, recorded: tuple) -> Stack:
+    """Captures as a batch: what was drawn and the masks differ, all else is the same."""
 
     def drawn(capture: Observations) -> tuple:
         return capture.readings, capture.brightness, capture.saturated, capture.valid
 
-    count = len(parts[1])
-    parts = jax.tree.map(lambda x: np.broadcast_to(x, (count, *data.shape)), parts)
-    valid = np.broadcast_to(np.asarray(data.valid), (count, *data.shape))
+    shape = (len(recorded[1]), *data.shape)
+    recorded = jax.tree.map(lambda x: np.broadcast_to(x, shape), recorded)
+    valid = np.broadcast_to(np.asarray(data.valid), shape)
     plain = jax.tree.map(np.asarray, data)
-    whole = eqx.tree_at(drawn, plain, (*parts, valid))
-    is_own = eqx.tree_at(
-        drawn,
-        jax.tree.map(lambda _: False, plain),
-        jax.tree.map(lambda _: True, drawn(plain)),
+    is_drawn = eqx.tree_at(
+        drawn, jax.tree.map(lambda _: False, plain), jax.tree.map(lambda _: True, drawn(plain))
     )
-    own, shared = eqx.partition(whole, is_own)
-    views = valid.reshape(count, -1, data.shape[-1]).any(axis=1).sum(axis=-1)
+    own, shared = eqx.partition(eqx.tree_at(drawn, plain, (*recorded, valid)), is_drawn)
+    views = valid.reshape(shape[0], -1, shape[-1]).any(axis=1).sum(axis=-1)
     return Stack(own, shared, views)

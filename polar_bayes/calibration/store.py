@@ -36,7 +36,7 @@ LIBRARIES = ("polar_bayes", "jax", "jaxlib", "numpyro", "numpy", "scipy")
 
 def fingerprint_of(plan: Plan) -> dict[str, str]:
     """All that fixes the numbers of a calibration, but how many simulations there are."""
-    told = _asked(plan.told) if plan.told is not None else {}
+    told = _asked(plan.generative_request) if plan.generative_request is not None else {}
     return {
         "capture": digest(jax.tree.leaves(plan.data), plan.data.dims, tuple(plan.data.readings)),
         **_asked(plan.request),

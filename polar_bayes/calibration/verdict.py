@@ -1,7 +1,7 @@
-"""What a calibration says, as a table and in words."""
+"""Tables of a calibration, and the sentences that state what they mean."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pandas as pd
@@ -10,21 +10,28 @@ import scipy.stats
 import xarray as xr
 
 from polar_bayes.calibration.files import check_calibration
-from polar_bayes.calibration.predictive import readings_verdict
 from polar_bayes.calibration.scores import (
     FALSE_ALARMS,
     is_calibrated,
-    limit_of,
+    significance_level,
     uniformity,
-    which_stray,
 )
-from polar_bayes.diagnostics.coverage import INTERVALS
+from polar_bayes.diagnostics.coverage import INTERVALS, coverage_columns
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.psis import LARGEST_TRUSTED
+from polar_bayes.inference.result import provenance_of
 
-MOST = 0.5
-"""Share of fits that are not trusted above which their ranks say nothing of the model."""
+MOST_UNTRUSTED = 0.5
+"""Share of fits that are not trusted above which their ranks do not judge the model."""
+
+SHIFT_LIMIT = SPREAD_LIMIT = 2.5
+TAIL_LIMIT = 2.0
+"""Standard errors from which a moment of the ranks is named as the deviation."""
+
+READING_TESTS = {"predictive_pit": "fresh", "loo_pit": "left out"}
+"""The groups of a calibration that hold PIT values of readings, and the names of their tests."""
 
 
 def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
@@ -39,7 +46,7 @@ def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
         neither too narrow, above, nor too wide); for 50, 80 and 95%, as `held_50`, the share of all
         fits whose interval holds the truth, failed ones counted as misses, with its 95% interval
         `_low` and `_high` (Wilson's); `width_95`, mean width of the 95% interval; `crps`, mean
-        ranked score.
+        continuous ranked probability score.
 
     Raises:
         FitError: It is no calibration.
@@ -53,75 +60,8 @@ def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
             where="calibration: truth",
             hint="give what polar_bayes.calibrate returned",
         )
-    rows = {each.label: _row(each, truths[each.label], marginals) for each in found}
+    rows = {each.label: _parameter_row(each, truths[each.label], marginals) for each in found}
     return pd.DataFrame.from_dict(rows, orient="index")
-
-
-def calibration_verdict(calibration: xr.DataTree) -> list[str]:
-    """What a calibration says, in sentences.
-
-    Args:
-        calibration: What `polar_bayes.calibrate` returns.
-
-    Returns:
-        First whether the ranks pass, then each parameter that does not and how it strays, then the
-        fits that failed (and a word where most are not trusted), then what the readings say, which
-        are judged by themselves.
-
-    Raises:
-        FitError: It is no calibration.
-    """
-    table = calibration_table(calibration)
-    passed = is_calibrated(table)
-    count = int(table["answered"].max() + table["failed"].min())
-    said = [
-        f"{'Calibrated' if passed else 'Not calibrated'}: the ranks of {len(table)} parameters in "
-        f"{count} simulations {'pass' if passed else 'fail'} a joint test that a right method "
-        f"fails {FALSE_ALARMS:.0%} of the time."
-    ]
-    said += which_stray(table, how_ranks_stray)
-    statuses = calibration["fits"]["status"].to_numpy()
-    for status in Status:
-        lost = int(np.sum(statuses == status))
-        if status != Status.GOOD and lost:
-            said.append(f"{lost} of {statuses.size} fits: {status.name.lower().replace('_', ' ')}.")
-    if np.mean(statuses == Status.NOT_TRUSTED) > MOST:
-        said.append(
-            "Most fits say themselves that they cannot be trusted: the ranks judge the method, not "
-            "the model. Another method or longer chains may do; chains of a fit (pb.methods.Nuts()) are "
-            "the slowest and the surest."
-        )
-    return said + readings_verdict(calibration)
-
-
-def how_ranks_stray(row: pd.Series) -> str:
-    """In which way the ranks of a parameter stray."""
-    count = row["answered"]
-    if count < 2:
-        return "fewer than two fits have an answer"
-    shift = (row["rank_mean"] - 0.5) * math.sqrt(12.0 * count)
-    usual = _spread_at(row["rank_mean"])
-    stretch = (row["rank_spread"] - usual) * math.sqrt(5.0 * count)  # sd of the spread: 1/sqrt(5 n)
-    ways = []
-    if abs(shift) > 2.5:
-        ways.append("the posterior is too low" if shift > 0.0 else "the posterior is too high")
-    if abs(stretch) > 2.5:
-        ways.append("intervals are too narrow" if stretch > 0.0 else "intervals are too wide")
-    if not ways:
-        share = row["held_95"] * (count + row["failed"]) / count
-        beyond = (share - 0.95) / math.sqrt(0.95 * 0.05 / count)
-        if abs(beyond) > 2.0:
-            ways.append(f"the tails of the posterior are too {'long' if beyond > 0.0 else 'short'}")
-    return " and ".join(ways) or "the ranks have another shape than the uniform"
-
-
-def _spread_at(mean: float) -> float:
-    """Spread of the ranks where posteriors are shifted and no more: it presses them together."""
-    # With normal posteriors ranks are Phi(z), z of variance one and mean sqrt(2) Phi^-1(mean);
-    # their second moment is in Owen's T function (Owen 1980, Commun. Stat. B 9, 389-419).
-    height = scipy.stats.norm.ppf(np.clip(mean, 1e-6, 1.0 - 1e-6))
-    second = scipy.stats.norm.cdf(height) - 2.0 * scipy.special.owens_t(height, 3.0**-0.5)
-    return math.sqrt(12.0 * max(second - scipy.stats.norm.cdf(height) ** 2, 0.0))
 
 
 def calibration_scalars(calibration: xr.DataTree, group: str) -> list[Scalar]:
@@ -131,55 +71,228 @@ def calibration_scalars(calibration: xr.DataTree, group: str) -> list[Scalar]:
     return scalars(dataset.rename(simulation="draw").expand_dims("chain"))
 
 
-def _row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> dict[str, float]:
-    pit = scalar.draws[0]
-    answered = pit[np.isfinite(pit)]
-    where = dict(scalar.index)
-    told = uniformity(answered) if answered.size > 1 else (math.nan,) * 3
-    row = {
-        "answered": answered.size,
-        "failed": pit.size - answered.size,
-        **dict(zip(("p_value", "rank_mean", "rank_spread"), told, strict=True)),
+def _parameter_row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> dict[str, float]:
+    pit, index = scalar.draws[0], dict(scalar.index)
+    bounds = marginals[f"{scalar.name}_quantile"].isel(index)
+    held = {}
+    for percent, levels in INTERVALS.items():
+        low, high = (bounds.sel(quantile=level).to_numpy() for level in levels)
+        held[percent] = int(np.sum((low <= truth) & (truth <= high)))
+    return {
+        **_rank_columns(pit),
+        **coverage_columns(held, pit.size),
+        "width_95": _finite_mean(high - low),
+        "crps": _finite_mean(marginals[f"{scalar.name}_crps"].isel(index).to_numpy()),
     }
-    bounds = marginals[f"{scalar.name}_quantile"].isel(where)
-    for percent, (low, high) in INTERVALS.items():
-        least, most = (bounds.sel(quantile=level).to_numpy() for level in (low, high))
-        held = int(np.sum((least <= truth) & (truth <= most)))
-        sure = scipy.stats.binomtest(held, pit.size).proportion_ci(0.95, method="wilson")
-        row[f"held_{percent}"] = held / pit.size
-        row[f"held_{percent}_low"], row[f"held_{percent}_high"] = sure.low, sure.high
-    row["width_95"] = _mean(most - least)
-    row["crps"] = _mean(marginals[f"{scalar.name}_crps"].isel(where).to_numpy())
-    return row
 
 
-def _mean(values: np.ndarray) -> float:
-    """Of the fits that have an answer."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if known.size else math.nan
+def _rank_columns(pit: np.ndarray) -> dict[str, float]:
+    finite = pit[np.isfinite(pit)]
+    moments = uniformity(finite) if finite.size > 1 else (math.nan,) * 3
+    return {
+        "answered": finite.size,
+        "failed": pit.size - finite.size,
+        **dict(zip(("p_value", "rank_mean", "rank_spread"), moments, strict=True)),
+    }
 
 
-# --- Calibrations of one layout by several methods, side by side ----------------------------------
+def _finite_mean(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else math.nan
 
+
+def calibration_readings(calibration: xr.DataTree) -> pd.DataFrame:
+    """Two rows for each recorded variable: a replicated reading, and one left out of the fit.
+
+    Where model, prior, links and method are right, both have uniform PIT values in the fits'
+    predictions. One entry is chosen in each simulation, so that simulations are independent and the
+    test that `calibration_table` makes of parameters holds here as well.
+
+    Args:
+        calibration: What `polar_bayes.calibrate` returns.
+
+    Returns:
+        Columns `reading` and `test` ("fresh" for replicated, or "left out"); `answered` and
+        `failed` (fits); `p_value` of uniform ranks; `rank_mean` (above a half predictions are too
+        low) and `rank_spread` (above one they are too narrow, below too wide); `untrusted`, the
+        number of readings left out whose Pareto k is above 0.7 (NaN for replicated ones, which need
+        none): where it is large, the importance weights cause the deviation.
+
+    Raises:
+        FitError: It is no calibration, or readings were not ranked.
+
+    Source:
+        See `polar_bayes.calibration.predictive`.
+    """
+    check_calibration(calibration)
+    if not holds_readings(calibration):
+        raise FitError(
+            "it holds no ranks of readings",
+            where="calibration",
+            hint="give what polar_bayes.calibrate returns with readings=True",
+        )
+    rows = {}
+    for name in map(str, calibration["predictive_pit"].data_vars):
+        pareto_k = calibration["readings"][f"{name}_pareto_k"].to_numpy()
+        for group, test in READING_TESTS.items():
+            pit = calibration[group][name].to_numpy()
+            untrusted = float(np.sum(pareto_k[np.isfinite(pit)] > LARGEST_TRUSTED))
+            rows[f"{name}, {test}"] = {
+                "reading": name,
+                "test": test,
+                **_rank_columns(pit),
+                "untrusted": untrusted if group == "loo_pit" else math.nan,
+            }
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def holds_readings(calibration: xr.DataTree) -> bool:
+    """Whether readings were ranked in a calibration."""
+    return set(READING_TESTS) <= set(calibration.children)
+
+
+def reading_ranks(calibration: xr.DataTree) -> dict[str, np.ndarray]:
+    """Ranks of readings by their label in `calibration_readings`, NaN where a fit has failed."""
+    return {
+        f"{name}, {test}": calibration[group][name].to_numpy()
+        for name in map(str, calibration["predictive_pit"].data_vars)
+        for group, test in READING_TESTS.items()
+    }
+
+
+# --- Sentences ------------------------------------------------------------------------------------
+
+
+def calibration_verdict(calibration: xr.DataTree) -> list[str]:
+    """The result of a calibration, in sentences.
+
+    Args:
+        calibration: What `polar_bayes.calibrate` returns.
+
+    Returns:
+        First whether the ranks pass, then each parameter that does not pass and how it deviates,
+        then the fits that failed (and advice where most are not trusted), then the result for
+        readings, which are tested separately.
+
+    Raises:
+        FitError: It is no calibration.
+    """
+    table = calibration_table(calibration)
+    passed = is_calibrated(table)
+    count = int(table["answered"].max() + table["failed"].min())
+    sentences = [
+        f"{'Calibrated' if passed else 'Not calibrated'}: the ranks of {len(table)} parameters in "
+        f"{count} simulations {'pass' if passed else 'fail'} a joint test that a right method "
+        f"fails {FALSE_ALARMS:.0%} of the time.",
+        *_deviations(table, parameter_deviation),
+    ]
+    statuses = calibration["fits"]["status"].to_numpy()
+    for status in Status:
+        lost = int(np.sum(statuses == status))
+        if status != Status.GOOD and lost:
+            name = status.name.lower().replace("_", " ")
+            sentences.append(f"{lost} of {statuses.size} fits: {name}.")
+    if np.mean(statuses == Status.NOT_TRUSTED) > MOST_UNTRUSTED:
+        sentences.append(
+            "Most fits say themselves that they cannot be trusted: the ranks judge the method, not "
+            "the model. Another method or longer chains may do; chains of a fit (pb.methods.Nuts()) are "
+            "the slowest and the surest."
+        )
+    return sentences + _reading_sentences(calibration)
+
+
+def _reading_sentences(calibration: xr.DataTree) -> list[str]:
+    if not holds_readings(calibration):
+        reason = provenance_of(calibration).get("readings_told", "")
+        return [f"Readings were not ranked: {reason}."] if reason else []
+    table = calibration_readings(calibration)
+    names = ", ".join(dict.fromkeys(table["reading"]))
+    sentences = [
+        f"Readings ({names}; fresh ones and ones left out) "
+        f"{'pass' if is_calibrated(table) else 'fail'} a joint test of their own that a right "
+        f"model fails {FALSE_ALARMS:.0%} of the time.",
+        *_deviations(table, reading_deviation),
+    ]
+    sentences += [
+        f"{label}: in {int(row['untrusted'])} of {int(row['answered'])} fits the weights "
+        f"without it say little (Pareto k above {LARGEST_TRUSTED:g})."
+        for label, row in table.iterrows()
+        if row["untrusted"] > 0
+    ]
+    return sentences
+
+
+def _deviations(table: pd.DataFrame, deviation: Callable[[pd.Series], str]) -> list[str]:
+    """A sentence for each row that fails its test."""
+    sentences = []
+    for label, row in table.iterrows():
+        if not row["p_value"] >= significance_level(table):  # a row without p-value fails too
+            p_value = f" (p = {row['p_value']:.2g})" if row["answered"] > 1 else ""
+            sentences.append(f"{label}: {deviation(row)}{p_value}.")
+    return sentences
+
+
+def parameter_deviation(row: pd.Series) -> str:
+    """How the ranks of a parameter deviate from the uniform distribution."""
+    return _deviation(row, _spread_of_shifted(row["rank_mean"]), "the posterior is", "intervals")
+
+
+def reading_deviation(row: pd.Series) -> str:
+    """How the ranks of a reading deviate from the uniform distribution."""
+    return _deviation(row, 1.0, "predictions are", "predictions")
+
+
+def _deviation(row: pd.Series, expected_spread: float, location: str, width: str) -> str:
+    count = row["answered"]
+    if count < 2:
+        return "fewer than two fits have an answer"
+    shift = (row["rank_mean"] - 0.5) * math.sqrt(12.0 * count)
+    # The standard error of the spread of n uniform ranks is 1 / sqrt(5 n).
+    stretch = (row["rank_spread"] - expected_spread) * math.sqrt(5.0 * count)
+    found = []
+    if abs(shift) > SHIFT_LIMIT:
+        found.append(f"{location} too {'low' if shift > 0.0 else 'high'}")
+    if abs(stretch) > SPREAD_LIMIT:
+        found.append(f"{width} are too {'narrow' if stretch > 0.0 else 'wide'}")
+    if not found and "held_95" in row:
+        share = row["held_95"] * (count + row["failed"]) / count
+        excess = (share - 0.95) / math.sqrt(0.95 * 0.05 / count)
+        if abs(excess) > TAIL_LIMIT:
+            found.append(
+                f"the tails of the posterior are too {'long' if excess > 0.0 else 'short'}"
+            )
+    return " and ".join(found) or "the ranks have another shape than the uniform"
+
+
+def _spread_of_shifted(mean: float) -> float:
+    """Spread of the ranks where posteriors are shifted and of the right width: it is below 1."""
+    # With normal posteriors ranks are Phi(z), z of variance one and mean sqrt(2) Phi^-1(mean);
+    # their second moment is in Owen's T function (Owen 1980, Commun. Stat. B 9, 389-419).
+    height = scipy.stats.norm.ppf(np.clip(mean, 1e-6, 1.0 - 1e-6))
+    second = scipy.stats.norm.cdf(height) - 2.0 * scipy.special.owens_t(height, 3.0**-0.5)
+    return math.sqrt(12.0 * max(second - scipy.stats.norm.cdf(height) ** 2, 0.0))
+
+
+# --- Calibrations of one layout by several methods ------------------------------------------------
 
 PASSES = "the ranks pass"
 
 
 def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFrame:
-    """Calibrations of the same parameters, side by side.
+    """Compare calibrations of the same parameters by several methods.
 
     Give all of them the same seed: they are then of the same simulations, and scores are compared
-    fit by fit, which tells far smaller differences than their means do.
+    fit by fit, which resolves far smaller differences than their means do.
 
     Args:
         calibrations: Each what `polar_bayes.calibrate` returns, by a name such as its method. The
-            first is what the scores of the others are compared with.
+            first is the baseline of the scores of the others.
 
     Returns:
         A row for each parameter and method: the columns of `calibration_table`, and `passes`
-        (whether its p-value is at least 5% over the number of parameters), `ways` (in words, how
-        its ranks stray), `score_change` (ranked score over that of the first method, minus one:
-        below zero is better) and `score_change_error` (its standard error). The change is NaN
+        (whether its p-value is at least 5% over the number of parameters), `deviation` (how its
+        ranks deviate, in words), `score_change` (ranked score over that of the first method, minus
+        one: below zero is better) and `score_change_error` (its standard error). The change is NaN
         where the simulations differ; a simulation counts where both methods have an answer.
 
     Raises:
@@ -198,17 +311,17 @@ def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFram
                 where=f"compare_calibrations: {name}",
                 hint="calibrate the same model on the same layout",
             )
-    limit = limit_of(expected)
+    level = significance_level(expected)
     rows = {}
     for scalar in calibration_scalars(calibrations[first], "truth"):
         for name, calibration in calibrations.items():
             row = tables[name].loc[scalar.label]
-            passes = bool(row["p_value"] >= limit)
+            passes = bool(row["p_value"] >= level)
             change, error = _score_change(calibration, calibrations[first], scalar)
             rows[scalar.label, name] = {
                 **row,
                 "passes": passes,
-                "ways": PASSES if passes else how_ranks_stray(row),
+                "deviation": PASSES if passes else parameter_deviation(row),
                 "score_change": change,
                 "score_change_error": error,
             }
@@ -218,7 +331,7 @@ def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFram
 
 
 def comparison_sentences(compared: pd.DataFrame) -> list[str]:
-    """Which parameters fail by which method, how, and what the other methods make of them.
+    """Which parameters fail by which method, how, and the result of the other methods.
 
     Args:
         compared: Of `compare_calibrations`.
@@ -226,53 +339,44 @@ def comparison_sentences(compared: pd.DataFrame) -> list[str]:
     Returns:
         First how many parameters fail by each method, then a sentence for each parameter that
         fails by any.
-
-    Raises:
-        Nothing.
     """
-    methods = list(compared.index.get_level_values("method").unique())
-    labels = list(compared.index.get_level_values("parameter").unique())
-    fails = {
-        method: int((~compared.xs(method, level="method")["passes"].astype(bool)).sum())
-        for method in methods
-    }
+    fails = ~compared["passes"].astype(bool)
     counts = ", ".join(
         f"{count or 'none'} {'fail' if count > 1 else 'fails'} by {method}"
-        for method, count in fails.items()
+        for method, count in fails.groupby(level="method", sort=False).sum().items()
     )
-    said = [f"Of {len(labels)} parameters {counts}."]
-    for label in labels:
-        own = compared.loc[label]
-        if not own["passes"].all():
-            ways = "; ".join(f"by {method} {_way(row)}" for method, row in own.iterrows())
-            said.append(f"{label}: {ways}.")
-    return said
+    parameters = compared.groupby(level="parameter", sort=False)
+    sentences = [f"Of {len(parameters)} parameters {counts}."]
+    for label, rows in parameters:
+        if not rows["passes"].all():
+            parts = (f"by {name} {_method_result(row)}" for (_, name), row in rows.iterrows())
+            sentences.append(f"{label}: {'; '.join(parts)}.")
+    return sentences
 
 
-def _way(row: pd.Series) -> str:
-    chance = "" if row["passes"] or row["answered"] < 2 else f"p = {row['p_value']:.2g}, "
-    return f"{row['ways']} ({chance}95% intervals hold {row['held_95']:.1%})"
+def _method_result(row: pd.Series) -> str:
+    p_value = "" if row["passes"] or row["answered"] < 2 else f"p = {row['p_value']:.2g}, "
+    return f"{row['deviation']} ({p_value}95% intervals hold {row['held_95']:.1%})"
 
 
 def _score_change(
-    calibration: xr.DataTree, first: xr.DataTree, scalar: Scalar
+    calibration: xr.DataTree, baseline: xr.DataTree, scalar: Scalar
 ) -> tuple[float, float]:
-    """Mean ranked score over that of the first, minus one, and its standard error."""
-    own, other = (_of(each, "truth", scalar.name, scalar) for each in (calibration, first))
-    if own.shape != other.shape or not np.array_equal(own, other, equal_nan=True):
+    """Mean CRPS over that of the baseline, minus one, and its standard error."""
+
+    def values(tree: xr.DataTree, group: str, name: str) -> np.ndarray:
+        return tree[group][name].isel(dict(scalar.index)).to_numpy().astype(float)
+
+    truth, base_truth = (values(each, "truth", scalar.name) for each in (calibration, baseline))
+    if not np.array_equal(truth, base_truth, equal_nan=True):
         return math.nan, math.nan
-    score, base = (
-        _of(each, "marginals", f"{scalar.name}_crps", scalar) for each in (calibration, first)
-    )
+    name = f"{scalar.name}_crps"
+    score, base = (values(each, "marginals", name) for each in (calibration, baseline))
     both = np.isfinite(score) & np.isfinite(base)
     if both.sum() < 2 or not base[both].mean() > 0.0:
         return math.nan, math.nan
     score, base = score[both], base[both]
     ratio = score.mean() / base.mean()
-    # The ratio of two means that go together, by the delta method.
+    # Standard error of the ratio of two correlated means, by the delta method.
     error = np.std(score - ratio * base, ddof=1) / (base.mean() * math.sqrt(both.sum()))
     return float(ratio - 1.0), float(error)
-
-
-def _of(tree: xr.DataTree, group: str, name: str, scalar: Scalar) -> np.ndarray:
-    return tree[group][name].isel(dict(scalar.index)).to_numpy().astype(float)

@@ -46,8 +46,9 @@ def _save(capture: Any, out: Path) -> None:
 @seed_option
 def simulate(out: Path, preset: str, scene: str, seed: int, **protocol: Any) -> None:
     """Draw a capture of a known material, by the paper's protocol."""
-    protocol = pb.simulation.Protocol(
-        views=views, largest_view_zenith=largest_view_zenith, wavelengths=wavelengths
+    _save(
+        pb.simulate(preset, scene=scene, protocol=pb.simulation.Protocol(**protocol), seed=seed),
+        out,
     )
 
 
@@ -69,9 +70,7 @@ def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Pa
                 hint="import or simulate one of the two again under another --name or file name",
             )
         named[label] = capture
-    capture = pb.capture.combine(named, dim=dim, drop=drop)
-    pb.save_capture(capture, out)
-    print_counts(capture, out)
+    _save(pb.capture.combine(named, dim=dim, drop=drop), out)
 
 
 # --- Commands that import raw measurements --------------------------------------------------------
@@ -203,46 +202,38 @@ def mosaic(frame: Path, layout: tuple[float, ...], out: Path, **options: Any) ->
     _save_image(pb.from_mosaic(frame, layout=rows, **_image_arguments(**options)), out)
 
 
-def _once(pairs: tuple[tuple[str, Any], ...], option: str) -> dict[str, Any]:
-    """A mapping from an option that is given once for each variable."""
-    names = [name for name, _ in pairs]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise click.UsageError(f"{option} names {twice[0]} twice")
-    return dict(pairs)
-
-
-def _write(capture: Any, out: Path) -> None:
-    pb.save_capture(capture, out)
-    print_counts(capture, out)
-    print_masked(capture)
-
-
-def _setting(options: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of an import from the options of a command."""
-    take = options.pop
-    spheres = tuple(pb.importers.Sphere(*each) for each in take("spheres"))
-    spheres += tuple(pb.importers.fit_sphere(rim) for rim in take("rims"))
-    normals = take("normals")
-    shape = _one({"--sphere or --rim": spheres or None, "--normals": normals})
-    light = _one(
-        {
-            "--light": _made(pb.importers.Direction, take("light")),
-            "--light-position": _made(pb.importers.Position, take("light_position")),
-            "--highlight": _made(pb.importers.Highlight, take("highlight")),
-            "--surroundings": pb.importers.Surroundings() if take("surroundings") else None,
-        }
+def _save_image(capture: Any, out: Path) -> None:
+    """Write a capture, and print how many readings are masked for which reason."""
+    _save(capture, out)
+    masked = ", ".join(
+        f"{number} {str(name).removeprefix('masked_').replace('_', ' ')}"
+        for name, number in capture.attrs.items()
+        if str(name).startswith("masked_") and number
     )
-    view = _made(pb.importers.Position, take("view_position"))
-    dark, dark_level = take("dark"), take("dark_level")
+    if masked:
+        click.echo(f"masked: {masked}")
+
+
+def _image_arguments(
+    *,
+    spheres: tuple[tuple[float, ...], ...],
+    rims: tuple[Path, ...],
+    normals: Path | None,
+    light: tuple[float, ...] | None,
+    light_position: tuple[float, ...] | None,
+    highlight: tuple[float, ...] | None,
+    surroundings: bool,
+    view_position: tuple[float, ...] | None,
+    dark: Path | None,
+    dark_level: float | None,
+    **options: Any,
+) -> dict[str, Any]:
+    """Arguments of an import from the options of a command."""
     if dark is not None and dark_level is not None:
         raise click.UsageError("--dark and --dark-level exclude each other")
-    dark = dark_level if dark is None else dark
-    detector = pb.importers.Detector(
-        dark=0.0 if dark is None else dark,
-        **{
-            name: take(name)
-            for name in ("flat", "saturation_level", "gain", "read_noise", "relative_error")
-        },
+    outlines = (
+        *(pb.importers.Sphere(*each) for each in spheres),
+        *map(pb.importers.fit_sphere, rims),
     )
     detector = {
         field.name: options.pop(field.name)

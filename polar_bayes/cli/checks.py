@@ -10,8 +10,8 @@ from polar_bayes.cli.options import (
     CALIBRATION_METHOD,
     NOT_CONVERGED,
     RESULT_FILE,
-    SCENE,
     STUDY_METHOD,
+    capture_argument,
     command,
     json_option,
     json_rows,
@@ -59,22 +59,23 @@ def calibrate(
         data, readings=not no_readings, store=store, resume=resume, **settings
     )
     pb.save_result(calibration, out)
-    table, said = (
+    table, verdict = (
         pb.calibration.calibration_table(calibration),
         pb.calibration.calibration_verdict(calibration),
     )
-    is_ranked = "predictive_pit" in calibration.children
-    readings = pb.calibration.calibration_readings(calibration) if is_ranked else None
+    tables = {"parameters": table}
+    if "predictive_pit" in calibration.children:
+        tables["readings"] = pb.calibration.calibration_readings(calibration)
     if as_json:
         rows = {name: json_rows(each) for name, each in tables.items()}
         print_json({**rows, "verdict": verdict})
     else:
-        shown = table[["answered", "failed", "p_value", "held_50", "held_80", "held_95", "crps"]]
-        click.echo(shown.to_string(float_format=lambda x: f"{x:.3g}"))
-        if readings is not None:
-            shown = readings.drop(columns=["reading", "test"])
-            click.echo(f"\n{shown.to_string(float_format=lambda x: f'{x:.3g}', na_rep='')}")
-        click.echo("\n".join(["", *said]))
+        columns = ["answered", "failed", "p_value", "held_50", "held_80", "held_95", "crps"]
+        print_frame(table[columns])
+        if "readings" in tables:
+            click.echo()
+            print_frame(tables["readings"].drop(columns=["reading", "test"]))
+        click.echo("\n".join(["", *verdict]))
     return 0 if pb.calibration.is_calibrated(table) else NOT_CONVERGED
 
 
@@ -108,19 +109,30 @@ def identify(
     data = pb.load_capture(capture)
     found = {}
     with stages() as progress:
-        found = pb.identify(data, progress=progress, **settings)
-        tables["parameters"] = pb.design.identifiability_table(found)
-        said["said"] = pb.design.identifiability_sentences(found)
+        settings["progress"] = progress
+        study = pb.identify(data, **settings)
+        found["parameters"] = (
+            pb.design.identifiability_table(study),
+            pb.design.identifiability_sentences(study),
+        )
         for name in profiled:
-            curve = pb.profile(data, name, progress=progress, **settings)
-            tables[f"profile of {name}"] = pb.design.profile_table(curve)
-            said[f"profile of {name}"] = pb.design.profile_sentences(curve)
-        if count is not None:
-            views = pb.next_views(
-                data, count=count, criterion=_criterion(criterion), progress=progress, **settings
+            curve = pb.profile(data, name, **settings)
+            found[f"profile of {name}"] = (
+                pb.design.profile_table(curve),
+                pb.design.profile_sentences(curve),
             )
-            tables["next views"] = pb.design.next_views_table(views)
-            said["next views"] = pb.design.next_views_sentences(views)
+        if count is not None:
+            letters = {"D": pb.design.DOptimal, "A": pb.design.AOptimal}
+            goal = (
+                letters[criterion]()
+                if criterion in letters
+                else pb.design.SingleParameter(criterion)
+            )
+            views = pb.next_views(data, count=count, criterion=goal, **settings)
+            found["next views"] = (
+                pb.design.next_views_table(views),
+                pb.design.next_views_sentences(views),
+            )
     if as_json:
         rows: dict[str, Any] = {name: json_rows(table) for name, (table, _) in found.items()}
         for name, (_, sentences) in found.items():
@@ -135,19 +147,19 @@ def identify(
 
 
 @command()
-@click.argument("capture", type=INPUT)
-@click.option("--out", type=RESULT_FILE, required=True, help="Study to write.")
-@click.option("--model", type=MODEL, default="per_material", show_default=True)
-@click.option("--scene", type=SCENE, help="Named scene; by default the one that the capture names.")
-@click.option("--largest-view-zenith", type=float, help="Set aside views beyond it [degrees].")
-@click.option(
+@capture_argument
+@out_option(RESULT_FILE, "Study to write.")
+@model_option
+@scene_option
+@view_limit_option
+@option(
     "--method", "methods", type=STUDY_METHOD, multiple=True,
-    help="Method to try; by default the whole ladder.",
+    help="Method to try, once for each; by default all of them.",
 )  # fmt: skip
-@click.option("--no-overrides", is_flag=True, help="Methods alone, nothing else changed.")
-@click.option("--tolerance", type=float, default=0.1, show_default=True, help="Of the advice.")
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
+@option("--no-overrides", is_flag=True, help="Compare methods only, with their default settings.")
+@option("--tolerance", type=float, default=0.1, help="Of the advice.")
+@seed_option
+@json_option
 def accuracy(
     capture: Path,
     out: Path,
@@ -158,10 +170,10 @@ def accuracy(
     **settings: Any,
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
-    data = pb.load_capture(capture)
     settings["methods"] = {name: pb.methods.LADDER[name] for name in methods or pb.methods.LADDER}
-    settings |= {"overrides": ()} if no_overrides else {}
-    study = pb.accuracy(data, **settings)
+    if no_overrides:
+        settings["overrides"] = ()
+    study = pb.accuracy(pb.load_capture(capture), **settings)
     pb.save_result(study, out)
     table = pb.benchmark.accuracy_table(study)
     advice = " ".join(pb.benchmark.accuracy_sentences(study, tolerance))
@@ -170,12 +182,6 @@ def accuracy(
         return
     print_frame(table[["error", "worst", "k_hat", "r_hat", "seconds_first", "seconds_again"]])
     click.echo(f"\n{advice}")
-
-
-def _criterion(name: str) -> Any:
-    """The criterion of that letter, or the one of that parameter alone."""
-    letters = {"D": pb.design.DOptimal, "A": pb.design.AOptimal}
-    return letters[name]() if name in letters else pb.design.SingleParameter(name)
 
 
 COMMANDS = (calibrate, identify, accuracy)

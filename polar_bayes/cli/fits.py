@@ -104,17 +104,16 @@ def fit(
             options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             scene = pb.choose_effects(data, progress=progress, **options)
-            click.echo(" ".join(pb.effects.ledger_sentences(scene.ledger)), err=True)
-        wish: dict[str, Any] = {"tolerance": tolerance} if is_auto else {}
-        result = pb.fit(data, scene=scene, progress=progress, **wish, **settings)
+            click.echo(pb.effects.ledger_sentences(scene.ledger), err=True)
+        settings |= {"tolerance": tolerance} if is_auto else {}
+        result = pb.fit(data, scene=scene, progress=progress, **settings)
     pb.save_result(result, out)
     for sentence in pb.inference.auto_sentences(result):
         click.echo(sentence, err=True)
-    if as_json:
-        click.echo(json.dumps(pb.diagnostics.json_summary(result), indent=2, allow_nan=False))
-    else:
-        print_table(result)
-    return status(result)
+    if not as_json:
+        return print_fit(result)
+    print_json(pb.diagnostics.json_summary(result))
+    return print_verdict(result)
 
 
 @command(name="map")
@@ -136,9 +135,9 @@ def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: A
     """Fit every pixel of an image."""
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
-    asked = {} if draws is None else {"draws": draws}
+    given: dict[str, Any] = {} if draws is None else {"draws": draws}
     chosen = (
-        pb.methods.PixelLaplace(**asked) if method == "laplace" else pb.methods.PixelTempering()
+        pb.methods.PixelLaplace(**given) if method == "laplace" else pb.methods.PixelTempering()
     )
     maps = pb.maps.map_file(capture, out, method=chosen, **settings)
     counts = ", ".join(
@@ -167,12 +166,14 @@ def effects(
     if out is not None:
         pb.save_result(ledger, out)
     if as_json:
-        click.echo(json.dumps(pb.effects.ledger_summary(ledger), indent=2, allow_nan=False))
+        print_json(pb.effects.ledger_summary(ledger))
     else:
-        table = pb.effects.ledger_table(ledger)
-        table["result"] = table["result"].str.ljust(table["result"].str.len().max())
-        click.echo(table.to_string())
-        click.echo(f"\n{' '.join(pb.effects.ledger_sentences(ledger))}")
+        click.echo(f"{pb.effects.ledger_table(ledger)}\n\n{pb.effects.ledger_sentences(ledger)}")
+
+
+def _with_setup(capture: Any, setup: str | None) -> Any:
+    """The capture, naming that set-up, so that scene, links and limits fit together."""
+    return capture if setup is None else capture.assign_attrs(setup=setup)
 
 
 @command()
@@ -188,12 +189,13 @@ def report(
     fit: Path, out: Path, truth: Path | None, uncorrected: Path | None, beside: tuple[Path, ...]
 ) -> None:
     """Write the standardized report of a fit, calibration, accuracy study, or map (.zarr)."""
-    others = {
-        "truth": None if truth is None else pb.maps.open_capture(truth),
-        "uncorrected": None if uncorrected is None else pb.maps.open_map(uncorrected),
-        "beside": _by_name(beside) or None,
-    }
-    page = pb.report(_opened(fit), out, **others)
+    page = pb.report(
+        _load(fit),
+        out,
+        truth=None if truth is None else pb.maps.open_capture(truth),
+        uncorrected=None if uncorrected is None else pb.maps.open_map(uncorrected),
+        beside=_load_all(pb.calibration.load_calibration, beside) or None,
+    )
     click.echo(f"report: {page}")
 
 
@@ -201,15 +203,13 @@ def report(
 @click.argument("fits", type=INPUT, nargs=-1, required=True)
 @out_option(FOLDER, "Folder to write.")
 def compare(fits: tuple[Path, ...], out: Path) -> int:
-    """Put fits of one capture side by side: predictions, parameters, and what the priors did."""
-    if len({path.stem for path in fits}) < len(fits):
-        raise click.UsageError("two of the files have the same name")
-    results = {path.stem: pb.load_result(path) for path in fits}
+    """Compare fits of one capture: predictions, parameters, and the effect of the priors."""
+    results = _load_all(pb.load_result, fits)
     comparison = pb.diagnostics.compare_fits(results)
     page = pb.report(results, out)
     if not comparison.loo.empty:
-        shown = comparison.loo.rename(columns={"elpd_diff": "difference", "dse": "error"})
-        click.echo(shown.to_string(float_format=lambda x: f"{x:.4g}") + "\n")
+        print_frame(comparison.loo.rename(columns={"elpd_diff": "difference", "dse": "error"}))
+        click.echo()
     for sentence in pb.reporting.comparison_of_fits_sentences(comparison):
         click.echo(sentence)
     click.echo(f"report: {page}")
@@ -220,8 +220,8 @@ def compare(fits: tuple[Path, ...], out: Path) -> int:
 def _load_all(load: Any, paths: tuple[Path, ...]) -> dict[str, Any]:
     """Results by the names of their files."""
     if len({path.stem for path in paths}) < len(paths):
-        raise click.UsageError("two files of --beside have the same name")
-    return {path.stem: pb.calibration.load_calibration(path) for path in paths}
+        raise click.UsageError("two of the files have the same name")
+    return {path.stem: load(path) for path in paths}
 
 
 def _load(path: Path) -> Any:

@@ -1,7 +1,8 @@
-"""Several fits of one capture side by side: predictions, parameters, and what the priors did."""
+"""Comparison of several fits of one capture: parameters, prior sensitivity and predictions."""
 
 import dataclasses
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -9,21 +10,38 @@ import xarray as xr
 from arviz_stats import compare
 from arviz_stats.utils import ELPDDataLOO
 
-from polar_bayes.diagnostics.convergence import Verdict, judge, summary
-from polar_bayes.diagnostics.parameters import SAMPLE_DIMS, method_of, posterior_scalars, scalars
-from polar_bayes.diagnostics.predictive import LARGEST_PARETO_K, Loo, predictive_checks, usable
+from polar_bayes.diagnostics.convergence import Verdict, summary, verdict
+from polar_bayes.diagnostics.parameters import (
+    CENTRAL_95,
+    SAMPLE_DIMS,
+    method_of,
+    posterior_scalars,
+    scalars,
+)
+from polar_bayes.diagnostics.predictive import (
+    MAX_PARETO_K,
+    Loo,
+    predictive_checks,
+    usable_readings,
+)
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import check_fit
 
 GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
-NUMBERS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
-OF_PRIOR = ("prior_inside", "verdict", "prior_sensitivity", "likelihood_sensitivity", "remark")
+SUMMARY_COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
+SENSITIVITY_COLUMNS = (
+    "prior_inside",
+    "verdict",
+    "prior_sensitivity",
+    "likelihood_sensitivity",
+    "remark",
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FitComparison:
-    """Fits of one capture, side by side.
+    """Comparison of several fits of one capture.
 
     Args:
         parameters: A row for each parameter and fit that has it, in the order of the fits: mean,
@@ -33,7 +51,7 @@ class FitComparison:
             elpd_diff and dse (to the best), weight (stacking), unreliable (readings whose Pareto k
             is above 0.7). Empty where they cannot be compared.
         left_out: By fit, or "" for all, why predictions are not compared.
-        verdicts: May the numbers of each fit be used?
+        verdicts: Whether the numbers of each fit may be used.
     """
 
     parameters: pd.DataFrame
@@ -43,7 +61,7 @@ class FitComparison:
 
 
 def compare_fits(fits: Mapping[str, xr.DataTree]) -> FitComparison:
-    """Put fits of one capture side by side.
+    """Compare fits of one capture.
 
     Args:
         fits: Trees that `polar_bayes.fit` returned, or read back from files, by a name for each.
@@ -76,7 +94,7 @@ def compare_fits(fits: Mapping[str, xr.DataTree]) -> FitComparison:
         parameters=_parameters(named, tables),
         loo=loo,
         left_out=left_out,
-        verdicts={name: judge(fit, tables[name]) for name, fit in named.items()},
+        verdicts={name: verdict(fit, tables[name]) for name, fit in named.items()},
     )
 
 
@@ -87,27 +105,33 @@ def _parameters(
     labels = dict.fromkeys(s.label for fit in fits.values() for s in posterior_scalars(fit))
     rows = {
         (label, name): {
-            **table.loc[label, list(NUMBERS)],
-            **(priors[name].loc[label, list(OF_PRIOR)] if label in priors[name].index else {}),
+            **table.loc[label, list(SUMMARY_COLUMNS)],
+            **(
+                priors[name].loc[label, list(SENSITIVITY_COLUMNS)]
+                if label in priors[name].index
+                else {}
+            ),
         }
         for label in labels
         for name, table in tables.items()
         if label in table.index
     }
-    found = pd.DataFrame.from_dict(rows, orient="index").reindex(columns=[*NUMBERS, *OF_PRIOR])
+    found = pd.DataFrame.from_dict(rows, orient="index").reindex(
+        columns=[*SUMMARY_COLUMNS, *SENSITIVITY_COLUMNS]
+    )
     found.index = pd.MultiIndex.from_tuples(rows, names=["parameter", "fit"])
     return found
 
 
 def _check_same_capture(one: xr.DataTree, other: xr.DataTree, first: str, name: str) -> None:
-    """Directions and readings must be the same; what each fit has set aside may differ."""
+    """Directions and readings must be the same; the readings that each fit uses may differ."""
     for group, names in (("constant_data", GEOMETRY), ("observed_data", None)):
-        here, there = (
+        values, expected = (
             tree[group].to_dataset() if group in tree.children else xr.Dataset()
-            for tree in (one, other)
+            for tree in (other, one)
         )
-        for variable in names or [n for n in here.data_vars if n in there.data_vars]:
-            if variable not in here or not _agree(here[variable], there.get(variable)):
+        for variable in names or [n for n in expected.data_vars if n in values.data_vars]:
+            if variable not in expected or not _agree(expected[variable], values.get(variable)):
                 raise FitError(
                     f"it is of another capture than {first}: {variable} differs",
                     where=f"compare_fits: {name}",
@@ -118,44 +142,40 @@ def _check_same_capture(one: xr.DataTree, other: xr.DataTree, first: str, name: 
 def _agree(one: xr.DataArray, other: xr.DataArray | None) -> bool:
     if other is None or dict(one.sizes) != dict(other.sizes):
         return False
-    here, there = one.to_numpy(), other.transpose(*one.dims).to_numpy()
-    both = np.isfinite(here) & np.isfinite(there)
-    return bool(np.allclose(here[both], there[both], rtol=1e-9, atol=1e-12))
+    first, second = one.to_numpy(), other.transpose(*one.dims).to_numpy()
+    both = np.isfinite(first) & np.isfinite(second)
+    return bool(np.allclose(first[both], second[both], rtol=1e-9, atol=1e-12))
 
 
 def _loo(fits: Mapping[str, xr.DataTree]) -> tuple[pd.DataFrame, dict[str, str]]:
-    """Expected log density of each reading given all others, fit beside fit."""
-    left_out, found, read = {}, {}, {}
+    """Expected log density of each reading given all others, by fit; and why there is none."""
+    left_out, found, used = {}, {}, {}
     for name, fit in fits.items():
         parts = {n: check.loo for n, check in sorted(predictive_checks(fit).items())}
         if method_of(fit) == "point" or not parts or any(loo is None for loo in parts.values()):
             left_out[name] = "it has no draws that predict the readings"
             continue
         found[name] = [loo for loo in parts.values() if loo is not None]
-        read[name] = {n: usable(fit, n) for n in parts}
+        used[name] = {n: usable_readings(fit, n) for n in parts}
     if len(found) < 2:
         return pd.DataFrame(), {"": "Fewer than two fits have draws that predict the readings."}
-    (first, expected), *others = read.items()
+    (first, expected), *others = used.items()
     for name, own in others:
         if set(own) != set(expected):
-            said = f"{first} describes {_list(expected)}, {name} {_list(own)}"
-            return pd.DataFrame(), {"": f"They predict different readings: {said}."}
+            names = f"{first} describes {' and '.join(expected)}, {name} {' and '.join(own)}"
+            return pd.DataFrame(), {"": f"They predict different readings: {names}."}
         if any(not np.array_equal(own[n], expected[n]) for n in own):
-            said = f"{first} and {name} have set aside different views"
-            return pd.DataFrame(), {"": f"They were fitted to different readings: {said}."}
-    table = compare({name: _together(parts) for name, parts in found.items()}, round_to="none")
-    bad = {name: sum(part.unreliable for part in parts) for name, parts in found.items()}
+            names = f"{first} and {name} have set aside different views"
+            return pd.DataFrame(), {"": f"They were fitted to different readings: {names}."}
+    table = compare({name: _combined(parts) for name, parts in found.items()}, round_to="none")
+    unreliable = {name: sum(part.unreliable for part in parts) for name, parts in found.items()}
     columns = ["elpd", "se", "p", "elpd_diff", "dse", "weight"]
-    return table[columns].assign(unreliable=pd.Series(bad)), left_out
+    return table[columns].assign(unreliable=pd.Series(unreliable)), left_out
 
 
-def _list(names: Mapping[str, object]) -> str:
-    return " and ".join(names)
-
-
-def _together(parts: list[Loo]) -> ELPDDataLOO:
+def _combined(parts: list[Loo]) -> ELPDDataLOO:
     """The readings of all variables as ArviZ holds them."""
-    each = xr.DataArray(np.concatenate([part.parts for part in parts]), dims="reading")
+    each = xr.DataArray(np.concatenate([part.pointwise for part in parts]), dims="reading")
     pareto_k = xr.DataArray(np.concatenate([part.pareto_k for part in parts]), dims="reading")
     return ELPDDataLOO(
         elpd=float(each.sum()),
@@ -164,27 +184,28 @@ def _together(parts: list[Loo]) -> ELPDDataLOO:
         n_samples=1,  # not used by the comparison
         n_data_points=each.size,
         scale="log",
-        warning=bool((pareto_k > LARGEST_PARETO_K).any()),
-        good_k=LARGEST_PARETO_K,
+        warning=bool((pareto_k > MAX_PARETO_K).any()),
+        good_k=MAX_PARETO_K,
         elpd_i=each,
         pareto_k=pareto_k,
     )
 
 
-# --- Readings in one row, without those that were not fitted, as tools for plain data want them ---
+# --- The fitted readings on a single axis ---------------------------------------------------------
 
-
-OF_READINGS = (
+READING_GROUPS = (
     "observed_data",
     "log_likelihood",
     "posterior_predictive",
     "noise_free",
     "prior_predictive",
 )
+FITTED = MappingProxyType({"valid": True})
+"""Flags of readings that were fitted."""
 
 
 def stack_readings(result: xr.DataTree) -> xr.DataTree:
-    """The same result with a single axis of readings, those alone that the fit has read.
+    """The same result with a single axis of readings: only those that the fit has used.
 
     Masked views and views beyond the angle limit stay in a result, so that its axes are those of
     the capture; their log likelihood is zero in every draw. Leave-one-out functions refuse such
@@ -195,7 +216,7 @@ def stack_readings(result: xr.DataTree) -> xr.DataTree:
 
     Returns:
         A new tree. In `observed_data`, `log_likelihood`, `posterior_predictive`, `noise_free` and
-        `prior_predictive` each variable `x` has one axis `x_reading` beside chain and draw; all
+        `prior_predictive` each variable `x` has the axes chain, draw and `x_reading`; all
         other groups and attributes are the same.
 
     Raises:
@@ -209,33 +230,27 @@ def stack_readings(result: xr.DataTree) -> xr.DataTree:
         )
     check_fit(result)
     observed = result["observed_data"].to_dataset()
-    kept = {str(name): _kept(result, observed[name]) for name in observed.data_vars}
     stacked = result.copy()
-    for group in OF_READINGS:
+    for group in READING_GROUPS:
         if group in result.children:
-            own = result[group].to_dataset()
-            rows = {n: _row(own[n], observed[n], keep) for n, keep in kept.items() if n in own}
+            variables = result[group].to_dataset()
+            rows = {
+                name: _stack(variables[name], reading, usable_readings(result, str(name), FITTED))
+                for name, reading in observed.items()
+                if name in variables
+            }
             stacked[group] = xr.DataTree(xr.Dataset(rows))
     return stacked
 
 
-def _kept(result: xr.DataTree, reading: xr.DataArray) -> np.ndarray:
-    """Whether each reading was fitted, in the order of its axes."""
-    finite = reading.notnull()
-    if "constant_data" in result.children and "valid" in result["constant_data"].data_vars:
-        finite = finite & (result["constant_data"].to_dataset()["valid"] == 1)
-    return finite.transpose(*reading.dims).to_numpy().ravel()
+def _stack(variable: xr.DataArray, reading: xr.DataArray, fitted: np.ndarray) -> xr.DataArray:
+    sample_dims = [dim for dim in SAMPLE_DIMS if dim in variable.dims]
+    values: np.ndarray = variable.transpose(*sample_dims, *reading.dims).to_numpy()
+    dims = (*sample_dims, f"{reading.name}_reading")
+    return xr.DataArray(values[..., fitted], dims=dims, attrs=variable.attrs)
 
 
-def _row(variable: xr.DataArray, reading: xr.DataArray, kept: np.ndarray) -> xr.DataArray:
-    lead = [dim for dim in SAMPLE_DIMS if dim in variable.dims]
-    values: np.ndarray = variable.transpose(*lead, *reading.dims).to_numpy()
-    rows = values.reshape(*values.shape[: len(lead)], -1)[..., kept]
-    return xr.DataArray(rows, dims=(*lead, f"{reading.name}_reading"), attrs=variable.attrs)
-
-
-# --- What would the fit claim if it denied that the instrument errs? ------------------------------
-
+# --- Intervals without a part of the instrument ---------------------------------------------------
 
 COLUMNS = (
     "mean",
@@ -246,29 +261,30 @@ COLUMNS = (
     "q97.5_without",
     "width_ratio",
 )
-INTERVAL = (0.025, 0.975)
 
 WITHOUT = {"discrepancy": "the discrepancy term", "instrument": "any instrument term"}
-"""Fits that may stand beside the main one, in the groups `without_<key>`: what they leave out."""
+"""Fits for comparison, in the groups `without_<key>` of a result: the terms that they omit."""
 
 
 def compare_without(result: xr.DataTree, part: str) -> pd.DataFrame:
-    """The material's intervals with and without a part of the instrument, side by side."""
-    found = posterior_scalars(result)
-    rows, labels = [], []
-    plain = {}
-    if f"without_{part}" in result.children:
-        plain = {s.label: s.draws for s in scalars(result[f"without_{part}"].to_dataset())}
-    for scalar in found:
-        other = plain.get(scalar.label)
+    """The material's intervals with and without a part of the instrument."""
+    group = f"without_{part}"
+    without = scalars(result[group].to_dataset()) if group in result.children else []
+    others = {scalar.label: scalar.draws for scalar in without}
+    rows = {}
+    for scalar in posterior_scalars(result):
+        draws, other = scalar.draws, others.get(scalar.label)
         if other is None or not scalar.is_material:
             continue
-        if not (np.isfinite(scalar.draws).all() and np.isfinite(other).all()):
+        if not (np.isfinite(draws).all() and np.isfinite(other).all()):
             continue
-        (low, high), (bare_low, bare_high) = (
-            np.quantile(draws, INTERVAL) for draws in (scalar.draws, other)
+        low, high = np.quantile(draws, CENTRAL_95)
+        other_low, other_high = np.quantile(other, CENTRAL_95)
+        ratio = (other_high - other_low) / (high - low) if high > low else np.nan
+        rows[scalar.label] = (
+            *(draws.mean(), low, high),
+            *(other.mean(), other_low, other_high),
+            ratio,
         )
-        ratio = (bare_high - bare_low) / (high - low) if high > low else np.nan
-        labels.append(scalar.label)
-        rows.append([scalar.draws.mean(), low, high, other.mean(), bare_low, bare_high, ratio])
-    return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index(labels, dtype=str))
+    index = pd.Index(list(rows), dtype=str)
+    return pd.DataFrame(list(rows.values()), columns=list(COLUMNS), index=index)

@@ -1,8 +1,12 @@
-"""May these numbers be quoted? A table of every parameter and a verdict in plain sentences."""
+"""Convergence: a table of every parameter, and a verdict on the fit in sentences.
+
+Source: Vehtari et al. (2021), Bayesian Analysis 16(2) (R-hat, ESS); Vehtari et al. (2024), JMLR
+25(72) (Pareto k-hat).
+"""
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +16,7 @@ from arviz_stats.base import array_stats
 
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
+    CENTRAL_95,
     Scalar,
     method_of,
     posterior_scalars,
@@ -21,26 +26,25 @@ from polar_bayes.inference.result import bounds_of, provenance_of
 from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
-INTERVAL = (0.025, 0.975)
 TAILS = (0.05, 0.95)
 LARGEST_R_HAT = 1.01
 SMALLEST_ESS = 400
 LARGEST_K_HAT = 0.7
-LARGEST_SECOND_MODE = 0.01
-MANY_MASKED = 0.25
-MANY_DEEP = 0.01
-LONGEST_LIST = 4
+MAX_SECOND_MODE = 0.01
+MAX_MASKED = 0.25
+MAX_DEEP_TREES = 0.01
+MAX_LISTED = 4
 ROUNDING = 1e-6
-"""How far draws in single precision may lie beyond the end of their prior."""
-HEAVIEST = ", and only the heaviest is described here; use method='nuts', or "
+"""Tolerance of draws in single precision at the ends of their prior."""
+ONLY_HEAVIEST = ", and only the heaviest is described here; use method='nuts', or "
 OTHER_MODES = {
-    "laplace": HEAVIEST,
-    "variational": HEAVIEST,
+    "laplace": ONLY_HEAVIEST,
+    "variational": ONLY_HEAVIEST,
     "importance": ", and the draws are of both; a mean may lie between them; ",
     "nuts": ", and chains may not have visited them in proportion; compare chains in the rank "
     "plot, or ",
 }
-"""What methods make of a further mode; of one's own nothing is known."""
+"""The effect of a further mode on the results of each method."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,8 +80,8 @@ def summary(result: xr.DataTree) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index([s.label for s in found]))
 
 
-def verdict(result: xr.DataTree) -> Verdict:
-    """Whether the numbers of a fit may be used, and what a reader of them should know.
+def verdict(result: xr.DataTree, table: pd.DataFrame | None = None) -> Verdict:
+    """Whether the numbers of a fit may be used, and cautions for their reader.
 
     Sampling fails on any R-hat above 1.01, any effective sample size below 400 and any divergence;
     every method fails on a draw that is not finite or that its prior or physics rules out, on draws
@@ -85,6 +89,7 @@ def verdict(result: xr.DataTree) -> Verdict:
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+        table: Its `summary`, if it is computed already.
 
     Returns:
         The verdict; its sentences name the parameter, the number and the remedy.
@@ -92,27 +97,21 @@ def verdict(result: xr.DataTree) -> Verdict:
     Raises:
         FitError: The tree holds no posterior.
     """
-    return judge(result, summary(result))
-
-
-def judge(result: xr.DataTree, table: pd.DataFrame) -> Verdict:
-    """The verdict of `verdict`, from a table that is already there."""
+    table = summary(result) if table is None else table
     method, provenance = method_of(result), provenance_of(result)
-    problems = [f"{_sentence(problem)}." for problem in provenance.get("problems", ())]
     found = posterior_scalars(result)
-    problems += _not_finite(found, method) + _impossible(found, provenance)
-    if method != "point":
-        problems += _frozen(found, provenance)
+    noted = (str(problem).rstrip(".") for problem in provenance.get("problems", ()))
+    problems = [f"{text[:1].upper()}{text[1:]}." for text in noted]
+    problems += _draw_problems(found, method, provenance)
     if method == "nuts":
-        problems += _chains_disagree(table) + _divergences(result)
-    cautions = [
-        *_approximation(result, method),
-        *_several_modes(provenance),
-        *_deep_trees(result),
-        *_undetermined_point(table, method),
-        *_readings(provenance.get("counts", {})),
-    ]
-    return Verdict(not problems, tuple(problems), tuple(cautions))
+        problems += _chain_problems(result, table)
+    cautions = (
+        *_approximation_cautions(result, method),
+        *_mode_cautions(provenance),
+        *_estimate_cautions(result, table, method),
+        *_reading_cautions(provenance.get("counts", {})),
+    )
+    return Verdict(not problems, tuple(problems), cautions)
 
 
 def json_summary(result: xr.DataTree) -> dict[str, Any]:
@@ -129,19 +128,19 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
         FitError: The tree holds no posterior.
     """
     table, provenance = summary(result), provenance_of(result)
-    judged = judge(result, table)
+    found = verdict(result, table)
     shown = [column for column in COLUMNS if column != "mcse_mean"]
-    said = {key: provenance.get(key) for key in ("model", "scene", "seed", "counts", "timings")}
+    about = {key: provenance.get(key) for key in ("model", "scene", "seed", "counts", "timings")}
     return {
         "parameters": {
             str(label): {column: _number(row[column]) for column in shown}
             for label, row in table.iterrows()
         },
-        "converged": judged.converged,
-        "problems": list(judged.problems),
-        "cautions": list(judged.cautions),
+        "converged": found.converged,
+        "problems": list(found.problems),
+        "cautions": list(found.cautions),
         "method": method_of(result),
-        **said,
+        **about,
     }
 
 
@@ -166,26 +165,26 @@ def laplace_k_hat(result: xr.DataTree) -> float:
 
 def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
     draws = np.stack([scalar.draws for scalar in found])
-    # A draw that is not finite spoils its whole row, visibly, and no other.
-    whole = np.isfinite(draws).all(axis=(1, 2))
+    # A draw that is not finite makes its whole row NaN, and no other.
+    finite = np.isfinite(draws).all(axis=(1, 2))
     rows = np.full((len(found), len(COLUMNS)), np.nan)
     if draws[0].size == 1:  # one draw is a number without a width
-        rows[whole, 0] = draws[whole, 0, 0]
+        rows[finite, 0] = draws[finite, 0, 0]
         return rows
-    if not whole.any():
+    if not finite.any():
         return rows
-    kept = draws[whole]
-    flat = kept.reshape(len(kept), -1)
+    draws = draws[finite]
+    flat = draws.reshape(len(draws), -1)
     with np.errstate(all="ignore"):  # R-hat of a parameter that never moved is 0/0
-        rows[whole] = np.stack(
+        rows[finite] = np.stack(
             [
                 flat.mean(axis=1),
                 flat.std(axis=1, ddof=1),
-                *np.quantile(flat, INTERVAL, axis=1),
-                array_stats.rhat(kept),
-                array_stats.ess(kept, method="bulk"),
-                array_stats.ess(kept, method="tail", prob=TAILS),
-                array_stats.mcse(kept, method="mean"),
+                *np.quantile(flat, CENTRAL_95, axis=1),
+                array_stats.rhat(draws),
+                array_stats.ess(draws, method="bulk"),
+                array_stats.ess(draws, method="tail", prob=TAILS),
+                array_stats.mcse(draws, method="mean"),
             ],
             axis=1,
         )
@@ -194,177 +193,146 @@ def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
 
 def _point_rows(result: xr.DataTree, found: Sequence[Scalar]) -> np.ndarray:
     errors = provenance_of(result).get("standard_errors", {})
+    stated = {name: iter(values) for name, values in errors.items()}
     rows = np.full((len(found), len(COLUMNS)), np.nan)
-    rows[:, 0] = [scalar.draws.mean() for scalar in found]
-    place: dict[str, int] = {}
-    for row, scalar in enumerate(found):
-        stated, at = errors.get(scalar.name, []), place.get(scalar.name, 0)
-        place[scalar.name] = at + 1
-        if at < len(stated) and stated[at] is not None:
-            rows[row, 1] = stated[at]
+    for row, scalar in zip(rows, found, strict=True):
+        error = next(stated.get(scalar.name, iter(())), None)
+        row[:2] = scalar.draws.mean(), math.nan if error is None else error
     return rows
 
 
-def _not_finite(found: Iterable[Scalar], method: str) -> list[str]:
-    bad = {s.label: float(np.mean(~np.isfinite(s.draws))) for s in found}
-    bad = {label: share for label, share in bad.items() if share > 0.0}
-    if not bad:
-        return []
-    remedy = {
-        "laplace": "the posterior is flat or open at its mode, so use method='nuts'",
-        "point": "give starting values a chance with narrower priors",
-    }.get(method, "check the readings that the fit could not explain, or narrow the priors")
-    return [f"Not finite: {_list(bad, lambda x: f'{x:.0%} of its draws')}; {remedy}."]
-
-
-def _impossible(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]:
-    """Draws beyond the ends of their prior, or beyond what the parameter can be at all."""
-    bad = {}
-    for scalar in found:
-        if scalar.name in (provenance.get("declared") or {}):
-            continue  # a model of the user's own may give any name to anything
-        least, most = RANGES.get(scalar.name, (-math.inf, math.inf))
-        low, high = bounds_of(provenance, scalar.name)
-        low, high = max(low, least), min(high, most)
-        slack = [
-            ROUNDING * max(1.0, abs(end)) if math.isfinite(end) else 0.0 for end in (low, high)
-        ]
-        outside = (scalar.draws < low - slack[0]) | (scalar.draws > high + slack[1])
-        if share := float(np.mean(outside & np.isfinite(scalar.draws))):
-            bad[f"{scalar.label} [{low:g}, {high:g}]"] = share
-    if not bad:
-        return []
-    return [
-        f"Outside its range: {_list(bad, lambda x: f'{x:.0%} of its draws')}; no fit gives such "
-        "values, so the result was changed or damaged: fit the capture again."
-    ]
-
-
-def _frozen(found: Iterable[Scalar], provenance: Mapping[str, Any]) -> list[str]:
-    """Parameters whose draws say nothing of a width, but for those that were held fixed."""
+def _draw_problems(
+    found: Sequence[Scalar], method: str, provenance: Mapping[str, Any]
+) -> Iterator[str]:
+    """Draws that are not finite, out of range, or all equal."""
+    if infinite := _percentages((s.label, ~np.isfinite(s.draws)) for s in found):
+        hint = {
+            "laplace": "the posterior is flat or open at its mode, so use method='nuts'",
+            "point": "give starting values a chance with narrower priors",
+        }.get(method, "check the readings that the fit could not explain, or narrow the priors")
+        yield f"Not finite: {infinite}; {hint}."
+    declared = provenance.get("declared") or {}  # a user's model may give any name to anything
+    known = (s for s in found if s.name not in declared)
+    if outside := _percentages(_out_of_range(scalar, provenance) for scalar in known):
+        yield (
+            f"Outside its range: {outside}; no fit gives such values, so the result was changed or "
+            "damaged: fit the capture again."
+        )
     free = (s for s in found if s.name not in (provenance.get("fixed") or {}))
-    same = {s.label: 0.0 for s in free if s.draws.min() == s.draws.max()}
-    if not same:
-        return []
-    return [
-        f"All draws are equal: {_list(same, None)}; nothing is known of the width of the "
-        "posterior, so fit again with more draws, or hold the parameter fixed."
-    ]
+    equal = [s.label for s in free if s.draws.min() == s.draws.max()]
+    if equal and method != "point":
+        yield (
+            f"All draws are equal: {_list(equal)}; nothing is known of the width of the posterior, "
+            "so fit again with more draws, or hold the parameter fixed."
+        )
 
 
-def _chains_disagree(table: pd.DataFrame) -> list[str]:
-    problems = []
+def _out_of_range(scalar: Scalar, provenance: Mapping[str, Any]) -> tuple[str, np.ndarray]:
+    """Finite draws outside the prior, or outside the physical range of the parameter."""
+    least, most = RANGES.get(scalar.name, (-math.inf, math.inf))
+    low, high = bounds_of(provenance, scalar.name)
+    ends = np.array([max(low, least), min(high, most)])
+    low, high = ends + np.array([-ROUNDING, ROUNDING]) * np.maximum(1.0, abs(ends))
+    outside = (scalar.draws < low) | (scalar.draws > high)
+    label = f"{scalar.label} [{ends[0]:g}, {ends[1]:g}]"
+    return label, outside & np.isfinite(scalar.draws)
+
+
+def _percentages(flags: Iterable[tuple[str, np.ndarray]]) -> str:
+    """`roughness 3% of its draws` of each parameter that has flagged draws; empty without any."""
+    return _list(f"{label} {bad.mean():.0%} of its draws" for label, bad in flags if bad.any())
+
+
+def _chain_problems(result: xr.DataTree, table: pd.DataFrame) -> Iterator[str]:
+    """Chains that disagree, are too short, or have diverged."""
     r_hat = table["r_hat"]
-    unequal = r_hat[~(r_hat <= LARGEST_R_HAT)].sort_values(ascending=False)
-    if len(unequal):
-        problems.append(
-            f"R-hat above {LARGEST_R_HAT}: {_list(unequal, lambda x: f'{x:.4g}')}; the chains "
-            "have not found one distribution, so sample longer, as in Nuts(warmup=1000, "
+    high = r_hat[~(r_hat <= LARGEST_R_HAT)].sort_values(ascending=False)
+    if len(high):
+        yield (
+            f"R-hat above {LARGEST_R_HAT}: {_list(f'{n} {x:.4g}' for n, x in high.items())}; the "
+            "chains have not found one distribution, so sample longer, as in Nuts(warmup=1000, "
             "most_draws=20000), and look at the pair plot for several modes."
         )
-    for column, part, place in (("ess_bulk", "Bulk", "center"), ("ess_tail", "Tail", "interval")):
-        few = table[column][~(table[column] >= SMALLEST_ESS)].sort_values()
-        if len(few):
-            problems.append(
-                f"{part} ESS below {SMALLEST_ESS}: {_list(few, lambda x: f'{np.floor(x):.0f}')}; "
-                f"the {place} is not known well enough, so sample longer, as in "
-                "Nuts(most_draws=20000)."
+    for column, part, estimate in (
+        ("ess_bulk", "Bulk", "center"),
+        ("ess_tail", "Tail", "interval"),
+    ):
+        low = table[column][~(table[column] >= SMALLEST_ESS)].sort_values()
+        if len(low):
+            numbers = _list(f"{label} {np.floor(x):.0f}" for label, x in low.items())
+            yield (
+                f"{part} ESS below {SMALLEST_ESS}: {numbers}; the {estimate} is not known well "
+                "enough, so sample longer, as in Nuts(most_draws=20000)."
             )
-    return problems
-
-
-def _divergences(result: xr.DataTree) -> list[str]:
     diverging = stats_of(result).get("diverging")
-    count = 0 if diverging is None else int(diverging.sum())
-    if diverging is None or not count:
-        return []
-    return [
-        f"{count} of {diverging.size} draws diverged: the sampler could not follow a sharp corner "
-        "of the posterior and may have missed part of it, so raise target_acceptance, as in "
-        "Nuts(target_acceptance=0.99), or narrow the priors."
-    ]
+    if diverging is not None and diverging.any():
+        yield (
+            f"{int(diverging.sum())} of {diverging.size} draws diverged: the sampler could not "
+            "follow a sharp corner of the posterior and may have missed part of it, so raise "
+            "target_acceptance, as in Nuts(target_acceptance=0.99), or narrow the priors."
+        )
 
 
-def _approximation(result: xr.DataTree, method: str) -> list[str]:
-    if method not in APPROXIMATIONS:
-        return []
-    stats = stats_of(result)
+def _approximation_cautions(result: xr.DataTree, method: str) -> Iterator[str]:
+    if method not in APPROXIMATIONS or "log_weight" not in stats_of(result):
+        return
     k_hat = laplace_k_hat(result)
-    if "log_weight" not in stats or k_hat <= LARGEST_K_HAT:
-        return []
-    whose, what = (
-        ("the Laplace draws", "a normal distribution")
-        if method == "laplace"
-        else ("the guide's draws", "the guide")
-    )
-    return [
-        f"Pareto k-hat of {whose} is {k_hat:.2f} (at most {LARGEST_K_HAT}): the posterior is not "
-        f"close to {what}; use method='nuts' for intervals."
-    ]
+    if not k_hat <= LARGEST_K_HAT:
+        draws, shape = ("the guide's draws", "the guide")
+        if method == "laplace":
+            draws, shape = ("the Laplace draws", "a normal distribution")
+        yield (
+            f"Pareto k-hat of {draws} is {k_hat:.2f} (at most {LARGEST_K_HAT}): the posterior is "
+            f"not close to {shape}; use method='nuts' for intervals."
+        )
 
 
-def _several_modes(provenance: Mapping[str, Any]) -> list[str]:
+def _mode_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
     weights = (provenance.get("modes") or {}).get("weights", [])
-    if len(weights) < 2 or not weights[1] > LARGEST_SECOND_MODE:
-        return []
-    method = str(provenance.get("method", "laplace"))
-    return [
-        f"The posterior has another mode, of weight {weights[1]:.2g}: another explanation of the "
-        f"readings exists{OTHER_MODES.get(method, '; ')}add views that tell them apart."
-    ]
+    if len(weights) > 1 and weights[1] > MAX_SECOND_MODE:
+        effect = OTHER_MODES.get(str(provenance.get("method", "laplace")), "; ")
+        yield (
+            f"The posterior has another mode, of weight {weights[1]:.2g}: another explanation of "
+            f"the readings exists{effect}add views that tell them apart."
+        )
 
 
-def _deep_trees(result: xr.DataTree) -> list[str]:
-    stats = stats_of(result)
-    if "reached_max_treedepth" not in stats:
-        return []
-    count, size = int(stats["reached_max_treedepth"].sum()), stats["reached_max_treedepth"].size
-    if count <= MANY_DEEP * size:
-        return []
-    return [
-        f"{count} of {size} draws reached the largest tree depth: steps were cut short, which "
-        "biases nothing but makes draws alike; raise it, as in Nuts(max_tree_depth=10)."
-    ]
+def _estimate_cautions(result: xr.DataTree, table: pd.DataFrame, method: str) -> Iterator[str]:
+    deep = stats_of(result).get("reached_max_treedepth")
+    if deep is not None and deep.sum() > MAX_DEEP_TREES * deep.size:
+        yield (
+            f"{int(deep.sum())} of {deep.size} draws reached the largest tree depth: steps were "
+            "cut short, which biases nothing but makes draws alike; raise it, as in "
+            "Nuts(max_tree_depth=10)."
+        )
+    undetermined = table.index[table["sd"].isna()]
+    if method == "point" and len(undetermined):
+        yield (
+            f"No standard error: {_list(dict.fromkeys(undetermined))}; least squares does not "
+            "determine such values, so they say nothing."
+        )
 
 
-def _undetermined_point(table: pd.DataFrame, method: str) -> list[str]:
-    open_ = table.index[table["sd"].isna()] if method == "point" else ()
-    if not len(open_):
-        return []
-    return [
-        f"No standard error: {_list(dict.fromkeys(open_, 0.0), None)}; least squares does not "
-        "determine such values, so they say nothing."
-    ]
-
-
-def _readings(counts: Mapping[str, Any]) -> list[str]:
-    cautions = []
+def _reading_cautions(counts: Mapping[str, Any]) -> Iterator[str]:
     total, masked = counts.get("views") or 0, counts.get("masked") or 0
-    if total and masked / total > MANY_MASKED:
-        cautions.append(
+    if total and masked / total > MAX_MASKED:
+        yield (
             f"{masked} of {total} readings are marked valid=False: the rest may not be a fair "
             "sample of the angles."
         )
     for name, count in (counts.get("at_margin") or {}).items():
         if count:
-            cautions.append(
+            yield (
                 f"{count} readings of {name} lie at the edge of their range and were moved to "
                 "the link's margin: their noise is not what the link describes."
             )
-    return cautions
 
 
-def _list(values: Mapping[Any, float] | pd.Series, number: Callable[[float], str] | None) -> str:
+def _list(items: Iterable[str]) -> str:
     """`roughness 1.08, absorption[450] 1.03 and 2 more`."""
-    items = [
-        f"{label} {number(value)}" if number else str(label) for label, value in values.items()
-    ]
-    shown, more = items[:LONGEST_LIST], len(items) - LONGEST_LIST
-    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
-
-
-def _sentence(text: str) -> str:
-    return (text[:1].upper() + text[1:]).rstrip(".")
+    items = list(items)
+    more = len(items) - MAX_LISTED
+    return ", ".join(items[:MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _number(value: float) -> float | None:

@@ -1,7 +1,7 @@
 """How often do the intervals of a map hold the truth?"""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -19,12 +19,22 @@ INTERVALS = {50: (0.25, 0.75), 80: (0.1, 0.9), 95: (0.025, 0.975)}
 """Percent, and the levels of both ends."""
 
 CASES = ("unknown", "masked", "unanswered", "answered")
-COLUMNS = (
-    *CASES,
-    *(f"held_{each}{end}" for each in INTERVALS for end in ("", "_low", "_high", "_of_read")),
-)
 BLOCK = 65536
-"""Pixels that are looked at together: a chunk of a store."""
+"""Pixels that are evaluated together: a chunk of a store."""
+
+
+def coverage_columns(held: Mapping[int, int], count: int) -> dict[str, float]:
+    """Share of `count` intervals that hold the truth, by percent, with its 95% interval."""
+    # Source: Wilson (1927), JASA 22(158), 209-212.
+    columns: dict[str, float] = {}
+    for percent, hits in held.items():
+        share = low = high = math.nan
+        if count:
+            share = hits / count
+            low, high = scipy.stats.binomtest(hits, count).proportion_ci(0.95, method="wilson")
+        name = f"held_{percent}"
+        columns |= {name: share, f"{name}_low": float(low), f"{name}_high": float(high)}
+    return columns
 
 
 def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
@@ -75,13 +85,11 @@ def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
             added = _count(maps["status"].isel(place).load(), bounds.load(), here.load())
             counts[name] = counts.get(name, 0) + added
     shown = [scalar for scalar in found if scalar.name in known]
-    places = [tuple(scalar.index.values()) for scalar in shown]
     rows = [
-        _row([int(case[place]) for case in counts[scalar.name]])
-        for scalar, place in zip(shown, places, strict=True)
+        _row([int(case[tuple(each.index.values())]) for case in counts[each.name]])
+        for each in shown
     ]
-    labels = pd.Index([scalar.label for scalar in shown], dtype=object)
-    return pd.DataFrame(rows, columns=list(COLUMNS), index=labels)
+    return pd.DataFrame(rows, index=pd.Index([each.label for each in shown], dtype=object))
 
 
 def map_scalars(maps: xr.Dataset) -> list[Scalar]:
@@ -89,9 +97,8 @@ def map_scalars(maps: xr.Dataset) -> list[Scalar]:
     names = [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
     if not names or "status" not in maps:
         raise FitError("it holds no maps", where="maps", hint="give what fit_pixels returns")
-    # An empty corner has the axes and labels of a posterior, and nothing is read.
-    corner = maps[names].isel({dim: slice(1) for dim in IMAGE}).drop_vars(IMAGE, errors="ignore")
-    return scalars(xr.zeros_like(corner).rename(dict(zip(IMAGE, ("chain", "draw"), strict=True))))
+    # One pixel of zeros has the axes and labels of all, and nothing is read from a store.
+    return scalars(xr.zeros_like(maps[names].isel({dim: slice(1) for dim in IMAGE})), IMAGE)
 
 
 def _truth_of(maps: xr.Dataset, truth: xr.Dataset, name: str) -> xr.DataArray | None:
@@ -106,7 +113,7 @@ def _truth_of(maps: xr.Dataset, truth: xr.Dataset, name: str) -> xr.DataArray | 
             " x ".join(f"{dim} {each.sizes[dim]}" for dim in true.dims) for each in (true, mean)
         )
         raise CaptureError(
-            f"true_{name} and the map stand on different axes ({sizes})",
+            f"true_{name} and the map have different axes ({sizes})",
             where=_name_of(truth),
             hint="give the capture of which the map was made",
         ) from error
@@ -123,34 +130,20 @@ def _count(status: xr.DataArray, bounds: xr.DataArray, true: xr.DataArray) -> np
     true = true.astype(bounds.dtype)
     is_known, is_masked = true.notnull(), status == Status.MASKED
     has_answer = is_known & (status == Status.GOOD) & (abs(bounds) < np.inf).all("quantile")
-    cases = [
-        ~is_known,
-        is_known & is_masked,
-        is_known & ~is_masked & ~has_answer,
-        has_answer,
-        *(has_answer & inside for inside in _inside(bounds, true)),
-    ]
+    cases = [~is_known, is_known & is_masked, is_known & ~is_masked & ~has_answer, has_answer]
+    for levels in INTERVALS.values():
+        low, high = (bounds.sel(quantile=level, drop=True) for level in levels)
+        cases.append(has_answer & (low <= true) & (true <= high))
     whole = bounds.isel(quantile=0, drop=True)
     return np.stack(
         [case.broadcast_like(whole).sum(IMAGE).transpose(*own).to_numpy() for case in cases]
     )
 
 
-def _inside(bounds: xr.DataArray, true: xr.DataArray) -> Iterator[xr.DataArray]:
-    for low, high in INTERVALS.values():
-        least, most = (bounds.sel(quantile=level, drop=True) for level in (low, high))
-        yield (least <= true) & (true <= most)
-
-
-def _row(counts: Sequence[int]) -> list[float]:
-    *cases, answered = counts[: len(CASES)]
-    read = answered + cases[CASES.index("unanswered")]
-    row: list[float] = [*cases, answered]
-    for held in counts[len(CASES) :]:
-        low, high = math.nan, math.nan
-        if answered:
-            sure = scipy.stats.binomtest(held, answered).proportion_ci(0.95, method="wilson")
-            low, high = float(sure.low), float(sure.high)
-        row += [held / answered if answered else math.nan, low, high]
-        row += [held / read if read else math.nan]
+def _row(counts: Sequence[int]) -> dict[str, float]:
+    row: dict[str, float] = dict(zip(CASES, counts, strict=False))
+    answered, read = row["answered"], row["answered"] + row["unanswered"]
+    for percent, held in zip(INTERVALS, counts[len(CASES) :], strict=True):
+        row |= coverage_columns({percent: held}, int(answered))
+        row[f"held_{percent}_of_read"] = held / read if read else math.nan
     return row

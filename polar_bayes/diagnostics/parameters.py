@@ -1,7 +1,7 @@
-"""The scalar parameters of a fit: one label and one block of draws each, the material first."""
+"""The scalar parameters of a fit: each with a label and an array of draws, the material first."""
 
 import dataclasses
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -13,11 +13,14 @@ from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 SAMPLE_DIMS = ("chain", "draw")
 APPROXIMATIONS = ("laplace", "variational")
-"""Methods whose draws are of the approximation, and stand beside `log_weight`: log posterior minus
-log approximation, up to a constant."""
+"""Methods whose draws are of the approximation, stored with `log_weight`: log posterior minus log
+approximation, up to a constant."""
 
-OF_POPULATIONS = ("_location", "_spread")
-OF_PROCESSES = ("_level", "_amplitude", "_length")
+CENTRAL_95 = (0.025, 0.975)
+"""Probabilities of the ends of the equal-tailed 95% interval."""
+
+# Of a population, and of a process over wavelength.
+HYPERPARAMETER_SUFFIXES = ("_location", "_spread", "_level", "_amplitude", "_length")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,15 +41,15 @@ class Scalar:
 
 def is_hyperparameter(name: str, names: Collection[str]) -> bool:
     """True for what describes a population, or a process over wavelength, of another parameter."""
-    owners = [name.removesuffix(end) for end in OF_POPULATIONS + OF_PROCESSES if name.endswith(end)]
-    return any(owner in names for owner in owners)
+    ends = (end for end in HYPERPARAMETER_SUFFIXES if name.endswith(end))
+    return any(name.removesuffix(end) in names for end in ends)
 
 
-def scalars(group: xr.Dataset) -> list[Scalar]:
-    """Every scalar of a group of draws."""
+def scalars(group: xr.Dataset, sample_dims: Sequence[str] = SAMPLE_DIMS) -> list[Scalar]:
+    """Every scalar of a group of draws, whose leading axes are the sample dims."""
     names = set(map(str, group.data_vars))
     ordered = sorted(group.data_vars, key=lambda name: _rank(str(name), group[name], names))
-    found = [scalar for name in ordered for scalar in _entries(str(name), group[name])]
+    found = [scalar for name in ordered for scalar in _entries(group[name], sample_dims)]
     seen: dict[str, int] = {}
     for position, scalar in enumerate(found):
         seen[scalar.label] = repeat = seen.get(scalar.label, 0) + 1
@@ -80,7 +83,7 @@ def stats_of(result: xr.DataTree) -> Mapping[str, xr.DataArray]:
 
 
 def method_of(result: xr.DataTree) -> str:
-    """How the fit was made: the kind that its method gave, told by its statistics if not said."""
+    """Kind of the fit's method: as recorded, or inferred from its statistics."""
     if method := provenance_of(result).get("method"):
         return str(method)
     stats = stats_of(result)
@@ -94,26 +97,24 @@ def _rank(name: str, variable: xr.DataArray, names: Collection[str]) -> tuple[in
         return 0, MATERIAL_PARAMETERS.index(name)
     if is_hyperparameter(name, names):
         return 1, 0
-    return (3 if _has_event(name, variable) else 2), 0
+    # A vector that is one site, such as the weights of a discrepancy, is last.
+    has_event = any(str(dim).startswith(f"{name}_") for dim in variable.dims)
+    return (3 if has_event else 2), 0
 
 
-def _has_event(name: str, variable: xr.DataArray) -> bool:
-    """True for a vector that is one site, such as the weights of a discrepancy."""
-    return any(str(dim).startswith(f"{name}_") for dim in variable.dims)
-
-
-def _entries(name: str, variable: xr.DataArray) -> Iterator[Scalar]:
-    dims = [str(dim) for dim in variable.dims if dim not in SAMPLE_DIMS]
-    values = variable.transpose(*SAMPLE_DIMS, *dims).to_numpy().astype(float)
+def _entries(variable: xr.DataArray, sample_dims: Sequence[str]) -> Iterator[Scalar]:
+    name = str(variable.name)
+    dims = [str(dim) for dim in variable.dims if dim not in sample_dims]
+    values = variable.transpose(*sample_dims, *dims).to_numpy().astype(float)
     texts = {dim: _coordinate(variable, dim) for dim in dims}
-    for place in np.ndindex(values.shape[2:]):
-        labels = {dim: texts[dim][at] for dim, at in zip(dims, place, strict=True)}
+    for index in np.ndindex(values.shape[len(sample_dims) :]):
+        labels = {dim: texts[dim][at] for dim, at in zip(dims, index, strict=True)}
         yield Scalar(
             label=f"{name}[{', '.join(labels.values())}]" if labels else name,
             name=name,
-            index=dict(zip(dims, place, strict=True)),
+            index=dict(zip(dims, index, strict=True)),
             labels=labels,
-            draws=values[(slice(None), slice(None), *place)],
+            draws=values[(..., *index)],
         )
 
 

@@ -1,8 +1,8 @@
-"""How much do the members of a population differ, and how much does each lean on the others?
+"""Populations of a hierarchical fit: their summaries, and the shrinkage of each member.
 
-A parameter is pooled where the posterior holds `<parameter>_location` and `<parameter>_spread`
-beside it. The population is normal on the parameter's own scale: log for what is positive, log
-odds for a share, plain (cut at its bounds) for an index.
+A parameter is pooled where the posterior also holds `<parameter>_location` and
+`<parameter>_spread`. The population is normal on the parameter's own scale: log for positive
+parameters, log odds for shares, plain (truncated at its bounds) for an index.
 """
 
 import dataclasses
@@ -16,84 +16,10 @@ import scipy.special
 import scipy.stats
 import xarray as xr
 
-from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars
+from polar_bayes.diagnostics.parameters import CENTRAL_95, Scalar, method_of, posterior_scalars
 from polar_bayes.inference.result import bounds_of, provenance_of
 from polar_bayes.priors import RANGES
 
-# --- What the readings of one member say without its population, from draws with it ---------------
-
-
-STEPS = 100
-SETTLED = 1e-10
-LEAST_ERRORS = 2.0
-NARROWEST = 1e-6
-
-
-class GroupProgram(NamedTuple):
-    """One member without its population, on the scale on which the population is normal."""
-
-    mean: float
-    sd: float
-    leaning: float
-
-
-def estimate_alone(value: np.ndarray, location: np.ndarray, spread: np.ndarray) -> GroupProgram:
-    """Take a normal population out of the posterior draws of one of its members."""
-    # A likelihood $\exp(b x - p x^2 / 2)$ of the member makes its draws, given location $\mu$ and
-    # spread $s$ of the same draw,
-    # $$ x | \mu, s \sim Normal(m, v), \qquad v = \frac{1}{p + s^{-2}}, \qquad m = v (b + \mu
-    # s^{-2}) $$
-    # The log density of all draws is concave in (b, p): Newton's method finds its maximum. So the
-    # estimate is exact, up to Monte Carlo error, for any posterior of location and spread.
-    center, unit = float(value.mean()), float(value.std())
-    if not unit > 0.0:
-        return GroupProgram(math.nan, math.nan, math.nan)
-    x, mu = (value - center) / unit, (location - center) / unit
-    belief = np.maximum(spread / unit, NARROWEST) ** -2.0
-    b, p = 0.0, max(1.0 - 1.0 / float(np.mean(1.0 / belief)), 0.1)
-    floor = -0.99 * float(belief.min())
-    for _ in range(STEPS):
-        gradient, curvature = _derivatives(x, mu, belief, b, p)
-        step = np.linalg.solve(curvature, gradient)
-        # Halved until it stays where every variance is positive and the density does not fall.
-        before = _log_density(x, mu, belief, b, p)
-        while p + step[1] <= floor or (
-            _log_density(x, mu, belief, b + step[0], p + step[1]) < before - 1e-9 * abs(before)
-        ):
-            step = step / 2.0
-        b, p = b + step[0], p + step[1]
-        if gradient @ step < SETTLED * x.size:
-            break
-    error = math.sqrt(np.linalg.inv(_derivatives(x, mu, belief, b, p)[1])[1, 1])
-    leaning = float(np.mean(belief / (belief + max(p, 0.0))))
-    if not p > LEAST_ERRORS * error:
-        return GroupProgram(math.nan, math.nan, leaning)
-    return GroupProgram(center + unit * b / p, unit / math.sqrt(p), leaning)
-
-
-def _log_density(x: np.ndarray, mu: np.ndarray, belief: np.ndarray, b: float, p: float) -> float:
-    """Of all draws, up to a constant."""
-    variance = 1.0 / (p + belief)
-    mean = variance * (b + mu * belief)
-    return float(np.sum(-0.5 * (x - mean) ** 2 / variance - 0.5 * np.log(variance)))
-
-
-def _derivatives(
-    x: np.ndarray, mu: np.ndarray, belief: np.ndarray, b: float, p: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient of the log density in (b, p), and minus its second derivatives."""
-    variance = 1.0 / (p + belief)
-    mean = variance * (b + mu * belief)
-    gradient = np.array([np.sum(x - mean), 0.5 * np.sum(mean**2 + variance - x**2)])
-    cross = -np.sum(mean * variance)
-    square = np.sum(mean**2 * variance + 0.5 * variance**2)
-    return gradient, np.array([[np.sum(variance), cross], [cross, square]])
-
-
-# --- How much do the members of a population differ, and how much does each lean on the others? ---
-
-
-INTERVAL = (0.025, 0.975)
 NEW_MEMBERS = 20_000
 SUMMARY_COLUMNS = (
     "members",
@@ -117,10 +43,10 @@ MEMBER_COLUMNS = (
     "mean",
     "q2.5",
     "q97.5",
-    "alone",
-    "alone_q2.5",
-    "alone_q97.5",
-    "leaning",
+    "unpooled",
+    "unpooled_q2.5",
+    "unpooled_q97.5",
+    "shrinkage",
 )
 
 
@@ -161,7 +87,7 @@ class Population:
         return scipy.special.expit(value) if self.scale == "log odds" else np.asarray(value)
 
     def differences(self) -> np.ndarray:
-        """Draws of what the spread is in the unit of the parameter; a factor on the log scale."""
+        """Draws of the spread in the unit of the parameter; a factor on the log scale."""
         location, spread = self.location.draws.ravel(), self.spread.draws.ravel()
         if self.scale == "log":
             with np.errstate(over="ignore"):
@@ -178,7 +104,7 @@ class Population:
         rank = np.random.default_rng(seed).permutation(rank)
         center, width = self.to_scale(location[at]), np.maximum(spread[at], 1e-12)
         if self.scale == "plain":
-            # The population is cut at the bounds, not heaped up at them.
+            # The population is truncated at the bounds.
             low, high = (self.low - center) / width, (self.high - center) / width
             return center + width * scipy.stats.truncnorm.ppf(rank, low, high)
         return self.from_scale(center + width * scipy.special.ndtri(rank))
@@ -230,123 +156,169 @@ def population_summary(result: xr.DataTree) -> pd.DataFrame:
     Source:
         Gelman & Pardoe (2006), Technometrics 48(2), 241-251: the pooling factor.
     """
-    found = _drawn(result)
+    found = [] if method_of(result) == "point" else populations(result)
     labels = pd.Index([each.label for each in found], dtype=object)
     rows = [_summary_row(each) for each in found]
     return pd.DataFrame(rows, columns=list(SUMMARY_COLUMNS), index=labels)
-
-
-def shrinkage(result: xr.DataTree) -> pd.DataFrame:
-    """How far the population pulls each member, and where its own readings alone would put it."""
-    # The estimate of a member alone is not fitted again: the population is taken out of the draws.
-    # If the readings of a member say $x_m \sim Normal(a, 1/p)$ on the population's scale, its
-    # posterior given the population is
-    # $$ x_m | \mu, s \sim Normal\Big(\frac{p a + \mu / s^2}{p + 1 / s^2}, \frac{1}{p + 1 /
-    # s^2}\Big) $$
-    # and $a$ and $p$ are those under which the draws are likeliest, so that the uncertainty of
-    # location and spread is accounted for. This holds where what a member's readings say is about
-    # normal on that scale, and the bounds of an index are far; elsewhere it is an approximation.
-    # The other parameters of the member keep their priors.
-    found = _drawn(result)
-    rows, labels = [], []
-    for each in found:
-        labels += [scalar.label for scalar in each.members]
-        rows += _member_rows(each)
-    index = pd.Index(labels, dtype=object)
-    return pd.DataFrame(rows, columns=list(MEMBER_COLUMNS), index=index, dtype=float)
-
-
-def _drawn(result: xr.DataTree) -> list[Population]:
-    """The populations of which there are draws."""
-    found = populations(result)
-    return [] if method_of(result) == "point" else found
 
 
 def _of_parameter(
     name: str, found: Mapping[str, list[Scalar]], provenance: Mapping[str, Any]
 ) -> Iterator[Population]:
     for location in found[f"{name}_location"]:
-        place = location.index
-        members = tuple(s for s in found[name] if _stands_at(s, place))
+        index = location.index.items()
+        members = tuple(s for s in found[name] if index <= s.index.items())
         # A spread over wavelength is allowed, although the models of this package have one.
-        spread = next((s for s in found[f"{name}_spread"] if _agrees(s, place)), None)
+        spread = next((s for s in found[f"{name}_spread"] if s.index.items() <= index), None)
         if spread is not None and len(members) > 1:
             label = location.label.replace(f"{name}_location", name, 1)
             low, high = bounds_of(provenance, f"{name}_location")
             yield Population(label, location, spread, members, low, high)
 
 
-def _stands_at(scalar: Scalar, place: Mapping[str, int]) -> bool:
-    return all(scalar.index.get(dim) == at for dim, at in place.items())
-
-
-def _agrees(scalar: Scalar, place: Mapping[str, int]) -> bool:
-    return all(place.get(dim) == at for dim, at in scalar.index.items())
-
-
-def _is_whole(population: Population) -> bool:
+def _is_finite(population: Population) -> bool:
     """True where every draw is finite, also on the population's scale."""
     on_scale = (population.to_scale(s.draws) for s in (population.location, *population.members))
     return all(bool(np.isfinite(draws).all()) for draws in (population.spread.draws, *on_scale))
 
 
-def _interval(draws: np.ndarray) -> tuple[float, float]:
-    low, high = np.quantile(draws, INTERVAL)
-    return float(low), float(high)
-
-
 def _described(draws: np.ndarray) -> list[float]:
     if not np.isfinite(draws).all():
         return [math.nan] * 4
-    return [float(draws.mean()), float(draws.std(ddof=1)), *_interval(draws)]
-
-
-def _departures(population: Population) -> np.ndarray:
-    """Of every member from the location, on the population's scale: (member, draw)."""
-    members = np.stack([scalar.draws.ravel() for scalar in population.members])
-    return population.to_scale(members) - population.to_scale(population.location.draws.ravel())
-
-
-def _pooling_factor(population: Population) -> float:
-    departures = _departures(population)
-    estimated = np.var(departures.mean(axis=1), ddof=1)
-    return float(1.0 - estimated / np.var(departures, axis=0, ddof=1).mean())
+    return [float(draws.mean()), float(draws.std(ddof=1)), *np.quantile(draws, CENTRAL_95)]
 
 
 def _summary_row(population: Population) -> list[Any]:
-    count = len(population.members)
-    if not _is_whole(population):
-        parts = [*_described(population.location.draws), *_described(population.spread.draws)]
-        return [count, *parts, *[math.nan] * 5, "", math.nan]
-    differences = population.differences()
-    middle, low, high = float(np.median(differences)), *_interval(differences)
-    return [
-        count,
+    row = [
+        len(population.members),
         *_described(population.location.draws),
         *_described(population.spread.draws),
-        *_interval(population.new_members()),
-        *(middle, low, high),
-        _meaning(population.scale, middle),
+    ]
+    if not _is_finite(population):
+        return [*row, *[math.nan] * 5, "", math.nan]
+    differences = population.differences()
+    median = float(np.median(differences))
+    return [
+        *row,
+        *np.quantile(population.new_members(), CENTRAL_95),
+        *(median, *np.quantile(differences, CENTRAL_95)),
+        f"members differ by a factor of about {median:.3g}"
+        if population.scale == "log"
+        else f"members differ by about {median:.2g}",
         _pooling_factor(population),
     ]
 
 
-def _meaning(scale: str, between: float) -> str:
-    if scale == "log":
-        return f"members differ by a factor of about {between:.3g}"
-    return f"members differ by about {between:.2g}"
-
-
-def _member_rows(population: Population) -> list[list[Any]]:
-    if not _is_whole(population):
-        return [[math.nan] * len(MEMBER_COLUMNS) for _ in population.members]
+def _pooling_factor(population: Population) -> float:
+    members = np.stack([scalar.draws.ravel() for scalar in population.members])
     location = population.to_scale(population.location.draws.ravel())
-    spread = population.spread.draws.ravel()
-    rows = []
-    for scalar in population.members:
-        draws = scalar.draws.ravel()
-        alone = estimate_alone(population.to_scale(draws), location, spread)
-        middle = [alone.mean, *(alone.mean + np.array([-1.96, 1.96]) * alone.sd)]
-        back = population.from_scale(np.array(middle))
-        rows.append([draws.mean(), *_interval(draws), *back, alone.leaning])
-    return rows
+    departures = population.to_scale(members) - location
+    estimated = np.var(departures.mean(axis=1), ddof=1)
+    return float(1.0 - estimated / np.var(departures, axis=0, ddof=1).mean())
+
+
+# --- Shrinkage: each member with and without its population ---------------------------------------
+
+MAX_STEPS = 100
+TOLERANCE = 1e-10
+MIN_PRECISION_ERRORS = 2.0
+MIN_SPREAD = 1e-6
+
+
+def shrinkage(result: xr.DataTree) -> pd.DataFrame:
+    """Each member's pooled and unpooled estimate, and how far the population shrinks it."""
+    # The unpooled estimate is not a further fit: the population is divided out of the draws. If the
+    # likelihood of a member is that of $x_m \sim Normal(a, 1/p)$ on the population's scale, its
+    # posterior given the population is
+    # $$ x_m | \mu, s \sim Normal\Big(\frac{p a + \mu / s^2}{p + 1 / s^2}, \frac{1}{p + 1 /
+    # s^2}\Big) $$
+    # and $a$ and $p$ maximize the likelihood of the draws, so that the uncertainty of location and
+    # spread is accounted for. This holds where the member's likelihood is about normal on that
+    # scale, and the bounds of an index are far; elsewhere it is an approximation. The other
+    # parameters of the member keep their priors.
+    rows = {}
+    for population in [] if method_of(result) == "point" else populations(result):
+        location = population.to_scale(population.location.draws.ravel())
+        is_finite = _is_finite(population)
+        for scalar in population.members:
+            rows[scalar.label] = [math.nan] * len(MEMBER_COLUMNS)
+            if is_finite:
+                draws = scalar.draws.ravel()
+                spread = population.spread.draws.ravel()
+                unpooled = unpooled_estimate(population.to_scale(draws), location, spread)
+                ends = unpooled.mean + np.array([0.0, -1.96, 1.96]) * unpooled.sd
+                rows[scalar.label] = [
+                    draws.mean(),
+                    *np.quantile(draws, CENTRAL_95),
+                    *population.from_scale(ends),
+                    unpooled.shrinkage,
+                ]
+    index = pd.Index(list(rows), dtype=object)
+    values = list(rows.values())
+    return pd.DataFrame(values, columns=list(MEMBER_COLUMNS), index=index, dtype=float)
+
+
+class UnpooledEstimate(NamedTuple):
+    """One member without its population, on the scale on which the population is normal.
+
+    The shrinkage is the weight of the population in the member's posterior mean.
+    """
+
+    mean: float
+    sd: float
+    shrinkage: float
+
+
+def unpooled_estimate(
+    value: np.ndarray, location: np.ndarray, spread: np.ndarray
+) -> UnpooledEstimate:
+    """Divide a normal population out of the posterior draws of one of its members."""
+    # Under a likelihood $\exp(b x - p x^2 / 2)$ of the member, its draws given location $\mu$ and
+    # spread $s$ of the same draw are
+    # $$ x | \mu, s \sim Normal(m, v), \qquad v = \frac{1}{p + s^{-2}}, \qquad m = v (b + \mu
+    # s^{-2}) $$
+    # The log density of all draws is concave in (b, p): Newton's method finds its maximum. So the
+    # estimate is exact, up to Monte Carlo error, for any posterior of location and spread.
+    center, unit = float(value.mean()), float(value.std())
+    if not unit > 0.0:
+        return UnpooledEstimate(math.nan, math.nan, math.nan)
+    x, mu = (value - center) / unit, (location - center) / unit
+    precision = np.maximum(spread / unit, MIN_SPREAD) ** -2.0
+    b, p = 0.0, max(1.0 - 1.0 / float(np.mean(1.0 / precision)), 0.1)
+    lowest = -0.99 * float(precision.min())
+    for _ in range(MAX_STEPS):
+        gradient, curvature = _derivatives(x, mu, precision, b, p)
+        step = np.linalg.solve(curvature, gradient)
+        # Halved until every variance is positive and the density does not fall.
+        before = _log_density(x, mu, precision, b, p)
+        while p + step[1] <= lowest or (
+            _log_density(x, mu, precision, b + step[0], p + step[1]) < before - 1e-9 * abs(before)
+        ):
+            step = step / 2.0
+        b, p = b + step[0], p + step[1]
+        if gradient @ step < TOLERANCE * x.size:
+            break
+    error = math.sqrt(np.linalg.inv(_derivatives(x, mu, precision, b, p)[1])[1, 1])
+    weight = float(np.mean(precision / (precision + max(p, 0.0))))
+    if not p > MIN_PRECISION_ERRORS * error:
+        return UnpooledEstimate(math.nan, math.nan, weight)
+    return UnpooledEstimate(center + unit * b / p, unit / math.sqrt(p), weight)
+
+
+def _log_density(x: np.ndarray, mu: np.ndarray, precision: np.ndarray, b: float, p: float) -> float:
+    """Of all draws, up to a constant."""
+    variance = 1.0 / (p + precision)
+    mean = variance * (b + mu * precision)
+    return float(np.sum(-0.5 * (x - mean) ** 2 / variance - 0.5 * np.log(variance)))
+
+
+def _derivatives(
+    x: np.ndarray, mu: np.ndarray, precision: np.ndarray, b: float, p: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient of the log density in (b, p), and minus its second derivatives."""
+    variance = 1.0 / (p + precision)
+    mean = variance * (b + mu * precision)
+    gradient = np.array([np.sum(x - mean), 0.5 * np.sum(mean**2 + variance - x**2)])
+    cross = -np.sum(mean * variance)
+    square = np.sum(mean**2 * variance + 0.5 * variance**2)
+    return gradient, np.array([[np.sum(variance), cross], [cross, square]])

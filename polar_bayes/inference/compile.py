@@ -1,26 +1,27 @@
-"""One thread at a time traces a model: NumPyro keeps one stack of handlers for the whole process.
+"""Ahead-of-time compilation, the cache of compiled programs, and deadlines.
 
-Two threads that trace at once would find each other's handlers on it: a crash at best, another
-model's values at worst. Only tracing and lowering hold that lock. What is traced compiles beside
-anything else, once, and compiled programs run side by side: a thread whose result nobody waits for
-any more keeps no other one from its work.
+NumPyro has one stack of effect handlers for the whole process, so only one thread may trace a model
+at a time. `TRACING_LOCK` is held while a model is traced and lowered; compilation and execution run
+in parallel with everything else.
 """
 
 import contextvars
 import dataclasses
+import gc
 import os
 import queue
 import sys
-import sysconfig
 import threading
 import time
-import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
+import cachetools
 import jax
+import numpy as np
 from dask.base import tokenize
 from numpyro import distributions as dist
 
@@ -31,130 +32,122 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress
 
 COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
-"""Of three levels: fits run as fast as with all, first ones take three quarters of the time."""
+"""XLA's optimization level, of 0 to 3: fits run as fast as with 3, and the first one of a layout
+takes three quarters of the time."""
 
 CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
-_COMPILER_THREAD = ThreadPoolExecutor(1, "polar_bayes compiles")
+_COMPILER_THREAD = ThreadPoolExecutor(1, "polar_bayes compiler")
 
 
 class AbandonedError(Exception):
-    """Raised in a thread whose result nobody waits for any more, so that it ends."""
+    """Ends a thread that passed its deadline."""
 
 
-class _Tracing:
-    """A lock that one thread may take several times, and abandoned threads no more."""
+_ABANDONED: contextvars.ContextVar[threading.Event | None] = contextvars.ContextVar(
+    "polar_bayes_abandoned", default=None
+)
+"""In a thread with a deadline: set when the deadline has passed."""
+
+
+class _TracingLock:
+    """A reentrant lock that abandoned threads cannot acquire."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
-        self._refused: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
 
     def __enter__(self) -> None:
         self._lock.acquire()
-        if threading.current_thread() in self._refused:
+        abandoned = _ABANDONED.get()
+        if abandoned is not None and abandoned.is_set():
             self._lock.release()
             raise AbandonedError
 
     def __exit__(self, *_: object) -> None:
         self._lock.release()
 
-    def refuse(self, thread: threading.Thread) -> None:
-        """Wait until the thread is not tracing, and let it never trace again."""
+    def wait(self) -> None:
+        """Wait until no other thread is tracing, even in an abandoned thread."""
         with self._lock:
-            self._refused.add(thread)
+            pass
 
 
-TRACING_LOCK = _Tracing()
-"""Held while a model is traced; nobody compiles, runs or waits for a program while holding it."""
+TRACING_LOCK = _TracingLock()
+"""Held while a model is traced, and never while a program is compiled or runs."""
 
 
 def compiled(function: Callable) -> Any:
-    """The function as `jax.jit` has it, compiled with as much effort as running it pays back."""
+    """The function under `jax.jit`, with `COMPILER_OPTIONS` on a CPU."""
     return jax.jit(
         function, compiler_options=COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
     )
 
 
 class JitOnce:
-    """A function that is traced alone in the process, and compiled once, by its first call."""
+    """A function that is traced under the lock, and compiled once for each shape and device.
+
+    The shape is that of the first argument; those of others must follow from it.
+    """
 
     def __init__(self, function: Callable) -> None:
         self._function = compiled(function)
-        self._begun: _Compilation | None = None
-        self._run: Callable | None = None
-        self._device: Any = None
+        self._compilations: dict[Hashable, _Compilation] = {}
 
     @property
     def is_begun(self) -> bool:
-        """Whether it is compiled, or being compiled."""
-        return self._begun is not None
+        """Whether a compilation has begun."""
+        return bool(self._compilations)
 
     def __call__(self, *arguments: Any) -> Any:
-        """Run it; the first time, trace and compile it before."""
+        """Run the program, which the first call compiles."""
         return self.program(*arguments)(*arguments)
 
     def begin(self, *arguments: Any) -> None:
-        """Trace it for arguments of such shapes and types, and compile it beside what follows."""
-        if self._begun is None:
-            _COMPILER_THREAD.submit(self._traced(*arguments).result)
+        """Trace now, and compile on another thread; the arguments may be `ShapeDtypeStruct`."""
+        if self._key(arguments) not in self._compilations:
+            _COMPILER_THREAD.submit(self._trace(arguments).result)
 
     def program(self, *arguments: Any) -> Callable:
         """The compiled program for arguments of these shapes and types."""
-        run = self._run
-        if run is None or self._device != jax.config.jax_default_device:
-            run = self._run = self._traced(*arguments).result()
-        return run
+        found = self._compilations.get(self._key(arguments))
+        return (found or self._trace(arguments)).result()
 
-    def _traced(self, *arguments: Any) -> "_Compilation":
+    def _trace(self, arguments: tuple) -> "_Compilation":
         with TRACING_LOCK:
-            device = jax.config.jax_default_device  # a compiled program runs where it was made for
-            if self._begun is None or self._device != device:
-                self._begun, self._run = _Compilation(self._function.lower(*arguments)), None
-                self._device = device
-            return self._begun
+            key = self._key(arguments)
+            if key not in self._compilations:
+                self._compilations[key] = _Compilation(self._function.lower(*arguments))
+            return self._compilations[key]
 
-
-class JitByShape:
-    """The same for a function whose first argument comes in several shapes."""
-
-    def __init__(self, function: Callable) -> None:
-        self._function = function
-        self._of_shape: dict[tuple[int, ...], JitOnce] = {}
-
-    def begin(self, first: Any, *others: Any) -> None:
-        """Trace it for arguments of such shapes, and compile it beside what follows."""
-        self._of(first.shape).begin(first, *others)
-
-    def __call__(self, first: Any, *others: Any) -> Any:
-        """Run it; with a first argument of a new shape, trace and compile it before."""
-        return self._of(first.shape)(first, *others)
-
-    def _of(self, shape: tuple[int, ...]) -> JitOnce:
-        found = self._of_shape.get(shape)
-        return found or self._of_shape.setdefault(shape, JitOnce(self._function))
+    @staticmethod
+    def _key(arguments: tuple) -> Hashable:
+        shape = getattr(arguments[0], "shape", None)
+        return shape, jax.config.jax_default_device  # a compiled program runs on one device
 
 
 class _Compilation:
-    """A traced program, compiled once, by whichever thread comes to it first."""
+    """A lowered program, compiled once, by the first thread that asks."""
 
     def __init__(self, lowered: Any) -> None:
         self._lowered = lowered
-        self._found: Callable | None = None
+        self._compiled: Any = None
+        self._program: Callable | None = None
         self._lock = threading.Lock()
 
     def result(self) -> Callable:
-        # A thread that waits for the queue of `_COMPILER_THREAD` would wait for programs of others,
-        # too: it compiles what it needs itself, where that has not begun.
-        with self._lock:
-            if self._found is None:
-                self._found = self._lowered.compile()
-                self._lowered = None  # only the program is kept
-            check_memory(bytes_of(self._found))
-            return self._found
+        # A thread does not wait for the queue of `_COMPILER_THREAD`, which holds programs of other
+        # fits: what is still in the queue is compiled by the thread that needs it.
+        if self._program is None:
+            with self._lock:
+                if self._lowered is not None:
+                    self._compiled, self._lowered = self._lowered.compile(), None
+                check_memory(bytes_of(self._compiled))
+                self._program = self._compiled
+        return self._program
 
 
 def bytes_of(program: Any) -> int:
-    """Memory that one run of a compiled program takes; 0 where the backend does not say."""
+    """Memory that one run of a compiled program takes; 0 where the backend reports nothing."""
     analysis = program.memory_analysis()
     if analysis is None:
         return 0
@@ -163,52 +156,46 @@ def bytes_of(program: Any) -> int:
 
 
 def check_memory(needed: int) -> None:
-    """Refuse what cannot be held in memory, before anything is allocated."""
-    there = memory_limit()
-    if there is not None and needed > there:
+    """Refuse a program that does not fit into memory, before anything is allocated."""
+    limit = memory_limit()
+    if limit is not None and needed > limit:
         raise FitError(
-            f"this fit would need {needed / 1e9:.1f} GB at once, of {there / 1e9:.1f} GB",
+            f"this fit would need {needed / 1e9:.1f} GB at once, of {limit / 1e9:.1f} GB",
             where="memory",
             hint="average neighboring views, or take a sample of them",
         )
 
 
 def memory_limit() -> int | None:
-    """Bytes of the accelerator, or of the machine and its container; None where nobody says."""
+    """Bytes of the accelerator, or of the machine and its container; None where not known."""
     if jax.default_backend() != "cpu":
         return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit")
-    found = []
+    limits = []
     if hasattr(os, "sysconf"):
-        found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     for file in map(Path, CONTAINER_LIMITS):
         text = file.read_text().strip() if file.is_file() else ""
         if text.isdigit():
-            found.append(int(text))
-    return min(found, default=None)
+            limits.append(int(text))
+    return min(limits, default=None)
 
 
-# --- What was compiled is kept for the next fit that is the same but for its readings -------------
-
-
-INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib")})
+# --- The cache of compiled programs, which fits of one layout share -------------------------------
 
 
 class LRUCache[T]:
-    """The last few things that were made, by key; safe to ask from several threads."""
+    """The values used last, by key; several threads may ask at once."""
 
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._found: dict[Any, T] = {}
+    def __init__(self, maxsize: int) -> None:
+        self._values: cachetools.LRUCache[Hashable, T] = cachetools.LRUCache(maxsize)
         self._lock = threading.RLock()
 
-    def of(self, key: Any, make: Callable[[], T]) -> T:
-        """What has that key, made now if it is not kept."""
+    def of(self, key: Hashable, make: Callable[[], T]) -> T:
+        """The value of a key, made now if it is not in the cache."""
         with self._lock:
-            found = self._found.pop(key) if key in self._found else make()
-            self._found[key] = found
-            while len(self._found) > self._most:
-                del self._found[next(iter(self._found))]
-            return found
+            if key not in self._values:
+                self._values[key] = make()
+            return self._values[key]
 
 
 def cache_key(
@@ -218,44 +205,89 @@ def cache_key(
     links: Mapping[str, AbstractLink],
     *further: Any,
 ) -> str:
-    """A text that is the same for stories whose programs are the same."""
+    """A text that is equal for requests whose compiled programs are the same."""
+    scene = dataclasses.replace(scene)  # without its ledger
     parts = [
         model,
-        dataclasses.replace(scene),  # without its ledger
-        # Not the priors themselves: distributions keep what they have computed.
+        scene,
+        # Not the priors themselves: distributions store what they have computed.
         *(
             (name, jax.tree.leaves(prior), str(jax.tree.structure(prior)))
             for name, prior in priors.items()
         ),
         links,
-        last_edit(),
+        *_code_of(model, scene, links, *map(type, priors.values())),
         *further,
     ]
-    # One by one: a token depends on which objects of what it is made of are the same one.
+    # One by one: a token depends on which of the objects inside it are identical.
     return tokenize([tokenize(part) for part in parts])
 
 
 def layout_of(data: Observations) -> tuple[str, ...]:
-    """What programs know of a capture: variables, axes, lengths and types, and no reading."""
+    """What programs depend on in a capture: variables, axes, lengths and types, not readings."""
     return (str(jax.tree.structure(data)), *(f"{x.dtype}{x.shape}" for x in jax.tree.leaves(data)))
 
 
-def last_edit() -> int:
-    """When a module that is not installed was edited last, in ns."""
-    # A model, link or part of the user's own that is edited and loaded again has the name that it
-    # had before. What was compiled of the old one must not answer for it.
-    edits = [0]
-    for module in list(sys.modules.values()):
-        file = getattr(module, "__file__", None)
-        if file and not file.startswith(INSTALLED):
-            try:
-                edits.append(Path(file).stat().st_mtime_ns)
-            except OSError:  # in an archive, or gone
-                continue
-    return max(edits)
+CONSTANTS = (str, bytes, int, float, complex, np.ndarray, np.generic, jax.Array)
 
 
-# --- Work that is abandoned at a deadline, because what runs compiled cannot be interrupted -------
+def _code_of(*roots: object) -> Iterator[object]:
+    """Byte code of the user's functions that the roots refer to, and the constants they read."""
+    # A function or class that is edited and loaded again keeps its name, by which it is pickled.
+    # Programs compiled from the old code must not serve the new one.
+    seen: dict[int, object] = {}  # holds the objects, so that no other one gets the same id
+    pending = list(roots)
+    while pending:
+        value = pending.pop()
+        if isinstance(value, CONSTANTS):
+            yield value
+        elif id(value) not in seen:
+            seen[id(value)] = value
+            if isinstance(value, FunctionType) and not _is_installed(value.__module__):
+                yield value.__code__
+            pending.extend(_references(value))
+
+
+def _references(value: object) -> Iterable[object]:
+    """Objects whose code may run when a value is used."""
+    if isinstance(value, ModuleType):
+        return ()
+    if isinstance(value, FunctionType):
+        attached = (value.__closure__, value.__dict__)
+        if _is_installed(value.__module__):
+            return attached
+        return (*attached, value.__defaults__, value.__kwdefaults__, *_globals_of(value))
+    if isinstance(value, type):
+        return () if _is_installed(value.__module__) else (*vars(value).values(), *value.__bases__)
+    if type(value).__module__ in ("builtins", "functools"):  # containers, cells, methods, partials
+        return gc.get_referents(value)
+    return (type(value), *getattr(value, "__dict__", {}).values())
+
+
+def _globals_of(function: FunctionType) -> Iterator[object]:
+    """Values of the global names in a function, and of attributes of the user's own modules."""
+    codes = [function.__code__]
+    names: list[str] = []
+    for code in codes:
+        names.extend(code.co_names)
+        codes.extend(constant for constant in code.co_consts if isinstance(constant, CodeType))
+    for name in names:
+        value = function.__globals__.get(name)
+        yield value
+        if isinstance(value, ModuleType) and not _is_installed(value.__name__):
+            yield from (getattr(value, attribute, None) for attribute in names)
+
+
+def _is_installed(module: str | None) -> bool:
+    """Whether a module is part of Python, of this package or of another installed one."""
+    package = (module or "").partition(".")[0]
+    if package in sys.stdlib_module_names or package == "polar_bayes":
+        return True
+    file = getattr(sys.modules.get(module or ""), "__file__", None) or ""
+    return not {"site-packages", "dist-packages"}.isdisjoint(Path(file).parts)
+
+
+# --- Deadlines: compiled programs cannot be interrupted, but their thread can be abandoned --------
 
 
 class OutOfTimeError(Exception):
@@ -263,57 +295,56 @@ class OutOfTimeError(Exception):
 
 
 def run_until[T](deadline: float, progress: Progress, work: Callable[[Progress], T]) -> T:
-    """Do work in a thread of its own, and go on without it after the deadline."""
-    # Compilation and compiled programs cannot be interrupted from Python. An abandoned thread ends
-    # when it next reports progress or wants to trace a model; it traces nothing after this function
-    # has returned or raised, so that it never meets the caller in NumPyro's stack of handlers.
+    """Run work on a thread of its own, and abandon it at the deadline (`time.perf_counter`)."""
+    # An abandoned thread ends when it next reports progress or tries to trace a model. It traces
+    # nothing after this function has returned or raised, so NumPyro's handlers are not shared.
     if deadline == float("inf"):
         return work(progress)
     if time.perf_counter() >= deadline:
         raise OutOfTimeError("the time was up")
-    task = _Task(work)
+    reports: _Reports = queue.SimpleQueue()
+    abandoned = threading.Event()
+    outcome = _start(work, reports, abandoned)
     try:
         while True:
-            left = max(deadline - time.perf_counter(), 0.0)
-            said = task.reports.get(timeout=min(left, threading.TIMEOUT_MAX))
-            if said is None:
-                return task.outcome.result()
-            progress(*said)
+            remaining = max(deadline - time.perf_counter(), 0.0)
+            report = reports.get(timeout=min(remaining, threading.TIMEOUT_MAX))
+            if report is None:
+                return outcome.result()
+            progress(*report)
     except queue.Empty:
         raise OutOfTimeError("abandoned when the time was up") from None
     finally:
-        task.abandon()
+        abandoned.set()
+        if not outcome.done():
+            TRACING_LOCK.wait()
 
 
-class _Task[T]:
-    """Work in a thread of its own."""
+_Reports = queue.SimpleQueue[tuple[str, float] | None]
+"""Progress of a thread; None when it has ended."""
 
-    def __init__(self, work: Callable[[Progress], T]) -> None:
-        self.outcome: Future[T] = Future()
-        self.reports: queue.SimpleQueue[tuple[str, float] | None] = queue.SimpleQueue()
-        self._work, self._abandoned = work, threading.Event()
-        self._in_double = jax.config.jax_enable_x64
-        # Not a daemon: an interpreter that shuts down under compiled code crashes.
-        self._thread = threading.Thread(
-            target=contextvars.copy_context().run, args=(self._run,), name="polar_bayes in time"
-        )
-        self._thread.start()
 
-    def abandon(self) -> None:
-        """Nobody waits any more; nothing happens where it is done."""
-        self._abandoned.set()
-        if not self.outcome.done():
-            TRACING_LOCK.refuse(self._thread)
+def _start[T](
+    work: Callable[[Progress], T], reports: _Reports, abandoned: threading.Event
+) -> Future[T]:
+    """Run work on a new thread until it is abandoned."""
+    enable_x64 = jax.config.jax_enable_x64  # a thread does not inherit it
 
-    def _run(self) -> None:
-        try:
-            with jax.enable_x64(self._in_double):  # a thread does not inherit it
-                self.outcome.set_result(self._work(self._report))
-        except BaseException as error:  # raised again where somebody waits
-            self.outcome.set_exception(error)
-        self.reports.put(None)
-
-    def _report(self, stage: str, fraction: float) -> None:
-        if self._abandoned.is_set():
+    def report(stage: str, fraction: float) -> None:
+        if abandoned.is_set():
             raise AbandonedError
-        self.reports.put((stage, fraction))
+        reports.put((stage, fraction))
+
+    def run() -> T:
+        _ABANDONED.set(abandoned)
+        try:
+            with jax.enable_x64(enable_x64):
+                return work(report)
+        finally:
+            reports.put(None)
+
+    # Not a daemon thread: an interpreter that shuts down while compiled code runs crashes.
+    executor = ThreadPoolExecutor(1, "polar_bayes deadline")
+    outcome = executor.submit(contextvars.copy_context().run, run)
+    executor.shutdown(wait=False)
+    return outcome

@@ -1,10 +1,10 @@
-"""What fits hold, and their netCDF files: one tree a file, whole or not at all.
+"""The schema of results, and their netCDF files: one tree a file, whole or not at all.
 
-A schema says which groups, variables, attributes and provenance are read, and of what type each is.
-What nobody reads is not looked at, so trees that ArviZ made, or that a user has edited, pass
-wherever their parts fit together. Functions behind the door trust what they are given. The tables
-stand beside the loaders: `polar_bayes.inference.files`, `calibration.files` and
-`budget.accuracy_files`.
+A schema lists the groups, variables, attributes and provenance that this package reads, with the
+type of each. Everything else in a tree is ignored, so trees that ArviZ made, or that a user has
+edited, pass wherever their parts fit together. Functions trust a tree that has passed its schema.
+The schemas of calibrations and accuracy studies are in `polar_bayes.calibration.files` and
+`polar_bayes.benchmark.accuracy`.
 """
 
 import dataclasses
@@ -22,19 +22,14 @@ from polar_bayes.errors import FitError, OutputError
 from polar_bayes.inference.result import GEOMETRY, PROVENANCE, provenance_of
 from polar_bayes.paths import existing_file, replacing
 
-# --- What a kind of tree holds: a table, and the check of a tree against it -----------------------
-
-
-DRAWS = ("chain", "draw")
-
-Departures = Iterator[tuple[str, str]]
+Problems = Iterator[tuple[str, str]]
 """Where a tree departs from its schema, and what is wrong there."""
 
-# --- types of JSON values ---------------------------------------------------------------------
+# --- JSON: provenance and attributes --------------------------------------------------------------
 
 
 class Leaf(NamedTuple):
-    """A type of value: its name, and whether a value is of it."""
+    """A type of JSON value: its name, and whether a value has it."""
 
     name: str
     holds: Callable[[Any], bool]
@@ -62,78 +57,132 @@ BOUNDS = Leaf("a least and a largest value", _are_bounds)
 OPTIONAL = Leaf("a number or null", lambda value: value is None or _is_number(value))
 
 type Spec = Leaf | Mapping[str, Spec] | list[Spec]
-"""A leaf; keys of a mapping, with `?` where one may be missing or null; or the type of each item
-of a list, as its only entry."""
+"""A leaf; the keys of a mapping, with `?` where one may be missing or null; or a list whose only
+entry is the type of each item."""
 
 EACH = "*"
-"""Stands for every key of a mapping that its table does not name."""
+"""Stands for every key of a mapping that the specification does not name."""
 
 
-def _mismatches(value: Any, spec: Spec, place: str) -> Departures:
-    """Where a JSON value is not of its type."""
+def _check_json(value: Any, spec: Spec, where: str) -> Problems:
+    """Where a JSON value departs from its specification."""
     if isinstance(spec, Leaf):
         if not spec.holds(value):
-            yield place, f"it is {value!r}, not {spec.name}"
+            yield where, f"it is {value!r}, not {spec.name}"
     elif isinstance(spec, list):
         if not isinstance(value, list):
-            yield place, f"it is {value!r}, not a list"
+            yield where, f"it is {value!r}, not a list"
             return
         for number, item in enumerate(value):
-            yield from _mismatches(item, spec[0], f"{place}[{number}]")
+            yield from _check_json(item, spec[0], f"{where}[{number}]")
     elif isinstance(value, Mapping):
-        yield from _of_mapping(value, spec, place)
+        yield from _check_mapping(value, spec, where)
     else:
-        yield place, f"it is {value!r}, not a mapping"
+        yield where, f"it is {value!r}, not a mapping"
 
 
-def _of_mapping(value: Mapping[str, Any], spec: Mapping[str, Spec], place: str) -> Departures:
-    known = {key.removesuffix("?"): key for key in spec if key != EACH}
-    for name, key in known.items():
-        if name not in value and not key.endswith("?"):
-            yield f"{place}.{name}", "it is missing"
+def _check_mapping(value: Mapping[str, Any], spec: Mapping[str, Spec], where: str) -> Problems:
+    for key in spec:
+        if key != EACH and not key.endswith("?") and key not in value:
+            yield f"{where}.{key}", "it is missing"
     for name, item in value.items():
-        key = known.get(name, EACH)
-        if key in spec and not (item is None and key.endswith("?")):
-            yield from _mismatches(item, spec[key], f"{place}.{name}")
+        optional = f"{name}?"
+        key = name if name in spec else optional if optional in spec else EACH
+        if key in spec and not (item is None and key == optional):
+            yield from _check_json(item, spec[key], f"{where}.{name}")
 
 
-# --- groups and variables ---------------------------------------------------------------------
+# --- Groups and variables -------------------------------------------------------------------------
 
+DRAWS = ("chain", "draw")
 Variables = Mapping[str, xr.Variable]
 
 NUMBERS, FLAGS, TEXTS = "biuf", "biu", "OSUT"
 """Kinds of NumPy types; text is read from files as objects."""
 
+_KIND_NAMES = {NUMBERS: "real numbers", FLAGS: "whole numbers or truth values", TEXTS: "text"}
+
 
 class Like(NamedTuple):
-    """That a group has variables in the shape of those of another group."""
+    """The variables of another group, each with endings of its name and the dims that they add."""
 
     group: str
     endings: Mapping[str, tuple[str, ...]]
-    needed: bool = False
+    required: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """What is read of a group."""
+    """The schema of one group."""
 
-    dims: tuple[str, ...] = ()
-    others: bool = True
-    never: tuple[str, ...] = ()
-    needed: bool = False
-    tied: bool = False
-    labeled: bool = True
-    kinds: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    variables: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
-    names: tuple[str, ...] | None = None
+    dims: tuple[str, ...] = ()  # of every variable that `variables` does not list
+    extra_dims: bool = True  # whether variables may have further dims
+    never: tuple[str, ...] = ()  # dims that no variable may have
+    required: bool = False  # whether a tree without it, or with an empty one, is refused
+    tied: bool = False  # whether chains and draws are those of the posterior
+    labeled: bool = True  # whether dims have the labels that they have in other groups
+    kinds: Mapping[str, str] = dataclasses.field(default_factory=dict)  # numbers by default
+    variables: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)  # required
+    names: tuple[str, ...] | None = None  # patterns of the variables that are read; None: all
     like: Like | None = None
-    inside: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    inside: Mapping[str, str] = dataclasses.field(default_factory=dict)  # groups with all its dims
     attributes: Mapping[str, Spec] = dataclasses.field(default_factory=dict)
-    marks: Mapping[str, Spec] = dataclasses.field(default_factory=dict)
+    variable_attributes: Mapping[str, Spec] = dataclasses.field(default_factory=dict)
 
-    def is_read(self, name: str) -> bool:
-        """Whether a variable is read, by its name."""
-        return self.names is None or any(fnmatch.fnmatchcase(name, each) for each in self.names)
+    def read(self, node: xr.DataTree) -> Variables:
+        """The variables that are read, and the coordinates that `variables` lists."""
+        names = [*node.data_vars, *(key for key in self.variables if key in node.coords)]
+        patterns = self.names or ("*",)
+        return {
+            name: node.variables[name]
+            for name in names
+            if any(fnmatch.fnmatchcase(str(name), pattern) for pattern in patterns)
+        }
+
+    def check(self, variables: Variables, attributes: Mapping[Any, Any], where: str) -> Problems:
+        """Where a group departs from this schema."""
+        yield from _check_json(attributes, self.attributes, where)
+        for name in self.variables:
+            if name not in variables:
+                yield f"{where}/{name}", "it is missing"
+        for name, variable in variables.items():
+            names = (name, *variable.dims)
+            if odd := [each for each in names if not isinstance(each, str)]:
+                yield where, f"{odd[0]!r} is no name"
+            else:
+                yield from self._check_variable(name, variable, f"{where}/{name}")
+        sizes = [variables[name].size for name in self.variables if name in variables]
+        if self.required and not (all(sizes) and any(x.size for x in variables.values())):
+            yield where, "it is empty"
+
+    def _check_variable(self, name: str, variable: xr.Variable, where: str) -> Problems:
+        kinds, dims = self.kinds.get(name, NUMBERS), set(variable.dims)
+        if variable.dtype.kind not in kinds:
+            yield where, f"it holds {variable.dtype}, not {_KIND_NAMES[kinds]}"
+        expected = self.variables.get(name, self.dims)
+        is_closed = name in self.variables or not self.extra_dims
+        if not dims >= set(expected) or (is_closed and dims != set(expected)):
+            yield where, f"its dims are {_join(variable.dims)}, not {_join(expected)}"
+        if odd := [dim for dim in self.never if dim in dims]:
+            yield where, f"it has the dim {odd[0]}"
+        yield from _check_json(variable.attrs, self.variable_attributes, where)
+
+    def check_dims(self, own: Variables, read: Mapping[str, Variables], where: str) -> Problems:
+        """Where dims are not those that `like` and `inside` take from other groups."""
+        for name, group in self.inside.items():
+            for other, variable in read.get(group, {}).items() if name in own else ():
+                if not set(own[name].dims) <= set(variable.dims):
+                    what = f"{group}/{other} has not its dims {_join(own[name].dims)}"
+                    yield f"{where}/{name}", what
+        like = self.like or Like("", {})
+        for name, variable in read.get(like.group, {}).items():
+            for ending, added in like.endings.items():
+                key, expected = f"{name}{ending}", (*added, *variable.dims)
+                if key in own and set(own[key].dims) != set(expected):
+                    what = f"its dims are {_join(own[key].dims)}, not {_join(expected)}"
+                    yield f"{where}/{key}", what
+                if key not in own and like.required:
+                    yield f"{where}/{key}", "it is missing"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,40 +196,40 @@ class Schema:
     provenance: Mapping[str, Spec]
 
     def describes(self, tree: object) -> bool:
-        """Whether a tree has the groups of this kind; a fit that has others, too, is a fit."""
+        """Whether a tree has the required groups; a tree with a posterior is a fit only."""
         if not isinstance(tree, xr.DataTree):
             return False
-        needed = {name for name, group in self.groups.items() if group.needed}
-        return needed <= set(tree.children) and ("posterior" in needed) == (
-            "posterior" in tree.children
-        )
+        required = {name for name, group in self.groups.items() if group.required}
+        is_fit = "posterior" in tree.children
+        return required <= set(tree.children) and ("posterior" in required) == is_fit
 
     def check(self, tree: xr.DataTree, source: str) -> None:
-        """Refuse a tree that does not hold what this kind holds."""
+        """Raise a `FitError` where a tree departs from this schema."""
         if not self.describes(tree):
             hint = f"give the tree that {self.made_by} returned"
             raise FitError(f"it holds no {self.kind}", where=source, hint=hint)
-        for place, what in self._departures(tree):
+        for where, what in self._problems(tree):
             hint = f"give the tree as {self.made_by} returned it"
-            raise FitError(what, where=f"{source}: {place}", hint=hint)
+            raise FitError(what, where=f"{source}: {where}", hint=hint)
 
-    def _departures(self, tree: xr.DataTree) -> Departures:
-        yield from _mismatches(provenance_of(tree), self.provenance, PROVENANCE)
+    def _problems(self, tree: xr.DataTree) -> Problems:
+        yield from _check_json(provenance_of(tree), self.provenance, PROVENANCE)
         read: dict[str, Variables] = {}
         for name, group in self.groups.items():
             if name in tree.children:
-                yield from _unreadable(tree.children[name], name)
-                yield from _repeated(tree.children[name], name)
-                read[name] = _variables(group, tree.children[name])
-                yield from _of_group(group, read[name], tree.children[name].attrs, name)
+                node = tree.children[name]
+                yield from _check_node(node, name)
+                read[name] = group.read(node)
+                yield from group.check(read[name], node.attrs, name)
         for name, variables in read.items():
-            yield from _unlike(self.groups[name], variables, read, name)
-        yield from self._lengths(read)
-        labeled = {name: tree.children[name] for name in read if self.groups[name].labeled}
-        yield from _labels(labeled)
+            yield from self.groups[name].check_dims(variables, read, name)
+        yield from self._check_lengths(read)
+        yield from _check_labels(
+            {name: tree.children[name] for name in read if self.groups[name].labeled}
+        )
 
-    def _lengths(self, read: Mapping[str, Variables]) -> Departures:
-        """Dims that groups share have one length everywhere, but for the draws of others."""
+    def _check_lengths(self, read: Mapping[str, Variables]) -> Problems:
+        """Dims that groups share have one length, except chains and draws of untied groups."""
         sizes: dict[str, tuple[str, int]] = {}
         for name, variables in read.items():
             for dim, size in {d: n for x in variables.values() for d, n in x.sizes.items()}.items():
@@ -191,55 +240,25 @@ class Schema:
                     yield name, f"its {dim} has {size} entries, that of {first} {expected}"
 
 
-def _unreadable(node: xr.DataTree, place: str) -> Departures:
-    """A group whose variables do not fit together, as an edit that xarray broke off leaves it."""
+def _check_node(node: xr.DataTree, where: str) -> Problems:
+    """Groups that xarray itself cannot handle, as an edit that failed half-way leaves them."""
     try:
         node.to_dataset()
     except ValueError as error:
-        yield place, f"its variables do not fit together ({error})"
-
-
-def _repeated(node: xr.DataTree, place: str) -> Departures:
-    """Dims of one variable with one name, which xarray allows and cannot handle."""
+        yield where, f"its variables do not fit together ({error})"
     for name, variable in node.variables.items():
         if len(set(variable.dims)) < variable.ndim:
-            yield f"{place}/{name}", f"its dims are {_listed(variable.dims)}, one of them twice"
+            yield f"{where}/{name}", f"its dims are {_join(variable.dims)}, one of them twice"
 
 
-def _variables(group: Group, node: xr.DataTree) -> Variables:
-    """The variables of a group that are read, and the coordinates that its table names."""
-    names = [*node.data_vars, *(key for key in group.variables if key in node.coords)]
-    return {name: node.variables[name] for name in names if group.is_read(str(name))}
-
-
-def _of_group(
-    group: Group, variables: Variables, attributes: Mapping[Any, Any], place: str
-) -> Departures:
-    yield from _mismatches(attributes, group.attributes, place)
-    for name in group.variables:
-        if name not in variables:
-            yield f"{place}/{name}", "it is missing"
-    for name, variable in variables.items():
-        names = (name, *variable.dims)
-        if odd := [each for each in names if not isinstance(each, str)]:
-            yield place, f"{odd[0]!r} is no name"
-        else:
-            yield from _of_variable(group, name, variable, f"{place}/{name}")
-    sizes = [variables[name].size for name in group.variables if name in variables]
-    if group.needed and not (all(sizes) and any(x.size for x in variables.values())):
-        yield place, "it is empty"
-
-
-def _labels(labeled: Mapping[str, xr.DataTree]) -> Departures:
-    """Dims that groups share have the same labels everywhere; wavelengths are lengths."""
+def _check_labels(labeled: Mapping[str, xr.DataTree]) -> Problems:
+    """Dims that groups share have the same labels; wavelengths are lengths."""
     seen: dict[Any, tuple[str, xr.Variable | None]] = {}
     for name, node in labeled.items():
         for dim in (dim for dim in node.dims if dim not in DRAWS):
             found = node.variables[dim] if dim in node.coords else None
             first, expected = seen.setdefault(dim, (name, found))
-            is_same = found is expected or (
-                found is not None and expected is not None and expected.equals(found)
-            )
+            is_same = expected is found if expected is None else expected.equals(found)
             if not is_same:
                 yield f"{name}/{dim}", f"its labels are not those of {first}"
     name, found = seen.get("wavelength", ("", None))
@@ -249,52 +268,14 @@ def _labels(labeled: Mapping[str, xr.DataTree]) -> Departures:
         yield f"{name}/wavelength", "a label is no length in nm"
 
 
-def _of_variable(group: Group, name: str, variable: xr.Variable, place: str) -> Departures:
-    kinds, dims = group.kinds.get(name, NUMBERS), set(variable.dims)
-    if variable.dtype.kind not in kinds:
-        yield place, f"it holds {variable.dtype}, not {_WORDS[kinds]}"
-    expected = group.variables.get(name, group.dims)
-    is_closed = name in group.variables or not group.others
-    if not dims >= set(expected) or (is_closed and dims != set(expected)):
-        yield place, f"its dims are {_listed(variable.dims)}, not {_listed(expected)}"
-    if odd := [dim for dim in group.never if dim in dims]:
-        yield place, f"it has the dim {odd[0]}"
-    yield from _mismatches(variable.attrs, group.marks, place)
-
-
-_WORDS = {NUMBERS: "real numbers", FLAGS: "whole numbers or truth values", TEXTS: "text"}
-
-
-def _unlike(group: Group, own: Variables, read: Mapping[str, Variables], place: str) -> Departures:
-    """Where the dims of a group are not those that other groups ask for."""
-    for name, other in group.inside.items():
-        for host, variable in read.get(other, {}).items() if name in own else ():
-            if not set(own[name].dims) <= set(variable.dims):
-                yield (
-                    f"{place}/{name}",
-                    f"{other}/{host} has not its dims {_listed(own[name].dims)}",
-                )
-    like = group.like or Like("", {})
-    for name, variable in read.get(like.group, {}).items():
-        for ending, besides in like.endings.items():
-            key, expected = f"{name}{ending}", (*besides, *variable.dims)
-            if key in own and set(own[key].dims) != set(expected):
-                yield (
-                    f"{place}/{key}",
-                    f"its dims are {_listed(own[key].dims)}, not {_listed(expected)}",
-                )
-            if key not in own and like.needed:
-                yield f"{place}/{key}", "it is missing"
-
-
-def _listed(dims: Any) -> str:
+def _join(dims: Any) -> str:
     return f"({', '.join(map(str, dims))})"
 
 
-# --- What fits hold, and their netCDF files: one tree a file, whole or not at all -----------------
+# --- Fits -----------------------------------------------------------------------------------------
 
 
-OF_ALL: Mapping[str, Spec] = {
+COMMON_PROVENANCE: Mapping[str, Spec] = {
     "method?": TEXT,
     "model?": TEXT,
     "scene?": TEXT,
@@ -305,11 +286,11 @@ OF_ALL: Mapping[str, Spec] = {
     "versions?": {EACH: ANY},
     "timings?": {EACH: FINITE},
 }
-"""Provenance that every kind of tree may have."""
+"""Provenance that every kind of result may have."""
 
 _STEP = {"name": TEXT, "taken": FLAG, "why": TEXT, "seconds": FINITE, "monte_carlo?": FINITE}
-OF_FIT: Mapping[str, Spec] = {
-    **OF_ALL,
+_FIT_PROVENANCE: Mapping[str, Spec] = {
+    **COMMON_PROVENANCE,
     "settings?": {EACH: ANY},
     "model_settings?": {EACH: ANY},
     "model_source?": TEXT,
@@ -338,7 +319,7 @@ STATISTICS = (
     "reached_max_treedepth",
     "step_size",
 )
-"""What is read of `sample_stats`; samplers of other packages have more."""
+"""Variables of `sample_stats` that are read; samplers of other packages have more."""
 
 _EFFECT, _PARAMETER, _ROW = ("effect",), ("parameter",), ("row",)
 _COSTS = ("operations", "compile_seconds", "run_seconds")
@@ -362,7 +343,7 @@ LEDGER = Group(
         "tolerance": FINITE,
     },
 )
-"""The group `effects`: a ledger of `polar_bayes.choose_effects`."""
+"""The group `effects`: the table of `polar_bayes.choose_effects`."""
 
 _OF_ACCURACY = {
     **dict.fromkeys(("mean_error", "sd_error", "low_error", "high_error"), (*_ROW, *_PARAMETER)),
@@ -394,14 +375,14 @@ FIT = Schema(
     made_by="polar_bayes.fit or load_result",
     command="`polar-bayes fit`",
     groups={
-        "posterior": Group(DRAWS, needed=True, tied=True),
+        "posterior": Group(DRAWS, required=True, tied=True),
         "unconstrained_posterior": Group(DRAWS, tied=True, labeled=False),
         "prior": Group(DRAWS),
         "sample_stats": Group(
-            DRAWS, others=False, tied=True, kinds=dict.fromkeys(_FLAGS, FLAGS), names=STATISTICS
+            DRAWS, extra_dims=False, tied=True, kinds=dict.fromkeys(_FLAGS, FLAGS), names=STATISTICS
         ),
         "log_prior": Group(DRAWS, tied=True, labeled=False),
-        "observed_data": Group(never=DRAWS, marks={"saturation_level?": FINITE}),
+        "observed_data": Group(never=DRAWS, variable_attributes={"saturation_level?": FINITE}),
         "posterior_predictive": _OF_READINGS,
         "noise_free": _OF_READINGS,
         "log_likelihood": _OF_READINGS,
@@ -416,13 +397,12 @@ FIT = Schema(
         "effects": LEDGER,
         "accuracy": ACCURACY,
     },
-    provenance=OF_FIT,
+    provenance=_FIT_PROVENANCE,
 )
-"""What is read of a fit."""
 
 
 def check_fit(result: xr.DataTree, source: str = "result") -> None:
-    """Refuse what is no fit, or does not hold together."""
+    """Raise a `FitError` where a tree is no fit, or its parts do not fit together."""
     FIT.check(result, source)
 
 
@@ -443,7 +423,7 @@ def load_result(path: str | os.PathLike[str]) -> xr.DataTree:
 
 
 def load_tree(path: str | os.PathLike[str], schema: Schema) -> xr.DataTree:
-    """A tree of one kind from a netCDF file."""
+    """A tree of one kind from a netCDF file, checked."""
     file = existing_file(path, schema.kind)
     hint = f"give the file that {schema.command} or save_result wrote"
     broken = FitError("it cannot be read as netCDF", where=str(file), hint=hint)

@@ -67,8 +67,8 @@ def fit(
         A DataTree with the groups posterior, sample_stats, log_likelihood, log_prior,
         posterior_predictive, noise_free, prior, prior_predictive, observed_data and
         constant_data, and effects for a scene of `polar_bayes.choose_effects`;
-        `polar_bayes.verdict` says whether it converged, and `polar_bayes.inference.auto_sentences` what
-        "auto" did and why.
+        `polar_bayes.verdict` says whether it converged, and
+        `polar_bayes.inference.auto_sentences` what "auto" did and why.
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.

@@ -1,12 +1,11 @@
-"""One patch of a capture by itself: its peaks, and the shape of its density around a point.
+"""The model of one group: the modes of each patch or material, and its density around a point.
 
-Given the parameters that all patches share, the patches of a capture know nothing of each other.
-Everything that makes many patches cheap rests on that: each can be climbed alone, and each has a
-small curvature of its own.
+Given the parameters that all groups share, the groups of a capture are independent. So each group
+has a mode search and a Hessian of its own, which makes captures of many groups cheap.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -17,22 +16,22 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.optimize import (
     Modes,
     ValueAndGradient,
-    climb,
-    distinct,
-    quiet_line_search,
+    central_difference_hessian,
+    distinct_modes,
+    find_mode,
+    ignore_line_search_warnings,
+    numpy_potential,
+    symmetrize,
 )
 from polar_bayes.inference.program import Model, Program, compile_program
 from polar_bayes.observation.data import Observations
-
-# --- Which coordinates of a program belong to which patch of a capture ----------------------------
-
 
 SHARED_AXES = ("wavelength", "view")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Groups:
-    """Positions in the flat vector of a program."""
+    """Positions in the flat vector of a program: of each group, (group, local), and of the rest."""
 
     axis: str
     local: np.ndarray
@@ -40,143 +39,117 @@ class Groups:
 
     @property
     def count(self) -> int:
-        """How many groups there are."""
+        """Number of groups."""
         return len(self.local)
 
 
 def find_groups(program: Program, data: Observations) -> Groups | None:
-    """The groups of a capture with a leading axis."""
+    """The groups along the only leading axis of a capture; None without one."""
     leading = [(name, length) for name, length in data.dims if name not in SHARED_AXES]
     if len(leading) != 1:
         return None
     name, length = leading[0]
-    local, common = [], []
+    local, common = [], [np.zeros(0, int)]
     for site, positions in program.unravel(jnp.arange(float(program.size))).items():
         flat = np.asarray(positions).astype(int)
         if name not in program.dims[site]:
             common.append(flat.ravel())
             continue
-        # Plates stand outermost first; what an event adds, or a bijection leaves, follows.
+        # Axes of plates come first, outermost first; then those of the event or its bijection.
         sizes = [program.plates[dim] for dim in program.dims[site]]
         per_plate = flat.reshape(*sizes, -1)
         local.append(np.moveaxis(per_plate, program.dims[site].index(name), 0).reshape(length, -1))
     if not local:
         return None
-    nothing = np.zeros(0, int)
-    return Groups(name, np.concatenate(local, axis=1), np.concatenate(common or [nothing]))
+    return Groups(name, np.concatenate(local, axis=1), np.concatenate(common))
 
 
 def group_of(data: Observations, number: int) -> Observations:
     """One group of a capture, as a capture with a leading axis of length 1."""
-    length = data.dims[0][1]
+    axis, length = data.dims[0]
 
     def cut(array: jax.Array) -> jax.Array:
-        # What is shared by all groups has a leading axis of length 1, or none.
+        # Arrays that all groups share have a leading axis of length 1, or none.
         has_axis = array.ndim == len(data.dims) and array.shape[0] == length
         return array[number : number + 1] if has_axis else array
 
-    dims = ((data.dims[0][0], 1), *data.dims[1:])
-    return dataclasses.replace(jax.tree.map(cut, data), dims=dims)
-
-
-# --- One patch of a capture by itself: its peaks, and the shape of its density around a point -----
-
-
-Starts = tuple[np.ndarray, np.ndarray]
-"""Coordinates of a patch, (start, local), and common ones, (start, common)."""
+    return dataclasses.replace(jax.tree.map(cut, data), dims=((axis, 1), *data.dims[1:]))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class GroupModel:
-    """The model of one patch, compiled once for all patches of all captures."""
+    """The model of one group, compiled once for all groups of all captures of a layout."""
 
     program: Program
     groups: Groups
 
 
 def find_group_model(model: Model, groups: Groups, data: Observations) -> GroupModel | None:
-    """The model told for one patch, where it can be: not where a prior names every patch."""
+    """The model of one group; None where it differs between groups, as by a prior for each."""
     first = group_of(data, 0)
     try:
         program = compile_program(model, first)
-    except (TypeError, ValueError):  # arrays of the wrong length for one patch
+    except (TypeError, ValueError):  # arrays of the wrong length for one group
         return None
-    alone = find_groups(program, first)
-    if alone is None:
+    single = find_groups(program, first)
+    if single is None or single.local.shape != (1, groups.local.shape[1]):
         return None
-    same_local = alone.local.shape == (1, groups.local.shape[1])
-    same = same_local and alone.common.size == groups.common.size
-    return GroupModel(program, alone) if same else None
+    return GroupModel(program, single) if single.common.size == groups.common.size else None
+
+
+Starts = tuple[np.ndarray, np.ndarray]
+"""Coordinates of a group, (start, local), and common ones, (start, common)."""
 
 
 class GroupProgram:
-    """The patches of one capture, each by itself."""
+    """The groups of one capture, each by itself."""
 
     def __init__(self, group_model: GroupModel, data: Observations, threads: int = 2) -> None:
-        self._program, self._groups = group_model.program, group_model.groups
+        self._program = group_model.program
+        self._local, self._common = group_model.groups.local[0], group_model.groups.common
         self._parts = [group_of(data, number) for number in range(data.dims[0][1])]
         self._dtype = data.brightness.dtype
         self._threads = threads
 
-    @property
-    def common(self) -> np.ndarray:
-        """Where common coordinates stand in the vector of one patch."""
-        return self._groups.common
-
-    def potential(self, patch: int) -> ValueAndGradient:
-        """Minus the log density of one patch and what is common, with its gradient."""
-
-        def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
-            at = jnp.asarray(z, self._dtype)
-            value, gradient = self._program.value_and_gradient(at, self._parts[patch])
-            return float(value), np.asarray(gradient, float)
-
-        return potential
-
-    def peaks(
+    def find_modes(
         self,
         starts: Callable[[int], Starts],
         common: np.ndarray,
         movable: np.ndarray,
-        tell: Callable[[float], None],
+        progress: Callable[[float], None],
     ) -> list[Modes]:
-        """The peaks of every patch over its own coordinates and the movable common ones."""
+        """The modes of every group over its own coordinates and the movable common ones."""
 
-        def climb_one(patch: int) -> Modes:
+        def of_group(number: int) -> Modes:
             # A thread starts with the settings of the process, not with those of this fit.
             with jax.enable_x64(self._dtype == jnp.float64):
-                return self._climb(patch, starts(patch), common, movable)
+                return self._find_modes(number, starts(number), common, movable)
 
-        # Compiled before the threads start: a deadline reaches this thread only.
+        # Compiled before the threads start: only this thread knows the deadline.
         z = jnp.zeros(self._program.size, self._dtype)
         self._program.value_and_gradient.program(z, self._parts[0])
         found: list[Modes] = []
-        with quiet_line_search(), ThreadPoolExecutor(self._threads) as pool:
-            for modes in pool.map(climb_one, range(len(self._parts))):
+        with ignore_line_search_warnings(), ThreadPoolExecutor(self._threads) as pool:
+            for modes in pool.map(of_group, range(len(self._parts))):
                 found.append(modes)
-                tell(len(found) / len(self._parts))
+                progress(len(found) / len(self._parts))
         return found
 
     def expand(
-        self, patch: int, local: np.ndarray, common: np.ndarray, spread: Iterable[float]
+        self, number: int, local: np.ndarray, common: np.ndarray, sd: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Gradient and second derivatives of the potential, by central differences."""
-        potential, z = self.potential(patch), self._join(local, common)
-        mine = self._groups.local[0]
-        # As in `modes.curvature`: truncation and rounding are then of one size.
-        step_of = np.finfo(self._dtype).eps ** 0.25
-        rows = []
-        for index, sd in zip(mine, spread, strict=True):
-            shift = np.zeros_like(z)
-            shift[index] = step_of * min(max(sd, 1e-6), 1.0)
-            rows.append((potential(z + shift)[1] - potential(z - shift)[1]) / (2 * shift[index]))
-        hessian = np.nan_to_num(np.stack(rows))
-        own = 0.5 * (hessian[:, mine] + hessian[:, mine].T)
-        return np.nan_to_num(potential(z)[1][mine]), own, hessian[:, self._groups.common]
+        """Gradient, Hessian and mixed derivatives of the potential in a group's coordinates."""
+        potential, z = self._potential(number), self._join(local, common)
+        rows = central_difference_hessian(potential, z, sd, self._dtype, self._local)
+        hessian = np.nan_to_num(rows)
+        own, mixed = symmetrize(hessian[:, self._local]), hessian[:, self._common]
+        return np.nan_to_num(potential(z)[1][self._local]), own, mixed
 
-    def _climb(self, patch: int, starts: Starts, common: np.ndarray, movable: np.ndarray) -> Modes:
-        whole, size = self.potential(patch), self._groups.local.shape[1]
-        moving = np.concatenate([self._groups.local[0], self._groups.common[movable]])
+    def _find_modes(
+        self, number: int, starts: Starts, common: np.ndarray, movable: np.ndarray
+    ) -> Modes:
+        whole, size = self._potential(number), self._local.size
+        moving = np.concatenate([self._local, self._common[movable]])
 
         def potential(x: np.ndarray) -> tuple[float, np.ndarray]:
             at = common.copy()
@@ -186,17 +159,20 @@ class GroupProgram:
 
         local, start_common = starts
         points = np.concatenate([local, start_common[:, movable]], axis=1)
-        modes = distinct([climb(potential, point) for point in points])
+        modes = distinct_modes([find_mode(potential, point) for point in points])
         if modes is None:
             raise FitError(
                 f"none of {len(points)} starts reached a peak of the posterior",
-                where=f"fit: {self._parts[0].dims[0][0]} {patch}",
+                where=f"fit: {self._parts[0].dims[0][0]} {number}",
                 hint="check its readings against the prior predictive, mark them valid=False, or "
                 "give narrower priors",
             )
         return modes
 
+    def _potential(self, number: int) -> ValueAndGradient:
+        return numpy_potential(self._program.value_and_gradient, self._parts[number], self._dtype)
+
     def _join(self, local: np.ndarray, common: np.ndarray) -> np.ndarray:
         z = np.zeros(self._program.size, local.dtype)
-        z[self._groups.local[0]], z[self._groups.common] = local, common
+        z[self._local], z[self._common] = local, common
         return z

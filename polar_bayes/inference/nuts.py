@@ -1,10 +1,9 @@
-"""The No-U-Turn sampler, started at the modes, compiled once, and stopped when it is done.
+"""The No-U-Turn sampler (Hoffman and Gelman 2014, JMLR 15, 1593-1623), started at the modes.
 
 NumPyro's kernel advances a chain by a block of draws at a time. One compiled block serves every
-chain; chains run on threads, so both cores work, nobody waits in lock-step, and a progress bar
-costs nothing. After each round of blocks the draws are judged: sampling goes on until every
-coordinate has mixed, within the limits that the caller sets. The draws do not depend on how many
-threads there are.
+chain; chains run on threads, which need not wait for each other within a block. After each round of
+blocks R-hat and effective sample sizes are computed: sampling continues until every coordinate has
+reached the goals, within the limits of the settings. The draws do not depend on the threads.
 """
 
 import dataclasses
@@ -29,7 +28,7 @@ Progress = Callable[[float], None]
 LARGEST_R_HAT = 1.008
 """A little below the 1.01 at which a fit is refused."""
 
-MOST_KEPT = 4
+MAX_SAMPLERS = 4
 """Samplers of one density, by their lengths and goals, that stay compiled."""
 
 
@@ -90,7 +89,7 @@ class Nuts(HTMLRepr):
 
 
 class Step(NamedTuple):
-    """What is kept of one draw."""
+    """One draw with its statistics; or a stack of them."""
 
     z: Float[Array, " size"]
     diverging: Array
@@ -101,21 +100,30 @@ class Step(NamedTuple):
 
 
 class Target(NamedTuple):
-    """What is sampled."""
+    """A density with starting points and metric."""
 
-    samplers: "Samplers"
+    samplers: "SamplerCache"
     given: Any
     potential: ValueAndGradient
     starts: np.ndarray
     metric: np.ndarray
-    place: Callable[[np.ndarray], np.ndarray]
+    transform: Callable[[np.ndarray], np.ndarray] = lambda z: z
+    """From draws in the coordinates of the sampler to those of the program, (chain, draw, size)."""
     acceptance: float = 0.9
     warmup: int = 300
 
-    @property
-    def knows_its_metric(self) -> bool:
-        """True where nothing is left to be learned but the step size."""
-        return self.metric.ndim == 1
+    def sampler(self, settings: Nuts) -> "_Sampler":
+        """The compiled sampler; the target supplies what the settings leave open."""
+        warmup, acceptance = settings.warmup, settings.target_acceptance
+        return self.samplers.of(
+            _Static(
+                warmup=self.warmup if warmup is None else warmup,
+                acceptance=self.acceptance if acceptance is None else acceptance,
+                max_tree_depth=settings.max_tree_depth,
+                block=settings.block,
+                adapts_metric=self.metric.ndim == 2,  # a diagonal one is exact already
+            )
+        )
 
 
 def sample(
@@ -124,84 +132,68 @@ def sample(
     settings: Nuts,
     progress: Progress = lambda _: None,
 ) -> tuple[np.ndarray, dict[str, np.ndarray], bool]:
-    """Draw from the posterior."""
-    sampler = _sampler(target, settings)
-    warmup = sampler.fixed.warmup
+    """Draws (chain, draw, size), statistics by name, and whether the chains reached the goals."""
+    sampler = target.sampler(settings)
+    warmup = sampler.static.warmup
     keys = jax.random.split(key, settings.chains)
-    states = [sampler.begin(target, key, at) for key, at in zip(keys, target.starts, strict=True)]
+    states = [sampler.init(target, key, at) for key, at in zip(keys, target.starts, strict=True)]
     # Compiled before the threads start: all then share one executable.
     advance = sampler.advance.program(states[0], target.given)
 
     rounds: list[Step] = []
-    steps_before = np.zeros(settings.chains, int)
-    mixed = False
+    warmup_steps = np.zeros(settings.chains, int)
+    converged = False
     warmup_blocks, least, most = (
         -(-draws // settings.block) for draws in (warmup, settings.draws, settings.most_draws)
     )
 
     def advance_all(states: list[infer.hmc.HMCState]) -> tuple[list[infer.hmc.HMCState], Step]:
         advanced = list(pool.map(lambda state: advance(state, target.given), states))
-        steps = [jax.tree.map(np.asarray, step) for _, step in advanced]
-        joined = jax.tree.map(lambda *x: np.stack(x), *steps)
-        return [state for state, _ in advanced], joined._replace(z=target.place(joined.z))
+        joined = jax.tree.map(lambda *x: np.stack(x), *(steps for _, steps in advanced))
+        return [state for state, _ in advanced], joined._replace(z=target.transform(joined.z))
 
     progress(0.0)
     with ThreadPoolExecutor(settings.threads) as pool:
         for done in range(warmup_blocks + most):
             states, steps = advance_all(states)
-            # Blocks are whole: one may hold the end of the warm-up and the first draws.
+            # A block may hold the end of the warm-up and the first draws.
             before = int(np.clip(warmup - done * settings.block, 0, settings.block))
-            steps_before += steps.n_steps[:, :before].sum(axis=1)
+            warmup_steps += steps.n_steps[:, :before].sum(axis=1)
             if before < settings.block:
                 rounds.append(jax.tree.map(lambda x, first=before: x[:, first:], steps))
             progress(min((done + 1) / (warmup_blocks + least), 1.0))
-            if done + 1 >= warmup_blocks + least and (mixed := _mixed(rounds, settings)):
+            if done + 1 >= warmup_blocks + least and (converged := _converged(rounds, settings)):
                 break
     joined = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *rounds)
     stats = jax.tree.map(lambda x: x[:, : settings.most_draws], joined)._asdict()
     z = stats.pop("z")
     step_size = np.array([float(state.adapt_state.step_size) for state in states])
     stats["step_size"] = np.broadcast_to(step_size[:, None], z.shape[:2])
-    stats["warmup_steps"] = np.broadcast_to(steps_before[:, None], z.shape[:2])
+    stats["warmup_steps"] = np.broadcast_to(warmup_steps[:, None], z.shape[:2])
     stats["reached_max_treedepth"] = stats["n_steps"] >= 2**settings.max_tree_depth - 1
-    return z, stats, mixed
+    return z, stats, converged
 
 
 def expect(target: Target, settings: Nuts) -> None:
-    """Begin to compile what `sample` will need, beside whatever follows."""
-    sampler = _sampler(target, settings)
+    """Begin to compile what `sample` will need, in parallel with whatever follows."""
+    sampler = target.sampler(settings)
     if not sampler.advance.is_begun:
-        state = sampler.begin(target, jax.random.key(0), target.starts[0])
+        state = sampler.init(target, jax.random.key(0), target.starts[0])
         sampler.advance.begin(state, target.given)
 
 
-def _sampler(target: Target, settings: Nuts) -> "_Sampler":
-    warmup, acceptance = _warmup(settings, target)
-    return target.samplers.of(
-        _Fixed(warmup, acceptance, settings.max_tree_depth, settings.block, target.knows_its_metric)
-    )
-
-
-def _warmup(settings: Nuts, target: Target) -> tuple[int, float]:
-    """Length and goal of the warm-up, where the settings leave them open."""
-    return (
-        target.warmup if settings.warmup is None else settings.warmup,
-        target.acceptance if settings.target_acceptance is None else settings.target_acceptance,
-    )
-
-
-def _mixed(rounds: list[Step], settings: Nuts) -> bool:
+def _converged(rounds: list[Step], settings: Nuts) -> bool:
     """Whether every coordinate has reached the goals; both are invariant to monotone maps."""
     z = np.concatenate([steps.z for steps in rounds], axis=1)
     bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))
-    enough = min(bulk.min(), tail.min()) >= settings.effective_draws
-    return bool(enough and r_hat.max() <= LARGEST_R_HAT)
+    smallest = min(bulk.min(), tail.min())
+    return bool(smallest >= settings.effective_draws and r_hat.max() <= LARGEST_R_HAT)
 
 
 def draw_starts(
     potential: ValueAndGradient, modes: Modes, key: Array, chains: int
 ) -> Float[np.ndarray, "chains size"]:
-    """Starting points: Laplace draws at modes chosen by weight, kept only where finite."""
+    """Laplace draws at modes chosen by weight; the mode itself where the draw is not finite."""
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     starts = []
     for mode in random.choice(len(modes.weight), size=chains, p=modes.weight):
@@ -210,53 +202,53 @@ def draw_starts(
     return np.stack(starts)
 
 
-class _Fixed(NamedTuple):
-    """What a compiled sampler cannot change."""
+class _Static(NamedTuple):
+    """What is fixed when a sampler is compiled."""
 
     warmup: int
     acceptance: float
     max_tree_depth: int
     block: int
-    knows_its_metric: bool
+    adapts_metric: bool
 
 
-class Samplers:
-    """The samplers of one density, each compiled once."""
+class SamplerCache:
+    """The compiled samplers of one density."""
 
     def __init__(self, density: Callable[[Array, Any], Array]) -> None:
         self._density = density
-        self._made: LRUCache[_Sampler] = LRUCache(MOST_KEPT)
+        self._samplers: LRUCache[_Sampler] = LRUCache(MAX_SAMPLERS)
 
-    def of(self, fixed: _Fixed) -> "_Sampler":
+    def of(self, static: _Static) -> "_Sampler":
         """The sampler of such lengths and goals."""
-        return self._made.of(fixed, lambda: _Sampler(self._density, fixed))
+        return self._samplers.of(static, lambda: _Sampler(self._density, static))
 
 
 class _Sampler:
-    """NumPyro's NUTS as two functions of arrays: begin a chain, advance it by a block."""
+    """NumPyro's NUTS as two functions of arrays: start a chain, advance it by a block."""
 
-    def __init__(self, density: Callable[[Array, Any], Array], fixed: _Fixed) -> None:
-        self.fixed = fixed
+    def __init__(self, density: Callable[[Array, Any], Array], static: _Static) -> None:
+        self.static = static
         # From a state and the data to the state after a block and its steps.
         self.advance = JitOnce(self._advance)
         self._init, self._next = infer.hmc.hmc(
             potential_fn_gen=lambda given: lambda z: density(z, given), algo="NUTS"
         )
 
-    def begin(self, target: Target, key: Array, start: np.ndarray) -> infer.hmc.HMCState:
+    def init(self, target: Target, key: Array, start: np.ndarray) -> infer.hmc.HMCState:
         value, gradient = target.potential(start)
-        # Value and gradient are given, so that beginning a chain compiles no model.
+        # Value and gradient are given, so that starting a chain compiles no model.
         given = infer.util.ParamInfo(jnp.asarray(start), jnp.asarray(value), jnp.asarray(gradient))
         return self._init(
             given,
-            self.fixed.warmup,
+            self.static.warmup,
             step_size=0.5,
             inverse_mass_matrix=jnp.asarray(target.metric),
-            dense_mass=not self.fixed.knows_its_metric,
-            adapt_mass_matrix=not self.fixed.knows_its_metric,
-            target_accept_prob=self.fixed.acceptance,
+            dense_mass=self.static.adapts_metric,
+            adapt_mass_matrix=self.static.adapts_metric,
+            target_accept_prob=self.static.acceptance,
             trajectory_length=None,
-            max_tree_depth=self.fixed.max_tree_depth,
+            max_tree_depth=self.static.max_tree_depth,
             model_args=(target.given,),
             rng_key=key,
         )
@@ -273,4 +265,4 @@ class _Sampler:
                 lp=-state.potential_energy,
             )
 
-        return jax.lax.scan(step, state, None, length=self.fixed.block)
+        return jax.lax.scan(step, state, None, length=self.static.block)

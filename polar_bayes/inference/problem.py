@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference import laplace
-from polar_bayes.inference.compile import TRACING_LOCK, JitByShape, LRUCache, cache_key, layout_of
+from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache, cache_key, layout_of
 from polar_bayes.inference.initialization import AbstractInit, AbstractInitializer, make_initializer
 from polar_bayes.inference.program import Model, Program, compile_program
 from polar_bayes.inference.request import Request
@@ -41,7 +41,7 @@ class CompiledModel:
     @functools.cached_property
     def least_squares(self) -> Callable[[Array, Observations], laplace.Estimate]:
         """The least squares from some starts, compiled."""
-        return JitByShape(lambda starts, data: laplace.estimate(self.program, data, starts))
+        return JitOnce(lambda starts, data: laplace.estimate(self.program, data, starts))
 
 
 _KEPT: LRUCache[CompiledModel] = LRUCache(MOST_KEPT)

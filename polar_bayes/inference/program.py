@@ -1,8 +1,7 @@
 """A model and its data as pure functions of one flat, unconstrained vector.
 
-Every method knows sites and shapes only, never a parameter by name: point fits, Laplace and
-NUTS all stand on this file. Data enter as an argument, so that a fit whose data change and whose
-shapes do not compiles nothing.
+Methods use sites and shapes, never a parameter by name. The data are an argument of every function,
+so that fits to captures of one layout share their compiled programs.
 """
 
 import dataclasses
@@ -22,7 +21,7 @@ from numpyro.infer.util import potential_energy
 from numpyro.primitives import Messenger
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import JitByShape, JitOnce
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -30,12 +29,11 @@ from polar_bayes.priors import PriorTable, check_support
 
 Model = Callable[[Observations], None]
 
-
 Values = dict[str, Array] | dict[str, np.ndarray]
 
 
 class Draw(NamedTuple):
-    """All that one posterior draw says, by site name; or a stack of draws, as NumPy arrays."""
+    """Values of one posterior draw, by site name; or of a stack of draws, as NumPy arrays."""
 
     parameters: Values
     coordinates: Values
@@ -57,8 +55,6 @@ class Program:
     auxiliary: tuple[str, ...]
     derived: tuple[str, ...]
     observed: tuple[str, ...]
-    fixed: tuple[str, ...]
-    families: Mapping[str, str]
     size: int
     unravel: Callable[[Float[Array, " size"]], dict[str, Array]]
 
@@ -67,13 +63,13 @@ class Program:
         return self.potential_at(self.unravel(z), data)
 
     def potential_at(self, sites: dict[str, Array], data: Observations) -> Float[Array, ""]:
-        """The same of the latent sites by name, each unconstrained."""
+        """The same of the unconstrained latent sites by name."""
         return potential_energy(self.model, (data,), {}, sites)
 
     def prior_potential(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
-        """The part of the potential in which no reading has a share."""
-        alone = handlers.block(self.model, hide=list(self.observed))
-        return potential_energy(alone, (data,), {}, self.unravel(z))
+        """The potential without the likelihood."""
+        prior = handlers.block(self.model, hide=list(self.observed))
+        return potential_energy(prior, (data,), {}, self.unravel(z))
 
     def constrain(self, z: Float[Array, " size"]) -> dict[str, Array]:
         """The latent sites in their supports."""
@@ -82,12 +78,16 @@ class Program:
             for name, value in self.unravel(z).items()
         }
 
+    def trace(
+        self, z: Float[Array, " size"], data: Observations, key: Array | None = None
+    ) -> dict[str, dict]:
+        """The sites of the model at an unconstrained vector."""
+        fixed = handlers.substitute(self.model, data=self.constrain(z))
+        return _trace(fixed, jax.random.key(0) if key is None else key, data)
+
     def parameters(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
-        """What the model is about: latent sites that are parameters, and what derives from them."""
-        latent = self.constrain(z)
-        fixed = handlers.substitute(self.model, data=latent)
-        trace = handlers.trace(handlers.seed(fixed, jax.random.key(0))).get_trace(data)
-        return self._parameters(trace)
+        """The parameters: latent sites that are not auxiliary, and what derives from them."""
+        return self._parameters(self.trace(z, data))
 
     def _parameters(self, trace: dict) -> dict[str, Array]:
         names = (*(name for name in self.supports if name not in self.auxiliary), *self.derived)
@@ -95,7 +95,7 @@ class Program:
 
     def from_prior(self, key: Array, data: Observations) -> Float[Array, " size"]:
         """An unconstrained vector drawn from the prior."""
-        trace = handlers.trace(handlers.seed(self.model, key)).get_trace(data)
+        trace = _trace(self.model, key, data)
         return ravel_pytree(
             {
                 name: dist.biject_to(support).inv(trace[name]["value"])
@@ -104,35 +104,30 @@ class Program:
         )[0]
 
     def describe(self, key: Array, z: Float[Array, " size"], data: Observations) -> Draw:
-        """Everything that is stored of one draw: parameters, densities, predicted readings."""
-        fixed = handlers.substitute(self.model, data=self.constrain(z))
-        return self._read(handlers.trace(handlers.seed(fixed, key)).get_trace(data), key)
-
-    def prior_draw(self, key: Array, data: Observations) -> Draw:
-        """The same for one draw from the prior."""
-        return self._read(handlers.trace(handlers.seed(self.model, key)).get_trace(data), key)
-
-    def _read(self, trace: dict, key: Array) -> Draw:
+        """Parameters, densities and predicted readings of one draw."""
+        trace = self.trace(z, data, key)
         keys = dict(zip(self.observed, jax.random.split(key, len(self.observed)), strict=True))
-        shapes = {name: trace[name]["value"].shape for name in self.observed}
+        readings = {name: trace[name] for name in self.observed}
         return Draw(
             parameters=self._parameters(trace),
             coordinates={name: trace[name]["value"] for name in self.auxiliary},
-            center={n: jnp.broadcast_to(noise_free(trace, n), shapes[n]) for n in self.observed},
-            log_likelihood={n: trace[n]["fn"].log_prob(trace[n]["value"]) for n in self.observed},
-            # A population's members are not priors of anything: their spread says it all.
+            center={
+                name: jnp.broadcast_to(noise_free(trace, name), site["value"].shape)
+                for name, site in readings.items()
+            },
+            log_likelihood={n: site["fn"].log_prob(site["value"]) for n, site in readings.items()},
+            # Auxiliary sites have no prior of their own: their population is the prior.
             log_prior={
                 n: jnp.sum(trace[n]["fn"].log_prob(trace[n]["value"]))
                 for n in self.supports
                 if n not in self.auxiliary
             },
-            predictive={name: trace[name]["fn"].sample(keys[name]) for name in self.observed},
+            predictive={name: site["fn"].sample(keys[name]) for name, site in readings.items()},
         )
 
     def residuals(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
         """Reading minus noise-free reading of every observed site; 0 where not valid."""
-        fixed = handlers.substitute(self.model, data=self.constrain(z))
-        trace = handlers.trace(handlers.seed(fixed, jax.random.key(0))).get_trace(data)
+        trace = self.trace(z, data)
         return {
             name: jnp.where(data.valid, trace[name]["value"] - noise_free(trace, name), 0.0)
             for name in self.observed
@@ -140,7 +135,7 @@ class Program:
 
     @functools.cached_property
     def potential_jit(self) -> Callable[[Array, Observations], Array]:
-        """The potential; the model is told once, however many programs compute it."""
+        """The potential; the model is traced once, however many programs compute it."""
         return jax.jit(self.potential, inline=True)
 
     @functools.cached_property
@@ -150,57 +145,49 @@ class Program:
 
     @functools.cached_property
     def drawn_from_prior(self) -> Callable[[np.ndarray, int, Observations], Array]:
-        """Vectors drawn from the prior, one for each of the first keys, compiled."""
-        # The others are zero: how many are wanted is no part of what is compiled.
+        """Vectors drawn from the prior, compiled: one for each of the first `count` keys."""
+        # The others are zero, so that one program serves any count.
 
         def draw(keys: Array, count: int, data: Observations) -> Array:
             wrapped = jax.random.wrap_key_data(keys)
-            nothing = jnp.zeros((len(keys), self.size), data.brightness.dtype)
+            zeros = jnp.zeros((len(keys), self.size), data.brightness.dtype)
             return jax.lax.fori_loop(
-                0, count, lambda i, z: z.at[i].set(self.from_prior(wrapped[i], data)), nothing
+                0, count, lambda i, z: z.at[i].set(self.from_prior(wrapped[i], data)), zeros
             )
 
-        return JitByShape(draw)
+        return JitOnce(draw)
 
     @functools.cached_property
-    def described(self) -> JitByShape:
-        """Many draws described, compiled; keys as the numbers that they hold, (draw, ...)."""
+    def described(self) -> JitOnce:
+        """`describe` of many draws, compiled; keys as the data that they hold, (draw, ...)."""
 
         def describe(keys: Array, z: Array, data: Observations) -> Draw:
             wrapped = jax.random.wrap_key_data(keys)
             return jax.lax.map(lambda kz: self.describe(kz[0], kz[1], data), (wrapped, z))
 
-        return JitByShape(describe)
+        return JitOnce(describe)
 
     @functools.cached_property
     def parameters_of_chains(self) -> Callable[[Array, Observations], dict[str, Array]]:
-        """The parameters of chains of draws, (chain, draw, size), compiled."""
+        """`parameters` of chains of draws, (chain, draw, size), compiled."""
         over_draws = jax.vmap(self.parameters, in_axes=(0, None))
-        return JitByShape(jax.vmap(over_draws, in_axes=(0, None)))
+        return JitOnce(jax.vmap(over_draws, in_axes=(0, None)))
 
     @functools.cached_property
     def slopes(self) -> Callable[[Array], dict[str, Array]]:
-        """Derivatives of the latent sites in the vector, compiled."""
+        """Jacobian of `constrain`, compiled."""
         return JitOnce(jax.jacfwd(self.constrain))
 
 
 def compile_program(model: Model, data: Observations) -> Program:
-    """Walk the model once, without computing anything, and note its sites."""
-    sites: dict[str, dict] = {}
-
-    def walk(data: Observations) -> None:
-        trace = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(data)
-        sites.update(trace)
-
-    jax.eval_shape(walk, data)
-    sampled = {name: site for name, site in sites.items() if site["type"] == "sample"}
-    latent = {name: site for name, site in sampled.items() if not site["is_observed"]}
+    """Trace the model once with abstract arrays, and record its sites."""
+    sites, sampled, latent = _abstract_sites(model, data)
     observed = tuple(n for n, site in sampled.items() if site["is_observed"] and n in data.readings)
-    said = {f"{name}_mean" for name in observed}
     derived = {
         name: site
         for name, site in sites.items()
-        if site["type"] == "deterministic" and name not in said
+        if site["type"] == "deterministic"
+        and name not in {f"{reading}_mean" for reading in observed}
     }
     supports = {name: site["fn"].support for name, site in latent.items()}
     prototype = {
@@ -208,42 +195,64 @@ def compile_program(model: Model, data: Observations) -> Program:
         for name, site in latent.items()
     }
     flat, unravel = ravel_pytree(prototype)
+    plates = {name: site["cond_indep_stack"] for name, site in (sampled | derived).items()}
     return Program(
         model=model,
-        dims={name: _plate_names(site) for name, site in (sampled | derived).items()},
-        plates={
-            frame.name: frame.size
-            for site in (sampled | derived).values()
-            for frame in site["cond_indep_stack"]
+        dims={
+            name: tuple(frame.name for frame in sorted(frames, key=lambda frame: frame.dim))
+            for name, frames in plates.items()
         },
+        plates={frame.name: frame.size for frames in plates.values() for frame in frames},
         events={name: tuple(site["fn"].event_shape) for name, site in sampled.items()}
-        | {name: _own_shape(site) for name, site in derived.items()},
+        | {name: _event_shape(site) for name, site in derived.items()},
         supports=supports,
         auxiliary=tuple(name for name, site in latent.items() if is_auxiliary(site)),
         derived=tuple(derived),
         observed=observed,
-        fixed=tuple(
-            n for n, site in sampled.items() if site["is_observed"] and n not in data.readings
-        ),
-        families={name: family_of(site["fn"]) for name, site in latent.items()},
         size=flat.size,
         unravel=unravel,
     )
 
 
 def is_auxiliary(site: Mapping[str, Any]) -> bool:
-    """True for a latent site that says `infer={"auxiliary": True}`: a coordinate, no parameter."""
+    """True for a latent site with `infer={"auxiliary": True}`: a coordinate, not a parameter."""
     return bool(site["infer"].get("auxiliary", False))
 
 
 def noise_free(trace: dict, name: str) -> Array:
-    """The noise-free reading: the site that says so, or the mean of the likelihood."""
-    said = trace.get(f"{name}_mean")
-    return said["value"] if said is not None else trace[name]["fn"].mean
+    """The noise-free reading: the site `<name>_mean`, or else the mean of the likelihood."""
+    site = trace.get(f"{name}_mean")
+    return site["value"] if site is not None else trace[name]["fn"].mean
 
 
-def _own_shape(site: dict) -> tuple[int, ...]:
-    """The axes of a deterministic site that no plate gave it."""
+def family_of(distribution: dist.Distribution) -> str:
+    """The name of a distribution's class, without the wrappers that plates add."""
+    while isinstance(distribution, dist.Independent | dist.ExpandedDistribution):
+        distribution = distribution.base_dist
+    return type(distribution).__name__
+
+
+Sites = dict[str, dict[str, Any]]
+
+
+def _trace(model: Callable, key: Array, data: Observations, **arguments: Any) -> Sites:
+    return handlers.trace(handlers.seed(model, key)).get_trace(data, **arguments)
+
+
+def _abstract_sites(
+    model: Callable, data: Observations, **arguments: Any
+) -> tuple[Sites, Sites, Sites]:
+    """All sites of a model, the sampled ones, and of these the latent ones; nothing is computed."""
+    sites: Sites = {}
+    jax.eval_shape(
+        lambda data: sites.update(_trace(model, jax.random.key(0), data, **arguments)), data
+    )
+    sampled = {name: site for name, site in sites.items() if site["type"] == "sample"}
+    return sites, sampled, {n: site for n, site in sampled.items() if not site["is_observed"]}
+
+
+def _event_shape(site: dict) -> tuple[int, ...]:
+    """The axes of a deterministic site that no plate added."""
     repeated = math.prod(frame.size for frame in site["cond_indep_stack"])
     shape = tuple(site["value"].shape)
     if math.prod(shape) == repeated:
@@ -252,23 +261,11 @@ def _own_shape(site: dict) -> tuple[int, ...]:
     return shape[outer:]
 
 
-def family_of(distribution: dist.Distribution) -> str:
-    """The name of a distribution's class, without what plates have wrapped around it."""
-    while isinstance(distribution, dist.Independent | dist.ExpandedDistribution):
-        distribution = distribution.base_dist
-    return type(distribution).__name__
-
-
-def _plate_names(site: dict) -> tuple[str, ...]:
-    plates = sorted(site["cond_indep_stack"], key=lambda frame: frame.dim)
-    return tuple(frame.name for frame in plates)
-
-
-# --- What a model says about itself when it is told once, without computing anything --------------
+# --- Checks of a model before it is fitted --------------------------------------------------------
 
 
 class ModelInfo(NamedTuple):
-    """What was found."""
+    """Priors that a model reads, priors that it declares, and sites that it holds fixed."""
 
     priors: tuple[str, ...]
     declared: dict[str, str]
@@ -282,18 +279,8 @@ def inspect_model(
     priors: PriorTable,
     links: Mapping[str, AbstractLink],
 ) -> ModelInfo:
-    """Tell the story once, with abstract arrays, and refuse what cannot be fitted."""
-    sites: dict[str, dict] = {}
-
-    def tell(data: Observations) -> None:
-        seeded = handlers.seed(model, jax.random.key(0))
-        sites.update(
-            handlers.trace(seeded).get_trace(data, scene=scene, priors=priors, links=links)
-        )
-
-    jax.eval_shape(tell, data)
-    sampled = {name: site for name, site in sites.items() if site["type"] == "sample"}
-    latent = {name: site for name, site in sampled.items() if not site["is_observed"]}
+    """Trace a model once with abstract arrays; a `FitError` where it cannot be fitted."""
+    _, sampled, latent = _abstract_sites(model, data, scene=scene, priors=priors, links=links)
     for name, site in latent.items():
         _check_site(name, site["fn"])
     _check_handlers(model, tuple(sampled))
@@ -306,22 +293,17 @@ def inspect_model(
             if name not in priors.read and not is_auxiliary(site)
         },
         fixed={
-            name: _value_of(site["value"])
+            name: "as the model computes it"
+            if isinstance(site["value"], jax.core.Tracer)
+            else np.asarray(site["value"]).tolist()
             for name, site in sampled.items()
             if site["is_observed"] and name not in data.readings
         },
     )
 
 
-def _value_of(value: Any) -> Any:
-    """What JSON can hold of a value that a model was given."""
-    if isinstance(value, jax.core.Tracer):
-        return "as the model computes it"
-    return np.asarray(value).tolist()
-
-
 def _check_handlers(model: Callable, sites: tuple[str, ...]) -> None:
-    """Two handlers hold a value while one simulates, but not while one samples a posterior."""
+    """`substitute` and `do` hold a value in simulations, but not while a posterior is sampled."""
     while isinstance(model, Messenger):
         held = [name for name in getattr(model, "data", None) or {} if name in sites]
         if isinstance(model, handlers.substitute | handlers.do) and held:
@@ -345,7 +327,7 @@ def _check_site(name: str, distribution: dist.Distribution) -> None:
 
 
 def _check_readings(sampled: Mapping[str, dict], data: Observations) -> None:
-    """A model that observes nothing, or draws a reading, has lost its data."""
+    """Every model must observe a reading, and draw none."""
     drawn = [n for n in data.readings if n in sampled and not sampled[n]["is_observed"]]
     if drawn:
         raise FitError(
@@ -361,14 +343,11 @@ def _check_readings(sampled: Mapping[str, dict], data: Observations) -> None:
         )
 
 
-# --- Parameters of many draws at once -------------------------------------------------------------
-
-
 PIECE = 500
 
 
 def parameters_of(program: Program, z: np.ndarray, data: Observations) -> dict[str, np.ndarray]:
-    """What draws say of the parameters, and nothing of readings."""
+    """Parameters of draws (chain, draw, size) by name, in blocks of one compiled length."""
     count = z.shape[1]
     pieces = []
     for begin in range(0, count, PIECE):

@@ -1,7 +1,7 @@
-"""A finished fit as an ArviZ DataTree: labels come back here, and everything is saved.
+"""A finished fit as an ArviZ DataTree: draws, readings, their labels, and the provenance.
 
-Root attributes are one JSON string, because netCDF holds only text and numbers; it says enough
-to repeat the fit.
+The provenance is one root attribute in JSON, because netCDF holds only text and numbers. It is
+complete enough to repeat the fit.
 """
 
 import json
@@ -30,70 +30,74 @@ def assemble(
     posterior: Draw,
     prior: Draw,
     sample_stats: Mapping[str, np.ndarray],
-    beside: Mapping[str, xr.Dataset],
+    comparisons: Mapping[str, xr.Dataset],
     provenance: Mapping[str, object],
 ) -> xr.DataTree:
-    """Put draws, data and provenance into one tree."""
+    """Draws, data and provenance as one tree."""
     groups: dict[str, dict[str, np.ndarray]] = {
         "posterior": _shaped(program, posterior.parameters),
         "sample_stats": {name: np.asarray(x) for name, x in sample_stats.items()},
         "posterior_predictive": _readings(posterior.predictive, data),
         "log_likelihood": {n: np.asarray(x) for n, x in posterior.log_likelihood.items()},
-        "log_prior": {n: np.asarray(x) for n, x in posterior.log_prior.items()},
         "noise_free": _readings(posterior.center, data),
         "prior": _shaped(program, prior.parameters),
         "prior_predictive": _readings(prior.predictive, data),
     }
     if program.auxiliary:
         groups["unconstrained_posterior"] = _shaped(program, posterior.coordinates)
-    lengths = dict(data.dims)
-    coords = {dim: capture[dim].to_numpy() for dim in lengths if dim in capture.coords}
-    coords |= {dim: np.arange(length) for dim, length in lengths.items() if dim not in coords}
-    # The log prior is one number per site and draw, whatever the site's own axes are.
-    log_prior = xr.Dataset(
-        {name: (("chain", "draw"), x) for name, x in groups.pop("log_prior").items()}
-    )
+    coords = {
+        dim: capture[dim].to_numpy() if dim in capture.coords else np.arange(length)
+        for dim, length in data.dims
+    }
     tree = from_dict(groups, coords=coords, dims=dims_of(program))
-    tree["log_prior"] = xr.DataTree(log_prior)
-    tree["observed_data"] = xr.DataTree(_observed(program, capture, data, coords))
-    tree["constant_data"] = xr.DataTree(_constants(capture, data, coords))
-    for name, dataset in beside.items():
+    # The log prior is one number per site and draw, whatever the site's own axes are.
+    log_prior = {n: (("chain", "draw"), np.asarray(x)) for n, x in posterior.log_prior.items()}
+    added = {"log_prior": xr.Dataset(log_prior), **_data_groups(program, capture, data, coords)}
+    for name, dataset in comparisons.items():
         labels = {dim: values for dim, values in coords.items() if dim in dataset.dims}
-        tree[name] = xr.DataTree(dataset.assign_coords(labels))
+        added[name] = dataset.assign_coords(labels)
+    for name, dataset in added.items():
+        tree[name] = xr.DataTree(dataset)
     for group in ("posterior", "prior"):
-        _annotate(tree.children[group])
+        for parameter, variable in tree.children[group].data_vars.items():
+            variable.attrs |= attributes_of(str(parameter))
     tree.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
     return tree
 
 
+def attributes_of(name: str) -> dict[str, str]:
+    """Meaning, unit and symbol of a parameter, as attributes of its variable."""
+    symbol, meaning, unit = notation(name)
+    known = {"long_name": meaning, "units": unit}
+    return known | {"symbol": symbol} if symbol else known
+
+
 def provenance_of(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
-    """What a result says about how it was made."""
-    text = result.attrs.get(PROVENANCE, "{}")
+    """How a result was made; null entries are left out."""
     try:
-        said = json.loads(text)
+        found = json.loads(result.attrs.get(PROVENANCE, "{}"))
     except (TypeError, ValueError, RecursionError):
-        said = None
-    if not isinstance(said, dict):
+        found = None
+    if not isinstance(found, dict):
         raise FitError(
             "it is no mapping in JSON",
             where=f"result: attribute {PROVENANCE}",
             hint="give the result as it was saved, or delete the attribute",
         )
-    return {key: value for key, value in said.items() if value is not None}
+    return {key: value for key, value in found.items() if value is not None}
 
 
 def bounds_of(provenance: Mapping[str, Any], name: str) -> tuple[float, float]:
-    """Where the prior of a parameter ends."""
-    limits = RANGES.get(name, (-math.inf, math.inf))
-    said = (provenance.get("bounds") or {}).get(name)
-    if said is None:
-        return limits
-    low, high = said
+    """Support of the prior of a parameter."""
+    bounds = (provenance.get("bounds") or {}).get(name)
+    if bounds is None:
+        return RANGES.get(name, (-math.inf, math.inf))
+    low, high = bounds
     return -math.inf if low is None else low, math.inf if high is None else high
 
 
 def posterior_of(program: Program, parameters: Mapping[str, Any]) -> xr.Dataset:
-    """A posterior group alone, for a fit that stands beside the main one."""
+    """The group `posterior` of a fit without any other group."""
     tree = from_dict({"posterior": _shaped(program, parameters)}, dims=dims_of(program))
     return tree["posterior"].to_dataset()
 
@@ -107,7 +111,7 @@ def dims_of(program: Program) -> dict[str, list[str]]:
 
 
 def shape_of(program: Program, name: str) -> tuple[int, ...]:
-    """Lengths of the axes of a site, without those of length 1 that plates leave behind."""
+    """Lengths of the axes of a site, without the axes of length 1 that plates may add."""
     return (*(program.plates[dim] for dim in program.dims[name]), *program.events[name])
 
 
@@ -123,38 +127,20 @@ def _readings(values: Mapping[str, Any], data: Observations) -> dict[str, np.nda
     return {name: np.asarray(value) * unit.get(name, 1.0) for name, value in values.items()}
 
 
-def _observed(
+def _data_groups(
     program: Program, capture: xr.Dataset, data: Observations, coords: Mapping[str, np.ndarray]
-) -> xr.Dataset:
-    order = [dim for dim, _ in data.dims]
-    valid = xr.DataArray(np.asarray(data.valid), dims=order)
-    readings = {
-        name: capture[name]
-        .transpose(*order)
-        .drop_vars(capture.coords, errors="ignore")
-        .where(valid)
-        for name in program.observed
-        if name in capture
-    }
-    return xr.Dataset(readings, coords=dict(coords))
-
-
-def _constants(
-    capture: xr.Dataset, data: Observations, coords: Mapping[str, np.ndarray]
-) -> xr.Dataset:
+) -> dict[str, xr.Dataset]:
+    """Readings that were fitted, and what the model was given: geometry, errors, flags, truth."""
     order = [dim for dim, _ in data.dims]
     bare = capture.drop_vars(capture.coords)
-    constants = {name: bare[name] for name in GEOMETRY}
-    constants |= {str(n): bare[n] for n in bare if str(n).startswith("true_")}
-    constants |= {str(n): bare[n] for n in bare if str(n).endswith("_error")}
-    constants["valid"] = xr.DataArray(np.asarray(data.valid).astype("int8"), dims=order)
-    constants["saturated"] = xr.DataArray(np.asarray(data.saturated).astype("int8"), dims=order)
-    return xr.Dataset(constants, coords=dict(coords))
-
-
-def _annotate(group: xr.DataTree) -> None:
-    for name, variable in group.data_vars.items():
-        symbol, meaning, unit = notation(str(name))
-        variable.attrs |= {"long_name": meaning, "units": unit}
-        if symbol:
-            variable.attrs["symbol"] = symbol
+    valid, saturated = (
+        xr.DataArray(np.asarray(flag), dims=order) for flag in (data.valid, data.saturated)
+    )
+    readings = [name for name in program.observed if name in bare]
+    given = [n for n in bare if str(n).startswith("true_") or str(n).endswith("_error")]
+    flags = {"valid": valid.astype("int8"), "saturated": saturated.astype("int8")}
+    groups = {
+        "observed_data": {name: bare[name].transpose(*order).where(valid) for name in readings},
+        "constant_data": {str(name): bare[name] for name in (*GEOMETRY, *given)} | flags,
+    }
+    return {name: xr.Dataset(group, coords=dict(coords)) for name, group in groups.items()}

@@ -1,4 +1,8 @@
-"""Spectra at wavelengths that were not measured, from a finished fit."""
+"""Spectra at wavelengths that were not measured: Gaussian process prediction from a finished fit.
+
+Each posterior draw is conditioned on its weights at the measured wavelengths and drawn at the new
+ones (Rasmussen and Williams 2006, *Gaussian Processes for Machine Learning*, section 2.2).
+"""
 
 import ast
 from collections.abc import Mapping
@@ -13,11 +17,10 @@ from jaxtyping import Array
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.result import bounds_of, provenance_of
+from polar_bayes.inference.result import attributes_of, bounds_of, provenance_of
 from polar_bayes.models.gp_spectral import GpSpectral
 from polar_bayes.models.spectral_process import SPECTRA, SpectralProcess, around, widening_of
 from polar_bayes.physics.dispersion import AbstractDispersion, Cauchy, Sellmeier
-from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
 
 BATCH = 64
@@ -34,9 +37,10 @@ def predict_spectrum(
 ) -> xr.Dataset:
     """Draws of n and a at any wavelengths.
 
-    A process is conditioned on each posterior draw and drawn between and beyond the measured
-    colors, so bands widen away from them; a law of dispersion is evaluated. What the knots leave
-    open is computed in double precision whatever the fit's, which the answer has again.
+    A Gaussian process is conditioned on each posterior draw and drawn between and beyond the
+    measured wavelengths, so bands widen away from them; a law of dispersion is evaluated. The
+    conditional covariance is computed in double precision, whatever the precision of the fit; the
+    result has the precision of the fit.
 
     Args:
         result: Of a fit with `GpSpectral`, or of any model in a scene with a law of dispersion;
@@ -56,26 +60,25 @@ def predict_spectrum(
     """
     new = _checked(wavelengths)
     check_fit(result)
-    told = provenance_of(result)
+    provenance = provenance_of(result)
     found: dict[str, xr.DataArray] = {}
-    law = _law_of(told, scene)
+    law = _law_of(provenance, scene)
     if law is not None:
-        found["refractive_index"] = _follow(law, result["posterior"].dataset, new)
+        found["refractive_index"] = _evaluate(law, result["posterior"].dataset, new)
     processes = [n for n in SPECTRA if f"{n}_amplitude" in result["posterior"].data_vars]
     if processes:
-        fitted = _model_of(told, model)
+        fitted = _model_of(provenance, model)
         for number, name in enumerate(processes):
             key = [seed, number]
-            found[name] = _condition(name, fitted.process_of(name), result, told, new, key)
+            found[name] = _predict(name, fitted.process_of(name), result, provenance, new, key)
     if not found:
         raise FitError(
             "the fit ties no color to another",
-            where=f"predict_spectrum: result of model {told.get('model', 'unknown')!r}",
+            where=f"predict_spectrum: result of model {provenance.get('model', 'unknown')!r}",
             hint="fit with model='gp_spectral', or in a scene with a law of dispersion",
         )
     for name, spectrum in found.items():
-        symbol, meaning, unit = notation(name)
-        spectrum.attrs = {"long_name": meaning, "units": unit, "symbol": symbol}
+        spectrum.attrs = attributes_of(name)
     return xr.Dataset(found)
 
 
@@ -93,18 +96,18 @@ def _checked(wavelengths: Any) -> np.ndarray:
     return new
 
 
-def _law_of(told: Mapping[str, Any], scene: Scene | None) -> AbstractDispersion | None:
-    """The law of dispersion of the fit, read from what it says of its scene unless it is given."""
+def _law_of(provenance: Mapping[str, Any], scene: Scene | None) -> AbstractDispersion | None:
+    """The law of dispersion: of the scene that is given, or parsed from the provenance."""
     if scene is not None:
         return scene.dispersion
-    parts = str(told.get("scene_parts", ""))
+    parts = str(provenance.get("scene_parts", ""))
     try:
         for node in ast.walk(ast.parse(parts, mode="eval")):
             law = node.value if isinstance(node, ast.keyword) and node.arg == "dispersion" else None
             if isinstance(law, ast.Call) and isinstance(law.func, ast.Name):
                 fields = {str(part.arg): ast.literal_eval(part.value) for part in law.keywords}
                 return LAWS[law.func.id](**fields)
-    except (SyntaxError, ValueError, KeyError) as error:  # a part or a law of the user's own
+    except (SyntaxError, ValueError, KeyError) as error:  # the user's own part or law
         if "dispersion=" in parts and "dispersion=None" not in parts:
             raise FitError(
                 "the law of dispersion of the fit's scene is not one of this package",
@@ -114,8 +117,8 @@ def _law_of(told: Mapping[str, Any], scene: Scene | None) -> AbstractDispersion 
     return None
 
 
-def _model_of(told: Mapping[str, Any], model: GpSpectral | None) -> GpSpectral:
-    """The model of the fit, from its settings unless it is given."""
+def _model_of(provenance: Mapping[str, Any], model: GpSpectral | None) -> GpSpectral:
+    """The model of the fit: the one that is given, or made from the settings in the provenance."""
     if model is not None:
         if not isinstance(model, GpSpectral):
             raise FitError(
@@ -124,33 +127,24 @@ def _model_of(told: Mapping[str, Any], model: GpSpectral | None) -> GpSpectral:
                 hint="give the model of the fit, such as GpSpectral()",
             )
         return model
-    settings = told.get("model_settings") or {}
+    settings = provenance.get("model_settings") or {}
     process = settings.get("process", {})
-    several = isinstance(process, list)
-    rebuilt = tuple(_process_of(each) for each in (process if several else [process]))
+    problem = "the fit's kernel has no name by which it can be found"
     try:
+        several = isinstance(process, list)
+        made = tuple(SpectralProcess(**each) for each in (process if several else [process]))
+        problem = "the settings of the fit's model are not those of GpSpectral"
         return GpSpectral(
             coupled=tuple(settings.get("coupled", SPECTRA)),
-            process=rebuilt if several else rebuilt[0],
+            process=made if several else made[0],
             pooled=tuple(settings.get("pooled", ())),
         )
-    except (TypeError, IndexError) as error:
-        raise _unknown("the settings of the fit's model are not those of GpSpectral") from error
+    except (FitError, TypeError, IndexError) as error:
+        hint = "give the model again: predict_spectrum(result, wavelengths, model=...)"
+        raise FitError(problem, where="predict_spectrum: model", hint=hint) from error
 
 
-def _process_of(settings: Mapping[str, Any]) -> SpectralProcess:
-    try:
-        return SpectralProcess(**settings)
-    except (FitError, TypeError) as error:
-        raise _unknown("the fit's kernel has no name to find it by") from error
-
-
-def _unknown(what: str) -> FitError:
-    hint = "give the model again: predict_spectrum(result, wavelengths, model=...)"
-    return FitError(what, where="predict_spectrum: model", hint=hint)
-
-
-def _follow(law: AbstractDispersion, posterior: xr.Dataset, new: np.ndarray) -> xr.DataArray:
+def _evaluate(law: AbstractDispersion, posterior: xr.Dataset, new: np.ndarray) -> xr.DataArray:
     """A law of dispersion with the coefficients of every draw."""
     draws = xr.DataArray(
         np.zeros((posterior.sizes["chain"], posterior.sizes["draw"])),
@@ -168,15 +162,15 @@ def _follow(law: AbstractDispersion, posterior: xr.Dataset, new: np.ndarray) -> 
     return _label(np.broadcast_to(index, (*first.shape, new.size)), first, new)
 
 
-def _condition(
+def _predict(
     name: str,
     process: SpectralProcess,
     result: xr.DataTree,
-    told: Mapping[str, Any],
+    provenance: Mapping[str, Any],
     new: np.ndarray,
     seed: list[int],
 ) -> xr.DataArray:
-    """A process given each draw of its weights, amplitude and length, drawn at `new`."""
+    """A process at `new` wavelengths, given each draw of its weights, amplitude and length."""
     posterior = result["posterior"].dataset
     coordinates = result.children.get("unconstrained_posterior", xr.DataTree()).dataset
     needed = {name: posterior, f"{name}_level": posterior, f"{name}_weights": coordinates}
@@ -199,8 +193,8 @@ def _condition(
             hint="give the model of the fit",
         )
     prior = f"{name}_level_location" if f"{name}_level_location" in posterior else f"{name}_level"
-    bounds = bounds_of(told, prior)
-    # A wavelength given twice is one wavelength: both get the same draw.
+    bounds = bounds_of(provenance, prior)
+    # A wavelength that is given twice gets the same draw twice.
     distinct, again = np.unique(new, return_inverse=True)
     dtype = weights.dtype
     old, at = (np.asarray(part, dtype) for part in (measured, distinct))
@@ -216,8 +210,8 @@ def _condition(
             places.astype(float),
             jnp.asarray(distinct),
         )
-        left = draw["noise"] @ factor.T
-        departure = values[..., old.size :] - mean + left.astype(dtype)
+        remainder = draw["noise"] @ factor.T
+        departure = values[..., old.size :] - mean + remainder.astype(dtype)
         return around(name, draw["level"][..., None], draw["amplitude"], departure, bounds)
 
     flat = (-1, *level.shape[2:])

@@ -12,19 +12,17 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from polar_bayes.calibration.files import is_calibration
-from polar_bayes.calibration.predictive import (
-    calibration_readings,
-    holds_readings,
-    how_predictions_stray,
-    reading_ranks,
-)
-from polar_bayes.calibration.scores import is_calibrated, limit_of
+from polar_bayes.calibration.scores import is_calibrated, significance_level
 from polar_bayes.calibration.verdict import (
+    calibration_readings,
     calibration_table,
     calibration_verdict,
     compare_calibrations,
     comparison_sentences,
-    how_ranks_stray,
+    holds_readings,
+    parameter_deviation,
+    reading_deviation,
+    reading_ranks,
 )
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.errors import FitError, one_line
@@ -126,7 +124,11 @@ def comparison_rows(compared: pd.DataFrame, parts: Mapping[str, Part]) -> Table:
     """Every parameter by every method."""
     rows = []
     for (label, method), row in compared.iterrows():
-        cells = [one_line(str(method)), chance(row["p_value"], bool(row["passes"])), row["ways"]]
+        cells = [
+            one_line(str(method)),
+            chance(row["p_value"], bool(row["passes"])),
+            row["deviation"],
+        ]
         cells += [f"{int(row['failed']):,}", _change(row), *_numbers(row)]
         rows.append(Row(label, parts[label].title, tuple(cells)))
     first = one_line(str(compared.index.get_level_values("method")[0]))
@@ -284,7 +286,7 @@ class ReadingRanks:
 def ranks_of_readings(calibration: xr.DataTree) -> list[ReadingRanks]:
     """Every row of `calibration_readings` with its ranks."""
     table, ranks = calibration_readings(calibration), reading_ranks(calibration)
-    level = limit_of(table)
+    level = significance_level(table)
     return [
         ReadingRanks(
             label=label,
@@ -303,7 +305,7 @@ def reading_rows(parts: list[ReadingRanks]) -> Table:
     rows = []
     for part in parts:
         row = part.row
-        words = "uniform" if part.passes else how_predictions_stray(row)
+        words = "uniform" if part.passes else reading_deviation(row)
         every = int(row["answered"] + row["failed"])
         cells = [chance(row["p_value"], part.passes), words, f"{int(row['failed']):,} of {every:,}"]
         cells += [or_dash(row[name], "{:.3f}") for name in ("rank_mean", "rank_spread")]
@@ -346,7 +348,9 @@ def render_calibration(
     parts = parts_of(calibration, table)
     said = verdict_words(calibration_verdict(calibration))
     compared = compare_calibrations({method: calibration, **rivals}) if rivals else None
-    words = {label: how_ranks_stray(part.row) for label, part in parts.items() if not part.passes}
+    words = {
+        label: parameter_deviation(part.row) for label, part in parts.items() if not part.passes
+    }
     others = {name: parts_of(each) for name, each in rivals.items()}
     has_readings = holds_readings(calibration)
     read = ranks_of_readings(calibration) if has_readings else []

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
-from polar_bayes.calibration.scores import EcdfBand, ecdf_band, histogram_band, limit_of
+from polar_bayes.calibration.scores import EcdfBand, ecdf_band, histogram_band, significance_level
 from polar_bayes.calibration.verdict import calibration_scalars, calibration_table
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.errors import FitError
@@ -109,7 +109,7 @@ def parts_of(calibration: xr.DataTree, table: pd.DataFrame | None = None) -> dic
     table = calibration_table(calibration) if table is None else table
     truths = {each.label: each.draws[0] for each in calibration_scalars(calibration, "truth")}
     ranks, marginals = (calibration[name].to_dataset() for name in ("prior_sbc", "marginals"))
-    level = limit_of(table)
+    level = significance_level(table)
     found = {}
     for scalar in calibration_scalars(calibration, "prior_sbc"):
         place = dict(scalar.index)

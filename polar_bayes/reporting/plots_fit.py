@@ -30,7 +30,7 @@ from polar_bayes.diagnostics.population import (
     populations,
     shrinkage,
 )
-from polar_bayes.diagnostics.predictive import Check, pit_band, predictive_checks
+from polar_bayes.diagnostics.predictive import PredictiveCheck, pit_band, predictive_checks
 from polar_bayes.errors import FitError
 from polar_bayes.reporting.style import (
     BLUE,
@@ -229,7 +229,7 @@ def plot_prior_posterior(result: xr.DataTree) -> Figure:
 
 
 @styled
-def plot_pit(result: xr.DataTree, checks: dict[str, Check] | None = None) -> Figure:
+def plot_pit(result: xr.DataTree, checks: dict[str, PredictiveCheck] | None = None) -> Figure:
     """PIT and leave-one-out PIT of every variable: distance from the uniform distribution.
 
     Args:
@@ -276,7 +276,7 @@ def _pit_panel(axes: Axes, values: np.ndarray | None) -> None:
     if band is None:
         axes.text(0.5, 0.5, "not available", ha="center", transform=axes.transAxes, color=GRAY)
         return
-    color = VERMILLION if band.leaves else BLUE
+    color = VERMILLION if band.rejects_uniformity else BLUE
     axes.fill_between(band.at, band.lower, band.upper, color=lighten(GRAY, 0.75), lw=0, step="mid")
     axes.axhline(0.0, color=GRAY, lw=0.8)
     axes.step(band.at, band.difference, where="mid", color=color, lw=1.4)
@@ -484,7 +484,7 @@ def _limits(
     width = np.ptp(pooled) or 1.0
     # Nothing is below zero on a log axis: what alone reaches there stays outside.
     with np.errstate(all="ignore"):
-        others = forward(rows[["true", "alone", "alone_q2.5", "alone_q97.5"]].to_numpy())
+        others = forward(rows[["true", "unpooled", "unpooled_q2.5", "unpooled_q97.5"]].to_numpy())
     others = others[np.isfinite(others)]
     low = max(min(pooled.min(), others.min(initial=np.inf)), pooled.min() - REACH * width)
     high = min(max(pooled.max(), others.max(initial=-np.inf)), pooled.max() + REACH * width)
@@ -497,12 +497,16 @@ def _draw_member(axes: Axes, at: float, row: pd.Series, *, small: bool) -> None:
     size = 3.6 if small else 5.0
     low, high = axes.get_xlim()
     faint = lighten(PURPLE, 0.25)
-    if np.isfinite(row["alone"]):
-        seen = float(np.clip(row["alone"], low, high))
-        outside = {True: "o", row["alone"] < low: "<", row["alone"] > high: ">"}[True]
+    if np.isfinite(row["unpooled"]):
+        seen = float(np.clip(row["unpooled"], low, high))
+        outside = {True: "o", row["unpooled"] < low: "<", row["unpooled"] > high: ">"}[True]
         axes.plot([seen, row["mean"]], [at + APART, at - APART], color=GRAY, lw=0.7, zorder=2)
         axes.plot(
-            [row["alone_q2.5"], row["alone_q97.5"]], [at + APART] * 2, color=faint, lw=0.9, zorder=2
+            [row["unpooled_q2.5"], row["unpooled_q97.5"]],
+            [at + APART] * 2,
+            color=faint,
+            lw=0.9,
+            zorder=2,
         )
         style: dict[str, Any] = {"mfc": paper(), "mec": PURPLE, "mew": 1.1, "clip_on": False}
         axes.plot([seen], [at + APART], outside, ms=size, zorder=4, **style)
@@ -528,11 +532,11 @@ def _legend(rows: pd.DataFrame) -> list[Line2D | Patch]:
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=BLUE, lw=1.8, marker="o", ms=5, label="pooled: mean and 95%"),
     ]
-    if np.isfinite(rows["alone"]).any():
+    if np.isfinite(rows["unpooled"]).any():
         color = lighten(PURPLE, 0.25)
         label = "alone, without the population: about, 95%"
         handles.append(Line2D([], [], color=color, lw=0.9, marker="o", label=label, **hollow))
-    if not np.isfinite(rows["alone"]).all():
+    if not np.isfinite(rows["unpooled"]).all():
         label = "alone it says nothing"
         handles.append(Line2D([], [], color=PURPLE, lw=0.9, ls=(0, (1, 3)), label=label))
     handles += [

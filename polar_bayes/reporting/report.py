@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from polar_bayes.benchmark.accuracy import is_accuracy
 from polar_bayes.calibration.files import is_calibration
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
-from polar_bayes.diagnostics.convergence import judge, summary
+from polar_bayes.diagnostics.convergence import summary, verdict
 from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars
 from polar_bayes.diagnostics.population import population_summary, populations, shrinkage
-from polar_bayes.diagnostics.predictive import Check, predictive_checks
+from polar_bayes.diagnostics.predictive import PredictiveCheck, predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.effects.choose import ledger_sentences
 from polar_bayes.errors import FitError, one_line
@@ -123,7 +123,7 @@ def render(result: xr.DataTree) -> str:
     prior, checks = sensitivity(result), predictive_checks(result)
     method, provenance = method_of(result), provenance_of(result)
     posterior = result["posterior"].to_dataset()
-    judged = judge(result, table)
+    judged = verdict(result, table)
     is_point = method == "point"
     population = None if is_point else _population(result, posterior)
     name = one_line(str((provenance.get("capture") or {}).get("name", "capture")))
@@ -250,7 +250,7 @@ def _effects(result: xr.DataTree) -> dict[str, Any] | None:
 
 
 def _pictures(
-    result: xr.DataTree, checks: dict[str, Check], method: str
+    result: xr.DataTree, checks: dict[str, PredictiveCheck], method: str
 ) -> dict[str, list[Picture]]:
     """Every figure that applies, by the section where it stands."""
     has_draws = method != "point" and bool(plots_fit.drawable(result))

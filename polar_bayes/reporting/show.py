@@ -12,8 +12,12 @@ import xarray as xr
 from polar_bayes.benchmark.accuracy import is_accuracy
 from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
 from polar_bayes.calibration.files import is_calibration
-from polar_bayes.calibration.verdict import calibration_table, calibration_verdict, how_ranks_stray
-from polar_bayes.diagnostics.convergence import judge, summary
+from polar_bayes.calibration.verdict import (
+    calibration_table,
+    calibration_verdict,
+    parameter_deviation,
+)
+from polar_bayes.diagnostics.convergence import summary, verdict
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.diagnostics.parameters import method_of, posterior_scalars
 from polar_bayes.diagnostics.sensitivity import sensitivity
@@ -52,7 +56,7 @@ def show(result: xr.DataTree | xr.Dataset) -> Card:
 def _of_fit(result: xr.DataTree) -> Card:
     found, table = posterior_scalars(result), summary(result)
     method, provenance = method_of(result), provenance_of(result)
-    judged, prior = judge(result, table), sensitivity(result)
+    judged, prior = verdict(result, table), sensitivity(result)
     posterior = result["posterior"].to_dataset()
     determined = text.determined(found, prior, posterior) if judged.converged else []
     said = [
@@ -81,7 +85,9 @@ def _of_maps(maps: xr.Dataset) -> Card:
 def _of_calibration(calibration: xr.DataTree) -> Card:
     table = calibration_table(calibration)
     parts = parts_of(calibration, table)
-    words = {label: how_ranks_stray(part.row) for label, part in parts.items() if not part.passes}
+    words = {
+        label: parameter_deviation(part.row) for label, part in parts.items() if not part.passes
+    }
     _, is_good = calibration_page.verdict_head(table, None)
     said = calibration_verdict(calibration)
     rows = calibration_page.calibration_rows(table, parts, words)

@@ -18,7 +18,7 @@ from polar_bayes.diagnostics.parameters import (
     truth_of,
 )
 from polar_bayes.diagnostics.population import Population
-from polar_bayes.diagnostics.predictive import PROBABILITIES, Check
+from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE
 from polar_bayes.effects.choose import ledger_table
 from polar_bayes.errors import one_line
@@ -229,9 +229,9 @@ def member_table(result: xr.DataTree, members: pd.DataFrame, found: Sequence[Pop
         row = members.loc[scalar.label]
         scale = (row["q97.5"] - row["q2.5"]) / 4.0
         cells = [*numbers([row["mean"]], scale), interval(row["q2.5"], row["q97.5"])]
-        cells += numbers([row["alone"]], scale)
-        cells += [interval(row["alone_q2.5"], row["alone_q97.5"], scale)]
-        cells.append(percent(row["leaning"]))
+        cells += numbers([row["unpooled"]], scale)
+        cells += [interval(row["unpooled_q2.5"], row["unpooled_q97.5"], scale)]
+        cells.append(percent(row["shrinkage"]))
         rows.append(Row(scalar.label, title_of(scalar, posterior), tuple(cells)))
     caption = (
         "Alone: about where the readings of a member would put it without the population, taken "
@@ -242,7 +242,7 @@ def member_table(result: xr.DataTree, members: pd.DataFrame, found: Sequence[Pop
     return Table(caption, heads, tuple(rows), members)
 
 
-def check_table(checks: Mapping[str, Check]) -> Table:
+def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
     """Residuals, coverage, and leave-one-out results of every variable."""
     rows = []
     has_draws = any(check.pit.size for check in checks.values())
@@ -264,7 +264,7 @@ def check_table(checks: Mapping[str, Check]) -> Table:
     return Table(caption, tuple(heads), tuple(rows), behind)
 
 
-def _check_numbers(check: Check) -> dict[str, float]:
+def _check_numbers(check: PredictiveCheck) -> dict[str, float]:
     found = {"readings": check.count, "residual_rms": check.residual_rms}
     found |= {f"inside_{probability:g}": share for probability, share in check.coverage.items()}
     if check.loo:
@@ -273,7 +273,7 @@ def _check_numbers(check: Check) -> dict[str, float]:
     return found
 
 
-def _predictive_cells(check: Check) -> list[str]:
+def _predictive_cells(check: PredictiveCheck) -> list[str]:
     loo, cells = check.loo, []
     for probability in PROBABILITIES:
         chance = 2.0 * math.sqrt(probability * (1.0 - probability) / check.count)

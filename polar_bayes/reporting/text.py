@@ -9,7 +9,7 @@ import xarray as xr
 
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.population import Population
-from polar_bayes.diagnostics.predictive import Band, Check, pit_band
+from polar_bayes.diagnostics.predictive import PitBand, PredictiveCheck, pit_band
 from polar_bayes.reporting.style import QUANTITIES, place_of, title_of
 
 # --- Numbers as text, with the digits that they deserve -------------------------------------------
@@ -190,13 +190,13 @@ def _places(group: Sequence[Scalar], posterior: xr.Dataset) -> str:
     return f" ({'; '.join(places[:MOST_PLACES])}{more})"
 
 
-def expected(checks: Mapping[str, Check]) -> list[str]:
+def expected(checks: Mapping[str, PredictiveCheck]) -> list[str]:
     """Whether the readings are distributed as the model expects, variable by variable."""
     sentences = []
     for check in checks.values():
         band = pit_band(check.loo.pit if check.loo else check.pit)
         name = QUANTITIES.get(check.name, check.name)
-        if band is not None and band.leaves:
+        if band is not None and band.rejects_uniformity:
             sentences.append(
                 f"The readings of {name} are not distributed as the model expects: {shape(band)}. "
                 "The intervals may be off."
@@ -219,7 +219,7 @@ def expected(checks: Mapping[str, Check]) -> list[str]:
     return sentences
 
 
-def trust(method: str, cautions: Sequence[str], checks: Mapping[str, Check]) -> str:
+def trust(method: str, cautions: Sequence[str], checks: Mapping[str, PredictiveCheck]) -> str:
     """Whether the intervals can be trusted, as far as one fit can tell."""
     if method == "point":
         return (
@@ -227,7 +227,7 @@ def trust(method: str, cautions: Sequence[str], checks: Mapping[str, Check]) -> 
             "not read them as intervals."
         )
     bands = [pit_band(check.loo.pit if check.loo else check.pit) for check in checks.values()]
-    if cautions or any(band is not None and band.leaves for band in bands):
+    if cautions or any(band is not None and band.rejects_uniformity for band in bands):
         return "Trust the intervals with care: what speaks against them is said on this page."
     return (
         "Nothing here speaks against the intervals. How often such intervals hold the truth, a "
@@ -235,7 +235,7 @@ def trust(method: str, cautions: Sequence[str], checks: Mapping[str, Check]) -> 
     )
 
 
-def shape(band: Band) -> str:
+def shape(band: PitBand) -> str:
     """In which way the readings depart from the prediction, once the curve leaves its band."""
     above = np.flatnonzero(band.difference > band.upper)
     below = np.flatnonzero(band.difference < band.lower)

@@ -4,14 +4,14 @@ import numpy as np
 from cases import each
 from scipy import stats
 
-from polar_bayes.calibration.scores import MOST_POINTS, ecdf_band, histogram_band, uniformity
+from polar_bayes.calibration.scores import MAX_POINTS, ecdf_band, histogram_band, uniformity
 
 
 @each("count", [20, 300, 700])
 @each("level", [0.05, 0.01])
 def test_a_curve_leaves_its_band_exactly_where_the_test_fails(count: int, level: float) -> None:
     random, band = np.random.default_rng(count), ecdf_band(count, level)
-    points = min(count, MOST_POINTS)
+    points = min(count, MAX_POINTS)
     outside, fails = [], []
     for at in range(400):
         sample = random.beta(*((1.0, 1.0) if at < 300 else (0.8, 0.8)), size=count)

@@ -29,8 +29,8 @@ def test_each_parameter_by_each_method(compared) -> None:
         (label, method): method == "importance" or label == "subsurface_fraction"
         for label, method in compared.index
     }
-    assert compared.loc[("roughness", "laplace"), "ways"] == "intervals are too narrow"
-    assert compared.loc[("refractive_index", "laplace"), "ways"] == "the posterior is too high"
+    assert compared.loc[("roughness", "laplace"), "deviation"] == "intervals are too narrow"
+    assert compared.loc[("refractive_index", "laplace"), "deviation"] == "the posterior is too high"
     assert (compared.xs("laplace", level="method")["failed"] == 2).all()
 
 
@@ -59,7 +59,7 @@ def test_sentences_name_what_fails_and_what_mends_it(compared) -> None:
 def test_a_shift_alone_is_not_called_a_width() -> None:
     for shift in (-1.0, -0.4, 0.4, 1.0):
         tree = make_calibration(shifted={"roughness": shift}, count=4000)
-        way = pb.calibration.compare_calibrations({"a": tree})["ways"].iloc[0]
+        way = pb.calibration.compare_calibrations({"a": tree})["deviation"].iloc[0]
         assert way == f"the posterior is too {'high' if shift > 0.0 else 'low'}"
 
 

@@ -11,8 +11,14 @@ from scipy import stats
 from synthetic_calibrations import make_calibration
 
 import polar_bayes as pb
-from polar_bayes.calibration.predictive import DRAWS, Readings, _choose, _resample, why_untold
-from polar_bayes.calibration.simulations import draw_captures, draw_fresh
+from polar_bayes.calibration.predictive import (
+    DRAWS,
+    PredictivePit,
+    _choose,
+    _resample,
+    unranked_reason,
+)
+from polar_bayes.calibration.simulations import draw_captures, redraw_readings
 from polar_bayes.inference.program import compile_program
 from polar_bayes.observation.data import observe
 
@@ -36,9 +42,9 @@ def read():
     with jax.enable_x64(False):
         rough = compile_program(shifted, data.in_single_precision())
     program, numbers = compile_program(shifted, data), np.arange(FITS)
-    drawn = draw_captures(program, data, FITS, jax.random.key(3))
-    again = draw_fresh(program, data, drawn, numbers, jax.random.key(3))
-    readings = Readings(rough, drawn.captures, again, numbers, seed=4)
+    drawn = draw_captures(program, data, numbers, jax.random.key(3))
+    again = redraw_readings(program, data, drawn, numbers, jax.random.key(3))
+    readings = PredictivePit(rough, drawn.captures, again, numbers, seed=4)
     q = np.asarray(drawn.captures.own.readings["q"])[:, valid.to_numpy()]
     variance = 1.0 / (1.0 / 0.3**2 + q.shape[1] / NOISE**2)
     mean = variance * q.sum(axis=1) / NOISE**2
@@ -51,7 +57,7 @@ def read():
 def test_they_stand_where_the_exact_prediction_has_them(read) -> None:
     """Within what 128 draws can tell: 0.044 at the middle of each, less at its ends."""
     readings, drawn, again, mean, variance = read
-    place = readings.place["q"]
+    place = readings.entry["q"]
     rows = np.arange(FITS)
     fresh = again["q"][rows, place]
     exact = stats.norm.cdf(fresh, mean, np.sqrt(variance + NOISE**2))
@@ -68,7 +74,7 @@ def test_they_stand_where_the_exact_prediction_has_them(read) -> None:
 
 
 def test_masked_entries_are_never_chosen(read) -> None:
-    assert set(read[0].place["q"]) == {0, 1, 3, 4}
+    assert set(read[0].entry["q"]) == {0, 1, 3, 4}
     valid = np.array([[False, True, True], [False, False, False]])
     for chance in (0.0, 0.49, 0.5, 0.999999):
         found = _choose(valid, np.full(2, chance))
@@ -97,9 +103,9 @@ def test_a_model_whose_draws_do_not_say_all_is_told() -> None:
     data = observe(plate_capture(np.linspace(30.0, 70.0, 5), 0.03, seed=0))
     given = {"level": ()}
     program = compile_program(pooled, data)
-    assert "draws do not hold place" in why_untold(program, program, data, given)
+    assert "draws do not hold place" in unranked_reason(program, program, data, given)
     plain = compile_program(shifted, data)
-    assert why_untold(plain, plain, data, given) == ""
+    assert unranked_reason(plain, plain, data, given) == ""
 
 
 @pytest.mark.thorough

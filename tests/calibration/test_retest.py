@@ -33,7 +33,7 @@ def test_repeats_that_scatter_as_they_say_raise_few_alarms() -> None:
     for _ in range(runs):
         means = {name: 0.3 + SD * random.standard_normal(5) for name in ("roughness", "absorption")}
         table = pb.calibration.retest(fits(means))
-        alarms += table["words"].str.contains("more than the intervals say").any()
+        alarms += table["conclusion"].str.contains("more than the intervals say").any()
         pairs.append(table["agreeing"].mean())
     assert alarms <= stats.binom.ppf(0.9999, runs, 0.05)
     assert np.mean(pairs) == pytest.approx(0.95, abs=0.02)
@@ -48,14 +48,16 @@ def test_repeats_that_scatter_more_are_told_by_how_much() -> None:
     assert row["p_value"] < 1e-4
     assert row["agreeing"] < 0.6
     assert row["pairs"] == 66
-    assert row["words"] == f"repeats scatter {row['ratio']:.1f} times more than the intervals say"
+    assert (
+        row["conclusion"] == f"repeats scatter {row['ratio']:.1f} times more than the intervals say"
+    )
 
 
 @pytest.mark.thorough
 def test_repeats_that_scatter_less_are_no_alarm() -> None:
     means = 1.5 + 0.1 * SD * stats.norm.ppf((np.arange(12) + 0.5) / 12)
     words = pb.calibration.retest(fits({"refractive_index": means})).loc[
-        "refractive_index", "words"
+        "refractive_index", "conclusion"
     ]
     assert "the rest of the intervals is what all repeats share" in words
 
@@ -65,7 +67,7 @@ def test_failed_repeats_are_counted() -> None:
     row = pb.calibration.retest(fits({"roughness": np.array([0.3, np.nan, 0.31, 0.29])})).iloc[0]
     assert (row["repeats"], row["failed"], row["pairs"]) == (3, 1, 3)
     alone = pb.calibration.retest(fits({"roughness": np.array([0.3, np.nan])})).iloc[0]
-    assert alone["words"] == "too few repeats have an answer"
+    assert alone["conclusion"] == "too few repeats have an answer"
 
 
 def test_what_are_no_repeats_is_refused() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from polar_bayes.calibration.scores import PitCrps, ranked_score, share_below
+from polar_bayes.calibration.scores import PitCrps, crps, randomized_pit
 
 
 def even(fits: int, draws: int) -> np.ndarray:
@@ -14,9 +14,9 @@ def even(fits: int, draws: int) -> np.ndarray:
 def test_the_truth_among_draws_of_its_own_distribution_is_uniform() -> None:
     random = np.random.default_rng(0)
     values = random.normal(size=(4000, 20))
-    pit = share_below(values[:, 1:], even(4000, 19), values[:, 0], random.random(4000))
+    pit = randomized_pit(values[:, 1:], even(4000, 19), values[:, 0], random.random(4000))
     assert stats.kstest(pit, "uniform").pvalue > 1e-3
-    few = share_below(values[:, 1:3], even(4000, 2), values[:, 0], random.random(4000))
+    few = randomized_pit(values[:, 1:3], even(4000, 2), values[:, 0], random.random(4000))
     assert stats.kstest(few, "uniform").pvalue > 1e-3
 
 
@@ -24,7 +24,7 @@ def test_the_truth_among_draws_of_its_own_distribution_is_uniform() -> None:
 def test_ties_are_shared_evenly() -> None:
     random = np.random.default_rng(1)
     values = random.integers(0, 3, size=(4000, 20)).astype(float)
-    pit = share_below(values[:, 1:], even(4000, 19), values[:, 0], random.random(4000))
+    pit = randomized_pit(values[:, 1:], even(4000, 19), values[:, 0], random.random(4000))
     assert stats.kstest(pit, "uniform").pvalue > 1e-3
 
 
@@ -32,11 +32,9 @@ def test_weights_count_as_repeated_draws() -> None:
     draws, weights = np.array([[0.0, 1.0, 2.0]]), np.array([[0.5, 0.25, 0.25]])
     repeated = np.array([[0.0, 0.0, 1.0, 2.0]])
     truth, chance = np.array([1.5]), np.array([0.0])
-    told = share_below(draws, weights, truth, chance) * 4 / 3
-    assert told == pytest.approx(share_below(repeated, even(1, 4), truth, chance) * 5 / 4)
-    assert ranked_score(draws, weights, truth) == pytest.approx(
-        ranked_score(repeated, even(1, 4), truth)
-    )
+    told = randomized_pit(draws, weights, truth, chance) * 4 / 3
+    assert told == pytest.approx(randomized_pit(repeated, even(1, 4), truth, chance) * 5 / 4)
+    assert crps(draws, weights, truth) == pytest.approx(crps(repeated, even(1, 4), truth))
 
 
 def test_the_score_of_a_normal_distribution_is_that_of_its_formula() -> None:
@@ -45,7 +43,7 @@ def test_the_score_of_a_normal_distribution_is_that_of_its_formula() -> None:
     for truth in (-2.0, 0.0, 0.7):
         expected = truth * (2.0 * stats.norm.cdf(truth) - 1.0) + 2.0 * stats.norm.pdf(truth)
         expected -= 1.0 / np.sqrt(np.pi)
-        found = ranked_score(draws[None], even(1, 20_000), np.array([truth]))
+        found = crps(draws[None], even(1, 20_000), np.array([truth]))
         assert found == pytest.approx(expected, abs=1e-4)  # of the draws' ends
 
 

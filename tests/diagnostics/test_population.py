@@ -14,10 +14,10 @@ from synthetic_results import make_result, pool
 from polar_bayes.diagnostics.population import (
     MEMBER_COLUMNS,
     SUMMARY_COLUMNS,
-    estimate_alone,
     population_summary,
     populations,
     shrinkage,
+    unpooled_estimate,
 )
 from polar_bayes.errors import FitError
 
@@ -63,7 +63,7 @@ def exact_draws(readings, errors, spreads, rng, *, location=None):
     return mean + rng.standard_normal(mean.shape) / np.sqrt(precision), mu, spread
 
 
-def error_of_alone(reading, error, mu, spread):
+def error_of_unpooled(reading, error, mu, spread):
     """Monte Carlo standard errors of b / p and p, from the information in the draws."""
     v = 1.0 / (error**-2.0 + spread**-2.0)
     m = v * (reading / error**2 + mu / spread**2)
@@ -83,30 +83,30 @@ def test_estimates_alone_are_what_the_readings_say(spreads, rng) -> None:
     """With the spread known, and with a spread that the members tell poorly."""
     value, mu, spread = exact_draws(READINGS, ERRORS, spreads, rng)
     for x, reading, error in zip(value, READINGS, ERRORS, strict=True):
-        alone = estimate_alone(x, mu, spread)
-        of_mean, of_precision = error_of_alone(reading, error, mu, spread)
-        if np.isnan(alone.mean):
+        unpooled = unpooled_estimate(x, mu, spread)
+        of_mean, of_precision = error_of_unpooled(reading, error, mu, spread)
+        if np.isnan(unpooled.mean):
             assert error**-2.0 < 5.0 * of_precision
             continue
-        assert abs(alone.mean - reading) < 5.0 * of_mean
-        assert abs(alone.sd**-2.0 - error**-2.0) < 5.0 * of_precision
+        assert abs(unpooled.mean - reading) < 5.0 * of_mean
+        assert abs(unpooled.sd**-2.0 - error**-2.0) < 5.0 * of_precision
         expected = np.mean(spread**-2.0 / (spread**-2.0 + error**-2.0))
-        assert alone.leaning == pytest.approx(expected, abs=5.0 * of_precision * error**2)
+        assert unpooled.shrinkage == pytest.approx(expected, abs=5.0 * of_precision * error**2)
 
 
 @pytest.mark.thorough
 def test_a_member_without_readings_says_nothing(rng) -> None:
     no_progress = 1e6
     value, mu, spread = exact_draws(READINGS, np.append(ERRORS[:-1], no_progress), [0.06, 0.1], rng)
-    alone = estimate_alone(value[-1], mu, spread)
-    assert np.isnan(alone.mean)
-    assert np.isnan(alone.sd)
-    assert alone.leaning > 0.95
+    unpooled = unpooled_estimate(value[-1], mu, spread)
+    assert np.isnan(unpooled.mean)
+    assert np.isnan(unpooled.sd)
+    assert unpooled.shrinkage > 0.95
 
 
 @pytest.mark.thorough
 def test_a_member_that_does_not_move_has_no_estimate() -> None:
-    assert np.isnan(estimate_alone(np.ones(9), np.zeros(9), np.ones(9))).all()
+    assert np.isnan(unpooled_estimate(np.ones(9), np.zeros(9), np.ones(9))).all()
 
 
 @each("name", LINKS)
@@ -119,8 +119,8 @@ def test_shrinkage_is_on_the_scale_of_the_population(name, rng) -> None:
     assert list(table.index) == [f"{name}[{i}]" for i in range(6)]
     assert table["mean"].to_numpy() == pytest.approx(back(value).mean(axis=1))
     for row, reading, error in zip(table.itertuples(), readings, errors, strict=True):
-        of_mean, _ = error_of_alone(reading, error, mu, spread)
-        assert abs(forward(row.alone) - reading) < 5.0 * of_mean
+        of_mean, _ = error_of_unpooled(reading, error, mu, spread)
+        assert abs(forward(row.unpooled) - reading) < 5.0 * of_mean
         width = forward(row._6) - forward(row._5)
         assert width == pytest.approx(2 * 1.96 * error, rel=0.2)
 

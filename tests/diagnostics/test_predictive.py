@@ -8,7 +8,7 @@ from cases import each
 from scipy import stats
 from synthetic_results import SCALE, make_result, replace
 
-from polar_bayes.diagnostics.predictive import pit_band, predictive_checks, usable
+from polar_bayes.diagnostics.predictive import pit_band, predictive_checks, usable_readings
 
 SMALL = {"wavelengths": (), "views": 20, "draws": 150}
 
@@ -18,7 +18,7 @@ def test_a_calibrated_fit_raises_no_more_alarms_than_it_should() -> None:
     alarms = 0
     for seed in range(60):
         check = predictive_checks(make_result(**SMALL, variables=("dop",), seed=seed))["dop"]
-        alarms += pit_band(check.loo.pit).leaves
+        alarms += pit_band(check.loo.pit).rejects_uniformity
     assert alarms <= stats.binom.isf(0.002, 60, 0.05)
 
 
@@ -36,7 +36,7 @@ def test_pooled_pit_of_calibrated_fits_is_uniform() -> None:
 def test_readings_that_scatter_otherwise_leave_the_band(noise: float, first_side: str) -> None:
     check = predictive_checks(make_result(noise=noise))["dop"]
     band = pit_band(check.loo.pit)
-    assert band.leaves
+    assert band.rejects_uniformity
     early = band.difference[: len(band.at) // 4]
     assert (early.mean() > 0.0) == (first_side == "above")
 
@@ -80,7 +80,7 @@ def test_masked_set_aside_and_saturated_readings_are_left_out() -> None:
     saturated = tree["constant_data"].to_dataset()["saturated"].to_numpy().copy()
     saturated[10] = 1
     tree = replace(tree, "constant_data", "saturated", saturated)
-    keep = usable(tree, "intensity")
+    keep = usable_readings(tree, "intensity")
     assert not keep[[3, 4, 10, -1]].any()
     for check in predictive_checks(tree).values():
         assert check.count == keep.sum() < 40
@@ -115,15 +115,15 @@ def test_a_band_needs_two_values() -> None:
     assert pit_band(np.array([0.5])) is None
     assert pit_band(np.array([np.nan, 0.5])) is None
     assert pit_band(np.array([])) is None
-    assert not pit_band(np.array([0.3, 0.8])).leaves
-    assert pit_band(np.full(50, 0.5)).leaves
+    assert not pit_band(np.array([0.3, 0.8])).rejects_uniformity
+    assert pit_band(np.full(50, 0.5)).rejects_uniformity
 
 
 @pytest.mark.thorough
 def test_many_readings_are_fast_and_calibrated() -> None:
     values = np.random.default_rng(1).uniform(size=20_000)
     band = pit_band(values)
-    assert not band.leaves
+    assert not band.rejects_uniformity
     assert len(band.at) < 1000
 
 

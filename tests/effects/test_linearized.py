@@ -8,9 +8,8 @@ import xarray as xr
 from plates import LINKS, plate_capture
 
 import polar_bayes as pb
-from polar_bayes.design.setup import label_coordinates
-from polar_bayes.effects.compare_scenes import Baseline, compile_density, fit_laplace
-from polar_bayes.inference.optimize import climb
+from polar_bayes.effects.compare_scenes import compare, compile_density, coordinates, find_peak
+from polar_bayes.inference.optimize import find_mode
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
@@ -77,7 +76,7 @@ def test_on_a_plate_they_are_those_of_climbs_with_exact_gradients(
             return float(value), np.asarray(gradient)
 
         assert density.potential(start) == pytest.approx(potential(start)[0], rel=1e-12)
-        ends.append(climb(potential, start + 0.01))
+        ends.append(find_mode(potential, start + 0.01))
     theirs = [densities[0].labels.index(label) for label in densities[1].labels]
     sd = np.sqrt(np.diagonal(ends[0].covariance))[theirs]
     shift = (ends[1].z - ends[0].z[theirs]) / sd

@@ -182,7 +182,7 @@ def test_normals_over_a_square_are_averaged_and_gaps_spread():
         ),
         (lambda: pb.importers.Direction(0.0, 0.0, 0.0), "it points nowhere"),
         (lambda: pb.importers.Direction(np.nan, 0.0, 0.0), "Direction: x: it is nan"),
-        (lambda: pb.importers.Position(0.0, 0.0, -1.0), "it stands behind the surface"),
+        (lambda: pb.importers.Position(0.0, 0.0, -1.0), "it is behind the surface"),
         (lambda: pb.importers.Highlight(-1.0, 2.0), "Highlight: row: it is -1.0"),
         (lambda: NormalMap(np.ones((2, 2, 2))), "normals: it holds float64 of shape (2, 2, 2)"),
         (lambda: NormalMap("none.npy"), "none.npy: there is no such file"),

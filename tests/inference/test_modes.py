@@ -5,7 +5,12 @@ import pytest
 from cases import each
 from scipy.stats import multivariate_normal
 
-from polar_bayes.inference.optimize import Status, climb, curvature, distinct
+from polar_bayes.inference.optimize import (
+    ModeStatus,
+    central_difference_hessian,
+    distinct_modes,
+    find_mode,
+)
 
 SPREAD = np.array([[0.5, 0.2], [0.2, 0.3]])
 
@@ -38,8 +43,8 @@ def mixture_potential(centers: np.ndarray, shares: np.ndarray):
 
 
 def test_a_normal_peak_is_found_with_its_width() -> None:
-    end = climb(normal_potential(np.array([1.0, -2.0])), np.zeros(2))
-    assert end.status is Status.OK
+    end = find_mode(normal_potential(np.array([1.0, -2.0])), np.zeros(2))
+    assert end.status is ModeStatus.OK
     # The decrement bounds the distance; central differences of a quadratic are exact to rounding.
     np.testing.assert_allclose(end.z, [1.0, -2.0], atol=0.01)
     np.testing.assert_allclose(end.covariance, SPREAD, rtol=1e-7)
@@ -51,14 +56,14 @@ def test_curvature_of_a_cubic_is_accurate_to_the_stated_error() -> None:
         return float(np.sum(np.exp(z))), np.exp(z)
 
     z = np.array([0.3, -0.7])
-    measured = curvature(potential, z, np.ones(2), np.dtype(float))
+    measured = central_difference_hessian(potential, z, np.ones(2), np.dtype(float))
     np.testing.assert_allclose(measured, np.diag(np.exp(z)), atol=1e-7)
 
 
 def test_two_peaks_are_weighed_by_their_evidence() -> None:
     centers = np.array([[-6.0, 0.0], [6.0, 0.0]])
     potential = mixture_potential(centers, np.array([0.2, 0.8]))
-    modes = distinct([climb(potential, center + 0.5) for center in (*centers, *centers)])
+    modes = distinct_modes([find_mode(potential, center + 0.5) for center in (*centers, *centers)])
     assert modes is not None
     np.testing.assert_allclose(modes.weight, [0.8, 0.2], rtol=1e-3)
     assert modes.starts == 4
@@ -69,10 +74,10 @@ def test_a_saddle_is_never_called_a_peak() -> None:
     def saddle(z: np.ndarray) -> tuple[float, np.ndarray]:
         return 0.5 * (z[0] ** 2 - z[1] ** 2), np.array([z[0], -z[1]])
 
-    end = climb(saddle, np.zeros(2))
-    assert end.status is Status.NOT_A_MAXIMUM
+    end = find_mode(saddle, np.zeros(2))
+    assert end.status is ModeStatus.NOT_A_MAXIMUM
     assert np.isnan(end.covariance).all()
-    assert distinct([end]) is None
+    assert distinct_modes([end]) is None
 
 
 @pytest.mark.thorough
@@ -80,7 +85,7 @@ def test_a_wall_of_nan_ends_a_climb_without_a_peak() -> None:
     def nowhere(z: np.ndarray) -> tuple[float, np.ndarray]:
         return np.nan, np.full(z.size, np.nan)
 
-    assert distinct([climb(nowhere, np.zeros(3))]) is None
+    assert distinct_modes([find_mode(nowhere, np.zeros(3))]) is None
 
 
 @each("seed", range(3))
@@ -88,6 +93,6 @@ def test_the_order_of_the_starts_does_not_matter(seed: int) -> None:
     centers = np.array([[-6.0, 0.0], [6.0, 0.0]])
     potential = mixture_potential(centers, np.array([0.3, 0.7]))
     starts = np.random.default_rng(seed).permutation(np.repeat(centers, 3, axis=0) + 0.3)
-    modes = distinct([climb(potential, start) for start in starts])
+    modes = distinct_modes([find_mode(potential, start) for start in starts])
     assert modes is not None
     np.testing.assert_allclose(modes.z, centers[::-1], atol=0.01)

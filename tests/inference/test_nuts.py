@@ -15,12 +15,11 @@ def density(z: jax.Array, center: jax.Array) -> jax.Array:
 def target(size: int, chains: int) -> nuts.Target:
     starts = np.random.default_rng(0).standard_normal((chains, size))
     return nuts.Target(
-        samplers=nuts.Samplers(density),
+        samplers=nuts.SamplerCache(density),
         given=jnp.zeros(size),
         potential=lambda z: (0.5 * float(z @ z), z),
         starts=starts,
         metric=np.eye(size),
-        place=lambda z: z,
     )
 
 

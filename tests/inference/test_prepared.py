@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib
-import os
 import sys
 import threading
 import warnings
@@ -26,8 +25,8 @@ import polar_bayes as pb
 from polar_bayes.effects.choose import ChosenScene
 from polar_bayes.inference import hierarchical_reparam, initialization, optimize, request
 from polar_bayes.inference import joint_fit as fitting
-from polar_bayes.inference.compile import LRUCache, cache_key, last_edit
-from polar_bayes.inference.optimize import quiet_line_search
+from polar_bayes.inference.compile import LRUCache, cache_key
+from polar_bayes.inference.optimize import ignore_line_search_warnings
 from polar_bayes.inference.problem import compile_model
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.inference.request import resolve
@@ -255,19 +254,54 @@ def test_how_a_scene_was_chosen_does_not_count() -> None:
     assert keys[0] == keys[1]
 
 
+SOURCE = """
+import dataclasses, jax, helper_of_mine, polar_bayes
+SCALE = 2.0
+def inner(x):
+    return [helper_of_mine.shift(SCALE * y) for y in x]
+@jax.jit
+def jitted(x):
+    return x + 1
+def model(data, scene, priors, links):
+    return jax.vmap(lambda x: jitted(inner(x)))(data)
+class Link(polar_bayes.links.StokesLink):
+    def reading(self, values):
+        return values
+@dataclasses.dataclass(frozen=True)
+class Model:
+    size: int = 1
+    def __call__(self, data, scene, priors, links):
+        return model(data, scene, priors, links)
+"""
+HELPER = "def shift(x):\n    return x + 3\n"
+
+
+def load_anew(folder: Path, *edit: str) -> tuple[str, ...]:
+    """Cache keys of the user's model, as a function and as a value, and of the user's link."""
+    for name, text in (("model_of_mine", SOURCE), ("helper_of_mine", HELPER)):
+        (folder / f"{name}.py").write_text(text.replace(*edit) if edit else text)
+        sys.modules.pop(name, None)
+    importlib.invalidate_caches()
+    mine = importlib.import_module("model_of_mine")
+    models = (mine.model, mine.Model(), handlers.condition(mine.model, data={}))
+    keys = [cache_key(model, PLATE, {}, {}) for model in models]
+    return *keys, cache_key(per_material, PLATE, {}, {"q": mine.Link()})
+
+
 def test_a_model_that_is_edited_and_loaded_again_is_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It has the same name as before, which is all that a pickle of it says."""
-    file = tmp_path / "model_of_mine.py"
-    file.write_text("def model(data, scene, priors, links): return 1\n")
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.syspath_prepend(str(tmp_path))
-    mine = importlib.import_module("model_of_mine")
-    before = cache_key(mine.model, PLATE, {}, {})
-    assert cache_key(mine.model, PLATE, {}, {}) == before
-    os.utime(file, ns=(last_edit() + 1,) * 2)
-    assert cache_key(mine.model, PLATE, {}, {}) != before
-    del sys.modules["model_of_mine"]
+    before = load_anew(tmp_path)
+    assert load_anew(tmp_path) == before
+    for edit in (("SCALE = 2.0", "SCALE = 3.0"), ("x + 1", "x - 1"), ("x + 3", "x + 4")):
+        edited = load_anew(tmp_path, *edit)
+        assert [a != b for a, b in zip(before, edited, strict=True)] == [True, True, True, False]
+    edited = load_anew(tmp_path, "return values", "return values + 0.1")
+    assert edited[-1] != before[-1]
+    del sys.modules["model_of_mine"], sys.modules["helper_of_mine"]
 
 
 @pytest.mark.thorough
@@ -291,7 +325,7 @@ def test_fits_side_by_side_leave_warnings_as_they_were() -> None:
     heard: list[str] = []
 
     def second() -> None:
-        with quiet_line_search():
+        with ignore_line_search_warnings():
             second_began.set()
             first_ended.wait(10.0)
             try:
@@ -300,7 +334,7 @@ def test_fits_side_by_side_leave_warnings_as_they_were() -> None:
                 heard.append(str(warning))
 
     thread = threading.Thread(target=second)
-    with quiet_line_search():
+    with ignore_line_search_warnings():
         thread.start()
         assert second_began.wait(10.0)
     first_ended.set()

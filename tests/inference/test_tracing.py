@@ -18,7 +18,7 @@ from toy_models import line
 import polar_bayes as pb
 from polar_bayes.inference import compile
 from polar_bayes.inference import joint_fit as fitting
-from polar_bayes.inference.compile import JitByShape, JitOnce, LRUCache, bytes_of
+from polar_bayes.inference.compile import JitOnce, LRUCache, bytes_of
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def test_what_was_begun_is_compiled_once(programs: list[str]) -> None:
     def twice_the_sum(x: jax.Array, y: jax.Array) -> jax.Array:
         return 2.0 * jnp.sum(x) + y
 
-    run, y = JitByShape(twice_the_sum), jnp.asarray(1.0)
+    run, y = JitOnce(twice_the_sum), jnp.asarray(1.0)
     run.begin(jax.ShapeDtypeStruct((3,), y.dtype), y)
     run.begin(jax.ShapeDtypeStruct((3,), y.dtype), y)
     assert [float(run(np.full(3, value), y)) for value in (1.0, 2.0)] == [7.0, 13.0]
@@ -55,7 +55,7 @@ def test_an_error_of_the_compiler_is_told_where_the_program_is_wanted() -> None:
     def strange(x: jax.Array) -> jax.Array:
         return jax.ffi.ffi_call("no_such_target", jax.ShapeDtypeStruct((), x.dtype))(x)
 
-    run = JitByShape(strange)
+    run = JitOnce(strange)
     run.begin(jnp.ones(2))
     with pytest.raises(Exception, match="no_such_target"):
         run(jnp.ones(2))
@@ -121,7 +121,7 @@ def test_who_compiles_keeps_nobody_from_tracing(gate: Gate, slow_to_compile: Non
     def slow(x: jax.Array) -> jax.Array:
         return 2.0 * x
 
-    run = JitByShape(slow)
+    run = JitOnce(slow)
     with ThreadPoolExecutor(2) as pool:
         waiting = [pool.submit(run, np.ones(3)) for _ in range(2)]
         assert gate.reached.wait(60.0)

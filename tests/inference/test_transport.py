@@ -12,7 +12,11 @@ from scipy import stats
 
 import polar_bayes as pb
 from polar_bayes.inference.group_model import find_groups, group_of
-from polar_bayes.inference.hierarchical_reparam import Anchored, Anchors, Transport
+from polar_bayes.inference.hierarchical_reparam import (
+    ExpansionPoint,
+    HierarchicalReparam,
+    ReparamInputs,
+)
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
@@ -50,10 +54,10 @@ def made(capture: xr.Dataset):
     data = observe(request.capture)
     program = compile_program(request.bind(SCENE), data)
     groups = find_groups(program, data)
-    return Transport(program, groups), data
+    return HierarchicalReparam(program, groups), data
 
 
-def anchors(rng: np.random.Generator, *, exact: np.ndarray | None = None) -> Anchors:
+def point(rng: np.random.Generator, *, exact: np.ndarray | None = None) -> ExpansionPoint:
     """Random anchors; or those of the readings, which are normal around their means."""
     if exact is None:
         half = rng.normal(size=(MEMBERS, 1, 1))
@@ -72,7 +76,7 @@ def anchors(rng: np.random.Generator, *, exact: np.ndarray | None = None) -> Anc
             np.zeros(2), np.eye(2), exact.mean(axis=1, keepdims=True), nothing, curvature,
             np.zeros((MEMBERS, 1, 2)),
         )  # fmt: skip
-    return Anchors(*map(jnp.asarray, parts))
+    return ExpansionPoint(*map(jnp.asarray, parts))
 
 
 @pytest.mark.thorough
@@ -90,12 +94,12 @@ def test_patches_find_their_coordinates(made) -> None:
 def test_there_and_back_with_the_volume_of_the_map(made, seed: int) -> None:
     transport, data = made
     rng = np.random.default_rng(seed)
-    given = Anchored(anchors(rng), data)
+    given = ReparamInputs(point(rng), data)
     w = jnp.asarray(rng.normal(size=transport.size))
-    z, log_volume = transport.to_program(w, given)
-    np.testing.assert_allclose(transport.from_program(z, given), w, atol=1e-10)
-    jacobian = jax.jacfwd(lambda w: transport.to_program(w, given)[0])(w)
-    constant = np.linalg.slogdet(given.anchors.factor)[1]
+    z, log_volume = transport.forward(w, given)
+    np.testing.assert_allclose(transport.inverse(z, given), w, atol=1e-10)
+    jacobian = jax.jacfwd(lambda w: transport.forward(w, given)[0])(w)
+    constant = np.linalg.slogdet(given.point.factor)[1]
     np.testing.assert_allclose(
         log_volume + constant, np.linalg.slogdet(jacobian)[1], rtol=1e-9, atol=1e-9
     )
@@ -107,7 +111,7 @@ def test_where_readings_are_normal_members_are_independent_of_their_population(
     """Minus the log density is |w|^2/2 plus that of the population, members integrated out."""
     transport, data = made
     q = capture["q"].to_numpy()
-    given = Anchored(anchors(np.random.default_rng(0), exact=q), data)
+    given = ReparamInputs(point(np.random.default_rng(0), exact=q), data)
     rng = np.random.default_rng(1)
     found, expected = [], []
     for log_tau in (-20.0, -5.0, -1.0, 0.0, 3.0):  # from complete pooling to none

@@ -31,7 +31,9 @@ pb.maps.map_file(
     resume=resume == "resume",
     scheduler=scheduler if scheduler != "none" else None,
     progress=lambda done, every: print(done, flush=True),
-    method=pb.methods.PixelLaplace(draws=64, sampler=pb.methods.PixelNuts(warmup=20, draws=50, largest_r_hat=9.0)),
+    method=pb.methods.PixelLaplace(
+        draws=64, sampler=pb.methods.PixelNuts(warmup=20, draws=50, largest_r_hat=9.0)
+    ),
     **ASKED,
 )
 """

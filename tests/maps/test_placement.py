@@ -13,12 +13,12 @@ SCRIPT = """
 import jax
 from plate_images import ASKED, plate_image
 import polar_bayes as pb
-from polar_bayes.inference.compile import TracedOnce
+from polar_bayes.inference.compile import JitOnce
 
 jax.config.update("jax_disable_most_optimizations", True)
 _, second = jax.devices()
 seen = set()
-run = TracedOnce.__call__
+run = JitOnce.__call__
 
 def watched(self, *given):
     found = run(self, *given)
@@ -30,7 +30,7 @@ image, method = plate_image(2, 3), pb.methods.PixelLaplace(draws=64, sampler=Non
 here = pb.fit_pixels(image, method=method, **ASKED)
 jax.config.update("jax_default_device", second)
 jax.clear_caches()
-TracedOnce.__call__ = watched
+JitOnce.__call__ = watched
 there = pb.fit_pixels(image, method=method, **ASKED)
 assert seen == {second}, seen
 for name, values in here.items():

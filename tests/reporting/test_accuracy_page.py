@@ -63,7 +63,7 @@ def test_a_fit_that_holds_a_study_shows_it():
 
 
 @pytest.mark.thorough
-def test_every_method_as_given_is_named_and_nothing_is_cut_off():
+def test_every_rung_as_given_is_named_and_nothing_is_cut_off():
     figure = pb.plots.plot_accuracy(make_accuracy())
     assert len(figure.axes) == 2
     for axes in figure.axes:

@@ -56,7 +56,7 @@ def test_a_member_that_says_nothing_alone_is_drawn_as_such() -> None:
     drawn = location + spread * rng.standard_normal(location.shape)
     posterior["refractive_index"][{"material": 2}] = drawn.to_numpy()
     result["posterior"] = xr.DataTree(posterior)
-    assert np.isnan(shrinkage(result)["alone"].iloc[2])
+    assert np.isnan(shrinkage(result)["unpooled"].iloc[2])
     figure = plot_shrinkage(result, "refractive_index")
     said = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "alone it says nothing" in said
