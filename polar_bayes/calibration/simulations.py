@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference.batching import Stack, together
-from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.compile import JitOnce, LRUCache
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.observation.data import Observations
 
@@ -48,29 +48,8 @@ def redraw_readings(
     return jax.tree.map(np.asarray, found)
 
 
-@functools.lru_cache(maxsize=4)
-def _reading_again(program: Program) -> Callable[..., Values]:
-    """Fresh readings of many truths, compiled once for a program."""
-
-    def read(
-        number: Array, key: Array, data: Observations, own: Observations, shared: Observations
-    ) -> Values:
-        key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
-        z = program.from_prior(key_truth, data)
-        told = program.describe(jax.random.fold_in(key_noise, 1), z, together(own, shared))
-        return told.predictive
-
-    def read_all(
-        numbers: Array, key: Array, data: Observations, own: Observations, shared: Observations
-    ) -> Values:
-        return jax.lax.map(lambda at: read(at[0], key, data, at[1], shared), (numbers, own))
-
-    return JitOnce(read_all)
-
-
-@functools.lru_cache(maxsize=4)
-def _drawing(program: Program) -> Callable[[Array, Array, Observations], tuple[Values, tuple]]:
-    """The story of many captures, compiled once for a program."""
+def _simulator(program: Program) -> Callable[[Array, Array, Observations], tuple[Values, tuple]]:
+    """Compiled: parameters and readings of many captures."""
 
     def simulate(number: Array, key: Array, data: Observations) -> tuple[Values, tuple]:
         key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
@@ -83,7 +62,7 @@ def _drawing(program: Program) -> Callable[[Array, Array, Observations], tuple[V
         return draw.parameters, (recorded.readings, recorded.brightness, recorded.saturated)
 
     return JitOnce(
-        lambda numbers, key, data: jax.lax.map(lambda at: simulate(at, key, data), numbers)
+        lambda numbers, key, data: jax.lax.map(lambda number: simulate(number, key, data), numbers)
     )
 
 
@@ -102,7 +81,7 @@ def _reader(program: Program) -> Callable[..., Values]:
 
         return jax.lax.map(read, (numbers, own))
 
-    return JitByShape(read_all)
+    return JitOnce(read_all)
 
 
 def _recorded(data: Observations, readings: Mapping[str, Any]) -> Observations:

@@ -195,7 +195,7 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
     if np.mean(statuses == Status.NOT_TRUSTED) > MOST_UNTRUSTED:
         sentences.append(
             "Most fits say themselves that they cannot be trusted: the ranks judge the method, not "
-            "the model. Another method or longer chains may do; chains of a fit (pb.methods.Nuts()) are "
+            "the model. Another method or longer chains may do; chains (pb.methods.Nuts()) are "
             "the slowest and the surest."
         )
     return sentences + _reading_sentences(calibration)

@@ -27,7 +27,8 @@ from jaxtyping import Array
 from numpyro import distributions as dist
 from numpyro.infer.util import log_density
 
-from polar_bayes.diagnostics.parameters import scalars
+from polar_bayes.design.fisher import observation_distributions
+from polar_bayes.design.setup import label_coordinates
 from polar_bayes.inference.optimize import (
     ModeStatus,
     ValueAndGradient,
@@ -232,49 +233,18 @@ def fit_laplace(density: Density, key: Array, progress: Progress) -> LaplaceFit:
     return _refine(density, modes.z[0], modes.covariance[0])
 
 
-def compare(peak: Peak, noise_sd: Readings, other: Density) -> tuple[Change, Peak]:
-    """Put another scene in the place of one whose peak is known."""
-    here = {label: index for index, label in enumerate(peak.density.labels)}
-    theirs = [index for index, label in enumerate(other.labels) if label in here]
-    mine = [here[other.labels[index]] for index in theirs]
-    start = np.zeros(len(other.labels))
-    start[theirs] = peak.z[mine]
-    width = np.diag(np.full(start.size, NEW_WIDTH**2))
-    width[np.ix_(theirs, theirs)] = peak.covariance[np.ix_(mine, mine)]
-    moves = _moves(peak, noise_sd, other, start)
-    found = _climb(other, start, width)
-    shift, sd_ratio = np.full((2, peak.z.size), np.nan)
-    if found.found:
-        shift[mine] = (found.z[theirs] - peak.z[mine]) / peak.sd[mine]
-        sd_ratio[mine] = found.sd[theirs] / peak.sd[mine]
-    largest, rms = float(np.max(np.abs(moves))), float(np.sqrt(np.mean(moves**2)))
-    return Change(largest, rms, shift, sd_ratio, found.found), found
-
-
-def _moves(peak: Peak, noise_sd: Readings, other: Density, start: np.ndarray) -> np.ndarray:
-    """Changes of all valid readings' predictions in units of their noise, in one row."""
-    # A sensor far beyond its full scale has no noise, and what it records does not move.
-    before, after = peak.density.noise_free(peak.z), other.noise_free(start)
-    valid = np.asarray(peak.density.data.valid)
-    rows = []
-    for name, sd in noise_sd.items():
-        move = np.where(sd > 0.0, after[name] - before[name], 0.0) / np.where(sd > 0.0, sd, 1.0)
-        rows.append(np.broadcast_to(move, valid.shape)[valid])
-    return np.concatenate(rows)
-
-
-def _climb(density: Density, z: np.ndarray, covariance: np.ndarray) -> Peak:
-    """Climb in coordinates in which the posterior is round and of width one, as far as known."""
-    for _ in range(CLIMBS):
-        width = np.linalg.cholesky(covariance)
-        potential = _with_gradient(density, z, width, STEP)
+def _refine(density: Density, z: np.ndarray, covariance: np.ndarray) -> LaplaceFit:
+    """Search the mode in coordinates in which the posterior is about standard normal."""
+    for _ in range(SEARCHES):
+        factor = np.linalg.cholesky(covariance)
+        potential = _scaled_potential(density, z, factor, STEP)
         end = find_mode(potential, np.zeros(z.size))
         if not np.isfinite(end.covariance).all():
-            return Peak(density, z, np.full_like(covariance, np.nan), found=False)
-        # A climb ends within a hundredth of a width; one more step makes that nothing.
-        z = z + width @ (end.z - end.covariance @ potential(end.z)[1])
-        covariance = width @ end.covariance @ width.T
-    return Peak(density, z, covariance, found=end.status is ModeStatus.OK)
+            return LaplaceFit(density, z, np.full_like(covariance, np.nan), found=False)
+        # The search ends within a hundredth of an sd; one more Newton step removes that.
+        z = z + factor @ (end.z - end.covariance @ potential(end.z)[1])
+        covariance = factor @ end.covariance @ factor.T
+    return LaplaceFit(density, z, covariance, found=end.status is ModeStatus.OK)
 
 
 def _scaled_potential(

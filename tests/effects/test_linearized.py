@@ -8,8 +8,8 @@ import xarray as xr
 from plates import LINKS, plate_capture
 
 import polar_bayes as pb
-from polar_bayes.effects.compare_scenes import compare, compile_density, coordinates, find_peak
-from polar_bayes.inference.optimize import find_mode
+from polar_bayes.design.setup import label_coordinates
+from polar_bayes.effects.compare_scenes import Baseline, compile_density, fit_laplace
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
