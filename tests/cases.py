@@ -5,7 +5,6 @@ case that fails is reported under its name, with its own traceback, and the othe
 """
 
 import contextlib
-import copy
 import functools
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -16,7 +15,14 @@ import xarray as xr
 
 Names = Iterable[object] | Callable[[Any], object] | None
 
-MUTABLE = (dict, list, xr.Dataset)
+
+def _copy(value: Any) -> Any:
+    """A dataset or a dictionary of datasets, copied; anything else as it is."""
+    if isinstance(value, xr.Dataset):
+        return value.copy(deep=True)
+    if isinstance(value, dict) and all(isinstance(each, xr.Dataset) for each in value.values()):
+        return {name: each.copy(deep=True) for name, each in value.items()}
+    return value
 
 
 def _value_name(value: Any, ids: Names) -> str:
@@ -45,7 +51,7 @@ def _cases(
 @contextlib.contextmanager
 def _fresh(fixtures: dict[str, Any], number: int) -> Iterator[dict[str, Any]]:
     """The fixtures of a test, such that a case leaves no trace in the next one."""
-    fixtures = {n: copy.deepcopy(f) if isinstance(f, MUTABLE) else f for n, f in fixtures.items()}
+    fixtures = {name: _copy(value) for name, value in fixtures.items()}
     with contextlib.ExitStack() as stack:
         if "monkeypatch" in fixtures:
             fixtures["monkeypatch"] = stack.enter_context(pytest.MonkeyPatch.context())
@@ -66,7 +72,7 @@ def each(names: str | Sequence[str], values: Iterable, ids: Names = None) -> Cal
         ids: Names of the cases, or a function of one value.
 
     Decorators above one another give every combination. In each case `monkeypatch` and
-    `tmp_path` are fresh, and datasets, dictionaries and lists of fixtures are copies.
+    `tmp_path` are fresh, and fixtures that are datasets, or dictionaries of them, are copies.
     """
     outer = _cases(names, values, ids)
 

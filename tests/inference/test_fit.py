@@ -311,6 +311,7 @@ def test_progress_reports_every_stage(capture: xr.Dataset) -> None:
     assert all(0.0 <= fraction <= 1.0 for _, fraction in heard)
 
 
+@pytest.mark.thorough
 def test_a_comparison_that_fails_is_told_and_costs_nothing(
     capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -110,6 +110,7 @@ POOLED = Hierarchical(pooled=("subsurface_fraction",))
 MOVED = handlers.reparam(POOLED, config={"subsurface_fraction_base": LocScaleReparam(0.0)})
 
 
+@pytest.mark.thorough
 def test_by_reparam(plates: xr.Dataset) -> None:
     result = fit(plates, model=MOVED, method="laplace")
     assert provenance_of(result)["model"] == "reparam(Hierarchical)"

@@ -61,6 +61,7 @@ def test_an_error_of_the_compiler_is_told_where_the_program_is_wanted() -> None:
         run(jnp.ones(2))
 
 
+@pytest.mark.thorough
 def test_the_sampler_is_compiled_beside_the_search_and_once(
     programs: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

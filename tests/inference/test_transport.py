@@ -90,6 +90,7 @@ def test_patches_find_their_coordinates(made) -> None:
     np.testing.assert_array_equal(alone.readings["q"][0], data.readings["q"][3])
 
 
+@pytest.mark.thorough
 @each("seed", range(5))
 def test_there_and_back_with_the_volume_of_the_map(made, seed: int) -> None:
     transport, data = made
