@@ -17,8 +17,8 @@ Names = Iterable[object] | Callable[[Any], object] | None
 
 
 def _copy(value: Any) -> Any:
-    """A dataset or a dictionary of datasets, copied; anything else as it is."""
-    if isinstance(value, xr.Dataset):
+    """A dataset, tree or dictionary of datasets, copied; anything else as it is."""
+    if isinstance(value, xr.Dataset | xr.DataTree):
         return value.copy(deep=True)
     if isinstance(value, dict) and all(isinstance(each, xr.Dataset) for each in value.values()):
         return {name: each.copy(deep=True) for name, each in value.items()}
@@ -72,7 +72,7 @@ def each(names: str | Sequence[str], values: Iterable, ids: Names = None) -> Cal
         ids: Names of the cases, or a function of one value.
 
     Decorators above one another give every combination. In each case `monkeypatch` and
-    `tmp_path` are fresh, and fixtures that are datasets, or dictionaries of them, are copies.
+    `tmp_path` are fresh, and fixtures that are datasets, trees or dictionaries of datasets are copies.
     """
     outer = _cases(names, values, ids)
 
