@@ -82,5 +82,5 @@ from .physics.surface import (
 from .priors import PRIORS as PRIORS
 from .reporting import plots as plots
 from .reporting.report import report as report
-from .reporting.show import show as show
+from .reporting.report import show as show
 from .simulation import simulate as simulate

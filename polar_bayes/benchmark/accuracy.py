@@ -27,6 +27,7 @@ from polar_bayes.benchmark.run import (
     run_fresh,
     run_trial,
 )
+from polar_bayes.design.setup import request_provenance
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, Schema, holds, load_tree
 from polar_bayes.inference.methods import LADDER
@@ -130,13 +131,8 @@ def accuracy(
         rows.append(_row(trial, reference_run, fresh=fresh))
     show("trials", 1.0)
     provenance = {
+        **request_provenance(request),
         "accuracy": len(rows),
-        "model": request.model_name,
-        "scene": request.scene_name,
-        "scene_parts": repr(request.scene),
-        "links": {name: repr(link) for name, link in request.links.items()},
-        "seed": seed,
-        "capture": str(request.capture.attrs.get("name", "capture")),
         "fresh_processes": fresh,
         "versions": {name: version(name) for name in ("polar_bayes", "jax", "numpyro")},
     }

@@ -26,7 +26,7 @@ from jaxtyping import Array
 
 from polar_bayes.diagnostics.parameters import scalars
 from polar_bayes.effects.choose import choose_effects
-from polar_bayes.effects.variants import Effect, parts_of, simplify
+from polar_bayes.effects.variants import Effect, parameter_ranks, simplify
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.compile import LRUCache
 from polar_bayes.inference.method import PosteriorDraws
@@ -285,7 +285,7 @@ class FacetsOverride(AbstractOverride):
     def apply(self, request: Request, method: Method) -> Overridden | None:
         changed = [
             Effect("", key_path, part, self._of(part))
-            for key_path, part in parts_of(request.scene)
+            for key_path, part in parameter_ranks(request.scene)
             if isinstance(part, FacetQuadrature)
         ]
         scene = simplify(request.scene, changed)

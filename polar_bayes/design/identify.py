@@ -25,6 +25,7 @@ from polar_bayes.design.setup import (
     make_design_problem,
     parameter_vector,
     posterior_modes,
+    request_provenance,
 )
 from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.result import PROVENANCE
@@ -152,7 +153,7 @@ def _identify_at(problem: DesignProblem, mode: np.ndarray) -> xr.Dataset:
     )
     for scalar in labels.scalars:
         dataset.attrs[f"meaning_of_{scalar.name}"] = notation(scalar.name).meaning
-    dataset.attrs[PROVENANCE] = json.dumps(problem.provenance, sort_keys=True)
+    dataset.attrs[PROVENANCE] = json.dumps(request_provenance(problem.request), sort_keys=True)
     return dataset
 
 

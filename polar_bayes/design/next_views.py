@@ -49,6 +49,7 @@ from polar_bayes.design.setup import (
     make_design_problem,
     parameter_vector,
     posterior_modes,
+    request_provenance,
 )
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
@@ -212,7 +213,11 @@ def next_views(
     )
     found = _assemble(request.capture, views, design, selection, names)
     settings = {"criterion": repr(criterion), "constraints": repr(constraints)}
-    provenance = {**extended.provenance, **settings, "exchanges": selection.exchanges}
+    provenance = {
+        **request_provenance(extended.request),
+        **settings,
+        "exchanges": selection.exchanges,
+    }
     return found.assign_attrs({PROVENANCE: json.dumps(provenance, sort_keys=True)})
 
 

@@ -6,6 +6,7 @@ Sources: Atkinson, Donev & Tobias (2007), Optimum Experimental Designs, chapters
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, override
 
@@ -128,47 +129,44 @@ def fedorov_exchange(
     count: int,
 ) -> Selection:
     """Select candidates whose summed information has a small loss: greedily, then by exchange."""
+    best = functools.partial(_best_addition, loss, base, each)
 
-    def best_addition(picks: list[int]) -> tuple[int, float]:
-        free = np.flatnonzero(allowed & ~conflicts[picks].any(axis=0))
-        if free.size == 0:
-            return -1, np.inf
-        known = base + each[:, picks].sum(axis=1)
-        losses = loss(known[:, None] + each[:, free])
-        at = int(np.argmin(losses))
-        return int(free[at]), float(losses[at])
+    def free(picks: list[int]) -> list[int]:
+        return np.flatnonzero(allowed & ~conflicts[picks].any(axis=0)).tolist()
 
     picks: list[int] = []
     for number in range(count):
-        pick, reached = best_addition(picks)
-        if pick < 0:
+        if not (options := free(picks)):
             raise FitError(
                 f"only {number} of {len(allowed)} candidates can be taken together",
                 where="next_views",
                 hint="ask for fewer, or give more candidates or wider constraints",
             )
+        pick, reached = best(picks, options)
         picks.append(pick)
     exchanges, before = 0, -1
     while exchanges > before:  # each exchange lowers the loss, so this ends
         before = exchanges
         for at in range(count):
-            pick, lower = best_addition(picks[:at] + picks[at + 1 :])
+            others = picks[:at] + picks[at + 1 :]
+            pick, lower = best(others, free(others))
             if lower < reached - MIN_GAIN * max(1.0, abs(reached)):
                 picks[at], reached, exchanges = pick, lower, exchanges + 1
-    ordered, losses = _ordered(loss, base, each, picks)
+    ordered: list[int] = []
+    losses = [float(loss(base[:, None])[0])]
+    while picks:  # the same candidates in greedy order
+        pick, lowest = best(ordered, picks)
+        picks.remove(pick)
+        ordered.append(pick)
+        losses.append(lowest)
     return Selection(ordered, losses, exchanges)
 
 
-def _ordered(
-    loss: Loss, base: np.ndarray, each: np.ndarray, picks: list[int]
-) -> tuple[list[int], list[float]]:
-    """The same candidates in greedy order, and the loss before the first and after each."""
-    remaining, ordered, known = list(picks), [], base
-    losses = [float(loss(known[:, None])[0])]
-    while remaining:
-        options = loss(known[:, None] + each[:, remaining])
-        at = int(np.argmin(options))
-        losses.append(float(options[at]))
-        ordered.append(remaining.pop(at))
-        known = known + each[:, ordered[-1]]
-    return ordered, losses
+def _best_addition(
+    loss: Loss, base: np.ndarray, each: np.ndarray, picks: list[int], options: list[int]
+) -> tuple[int, float]:
+    """The option whose information, added to that of the picks, has the smallest loss."""
+    known = base + each[:, picks].sum(axis=1)
+    losses = loss(known[:, None] + each[:, options])
+    at = int(np.argmin(losses))
+    return options[at], float(losses[at])

@@ -34,6 +34,7 @@ from polar_bayes.design.setup import (
     make_design_problem,
     parameter_vector,
     posterior_modes,
+    request_provenance,
 )
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
@@ -215,7 +216,7 @@ def _assemble(problem: DesignProblem, coordinate: Coordinate, curve: "ProfileCur
         },
         attrs={
             "parameter": coordinate.label,
-            PROVENANCE: json.dumps(problem.provenance, sort_keys=True),
+            PROVENANCE: json.dumps(request_provenance(problem.request), sort_keys=True),
         },
     )
 

@@ -37,17 +37,17 @@ class DesignProblem(NamedTuple):
     program: Program
     prior: np.ndarray
 
-    @property
-    def provenance(self) -> dict[str, Any]:
-        """Capture, model and settings, as far as JSON can hold them."""
-        return {
-            "model": self.request.model_name,
-            "scene": self.request.scene_name,
-            "scene_parts": repr(self.request.scene),
-            "links": {name: repr(link) for name, link in self.request.links.items()},
-            "seed": self.request.seed,
-            "capture": str(self.request.capture.attrs.get("name", "capture")),
-        }
+
+def request_provenance(request: Request) -> dict[str, Any]:
+    """Capture, model and settings, as far as JSON can hold them."""
+    return {
+        "model": request.model_name,
+        "scene": request.scene_name,
+        "scene_parts": repr(request.scene),
+        "links": {name: repr(link) for name, link in request.links.items()},
+        "seed": request.seed,
+        "capture": str(request.capture.attrs.get("name", "capture")),
+    }
 
 
 def make_design_problem(

@@ -1,11 +1,8 @@
-"""The figure of an accuracy study: error against time.
+"""The report of an accuracy study: the error of every method against its time."""
 
-In a notebook it is the last line of a cell; `figure.savefig("name.pdf")` writes it.
-"""
-
+import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import LogLocator
 from matplotlib.transforms import Bbox
 
 from polar_bayes.benchmark.accuracy import AS_GIVEN
@@ -25,46 +22,23 @@ from polar_bayes.benchmark.advice import (
     accuracy_table,
     parameter_errors,
 )
-from polar_bayes.errors import FitError, one_line
+from polar_bayes.errors import FitError
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.reporting.page import Picture, fill, picture
-from polar_bayes.reporting.style import (
-    BLUE,
-    GRAY,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    Drawing,
-    lighten,
-    paper,
-    plain,
-    quiet_ticks,
-    styled,
-)
-from polar_bayes.reporting.tables import Row, Table, fact_rows, made_by
-from polar_bayes.reporting.text import DASH, or_dash
+from polar_bayes.reporting import page, style, text
+from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
+from polar_bayes.reporting.text import DASH, column, or_dash
 
-WINE, INDIGO = "#882255", "#332288"  # of Paul Tol's muted scheme, beside those of the house
+METHOD, VARIATION = "method", "override"
+"""Names of the dimensions of a study: a method, and what was changed of it."""
+
+WINE, INDIGO = "#882255", "#332288"  # Paul Tol's muted scheme
 COLORS = (VERMILLION, ORANGE, SKY, GREEN, PURPLE, WINE, GRAY, BLUE, INDIGO)
 MARKERS = ("o", "^", "v", "s", "D", "P", "X", "*")
-LETTER, LINE = 5.2, 10.0
-"""About the size of a letter of a label, unit point: labels are placed before they are drawn."""
+LETTER_WIDTH, LINE_HEIGHT = 5.2, 10.0
+"""Approximate size of a label's letters, unit point: labels are placed before they are drawn."""
 
-AROUND = (
-    (6, 0),
-    (6, 8),
-    (6, -8),
-    (-6, 0),
-    (-6, 8),
-    (-6, -8),
-    (6, 18),
-    (6, -18),
-    (-6, 18),
-    (-6, -18),
-)
-"""Where a label may stand beside its point, unit point; the first free place is taken."""
+OFFSETS = tuple((right, up) for step in ((0, 8, -8), (18, -18)) for right in (6, -6) for up in step)
+"""Positions of a label relative to its point, unit point; the first free one is taken."""
 
 NEAR = 8
 """Unit point: a label that is higher or lower has a line to its point."""
@@ -75,11 +49,11 @@ TIME_LABELS = {
 }
 
 
-@styled
+@style.styled
 def plot_accuracy(
     result: xr.DataTree | xr.Dataset, *, times: Sequence[str] | None = None
 ) -> Figure:
-    """Error against time of every method and override, with the Pareto front.
+    """Error against time of every method and its variations, with the Pareto front.
 
     Args:
         result: What `polar_bayes.accuracy` returns, or one read back from a file.
@@ -87,31 +61,31 @@ def plot_accuracy(
             "seconds_again"; by default both, where they were measured.
 
     Returns:
-        The figure. A color stands for a method, a marker for the override; methods as given are
-        filled and named. The line joins points than which none is both faster and better. In the
-        gray area the reference itself does not tell errors from nothing.
+        The figure. A color stands for a method, a marker for what was changed of it; methods as
+        given are filled and named. The line joins the Pareto front: points than which none is both
+        faster and better. In the gray area errors are smaller than that of the reference.
 
     Raises:
         FitError: It holds no accuracy study, or no such column.
     """
-    found = accuracy_dataset(result)
-    table = accuracy_table(found)
-    shown = list(times) if times is not None else _measured(table)
-    strange = [name for name in shown if name not in TIME_LABELS]
-    if strange or not shown:
+    study = accuracy_dataset(result)
+    table = accuracy_table(study)
+    shown = list(times) if times is not None else [t for t in TIME_LABELS if table[t].notna().any()]
+    unknown = [name for name in shown if name not in TIME_LABELS]
+    if unknown or not shown:
         raise FitError(
-            f"there is no time {', '.join(strange)}" if strange else "no time was measured",
+            f"there is no time {', '.join(unknown)}" if unknown else "no time was measured",
             where="plot_accuracy",
             hint=f"give some of {', '.join(TIME_LABELS)}",
         )
-    figure = Drawing(figsize=(5.2 * len(shown), 4.4), layout="constrained")
+    figure = style.NotebookFigure(figsize=(5.2 * len(shown), 4.4), layout="constrained")
     for at, name in enumerate(shown):
         axes = figure.add_subplot(1, len(shown), at + 1)
-        front_panel(axes, found, name)
+        front_panel(axes, study, name)
         if at == 0:
             axes.set_ylabel("largest error of a mean or sd [posterior sd]")
-    overrides = list(dict.fromkeys(table["override"]))
-    if len(overrides) > 1:
+    markers = _assign(table[VARIATION], MARKERS)
+    if len(markers) > 1:
         handles = [
             Line2D(
                 [],
@@ -120,11 +94,9 @@ def plot_accuracy(
                 marker=marker,
                 mfc=GRAY if at == 0 else "none",
                 mec=GRAY,
-                label=override,
+                label=variation,
             )
-            for at, (override, marker) in enumerate(
-                zip(overrides, _repeat(MARKERS, len(overrides)), strict=True)
-            )
+            for at, (variation, marker) in enumerate(markers.items())
         ]
         figure.legend(
             handles=handles, loc="outside lower center", ncols=4 * len(shown), frameon=False
@@ -132,199 +104,151 @@ def plot_accuracy(
     return figure
 
 
-def _measured(table: pd.DataFrame) -> list[str]:
-    return [name for name in TIME_LABELS if table[name].notna().any()]
-
-
-def front_panel(axes: Axes, found: xr.Dataset, time: str) -> None:
+def front_panel(axes: Axes, study: xr.Dataset, time: str) -> None:
     """One panel of `plot_accuracy`."""
-    table, noise = accuracy_table(found), float(found.attrs["reference_error"])
-    # Axes of logarithms have no place for a time of zero.
+    table, noise = accuracy_table(study), float(study.attrs["reference_error"])
+    # Logarithmic axes cannot show a time of zero.
     known = table[np.isfinite(table["error"]) & np.isfinite(table[time]) & (table[time] > 0.0)]
-    methods, overrides = (list(dict.fromkeys(table[name])) for name in ("method", "override"))
-    colors = dict(zip(methods, _repeat(COLORS, len(methods)), strict=True))
-    markers = dict(zip(overrides, _repeat(MARKERS, len(overrides)), strict=True))
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.axhspan(1e-9, RESOLVED * noise, color=lighten(GRAY, 0.85), lw=0, zorder=0)
-    front = _front(known, time)
+    colors, markers = _assign(table[METHOD], COLORS), _assign(table[VARIATION], MARKERS)
+    axes.set(xscale="log", yscale="log", xlabel=TIME_LABELS[time])
+    axes.axhspan(1e-9, RESOLVED * noise, color=style.lighten(GRAY, 0.85), lw=0, zorder=0)
+    front = _pareto_front(known, time)
     axes.plot(front[time], front["error"], color=GRAY, lw=1.0, drawstyle="steps-post", zorder=1)
     for _, row in known.iterrows():
-        given = row["override"] == AS_GIVEN
+        given, color = row[VARIATION] == AS_GIVEN, colors[row[METHOD]]
         axes.plot(
             row[time],
             row["error"],
             ls="",
-            marker=markers[row["override"]],
+            marker=markers[row[VARIATION]],
             ms=6.5 if given else 4.5,
-            mfc=colors[row["method"]] if given else "none",
-            mec=colors[row["method"]],
+            mfc=color if given else "none",
+            mec=color,
             zorder=3 if given else 2,
         )
-    _limits(axes, known, time, noise)
-    axes.set_xlabel(TIME_LABELS[time])
+    if not known.empty:  # with room for a name on the right
+        error = known["error"].clip(lower=1e-6)
+        axes.set_xlim(float(known[time].min()) / 1.6, float(known[time].max()) * 3.0)
+        axes.set_ylim(min(float(error.min()), noise) / 1.6, float(error.max()) * 1.8)
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # often less than a decade
-    for axis in (axes.xaxis, axes.yaxis):  # the style reads no formulas
-        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axis.set_minor_formatter(NullFormatter())
-    _name_points(axes, known, time, colors)
-    quiet_ticks(axes)
+    style.plain_numbers(axes.xaxis, axes.yaxis)
+    _name_methods(axes, known, time, colors)
+    style.set_tick_style(axes)
 
 
-def _front(known: pd.DataFrame, time: str) -> pd.DataFrame:
+def _assign(names: pd.Series, values: Sequence[str]) -> dict[str, str]:
+    """A color or marker for each distinct name."""
+    return dict(zip(dict.fromkeys(names), itertools.cycle(values), strict=False))
+
+
+def _pareto_front(known: pd.DataFrame, time: str) -> pd.DataFrame:
     """Rows that are better than all faster ones."""
     ordered = known.sort_values([time, "error"], kind="stable")
     before = ordered["error"].cummin().shift(fill_value=np.inf)
     return ordered[ordered["error"] < before]
 
 
-def _limits(axes: Axes, known: pd.DataFrame, time: str, noise: float) -> None:
-    """Room around all points, and to the right for a name."""
-    if known.empty:
-        return
-    seconds, error = known[time], known["error"].clip(lower=1e-6)
-    axes.set_xlim(float(seconds.min()) / 1.6, float(seconds.max()) * 3.0)
-    axes.set_ylim(min(float(error.min()), noise) / 1.6, float(error.max()) * 1.8)
-
-
-def _name_points(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, str]) -> None:
-    """The name of each method beside its point, where no other name or point stands."""
+def _name_methods(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, str]) -> None:
+    """The name of each method next to its point, where it covers no other name or point."""
     figure = axes.get_figure()
     scale = 72.0 / (figure.dpi if figure is not None else 100.0)
-    places = axes.transData.transform(known[[time, "error"]].to_numpy(float)) * scale
-    taken = [Bbox.from_bounds(x - 3, y - 3, 6, 6) for x, y in places]
-    given = known[known["override"] == AS_GIVEN]
-    own = places[(known["override"] == AS_GIVEN).to_numpy()]
-    for (x, y), name in zip(own, given["method"], strict=True):
-        width = LETTER * len(name)
-        for right, up in AROUND:
-            box = Bbox.from_bounds(
-                x + (right if right > 0 else right - width), y + up - 5, width, LINE
-            )
+    points = axes.transData.transform(known[[time, "error"]].to_numpy(float)) * scale
+    taken = [Bbox.from_bounds(x - 3, y - 3, 6, 6) for x, y in points]
+    is_given = (known[VARIATION] == AS_GIVEN).to_numpy()
+    for (x, y), (_, row) in zip(points[is_given], known[is_given].iterrows(), strict=True):
+        name = row[METHOD]
+        width = LETTER_WIDTH * len(name)
+        for right, up in OFFSETS:
+            left = x + (right if right > 0 else right - width)
+            box = Bbox.from_bounds(left, y + up - 5, width, LINE_HEIGHT)
             if not any(box.overlaps(other) for other in taken):
                 break
         taken.append(box)
+        line = {"arrowstyle": "-", "color": colors[name], "lw": 0.6}
         axes.annotate(
-            plain(name),
-            tuple(given.loc[given["method"] == name, [time, "error"]].to_numpy(float)[0]),
+            style.label_text(name),
+            (float(row[time]), float(row["error"])),
             xytext=(right, up),
             textcoords="offset points",
             ha="left" if right > 0 else "right",
             va="center",
             fontsize=8,
             color=colors[name],
-            arrowprops={"arrowstyle": "-", "color": colors[name], "lw": 0.6}
-            if abs(up) > NEAR
-            else None,
-            path_effects=[withStroke(linewidth=2.5, foreground=paper())],
+            arrowprops=line if abs(up) > NEAR else None,
+            path_effects=[withStroke(linewidth=2.5, foreground=style.background())],
         )
 
 
-def _repeat(values: Sequence[str], count: int) -> list[str]:
-    return [values[at % len(values)] for at in range(count)]
+# --- The page -------------------------------------------------------------------------------------
 
 
-# --- The report of an accuracy study: advice, the picture, and the numbers behind it --------------
+def accuracy_page(result: xr.DataTree) -> page.Page:
+    """The page of an accuracy study."""
+    study, provenance = accuracy_dataset(result), provenance_of(result)
+    facts = page.make_facts(
+        {str(key).replace("_", " "): value for key, value in provenance.items()}
+    )
+    sections = [
+        page.Section("front", "Error against time", [accuracy_picture(study)]),
+        page.Section("methods", "Methods and settings", [study_table(study)]),
+        page.Section("parameters", "Errors of every parameter", [error_table(study)]),
+        page.Section("provenance", "Provenance", facts),
+    ]
+    return page.Page(
+        kind="Accuracy against time",
+        name=text.capture_name(provenance),
+        subtitles=[text.made_by(provenance, "every method of the study")],
+        headline=" ".join(accuracy_sentences(study)),
+        passed=not study.attrs["reference_doubts"],
+        sentences=[text.reference_sentence(study)],
+        sections=sections,
+        footer="Computed from accuracy.nc, which lies in the same folder.",
+    )
 
 
-HEADS = (
-    "method", "error", "of", "first s", "next s", "MiB", "interval", "Wasserstein", "R-hat",
-    "k-hat", "worth", "gradients", "densities",
-)  # fmt: skip
-CAPTION = (
-    "Error: the largest of any mean or standard deviation, in posterior standard deviations, and "
-    "of which parameter; marked < where the reference itself cannot tell it from nothing. "
-    "Interval: the same of the ends of 95% intervals. Worth: independent draws. First and next: "
-    "seconds of a first fit in a fresh process, compilation included, and of the next one. "
-    "Gradients of chains count warm-up as long as what is kept. * on the front: nothing is both "
-    "faster and better."
-)
-
-
-def render_accuracy(result: xr.DataTree) -> str:
-    """The page as text."""
-    about = provenance_of(result)
-    content = {
-        "kind": "Accuracy against time",
-        "name": one_line(str(about.get("capture", "capture"))),
-        "under": [made_by(about, "every method of the ladder")],
-        "facts_of_study": fact_rows(
-            {str(key).replace("_", " "): value for key, value in about.items()}
-        ),
-        **accuracy_section(result),
-    }
-    return fill("accuracy.html.j2", content)
-
-
-def accuracy_section(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
-    """What a page says of a study: advice, reference, figure and tables."""
-    found = accuracy_dataset(result)
-    return {
-        "advice": " ".join(accuracy_sentences(found)),
-        "is_sound": not found.attrs["reference_doubts"],
-        "reference": reference_sentence(found),
-        "picture": accuracy_picture(found),
-        "table": study_table(found),
-        "parameters": parameter_table(found),
-    }
-
-
-def accuracy_picture(found: xr.Dataset) -> Picture:
+def accuracy_picture(study: xr.Dataset) -> page.Picture:
     """Error against time."""
-    return picture(
-        plot_accuracy(found),
-        "Error against time of every method",
-        "Down is better, left is faster. A color stands for a method, a marker for the override "
-        "beside it; methods as given are filled and named. The line joins those than which nothing "
-        "is both faster and better. In the gray area the reference itself cannot tell an error "
-        "from nothing.",
-    )
+    return page.make_picture(plot_accuracy(study), *text.figure_caption("accuracy.figure_front"))
 
 
-def reference_sentence(result: xr.DataTree | xr.Dataset) -> str:
-    """What the reference is, and how well it is known."""
-    told = accuracy_dataset(result).attrs
-    sentence = (
-        f"The reference is {told['reference_draws']:,} draws of {told['reference']}, worth "
-        f"{told['reference_effective_draws']:,.0f} independent ones; its own Monte Carlo error is "
-        f"at most {told['reference_error']:.2g} posterior sd."
-    )
-    doubts = told["reference_doubts"]
-    return f"{sentence} Against it speaks: {doubts}." if doubts else sentence
+def study_table(study: xr.Dataset) -> page.Table:
+    """A row for each method and each variation of it."""
+    noise = float(study.attrs["reference_error"])
+    table = accuracy_table(study)
 
-
-def study_table(found: xr.Dataset) -> Table:
-    """A row for each method and override."""
-    noise = float(found.attrs["reference_error"])
-    rows, table = [], accuracy_table(found)
-    for name, row in table.iterrows():
-        error = or_dash(row["error"], "{:.2g}")
+    def error(row: pd.Series) -> str:
         if math.isfinite(row["error"]) and not row["resolved"]:
-            error = f"< {RESOLVED * noise:.2g}"
-        cells = (
-            error,
-            row["worst"] if math.isfinite(row["error"]) else DASH,
-            *(or_dash(row[key], "{:.2g}") for key in ("seconds_first", "seconds_again")),
-            or_dash(row["peak_memory"], "{:,.0f}"),
-            *(or_dash(row[key], "{:.2g}") for key in ("interval", "wasserstein")),
-            or_dash(row["r_hat"], "{:.3f}"),
-            or_dash(row["k_hat"], "{:.2f}"),
-            *(
-                or_dash(row[key], "{:,.0f}")
-                for key in ("effective_draws", "gradients", "densities")
-            ),
-        )
-        words = "; ".join(filter(None, ["*" if row["on_front"] else "", row["problems"]]))
-        rows.append(Row(str(name), words or str(name), cells))
-    return Table(CAPTION, HEADS, tuple(rows), table)
+            return f"< {RESOLVED * noise:.2g}"
+        return or_dash(row["error"], ".2g")
 
-
-def parameter_table(found: xr.Dataset) -> Table:
-    """Errors of every parameter by the methods as given."""
-    errors = parameter_errors(found)[found["override"].to_numpy() == AS_GIVEN]
-    rows = tuple(
-        Row(str(name), str(name), tuple(or_dash(value, "{:.2g}") for value in row))
-        for name, row in errors.iterrows()
+    marks = {
+        str(name): "; ".join(filter(None, ["*" if row["on_front"] else "", row["problems"]]))
+        or str(name)
+        for name, row in table.iterrows()
+    }
+    cells: page.Cells = {
+        "error": error,
+        "of": lambda row: row["worst"] if math.isfinite(row["error"]) else DASH,
+        "first s": column("seconds_first", ".2g"),
+        "next s": column("seconds_again", ".2g"),
+        "MiB": column("peak_memory", ",.0f"),
+        "interval": column("interval", ".2g"),
+        "Wasserstein": column("wasserstein", ".2g"),
+        "R-hat": column("r_hat", ".3f"),
+        "k-hat": column("k_hat", ".2f"),
+        "ESS": column("effective_draws", ",.0f"),
+        "gradients": column("gradients", ",.0f"),
+        "densities": column("densities", ",.0f"),
+    }
+    caption = text.caption("accuracy.study")
+    return page.make_table(
+        "study", caption, cells, table, label="method", descriptions=marks, prose=["method"]
     )
+
+
+def error_table(study: xr.Dataset) -> page.Table:
+    """Errors of every parameter by the methods as given."""
+    errors = parameter_errors(study)[study[VARIATION].to_numpy() == AS_GIVEN]
+    cells: page.Cells = {str(name): column(name, ".2g") for name in errors.columns}
     caption = "The larger error of mean and standard deviation of each, in posterior sds."
-    return Table(caption, ("method", *map(str, errors.columns)), rows, errors)
+    return page.make_table("error", caption, cells, errors, label="method")

@@ -1,54 +1,200 @@
-"""What every page has in common: it stands alone, and is written whole or not at all."""
+"""A report page: title, verdict, and sections of sentences, tables and figures.
+
+A page is one HTML file without scripts or references to other files. `Page.html` fills the one
+template; `write_page` writes the file, and the result that belongs to it, whole or not at all.
+"""
 
 import base64
 import csv
 import dataclasses
+import functools
 import io
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import matplotlib
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 
 from polar_bayes.paths import check_output, move_into_place, unfinished_folder, written
-from polar_bayes.reporting.style import ALWAYS
+from polar_bayes.reporting.style import FIXED_STYLE
+from polar_bayes.repr_html import Grid
 
 PAGE = "index.html"
-MARK, HEAD = b'<meta name="generator" content="polar_bayes">', 1024
-"""What every page of ours has among its first bytes."""
+MARK, MARK_BYTES = b'<meta name="generator" content="polar_bayes">', 1024
+"""Every page has this mark among its first bytes."""
+
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""A spreadsheet runs a text that begins with one of these."""
+
+MAIN_GROUP = ""
+LONG_TABLE = 40
+"""Tables with more rows scroll in a box of their own."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One row of a table as text."""
+
+    name: str
+    description: str
+    cells: tuple[str, ...]
+    group: str = MAIN_GROUP
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Table:
+    """Rows of text under columns, with the numbers behind them; columns of prose are wrapped."""
+
+    name: str
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[Row, ...]
+    data: pd.DataFrame | None = None
+    prose: Collection[str] = ()
+    kind: ClassVar[str] = "table"
+
+    @property
+    def csv(self) -> str:
+        """A link that holds the table, with every digit, as a CSV file."""
+        if self.data is not None:
+            return csv_link(self.data, self.columns[0])
+        texts = pd.DataFrame.from_records(
+            [row.cells for row in self.rows],
+            index=pd.Index([row.name for row in self.rows]),
+            columns=list(self.columns[1:]),
+        )
+        return csv_link(texts, self.columns[0])
+
+    @property
+    def groups(self) -> list[tuple[str, list[Row]]]:
+        """Rows by the title of their group, in order; the main group has none."""
+        groups: dict[str, list[Row]] = {}
+        for row in self.rows:
+            groups.setdefault(row.group, []).append(row)
+        return list(groups.items())
+
+    @property
+    def is_long(self) -> bool:
+        """True where a page would be mostly this table."""
+        return len(self.rows) > LONG_TABLE
+
+    def grid(self, max_rows: int) -> Grid:
+        """The first rows, for a notebook or a terminal."""
+        rows = tuple((row.name, *row.cells) for row in self.rows[:max_rows])
+        return Grid(self.columns, rows, numeric=True)
+
+
+type Cells = Mapping[str, Callable[[pd.Series], str]]
+"""Columns of a table: the text of a cell from its row of numbers."""
+
+
+def make_table(
+    table: str,
+    caption: str,
+    cells: Cells,
+    data: pd.DataFrame,
+    *,
+    label: str = "parameter",
+    descriptions: Mapping[str, str] = {},
+    groups: Mapping[str, str] = {},
+    prose: Collection[str] = (),
+) -> Table:
+    """A table with a row for each row of numbers; `label` heads the column of their names."""
+    rows = []
+    for key, numbers in data.iterrows():
+        name = str(key[0] if isinstance(key, tuple) else key)
+        texts = tuple(cell(numbers) for cell in cells.values())
+        group = groups.get(name, MAIN_GROUP)
+        rows.append(Row(name, descriptions.get(name, name), texts, group))
+    return Table(table, caption, (label, *cells), tuple(rows), data, prose)
 
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A figure on the page."""
+    """A figure as an image that the page itself holds."""
 
     source: str
     alternative: str
     caption: str
     wide: bool
+    kind: ClassVar[str] = "picture"
 
 
-def picture(figure: Figure, alternative: str, caption: str) -> Picture:
-    """A figure as a part of the page."""
-    buffer = io.BytesIO()
-    with matplotlib.rc_context(ALWAYS):
-        # No date and a fixed salt: the same result gives the same page, byte for byte.
-        figure.savefig(buffer, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
-    encoded = base64.b64encode(buffer.getvalue()).decode("ascii")
-    return Picture(
-        source=f"data:image/svg+xml;base64,{encoded}",
-        alternative=alternative,
-        caption=caption,
-        wide=figure.get_figwidth() > 7.0,
-    )
+@dataclasses.dataclass(frozen=True)
+class Facts:
+    """Names, values and marks under an optional title."""
+
+    rows: tuple[tuple[str, str, str], ...]
+    title: str = ""
+    kind: ClassVar[str] = "facts"
 
 
-def fill(template: str, content: Mapping[str, Any]) -> str:
-    """A template with its content; every text is escaped."""
+@dataclasses.dataclass(frozen=True)
+class Heading:
+    """A heading within a section."""
+
+    text: str
+    kind: ClassVar[str] = "heading"
+
+
+@dataclasses.dataclass(frozen=True)
+class Bullets:
+    """A list of sentences."""
+
+    sentences: tuple[str, ...]
+    kind: ClassVar[str] = "bullets"
+
+
+@dataclasses.dataclass(frozen=True)
+class Details:
+    """Blocks or a program that unfold on request."""
+
+    summary: str
+    blocks: "tuple[Block, ...]" = ()
+    code: str = ""
+    kind: ClassVar[str] = "details"
+
+
+type Block = str | Table | Picture | Facts | Heading | Bullets | Details
+
+
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """A part of a page, which the menu calls `link`; one without blocks is left out."""
+
+    id: str
+    title: str
+    blocks: Sequence[Block]
+    link: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Page:
+    """Everything that a page says."""
+
+    kind: str
+    name: str
+    subtitles: Sequence[str]
+    headline: str
+    passed: bool
+    sections: Sequence[Section]
+    footer: str
+    problems: Sequence[str] = ()
+    sentences: Sequence[str] = ()
+    cautions: Sequence[str] = ()
+
+    @property
+    def html(self) -> str:
+        """The page as HTML; every text is escaped."""
+        return _template().render(page=self)
+
+
+@functools.cache
+def _template() -> Template:
     environment = Environment(
         loader=PackageLoader("polar_bayes.reporting"),
         autoescape=True,
@@ -56,17 +202,53 @@ def fill(template: str, content: Mapping[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["plain_letters"] = lambda text: re.sub(r"[^a-z0-9]", "", text.lower())
-    return environment.get_template(template).render(content)
+    environment.filters["only_letters"] = lambda text: re.sub(r"[^a-z0-9]", "", text.lower())
+    return environment.get_template("page.html.j2")
+
+
+def make_picture(figure: Figure, alternative: str, caption: str) -> Picture:
+    """A figure as a block of a page."""
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(FIXED_STYLE):
+        # No date and a fixed salt: the same result gives the same page, byte for byte.
+        figure.savefig(buffer, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
+    encoded = base64.b64encode(buffer.getvalue()).decode("ascii")
+    source = f"data:image/svg+xml;base64,{encoded}"
+    return Picture(source, alternative, caption, wide=figure.get_figwidth() > 7.0)
+
+
+def make_facts(
+    values: Mapping[str, Any], title: str = "", *, marked: Collection[str] = (), mark: str = ""
+) -> list[Block]:
+    """Names and values as a block, `mark` behind those that are marked; none without values."""
+    rows = tuple(
+        (str(name), _as_text(value), mark if name in marked else "")
+        for name, value in values.items()
+    )
+    return [Facts(rows, title)] if rows else []
+
+
+def make_bullets(sentences: Iterable[str]) -> list[Block]:
+    """Sentences as a list; none without sentences."""
+    found = tuple(sentences)
+    return [Bullets(found)] if found else []
+
+
+def _as_text(value: object) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_as_text(item)}" for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_as_text, value)) or "none"
+    return str(value)
 
 
 def write_page(
     folder: Path, page: str, others: Mapping[str, Callable[[Path], object]] | None = None
 ) -> Path:
-    """Write a page and the files that go with it; an older report in the folder is replaced."""
+    """Write a page and the files that belong to it; an older report in the folder is replaced."""
     with written(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    is_report = is_page(folder / PAGE)
+    is_report = _is_page(folder / PAGE)
     names = (*(others or {}), PAGE)
     files = {name: check_output(folder / name, lambda _: is_report) for name in names}
     with written(folder), unfinished_folder(folder) as unfinished:
@@ -78,35 +260,27 @@ def write_page(
     return folder / PAGE
 
 
-def is_page(file: Path) -> bool:
-    """Whether a file is a page that `fill` made."""
+def _is_page(file: Path) -> bool:
     try:
-        return MARK in file.read_bytes()[:HEAD]
+        return MARK in file.read_bytes()[:MARK_BYTES]
     except OSError:
         return False
 
 
-# --- Tables of a page as CSV files that the page itself holds: no second file, no network ---------
-
-
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What a spreadsheet runs when a text begins with it."""
-
-
 def csv_link(table: pd.DataFrame, first: str) -> str:
-    """A table as the address of a link."""
-    safe = table.map(_inert)
+    """A table as the address of a link, with no text that a spreadsheet would run."""
+    safe = table.map(_escape_formula)
     if isinstance(table.index, pd.MultiIndex):
         safe.index = pd.MultiIndex.from_tuples(
-            [tuple(map(_inert, row)) for row in table.index], names=table.index.names
+            [tuple(map(_escape_formula, row)) for row in table.index], names=table.index.names
         )
         labels: str | list[str] = [str(name) for name in table.index.names]
     else:
-        safe.index, labels = pd.Index([_inert(name) for name in table.index]), first
-    safe.columns = pd.Index([_inert(str(name)) for name in table.columns])
+        safe.index, labels = pd.Index([_escape_formula(name) for name in table.index]), first
+    safe.columns = pd.Index([_escape_formula(str(name)) for name in table.columns])
     text = safe.to_csv(index_label=labels, quoting=csv.QUOTE_NONNUMERIC)
     return f"data:text/csv;charset=utf-8;base64,{base64.b64encode(text.encode()).decode('ascii')}"
 
 
-def _inert(value: object) -> object:
+def _escape_formula(value: object) -> object:
     return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value

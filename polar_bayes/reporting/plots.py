@@ -4,6 +4,7 @@ from polar_bayes.reporting.accuracy import plot_accuracy
 from polar_bayes.reporting.comparison import plot_comparison
 from polar_bayes.reporting.maps import plot_maps
 from polar_bayes.reporting.plots_calibration import plot_calibration
+from polar_bayes.reporting.plots_curves import plot_readings, plot_residuals, plot_spectrum
 from polar_bayes.reporting.plots_fit import (
     plot_pairs,
     plot_pit,
@@ -11,8 +12,6 @@ from polar_bayes.reporting.plots_fit import (
     plot_ranks,
     plot_shrinkage,
 )
-from polar_bayes.reporting.plots_observations import plot_readings, plot_residuals
-from polar_bayes.reporting.plots_spectrum import plot_spectrum
 
 __all__ = [
     "plot_accuracy",

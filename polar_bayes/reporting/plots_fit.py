@@ -1,20 +1,18 @@
-"""Figures of a fit: each is drawn from the saved tree alone.
+"""Figures of a fit: its parameters, its checks, and the members of its populations."""
 
-`plot_readings` (its own file) shows the data; here are the parameters and the checks. In a notebook
-a figure is the last line of a cell; `figure.savefig("name.pdf")` writes it.
-"""
-
+import functools
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import LogLocator
 
 from polar_bayes.diagnostics.parameters import (
     Scalar,
@@ -32,6 +30,7 @@ from polar_bayes.diagnostics.population import (
 )
 from polar_bayes.diagnostics.predictive import PredictiveCheck, pit_band, predictive_checks
 from polar_bayes.errors import FitError
+from polar_bayes.reporting import style
 from polar_bayes.reporting.style import (
     BLUE,
     CHAIN_COLORS,
@@ -40,22 +39,13 @@ from polar_bayes.reporting.style import (
     PURPLE,
     QUANTITIES,
     VERMILLION,
-    Drawing,
-    grid,
-    ink,
     lighten,
-    paper,
-    place_of,
-    plain,
-    quiet_ticks,
-    styled,
-    title_of,
-    wrapped,
+    parameter_title,
 )
 
-MOST_PAIRED = 8
-MOST_PANELS = 12
-MOST_POINTS = 800
+MAX_PAIRED = 8
+MAX_PANELS = 12
+MAX_POINTS = 800
 RANK_BINS = 20
 MINUS = "\N{MINUS SIGN}"
 
@@ -79,7 +69,7 @@ def _first_material_first(scalar: Scalar) -> tuple[bool, list[int]]:
     return not scalar.is_material, places
 
 
-@styled
+@style.styled
 def plot_pairs(result: xr.DataTree) -> Figure:
     """Joint draws of the material parameters (the first material, at most 8), and correlations.
 
@@ -94,18 +84,18 @@ def plot_pairs(result: xr.DataTree) -> Figure:
     """
     found = drawable(result, material=True)
     found = [s for s in found if _first_material_first(s) == _first_material_first(found[0])]
-    found = found[:MOST_PAIRED]
+    found = found[:MAX_PAIRED]
     if len(found) < 2:
-        raise _nothing("plot_pairs", "two material parameters with draws")
+        raise _nothing_to_draw("plot_pairs", "two material parameters with draws")
     posterior = result["posterior"].to_dataset()
-    labels = [_narrow(title_of(scalar, posterior)) for scalar in found]
+    labels = [_narrow_label(parameter_title(scalar, posterior)) for scalar in found]
     size = len(found)
-    figure, panels = _square(size, lines=max(label.count("\n") for label in labels) + 1)
+    figure, panels = _pair_panels(size, lines=max(label.count("\n") for label in labels) + 1)
     draws = np.stack([scalar.draws.ravel() for scalar in found])
-    shown = np.linspace(0, draws.shape[1] - 1, min(MOST_POINTS, draws.shape[1])).astype(int)
-    diverging = _diverging(result)
+    shown = np.linspace(0, draws.shape[1] - 1, min(MAX_POINTS, draws.shape[1])).astype(int)
+    diverging = _divergent_draws(result)
     correlation = np.corrcoef(draws)
-    limits = [_range(values) for values in draws]
+    limits = [style.padded_range(values, 0.04) for values in draws]
     truths = [truth_of(result, scalar) for scalar in found]
     for row in range(size):
         for column in range(size):
@@ -115,10 +105,10 @@ def plot_pairs(result: xr.DataTree) -> Figure:
                 _histogram(axes, draws[row], limits[row], truths[row])
             elif row > column:
                 axes.set_ylim(limits[row])
-                _scatter(axes, draws[[column, row]], shown, diverging)
-                _cross(axes, truths[column], truths[row])
+                _draw_points(axes, draws[[column, row]], shown, diverging)
+                _draw_truth(axes, truths[column], truths[row])
             else:
-                _correlation(axes, correlation[row, column])
+                _write_correlation(axes, correlation[row, column])
             _pair_ticks(axes, row, column, size)
         panels[-1, row].set_xlabel(labels[row], fontsize=8)
         if row:
@@ -128,7 +118,7 @@ def plot_pairs(result: xr.DataTree) -> Figure:
     return figure
 
 
-@styled
+@style.styled
 def plot_ranks(result: xr.DataTree) -> Figure:
     """How each chain's draws rank among all draws: flat and overlapping lines are good.
 
@@ -143,12 +133,12 @@ def plot_ranks(result: xr.DataTree) -> Figure:
     """
     found = drawable(result)
     if not found or found[0].draws.shape[0] < 2:
-        raise _nothing("plot_ranks", "two chains")
+        raise _nothing_to_draw("plot_ranks", "two chains")
     r_hat = array_stats.rhat(np.stack([scalar.draws for scalar in found]))
-    worst = np.sort(np.argsort(-r_hat, kind="stable")[:MOST_PANELS])
+    worst = np.sort(np.argsort(-r_hat, kind="stable")[:MAX_PANELS])
     found = [found[i] for i in worst]
     posterior = result["posterior"].to_dataset()
-    figure, panels = grid(len(found), columns=3, width=8.2, panel_height=1.35, header=0.5)
+    figure, panels = style.grid(len(found), panel_height=1.35, header=0.5)
     chains, length = found[0].draws.shape
     edges = np.linspace(0.0, 1.0, RANK_BINS + 1)
     for axes, scalar in zip(panels, found, strict=True):
@@ -159,19 +149,19 @@ def plot_ranks(result: xr.DataTree) -> Figure:
             axes.stairs(share, edges, color=color, lw=1.1, baseline=None)
         axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
         axes.set(xlim=(0, 1), ylim=(0, max(2.0, axes.get_ylim()[1])), xticks=[0, 0.5, 1])
-        axes.set_title(wrapped(title_of(scalar, posterior), 38), loc="left")
-    quiet_ticks(panels)
+        axes.set_title(style.wrap(parameter_title(scalar, posterior), 38), loc="left")
+    style.set_tick_style(panels)
     figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)", fontsize=9)
     figure.supylabel("density", fontsize=9)
     handles = [
         Line2D([], [], color=color, label=f"chain {i + 1}")
         for i, color in enumerate(CHAIN_COLORS[:chains])
     ]
-    figure.legend(handles=handles, loc="outside upper left", ncols=6, frameon=False)
+    style.add_legend(figure, handles, columns=6)
     return figure
 
 
-@styled
+@style.styled
 def plot_prior_posterior(result: xr.DataTree) -> Figure:
     """Prior against posterior: what the data added.
 
@@ -191,23 +181,24 @@ def plot_prior_posterior(result: xr.DataTree) -> Figure:
         before = {s.label: s.draws for s in scalars(result["prior"].to_dataset())}
     found = [scalar for scalar in found if scalar.label in before]
     if not found:
-        raise _nothing("plot_prior_posterior", "draws of the prior")
+        raise _nothing_to_draw("plot_prior_posterior", "draws of the prior")
     posterior = result["posterior"].to_dataset()
     # Populations and processes, which concern all members, before the first members.
     names = set(map(str, posterior.data_vars))
-    common = [s for s in found if is_hyperparameter(s.name, names)][: MOST_PANELS // 2]
+    common = [s for s in found if is_hyperparameter(s.name, names)][: MAX_PANELS // 2]
     own = [s for s in found if not is_hyperparameter(s.name, names)]
-    found = [*common, *own][:MOST_PANELS]
-    figure, panels = grid(len(found), columns=3, width=8.2, panel_height=1.5, header=0.5)
+    found = [*common, *own][:MAX_PANELS]
+    figure, panels = style.grid(len(found), panel_height=1.5, header=0.5)
     any_truth = False
     for axes, scalar in zip(panels, found, strict=True):
         prior, draws = before[scalar.label].ravel(), scalar.draws.ravel()
-        limits = _range(np.concatenate([np.quantile(prior, [0.01, 0.99]), draws]))
-        _hill(axes, prior, limits, GRAY, 0.72)
-        _hill(axes, draws, limits, BLUE, 0.45)
+        values = np.concatenate([np.quantile(prior, [0.01, 0.99]), draws])
+        limits = style.padded_range(values, 0.04)
+        _scaled_histogram(axes, prior, limits, GRAY, 0.72)
+        _scaled_histogram(axes, draws, limits, BLUE, 0.45)
         low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
         axes.plot([low, high], [-0.09, -0.09], color=BLUE, lw=3, solid_capstyle="butt")
-        axes.plot([middle], [-0.09], "|", color=ink(), ms=8)
+        axes.plot([middle], [-0.09], "|", color=style.text_color(), ms=8)
         true = truth_of(result, scalar)
         if np.isfinite(true):
             any_truth = True
@@ -215,8 +206,8 @@ def plot_prior_posterior(result: xr.DataTree) -> Figure:
         axes.set(xlim=limits, ylim=(-0.18, 1.08), yticks=[])
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
-        axes.set_title(wrapped(title_of(scalar, posterior), 38), loc="left")
-    quiet_ticks(panels)
+        axes.set_title(style.wrap(parameter_title(scalar, posterior), 38), loc="left")
+    style.set_tick_style(panels)
     handles: list[Patch | Line2D] = [
         Patch(color=lighten(GRAY, 0.72), label="prior"),
         Patch(color=lighten(BLUE, 0.45), label="posterior"),
@@ -224,11 +215,11 @@ def plot_prior_posterior(result: xr.DataTree) -> Figure:
     ]
     if any_truth:
         handles.append(Line2D([], [], color=ORANGE, ls="--", label="true value"))
-    figure.legend(handles=handles, loc="outside upper left", ncols=4, frameon=False)
+    style.add_legend(figure, handles, columns=4)
     return figure
 
 
-@styled
+@style.styled
 def plot_pit(result: xr.DataTree, checks: dict[str, PredictiveCheck] | None = None) -> Figure:
     """PIT and leave-one-out PIT of every variable: distance from the uniform distribution.
 
@@ -245,8 +236,8 @@ def plot_pit(result: xr.DataTree, checks: dict[str, PredictiveCheck] | None = No
     checks = predictive_checks(result) if checks is None else checks
     rows = [check for check in checks.values() if check.pit.size >= 2]
     if not rows:
-        raise _nothing("plot_pit", "two readings and 100 draws")
-    figure = Drawing(figsize=(8.2, 2.1 * len(rows) + 0.5), layout="constrained")
+        raise _nothing_to_draw("plot_pit", "two readings and 100 draws")
+    figure = style.NotebookFigure(figsize=(8.2, 2.1 * len(rows) + 0.5), layout="constrained")
     panels = figure.subplots(len(rows), 2, sharex=True, sharey="row", squeeze=False)
     for row, check in enumerate(rows):
         parts = {"PIT": check.pit, "leave-one-out PIT": check.loo.pit if check.loo else None}
@@ -254,16 +245,16 @@ def plot_pit(result: xr.DataTree, checks: dict[str, PredictiveCheck] | None = No
             _pit_panel(axes, values)
             axes.set_title(f"{QUANTITIES.get(check.name, check.name)}: {kind}", loc="left")
         panels[row, 0].set_ylabel("share below, minus uniform")
-    quiet_ticks(list(panels.flat))
+    style.set_tick_style(list(panels.flat))
     figure.supxlabel("PIT: share of the prediction below the reading", fontsize=9)
     return figure
 
 
-def _square(size: int, *, lines: int) -> tuple[Figure, np.ndarray]:
+def _pair_panels(size: int, *, lines: int) -> tuple[Figure, np.ndarray]:
     """Panels for pairs, placed by hand: a layout engine takes seconds for this many axes."""
     side = max(5.6, min(1.35 * size + 0.9, 9.6))
     margin = 0.42 + 0.16 * lines
-    figure = Drawing(figsize=(side, side))
+    figure = style.NotebookFigure(figsize=(side, side))
     place = {"left": (margin + 0.25) / side, "bottom": margin / side, "right": 0.985, "top": 0.99}
     panels = figure.subplots(
         size, size, squeeze=False, gridspec_kw={**place, "hspace": 0.12, "wspace": 0.12}
@@ -274,7 +265,7 @@ def _square(size: int, *, lines: int) -> tuple[Figure, np.ndarray]:
 def _pit_panel(axes: Axes, values: np.ndarray | None) -> None:
     band = pit_band(values) if values is not None else None
     if band is None:
-        axes.text(0.5, 0.5, "not available", ha="center", transform=axes.transAxes, color=GRAY)
+        style.write_in_panel(axes, "not available")
         return
     color = VERMILLION if band.rejects_uniformity else BLUE
     axes.fill_between(band.at, band.lower, band.upper, color=lighten(GRAY, 0.75), lw=0, step="mid")
@@ -283,17 +274,11 @@ def _pit_panel(axes: Axes, values: np.ndarray | None) -> None:
     axes.set_xlim(0, 1)
 
 
-def _diverging(result: xr.DataTree) -> np.ndarray:
+def _divergent_draws(result: xr.DataTree) -> np.ndarray:
     stats = stats_of(result)
     if "diverging" not in stats:
         return np.empty(0, int)
     return np.flatnonzero(stats["diverging"].to_numpy().ravel())
-
-
-def _range(values: np.ndarray) -> tuple[float, float]:
-    low, high = float(np.min(values)), float(np.max(values))
-    margin = 0.04 * (high - low) or 1.0
-    return low - margin, high + margin
 
 
 def _histogram(
@@ -306,7 +291,7 @@ def _histogram(
         axes.axvline(true, color=ORANGE, lw=1.4, ls="--")
 
 
-def _hill(
+def _scaled_histogram(
     axes: Axes, values: np.ndarray, limits: tuple[float, float], color: str, share: float
 ) -> None:
     """A histogram over its own range, scaled to height 1."""
@@ -316,21 +301,21 @@ def _hill(
     axes.stairs(counts / counts.max(), edges, color=color, lw=0.8)
 
 
-def _scatter(axes: Axes, xy: np.ndarray, shown: np.ndarray, diverging: np.ndarray) -> None:
+def _draw_points(axes: Axes, xy: np.ndarray, shown: np.ndarray, diverging: np.ndarray) -> None:
     axes.plot(*xy[:, shown], "o", color=BLUE, ms=1.6, mew=0, alpha=0.4, rasterized=True)
     if diverging.size:
         axes.plot(*xy[:, diverging], "x", color=VERMILLION, ms=4, mew=1.2, rasterized=True)
 
 
-def _cross(axes: Axes, x: float, y: float) -> None:
-    style: dict[str, Any] = {"color": ORANGE, "lw": 1.2, "ls": "--", "zorder": 3}
+def _draw_truth(axes: Axes, x: float, y: float) -> None:
+    line: dict[str, Any] = {"color": ORANGE, "lw": 1.2, "ls": "--", "zorder": 3}
     if np.isfinite(x):
-        axes.axvline(x, **style)
+        axes.axvline(x, **line)
     if np.isfinite(y):
-        axes.axhline(y, **style)
+        axes.axhline(y, **line)
 
 
-def _correlation(axes: Axes, value: float) -> None:
+def _write_correlation(axes: Axes, value: float) -> None:
     axes.axis("off")
     strength = min(abs(value), 1.0)
     axes.text(
@@ -341,7 +326,7 @@ def _correlation(axes: Axes, value: float) -> None:
         va="center",
         transform=axes.transAxes,
         fontsize=8.0 + 3.0 * strength,
-        color=ink() if strength > 0.3 else GRAY,
+        color=style.text_color() if strength > 0.3 else GRAY,
     )
 
 
@@ -354,29 +339,33 @@ def _pair_ticks(axes: Axes, row: int, column: int, size: int) -> None:
         axes.set_yticks([])
 
 
-def _narrow(text: str) -> str:
+def _narrow_label(text: str) -> str:
     """Break a label at its commas, and long parts at a space, for narrow panels."""
-    return "\n".join(wrapped(part, 19) for part in text.split(", "))
+    return "\n".join(style.wrap(part, 19) for part in text.split(", "))
 
 
-def _nothing(what: str, needed: str) -> FitError:
+def _nothing_to_draw(what: str, needed: str) -> FitError:
     return FitError("there is nothing to draw", where=what, hint=f"give a result that has {needed}")
 
 
-# --- Shrinkage: what each member of a population says alone, and what it says among the others ----
+# --- Shrinkage: members of a population without and with pooling ----------------------------------
 
+MAX_MEMBERS = 60
+MANY_MEMBERS = 30
+"""With more members rows are lower and labels smaller."""
 
-MOST_MEMBERS = 60
-ROW, LOW_ROW = 0.24, 0.17
-APART = 0.17
-"""Alone above, pooled below the middle of a row, unit of rows."""
+ROW_HEIGHT, LOW_ROW_HEIGHT = 0.24, 0.17
+OFFSET = 0.17
+"""The estimate alone is drawn above the middle of a row, the pooled one below, unit row."""
+
 REACH = 1.2
-"""How far the axis follows estimates alone, in widths of what is pooled."""
-WIDE = 15.0
+"""How far the axis extends to estimates alone, in widths of the pooled range."""
+
+LOGARITHMIC = 15.0
 """From this ratio of largest to smallest value on, a positive parameter has a log axis."""
 
 
-@styled
+@style.styled
 def plot_shrinkage(
     result: xr.DataTree,
     label: str,
@@ -415,136 +404,115 @@ def plot_shrinkage(
             hint="see the verdict",
         )
     rows["true"] = [truth_of(result, scalar) for scalar in population.members]
-    rows["name"] = _names(population)
+    rows["name"] = [_member_name(scalar, population) for scalar in population.members]
     rows = rows.sort_values("mean", kind="stable", ignore_index=True)
     count = len(rows)
-    rows = rows.iloc[np.unique(np.linspace(0, count - 1, min(count, MOST_MEMBERS)).astype(int))]
-    return _draw(result, population, whole, rows.reset_index(drop=True), count)
-
-
-def _names(population: Population) -> list[str]:
-    """What tells the members apart; the population's own place stands in the title."""
-    return [
-        plain(", ".join(_short(d, x) for d, x in s.labels.items() if d not in shared), 24)
-        for shared in [population.location.labels]
-        for s in population.members
-    ]
-
-
-def _short(dim: str, label: str) -> str:
-    """`patch 3`, but the name alone where a material has one."""
-    return place_of(dim, label) if label.isdigit() else label
-
-
-def _draw(
-    result: xr.DataTree, population: Population, whole: pd.Series, rows: pd.DataFrame, count: int
-) -> Figure:
-    height = ROW if len(rows) <= 30 else LOW_ROW
-    figure = Drawing(figsize=(7.0, max(height * len(rows), 0.7) + 1.5), layout="constrained")
+    chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_MEMBERS)).astype(int))
+    rows = rows.iloc[chosen].reset_index(drop=True)
+    is_dense = len(rows) > MANY_MEMBERS
+    height = (LOW_ROW_HEIGHT if is_dense else ROW_HEIGHT) * len(rows)
+    figure = style.NotebookFigure(figsize=(7.0, max(height, 0.7) + 1.5), layout="constrained")
     axes = figure.subplots()
-    axes.set_xlim(_limits(axes, population, whole, rows))
-    axes.axvspan(whole["new_q2.5"], whole["new_q97.5"], color=lighten(GRAY, 0.85), lw=0)
-    axes.axvspan(whole["location_q2.5"], whole["location_q97.5"], color=lighten(GRAY, 0.6), lw=0)
+    axes.set_xlim(_shrinkage_limits(axes, population, whole, rows))
+    for part, share in (("new", 0.85), ("location", 0.6)):
+        color = lighten(GRAY, share)
+        axes.axvspan(whole[f"{part}_q2.5"], whole[f"{part}_q97.5"], color=color, lw=0)
     axes.axvline(whole["location"], color=GRAY, lw=0.9)
-    is_dense = len(rows) > 30
     for at, row in rows.iterrows():
-        _draw_member(axes, float(at), row, small=is_dense)
+        _draw_member(axes, float(at), row, size=3.6 if is_dense else 5.0)
     axes.set_ylim(-0.7, len(rows) - 0.3)
     axes.set_yticks(range(len(rows)), list(rows["name"]))
     axes.spines["left"].set_visible(False)
-    posterior = result["posterior"].to_dataset()
-    first = population.members[0]
-    places = [place_of(dim, text) for dim, text in population.location.labels.items()]
-    words = title_of(first, posterior).partition(", ")[0]
+    names = [style.short_title(population.members[0], result["posterior"].to_dataset())]
+    names += map(style.label_text, style.coordinate_labels(population.location))
     part = f" ({len(rows)} of {count}, evenly from low to high)" if count > len(rows) else ""
-    axes.set_xlabel(", ".join([words, *map(plain, places)]) + part)
-    quiet_ticks(axes)
+    axes.set_xlabel(", ".join(names) + part)
+    style.set_tick_style(axes)
     axes.tick_params(axis="y", length=0, labelsize=6.0 if is_dense else 7.5)
-    figure.legend(handles=_legend(rows), loc="outside upper left", ncols=2, frameon=False)
+    style.add_legend(figure, _shrinkage_legend(rows), columns=2)
     return figure
 
 
-def _limits(
+def _member_name(scalar: Scalar, population: Population) -> str:
+    """What distinguishes a member: `patch 3`, but the name alone where a material has one."""
+    names = [
+        style.coordinate_label(dim, label) if label.isdigit() else label
+        for dim, label in scalar.labels.items()
+        if dim not in population.location.labels
+    ]
+    return style.label_text(", ".join(names), 24)
+
+
+def _shrinkage_limits(
     axes: Axes, population: Population, whole: pd.Series, rows: pd.DataFrame
 ) -> tuple[float, float]:
-    """All that is pooled, the truth, and estimates alone that are not too far away."""
+    """All pooled values, the truth, and estimates alone that are not too far away."""
     pooled = np.concatenate(
         [rows[["q2.5", "q97.5"]].to_numpy().ravel(), whole[["new_q2.5", "new_q97.5"]]]
     ).astype(float)
-    is_log = (
-        population.scale == "log" and pooled.min() > 0 and np.ptp(np.log(pooled)) > np.log(WIDE)
+    is_log = bool(
+        population.scale == "log"
+        and pooled.min() > 0
+        and np.ptp(np.log(pooled)) > np.log(LOGARITHMIC)
     )
     if is_log:
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-    forward, back = (np.log, np.exp) if is_log else (np.asarray, np.asarray)
+        style.plain_numbers(axes.xaxis)
+    forward, inverse = (np.log, np.exp) if is_log else (np.asarray, np.asarray)
     pooled = forward(pooled)
     width = np.ptp(pooled) or 1.0
-    # Nothing is below zero on a log axis: what alone reaches there stays outside.
+    # A log axis has no values below zero: estimates alone that reach there are drawn at its end.
     with np.errstate(all="ignore"):
         others = forward(rows[["true", "unpooled", "unpooled_q2.5", "unpooled_q97.5"]].to_numpy())
-    others = others[np.isfinite(others)]
-    low = max(min(pooled.min(), others.min(initial=np.inf)), pooled.min() - REACH * width)
-    high = min(max(pooled.max(), others.max(initial=-np.inf)), pooled.max() + REACH * width)
-    margin = 0.03 * (high - low) or 1.0
-    low, high = (float(value) for value in back(np.array([low - margin, high + margin])))
-    return low, high
+    near = np.clip(
+        others[np.isfinite(others)], pooled.min() - REACH * width, pooled.max() + REACH * width
+    )
+    low, high = style.padded_range(np.concatenate([pooled, near]), 0.03)
+    return float(inverse(low)), float(inverse(high))
 
 
-def _draw_member(axes: Axes, at: float, row: pd.Series, *, small: bool) -> None:
-    size = 3.6 if small else 5.0
+def _draw_member(axes: Axes, at: float, row: pd.Series, *, size: float) -> None:
     low, high = axes.get_xlim()
+    above, below = at + OFFSET, at - OFFSET
     faint = lighten(PURPLE, 0.25)
     if np.isfinite(row["unpooled"]):
         seen = float(np.clip(row["unpooled"], low, high))
-        outside = {True: "o", row["unpooled"] < low: "<", row["unpooled"] > high: ">"}[True]
-        axes.plot([seen, row["mean"]], [at + APART, at - APART], color=GRAY, lw=0.7, zorder=2)
-        axes.plot(
-            [row["unpooled_q2.5"], row["unpooled_q97.5"]],
-            [at + APART] * 2,
-            color=faint,
-            lw=0.9,
-            zorder=2,
-        )
-        style: dict[str, Any] = {"mfc": paper(), "mec": PURPLE, "mew": 1.1, "clip_on": False}
-        axes.plot([seen], [at + APART], outside, ms=size, zorder=4, **style)
+        marker = "<" if row["unpooled"] < low else ">" if row["unpooled"] > high else "o"
+        axes.plot([seen, row["mean"]], [above, below], color=GRAY, lw=0.7, zorder=2)
+        ends = [row["unpooled_q2.5"], row["unpooled_q97.5"]]
+        axes.plot(ends, [above] * 2, color=faint, lw=0.9, zorder=2)
+        hollow = {**_hollow(), "ms": size}
+        axes.plot([seen], [above], marker, zorder=4, clip_on=False, **hollow)
     else:
-        axes.plot([low, high], [at + APART] * 2, color=faint, lw=0.9, ls=(0, (1, 3)), zorder=2)
-    axes.plot([row["q2.5"], row["q97.5"]], [at - APART] * 2, color=BLUE, lw=1.8, zorder=3)
-    axes.plot([row["mean"]], [at - APART], "o", color=BLUE, ms=size, mew=0, zorder=5)
+        axes.plot([low, high], [above] * 2, color=faint, lw=0.9, ls=(0, (1, 3)), zorder=2)
+    axes.plot([row["q2.5"], row["q97.5"]], [below] * 2, color=BLUE, lw=1.8, zorder=3)
+    axes.plot([row["mean"]], [below], "o", color=BLUE, ms=size, mew=0, zorder=5)
     if np.isfinite(row["true"]):
-        axes.plot(
-            [row["true"]],
-            [at - APART],
-            "d",
-            mfc=ORANGE,
-            mec=paper(),
-            mew=0.6,
-            ms=size + 1.2,
-            zorder=6,
-        )
+        truth = {**style.true_value_style(), "ms": size + 1.2, "mew": 0.6}
+        axes.plot([row["true"]], [below], zorder=6, **truth)
 
 
-def _legend(rows: pd.DataFrame) -> list[Line2D | Patch]:
-    hollow: dict[str, Any] = {"mfc": paper(), "mec": PURPLE, "mew": 1.1, "ms": 5}
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], color=BLUE, lw=1.8, marker="o", ms=5, label="pooled: mean and 95%"),
+def _hollow() -> dict[str, Any]:
+    """Marker of an estimate without pooling."""
+    return {"mfc": style.background(), "mec": PURPLE, "mew": 1.1, "ms": 5}
+
+
+def _shrinkage_legend(rows: pd.DataFrame) -> list[Artist]:
+    has_alone = np.isfinite(rows["unpooled"])
+    line = functools.partial(Line2D, [], [], lw=0.9)
+    handles: list[Artist] = [
+        line(color=BLUE, lw=1.8, marker="o", ms=5, label="pooled: mean and 95%")
     ]
-    if np.isfinite(rows["unpooled"]).any():
-        color = lighten(PURPLE, 0.25)
+    if has_alone.any():
         label = "alone, without the population: about, 95%"
-        handles.append(Line2D([], [], color=color, lw=0.9, marker="o", label=label, **hollow))
-    if not np.isfinite(rows["unpooled"]).all():
-        label = "alone it says nothing"
-        handles.append(Line2D([], [], color=PURPLE, lw=0.9, ls=(0, (1, 3)), label=label))
+        handles.append(line(color=lighten(PURPLE, 0.25), marker="o", label=label, **_hollow()))
+    if not has_alone.all():
+        handles.append(line(color=PURPLE, ls=(0, (1, 3)), label="alone it says nothing"))
     handles += [
         Patch(color=lighten(GRAY, 0.6), label="location of the population, 95%"),
         Patch(color=lighten(GRAY, 0.85), label="a new member, 95%"),
     ]
     if np.isfinite(rows["true"]).any():
-        handles.append(
-            Line2D([], [], ls="", marker="d", mfc=ORANGE, mec=paper(), ms=6.5, label="true value")
-        )
+        handles.append(style.true_value_handle())
     return handles

@@ -1,25 +1,29 @@
-"""How figures look: colors that everybody can tell apart, labels in words with units.
+"""Style of figures: colors that everybody can tell apart, labels with units, shared helpers.
 
-Whoever has chosen a matplotlib style, by `matplotlib.style.context` or for good, gets it: the house
-style fills in what they left alone. Ink and paper follow the style; colors that stand for something
-stay. Nothing here changes matplotlib's settings for longer than one figure takes, and no figure
-belongs to pyplot, so drawing leaves a notebook as it was.
+A matplotlib style that the user has chosen is respected: the settings here fill in what it leaves
+at its default. The colors of text and background follow that style; colors with a meaning stay.
+Drawing changes matplotlib's settings for the time of one figure only, and no figure belongs to
+pyplot.
 """
 
 import functools
 import io
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import matplotlib
 import matplotlib.style
 import numpy as np
 import xarray as xr
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
+from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import one_line
@@ -43,9 +47,9 @@ STYLE: Any = {
     "xtick.color": GRAY,
     "ytick.color": GRAY,
 }
-"""Of the house, each where the user has not said otherwise."""
+"""Defaults of this package, each replaced by a setting of the user."""
 
-ALWAYS: Any = {
+FIXED_STYLE: Any = {
     # Names of captures and materials are text, whatever dollar signs they contain.
     "text.parse_math": False,
     "text.usetex": False,
@@ -54,7 +58,7 @@ ALWAYS: Any = {
     "svg.hashsalt": "polar_bayes",
     "path.simplify": True,
 }
-"""Whatever the user's style says."""
+"""Settings that hold in every style."""
 
 QUANTITIES = {
     "dop": "degree of polarization",
@@ -67,7 +71,7 @@ GREEK = {"beta": "β"}
 
 
 def styled[**P, R](draw: Callable[P, R]) -> Callable[P, R]:
-    """Run a drawing function in the user's style, the house's beneath it; settings stay."""
+    """Run a drawing function in the user's style, with the defaults here where it has none."""
 
     @functools.wraps(draw)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -77,8 +81,8 @@ def styled[**P, R](draw: Callable[P, R]) -> Callable[P, R]:
     return wrapper
 
 
-def in_house_style[**P, R](write: Callable[P, R]) -> Callable[P, R]:
-    """Run what writes a report in the house style alone: the same result gives the same page."""
+def in_default_style[**P, R](write: Callable[P, R]) -> Callable[P, R]:
+    """Run a function that writes a report in one style: the same result gives the same page."""
 
     @functools.wraps(write)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -89,29 +93,38 @@ def in_house_style[**P, R](write: Callable[P, R]) -> Callable[P, R]:
 
 
 def _settings() -> Any:
-    """What the user has set, and where they have not, what the house does."""
     own: Any = matplotlib.rcParams
     default: Any = matplotlib.rcParamsDefault
     wanted = {**STYLE, **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), own["text.color"])}
-    house = {key: value for key, value in wanted.items() if own[key] == default[key]}
+    unset = {key: value for key, value in wanted.items() if own[key] == default[key]}
     families = own["font.family"]
-    # Every letter of a name can be drawn, whatever font comes first.
+    # DejaVu Sans comes last, so that every letter of a name can be drawn.
     fonts = [*([] if families == default["font.family"] else families), "DejaVu Sans"]
-    return {**house, **ALWAYS, "font.family": fonts}
+    return {**unset, **FIXED_STYLE, "font.family": fonts}
 
 
-def ink() -> str:
-    """The color of text and readings, in the style that is drawn in."""
+def text_color() -> str:
+    """The color of text and readings in the current style."""
     return str(matplotlib.colors.to_hex(matplotlib.rcParams["text.color"]))
 
 
-def paper() -> str:
-    """The color behind them."""
+def background() -> str:
+    """The background color of the current style."""
     return str(matplotlib.colors.to_hex(matplotlib.rcParams["axes.facecolor"]))
 
 
-class Drawing(Figure):
-    """A figure that a notebook shows by itself, whether pyplot is there or not."""
+def lighten(color: str, share: float) -> tuple[float, float, float]:
+    """A color mixed with the background's: areas need no transparency (print, old readers)."""
+    rgb, white = (np.array(matplotlib.colors.to_rgb(each)) for each in (color, background()))
+    red, green, blue = rgb + (white - rgb) * share
+    return float(red), float(green), float(blue)
+
+
+# --- Figures and axes -----------------------------------------------------------------------------
+
+
+class NotebookFigure(Figure):
+    """A figure that a notebook shows without pyplot."""
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
@@ -120,59 +133,100 @@ class Drawing(Figure):
 
 
 def grid(
-    count: int, *, columns: int, width: float, panel_height: float, header: float = 0.0
+    count: int, *, columns: int = 3, width: float = 8.2, panel_height: float, header: float = 0.0
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of equal panels in rows."""
+    """A figure of equal panels in rows, unit inch."""
     columns = max(1, min(columns, count))
     rows = max(1, math.ceil(count / columns))
-    figure = Drawing(figsize=(width, rows * panel_height + header), layout="constrained")
-    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
-    return figure, axes
+    figure = NotebookFigure(figsize=(width, rows * panel_height + header), layout="constrained")
+    return figure, [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
 
 
-def title_of(scalar: Scalar, posterior: xr.Dataset) -> str:
-    """A parameter in words with its unit: `refractive index n, 450 nm`."""
+def add_legend(figure: Figure, handles: Iterable[Artist], columns: int) -> None:
+    """A legend above the panels."""
+    figure.legend(handles=list(handles), loc="outside upper left", ncols=columns, frameon=False)
+
+
+def set_tick_style(axes: Axes | Iterable[Axes]) -> None:
+    """Fix tick sizes now: matplotlib would look them up only when the figure is drawn."""
+    for each in [axes] if isinstance(axes, Axes) else axes:
+        each.tick_params(labelsize=matplotlib.rcParams["xtick.labelsize"], length=3.0, color=GRAY)
+
+
+def plain_numbers(*axes: Axis) -> None:
+    """Tick labels of logarithmic axes without math text, which the style does not parse."""
+    for axis in axes:
+        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.set_minor_formatter(NullFormatter())
+
+
+def padded_range(values: np.ndarray, margin: float) -> tuple[float, float]:
+    """Limits of an axis around values, `margin` a share of their range."""
+    low, high = float(np.min(values)), float(np.max(values))
+    pad = margin * (high - low) or 1.0
+    return low - pad, high + pad
+
+
+def write_in_panel(axes: Axes, text: str) -> None:
+    """A text in place of a figure that cannot be drawn."""
+    axes.text(0.5, 0.5, text, ha="center", transform=axes.transAxes, color=GRAY)
+
+
+def true_value_style() -> dict[str, Any]:
+    """Marker of a true value."""
+    return {"marker": "d", "ls": "", "mfc": ORANGE, "mec": background(), "ms": 6.5}
+
+
+def true_value_handle() -> Line2D:
+    """Entry of a legend for the marker of a true value."""
+    return Line2D([], [], label="true value", **true_value_style())
+
+
+# --- Labels ---------------------------------------------------------------------------------------
+
+
+def parameter_title(scalar: Scalar, posterior: xr.Dataset) -> str:
+    """A parameter's name, symbol, unit and coordinates: `refractive index n, 450 nm`."""
     attributes = posterior[scalar.name].attrs
-    words = str(attributes.get("long_name", scalar.name.replace("_", " ")))
-    words = {"absorption relative to scattering": "absorption"}.get(words, words)
-    symbol = str(attributes.get("symbol", ""))
-    places = [place_of(dim, label) for dim, label in scalar.labels.items()]
-    unit = str(attributes.get("units", "1"))
-    name = f"{words} {GREEK.get(symbol, symbol)}".strip() + (f" [{unit}]" if unit != "1" else "")
-    return plain(", ".join([name, *places]))
+    name = str(attributes.get("long_name", scalar.name.replace("_", " ")))
+    name = {"absorption relative to scattering": "absorption"}.get(name, name)
+    name = quantity_label(name, str(attributes.get("symbol", "")), attributes.get("units", "1"))
+    return label_text(", ".join([name, *coordinate_labels(scalar)]))
 
 
-def place_of(dim: str, label: str) -> str:
-    """One coordinate in words: `450 nm`, `material leaf`."""
+def short_title(scalar: Scalar, posterior: xr.Dataset) -> str:
+    """The same without coordinates."""
+    return parameter_title(scalar, posterior).partition(", ")[0]
+
+
+def quantity_label(name: str, symbol: str, unit: object) -> str:
+    """`refractive index n`, `exposure [s]`."""
+    label = f"{name} {GREEK.get(symbol, symbol)}".strip()
+    return label if str(unit) == "1" else f"{label} [{unit}]"
+
+
+def coordinate_labels(scalar: Scalar) -> list[str]:
+    """Every coordinate of a parameter with its unit or dimension."""
+    return [coordinate_label(dim, label) for dim, label in scalar.labels.items()]
+
+
+def coordinate_label(dim: str, label: str) -> str:
+    """`450 nm`, `material leaf`."""
     if dim == "wavelength":
         return f"{label} nm"
     return label if dim.endswith(tuple("0123456789")) else f"{dim} {label}"
 
 
-def plain(text: str, longest: int = 60) -> str:
-    """Text that the figure's font can draw, on one line and not too long."""
-    line = one_line(text)
+def label_text(text: str, longest: int = 60) -> str:
+    """Text on one line in letters of the font, cut where it is too long."""
     known = _characters()
-    drawn = "".join(c if ord(c) in known else "□" for c in line)
+    drawn = "".join(c if ord(c) in known else "□" for c in one_line(text))
     return drawn if len(drawn) <= longest else f"{drawn[: longest - 1]}…"
 
 
-def wrapped(text: str, width: int, lines: int = 2) -> str:
+def wrap(text: str, width: int, lines: int = 2) -> str:
     """Text broken into short lines, cut where there are too many."""
     return "\n".join(textwrap.wrap(text, width, max_lines=lines, placeholder="…"))
-
-
-def lighten(color: str, share: float) -> tuple[float, float, float]:
-    """A color mixed with the paper's, so that areas need no transparency (print, old readers)."""
-    rgb, white = (np.array(matplotlib.colors.to_rgb(each)) for each in (color, paper()))
-    red, green, blue = rgb + (white - rgb) * share
-    return float(red), float(green), float(blue)
-
-
-def quiet_ticks(axes: Axes | Sequence[Axes]) -> None:
-    """Fix tick sizes now: matplotlib would look them up only when the figure is drawn."""
-    for axis in [axes] if isinstance(axes, Axes) else axes:
-        axis.tick_params(labelsize=matplotlib.rcParams["xtick.labelsize"], length=3.0, color=GRAY)
 
 
 @functools.cache

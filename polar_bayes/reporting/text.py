@@ -1,33 +1,52 @@
-"""The report's conclusions in plain sentences, each true of the numbers beside it."""
+"""Sentences of reports, and numbers as text.
 
+Every conclusion that a report states is written here, by the kind of result: fits, comparisons of
+fits, maps, calibrations and accuracy studies. Tables and captions belong to their pages.
+"""
+
+import functools
+import importlib.resources
+import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
+from polar_bayes.benchmark.advice import accuracy_dataset
+from polar_bayes.calibration.scores import is_calibrated, significance_level
+from polar_bayes.calibration.verdict import calibration_verdict
+from polar_bayes.diagnostics.compare import FitComparison
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.population import Population
 from polar_bayes.diagnostics.predictive import PitBand, PredictiveCheck, pit_band
-from polar_bayes.reporting.style import QUANTITIES, place_of, title_of
+from polar_bayes.errors import one_line
+from polar_bayes.inference.batch_fit import FEWEST_VIEWS
+from polar_bayes.inference.psis import LARGEST_TRUSTED
+from polar_bayes.reporting.style import QUANTITIES, coordinate_labels, short_title
 
 # --- Numbers as text, with the digits that they deserve -------------------------------------------
 
-
 DASH = "\N{EN DASH}"
+MAX_NAMED = 6
+"""Longer lists of names end with `and 3 more`."""
 
 
-def numbers(values: Iterable[float], scale: float) -> list[str]:
-    """Numbers with as many decimals as show two digits of the scale (three if it begins with 1)."""
+def number(value: float, scale: float) -> str:
+    """As many decimals as show two digits of the scale (three if it begins with 1)."""
     decimals = 3
     if math.isfinite(scale) and scale > 0.0:
         decimals = min(max(1 - math.floor(math.log10(scale / 2.0)), 0), 8)
     # Adding zero turns a rounded -0.0 into 0.0.
-    return [
-        f"{round(value, decimals) + 0.0:.{decimals}f}" if math.isfinite(value) else DASH
-        for value in values
-    ]
+    return f"{round(value, decimals) + 0.0:.{decimals}f}" if math.isfinite(value) else DASH
+
+
+def numbers(values: Iterable[float], scale: float) -> list[str]:
+    """Several numbers with the digits of one scale."""
+    return [number(value, scale) for value in values]
 
 
 def interval(low: float, high: float, scale: float | None = None) -> str:
@@ -44,199 +63,264 @@ def percent(share: float) -> str:
     return f"{share:.1%}" if share < 0.0995 else f"{share:.0%}"
 
 
+def count_percent(count: int, total: int) -> str:
+    """A share in percent that is never rounded to 0 or 100%."""
+    if total == 0:
+        return DASH
+    text = percent(count / total)
+    if count < total and text == "100%":
+        return "above 99.5%" if count / total < 0.9995 else "above 99.9%"
+    return "below 0.1%" if count > 0 and text == "0.0%" else text
+
+
 def or_dash(value: float, form: str) -> str:
-    """A number in the given format, or a dash."""
-    return form.format(value) if math.isfinite(value) else DASH
+    """A number in the given format, or a dash where it is not finite."""
+    return format(value, form) if math.isfinite(value) else DASH
 
 
-def spoken(names: Sequence[str]) -> str:
+def column(name: str, form: str) -> Callable[[pd.Series], str]:
+    """Cells of a table: one column of its row in the given format, or a dash."""
+    return lambda row: or_dash(row[name], form)
+
+
+SENSITIVITY_CELLS: Mapping[str, Callable[[pd.Series], str]] = {
+    "to the priors": column("prior_sensitivity", ".3f"),
+    "to the data": column("likelihood_sensitivity", ".3f"),
+    "remark": lambda row: str(row["remark"]),
+}
+
+
+def p_value(value: float, *, passes: bool) -> str:
+    """A p-value, marked where the test fails."""
+    text = or_dash(value, ".2g")
+    return text if passes or not math.isfinite(value) else f"{text} (fails)"
+
+
+def join(names: Sequence[str]) -> str:
     """`a, b and c`."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-# --- The report's conclusions in plain sentences, each true of the numbers beside it --------------
+def join_first(names: Sequence[str]) -> str:
+    """The first names of many: `a, b and 3 more`."""
+    more = len(names) - MAX_NAMED
+    return join([*names[:MAX_NAMED], *([f"{more} more"] if more > 0 else [])])
 
+
+def capture_name(provenance: Mapping[str, Any], default: str = "capture") -> str:
+    """The name of the capture that a result is of."""
+    capture = provenance.get("capture")
+    name = capture.get("name") if isinstance(capture, Mapping) else capture
+    return one_line(str(name or default))
+
+
+@functools.cache
+def _captions() -> dict[str, dict[str, Any]]:
+    file = importlib.resources.files("polar_bayes.reporting") / "templates" / "captions.toml"
+    return tomllib.loads(file.read_text(encoding="utf-8"))
+
+
+def caption(key: str, **values: object) -> str:
+    """A caption from `templates/captions.toml`, such as `fit.parameter`, with its values."""
+    kind, name = key.split(".")
+    return str(_captions()[kind][name]).format(**values)
+
+
+def figure_caption(key: str, **values: object) -> tuple[str, str]:
+    """The alternative text and the caption of a figure, such as `fit.figure_pairs`."""
+    kind, name = key.split(".")
+    alternative, caption = _captions()[kind][name]
+    return alternative.format(**values), caption.format(**values)
+
+
+# --- Fits -----------------------------------------------------------------------------------------
 
 # Two intervals whose widths differ by less than this are equally wide, as far as draws can tell.
 EQUAL_WIDTHS = 0.05
-MOST_PLACES = 6
 PLURALS = {"patch": "patches", "material": "materials"}
 HALF = 0.5
 
-HEADLINES = {
-    ("nuts", True): "The fit converged.",
-    ("nuts", False): "The fit did not converge: do not use these numbers.",
-    ("laplace", True): "The approximation raised no alarm.",
-    ("laplace", False): "The approximation failed: do not use these numbers.",
-    ("variational", True): "The guide raised no alarm.",
-    ("variational", False): "The guide failed: do not use these numbers.",
-    ("importance", True): "The weighted draws raised no alarm.",
-    ("importance", False): "The weighted draws failed: do not use these numbers.",
-    ("tempered", True): "The tempered draws raised no alarm.",
-    ("tempered", False): "The tempered draws failed: do not use these numbers.",
-    ("point", True): "Least squares met its tolerance.",
-    ("point", False): "Least squares failed: do not use these numbers.",
+METHODS = {
+    "nuts": "The fit",
+    "laplace": "The approximation",
+    "variational": "The guide",
+    "importance": "The weighted draws",
+    "tempered": "The tempered draws",
+    "point": "Least squares",
 }
+"""How a headline calls what each method computes; a method of the user's own is `The method`."""
 
-OTHERS = {
-    True: "The method raised no alarm.",
-    False: "The method failed: do not use these numbers.",
-}
-"""Of a method of the user's own."""
+HELD, PRIOR = " held fixed", "prior of "
 
 
-def headline(method: str, converged: bool, cautions: Sequence[str]) -> str:
+def fit_headline(method: str, converged: bool, cautions: Sequence[str]) -> str:
     """The verdict in one sentence."""
-    text = HEADLINES.get((method, converged), OTHERS[converged])
-    return f"{text} Mind the cautions." if converged and cautions else text
+    if not converged:
+        failed = "did not converge" if method == "nuts" else "failed"
+        return f"{METHODS.get(method, 'The method')} {failed}: do not use these numbers."
+    passed = {"nuts": "converged", "point": "met its tolerance"}.get(method, "raised no alarm")
+    headline = f"{METHODS.get(method, 'The method')} {passed}."
+    return f"{headline} Mind the cautions." if cautions else headline
 
 
-def determined(found: Sequence[Scalar], prior: pd.DataFrame, posterior: xr.Dataset) -> list[str]:
+def made_by(provenance: Mapping[str, Any], method: str) -> str:
+    """Scene, model, method and seed in one line."""
+    parts = {
+        key: f"{key} {one_line(str(provenance[key]))}"
+        for key in ("scene", "model", "seed")
+        if provenance.get(key) is not None
+    }
+    order = [parts.get("scene", ""), parts.get("model", ""), method, parts.get("seed", "")]
+    text = ", ".join(filter(None, order))
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def swapped_sentence(provenance: Mapping[str, Any]) -> str:
+    """What the user replaced, in one sentence."""
+    if "swapped" not in provenance:
+        return ""
+    swapped = [str(name) for name in provenance["swapped"]]
+    priors = [name.removeprefix(PRIOR) for name in swapped if name.startswith(PRIOR)]
+    held = [name.removesuffix(HELD) for name in swapped if name.endswith(HELD)]
+    parts = [f"the {n}" for n in swapped if not n.startswith(PRIOR) and not n.endswith(HELD)]
+    if priors:
+        parts.append(f"the prior{'s' if len(priors) > 1 else ''} of {join_first(priors)}")
+    sentences = [f"Swapped by the user: {join(parts)}."] if parts else []
+    sentences += [f"Held fixed: {join_first(held)}."] if held else []
+    return " ".join(sentences) or "Nothing was swapped: all parts and priors are as shipped."
+
+
+def determined(scalars: Sequence[Scalar], prior: pd.DataFrame, posterior: xr.Dataset) -> list[str]:
     """Which material parameters the data determine, and which they do not."""
-    groups: dict[str, list[Scalar]] = {"determined": [], "partly": [], "not determined": []}
-    for scalar in found:
-        word = str(prior.loc[scalar.label, "verdict"]) if scalar.label in prior.index else ""
-        if scalar.is_material and word in groups:
-            groups[word].append(scalar)
     phrases = {
         "determined": "The data determine {}.",
         "partly": "The data determine only in part: {}. There the prior still matters.",
         "not determined": "The data do not determine {}. There the interval is mostly the prior's: "
         "do not quote it as a measurement.",
     }
-    return [
-        phrases[word].format(named(group, posterior)) for word, group in groups.items() if group
-    ]
+    sentences = []
+    for verdict, phrase in phrases.items():
+        group = [
+            scalar
+            for scalar in scalars
+            if scalar.is_material
+            and scalar.label in prior.index
+            and prior.loc[scalar.label, "verdict"] == verdict
+        ]
+        if group:
+            sentences.append(phrase.format(parameter_names(group, posterior)))
+    return sentences
 
 
-def varied(summary: pd.DataFrame, found: Sequence[Population], posterior: xr.Dataset) -> list[str]:
+def between_members(
+    summary: pd.DataFrame, populations: Sequence[Population], posterior: xr.Dataset
+) -> list[str]:
     """How much the members of each population differ, and where a new one would lie."""
     groups: dict[str, list[Population]] = {}
-    for each in found:
+    for each in populations:
         if np.isfinite(summary.loc[each.label, "between"]):
             groups.setdefault(each.name, []).append(each)
-    return [_varied(summary, group, posterior) for group in groups.values()]
+    return [_between(summary, group, posterior) for group in groups.values()]
 
 
-def _varied(summary: pd.DataFrame, group: Sequence[Population], posterior: xr.Dataset) -> str:
+def _between(summary: pd.DataFrame, group: Sequence[Population], posterior: xr.Dataset) -> str:
     first = group[0]
-    # Members stand along one axis: what tells them apart is what they are called.
+    # Members along one axis are called after it.
     dims = [dim for dim in first.members[0].index if dim not in first.location.index]
     member = dims[0] if len(dims) == 1 and dims[0] in PLURALS else "member"
     row = summary.loc[first.label]
     scale = (row["between_q97.5"] - row["between_q2.5"]) / 4.0
     between, low, high = numbers([row["between"], row["between_q2.5"], row["between_q97.5"]], scale)
     factor = "a factor of about" if first.scale == "log" else "about"
-    words = _words(first.members[0], posterior)
-    count = len(first.members)
-    said = (
-        f"Between the {count} {PLURALS.get(member, 'members')} the {words} varies by {factor} "
-        f"{between} (95%: {low} to {high})"
-    )
-    # Of many colors the first and the last.
-    shown = [group[0], group[-1]] if len(group) > 1 else [group[0]]
     ranges = []
-    for each in shown:
-        row = summary.loc[each.label]
-        bounds = [row["new_q2.5"], row["new_q97.5"]]
-        ends = spoken(numbers(bounds, (bounds[1] - bounds[0]) / 4.0))
-        places = [place_of(dim, label) for dim, label in each.location.labels.items()]
-        ranges.append(f"between {ends}{' at ' + spoken(places) if places else ''}")
-    return f"{said}; a new {member} would lie {spoken(ranges)} (95%)."
+    # Of many colors the first and the last.
+    for each in [group[0], group[-1]] if len(group) > 1 else [group[0]]:
+        low_end, high_end = summary.loc[each.label, ["new_q2.5", "new_q97.5"]]
+        ends = join(numbers([low_end, high_end], (high_end - low_end) / 4.0))
+        places = coordinate_labels(each.location)
+        ranges.append(f"between {ends}{' at ' + join(places) if places else ''}")
+    return (
+        f"Between the {len(first.members)} {PLURALS.get(member, 'members')} the "
+        f"{short_title(first.members[0], posterior)} varies by {factor} {between} (95%: {low} to "
+        f"{high}); a new {member} would lie {join(ranges)} (95%)."
+    )
 
 
-def _words(scalar: Scalar, posterior: xr.Dataset) -> str:
-    return title_of(scalar, posterior).partition(", ")[0]
-
-
-def leaning(summary: pd.DataFrame, found: Sequence[Population], posterior: xr.Dataset) -> list[str]:
-    """Whether the members' own readings or their population decide, population by population."""
+def pooling(
+    summary: pd.DataFrame, populations: Sequence[Population], posterior: xr.Dataset
+) -> list[str]:
+    """Whether the readings of a member or its population decide, population by population."""
     groups: dict[bool, list[str]] = {}
-    for each in found:
-        pooling = summary.loc[each.label, "pooling"]
-        if np.isfinite(pooling):
-            places = [place_of(dim, label) for dim, label in each.location.labels.items()]
-            name = ", ".join([_words(each.members[0], posterior), *places])
-            groups.setdefault(bool(pooling > HALF), []).append(f"{name} ({pooling:.2f})")
+    for each in populations:
+        factor = summary.loc[each.label, "pooling"]
+        if np.isfinite(factor):
+            names = [short_title(each.members[0], posterior), *coordinate_labels(each.location)]
+            name = f"{', '.join(names)} ({factor:.2f})"
+            groups.setdefault(bool(factor > HALF), []).append(name)
     phrases = {
         True: "For {} the population says more than the readings of a single member (pooling "
         "factor in brackets): quote such estimates as those of a member of this population.",
         False: "For {} the readings of a single member say more than the population (pooling "
         "factor in brackets).",
     }
-    return [phrases[leans].format(spoken(names)) for leans, names in groups.items()]
+    return [phrases[is_pooled].format(join(names)) for is_pooled, names in groups.items()]
 
 
-def named(found: Sequence[Scalar], posterior: xr.Dataset) -> str:
-    """Parameters in words: `roughness r and refractive index n at 450, 550 and 650 nm`."""
+def parameter_names(scalars: Sequence[Scalar], posterior: xr.Dataset) -> str:
+    """`roughness r and refractive index n at 450, 550 and 650 nm`."""
     groups: dict[str, list[Scalar]] = {}
-    for scalar in found:
-        groups.setdefault(title_of(scalar, posterior).partition(", ")[0], []).append(scalar)
-    return spoken([f"{words}{_places(group, posterior)}" for words, group in groups.items()])
+    for scalar in scalars:
+        groups.setdefault(short_title(scalar, posterior), []).append(scalar)
+    return join([f"{name}{_coordinates(group, posterior)}" for name, group in groups.items()])
 
 
-def _places(group: Sequence[Scalar], posterior: xr.Dataset) -> str:
+def _coordinates(group: Sequence[Scalar], posterior: xr.Dataset) -> str:
     """` at 450 and 550 nm`, ` (material leaf, 450 nm; material fruit, 450 nm)` or nothing."""
     if not group[0].labels:
         return ""
     if list(group[0].labels) == ["wavelength"]:
-        return f" at {spoken([scalar.labels['wavelength'] for scalar in group])} nm"
+        return f" at {join([scalar.labels['wavelength'] for scalar in group])} nm"
     if len(group) > 1 and len(group) * group[0].draws.size == posterior[group[0].name].size:
         return " (everywhere)"
-    places = [
-        ", ".join(place_of(dim, label) for dim, label in scalar.labels.items()) for scalar in group
-    ]
-    more = f"; {len(places) - MOST_PLACES} more" if len(places) > MOST_PLACES else ""
-    return f" ({'; '.join(places[:MOST_PLACES])}{more})"
+    places = [", ".join(coordinate_labels(scalar)) for scalar in group]
+    more = f"; {len(places) - MAX_NAMED} more" if len(places) > MAX_NAMED else ""
+    return f" ({'; '.join(places[:MAX_NAMED])}{more})"
 
 
-def expected(checks: Mapping[str, PredictiveCheck]) -> list[str]:
+def predictive_sentences(checks: Mapping[str, PredictiveCheck]) -> list[str]:
     """Whether the readings are distributed as the model expects, variable by variable."""
     sentences = []
     for check in checks.values():
-        band = pit_band(check.loo.pit if check.loo else check.pit)
+        band = _band(check)
         name = QUANTITIES.get(check.name, check.name)
         if band is not None and band.rejects_uniformity:
             sentences.append(
-                f"The readings of {name} are not distributed as the model expects: {shape(band)}. "
-                "The intervals may be off."
+                f"The readings of {name} are not distributed as the model expects: "
+                f"{_departure(band)}. The intervals may be off."
             )
         elif band is not None:
             sentences.append(f"The readings of {name} are distributed as the model expects.")
         if check.loo and check.loo.unreliable:
-            many = check.loo.unreliable > HALF * check.count
+            effect = (
+                "leave-one-out cannot be approximated with these draws, so its results on this "
+                "page mean little."
+                if check.loo.unreliable > HALF * check.count
+                else "they are so influential that leave-one-out cannot be approximated for them. "
+                "Inspect them first."
+            )
             sentences.append(
                 f"Pareto k is above 0.7 for {check.loo.unreliable} of {check.count} readings of "
-                f"{name}: "
-                + (
-                    "leaving one out cannot be imitated with these draws, so what the report says "
-                    "about leaving out means little."
-                    if many
-                    else "they weigh so much that leaving them out cannot be imitated. Look at "
-                    "them first."
-                )
+                f"{name}: {effect}"
             )
     return sentences
 
 
-def trust(method: str, cautions: Sequence[str], checks: Mapping[str, PredictiveCheck]) -> str:
-    """Whether the intervals can be trusted, as far as one fit can tell."""
-    if method == "point":
-        return (
-            "Standard errors are those of least squares: they know no prior and no range, so do "
-            "not read them as intervals."
-        )
-    bands = [pit_band(check.loo.pit if check.loo else check.pit) for check in checks.values()]
-    if cautions or any(band is not None and band.rejects_uniformity for band in bands):
-        return "Trust the intervals with care: what speaks against them is said on this page."
-    return (
-        "Nothing here speaks against the intervals. How often such intervals hold the truth, a "
-        "calibration of this layout shows."
-    )
+def _band(check: PredictiveCheck) -> PitBand | None:
+    return pit_band(check.loo.pit if check.loo else check.pit)
 
 
-def shape(band: PitBand) -> str:
-    """In which way the readings depart from the prediction, once the curve leaves its band."""
+def _departure(band: PitBand) -> str:
+    """How the readings depart from the prediction, once the curve leaves its band."""
     above = np.flatnonzero(band.difference > band.upper)
     below = np.flatnonzero(band.difference < band.lower)
     if above.size and below.size:
@@ -244,43 +328,306 @@ def shape(band: PitBand) -> str:
     return f"more of them lie {'low' if above.size else 'high'} than it says"
 
 
+def trust(method: str, cautions: Sequence[str], checks: Mapping[str, PredictiveCheck]) -> str:
+    """Whether the intervals can be trusted, as far as one fit can tell."""
+    if method == "point":
+        return (
+            "The standard errors are those of least squares: they include no prior and no bounds, "
+            "so do not read them as intervals."
+        )
+    bands = [_band(check) for check in checks.values()]
+    if cautions or any(band is not None and band.rejects_uniformity for band in bands):
+        return "Trust the intervals with care: this page lists what speaks against them."
+    return (
+        "Nothing here speaks against the intervals. A calibration of this layout shows how often "
+        "such intervals contain the truth."
+    )
+
+
 def overconfidence(
-    compared: pd.DataFrame, found: Sequence[Scalar], posterior: xr.Dataset, what: str
+    compared: pd.DataFrame, scalars: Sequence[Scalar], posterior: xr.Dataset, part: str
 ) -> list[str]:
     """What to make of a fit that leaves out a part of the instrument."""
-    gain = {
-        s: 1.0 - compared.loc[s.label, "width_ratio"] for s in found if s.label in compared.index
-    }
-    narrower = {scalar: share for scalar, share in gain.items() if share > EQUAL_WIDTHS}
-    others = [scalar for scalar in gain if scalar not in narrower]
+    shared = [scalar for scalar in scalars if scalar.label in compared.index]
+    gain = {scalar: 1.0 - compared.loc[scalar.label, "width_ratio"] for scalar in shared}
+    narrower = [scalar for scalar in shared if gain[scalar] > EQUAL_WIDTHS]
+    others = [scalar for scalar in shared if gain[scalar] <= EQUAL_WIDTHS]
     sentences = []
     if narrower:
-        least, most = min(narrower.values()), max(narrower.values())
+        shares = [gain[scalar] for scalar in narrower]
+        least, most = min(shares), max(shares)
         by = f"{most:.0%}" if most - least < 0.01 else f"{least:.0%} to {most:.0%}"
         sentences.append(
-            f"Without {what} the 95% {_interval_of(list(narrower), posterior)} "
-            f"narrower by {by}. That is overconfident: the fit then counts errors of the "
-            "instrument as knowledge about the material."
+            f"Without {part} the 95% {_intervals_are(narrower, posterior)} narrower by {by}. That "
+            "is overconfident: the fit then counts errors of the instrument as knowledge about "
+            "the material."
         )
     if others:
         sentences.append(
-            f"Without {what} the 95% {_interval_of(others, posterior)} not narrower, as it "
+            f"Without {part} the 95% {_intervals_are(others, posterior)} not narrower, as it "
             "happens; still, that fit has no room for such errors of the instrument and holds "
             "only if there are none."
         )
     misses = (compared["mean"] < compared["q2.5_without"]) | (
         compared["mean"] > compared["q97.5_without"]
     )
-    apart = [scalar for scalar in gain if misses[scalar.label]]
+    apart = [scalar for scalar in shared if misses[scalar.label]]
     if apart:
         sentences.append(
-            f"The two fits disagree on {named(apart, posterior)}: the interval without {what} "
-            "does not contain the mean of this fit."
+            f"The two fits disagree on {parameter_names(apart, posterior)}: the interval without "
+            f"{part} does not contain the mean of this fit."
         )
-    return [*sentences, f"Do not quote the numbers without {what}."]
+    return [*sentences, f"Do not quote the numbers without {part}."]
 
 
-def _interval_of(found: Sequence[Scalar], posterior: xr.Dataset) -> str:
-    return f"interval{' of {} is' if len(found) == 1 else 's of {} are'}".format(
-        named(found, posterior)
+def _intervals_are(scalars: Sequence[Scalar], posterior: xr.Dataset) -> str:
+    names = parameter_names(scalars, posterior)
+    return f"interval of {names} is" if len(scalars) == 1 else f"intervals of {names} are"
+
+
+# --- Comparisons of fits --------------------------------------------------------------------------
+
+CLEAR = 4.0
+"""Differences of the expected log density below it say little (Sivula et al. 2020), unit nat."""
+
+
+def comparison_headline(comparison: FitComparison) -> str:
+    """Which fit predicts best, or that this cannot be told."""
+    failed = [name for name, verdict in comparison.verdicts.items() if not verdict.converged]
+    if failed:
+        return f"Do not use the numbers of {join(failed)}: read why first."
+    if len(comparison.loo) < 2:
+        return "Predictions are not compared; parameters are."
+    if not _is_clearly_worse(comparison.loo.iloc[1]):
+        return "The readings do not tell which of these fits predicts best."
+    return f"{comparison.loo.index[0]} predicts the readings best."
+
+
+def _is_clearly_worse(row: pd.Series) -> bool:
+    """Whether a fit predicts worse than the best beyond doubt."""
+    return bool(-row["elpd_diff"] >= max(CLEAR, 2.0 * row["dse"]))
+
+
+def comparison_of_fits_sentences(comparison: FitComparison) -> list[str]:
+    """What the fits say about the readings, and on which parameters they disagree.
+
+    Args:
+        comparison: Of `polar_bayes.diagnostics.compare_fits`.
+
+    Returns:
+        Sentences.
+    """
+    sentences, alike, best = [], [], next(iter(comparison.loo.index), "")
+    for name, row in list(comparison.loo.iterrows())[1:]:
+        if not _is_clearly_worse(row):
+            alike.append(str(name))
+            continue
+        difference, error = numbers([-row["elpd_diff"], row["dse"]], max(row["dse"], 0.2))
+        sentences.append(
+            f"{name} predicts left-out readings worse than {best}: their log density is lower by "
+            f"{difference} ± {error} in all."
+        )
+    if alike:
+        sentences.append(f"{join(alike)} predicts them about as well as {best}.")
+    unreliable = comparison.loo.get("unreliable", pd.Series(dtype=float))
+    if (unreliable > 0).any():
+        counts = [f"{int(count)} of {name}" for name, count in unreliable.items() if count]
+        sentences.append(
+            f"Pareto k is above 0.7 for {join(counts)}: leave-one-out cannot be approximated for "
+            "these readings, so differences may be off."
+        )
+    return [*sentences, *_disagreements(comparison.parameters)]
+
+
+def _disagreements(table: pd.DataFrame) -> list[str]:
+    """Pairs of intervals that do not overlap."""
+    apart, shared = [], 0
+    for label, own in table.groupby(level="parameter", sort=False):
+        known = own.droplevel("parameter").dropna(subset=["q2.5", "q97.5"])
+        shared += len(known) > 1
+        for (one, a), (other, b) in itertools.combinations(known.iterrows(), 2):
+            if a["q97.5"] < b["q2.5"] or b["q97.5"] < a["q2.5"]:
+                apart.append(f"{label} ({one} and {other})")
+    if apart:
+        return [
+            f"Their 95% intervals do not overlap for {join_first(apart)}: at least one of the fits "
+            "leaves out something that matters."
+        ]
+    if not shared:
+        return []
+    return [f"The 95% intervals of all {shared} parameters that two fits share overlap."]
+
+
+# --- Maps -----------------------------------------------------------------------------------------
+
+FEW = 0.95
+"""Below this share of answers the page warns."""
+
+SLIGHT = 0.01
+"""A smaller error of the coverage gives no warning, however many pixels show it."""
+
+APPROACHES = {
+    "none": "no numbers",
+    "laplace": "the normal approximation as it is",
+    "importance": "the normal approximation corrected by weights",
+    "adapted": "a proposal fitted to its own draws and corrected by weights",
+    "nuts": "sampling (NUTS)",
+    "tempered": "tempered draws",
+}
+
+
+def map_headline(counts: pd.DataFrame) -> tuple[str, bool]:
+    """How many pixels have an answer, and whether that is enough."""
+    by_status = counts.sum(axis=1)
+    total, good = int(by_status.sum()), int(by_status.get("good", 0))
+    read = total - int(by_status.get("masked", 0))
+    if read == 0:
+        return "No pixel was read: these maps are empty.", False
+    if good == 0:
+        return "No pixel has an answer: do not use these maps.", False
+    if good == read:
+        return "Every pixel that was read has an answer.", True
+    if lost := int(by_status.get("not fitted", 0)):
+        return f"{lost:,} of {total:,} pixels are not fitted: this map has holes.", False
+    share = count_percent(good, read)
+    headline = f"{good:,} of {read:,} pixels that were read have an answer ({share})."
+    return headline, good >= FEW * read
+
+
+def pixel_sentences(counts: pd.DataFrame) -> list[str]:
+    """How many pixels have each status."""
+    by_status = {str(status): int(number) for status, number in counts.sum(axis=1).items()}
+    total, good = sum(by_status.values()), by_status.get("good", 0)
+    sentences = []
+    if good:
+        by = {str(way): int(number) for way, number in counts.loc["good"].items() if number}
+        ways = [
+            f"{'all' if len(by) == 1 else format(number, ',')} by {APPROACHES.get(way, way)}"
+            for way, number in by.items()
+        ]
+        sentences.append(
+            f"Of {total:,} pixels {good:,} are good ({count_percent(good, total)}): {join(ways)}."
+        )
+    phrases = {
+        "masked": "masked: no reading there is valid.",
+        "too few views": f"read in fewer than {FEWEST_VIEWS} views and not fitted.",
+        "not converged": "not converged: no start led to an answer, and the maps are NaN there.",
+        "not trusted": f"not trusted: Pareto k is above {LARGEST_TRUSTED:g}, or the effective "
+        "sample size is too small, and no other method confirmed them. The maps show their numbers "
+        "there; do not quote them.",
+        "not fitted": "not fitted: they are called good without finite numbers, or were never "
+        "written. Copy the store again, or make the map again.",
+    }
+    for status, phrase in phrases.items():
+        if number := by_status.get(status):
+            sentences.append(f"{number:,} {'pixels are' if number > 1 else 'pixel is'} {phrase}")
+    return sentences
+
+
+def coverage_error(row: pd.Series, claimed: int) -> int:
+    """-1 where intervals contain the truth too seldom, 1 where too often, 0 otherwise."""
+    error = row[f"held_{claimed}"] - claimed / 100
+    if error < -SLIGHT and row[f"held_{claimed}_high"] < claimed / 100:
+        return -1
+    return int(error > SLIGHT and row[f"held_{claimed}_low"] > claimed / 100)
+
+
+def coverage_sentences(titles: Mapping[str, str], coverage: pd.DataFrame) -> list[str]:
+    """Whether the 95% intervals contain the truth as often as they should."""
+    groups: dict[int, list[str]] = {}
+    for label, title in titles.items():
+        if label in coverage.index and coverage.loc[label, "answered"]:
+            row = coverage.loc[label]
+            name = f"{title} ({row['held_95']:.1%})"
+            groups.setdefault(coverage_error(row, 95), []).append(name)
+    phrases = {
+        0: "The 95% intervals hold the truth about as often as they say: {}.",
+        1: "The 95% intervals hold the truth more often than they say: {}.",
+        -1: "The 95% intervals hold the truth less often than they say: {}.",
+    }
+    return [
+        phrases[error].format(join_first(groups[error])) for error in phrases if error in groups
+    ]
+
+
+def counted_pixels(coverage: pd.DataFrame) -> list[str]:
+    """Which pixels the coverage counts, and which it leaves out."""
+    sentences = []
+    for counts, rows in coverage.groupby(["unknown", "masked", "unanswered", "answered"]):
+        *others, answered = (int(count) for count in counts)
+        reasons = ("of unknown truth", "masked", "read without an answer")
+        aside = [f"{n:,} {why}" for n, why in zip(others, reasons, strict=True) if n]
+        names = "" if len(rows) == len(coverage) else f"{join_first(list(rows.index))}: "
+        left = f" Left out: {join(aside)}." if aside else " None is left out."
+        sentences.append(f"{names}{answered:,} pixels with an answer are counted.{left}")
+    return sentences
+
+
+# --- Calibrations ---------------------------------------------------------------------------------
+
+
+def calibration_headline(table: pd.DataFrame, readings: pd.DataFrame | None) -> tuple[str, bool]:
+    """The verdict in a few words, and whether all is well."""
+    passed = is_calibrated(table)
+    answered = float((table["answered"] / (table["answered"] + table["failed"])).min())
+    headline = "Calibrated" if passed else "Not calibrated"
+    if passed and readings is not None and not is_calibrated(readings):
+        headline, passed = "Parameters are calibrated, predicted readings are not", False
+    if answered < FEW:
+        link = ", but" if passed else ", and"
+        return f"{headline}{link} {1.0 - answered:.0%} of the fits failed.", False
+    return f"{headline}.", passed
+
+
+def verdict_after_headline(calibration: xr.DataTree) -> list[str]:
+    """Sentences of `calibration_verdict` without the first words, which the headline says."""
+    first, *others = calibration_verdict(calibration)
+    first = first.partition(": ")[2] or first
+    return [f"{first[0].upper()}{first[1:]}", *others]
+
+
+def wrong_on_purpose(provenance: Mapping[str, Any]) -> list[str]:
+    """Whether captures were simulated by something else than what was fitted."""
+    differing = [one_line(str(name)) for name in provenance.get("truth") or {}]
+    if not differing:
+        return []
+    return [
+        "What captures were simulated by differs on purpose from what was fitted, in its "
+        f"{join(differing)}: this calibration asks whether that mistake is seen."
+    ]
+
+
+def interval_sentences(table: pd.DataFrame, titles: Mapping[str, str]) -> list[str]:
+    """Coverage of the 95% intervals of parameters that fail the test, and failed fits."""
+    failing = table[~(table["p_value"] >= significance_level(table))]
+    sentences = []
+    if len(failing):
+        shares = [
+            f"the true {titles[str(label)]} in {share:.1%}"
+            for label, share in failing["held_95"].iloc[:MAX_NAMED].items()
+        ]
+        more = len(failing) - MAX_NAMED
+        others = f" ({more} more parameters fail)" if more > 0 else ""
+        sentences.append(f"The 95% intervals hold {join(shares)} of all fits{others}.")
+    if failed := int(table["failed"].max()):
+        total = int((table["answered"] + table["failed"]).max())
+        sentences.append(
+            f"{failed:,} of {total:,} fits have no answer. The ranks are those of the others; the "
+            "shares of intervals that hold the truth count them as misses."
+        )
+    return sentences
+
+
+# --- Accuracy studies -----------------------------------------------------------------------------
+
+
+def reference_sentence(result: xr.DataTree | xr.Dataset) -> str:
+    """What the reference is, and how accurate it is."""
+    study = accuracy_dataset(result).attrs
+    sentence = (
+        f"The reference is {study['reference_draws']:,} draws of {study['reference']}, worth "
+        f"{study['reference_effective_draws']:,.0f} independent ones; its own Monte Carlo error is "
+        f"at most {study['reference_error']:.2g} posterior sd."
     )
+    doubts = study["reference_doubts"]
+    return f"{sentence} Against it speaks: {doubts}." if doubts else sentence

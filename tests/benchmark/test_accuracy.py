@@ -17,7 +17,7 @@ from polar_bayes.benchmark import run
 from polar_bayes.benchmark.accuracy import AS_GIVEN
 from polar_bayes.benchmark.reference import ReferenceRun, best_reference, run_reference
 from polar_bayes.benchmark.run import AbstractOverride, Trial, problem_of, run_fresh
-from polar_bayes.effects.variants import parts_of
+from polar_bayes.effects.variants import parameter_ranks
 from polar_bayes.inference.mcse import errors_of, standard_errors
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import Problem
@@ -174,7 +174,7 @@ def test_facets_are_turned_where_there_are_any():
     request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
     changed, method = pb.benchmark.FacetsOverride(0.5).apply(request, pb.methods.Nuts())
     before, after = (
-        [part for _, part in parts_of(scene) if isinstance(part, pb.physics.FacetQuadrature)]
+        [part for _, part in parameter_ranks(scene) if isinstance(part, pb.physics.FacetQuadrature)]
         for scene in (request.scene, changed.scene)
     )
     assert len(before) == len(after) > 0

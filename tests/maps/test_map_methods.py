@@ -11,7 +11,7 @@ from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, plate_image
 import polar_bayes as pb
 from polar_bayes.inference.batch_result import Approach, Status
 from polar_bayes.inference.result import PROVENANCE
-from polar_bayes.reporting.maps import APPROACHES
+from polar_bayes.reporting.text import APPROACHES
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 

@@ -21,7 +21,7 @@ from polar_bayes.interrupts import clean_up
 from polar_bayes.maps import lazy
 from polar_bayes.maps import store as module
 from polar_bayes.maps.blocks import workers
-from polar_bayes.reporting.maps import render_map
+from polar_bayes.reporting.report import render
 
 METHOD = pb.methods.PixelLaplace(draws=64, sampler=None)
 ROWS = 2  # of a block of 40 pixels in an image 20 wide
@@ -249,7 +249,7 @@ def test_a_chunk_that_a_finished_map_lost_is_not_good(
         lost = counts["not fitted"]
         assert lost == 40 if name == "status" else 0 < lost <= 40
         assert counts["good"] <= whole["good"] - (0 if name == "status" else lost)
-        page = render_map(maps)
+        page = render(maps)
         assert f"{lost} of 180 pixels are not fitted: this map has holes." in page
         assert "Every pixel" not in page
         assert f"{lost} pixels are not fitted: they are called good" in str(pb.show(maps))

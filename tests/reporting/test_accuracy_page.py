@@ -9,13 +9,13 @@ from synthetic_accuracy import ROWS, make_accuracy
 from synthetic_results import make_result
 
 import polar_bayes as pb
-from polar_bayes.reporting.accuracy import reference_sentence, render_accuracy
 from polar_bayes.reporting.report import render
+from polar_bayes.reporting.text import reference_sentence
 
 
 @pytest.fixture(scope="module")
 def page() -> Page:
-    return Page(render_accuracy(make_accuracy()))
+    return Page(render(make_accuracy()))
 
 
 def test_it_stands_alone_and_its_anchors_lead_somewhere(page):
@@ -41,7 +41,7 @@ def test_an_error_that_the_reference_cannot_tell_is_marked(page):
 
 def test_a_doubtful_reference_is_said_in_red():
     study = make_accuracy(doubts="its R-hat is 1.3")
-    assert "verdict failed" in render_accuracy(study)
+    assert "verdict failed" in render(study)
     assert reference_sentence(study).endswith("Against it speaks: its R-hat is 1.3.")
 
 
@@ -49,7 +49,7 @@ def test_a_doubtful_reference_is_said_in_red():
 def test_the_report_lies_beside_its_file(tmp_path):
     page = pb.report(make_accuracy(), tmp_path / "report")
     again = pb.benchmark.load_accuracy(page.parent / "accuracy.nc")
-    assert page.read_text() == render_accuracy(again)
+    assert page.read_text() == render(again)
     with pytest.raises(pb.FitError, match="it goes with calibrations only"):
         pb.report(make_accuracy(), tmp_path / "other", beside={})
 

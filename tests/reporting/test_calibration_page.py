@@ -12,8 +12,8 @@ from synthetic_calibrations import NAMES, make_calibration
 from synthetic_results import make_result
 
 import polar_bayes as pb
-from polar_bayes.reporting.calibration_page import render_calibration
-from polar_bayes.reporting.plots_calibration import parts_of
+from polar_bayes.reporting.plots_calibration import parameter_ranks
+from polar_bayes.reporting.report import render
 
 FAILED = (3, 50, 77)
 
@@ -32,7 +32,7 @@ def broken() -> xr.DataTree:
 
 @pytest.fixture(scope="module")
 def page(good: xr.DataTree, broken: xr.DataTree) -> Page:
-    return Page(render_calibration(good, {"laplace": broken}))
+    return Page(render(good, beside={"laplace": broken}))
 
 
 def test_it_stands_alone_and_its_anchors_lead_somewhere(page: Page) -> None:
@@ -48,7 +48,7 @@ def test_it_stands_alone_and_its_anchors_lead_somewhere(page: Page) -> None:
 def test_the_verdict_comes_first(page: Page, broken: xr.DataTree) -> None:
     assert page.text.index("Calibrated.") < page.text.index("Parameters were drawn")
     assert "The ranks of 3 parameters in 400 simulations pass a joint test" in page.text
-    text = Page(render_calibration(broken)).text
+    text = Page(render(broken)).text
     assert "Not calibrated." in text
     assert "roughness: intervals are too narrow (p = " in text
     assert "refractive_index: the posterior is too high (p = " in text
@@ -68,10 +68,10 @@ def test_every_number_of_the_table_is_the_tree_s(page: Page, good: xr.DataTree) 
 
 @pytest.mark.thorough
 def test_readings_have_a_section_of_their_own(good: xr.DataTree) -> None:
-    assert "What became of the fits" in Page(render_calibration(good)).text
-    assert 'id="readings"' not in render_calibration(good)
+    assert "Status of the fits" in Page(render(good)).text
+    assert 'id="readings"' not in render(good)
     tree = make_calibration(failed=FAILED, readings={"dop": 0.7})
-    page = Page(render_calibration(tree))
+    page = Page(render(tree))
     assert page.open == []
     assert "Parameters are calibrated, predicted readings are not." in page.text
     assert "fail a joint test of their own that a right model fails 5% of the time" in page.text
@@ -94,9 +94,9 @@ def test_failed_fits_are_counted_everywhere(page: Page) -> None:
         "effective draws: median 302",
     ):
         assert said in page.text
-    text = Page(render_calibration(make_calibration(failed=tuple(range(60))))).text
+    text = Page(render(make_calibration(failed=tuple(range(60))))).text
     assert "Calibrated, but 15% of the fits failed." in text
-    assert 'class="verdict failed"' in render_calibration(make_calibration(failed=tuple(range(60))))
+    assert 'class="verdict failed"' in render(make_calibration(failed=tuple(range(60))))
 
 
 def test_every_figure_says_how_to_read_it(page: Page) -> None:
@@ -124,7 +124,7 @@ def test_the_comparison_says_which_parameter_and_how(page: Page) -> None:
 @pytest.mark.thorough
 def test_many_parameters_stay_readable() -> None:
     names = tuple(f"parameter_{at}" for at in range(15))
-    page = Page(render_calibration(make_calibration(names=names, count=60)))
+    page = Page(render(make_calibration(names=names, count=60)))
     assert page.tags.count("img") == 8
     alternatives = page.values("alt")
     assert all(any(f"{name}" in said for said in alternatives) for name in names)
@@ -134,14 +134,14 @@ def test_many_parameters_stay_readable() -> None:
 @pytest.mark.thorough
 def test_wavelengths_are_parameters_of_their_own() -> None:
     colors = (450.0, 650.0)
-    page = Page(render_calibration(make_calibration(names=NAMES[:1], wavelengths=colors, count=60)))
+    page = Page(render(make_calibration(names=NAMES[:1], wavelengths=colors, count=60)))
     assert "roughness[450] roughness, 450 nm" in page.text
     assert "2 parameters in 60 simulations" in page.text
 
 
 @pytest.mark.thorough
 def test_a_check_that_is_broken_on_purpose_says_so() -> None:
-    page = Page(render_calibration(make_calibration(count=60, truth={"priors": "Uniform(0, 1)"})))
+    page = Page(render(make_calibration(count=60, truth={"priors": "Uniform(0, 1)"})))
     assert "differs on purpose from what was fitted, in its priors" in page.text
 
 
@@ -150,8 +150,9 @@ def evil_page() -> str:
     names = ("a" * 60, "x")
     own = {"capture": EVIL, "scene": EVIL, "priors": {EVIL: EVIL * 20}, "versions": {"a": EVIL}}
     asked = {"names": names, "count": 40, "failed": (1,)}
-    return render_calibration(
-        make_calibration(**asked, **own, method=EVIL), {EVIL + "2": make_calibration(**asked)}
+    return render(
+        make_calibration(**asked, **own, method=EVIL),
+        beside={EVIL + "2": make_calibration(**asked)},
     )
 
 
@@ -171,7 +172,7 @@ def test_every_table_scrolls_in_a_box_of_its_own(evil_page: str) -> None:
 
 @pytest.mark.thorough
 def test_a_calibration_without_an_answer_has_a_page() -> None:
-    text = Page(render_calibration(make_calibration(count=30, failed=tuple(range(30))))).text
+    text = Page(render(make_calibration(count=30, failed=tuple(range(30))))).text
     assert "Not calibrated" in text
     assert "100% of the fits failed" in text
     assert not re.search(r"\bnan\b", text)
@@ -181,7 +182,7 @@ def test_the_folder_holds_page_and_calibration(tmp_path: Path, broken: xr.DataTr
     page = pb.report(broken, tmp_path / "report")
     assert sorted(path.name for path in page.parent.iterdir()) == ["calibration.nc", "index.html"]
     read = pb.calibration.load_calibration(page.parent / "calibration.nc")
-    assert render_calibration(read) == page.read_text()
+    assert render(read) == page.read_text()
 
 
 def test_arguments_that_do_not_apply_are_refused(tmp_path: Path, good: xr.DataTree) -> None:
@@ -237,5 +238,5 @@ def test_positive_parameters_of_many_sizes_have_logarithmic_axes() -> None:
 def test_dots_mark_where_the_curve_leaves_its_band(broken: xr.DataTree) -> None:
     figure = pb.plots.plot_calibration(broken)
     marked = [any(line.get_marker() == "o" for line in axes.lines) for axes in figure.axes[::3]]
-    assert marked == [not part.passes for part in parts_of(broken).values()]
+    assert marked == [not part.passes for part in parameter_ranks(broken).values()]
     assert np.sum(marked) == 2

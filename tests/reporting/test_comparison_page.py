@@ -10,7 +10,7 @@ from synthetic_results import edit_provenance, make_result, replace
 import polar_bayes as pb
 from polar_bayes.cli import main
 from polar_bayes.errors import FitError
-from polar_bayes.reporting.comparison import render_comparison
+from polar_bayes.reporting.report import render
 
 SMALL = {"wavelengths": (), "views": 16, "draws": 150, "variables": ("dop",)}
 
@@ -25,7 +25,7 @@ def worse(by: float, **asked):
 def page() -> Page:
     first = make_result(**SMALL)
     other = edit_provenance(worse(1.0), model="hierarchical", priors={"roughness": "Beta(1, 9)"})
-    return Page(render_comparison({"plain": first, "other": other}))
+    return Page(render({"plain": first, "other": other}))
 
 
 def test_the_verdict_names_the_better_fit_first(page: Page) -> None:
@@ -36,7 +36,7 @@ def test_the_verdict_names_the_better_fit_first(page: Page) -> None:
 
 @pytest.mark.thorough
 def test_fits_that_cannot_be_told_apart_are_not_ranked() -> None:
-    text = Page(render_comparison({"a": make_result(**SMALL), "b": worse(1e-3)})).text
+    text = Page(render({"a": make_result(**SMALL), "b": worse(1e-3)})).text
     assert "The readings do not tell which of these fits predicts best." in text
     assert "b predicts them about as well as a." in text
 
@@ -53,13 +53,13 @@ def test_intervals_that_do_not_overlap_are_named() -> None:
     moved = make_result(**SMALL)
     draws = moved["posterior"].to_dataset()["roughness"].to_numpy() + 5.0
     moved = replace(moved, "posterior", "roughness", draws)
-    text = Page(render_comparison({"a": make_result(**SMALL), "b": moved})).text
+    text = Page(render({"a": make_result(**SMALL), "b": moved})).text
     assert "do not overlap for roughness (a and b)" in text
 
 
 def test_a_failed_fit_is_named_first() -> None:
     broken = edit_provenance(make_result(**SMALL), problems=["no mode was reached"])
-    text = Page(render_comparison({"a": make_result(**SMALL), "b": broken})).text
+    text = Page(render({"a": make_result(**SMALL), "b": broken})).text
     assert "Do not use the numbers of b" in text
     assert "b: No mode was reached." in text
 
@@ -67,7 +67,7 @@ def test_a_failed_fit_is_named_first() -> None:
 @pytest.mark.thorough
 def test_names_are_text_and_nothing_else() -> None:
     odd = edit_provenance(make_result(**SMALL), scene=EVIL, priors={EVIL: EVIL})
-    page = Page(render_comparison({EVIL: odd, "b": make_result(**SMALL, method="point")}))
+    page = Page(render({EVIL: odd, "b": make_result(**SMALL, method="point")}))
     assert page.open == []
     assert "script" not in page.tags
     assert not [name for _, name, _ in page.attributes if name.startswith("on")]
@@ -77,7 +77,7 @@ def test_a_report_of_several_fits_is_one_page(tmp_path: Path) -> None:
     fits = {"a": make_result(**SMALL), "b": make_result(**SMALL, method="laplace")}
     page = pb.report(fits, tmp_path / "both")
     assert [path.name for path in (tmp_path / "both").iterdir()] == ["index.html"]
-    assert page.read_text() == render_comparison(fits)
+    assert page.read_text() == render(fits)
 
 
 def test_the_command_compares_files(tmp_path: Path, capsys) -> None:

@@ -16,7 +16,7 @@ from polar_bayes.diagnostics.parameters import posterior_scalars
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.files import load_result
 from polar_bayes.reporting.report import render, report
-from polar_bayes.reporting.text import interval, numbers, overconfidence, percent, spoken
+from polar_bayes.reporting.text import interval, join, numbers, overconfidence, percent
 
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 
@@ -227,4 +227,4 @@ def test_numbers_as_text() -> None:
     assert interval(1.4, 1.5) == "[1.400, 1.500]"
     assert percent(0.084) == "8.4%"
     assert percent(0.12) == "12%"
-    assert spoken(["a", "b", "c"]) == "a, b and c"
+    assert join(["a", "b", "c"]) == "a, b and c"

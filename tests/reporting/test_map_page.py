@@ -13,8 +13,9 @@ from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.inference.batch_result import Approach, Status
-from polar_bayes.reporting import maps as map_tables
-from polar_bayes.reporting.maps import render_map
+from polar_bayes.reporting.maps import count_cases
+from polar_bayes.reporting.report import render
+from polar_bayes.reporting.text import count_percent, map_headline
 
 EVIL = "<script>alert(1)</script>"
 SHAPE = (10, 20)
@@ -52,7 +53,7 @@ def text_of(page: str) -> str:
 def page() -> str:
     maps = mixed(scene="paper", model="per_material", priors={"roughness": "Beta(2, 3)"})
     bare = make_maps(MEANS, width=0.5, weighted=False)
-    return render_map(maps, truth(), bare)
+    return render(maps, truth=truth(), uncorrected=bare)
 
 
 def test_the_verdict_says_what_became_of_the_pixels(page: str) -> None:
@@ -73,7 +74,7 @@ def test_the_verdict_says_what_became_of_the_pixels(page: str) -> None:
 def test_tables_count_pixels_by_status_and_approach(page: str) -> None:
     text = text_of(page)
     assert "masked no valid reading 35 18%" in text
-    assert "not trusted numbers that no check confirms, by the approach told below 2" in text
+    assert "not trusted numbers that no check confirms, by the approach in the next table 2" in text
     assert "nuts sampling (NUTS) 10 5.0% 10" in text
     assert "laplace the normal approximation as it is 2 1.0% 0" in text
 
@@ -107,7 +108,7 @@ def test_coverage_stands_beside_that_of_a_map_that_was_not_corrected(page: str) 
 
 @pytest.mark.thorough
 def test_without_a_truth_nothing_is_said_of_coverage() -> None:
-    page = render_map(mixed())
+    page = render(mixed())
     assert 'id="coverage"' not in page
     assert "hold the truth" not in page
     assert "Map report: map" in page
@@ -115,8 +116,8 @@ def test_without_a_truth_nothing_is_said_of_coverage() -> None:
 
 @pytest.mark.thorough
 def test_what_is_named_like_markup_is_text() -> None:
-    page = render_map(
-        mixed(scene=EVIL, model=EVIL, priors={EVIL: EVIL}, settings={EVIL: EVIL}), truth(EVIL)
+    page = render(
+        mixed(scene=EVIL, model=EVIL, priors={EVIL: EVIL}, settings={EVIL: EVIL}), truth=truth(EVIL)
     )
     assert "<script" not in page
     assert "Map report: &lt;script&gt;alert(1)&lt;/script&gt;" in page
@@ -129,7 +130,7 @@ def test_every_parameter_is_drawn_four_at_a_time_and_a_few_wavelengths() -> None
     names = ("refractive_index", "roughness", "subsurface_fraction", "angle_zero", "dark_level")
     means = {name: np.full((3, 4), 0.5) for name in names}
     means["refractive_index"] = np.full((3, 4, 4), 1.5)
-    page = render_map(make_maps(means, wavelengths=colors))
+    page = render(make_maps(means, wavelengths=colors))
     pictures = re.findall(r'<img.*? src="data:image/svg\+xml;base64,([^"]*)" alt="([^"]*)"', page)
     said = [alternative for _, alternative in pictures]
     first = "Maps of roughness, subsurface_fraction, refractive_index and angle_zero at 400 nm"
@@ -144,13 +145,13 @@ def test_every_parameter_is_drawn_four_at_a_time_and_a_few_wavelengths() -> None
 
 @pytest.mark.thorough
 def test_a_map_that_was_not_checked_says_so_and_an_empty_one_fails() -> None:
-    unchecked = text_of(render_map(mixed(weighted=False)))
+    unchecked = text_of(render(mixed(weighted=False)))
     assert "The approximation was taken as it is (weighted=False)" in unchecked
     for status, said in (
         (Status.NOT_CONVERGED, "No pixel has an answer: do not use these maps."),
         (Status.MASKED, "No pixel was read: these maps are empty."),
     ):
-        page = render_map(make_maps(MEANS, status=np.full(SHAPE, status)), truth())
+        page = render(make_maps(MEANS, status=np.full(SHAPE, status)), truth=truth())
         assert said in page
         assert 'class="verdict failed"' in page
         assert not re.search(r"\bnan\b", text_of(page))
@@ -161,13 +162,13 @@ def test_a_map_that_was_not_checked_says_so_and_an_empty_one_fails() -> None:
 @each("number", [np.nan, np.inf])
 def test_a_pixel_that_is_called_good_without_numbers_is_not(name: str, number: float) -> None:
     maps = make_maps(MEANS)
-    assert map_tables.headline(map_tables.count_cases(maps))[0].startswith("Every pixel")
+    assert map_headline(count_cases(maps))[0].startswith("Every pixel")
     maps[name][{"y": 2, "x": slice(3, 10)}] = number
     assert pb.maps.count_pixels(maps) == dict.fromkeys(pb.maps.count_pixels(maps), 0) | {
         "good": 193,
         "not fitted": 7,
     }
-    page = render_map(maps)
+    page = render(maps)
     for said in (
         "7 of 200 pixels are not fitted: this map has holes.",
         "Of 200 pixels 193 are good (96%)",
@@ -189,16 +190,16 @@ def test_a_status_without_a_meaning_is_refused() -> None:
 
 @pytest.mark.thorough
 def test_shares_are_never_rounded_to_all_or_nothing() -> None:
-    assert map_tables.share(99_999, 100_000) == "above 99.9%"
-    assert map_tables.share(9_960, 10_000) == "above 99.5%"
-    assert map_tables.share(1, 100_000) == "below 0.1%"
-    assert map_tables.share(5, 5) == "100%"
+    assert count_percent(99_999, 100_000) == "above 99.9%"
+    assert count_percent(9_960, 10_000) == "above 99.5%"
+    assert count_percent(1, 100_000) == "below 0.1%"
+    assert count_percent(5, 5) == "100%"
 
 
 def test_the_folder_holds_the_page(tmp_path: Path) -> None:
     page = pb.report(mixed(), tmp_path / "report", truth=truth())
     assert [path.name for path in (tmp_path / "report").iterdir()] == ["index.html"]
-    assert page.read_text() == render_map(mixed(), truth())
+    assert page.read_text() == render(mixed(), truth=truth())
 
 
 def test_arguments_that_do_not_apply_are_refused(tmp_path: Path) -> None:

@@ -9,11 +9,12 @@ from synthetic_results import edit_provenance, make_result, pool
 
 from polar_bayes.diagnostics.population import population_summary, populations, shrinkage
 from polar_bayes.errors import FitError
-from polar_bayes.reporting import tables
+from polar_bayes.reporting import fit_page
 from polar_bayes.reporting import text as sentences
-from polar_bayes.reporting.plots_fit import MOST_MEMBERS, plot_shrinkage
+from polar_bayes.reporting.fit_page import provenance_facts
+from polar_bayes.reporting.plots_fit import MAX_MEMBERS, plot_shrinkage
 from polar_bayes.reporting.report import render
-from polar_bayes.reporting.tables import provenance_groups, swapped_sentence
+from polar_bayes.reporting.text import swapped_sentence
 
 EVIL = '<script>alert(1)</script>"><img src=x onerror=alert(2)>'
 
@@ -30,10 +31,10 @@ def test_members_of_every_number_are_drawn(count: int) -> None:
     figure = plot_shrinkage(pooled(count, views=4), "refractive_index")
     assert clipped(figure) == []
     (axes,) = figure.axes
-    assert len(axes.get_yticks()) == min(count, MOST_MEMBERS)
+    assert len(axes.get_yticks()) == min(count, MAX_MEMBERS)
     label = axes.get_xlabel()
     assert label.startswith("refractive index")
-    assert ("60 of 75, evenly" in label) == (count > MOST_MEMBERS)
+    assert ("60 of 75, evenly" in label) == (count > MAX_MEMBERS)
     said = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "pooled: mean and 95%" in said
     assert "true value" in said
@@ -159,12 +160,12 @@ def test_sentences_of_many_colors_name_the_first_and_the_last() -> None:
     result = pooled(3, wavelengths=(450.0, 550.0, 650.0))
     found, table = populations(result), population_summary(result)
     posterior = result["posterior"].to_dataset()
-    (said,) = sentences.varied(table, found, posterior)
+    (said,) = sentences.between_members(table, found, posterior)
     assert "a new material would lie between" in said
     assert "at 450 nm and between" in said
     assert said.endswith("at 650 nm (95%).")
     assert "550" not in said
-    decided = " ".join(sentences.leaning(table, found, posterior))
+    decided = " ".join(sentences.pooling(table, found, posterior))
     assert decided.count("refractive index, ") == 3
 
 
@@ -173,10 +174,10 @@ def test_tables_have_a_cell_for_every_head() -> None:
     result = pooled(3, "roughness", "refractive_index")
     found = populations(result)
     for table in (
-        tables.population_table(population_summary(result), found),
-        tables.member_table(result, shrinkage(result), found),
+        fit_page.population_table(population_summary(result), found),
+        fit_page.member_table(result, shrinkage(result), found),
     ):
-        assert {len(row.cells) + 1 for row in table.rows} == {len(table.heads)}
+        assert {len(row.cells) + 1 for row in table.rows} == {len(table.columns)}
 
 
 # --- what was swapped -----------------------------------------------------------------------------
@@ -208,29 +209,23 @@ def test_nothing_is_said_of_a_result_that_does_not_tell() -> None:
 
 
 def test_provenance_marks_what_was_swapped() -> None:
-    groups = dict(
-        provenance_groups(
-            {
-                "model": "my_story",
-                "scene": "paper",
-                "priors": {"roughness": "HalfNormal(0.1)", "absorption": "LogNormal(-1, 0.5)"},
-                "links": {"dop": "BetaLink()"},
-                "declared": {"tilt": "Normal"},
-                "model_settings": {"pooled": ["roughness"], "process": {"kernel": "matern52"}},
-                "fixed": {"refractive_index": 1.45},
-                "swapped": ["model", "prior of roughness", "refractive_index held fixed"],
-            }
-        )
-    )
-    marked = {row.name for rows in groups.values() for row in rows if row.words == "swapped"}
+    provenance = {
+        "model": "my_story",
+        "scene": "paper",
+        "priors": {"roughness": "HalfNormal(0.1)", "absorption": "LogNormal(-1, 0.5)"},
+        "links": {"dop": "BetaLink()"},
+        "declared": {"tilt": "Normal"},
+        "model_settings": {"pooled": ["roughness"], "process": {"kernel": "matern52"}},
+        "fixed": {"refractive_index": 1.45},
+        "swapped": ["model", "prior of roughness", "refractive_index held fixed"],
+    }
+    groups = {facts.title: facts.rows for facts in provenance_facts(provenance)}
+    marked = {name for rows in groups.values() for name, _, mark in rows if mark == "swapped"}
     assert marked == {"model", "roughness"}
-    assert groups["Priors that stand in the model itself"][0].cells == ("Normal",)
-    (held,) = groups["Held fixed, by the model or around it"]
-    assert (held.name, held.cells) == ("refractive_index", ("1.45",))
-    assert [row.cells[0] for row in groups["Settings of the model"]] == [
-        "roughness",
-        "kernel matern52",
-    ]
+    assert groups["Priors that stand in the model itself"] == (("tilt", "Normal", ""),)
+    assert groups["Held fixed, by the model or around it"] == (("refractive_index", "1.45", ""),)
+    values = [value for _, value, _ in groups["Settings of the model"]]
+    assert values == ["roughness", "kernel matern52"]
 
 
 def test_the_source_of_a_model_is_folded_and_escaped() -> None:

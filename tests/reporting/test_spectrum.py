@@ -9,8 +9,8 @@ from synthetic_results import edit_provenance, make_result, replace
 
 import polar_bayes as pb
 from polar_bayes.errors import FitError
-from polar_bayes.reporting import plots_spectrum as module
-from polar_bayes.reporting.plots_spectrum import LEVELS, plot_spectrum, spectra
+from polar_bayes.reporting import plots_curves as module
+from polar_bayes.reporting.plots_curves import LEVELS, plot_spectrum, spectra
 from polar_bayes.reporting.report import render
 
 SMALL = {"views": 6, "draws": 60, "variables": ("dop",)}
@@ -88,13 +88,13 @@ def test_a_process_is_drawn_from_its_prediction(monkeypatch) -> None:
     monkeypatch.setattr(module, "predict_spectrum", predict)
     found = spectra(edit_provenance(result, scene_parts=""))
     assert asked["draws"] == 1200
-    assert len(found["absorption"]) == module.MOST_MEMBERS
+    assert len(found["absorption"]) == module.MAX_MEMBERS
     assert found["absorption"][3].between.size > module.FINE
     assert found["absorption"][3].title == "material d"
     assert found["refractive_index"][0].between.size == 0
     figure = plot_spectrum(result, "absorption", found)
     assert clipped(figure) == []
-    assert len(figure.axes) == module.MOST_MEMBERS
+    assert len(figure.axes) == module.MAX_MEMBERS
     assert figure.get_supxlabel() == "wavelength [nm] (the first 12 of 14)"
     assert len({axes.get_ylim() for axes in figure.axes}) == 1
 

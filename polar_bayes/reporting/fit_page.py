@@ -1,0 +1,583 @@
+"""The report of a fit: what it says of the material, and every check of it."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
+from polar_bayes.diagnostics.compare import WITHOUT, compare_without
+from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, Verdict, laplace_k_hat, verdict
+from polar_bayes.diagnostics.convergence import summary as summarize
+from polar_bayes.diagnostics.parameters import (
+    APPROXIMATIONS,
+    Scalar,
+    is_hyperparameter,
+    method_of,
+    posterior_scalars,
+    stats_of,
+    truth_of,
+)
+from polar_bayes.diagnostics.population import (
+    Population,
+    population_summary,
+    populations,
+    shrinkage,
+)
+from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck, predictive_checks
+from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, sensitivity
+from polar_bayes.effects.choose import ledger_sentences, ledger_table
+from polar_bayes.errors import one_line
+from polar_bayes.inference.auto import auto_sentences
+from polar_bayes.inference.result import provenance_of
+from polar_bayes.reporting import page, plots_curves, plots_fit, text
+from polar_bayes.reporting.accuracy import accuracy_picture, study_table
+from polar_bayes.reporting.style import QUANTITIES, parameter_title
+from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
+
+SHARED_GROUP = "Populations and spectra"
+INSTRUMENT_GROUP = "Instrument and noise"
+METHODS = {
+    "nuts": "NUTS",
+    "laplace": "Laplace approximation",
+    "importance": "Laplace approximation with importance weights",
+    "tempered": "tempered sequential Monte Carlo",
+    "variational": "variational guide",
+    "point": "least squares",
+}
+SCALES = {
+    "log": "on the scale of its logarithm",
+    "log odds": "on the scale of its log odds",
+    "plain": "on its own scale",
+}
+MAX_POPULATIONS = 6
+SWAPPED = "swapped"
+
+
+class Fit(NamedTuple):
+    """A result with everything that its report is computed from."""
+
+    result: xr.DataTree
+    posterior: xr.Dataset
+    scalars: list[Scalar]
+    summary: pd.DataFrame
+    prior: pd.DataFrame
+    method: str
+    provenance: dict[str, Any]
+    verdict: Verdict
+
+    def table(
+        self,
+        name: str,
+        caption: str,
+        cells: page.Cells,
+        data: pd.DataFrame,
+        prose: Sequence[str] = (),
+    ) -> page.Table:
+        """A table with a row for each parameter that the numbers have, in groups."""
+        names = set(map(str, self.posterior.data_vars))
+        titles, groups = {}, {}
+        for scalar in self.scalars:
+            if scalar.label in data.index:
+                titles[scalar.label] = parameter_title(scalar, self.posterior)
+                groups[scalar.label] = page.MAIN_GROUP if scalar.is_material else INSTRUMENT_GROUP
+                if is_hyperparameter(scalar.name, names):
+                    groups[scalar.label] = SHARED_GROUP
+        data = data.loc[list(titles)]
+        return page.make_table(
+            name, caption, cells, data, descriptions=titles, groups=groups, prose=prose
+        )
+
+    def with_truth(self, data: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
+        """Numbers with a column of true values, where any is known."""
+        truths = {scalar.label: truth_of(self.result, scalar) for scalar in self.scalars}
+        if not any(math.isfinite(truths[str(label)]) for label in data.index):
+            return data, False
+        return data.assign(true_value=pd.Series(truths)), True
+
+    def determined(self) -> list[str]:
+        """Which parameters the data determine; nothing of a fit that failed."""
+        if not self.verdict.converged:
+            return []
+        return text.determined(self.scalars, self.prior, self.posterior)
+
+    def headline(self) -> str:
+        """The verdict in one sentence."""
+        return text.fit_headline(self.method, self.verdict.converged, self.verdict.cautions)
+
+
+def read_fit(result: xr.DataTree) -> Fit:
+    """Summaries of a result, which is checked first."""
+    scalars, table = posterior_scalars(result), summarize(result)
+    return Fit(
+        result=result,
+        posterior=result["posterior"].to_dataset(),
+        scalars=scalars,
+        summary=table,
+        prior=sensitivity(result),
+        method=method_of(result),
+        provenance=provenance_of(result),
+        verdict=verdict(result, table),
+    )
+
+
+def fit_page(result: xr.DataTree) -> page.Page:
+    """The page of a fit."""
+    fit = read_fit(result)
+    checks = predictive_checks(result)
+    is_point, converged = fit.method == "point", fit.verdict.converged
+    pooled = [] if is_point else populations(result)
+    summary = population_summary(result) if pooled else pd.DataFrame()
+    sentences = fit.determined()
+    if converged:
+        sentences += text.between_members(summary, pooled, fit.posterior)
+        sentences += text.predictive_sentences(checks)
+        sentences.append(text.trust(fit.method, fit.verdict.cautions, checks))
+    has_draws = not is_point and bool(plots_fit.drawable(result))
+    approximation = "Convergence" if fit.method == "nuts" else "Approximation"
+    without = [] if is_point else list(_without(fit))
+    prior = [] if is_point else [*_prior(result, has_draws), sensitivity_table(fit)]
+    sections = [
+        page.Section("parameters", "Parameters", [parameter_table(fit)]),
+        page.Section("population", "Population", _population(fit, summary, pooled)),
+        page.Section("spectrum", "Spectrum", _spectrum(result) if has_draws else []),
+        page.Section("without", "What trusting the instrument would claim", without, "Instrument"),
+        page.Section("readings", "Readings and fit", list(_readings(result, has_draws))),
+        page.Section("pairs", "Material parameters together", _pairs(result, has_draws)),
+        page.Section("prior", "What the prior said, and what the data", prior, "Prior and data"),
+        page.Section("convergence", approximation, _convergence(fit, has_draws), approximation),
+        page.Section("checks", "Predictive checks", _checks(result, checks)),
+        page.Section("effects", "Effects", _effects(result)),
+        page.Section("accuracy", "Accuracy against time", _accuracy(result)),
+        page.Section("provenance", "Provenance", _provenance(fit.provenance)),
+    ]
+    method = METHODS.get(fit.method, one_line(fit.method))
+    swapped = text.swapped_sentence(fit.provenance)
+    return page.Page(
+        kind="Fit report",
+        name=text.capture_name(fit.provenance),
+        subtitles=[text.made_by(fit.provenance, method), *filter(None, [swapped])],
+        headline=fit.headline(),
+        passed=converged,
+        problems=fit.verdict.problems,
+        sentences=sentences,
+        cautions=fit.verdict.cautions,
+        sections=sections,
+        footer="Computed from result.nc, which lies in the same folder and holds every draw.",
+    )
+
+
+# --- Parameters -----------------------------------------------------------------------------------
+
+
+def parameter_table(fit: Fit) -> page.Table:
+    """Every parameter with its interval, the truth where known, and what the data determine."""
+    if fit.method == "point":
+        return _estimate_table(fit)
+    data, has_truth = fit.with_truth(fit.summary.join(fit.prior[["prior_inside", "verdict"]]))
+    cells: dict[str, Callable[[pd.Series], str]] = {
+        "mean": lambda row: number(row["mean"], row["sd"]),
+        "sd": lambda row: number(row["sd"], row["sd"]),
+        "2.5%": lambda row: number(row["q2.5"], row["sd"]),
+        "97.5%": lambda row: number(row["q97.5"], row["sd"]),
+    }
+    if has_truth:
+        cells["true value"] = _truth_cell
+    cells["prior inside"] = lambda row: percent(row["prior_inside"])
+    cells["by the data"] = lambda row: str(row["verdict"])
+    caption = text.caption("fit.parameter", determined=DETERMINED, partly=PARTLY)
+    return fit.table("parameter", caption, cells, data)
+
+
+def _truth_cell(row: pd.Series) -> str:
+    truth = number(row["true_value"], row["sd"])
+    is_outside = row["true_value"] < row["q2.5"] or row["true_value"] > row["q97.5"]
+    return f"{truth} (outside)" if is_outside else truth
+
+
+def _estimate_table(fit: Fit) -> page.Table:
+    data = fit.summary[["mean", "sd"]].set_axis(["estimate", "standard_error"], axis="columns")
+    data, has_truth = fit.with_truth(data)
+    cells: dict[str, Callable[[pd.Series], str]] = {
+        "estimate": lambda row: number(row["estimate"], row["standard_error"]),
+        "standard error": lambda row: (
+            number(row["standard_error"], row["standard_error"])
+            if math.isfinite(row["standard_error"])
+            else "not determined"
+        ),
+    }
+    if has_truth:
+        cells["true value"] = lambda row: number(row["true_value"], row["standard_error"])
+    caption = "Least squares; standard errors from the curvature and the residuals."
+    return fit.table("parameter", caption, cells, data)
+
+
+def sensitivity_table(fit: Fit) -> page.Table:
+    """Prior against posterior, and how far a changed prior would change the posterior."""
+    cells: page.Cells = {
+        "prior 95%": lambda row: interval(row["prior_q2.5"], row["prior_q97.5"]),
+        "posterior 95%": lambda row: interval(row["q2.5"], row["q97.5"]),
+        "width left": lambda row: percent(row["width_left"]),
+        **text.SENSITIVITY_CELLS,
+    }
+    caption = text.caption("fit.sensitivity", sensitive=SENSITIVE)
+    return fit.table("sensitivity", caption, cells, fit.prior, prose=["remark"])
+
+
+def _prior(result: xr.DataTree, has_draws: bool) -> list[page.Block]:
+    if not has_draws or "prior" not in result.children:
+        return []
+    return [
+        page.make_picture(
+            plots_fit.plot_prior_posterior(result), *text.figure_caption("fit.figure_prior")
+        )
+    ]
+
+
+def _pairs(result: xr.DataTree, has_draws: bool) -> list[page.Block]:
+    if not has_draws or len(plots_fit.drawable(result, material=True)) < 2:
+        return []
+    return [
+        page.make_picture(plots_fit.plot_pairs(result), *text.figure_caption("fit.figure_pairs"))
+    ]
+
+
+# --- Populations and spectra ----------------------------------------------------------------------
+
+
+def _population(fit: Fit, summary: pd.DataFrame, pooled: Sequence[Population]) -> list[page.Block]:
+    """What the members of each population have in common, where anything is pooled."""
+    if not pooled:
+        return []
+    members = shrinkage(fit.result)
+    drawn = [each.label for each in pooled if math.isfinite(summary.loc[each.label, "pooling"])]
+    pictures: list[page.Block] = []
+    for label in drawn[:MAX_POPULATIONS]:
+        alternative, caption = text.figure_caption("fit.figure_shrinkage", label=label)
+        figure = plots_fit.plot_shrinkage(fit.result, label, summary, members)
+        caption = "The same." if pictures else caption
+        pictures.append(page.make_picture(figure, alternative, caption))
+    more = len(drawn) - MAX_POPULATIONS
+    return [
+        *(text.pooling(summary, pooled, fit.posterior) if fit.verdict.converged else []),
+        population_table(summary, pooled),
+        *pictures,
+        *([f"{more} more populations are in the table only."] if more > 0 else []),
+        page.Details("Every member in numbers", (member_table(fit.result, members, pooled),)),
+    ]
+
+
+def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> page.Table:
+    """Location, spread and the range of a new member, for every pooled parameter."""
+
+    def with_interval(row: pd.Series, part: str) -> str:
+        low, high = row[f"{part}_q2.5"], row[f"{part}_q97.5"]
+        scale = (high - low) / 2.0
+        return f"{number(row[part], scale)} {interval(low, high, scale)}"
+
+    cells: page.Cells = {
+        "location": lambda row: with_interval(row, "location"),
+        "spread": lambda row: with_interval(row, "spread"),
+        "members differ by": lambda row: (
+            str(row["meaning"]).removeprefix("members differ by ") or DASH
+        ),
+        "a new member": lambda row: interval(row["new_q2.5"], row["new_q97.5"]),
+        "pooling factor": column("pooling", ".2f"),
+    }
+    members = {
+        each.label: f"{summary.loc[each.label, 'members']} members, {SCALES[each.scale]}"
+        for each in pooled
+    }
+    caption = text.caption("fit.population")
+    return page.make_table("population", caption, cells, summary, descriptions=members)
+
+
+def member_table(
+    result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Population]
+) -> page.Table:
+    """Every member of every population, with and without it."""
+    posterior = result["posterior"].to_dataset()
+    titles = {
+        scalar.label: parameter_title(scalar, posterior)
+        for each in pooled
+        for scalar in each.members
+    }
+
+    def scale(row: pd.Series) -> float:
+        return (row["q97.5"] - row["q2.5"]) / 4.0
+
+    cells: page.Cells = {
+        "mean": lambda row: number(row["mean"], scale(row)),
+        "95% interval": lambda row: interval(row["q2.5"], row["q97.5"]),
+        "alone": lambda row: number(row["unpooled"], scale(row)),
+        "95% alone": lambda row: interval(row["unpooled_q2.5"], row["unpooled_q97.5"], scale(row)),
+        "pooled share": lambda row: percent(row["shrinkage"]),
+    }
+    data = members.loc[list(titles)]
+    return page.make_table("member", text.caption("fit.member"), cells, data, descriptions=titles)
+
+
+def _spectrum(result: xr.DataTree) -> list[page.Block]:
+    spectra = plots_curves.spectra(result)
+    pictures: list[page.Block] = []
+    for name, members in spectra.items():
+        key = f"fit.figure_spectrum_{'bands' if members[0].between.size else 'intervals'}"
+        captions = text.figure_caption(key, name=name.replace("_", " ").capitalize())
+        figure = plots_curves.plot_spectrum(result, name, spectra)
+        pictures.append(page.make_picture(figure, *captions))
+    return pictures
+
+
+# --- The instrument -------------------------------------------------------------------------------
+
+
+def _without(fit: Fit) -> Iterator[page.Block]:
+    """Each fit without a part of the instrument, compared with the main one."""
+    for at, (key, part) in enumerate(WITHOUT.items(), start=1):
+        compared = compare_without(fit.result, key)
+        if compared.empty:
+            continue
+        yield page.Heading(f"Without {part}")
+        yield discrepancy_table(fit, compared, part, f"without-{at}")
+        yield from text.overconfidence(compared, fit.scalars, fit.posterior, part)
+    for key, reason in (fit.provenance.get("comparisons_failed") or {}).items():
+        yield page.Heading(f"Without {WITHOUT.get(key.removeprefix('without_'), one_line(key))}")
+        yield f"This comparison failed, so nothing is said of it: {one_line(reason)}."
+
+
+def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) -> page.Table:
+    """The fit of the report next to the same fit without a part of the instrument."""
+    data, has_truth = fit.with_truth(compared)
+
+    def scale(row: pd.Series) -> float:
+        return min(row["q97.5"] - row["q2.5"], row["q97.5_without"] - row["q2.5_without"]) / 4.0
+
+    cells: dict[str, Callable[[pd.Series], str]] = {
+        "mean": lambda row: number(row["mean"], scale(row)),
+        "95% interval": lambda row: interval(row["q2.5"], row["q97.5"], scale(row)),
+        "mean without": lambda row: number(row["mean_without"], scale(row)),
+        "95% without": lambda row: interval(row["q2.5_without"], row["q97.5_without"], scale(row)),
+        "width": lambda row: percent(row["width_ratio"]),
+    }
+    if has_truth:
+        cells["true value"] = lambda row: number(row["true_value"], scale(row))
+    caption = text.caption("fit.without", part=part)
+    return fit.table(name, caption, cells, data)
+
+
+# --- Readings and checks --------------------------------------------------------------------------
+
+
+def _readings(result: xr.DataTree, has_draws: bool) -> Iterator[page.Picture]:
+    key = "fit.figure_readings" if has_draws else "fit.figure_point_readings"
+    for name in plots_curves.variables(result):
+        captions = text.figure_caption(key, quantity=QUANTITIES[name])
+        yield page.make_picture(plots_curves.plot_readings(result, name), *captions)
+        if name != "intensity":
+            captions = text.figure_caption("fit.figure_residuals", quantity=QUANTITIES[name])
+            yield page.make_picture(plots_curves.plot_residuals(result, name), *captions)
+
+
+def _checks(result: xr.DataTree, checks: Mapping[str, PredictiveCheck]) -> list[page.Block]:
+    if not checks:
+        return []
+    blocks: list[page.Block] = [check_table(checks)]
+    if any(check.pit.size > 1 for check in checks.values()):
+        blocks.append(
+            page.make_picture(
+                plots_fit.plot_pit(result, dict(checks)), *text.figure_caption("fit.figure_pit")
+            )
+        )
+    return blocks
+
+
+def check_table(checks: Mapping[str, PredictiveCheck]) -> page.Table:
+    """Residuals, coverage, and leave-one-out results of every variable."""
+    has_draws = any(check.pit.size for check in checks.values())
+    columns = ["variable", "readings", "residual RMS"]
+    caption = "Residual: reading minus the noise-free prediction, in the unit of the reading."
+    if has_draws:
+        columns += [*(f"inside {p:.0%}" for p in PROBABILITIES), "elpd", "p", "k > 0.7"]
+        caption += text.caption("fit.predictive_check")
+    rows, data = [], {}
+    for check in checks.values():
+        cells = [str(check.count), f"{check.residual_rms:.3g}"]
+        cells += _predictive_cells(check) if has_draws else []
+        rows.append(page.Row(check.name, QUANTITIES.get(check.name, check.name), tuple(cells)))
+        data[check.name] = _check_numbers(check)
+    frame = pd.DataFrame.from_dict(data, "index")
+    return page.Table("check", caption, tuple(columns), tuple(rows), frame)
+
+
+def _check_numbers(check: PredictiveCheck) -> dict[str, float]:
+    numbers = {"readings": check.count, "residual_rms": check.residual_rms}
+    numbers |= {f"inside_{probability:g}": share for probability, share in check.coverage.items()}
+    if check.loo:
+        numbers |= {"elpd": check.loo.elpd, "elpd_error": check.loo.standard_error}
+        numbers |= {"p_loo": check.loo.p_loo, "unreliable": check.loo.unreliable}
+    return numbers
+
+
+def _predictive_cells(check: PredictiveCheck) -> list[str]:
+    loo, cells = check.loo, []
+    for probability in PROBABILITIES:
+        chance = 2.0 * math.sqrt(probability * (1.0 - probability) / check.count)
+        share = check.coverage.get(probability, math.nan)
+        cells.append(f"{share:.0%} (±{chance:.0%})" if math.isfinite(share) else DASH)
+    if loo is None:
+        return [*cells, DASH, DASH, DASH]
+    error = or_dash(loo.standard_error, ".1f")
+    return [*cells, f"{loo.elpd:.1f} ± {error}", f"{loo.p_loo:.1f}", str(loo.unreliable)]
+
+
+# --- The method -----------------------------------------------------------------------------------
+
+
+def _convergence(fit: Fit, has_draws: bool) -> list[page.Block]:
+    blocks: list[page.Block] = [convergence_table(fit)] if fit.method == "nuts" else []
+    blocks += page.make_bullets(auto_sentences(fit.result))
+    blocks += page.make_facts(_sampler_facts(fit))
+    if fit.method == "nuts" and has_draws:
+        blocks.append(
+            page.make_picture(
+                plots_fit.plot_ranks(fit.result), *text.figure_caption("fit.figure_ranks")
+            )
+        )
+    return blocks
+
+
+def convergence_table(fit: Fit) -> page.Table:
+    """R-hat, effective sample sizes and Monte Carlo error of every parameter."""
+    cells: page.Cells = {
+        "R-hat": column("r_hat", ".4f"),
+        "ESS bulk": lambda row: or_dash(np.floor(row["ess_bulk"]), ".0f"),
+        "ESS tail": lambda row: or_dash(np.floor(row["ess_tail"]), ".0f"),
+        "error of the mean": column("mcse_mean", ".2g"),
+    }
+    caption = "Wanted: R-hat at most 1.01 and both effective sample sizes (ESS) at least 400."
+    data = fit.summary[["r_hat", "ess_bulk", "ess_tail", "mcse_mean"]]
+    return fit.table("convergence", caption, cells, data)
+
+
+def _sampler_facts(fit: Fit) -> dict[str, object]:
+    """What the sampler or approximation reports of itself."""
+    stats = stats_of(fit.result)
+    modes = fit.provenance.get("modes") or {}
+    facts: dict[str, object] = {}
+    if "diverging" in stats:
+        facts["divergences"] = int(stats["diverging"].sum())
+    if "reached_max_treedepth" in stats:
+        deep = stats["reached_max_treedepth"]
+        facts["draws at the largest tree depth"] = f"{int(deep.sum())} of {deep.size}"
+    if "acceptance_rate" in stats:
+        facts["mean acceptance"] = f"{float(stats['acceptance_rate'].mean()):.2f}"
+    if "step_size" in stats:
+        sizes = stats["step_size"].isel(draw=-1).to_numpy()
+        facts["step size of each chain"] = [f"{size:.3g}" for size in sizes]
+    facts |= _weight_facts(fit, has_weights="log_weight" in stats)
+    if modes.get("weights"):
+        facts["weights of the modes found"] = [f"{weight:.3g}" for weight in modes["weights"]]
+        facts["mode searches"] = f"{modes.get('starts')}, failed: {modes.get('failures')}"
+    return facts
+
+
+def _weight_facts(fit: Fit, *, has_weights: bool) -> dict[str, object]:
+    """How far the draws of an approximation, or weighted ones, can be trusted."""
+    facts: dict[str, object] = {}
+    k_hat = fit.provenance.get("k_hat")
+    if fit.method in APPROXIMATIONS and has_weights:
+        k_hat = laplace_k_hat(fit.result)
+    if k_hat is not None:
+        facts[f"Pareto k-hat (at most {LARGEST_K_HAT})"] = or_dash(k_hat, ".2f")
+    if (effective := fit.provenance.get("effective_draws")) is not None:
+        facts["effective sample size of the draws"] = f"{effective:.0f}"
+    return facts
+
+
+# --- Effects, accuracy and provenance -------------------------------------------------------------
+
+
+def _effects(result: xr.DataTree) -> list[page.Block]:
+    """How the scene was chosen, where it was."""
+    if "effects" not in result.children:
+        return []
+    ledger = result["effects"].to_dataset()
+    paths = map(str, ledger["path"].to_numpy())
+    rows = tuple(
+        page.Row(str(name), path, tuple(row))
+        for path, (name, row) in zip(paths, ledger_table(ledger).iterrows(), strict=True)
+    )
+    reason = "kept or dropped, and why"
+    columns = ("effect", "data", "shift", "sd", "operations", "time", reason)
+    caption = text.caption("fit.effect", tolerance=ledger.attrs["tolerance"])
+    single = [name for name in ledger.data_vars if ledger[name].dims == ("effect",)]
+    data = ledger[single].to_dataframe()
+    return [*ledger_sentences(ledger), page.Table("effect", caption, columns, rows, data, [reason])]
+
+
+def _accuracy(result: xr.DataTree) -> list[page.Block]:
+    """An accuracy study of the same capture, where the result holds one."""
+    if "accuracy" not in result.children:
+        return []
+    study = accuracy_dataset(result)
+    sentences = f"{accuracy_sentences(study)} {text.reference_sentence(study)}"
+    return [sentences, accuracy_picture(study), study_table(study)]
+
+
+def provenance_facts(provenance: Mapping[str, Any]) -> list[page.Block]:
+    """How the fit was made, in titled groups of names and values; swapped parts are marked."""
+    keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
+    keys += ["chain_method", "largest_view_zenith"]
+    fit = {key.replace("_", " "): provenance[key] for key in keys if key in provenance}
+    swapped = [str(name) for name in provenance.get("swapped") or ()]
+    fit["swapped by the user"] = swapped or "nothing: all defaults"
+    links, timings = provenance.get("links") or {}, dict(provenance.get("timings") or {})
+    if timings:
+        timings["total"] = round(sum(timings.values()), 3)
+    versions = {**(provenance.get("versions") or {}), **(provenance.get("machine") or {})}
+    groups: dict[str, Mapping[str, Any]] = {
+        "Fit": fit,
+        "Settings of the model": provenance.get("model_settings") or {},
+        "Readings": _counts(provenance.get("counts") or {}),
+        "Capture": provenance.get("capture") or {},
+        "Priors": provenance.get("priors") or {},
+        "Priors that stand in the model itself": provenance.get("declared") or {},
+        "Held fixed, by the model or around it": provenance.get("fixed") or {},
+        "Likelihood links": links,
+        "Seconds, compilation included": timings,
+        "Versions": versions,
+    }
+    marked = {
+        "Fit": {"model", "scene"} & set(swapped),
+        "Priors": {
+            name.removeprefix(text.PRIOR) for name in swapped if name.startswith(text.PRIOR)
+        },
+        "Likelihood links": set(links) if "links" in swapped else set(),
+    }
+    return [
+        block
+        for title, values in groups.items()
+        for block in page.make_facts(values, title, marked=marked.get(title, ()), mark=SWAPPED)
+    ]
+
+
+def _provenance(provenance: Mapping[str, Any]) -> list[page.Block]:
+    source = str(provenance.get("model_source") or "")
+    details = [page.Details("Source of the model", code=source)] if source else []
+    return [*provenance_facts(provenance), *details]
+
+
+def _counts(counts: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers of readings that were fitted, masked or set aside."""
+    found = {"all": counts.get("views"), "fitted": counts.get("used")}
+    found |= {"masked (valid=False)": counts.get("masked")}
+    if None not in found.values():
+        aside = counts["views"] - counts["masked"] - counts["used"]
+        found["set aside (beyond the angle limit)"] = aside
+    found["saturated"] = counts.get("saturated")
+    margin = counts.get("at_margin") or {}
+    found |= {f"{name} at the margin of its link": count for name, count in margin.items()}
+    return {name: count for name, count in found.items() if count is not None}

@@ -1,0 +1,550 @@
+"""Curves with bands of 50 and 95%: readings against view zenith, parameters against wavelength."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from polar_bayes.diagnostics.parameters import (
+    SAMPLE_DIMS,
+    Scalar,
+    is_hyperparameter,
+    method_of,
+    posterior_scalars,
+    scalars,
+    truth_of,
+)
+from polar_bayes.errors import FitError
+from polar_bayes.inference.files import check_fit
+from polar_bayes.inference.result import GEOMETRY, provenance_of
+from polar_bayes.inference.spectrum import predict_spectrum
+from polar_bayes.reporting import style
+from polar_bayes.reporting.style import BLUE, GRAY, QUANTITIES, SHORT, VERMILLION, lighten
+
+LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
+
+# --- Readings against view zenith -----------------------------------------------------------------
+
+MAX_AZIMUTHS = 4
+MAX_ROWS = 6
+COLUMNS = 3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Curve:
+    """One wavelength of one material: readings and predictions, each by view."""
+
+    title: str
+    zenith: np.ndarray
+    azimuth: np.ndarray
+    light_zenith: np.ndarray
+    observed: np.ndarray
+    fitted: np.ndarray
+    saturated: np.ndarray
+    levels: np.ndarray
+    center: np.ndarray
+
+    def at(self, views: np.ndarray) -> "Curve":
+        """The same with some of the views, sorted by zenith."""
+        order = np.flatnonzero(views & np.isfinite(self.zenith))
+        order = order[np.argsort(self.zenith[order], kind="stable")]
+        arrays = {
+            field.name: getattr(self, field.name)[..., order]
+            for field in dataclasses.fields(self)
+            if field.name != "title"
+        }
+        return Curve(title=self.title, **arrays)
+
+    def minus_center(self) -> "Curve":
+        """Readings and predictions as distances from the fitted curve."""
+        return dataclasses.replace(
+            self,
+            observed=self.observed - self.center,
+            levels=self.levels - self.center,
+            center=np.zeros_like(self.center),
+        )
+
+    @property
+    def is_smooth(self) -> bool:
+        """True where neighbors in zenith belong to one curve: one light, or the light follows."""
+        if self.zenith.size < 3:
+            return False
+        follows = np.allclose(self.light_zenith, self.zenith, atol=1.0)
+        return bool(np.ptp(self.light_zenith) < 0.5) or follows
+
+
+def variables(result: xr.DataTree) -> list[str]:
+    """The recorded variables of a result that can be drawn, polarization first."""
+    check_fit(result)
+    return [name for name in QUANTITIES if not _missing(result, name)]
+
+
+def _missing(result: xr.DataTree, name: str) -> str:
+    """What a result lacks to draw the readings of a variable: a path in the tree, or nothing."""
+    needed = [(group, name) for group in ("observed_data", "noise_free", "posterior_predictive")]
+    needed += [("constant_data", each) for each in (*GEOMETRY, "valid", "saturated")]
+    for group, variable in needed:
+        if group not in result.children or variable not in result.children[group].data_vars:
+            return f"{group}/{variable}"
+    return "" if result["observed_data"].to_dataset()[name].sizes.get("view") else "view"
+
+
+def curves(result: xr.DataTree, name: str) -> list[Curve]:
+    """One recorded variable and its prediction, split by material and wavelength."""
+    if name not in variables(result):
+        lacks = f", for it has no {_missing(result, name)}" if name in QUANTITIES else ""
+        raise FitError(
+            f"the result has no readings of {name} to draw{lacks}",
+            where="figure",
+            hint=f"choose one of {', '.join(variables(result)) or 'none'}",
+        )
+    observed = result["observed_data"].to_dataset()[name]
+    lead = [str(dim) for dim in observed.dims if dim != "view"]
+    constants = result["constant_data"].to_dataset()
+
+    def by_view(values: xr.DataArray) -> np.ndarray:
+        return values.broadcast_like(observed).transpose(*lead, "view").to_numpy()
+
+    values = by_view(observed).astype(float)
+    center, draws = (
+        result[group][name]
+        .transpose(*SAMPLE_DIMS, *lead, "view")
+        .to_numpy()
+        .astype(float)
+        .reshape(-1, *values.shape)
+        for group in ("noise_free", "posterior_predictive")
+    )
+    center = np.median(center, axis=0)
+    # A point fit has a single draw, whose quantiles would look like certainty.
+    levels = np.full((len(LEVELS), *center.shape), np.nan)
+    if len(draws) > 1:
+        levels = np.quantile(draws, LEVELS, axis=0)
+    angles = {key: by_view(constants[key]) for key in GEOMETRY}
+    fitted, saturated = (by_view(constants[key]).astype(bool) for key in ("valid", "saturated"))
+    azimuth = np.abs((angles["view_azimuth"] - angles["light_azimuth"] + 180.0) % 360.0 - 180.0)
+    titles = _titles(observed, lead)
+    return [
+        Curve(
+            title=titles[place],
+            zenith=angles["view_zenith"][place],
+            azimuth=azimuth[place],
+            light_zenith=angles["light_zenith"][place],
+            observed=values[place],
+            fitted=fitted[place],
+            saturated=saturated[place],
+            levels=levels[(slice(None), *place)],
+            center=center[place],
+        )
+        for place in np.ndindex(values.shape[:-1])
+    ]
+
+
+def _titles(observed: xr.DataArray, lead: list[str]) -> Mapping[tuple[int, ...], str]:
+    first = xr.Dataset({"x": observed.isel(view=0, drop=True).expand_dims(SAMPLE_DIMS)})
+    return {
+        tuple(scalar.index[dim] for dim in lead): ", ".join(
+            style.coordinate_label(dim, scalar.labels[dim]) for dim in lead
+        )
+        for scalar in scalars(first)
+    }
+
+
+@style.styled
+def plot_readings(result: xr.DataTree, name: str) -> Figure:
+    """One recorded variable against view zenith, with posterior median and predictive bands.
+
+    With 2 to 4 azimuths between view and light: a row for every material and wavelength (at most
+    6), a column for every azimuth. Otherwise one panel for every material and wavelength.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+        name: dop, q, u or intensity.
+
+    Returns:
+        The figure.
+
+    Raises:
+        FitError: The result has no such variable.
+    """
+    figure = _draw_readings(result, curves(result, name), QUANTITIES[name], SHORT[name])
+    if name == "dop":
+        bottom, top = figure.axes[0].get_ylim()
+        figure.axes[0].set_ylim(max(bottom, -0.03), min(top, 1.03))
+    return figure
+
+
+@style.styled
+def plot_residuals(result: xr.DataTree, name: str) -> Figure:
+    """The same after subtracting the fitted curve: where the model misses, and by how much.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+        name: dop, q, u or intensity.
+
+    Returns:
+        The figure, with the layout of `plot_readings`.
+
+    Raises:
+        FitError: The result has no such variable.
+    """
+    residuals = [curve.minus_center() for curve in curves(result, name)]
+    label = f"{SHORT[name]} minus fit"
+    return _draw_readings(result, residuals, label, label)
+
+
+def _draw_readings(result: xr.DataTree, found: list[Curve], label: str, short_label: str) -> Figure:
+    azimuths = _azimuths(found)
+    if len(azimuths) > 1:
+        shown = found[:MAX_ROWS]
+        figure, panels = _panels_by_azimuth(shown, azimuths, short_label)
+    else:
+        shown = found[: MAX_ROWS // 2 * COLUMNS]
+        figure, panels = _panels_by_curve(shown, label)
+    limit = float(provenance_of(result).get("largest_view_zenith", 90.0))
+    drawn: set[str] = set()
+    for axes, curve in panels:
+        drawn |= _draw_curve(axes, curve, limit)
+    style.set_tick_style(figure.axes)
+    zenith = np.concatenate([curve.zenith for curve in found])
+    zenith = zenith[np.isfinite(zenith)]
+    low, high = (float(zenith.min()), float(zenith.max())) if zenith.size else (0.0, 90.0)
+    margin = max(0.03 * (high - low), 1.0)
+    figure.axes[0].set_xlim(max(low - margin, -1.0), min(high + margin, 91.0))
+    where = f", {_azimuth_title(azimuths[0])}" if len(azimuths) == 1 else ""
+    # Not as a title: there the legend would cover it.
+    part = f" (the first {len(shown)} of {len(found)})" if len(found) > len(shown) else ""
+    figure.supxlabel(f"view zenith [degree]{where}{part}", fontsize=9)
+    handles = [handle for key, handle in _reading_handles().items() if key in drawn]
+    style.add_legend(figure, handles, columns=4 if figure.get_figwidth() > 7.0 else 3)
+    return figure
+
+
+type Panels = list[tuple[Axes, Curve]]
+
+
+def _panels_by_azimuth(
+    shown: list[Curve], azimuths: list[float], label: str
+) -> tuple[Figure, Panels]:
+    """A row for each curve, a column for each azimuth."""
+    figure = style.NotebookFigure(figsize=(8.2, 1.75 * len(shown) + 0.9), layout="constrained")
+    axes = figure.subplots(len(shown), len(azimuths), sharex=True, sharey=True, squeeze=False)
+    panels: Panels = []
+    for row, curve in zip(axes, shown, strict=True):
+        lines = [style.label_text(line, 24) for line in (label, curve.title) if line]
+        row[0].set_ylabel("\n".join(lines))
+        for each, azimuth in zip(row, azimuths, strict=True):
+            panels.append((each, curve.at(np.round(curve.azimuth) == azimuth)))
+    for each, azimuth in zip(axes[0], azimuths, strict=True):
+        each.set_title(_azimuth_title(azimuth))
+    return figure, panels
+
+
+def _panels_by_curve(shown: list[Curve], label: str) -> tuple[Figure, Panels]:
+    """One panel for each curve, whatever its azimuths."""
+    columns = {1: 1, 2: 2, 4: 2}.get(len(shown), COLUMNS)
+    rows = -(-len(shown) // columns)
+    size = (8.2, 2.1 * rows + 0.9) if columns > 1 else (6.6, 3.9)
+    figure = style.NotebookFigure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    panels: Panels = []
+    for each, curve in zip(axes.flat, shown, strict=False):
+        panels.append((each, curve.at(np.ones(curve.zenith.shape, bool))))
+        each.set_title(style.wrap(style.label_text(curve.title), 34))
+    for row in axes:
+        row[0].set_ylabel(label)
+    for each in axes.flat[len(shown) :]:
+        each.set_axis_off()
+    for each in axes.flat[max(len(shown) - columns, 0) : len(shown)]:
+        each.tick_params(labelbottom=True)
+    return figure, panels
+
+
+def _azimuths(found: list[Curve]) -> list[float]:
+    """The distinct azimuths between view and light, to the degree; none if there are many."""
+    azimuths = np.concatenate([curve.azimuth for curve in found])
+    distinct = sorted(set(np.round(azimuths[np.isfinite(azimuths)])), reverse=True)
+    return [float(each) for each in distinct] if len(distinct) <= MAX_AZIMUTHS else []
+
+
+def _azimuth_title(azimuth: float) -> str:
+    side = {180.0: " (mirror side)", 0.0: " (light's side)"}.get(azimuth, "")
+    return f"azimuth {azimuth:g}°{side}"
+
+
+def _draw_curve(axes: Axes, curve: Curve, limit: float) -> set[str]:
+    """Draw one panel; returns the keys of the legend entries that it uses."""
+    drawn = _draw_prediction(axes, curve)
+    markers = _reading_markers()
+    observed = np.isfinite(curve.observed)
+    for key, chosen in (
+        ("reading", observed & ~curve.saturated),
+        ("saturated", observed & curve.saturated),
+    ):
+        if chosen.any():
+            axes.plot(curve.zenith[chosen], curve.observed[chosen], zorder=5, **markers[key])
+            drawn.add(key)
+    masked = curve.zenith[~observed]
+    if masked.size:
+        transform = axes.get_xaxis_transform()
+        height = np.full(masked.size, 0.03)
+        axes.plot(masked, height, transform=transform, clip_on=False, **markers["masked"])
+        drawn.add("masked")
+    if limit < 90.0:
+        axes.axvspan(limit, 90.0, color=lighten(GRAY, 0.9), lw=0, zorder=0)
+        drawn.add("aside")
+    return drawn
+
+
+def _draw_prediction(axes: Axes, curve: Curve) -> set[str]:
+    if not curve.zenith.size:
+        return set()
+    line: dict[str, Any] = {"lw": 1.4} if curve.is_smooth else {"marker": "_", "ms": 7, "mew": 1.4}
+    ls = "-" if curve.is_smooth else ""
+    axes.plot(curve.zenith, curve.center, color=BLUE, zorder=3, ls=ls, **line)
+    # Where a reading is missing, so may be its error: the scatter there is not known.
+    known = curve.fitted & np.isfinite(curve.levels).all(axis=0)
+    if not known.any():
+        return {"median"}
+    zenith, levels = curve.zenith[known], curve.levels[:, known]
+    for inner, share, width in ((0, 0.78, 2.0), (1, 0.5, 4.5)):
+        low, high = levels[inner], levels[-1 - inner]
+        color = lighten(BLUE, share)
+        if curve.is_smooth:
+            axes.fill_between(zenith, low, high, color=color, lw=0)
+        else:
+            axes.vlines(zenith, low, high, color=color, lw=width)
+    return {"median", "half", "most"}
+
+
+def _reading_markers() -> dict[str, dict[str, Any]]:
+    edge = {"mec": style.text_color(), "mew": 0.5}
+    return {
+        "reading": {"ls": "none", "marker": "o", "ms": 3.4, "color": style.text_color()},
+        "saturated": {"ls": "none", "marker": "^", "ms": 5.5, "color": VERMILLION, **edge},
+        "masked": {"ls": "none", "marker": "x", "ms": 4.5, "color": GRAY, "mew": 1.1},
+    }
+
+
+def _reading_handles() -> dict[str, Artist]:
+    labels = {"reading": "reading", "saturated": "saturated", "masked": "masked: not fitted"}
+    markers = _reading_markers()
+    return {
+        **{key: Line2D([], [], label=labels[key], **markers[key]) for key in labels},
+        "aside": Patch(color=lighten(GRAY, 0.9), label="set aside: beyond the angle limit"),
+        "median": Line2D([], [], color=BLUE, lw=1.4, label="fitted curve"),
+        "half": Patch(color=lighten(BLUE, 0.5), label="50% of new readings"),
+        "most": Patch(color=lighten(BLUE, 0.78), label="95% of new readings"),
+    }
+
+
+# --- Parameters against wavelength ----------------------------------------------------------------
+
+MAX_MEMBERS = 12
+MAX_DRAWS = 1000
+FINE = 61
+BEYOND = 0.05
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Spectrum:
+    """One parameter of one member over wavelength."""
+
+    title: str
+    label: str
+    measured: np.ndarray
+    levels: np.ndarray
+    true: np.ndarray
+    between: np.ndarray
+    band: np.ndarray
+
+
+def spectra(result: xr.DataTree) -> dict[str, list[Spectrum]]:
+    """Each parameter of a fit over wavelength, of at most 12 members."""
+    every = posterior_scalars(result)
+    names = {scalar.name for scalar in every}
+    found: dict[str, dict[str, list[Scalar]]] = {}
+    for scalar in every:
+        if "wavelength" in scalar.index and not is_hyperparameter(scalar.name, names):
+            labels = {dim: at for dim, at in scalar.labels.items() if dim != "wavelength"}
+            member = ", ".join(style.coordinate_label(dim, at) for dim, at in labels.items())
+            found.setdefault(scalar.name, {}).setdefault(member, []).append(scalar)
+    found = {name: members for name, members in found.items() if _can_be_drawn(members)}
+    if not found or method_of(result) == "point":
+        return {}
+    wavelengths = result["posterior"].to_dataset()["wavelength"].to_numpy().astype(float)
+    low, high = wavelengths.min(), wavelengths.max()
+    beyond = min(BEYOND * (high - low), 0.5 * low)
+    between = np.union1d(np.linspace(low - beyond, high + beyond, FINE), wavelengths)
+    bands = _bands(result, between)
+    return {
+        name: [
+            _spectrum(result, title, own, between, bands.get(name, {}).get(at))
+            for at, (title, own) in enumerate(list(members.items())[:MAX_MEMBERS])
+        ]
+        for name, members in found.items()
+    }
+
+
+def _can_be_drawn(members: Mapping[str, Sequence[Scalar]]) -> bool:
+    """Whether there are two wavelengths, and all draws are finite."""
+    return all(
+        len({scalar.labels["wavelength"] for scalar in own}) > 1
+        and all(bool(np.isfinite(scalar.draws).all()) for scalar in own)
+        for own in members.values()
+    )
+
+
+def _bands(result: xr.DataTree, between: np.ndarray) -> dict[str, dict[int, np.ndarray]]:
+    """Quantiles between the measured wavelengths, by parameter and number of the member."""
+    posterior = result["posterior"].to_dataset()
+    step = max(1, posterior.sizes["chain"] * posterior.sizes["draw"] // MAX_DRAWS)
+    chosen = {"draw": slice(None, None, step)}
+    lead = [str(d) for d in posterior.dims if d in ("patch", "material")]
+    if len(lead) == 1:
+        chosen[lead[0]] = slice(MAX_MEMBERS)
+    thin = xr.DataTree.from_dict(
+        {
+            group: result[group].to_dataset().isel(chosen, missing_dims="ignore")
+            for group in ("posterior", "unconstrained_posterior")
+            if group in result.children
+        }
+    )
+    thin.attrs = dict(result.attrs)
+    try:
+        predicted = predict_spectrum(thin, between)
+    except FitError:
+        # Nothing ties the wavelengths together, or only the user's own model knows what does.
+        return {}
+    found: dict[str, dict[int, np.ndarray]] = {}
+    for name, variable in predicted.data_vars.items():
+        lead = [str(d) for d in variable.dims if d not in (*SAMPLE_DIMS, "wavelength")]
+        draws = variable.transpose(*SAMPLE_DIMS, *lead, "wavelength").to_numpy()
+        draws = draws.reshape(draws.shape[0] * draws.shape[1], -1, between.size)
+        found[str(name)] = dict(enumerate(np.quantile(draws, LEVELS, axis=0).transpose(1, 0, 2)))
+    return found
+
+
+def _spectrum(
+    result: xr.DataTree,
+    title: str,
+    own: Sequence[Scalar],
+    between: np.ndarray,
+    band: np.ndarray | None,
+) -> Spectrum:
+    posterior = result["posterior"].to_dataset()
+    measured = posterior["wavelength"].to_numpy().astype(float)
+    order = np.argsort(measured, kind="stable")
+    draws = np.stack([scalar.draws.ravel() for scalar in own])[order]
+    if band is None or not np.isfinite(band).all():
+        between, band = np.empty(0), np.empty((len(LEVELS), 0))
+    return Spectrum(
+        title=style.label_text(title),
+        label=style.short_title(own[0], posterior),
+        measured=measured[order],
+        levels=np.quantile(draws, LEVELS, axis=1),
+        true=np.array([truth_of(result, scalar) for scalar in own])[order],
+        between=between,
+        band=band,
+    )
+
+
+@style.styled
+def plot_spectrum(
+    result: xr.DataTree, name: str, found: dict[str, list[Spectrum]] | None = None
+) -> Figure:
+    """One parameter over wavelength: median, 50% and 95%, a panel for each member.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+        name: The parameter, such as refractive_index.
+        found: That of `spectra(result)`, where it is there already.
+
+    Returns:
+        The figure: bands between and beyond the measured wavelengths where the fit ties colors
+        together, and intervals at each of them where it does not.
+
+    Raises:
+        FitError: The fit does not have that parameter over wavelength.
+    """
+    found = spectra(result) if found is None else found
+    if name not in found:
+        raise FitError(
+            f"{name} was not fitted over wavelength",
+            where="plot_spectrum",
+            hint=f"choose one of {', '.join(found) or 'none'}",
+        )
+    shown = found[name]
+    several = len(shown) > 1
+    figure, panels = style.grid(
+        len(shown),
+        columns=3 if len(shown) != 4 else 2,
+        width=8.2 if several else 6.6,
+        panel_height=1.9 if several else 2.9,
+        header=0.8,
+    )
+    for axes, each in zip(panels, shown, strict=True):
+        _draw_spectrum(axes, each)
+        axes.set_title(style.wrap(each.title, 34) if several else "", loc="left")
+    # One scale for all members, so that they can be compared.
+    low, high = (end([axes.get_ylim() for axes in panels]) for end in (np.min, np.max))
+    for axes in panels:
+        axes.set_ylim(low, high)
+        axes.locator_params(axis="x", nbins=5)
+    style.set_tick_style(panels)
+    sizes = result["posterior"][name].sizes
+    total = np.prod([sizes[dim] for dim in sizes if dim not in (*SAMPLE_DIMS, "wavelength")])
+    part = f" (the first {len(shown)} of {int(total)})" if total > len(shown) else ""
+    figure.supxlabel(f"wavelength [nm]{part}", fontsize=9)
+    figure.supylabel(shown[0].label, fontsize=9)
+    style.add_legend(figure, _spectrum_handles(shown), columns=5)
+    return figure
+
+
+def _draw_spectrum(axes: Axes, each: Spectrum) -> None:
+    if each.between.size:
+        for at in each.measured:
+            axes.axvline(at, color=lighten(GRAY, 0.6), lw=0.7, ls=(0, (2, 2)), zorder=3)
+        for low, high, share in ((0, 4, 0.75), (1, 3, 0.45)):
+            color = lighten(BLUE, share)
+            axes.fill_between(each.between, each.band[low], each.band[high], color=color, lw=0)
+        axes.plot(each.between, each.band[2], color=BLUE, lw=1.4, zorder=4)
+        limits = each.between[[0, -1]]
+    else:
+        axes.vlines(each.measured, each.levels[0], each.levels[4], color=BLUE, lw=1.1)
+        axes.vlines(each.measured, each.levels[1], each.levels[3], color=BLUE, lw=3.6)
+        ring: dict[str, Any] = {"mfc": style.background(), "mec": BLUE, "ms": 4.5}
+        axes.plot(each.measured, each.levels[2], "o", ls="", **ring)
+        margin = 0.08 * np.ptp(each.measured)
+        limits = each.measured[[0, -1]] + [-margin, margin]
+    known = np.isfinite(each.true)
+    truth = {**style.true_value_style(), "mew": 0.6}
+    axes.plot(each.measured[known], each.true[known], zorder=6, **truth)
+    axes.set_xlim(*limits)
+
+
+def _spectrum_handles(shown: Sequence[Spectrum]) -> list[Artist]:
+    handles: list[Artist]
+    if shown[0].between.size:
+        handles = [
+            Line2D([], [], color=BLUE, lw=1.4, label="posterior median"),
+            Patch(color=lighten(BLUE, 0.45), label="50%"),
+            Patch(color=lighten(BLUE, 0.75), label="95%"),
+            Line2D([], [], color=lighten(GRAY, 0.6), lw=0.9, ls=(0, (2, 2)), label="measured"),
+        ]
+    else:
+        ring = style.background()
+        handles = [
+            Line2D([], [], color=BLUE, marker="o", mfc=ring, ls="", label="posterior median"),
+            Line2D([], [], color=BLUE, lw=3.6, label="50%"),
+            Line2D([], [], color=BLUE, lw=1.1, label="95%"),
+        ]
+    if any(np.isfinite(each.true).any() for each in shown):
+        handles.append(style.true_value_handle())
+    return handles
