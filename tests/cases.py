@@ -72,7 +72,7 @@ def each(names: str | Sequence[str], values: Iterable, ids: Names = None) -> Cal
         ids: Names of the cases, or a function of one value.
 
     Decorators above one another give every combination. In each case `monkeypatch` and
-    `tmp_path` are fresh, and fixtures that are datasets, trees or dictionaries of datasets are copies.
+    `tmp_path` are fresh; datasets, trees and dictionaries of datasets are copies.
     """
     outer = _cases(names, values, ids)
 
