@@ -17,6 +17,7 @@ def test_simulate_writes_what_fit_reads(tmp_path: Path, capsys: pytest.CaptureFi
     assert dict(capture.sizes) == {"view": 40, "wavelength": 3}
 
 
+@pytest.mark.thorough
 def test_the_table_has_a_row_per_parameter(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

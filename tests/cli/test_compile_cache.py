@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from cases import each
 
 from polar_bayes.cli.entry import FOLDER, keep_compiled_programs
 
@@ -47,7 +46,9 @@ def test_new_folders_are_for_the_user_alone(base: Path, capsys) -> None:
     assert FOLDER in os.environ
 
 
-@each(("part", "mode"), [("", 0o777), ("polar_bayes", 0o770), ("polar_bayes/compiled", 0o1777)])
+@pytest.mark.parametrize(
+    ("part", "mode"), [("", 0o777), ("polar_bayes", 0o770), ("polar_bayes/compiled", 0o1777)]
+)
 def test_a_folder_that_others_can_write_to_is_not_used(
     base: Path, capsys, part: str, mode: int
 ) -> None:

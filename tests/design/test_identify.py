@@ -105,6 +105,7 @@ def test_glass_does_not_tell_its_absorption(glass: xr.Dataset, of_glass: xr.Data
     assert flat[0].startswith("absorption is flat: the data exclude nothing below, down to 0.0")
 
 
+@pytest.mark.thorough
 def test_the_papers_sum_is_that_of_slopes_and_concentrations(
     glass: xr.Dataset, of_glass: xr.Dataset
 ) -> None:

@@ -36,6 +36,7 @@ CASES = {
 }
 
 
+@pytest.mark.thorough
 @each("case", CASES)
 def test_it_is_the_mean_square_of_scores(case: str) -> None:
     make, at = CASES[case]

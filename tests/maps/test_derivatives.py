@@ -69,7 +69,7 @@ CASES: dict[str, tuple[Callable, int]] = {
 
 
 EVERY = [
-    pytest.param(name, marks=pytest.mark.thorough) if name.startswith("two links") else name
+    name if name == "two colors" else pytest.param(name, marks=pytest.mark.thorough)
     for name in CASES
 ]
 
@@ -156,6 +156,7 @@ def readings(program: Program, z: jax.Array, data: Observations) -> jax.Array:
     return jnp.ravel(PLATE.predict(parameters, data.geometry)["q"])
 
 
+@pytest.mark.thorough
 @each("name", ["known noise", "two colors"])
 def test_scoring_of_normal_noise_is_that_of_gauss_and_newton(name: str) -> None:
     here = case(name)

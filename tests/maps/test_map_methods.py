@@ -28,6 +28,7 @@ def tempered(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
     return pb.fit_pixels(image, method=TEMPERING, **ASKED)
 
 
+@pytest.mark.thorough
 def test_tempered_maps_are_those_of_a_grid(image: xr.Dataset, tempered: xr.Dataset) -> None:
     assert (tempered["status"] == Status.GOOD).all()
     assert (tempered["approach"] == Approach.TEMPERED).all()

@@ -202,6 +202,7 @@ def test_a_map_without_weights_is_the_laplace_fit_of_its_pixel() -> None:
 # --- what the intervals are worth -----------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_intervals_hold_the_truth_as_often_as_they_say(image: xr.Dataset, maps: xr.Dataset) -> None:
     # 900 plates drawn from the priors, readings from the model's own noise: a true map fails
     # once in 1000 (six comparisons).

@@ -39,6 +39,7 @@ def sampled(made) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     return _sampled(engine, pixels, settled.peak, np.array([40, 50, 60]))
 
 
+@pytest.mark.thorough
 def test_a_skewed_pixel_has_the_posterior_of_a_grid(sampled) -> None:
     draws, r_hat, effective = sampled
     assert (r_hat < 1.02).all()

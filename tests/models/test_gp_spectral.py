@@ -193,6 +193,7 @@ HARD_COLORS = {
 }
 
 
+@pytest.mark.thorough
 @each("precision", ["double", "single"])
 @each("colors", HARD_COLORS.values(), ids=HARD_COLORS)
 def test_density_and_gradient_are_finite(colors: np.ndarray, precision: str) -> None:

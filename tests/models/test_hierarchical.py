@@ -190,6 +190,7 @@ def test_many_members_keep_a_fixed_metric_and_converge() -> None:
     assert spread[0] < 0.03 < spread[1]  # fails once in 1000 true captures
 
 
+@pytest.mark.thorough
 def test_coordinates_of_members_stand_apart_and_the_choice_is_recorded() -> None:
     model = pb.models.Hierarchical(pooled=("refractive_index", "subsurface_fraction"))
     capture = plates(np.linspace(1.45, 1.55, 12), 0.01, seed=7)

@@ -88,6 +88,7 @@ def test_bands_widen_away_from_the_knots() -> None:
     assert spread[-1] == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.thorough
 @each("dtype", [jnp.float64, jnp.float32])
 @each(
     ("kernel", "cases"),

@@ -5,6 +5,7 @@ import io
 
 import numpy as np
 import pandas as pd
+import pytest
 from cases import each
 from pages import Page
 from synthetic_accuracy import make_accuracy
@@ -46,6 +47,7 @@ def test_a_row_of_two_names_has_two_columns() -> None:
     assert found["fit"].tolist() == ["'=a"]
 
 
+@pytest.mark.thorough
 @each(
     "make",
     [

@@ -49,7 +49,7 @@ every_plot = each("draw", DRAWN.values(), ids=DRAWN)
 
 
 def test_every_public_plot_is_tested_here() -> None:
-    assert set(DRAWN) == {name for name in pb.__all__ if name.startswith("plot_")}
+    assert set(DRAWN) == {name for name in pb.plots.__all__ if name.startswith("plot_")}
 
 
 @every_plot
