@@ -60,13 +60,13 @@ def tried(case: Case, found: xr.DataTree, number: int, keep: Path) -> tuple[str,
             case.capture(seed=2),
             scene=case.scene,
             links=case.links,
-            rungs={rung: pb.methods.LADDER[rung]},
+            rungs={method: pb.methods.STUDY_METHODS[method]},
             overrides=(),
             fresh=False,
             seed=1,
         )
         pb.save_result(again, file)
-    return rung, float(
+    return method, float(
         pb.benchmark.accuracy_table(pb.benchmark.load_accuracy(file))["error"].iloc[0]
     )
 
@@ -89,18 +89,18 @@ def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]])
     """Errors and times of the methods, and the advice, in Markdown."""
     lines = [f"Measured on {platform.machine()}, {os.cpu_count()} cores.", ""]
     lines += [
-        "| scene | " + " | ".join(pb.methods.LADDER) + " | reference |",
-        "|---" * (len(pb.methods.LADDER) + 2) + "|",
+        "| scene | " + " | ".join(pb.methods.STUDY_METHODS) + " | reference |",
+        "|---" * (len(pb.methods.STUDY_METHODS) + 2) + "|",
     ]
     for name, found in studies.items():
         rows = pb.benchmark.accuracy_table(found)
         noise = float(accuracy_dataset(found).attrs["reference_error"])
-        cells = [_cell(rows, rung) for rung in pb.methods.LADDER]
+        cells = [_cell(rows, method) for method in pb.methods.STUDY_METHODS]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {noise:.2g} |")
     lines += ["", "| scene | advice | the best_method method on another capture |", "|---|---|---|"]
     for name, found in studies.items():
-        rung, error = trials[name]
-        seen = "" if np.isnan(error) else f"{rung}: {error:.2g} sd"
+        method, error = trials[name]
+        seen = "" if np.isnan(error) else f"{method}: {error:.2g} sd"
         lines.append(f"| {name} | {pb.benchmark.accuracy_sentences(found, TOLERANCE)} | {seen} |")
     return "\n".join(lines)
 

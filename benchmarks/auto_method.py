@@ -7,7 +7,6 @@ choice and judged by a reference of its own. Fits are kept in the folder, and go
 """
 
 import argparse
-import dataclasses
 import json
 import time
 from pathlib import Path
@@ -17,14 +16,16 @@ import jax
 import numpy as np
 import scipy.stats
 from accuracy_scenes import CASES, Case
+from jaxtyping import Array
 
 import polar_bayes as pb
 from polar_bayes.benchmark.reference import distances, run_reference
-from polar_bayes.benchmark.run import labeled, problem_of
+from polar_bayes.benchmark.run import labeled
 from polar_bayes.calibration.simulations import draw_captures
-from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.problem import CompiledModel, Problem, make_problem
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.run_method import answer
+from polar_bayes.observation.data import Observations
+from polar_bayes.progress import no_progress
 
 LAYOUTS = ("smooth glass, 6 views", "leaf, 40 views")
 REFERENCE = pb.benchmark.Reference(error=0.02)
@@ -35,36 +36,39 @@ RUNGS = ("importance", "tempered", "nuts")
 def fit_some(case: Case, numbers: np.ndarray, auto: pb.methods.Auto) -> list[dict[str, Any]]:
     """The automatic choice and the reference of some simulated captures."""
     layout = case.capture(seed=0)
-    request = resolve(layout, "per_material", auto, case.scene, None, case.links, None, 0, "double")
+    request = resolve(layout, "per_material", case.scene, None, case.links, None, 0, "double")
     key = jax.random.key(7)
-    base = problem_of(request, key)
+    base = make_problem(request, key)
     drawn = draw_captures(base.program, base.data, np.resize(numbers, CHUNK), key)
     found = []
     for at, number in enumerate(numbers):
         data = drawn.captures.pixel(at)
         own = jax.random.fold_in(key, int(number))
-        problem = Problem(request, base.compiled_model, data, own, base.progress)
-        found.append({"number": int(number), **_judged(problem, auto)})
+        found.append({"number": int(number), **_judged(base.compiled_model, data, own, auto)})
         print(found[-1], flush=True)
     return found
 
 
-def _judged(problem: Problem, auto: pb.methods.Auto) -> dict[str, Any]:
+def _judged(
+    model: CompiledModel, data: Observations, key: Array, auto: pb.methods.Auto
+) -> dict[str, Any]:
+    key_search, key_draws = jax.random.split(key)
+    problem = Problem(model, data, key_search)
     begin = time.perf_counter()
-    told = answer(auto, problem)
+    draws_of_auto = auto.run(problem, key_draws, no_progress)
     seconds = time.perf_counter() - begin
-    other = dataclasses.replace(problem, key=jax.random.fold_in(problem.key, 9))
-    reference_run = run_reference(REFERENCE, other)
-    _, draws = labeled(problem.program, told.z, problem.data)
+    key_search, key_draws = jax.random.split(jax.random.fold_in(key, 9))
+    reference_run = run_reference(REFERENCE, Problem(model, data, key_search), key_draws)
+    _, draws = labeled(problem, draws_of_auto.z)
     flat, reference = (x.reshape(len(x), -1) for x in (draws, reference_run.draws))
     apart = distances(flat, reference)
     error = float(np.max(np.abs([apart.mean_error, apart.sd_error])))
     return {
         "error": error,
         "seconds": seconds,
-        "chosen": told.said["auto"]["chosen"],
-        "said_met": told.said["auto"]["met"],
-        "expected": told.said["auto"]["expected_error"],
+        "chosen": draws_of_auto.metadata["auto"]["chosen"],
+        "said_met": draws_of_auto.metadata["auto"]["met"],
+        "expected": draws_of_auto.metadata["auto"]["expected_error"],
         "reference_error": reference_run.error,
         "reference_doubts": list(reference_run.doubts),
     }

@@ -45,7 +45,7 @@ LENGTHS = {"num_warmup": 500, "num_samples": 500}
 def by_loop(capture: xr.Dataset, count: int) -> Iterator[tuple[float, float]]:
     """Seconds and least ESS of each fit by a chain of NumPyro's own, compiled once."""
     with jax.enable_x64(True):
-        request = resolve(capture, "per_material", "laplace", SCENE, None, None, None, 0, "double")
+        request = resolve(capture, "per_material", SCENE, None, None, None, 0, "double")
         data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
         model = request.bind(SCENE)
         program = compile_program(model, data)
@@ -64,7 +64,7 @@ def by_loop(capture: xr.Dataset, count: int) -> Iterator[tuple[float, float]]:
 def by_simuk(capture: xr.Dataset, count: int) -> float:
     """Seconds of some fits by simuk."""
     with jax.enable_x64(True):
-        request = resolve(capture, "per_material", "laplace", SCENE, None, None, None, 0, "double")
+        request = resolve(capture, "per_material", SCENE, None, None, None, 0, "double")
         data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
         model = request.bind(SCENE)
 

@@ -71,7 +71,7 @@ def gradients(scenes: list[pb.Scene], data: xr.Dataset) -> list[Cost]:
     """Cost of one value and gradient of the log posterior density, scene by scene."""
     compiled, calls = [], []
     for scene in scenes:
-        request = resolve(data, "per_material", "laplace", scene, None, None, None, 0, "double")
+        request = resolve(data, "per_material", scene, None, None, None, 0, "double")
         readings = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
         program = compile_program(request.bind(scene), readings)
         z = np.zeros(program.size)

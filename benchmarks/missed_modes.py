@@ -21,12 +21,12 @@ from polar_bayes.calibration.calibrate import make_plan
 from polar_bayes.calibration.runner import Plan, fit_block
 from polar_bayes.inference.request import resolve
 
-LARGE = pb.methods.PixelTempering(walks=4096, draws=16384)
+LARGE = pb.methods.PixelSMC(num_chains=4096, draws=16384)
 
 
 def large(seed: int) -> Plan:
     """The same simulations, fitted by the larger crowd."""
-    request = resolve(layout(), "per_material", "laplace", SCENE, None, None, None, seed, "double")
+    request = resolve(layout(), "per_material", SCENE, None, None, None, seed, "double")
     return make_plan(request, None, LARGE, readings=False)
 
 

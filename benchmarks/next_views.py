@@ -34,9 +34,9 @@ from polar_bayes.design.fisher import (
 )
 from polar_bayes.design.optimal_design import Selection, fedorov_exchange
 from polar_bayes.design.setup import parameter_vector, unconstrain
-from polar_bayes.inference.batch_fit import PixelLaplace, fit_stack
-from polar_bayes.inference.batch_programs import BatchEngine, EngineSpec, key_of, make_engine
-from polar_bayes.inference.batching import Stack
+from polar_bayes.inference.batch_engine import BatchEngine, engine_key, make_engine
+from polar_bayes.inference.batch_laplace import PixelLaplace
+from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
@@ -74,11 +74,11 @@ def layout() -> xr.Dataset:
     )
 
 
-def fit_some(engine: BatchEngine, captures: Stack, seen: np.ndarray) -> Fits:
+def fit_some(engine: BatchEngine, captures: ObservationBatch, seen: np.ndarray) -> Fits:
     """Fit every capture by the views that it has seen, (material, view)."""
-    valid = np.broadcast_to(seen, captures.own.valid.shape)
-    masked = Stack(
-        dataclasses.replace(captures.own, valid=valid), captures.shared, valid.sum(axis=-1)
+    valid = np.broadcast_to(seen, captures.batched.valid.shape)
+    masked = ObservationBatch(
+        dataclasses.replace(captures.batched, valid=valid), captures.static, valid.sum(axis=-1)
     )
     count = len(captures)
     mean, sd = ({name: np.full(count, np.nan) for name in NAMES} for _ in range(2))
@@ -97,7 +97,7 @@ def fit_some(engine: BatchEngine, captures: Stack, seen: np.ndarray) -> Fits:
             for name, kept in few.items():
                 kept[material] = np.asarray(parameters[name])[row, some]
 
-    fit_stack(engine, PixelLaplace(draws=512), masked, np.arange(count), 0, describe)
+    PixelLaplace(draws=512).run_batch(engine, masked, np.arange(count), 0, describe)
     flat = {name: kept.ravel() for name, kept in few.items()}
     z = unconstrain(engine.program, flat).reshape(count, DRAWS, -1)
     return Fits(mean, sd, z)
@@ -157,10 +157,10 @@ def main(count: int) -> None:
     capture, links = layout(), {"dop": pb.links.BetaLink()}
     views = capture.sizes["view"]
     with jax.enable_x64(True):
-        request = resolve(capture, "per_material", "laplace", SCENE, None, links, None, 0, "double")
+        request = resolve(capture, "per_material", SCENE, None, links, None, 0, "double")
         data = observe(request.capture)
-        key = key_of(request, 32, request.largest_view_zenith)
-        engine = make_engine(EngineSpec(request, lambda: data, 32, key))
+        key = engine_key(request, request.largest_view_zenith)
+        engine = make_engine(key, request, lambda: data)
         drawn = draw_captures(engine.program, data, np.arange(count), jax.random.key(1))
         before = np.arange(views) < len(MEASURED)
         first = fit_some(engine, drawn.captures, np.tile(before, (count, 1)))

@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +28,6 @@ from paper_study import (
 
 import polar_bayes as pb
 from polar_bayes.calibration.simulations import Simulations, draw_captures
-from polar_bayes.inference.batching import together
 from polar_bayes.inference.laplace import Estimate, estimate
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.program import Program, compile_program
@@ -60,7 +60,6 @@ class LeastSquares:
             resolve(
                 capture,
                 model,
-                "laplace",
                 SCENE,
                 None,
                 None,
@@ -84,7 +83,7 @@ class LeastSquares:
         """All estimates with their standard errors."""
         captures = self.drawn.captures
         with jax.enable_x64(True):
-            found, slopes = self._run(captures.own, captures.shared)
+            found, slopes = self._run(captures.batched, captures.static)
         values, error = {}, {}
         variance = np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2)
         places = self.program.unravel(jnp.arange(self.program.size))
@@ -97,7 +96,7 @@ class LeastSquares:
 
 def _each(program: Program, own: Any, shared: Any, starts: Array) -> tuple[Estimate, tuple]:
     def fit(own: Any) -> tuple[Estimate, tuple]:
-        found = estimate(program, together(own, shared), starts)
+        found = estimate(program, eqx.combine(own, shared), starts)
         return found, (jax.jacfwd(program.constrain)(found.z), program.constrain(found.z))
 
     return jax.lax.map(fit, own)

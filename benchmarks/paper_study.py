@@ -17,7 +17,7 @@ import xarray as xr
 from jaxtyping import Array
 from numpyro import distributions as dist
 from one_material import SCENE
-from polar_bayes.models.sites import declare_readings, draw_own, material_parameters
+from polar_bayes.models.sites import declare_readings, draw_independent, material_parameters
 
 import polar_bayes as pb
 from polar_bayes.observation.data import Observations
@@ -89,7 +89,9 @@ class Population:
         at = jnp.clip(jnp.floor(which).astype(int), 0, len(self.classes) - 1)
         centers = [center(name) for name in self.classes]
         own = around({name: jnp.asarray([each[name] for each in centers])[at] for name in NAMES})
-        parameters = {name: draw_own(name, data, own) for name in material_parameters(scene)}
+        parameters = {
+            name: draw_independent(name, data, own) for name in material_parameters(scene)
+        }
         own["exposure"] = dist.LogNormal(jnp.log(exposure(parameters, scene)), SPREADS["exposure"])
         declare_readings(parameters, data, scene, own, links)
 

@@ -95,7 +95,6 @@ class Information:
             request = resolve(
                 capture,
                 "per_material",
-                "laplace",
                 SCENE,
                 None,
                 None,

@@ -10,7 +10,7 @@ compilation, on as many pixels as it can do in some seconds.
     scipy      least_squares in a loop, its own differences, normal priors of the coordinates
     guide      AutoLaplaceApproximation in a loop: BFGS, then its Hessian; compiled once
     newton     vmap of 25 damped Newton steps with full Hessians and jax.numpy.linalg
-    ours       `Engine.climb`: mode and covariance, one thread as the others
+    ours       `find_modes`: mode and covariance, one thread as the others
     threads    the same, a thread for each core
     single     the same in single precision, one thread
     both       single precision, a thread for each core
@@ -22,6 +22,7 @@ multiply-adds that stays in registers, the bandwidth that of a copy; both of one
 """
 
 import dataclasses
+import functools
 import os
 import platform
 import sys
@@ -30,6 +31,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,10 +44,14 @@ from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
 from polar_bayes.capture.schema import validate
-from polar_bayes.inference.batch_programs import BatchEngine
-from polar_bayes.inference.batching import CLIMBING, Stack, stack, together
-from polar_bayes.inference.levenberg_marquardt import expand, score
-from polar_bayes.maps.blocks import set_aside
+from polar_bayes.inference.batch_engine import BatchEngine
+from polar_bayes.inference.batching import LANES, ObservationBatch, batch_pixels
+from polar_bayes.inference.levenberg_marquardt import (
+    exact_derivatives,
+    find_modes,
+    scoring_derivatives,
+)
+from polar_bayes.maps.blocks import mask_missing
 from polar_bayes.maps.fit_map import plan_map
 from polar_bayes.observation.data import Observations
 
@@ -89,7 +95,7 @@ def rate(count: int, run: Callable[[], Any]) -> tuple[float, Any]:
     return count / (time.perf_counter() - start), found
 
 
-def by_scipy(engine: BatchEngine, pixels: Stack, count: int) -> np.ndarray:
+def by_scipy(engine: BatchEngine, pixels: ObservationBatch, count: int) -> np.ndarray:
     residuals = jax.jit(
         lambda z, data: jnp.concatenate([engine.program.residuals(z, data)["dop"] / NOISE, z])
     )
@@ -100,7 +106,7 @@ def by_scipy(engine: BatchEngine, pixels: Stack, count: int) -> np.ndarray:
     return np.stack(found)
 
 
-def by_guide(engine: BatchEngine, pixels: Stack, count: int) -> Any:
+def by_guide(engine: BatchEngine, pixels: ObservationBatch, count: int) -> Any:
     guide = AutoLaplaceApproximation(engine.program.model)
     search = SVI(engine.program.model, guide, optim.Minimize(), Trace_ELBO())
     state = search.init(jax.random.key(0), pixels.pixel(0))
@@ -114,9 +120,9 @@ def by_guide(engine: BatchEngine, pixels: Stack, count: int) -> Any:
     return lambda: [jax.block_until_ready(fit(pixels.pixel(i))) for i in range(count)]
 
 
-def by_newton(engine: BatchEngine, pixels: Stack, count: int) -> Callable:
+def by_newton(engine: BatchEngine, pixels: ObservationBatch, count: int) -> Callable:
     def fit(own: Observations, shared: Observations) -> jax.Array:
-        data = together(own, shared)
+        data = eqx.combine(own, shared)
 
         def potential(z: jax.Array) -> jax.Array:
             return engine.program.potential(z, data)
@@ -133,26 +139,26 @@ def by_newton(engine: BatchEngine, pixels: Stack, count: int) -> Callable:
 
     compiled = jax.jit(jax.vmap(fit, in_axes=(0, None)))
     some = pixels.subset(np.arange(count))
-    return lambda: jax.block_until_ready(compiled(some.own, some.shared))
+    return lambda: jax.block_until_ready(compiled(some.batched, some.static))
 
 
-def heights(engine: BatchEngine, pixels: Stack, z: np.ndarray) -> np.ndarray:
+def heights(engine: BatchEngine, pixels: ObservationBatch, z: np.ndarray) -> np.ndarray:
     """The potential of the first pixels at some places."""
     some = pixels.subset(np.arange(len(z)))
     with jax.enable_x64(True):
 
         def height(own: Observations, z: jax.Array) -> jax.Array:
-            return engine.program.potential(z, together(own, some.shared))
+            return engine.program.potential(z, eqx.combine(own, some.static))
 
-        return np.asarray(jax.jit(jax.vmap(height))(some.own, jnp.asarray(z)))
+        return np.asarray(jax.jit(jax.vmap(height))(some.batched, jnp.asarray(z)))
 
 
-def threaded(engine: BatchEngine, pixels: Stack) -> Callable:
+def threaded(engine: BatchEngine, pixels: ObservationBatch) -> Callable:
     """Climbs of equal shares of the pixels, a thread for each core."""
     cores = os.cpu_count() or 1
     shares = [pixels.subset(part) for part in np.array_split(np.arange(len(pixels)), cores)]
     pool = ThreadPoolExecutor(cores)
-    return lambda: list(pool.map(engine.climb, shares))
+    return lambda: list(pool.map(functools.partial(find_modes, engine), shares))
 
 
 def fastest(function: Callable, *given: Any) -> float:
@@ -179,25 +185,25 @@ def peaks(dtype: type) -> tuple[float, float]:
     return 2 * rounds * lanes / fastest(multiply_add, x), copied
 
 
-def roofline(engine: BatchEngine, pixels: Stack) -> None:
+def roofline(engine: BatchEngine, pixels: ObservationBatch) -> None:
     print("one look at a pixel      us   operations   bytes   Gop/s  of peak  of bandwidth")
     for name, program, look, dtype in (
-        ("scoring, single", engine.rough, score, np.float32),
-        ("scoring, double", engine.program, score, np.float64),
-        ("exact, double", engine.program, expand, np.float64),
+        ("scoring, single", engine.single_program, scoring_derivatives, np.float32),
+        ("scoring, double", engine.program, scoring_derivatives, np.float64),
+        ("exact, double", engine.program, exact_derivatives, np.float64),
     ):
         with jax.enable_x64(dtype is np.float64):
-            some = pixels.subset(np.arange(CLIMBING)).in_precision(dtype)
+            some = pixels.subset(np.arange(LANES)).in_precision(dtype)
 
             def batch(own: Any, shared: Any, z: Any, look=look, program=program) -> Any:
-                return jax.vmap(lambda own, z: look(program, z, together(own, shared)))(own, z)
+                return jax.vmap(lambda own, z: look(program, z, eqx.combine(own, shared)))(own, z)
 
-            given = (*jax.tree.map(jnp.asarray, (some.own, some.shared)), jnp.zeros((CLIMBING, 4)))
+            given = (*jax.tree.map(jnp.asarray, (some.batched, some.static)), jnp.zeros((LANES, 4)))
             compiled = jax.jit(batch).lower(*given).compile()
             cost, seconds = compiled.cost_analysis(), fastest(compiled, *given)
             peak, bandwidth = peaks(dtype)
-        operations, moved = cost["flops"] / CLIMBING, cost["bytes accessed"] / CLIMBING
-        speed = CLIMBING / seconds
+        operations, moved = cost["flops"] / LANES, cost["bytes accessed"] / LANES
+        speed = LANES / seconds
         print(
             f"{name:<18} {1e6 / speed:8.1f} {operations:12.0f} {moved:7.0f} "
             f"{operations * speed / 1e9:7.1f} {operations * speed / peak:8.2f} "
@@ -214,11 +220,11 @@ def main(count: int) -> None:
     }
     engine = plans["double"].engine
     with jax.enable_x64(True):
-        pixels = stack(plans["double"].observe(validate(set_aside(capture))))
+        pixels = batch_pixels(plans["double"].observe(validate(mask_missing(capture))))
         many = len(pixels)
-        ours, settled = rate(many, lambda: engine.climb(pixels))
+        ours, settled = rate(many, lambda: find_modes(engine, pixels))
         threads, _ = rate(many, threaded(engine, pixels))
-        single, near = rate(many, lambda: plans["single"].engine.climb(pixels))
+        single, near = rate(many, lambda: find_modes(plans["single"].engine, pixels))
         both, _ = rate(many, threaded(plans["single"].engine, pixels))
         scipy_rate, _ = rate(60, lambda: by_scipy(engine, pixels, 60))
         guide_rate, _ = rate(200, by_guide(engine, pixels, 200))
@@ -238,13 +244,13 @@ def main(count: int) -> None:
     }.items():
         ratios = (speed / peer for peer in (scipy_rate, newton_rate, guide_rate))
         print(f"{name:<8} {speed:11.0f}" + "".join(f"{ratio:11.1f}" for ratio in ratios))
-    sd = np.sqrt(np.sum(np.asarray(settled.peak.widths) ** 2, axis=1))
-    apart = np.max(np.abs(np.asarray(newton) - settled.peak.z[:1024]) / sd[:1024], axis=1)
+    sd = np.sqrt(np.sum(np.asarray(settled.mode.widths) ** 2, axis=1))
+    apart = np.max(np.abs(np.asarray(newton) - settled.mode.z[:1024]) / sd[:1024], axis=1)
     higher = heights(engine, pixels, np.asarray(newton)) - heights(
-        engine, pixels, settled.peak.z[:1024]
+        engine, pixels, settled.mode.z[:1024]
     )
-    off = np.max(np.abs(near.peak.z - settled.peak.z) / sd, axis=1)
-    narrow = np.sqrt(np.sum(np.asarray(near.peak.widths) ** 2, axis=1))
+    off = np.max(np.abs(near.mode.z - settled.mode.z) / sd, axis=1)
+    narrow = np.sqrt(np.sum(np.asarray(near.mode.root) ** 2, axis=1))
     print(
         f"converged {settled.converged.mean():.4f}; newton arrives at the same mode in "
         f"{np.mean(apart < 0.01):.3f} of the pixels, at a worse place in "

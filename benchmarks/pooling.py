@@ -100,7 +100,7 @@ def gradient() -> None:
     """Milliseconds of one gradient in the coordinates that are sampled."""
     for count in (10, 30, 100, 300, 1000):
         capture = patch_capture(np.full(count, 1.45), views=40)
-        request = resolve(capture, "hierarchical", "nuts", None, None, None, None, 0, "double")
+        request = resolve(capture, "hierarchical", None, None, None, None, 0, "double")
         with jax.enable_x64(True):
             data = observe(request.capture)
             program = compile_program(request.bind(request.scene), data)

@@ -1,8 +1,8 @@
-"""Colors that know of each other: a Gaussian process over wavelength (the paper's section 2).
+"""Spectra as Gaussian processes over wavelength (the paper's section 2).
 
 The refractive index, the logarithm of the absorption, or both are smooth functions of wavelength:
 a level, and a departure from it whose size (amplitude) and smoothness (length) are inferred with
-it. What one color cannot tell, its neighbors can, and wavelengths that were not measured have a
+it. Neighboring wavelengths share information, and wavelengths that were not measured have a
 posterior too (`polar_bayes.inference.predict_spectrum`).
 """
 
@@ -15,22 +15,22 @@ from jaxtyping import Array, Float
 from numpyro import distributions as dist
 from polar_bayes.models.hierarchical import check_members, check_pooled, draw_pooled
 from polar_bayes.models.sites import (
+    constant_axes,
     declare_readings,
     draw,
-    draw_own,
+    draw_independent,
     material_parameters,
     over_axes,
-    unchanging,
 )
 from polar_bayes.models.spectral_process import (
     SPECTRA,
     SpectralProcess,
-    around,
     check_capture,
     check_processes,
     check_spectra,
+    spectrum_around,
     wavelengths_of,
-    widening_of,
+    weight_scale,
 )
 
 from polar_bayes.observation.data import Observations
@@ -39,7 +39,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import support_bounds
 from polar_bayes.repr_html import HTMLRepr
 
-OF_A_PATCH = ("wavelength", "view")
+PER_PATCH = ("wavelength", "view")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +80,7 @@ class GpSpectral(HTMLRepr):
         priors: Mapping[str, dist.Distribution],
         links: Mapping[str, AbstractLink],
     ) -> None:
-        """Declare the story of a capture with a wavelength axis."""
+        """Declare the generative model of a capture with a wavelength axis."""
         check_capture(self.coupled, data, scene)
         check_members(self.pooled, data, scene)
         parameters = {}
@@ -88,9 +88,9 @@ class GpSpectral(HTMLRepr):
             if name in self.coupled:
                 parameters[name] = self._spectrum(name, data, priors)
             elif name in self.pooled:
-                parameters[name] = draw_pooled(name, data, priors, without=unchanging(name))
+                parameters[name] = draw_pooled(name, data, priors, without=constant_axes(name))
             else:
-                parameters[name] = draw_own(name, data, priors)
+                parameters[name] = draw_independent(name, data, priors)
 
         declare_readings(parameters, data, scene, priors, links)
 
@@ -100,29 +100,29 @@ class GpSpectral(HTMLRepr):
         """Sample one spectrum, for each patch its own."""
         process, wavelength = self.process_of(name), wavelengths_of(data)
 
-        # How much and how smoothly bodies of this kind change with color: one for the capture.
+        # Amplitude and length of the variation over wavelength: one each for the capture.
         amplitude = numpyro.sample(f"{name}_amplitude", priors[f"{name}_amplitude"])
         length = None
         if process.fits_length:
             length = numpyro.sample(f"{name}_length", priors[f"{name}_length"])
 
-        # Where this body lies, and how it departs from there.
-        places = process.places(wavelength)
-        widening = widening_of(name, amplitude * process.scales(length, places))
+        # The level of this body, and the departure from it.
+        knot_wavelengths = process.knot_wavelengths(wavelength)
+        widening = weight_scale(name, amplitude * process.scales(length, knot_wavelengths))
         if name in self.pooled:
-            level = draw_pooled(f"{name}_level", data, priors, without=OF_A_PATCH)
-        with over_axes(data, without=OF_A_PATCH):
+            level = draw_pooled(f"{name}_level", data, priors, without=PER_PATCH)
+        with over_axes(data, without=PER_PATCH):
             if name not in self.pooled:
                 level = draw(f"{name}_level", priors[f"{name}_level"], data)
             weights = numpyro.sample(
                 f"{name}_weights", dist.Normal(0.0, widening).to_event(1), infer={"auxiliary": True}
             )
-        patches = [size for axis, size in data.dims if axis not in OF_A_PATCH]
+        patches = [size for axis, size in data.dims if axis not in PER_PATCH]
         standard = (weights / widening).reshape(*patches, -1)
-        departure = process.values(standard, length, places, wavelength)
+        departure = process.values(standard, length, knot_wavelengths, wavelength)
         departure = departure - jnp.mean(departure, axis=-1, keepdims=True)
         prior = f"{name}_level_location" if name in self.pooled else f"{name}_level"
-        spectrum = around(name, level, amplitude, departure, support_bounds(priors[prior]))
+        spectrum = spectrum_around(name, level, amplitude, departure, support_bounds(priors[prior]))
         with over_axes(data, without=("view",)):
             return numpyro.deterministic(name, spectrum)
 

@@ -1,12 +1,12 @@
-"""Many patches, or many materials, that resemble each other: pooling (the paper's section 2).
+"""Hierarchical model of many patches or materials: partial pooling (the paper's section 2).
 
-What one patch cannot tell about its index, the others can: each index is drawn from a population
-whose mean and spread are inferred with it. A spread near zero pools completely, a large one not
-at all; the data decide.
+Each pooled parameter of a patch is drawn from a population whose location and spread are inferred
+with it. A spread near zero pools completely, a large one not at all; the data decide.
 
 The population is normal on the natural scale of the parameter: log for what is positive, log odds
-for a share, the plain scale for an index, cut to its physical range. Its `location` is the median
-in the parameter's own unit (before the cut), its `spread` the standard deviation on that scale.
+for a share, the plain scale for an index, truncated to its physical range. Its `location` is the
+median in the parameter's own unit (before truncation), its `spread` the standard deviation on that
+scale.
 """
 
 import abc
@@ -21,13 +21,13 @@ import numpyro
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 from polar_bayes.models.sites import (
-    Bent,
+    SoftClip,
+    constant_axes,
     declare_readings,
-    draw_own,
+    draw_independent,
     drop_view,
     material_parameters,
     over_axes,
-    unchanging,
 )
 
 from polar_bayes.errors import FitError
@@ -37,8 +37,6 @@ from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.priors import RANGES, support_bounds
 from polar_bayes.repr_html import HTMLRepr
 
-# --- Pooling: a parameter of many patches drawn from one population (the paper's section 2) -------
-
 
 @dataclasses.dataclass(frozen=True)
 class AbstractScale(abc.ABC):
@@ -46,11 +44,11 @@ class AbstractScale(abc.ABC):
 
     @abc.abstractmethod
     def population(self, location: Array, spread: Array) -> dist.Distribution:
-        """Where a member stands on this scale."""
+        """Distribution of a member's coordinate on this scale."""
 
     @abc.abstractmethod
-    def value(self, place: Array) -> Array:
-        """The parameter of a member, in its own unit."""
+    def value(self, coordinate: Array) -> Array:
+        """The parameter of a member, in its own unit, from its coordinate."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,8 +60,8 @@ class LogScale(AbstractScale):
         return dist.Normal(jnp.log(location), spread)
 
     @override
-    def value(self, place: Array) -> Array:
-        return jnp.exp(place)
+    def value(self, coordinate: Array) -> Array:
+        return jnp.exp(coordinate)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,12 +73,12 @@ class LogitScale(AbstractScale):
         return dist.Normal(jnp.log(location) - jnp.log1p(-location), spread)
 
     @override
-    def value(self, place: Array) -> Array:
-        return jax.nn.sigmoid(place)
+    def value(self, coordinate: Array) -> Array:
+        return jax.nn.sigmoid(coordinate)
 
 
 @dataclasses.dataclass(frozen=True)
-class PlainScale(AbstractScale):
+class IdentityScale(AbstractScale):
     """The parameter itself, which may take any value."""
 
     @override
@@ -88,13 +86,13 @@ class PlainScale(AbstractScale):
         return dist.Normal(location, spread)
 
     @override
-    def value(self, place: Array) -> Array:
-        return place
+    def value(self, coordinate: Array) -> Array:
+        return coordinate
 
 
 @dataclasses.dataclass(frozen=True)
-class CutScale(AbstractScale):
-    """The parameter itself between bounds, its population cut off there: the refractive index.
+class TruncatedScale(AbstractScale):
+    """The parameter itself, its population truncated at bounds: the refractive index.
 
     Args:
         low: Lower bound, finite.
@@ -108,11 +106,11 @@ class CutScale(AbstractScale):
     def population(self, location: Array, spread: Array) -> dist.Distribution:
         high = None if math.isinf(self.high) else self.high
         cut = dist.TruncatedNormal(location, spread, low=self.low, high=high)
-        return dist.TransformedDistribution(cut, Bent(self.low, self.high).inv)
+        return dist.TransformedDistribution(cut, SoftClip(self.low, self.high).inv)
 
     @override
-    def value(self, place: Array) -> Array:
-        return Bent(self.low, self.high)(place)
+    def value(self, coordinate: Array) -> Array:
+        return SoftClip(self.low, self.high)(coordinate)
 
 
 def natural_scale(name: str, location: dist.Distribution) -> AbstractScale:
@@ -123,7 +121,7 @@ def natural_scale(name: str, location: dist.Distribution) -> AbstractScale:
     if limits == (0.0, 1.0):
         return LogitScale()
     low, high = support_bounds(location)
-    return PlainScale() if math.isinf(low) else CutScale(low, high)
+    return IdentityScale() if math.isinf(low) else TruncatedScale(low, high)
 
 
 def draw_pooled(
@@ -148,10 +146,9 @@ def draw_pooled(
     spread = numpyro.sample(f"{name}_spread", priors[f"{name}_spread"])
     scale = natural_scale(name, priors[f"{name}_location"])
     with over_axes(data, without=without):
-        # The place on the scale is a coordinate; the parameter is what it stands for.
         population = scale.population(location, spread)
-        place = numpyro.sample(f"{name}_base", population, infer={"auxiliary": True})
-        value = numpyro.deterministic(name, scale.value(place))
+        coordinate = numpyro.sample(f"{name}_base", population, infer={"auxiliary": True})
+        value = numpyro.deterministic(name, scale.value(coordinate))
     return drop_view(value, data)
 
 
@@ -190,7 +187,7 @@ def check_members(pooled: tuple[str, ...], data: Observations, scene: Scene) -> 
         )
 
 
-# --- Many patches, or many materials, that resemble each other: pooling (the paper's section 2) ---
+# --- The model ------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
@@ -222,13 +219,13 @@ class Hierarchical(HTMLRepr):
         priors: Mapping[str, dist.Distribution],
         links: Mapping[str, AbstractLink],
     ) -> None:
-        """Declare the story of a capture with a leading axis (patch or material)."""
+        """Declare the generative model of a capture with a leading axis (patch or material)."""
         check_members(self.pooled, data, scene)
         parameters = {}
         for name in material_parameters(scene):
             if name in self.pooled:
-                parameters[name] = draw_pooled(name, data, priors, without=unchanging(name))
+                parameters[name] = draw_pooled(name, data, priors, without=constant_axes(name))
             else:
-                parameters[name] = draw_own(name, data, priors)
+                parameters[name] = draw_independent(name, data, priors)
 
         declare_readings(parameters, data, scene, priors, links)

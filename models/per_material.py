@@ -8,7 +8,7 @@ turns them into what the instrument would record (eq. 1), the links say how read
 from collections.abc import Mapping
 
 from numpyro import distributions as dist
-from polar_bayes.models.sites import declare_readings, draw_own, material_parameters
+from polar_bayes.models.sites import declare_readings, draw_independent, material_parameters
 
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
@@ -21,7 +21,7 @@ def per_material(
     priors: Mapping[str, dist.Distribution],
     links: Mapping[str, AbstractLink],
 ) -> None:
-    """Declare the story of one capture."""
-    parameters = {name: draw_own(name, data, priors) for name in material_parameters(scene)}
+    """Declare the generative model of one capture."""
+    parameters = {name: draw_independent(name, data, priors) for name in material_parameters(scene)}
 
     declare_readings(parameters, data, scene, priors, links)

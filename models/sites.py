@@ -1,4 +1,4 @@
-"""Plates for the axes of a capture, so that a model file can read like the paper."""
+"""Sample sites that all models share: plates, bounded coordinates, and the likelihood."""
 
 import contextlib
 import math
@@ -18,12 +18,12 @@ from polar_bayes.observation.links import AbstractLink, noise_parameters
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 
 SPECTRAL = ("absorption", "refractive_index")
-"""What has a value of its own at every wavelength."""
+"""Parameters with one value per wavelength."""
 
 
 @contextlib.contextmanager
 def over_axes(data: Observations, *, without: tuple[str, ...] = ()) -> Iterator[None]:
-    """Repeat what is declared inside over every axis of the capture except those named."""
+    """Plates over every axis of the capture except those named."""
     with contextlib.ExitStack() as stack:
         for position, (name, length) in enumerate(data.dims):
             if name not in without:
@@ -32,15 +32,15 @@ def over_axes(data: Observations, *, without: tuple[str, ...] = ()) -> Iterator[
 
 
 def material_parameters(scene: Scene) -> tuple[str, ...]:
-    """What a scene reads of the material; nothing else is sampled."""
+    """The parameters of the material that a scene reads; no others are sampled."""
     return tuple(name for name in MATERIAL_PARAMETERS if name in scene.parameters)
 
 
-def draw_own(
+def draw_independent(
     name: str, data: Observations, priors: Mapping[str, dist.Distribution]
 ) -> Float[Array, "..."]:
-    """Sample a parameter of the material that each patch, or color, has for itself."""
-    with over_axes(data, without=unchanging(name)):
+    """Sample a parameter of the material independently for each patch, or wavelength."""
+    with over_axes(data, without=constant_axes(name)):
         return draw(name, priors[name], data)
 
 
@@ -54,25 +54,25 @@ def drop_view(value: Float[Array, "..."], data: Observations) -> Float[Array, ".
     return value[..., 0] if len(data.dims) > 1 and value.ndim == len(data.dims) else value
 
 
-def unchanging(name: str) -> tuple[str, ...]:
+def constant_axes(name: str) -> tuple[str, ...]:
     """The axes of a capture over which a parameter of a material stays the same."""
     return ("view",) if name in SPECTRAL else ("wavelength", "view")
 
 
-# --- A coordinate without bounds for a parameter that has some ------------------------------------
+# --- An unbounded coordinate of a bounded parameter -----------------------------------------------
 
 
-BEND = 80.0
-"""The bend at a bound is this many times narrower than the interval."""
+HINGES = 80.0
+"""Width of the interval over that of the bend at a bound."""
 
 
-class Bent(Transform):
+class SoftClip(Transform):
     r"""The identity inside an interval, bent at its ends.
 
     $$ y = l + s \log\frac{1 + e^{(x-l)/s}}{1 + e^{(x-h)/s}}, \qquad s = (h-l)/80 $$
 
-    Away from the ends y = x, so what is normal stays normal, and what readings know of y they know
-    of x. NumPyro's own map onto an interval bends everywhere.
+    Away from the ends y = x, so a normal density stays normal. NumPyro's own transform onto an
+    interval is nonlinear everywhere.
 
     Args:
         low: l, finite.
@@ -85,7 +85,7 @@ class Bent(Transform):
     @property
     def scale(self) -> float:
         """s, in the unit of the parameter."""
-        return (self.high - self.low) / BEND if math.isfinite(self.high) else 1.0 / BEND
+        return (self.high - self.low) / HINGES if math.isfinite(self.high) else 1.0 / HINGES
 
     @property
     @override
@@ -121,7 +121,7 @@ class Bent(Transform):
         slope = jax.nn.log_sigmoid((x - self.low) / self.scale)
         if math.isinf(self.high):
             return slope
-        constant = math.log1p(-math.exp(-BEND))
+        constant = math.log1p(-math.exp(-HINGES))
         return slope + jax.nn.log_sigmoid((self.high - x) / self.scale) + constant
 
     @override
@@ -129,13 +129,13 @@ class Bent(Transform):
         return (), ((), {"low": self.low, "high": self.high})
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Bent) and (self.low, self.high) == (other.low, other.high)
+        return isinstance(other, SoftClip) and (self.low, self.high) == (other.low, other.high)
 
     def __hash__(self) -> int:
         return hash((self.low, self.high))
 
 
-# --- The second half of every model: from the parameters of a material to the readings ------------
+# --- Readings -------------------------------------------------------------------------------------
 
 
 def declare_readings(
@@ -145,7 +145,7 @@ def declare_readings(
     priors: Mapping[str, dist.Distribution],
     links: Mapping[str, AbstractLink],
 ) -> None:
-    """Declare the instrument, the noise, and how the readings scatter around eq. 1."""
+    """Declare instrument, noise, and the likelihood of the readings around eq. 1."""
     # The instrument and the noise: one value for the whole capture, shared by all its patches.
     instrument = {
         name: numpyro.sample(name, priors[name])
@@ -156,13 +156,13 @@ def declare_readings(
 
     parameters = {**parameters, **instrument}
     if scene.dispersion is not None and data.geometry.wavelength is not None:
-        # The law's coefficients are what is sampled; the index is what is asked for.
+        # The coefficients of the law are sampled; the index is deterministic.
         wavelength = data.geometry.wavelength[..., 0]
         with over_axes(data, without=("view",)):
             index = scene.dispersion.index(parameters, wavelength)
             numpyro.deterministic("refractive_index", index[..., None])
 
-    # What would be recorded without noise (eq. 1), and how the readings scatter around it.
+    # Readings without noise (eq. 1), and the likelihood.
     prediction = scene.predict(parameters, data.geometry)
     with over_axes(data):
         for name, link in links.items():

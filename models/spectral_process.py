@@ -1,4 +1,4 @@
-"""Smooth functions of wavelength: a Gaussian process through standard normal weights."""
+"""Sparse Gaussian process over wavelength (deterministic training conditional)."""
 
 import dataclasses
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
-from polar_bayes.models.sites import Bent
+from polar_bayes.models.sites import SoftClip
 from tinygp import kernels
 
 from polar_bayes.errors import FitError
@@ -17,7 +17,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.repr_html import HTMLRepr
 
 KERNELS = ("Exp", "ExpSquared", "Matern32", "Matern52")
-"""The decaying kernels of tinygp that a length says all of."""
+"""The decaying kernels of tinygp whose only parameter is a length."""
 
 LEAST_NUGGET = 1e-10
 
@@ -94,23 +94,23 @@ class SpectralProcess(HTMLRepr):
         """How many weights a process over so many wavelengths has."""
         return min(wavelengths, self.knots)
 
-    def places(self, wavelength: Float[Array, " wavelength"]) -> Float[Array, " knots"]:
+    def knot_wavelengths(self, wavelength: Float[Array, " wavelength"]) -> Float[Array, " knots"]:
         """The knots of these measured wavelengths in ascending order, nm."""
         if wavelength.size <= self.knots:
             return jnp.sort(wavelength)
         return jnp.linspace(jnp.min(wavelength), jnp.max(wavelength), self.knots)
 
     def scales(
-        self, length: Float[Array, ""] | None, places: Float[Array, " knots"]
+        self, length: Float[Array, ""] | None, knot_wavelengths: Float[Array, " knots"]
     ) -> Float[Array, " knots"]:
         """How much each weight moves the values at the knots, given those before it. 1, > 0."""
-        return jnp.diag(self._factor(length, places))
+        return jnp.diag(self._factor(length, knot_wavelengths))
 
     def values(
         self,
         weights: Float[Array, "... knots"],
         length: Float[Array, ""] | None,
-        places: Float[Array, " knots"],
+        knot_wavelengths: Float[Array, " knots"],
         wavelength: Float[Array, " wavelength"],
     ) -> Float[Array, "... wavelength"]:
         """The process at any wavelengths, as far as its knots determine it.
@@ -124,12 +124,12 @@ class SpectralProcess(HTMLRepr):
         Returns:
             f. (..., wavelength), 1.
         """
-        return weights @ self._across(length, places, wavelength)
+        return weights @ self._across(length, knot_wavelengths, wavelength)
 
     def remainder(
         self,
         length: Float[Array, ""] | None,
-        places: Float[Array, " knots"],
+        knot_wavelengths: Float[Array, " knots"],
         wavelength: Float[Array, " wavelength"],
     ) -> Float[Array, "wavelength wavelength"]:
         """Lower Cholesky factor of the covariance that the knots leave undetermined.
@@ -144,19 +144,21 @@ class SpectralProcess(HTMLRepr):
             wavelength), 1; near zero at a knot, the kernel's own far away from all. Give double
             precision: single has no digits left for it.
         """
-        across = self._across(length, places, wavelength)
+        across = self._across(length, knot_wavelengths, wavelength)
         prior = self._matrix(length, wavelength, wavelength)
         left = prior - across.T @ across
         return jnp.linalg.cholesky(left + self._nugget(prior, NUGGET_OF_REMAINDER))
 
-    def _across(self, length: Array | None, places: Array, wavelength: Array) -> Array:
+    def _across(self, length: Array | None, knot_wavelengths: Array, wavelength: Array) -> Array:
         """What each weight does to the values at these wavelengths: (knots, wavelength)."""
-        turned = _polynomials(places).T @ self._matrix(length, places, wavelength)
-        return solve_triangular(self._factor(length, places), turned, lower=True)
+        turned = _polynomials(knot_wavelengths).T @ self._matrix(
+            length, knot_wavelengths, wavelength
+        )
+        return solve_triangular(self._factor(length, knot_wavelengths), turned, lower=True)
 
-    def _factor(self, length: Array | None, places: Array) -> Array:
-        covariance = self._matrix(length, places, places)
-        turn = _polynomials(places)
+    def _factor(self, length: Array | None, knot_wavelengths: Array) -> Array:
+        covariance = self._matrix(length, knot_wavelengths, knot_wavelengths)
+        turn = _polynomials(knot_wavelengths)
         return jnp.linalg.cholesky(turn.T @ (covariance + self._nugget(covariance)) @ turn)
 
     def _matrix(self, length: Array | None, first: Array, second: Array) -> Array:
@@ -174,25 +176,25 @@ class SpectralProcess(HTMLRepr):
         return share * jnp.max(jnp.diag(covariance)) * np.eye(count, dtype=covariance.dtype)
 
 
-def _polynomials(places: Array) -> Array:
+def _polynomials(knots: Array) -> Array:
     """Orthonormal polynomials over the knots, one a column, the constant last."""
     # Householder's turn is orthogonal even where equal knots leave fewer polynomials.
-    span = jnp.maximum(places[-1] - places[0], jnp.finfo(places.dtype).tiny)
-    inside = jnp.clip(2.0 * (places - places[0]) / span - 1.0, -1.0, 1.0)
-    chebyshev = jnp.cos(jnp.arccos(inside)[:, None] * np.arange(len(places), dtype=places.dtype))
+    span = jnp.maximum(knots[-1] - knots[0], jnp.finfo(knots.dtype).tiny)
+    inside = jnp.clip(2.0 * (knots - knots[0]) / span - 1.0, -1.0, 1.0)
+    chebyshev = jnp.cos(jnp.arccos(inside)[:, None] * np.arange(len(knots), dtype=knots.dtype))
     return jax.lax.stop_gradient(jnp.roll(jnp.linalg.qr(chebyshev)[0], -1, axis=1))
 
 
-# --- Spectra of a material: which there are, and how a process around a level makes one -----------
+# --- Spectra of a material ------------------------------------------------------------------------
 
 
 SPECTRA = ("refractive_index", "absorption")
 
 TYPICAL_ERROR = {"refractive_index": 0.003, "absorption": 0.1}
-"""How well a fair capture tells n and log a of one color; only the ease of sampling leans on it."""
+"""Typical posterior sd of n and log a at one wavelength; only sampling efficiency depends on it."""
 
 
-def around(
+def spectrum_around(
     name: str, level: Array, amplitude: Array, departure: Array, bounds: tuple[float, float]
 ) -> Array:
     r"""A spectrum from its level and its process.
@@ -202,15 +204,15 @@ def around(
 
     with the mean of f over the measured wavelengths taken off, so that the level is the mean over
     them (of a, the geometric mean), which readings determine; one wavelength alone is its level.
-    T is `Bent`: it bends what comes near the ends of the range of the index. It does not depend on
-    the amplitude, which would tie the two together.
+    T is `SoftClip`, which bends values near the ends of the range of the index. It does not depend
+    on the amplitude, with which it would be correlated.
     """
     if name == "absorption":
         return level * jnp.exp(amplitude * departure)
-    return Bent(*bounds)(level + amplitude * departure)
+    return SoftClip(*bounds)(level + amplitude * departure)
 
 
-def widening_of(name: str, scales: Float[Array, " knots"]) -> Float[Array, " knots"]:
+def weight_scale(name: str, scales: Float[Array, " knots"]) -> Float[Array, " knots"]:
     r"""By how much weights are widened before they are sampled.
 
     $$ \sqrt{1 + (s_j/\sigma)^2}, \quad \text{and 1 for the last} $$

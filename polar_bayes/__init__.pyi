@@ -46,7 +46,7 @@ from .inference.files import (
     load_result as load_result,
     save_result as save_result,
 )
-from .inference.fit import fit as fit
+from .inference.fitting import fit as fit
 from .maps.fit_map import fit_pixels as fit_pixels
 from .observation import links as links
 from .physics import instrument as instrument

@@ -1,4 +1,4 @@
-"""What goes wrong is told in one line: where, what, and the mend."""
+"""Errors whose message is one line: `where: what; hint`."""
 
 import functools
 from collections.abc import Callable
@@ -6,12 +6,12 @@ from typing import override
 
 
 class PolarBayesError(ValueError):
-    """Base of every error that a user can mend; it may be sent to another process.
+    """Base of all errors that a user can correct; it can be pickled.
 
     Args:
         what: What is wrong, as a clause without a full stop.
         where: File, variable, view or option that is wrong.
-        mend: What to do about it, as an imperative clause.
+        hint: What to do about it, as an imperative clause.
     """
 
     def __init__(self, what: str, *, where: str, hint: str) -> None:
@@ -20,7 +20,7 @@ class PolarBayesError(ValueError):
 
     @override
     def __reduce__(self) -> tuple[Callable[[], "PolarBayesError"], tuple[()]]:
-        # Exceptions are unpickled from `args`, which know no keywords.
+        # Exceptions are unpickled from `args`, which hold no keywords.
         return functools.partial(type(self), self.what, where=self.where, hint=self.hint), ()
 
 

@@ -1,9 +1,9 @@
-"""What a program that is told to stop does before it ends: cleanups, newest first.
+"""Cleanups that run when a signal ends the program, newest first.
 
 A signal reaches the main thread while others are inside compiled code, which cannot be interrupted.
-The command line therefore ends the process at once (`polar_bayes.cli.entry`); whoever holds
-something that must not outlive the process (temporary files, child processes, a hidden cursor)
-registers its removal here for as long as it holds it.
+The command line therefore ends the process at once (`polar_bayes.cli.entry`). Code that holds a
+resource which must not outlive the process (temporary files, child processes, a hidden cursor)
+registers its release here while it holds it.
 """
 
 import contextlib
@@ -31,13 +31,13 @@ def on_interrupt(cleanup: Callable[[], str | None]) -> Iterator[None]:
 
 
 def clean_up() -> list[str]:
-    """Run every cleanup, newest first, whatever the others do; returns their sentences."""
+    """Run every cleanup, newest first, even if others fail; returns their sentences."""
     with _LOCK:
         cleanups = [_CLEANUPS[number] for number in sorted(_CLEANUPS, reverse=True)]
         _CLEANUPS.clear()
     sentences = []
     for cleanup in cleanups:
-        with contextlib.suppress(Exception):  # the process ends: nobody is left to mend it
+        with contextlib.suppress(Exception):  # the process ends in any case
             sentences.append(cleanup())
     return [sentence for sentence in sentences if sentence]
 

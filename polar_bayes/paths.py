@@ -1,9 +1,9 @@
-"""Paths as users give them, and outputs that are written whole or not at all.
+"""Checks of paths, and atomic writes.
 
-Every file that the package writes goes through `check_output`: it never takes the place of an
-input, a device, a folder or a file of another kind. It is written beside its place, synced to the
-disk, renamed, and the folder is synced: a process that dies at any moment leaves the older file or
-the new one, never a part.
+Every file that the package writes goes through `check_output`: it never replaces an input, a
+device, a folder or a file of another kind. It is written to a temporary folder beside the output,
+synced to the disk, renamed, and the folder is synced: a process that dies at any moment leaves the
+older file or the new one, never a part.
 """
 
 import contextlib
@@ -19,12 +19,12 @@ from polar_bayes.interrupts import on_interrupt
 
 PathLike = str | os.PathLike[str]
 
-UNFINISHED = ".polar-bayes-"
-"""Prefix of the folders in which unfinished outputs stand, beside their place."""
+TEMPORARY_PREFIX = ".polar-bayes-"
+"""Prefix of the temporary folders of unfinished outputs."""
 
 
 def as_path(path: PathLike, what: str, error: type[PolarBayesError] = CaptureError) -> Path:
-    """The path, not resolved, or a clear error when it is none."""
+    """A path from a user's argument, not resolved."""
     try:
         text = os.fspath(path)
     except TypeError:
@@ -35,7 +35,7 @@ def as_path(path: PathLike, what: str, error: type[PolarBayesError] = CaptureErr
 
 
 def existing_file(path: PathLike, what: str) -> Path:
-    """The path of a file that is there, not resolved."""
+    """The path of an existing, non-empty file, not resolved."""
     file = as_path(path, what)
     try:
         if not file.exists():
@@ -51,7 +51,7 @@ def existing_file(path: PathLike, what: str) -> Path:
 
 
 def system_error(error: OSError, path: Path) -> CaptureError:
-    """What the operating system said of an input, as one line."""
+    """The error of the operating system about an input, as one line."""
     reason = (error.strerror or str(error)).lower()
     return CaptureError(reason, where=str(path), hint="check the path, its rights and the disk")
 
@@ -59,7 +59,7 @@ def system_error(error: OSError, path: Path) -> CaptureError:
 def check_output(
     path: PathLike, replaces: Callable[[Path], bool], inputs: Iterable[PathLike] = ()
 ) -> Path:
-    """Refuse an output that cannot be written, or must not be, before anything is computed."""
+    """The resolved path of an output, refused before the computation if it must not be written."""
     given = as_path(path, "output", OutputError)
     where = str(given)
     try:
@@ -79,7 +79,7 @@ def check_output(
             )
         with tempfile.TemporaryFile(dir=file.parent):
             pass
-    except (OSError, RuntimeError) as error:  # RuntimeError: a circle of links
+    except (OSError, RuntimeError) as error:  # RuntimeError: a cycle of links
         raise output_error(error, given) from error
     return file
 
@@ -87,8 +87,8 @@ def check_output(
 def refuse_inputs(path: Path, inputs: Iterable[PathLike]) -> None:
     """Refuse an output that is one of the inputs, or lies inside one."""
     for each in map(Path, inputs):
-        inside = each.is_dir() and any(is_same_place(up, each) for up in path.resolve().parents)
-        if inside or is_same_place(path, each):
+        inside = each.is_dir() and any(is_same_file(up, each) for up in path.resolve().parents)
+        if inside or is_same_file(path, each):
             raise OutputError(
                 f"it {'lies inside' if inside else 'is'} one of the inputs",
                 where=str(path),
@@ -96,8 +96,8 @@ def refuse_inputs(path: Path, inputs: Iterable[PathLike]) -> None:
             )
 
 
-def is_same_place(one: Path, other: Path) -> bool:
-    """Whether two paths name one file, by whatever links; neither has to be there."""
+def is_same_file(one: Path, other: Path) -> bool:
+    """Whether two paths name one file, through any links; neither has to exist."""
     try:
         return one.samefile(other)
     except OSError:
@@ -105,7 +105,7 @@ def is_same_place(one: Path, other: Path) -> bool:
 
 
 def output_error(error: Exception, path: Path) -> OutputError:
-    """What the operating system or a library said of an output, as one line."""
+    """The error of the operating system or a library about an output, as one line."""
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return OutputError(
         f"it could not be written ({reason.lower()})",
@@ -115,16 +115,16 @@ def output_error(error: Exception, path: Path) -> OutputError:
 
 
 @contextlib.contextmanager
-def replacing(path: PathLike, replaces: Callable[[Path], bool]) -> Iterator[Path]:
-    """A path to write to; its file replaces `path` when the block ends without error."""
+def atomic_write(path: PathLike, replaces: Callable[[Path], bool]) -> Iterator[Path]:
+    """A temporary path to write to; its file replaces `path` when the block ends without error."""
     file = check_output(path, replaces)
-    with written(file), unfinished_folder(file.parent) as folder:
+    with write_errors(file), temporary_folder(file.parent) as folder:
         yield folder / file.name
-        move_into_place(folder / file.name, file)
+        replace_file(folder / file.name, file)
 
 
-def move_into_place(unfinished: Path, file: Path) -> None:
-    """Put a finished file where it belongs: synced, with the mode of the file that it replaces."""
+def replace_file(unfinished: Path, file: Path) -> None:
+    """Replace a file by a finished one: synced, with the mode of the older file."""
     if file.exists():
         unfinished.chmod(stat.S_IMODE(file.stat().st_mode))
     sync(unfinished)
@@ -133,8 +133,8 @@ def move_into_place(unfinished: Path, file: Path) -> None:
 
 
 @contextlib.contextmanager
-def written(path: Path) -> Iterator[None]:
-    """What goes wrong while an output is written, as one line."""
+def write_errors(path: Path) -> Iterator[None]:
+    """Raise errors of the operating system and libraries as `OutputError`."""
     try:
         yield
     except (OSError, RuntimeError, UnicodeError) as error:  # RuntimeError: netCDF, of a full disk
@@ -142,13 +142,13 @@ def written(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def unfinished_folder(beside: Path) -> Iterator[Path]:
-    """A new folder for what is not finished, removed in the end, by an interrupt too."""
-    with tempfile.TemporaryDirectory(dir=beside, prefix=UNFINISHED) as made:
+def temporary_folder(beside: Path) -> Iterator[Path]:
+    """A temporary folder, removed at the end and by an interrupt."""
+    with tempfile.TemporaryDirectory(dir=beside, prefix=TEMPORARY_PREFIX) as made:
         folder = Path(made)
 
         def remove() -> None:
-            # Threads that still write there find no folder, so they add nothing to what is removed.
+            # Threads that still write there find no folder, so they add no files meanwhile.
             hidden = folder.rename(folder.with_name(f"{folder.name}-"))
             shutil.rmtree(hidden, ignore_errors=True)
 
@@ -157,7 +157,7 @@ def unfinished_folder(beside: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk."""
+    """Write a file, or the names in a folder, to the disk."""
     if path.is_dir() and os.name != "posix":
         return  # only POSIX systems open folders
     opened = os.open(path, os.O_RDONLY)

@@ -1,14 +1,14 @@
-r"""The ends of a prior.
+r"""Default priors, their validation and description.
 
-NumPyro samples the log of a positive value. Where zero is as likely as anything, that log has a
-tail without end to the left, in which chains walk for long. The normal score has none:
+NumPyro samples the log of a positive value. Where the prior density at zero is finite, that log has
+an unbounded left tail, which mixes slowly. `HalfNormal` is sampled in its normal score instead,
 
 $$ z = \Phi^{-1}\big(2 \Phi(v/\sigma) - 1\big) $$
 
 under which the prior is standard normal.
 
-The table is written once and read by every model. A caller replaces any row with any NumPyro
-distribution of the right support: `priors={"refractive_index": dist.Normal(1.5, 0.02)}` is
+Every model reads the table `PRIORS`. A caller replaces any row with any NumPyro distribution of the
+right support: `priors={"refractive_index": dist.Normal(1.5, 0.02)}` is
 refused (an index below 1 is possible under it), `dist.TruncatedNormal(1.5, 0.02, low=1.0)` is
 not. Distributions are made of Python numbers, so that importing this file creates no array and
 the fit chooses the precision.
@@ -29,7 +29,7 @@ from numpyro.distributions import constraints, transforms
 
 from polar_bayes.errors import FitError
 from polar_bayes.physics.part import notation
-from polar_bayes.repr_html import Card, Grid
+from polar_bayes.repr_html import DisplaySummary, DisplayTable
 
 
 def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
@@ -42,7 +42,7 @@ def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
     return float(np.min(low)), float(np.max(high))
 
 
-# --- The half-normal prior of what readings seldom tell from zero ---------------------------------
+# --- Half-normal prior ----------------------------------------------------------------------------
 
 
 TWO_LOG_TWO = 2.0 * math.log(2.0)
@@ -54,10 +54,10 @@ class HalfNormal(dist.HalfNormal):
     @property
     @override
     def support(self) -> constraints.Constraint:
-        return Scored(self.scale)
+        return PositiveByNormalScore(self.scale)
 
 
-class Scored(constraints.Constraint):
+class PositiveByNormalScore(constraints.Constraint):
     """Positive values, whose coordinate is the normal score under a half-normal distribution."""
 
     lower_bound = 0.0
@@ -75,19 +75,19 @@ class Scored(constraints.Constraint):
 
     def eq(self, other: object, static: bool = False) -> bool:
         """Whether it is the same, as NumPyro asks."""
-        return isinstance(other, Scored) and other.scale == self.scale
+        return isinstance(other, PositiveByNormalScore) and other.scale == self.scale
 
     def tree_flatten(self) -> tuple:
         """As NumPyro has it."""
         return (self.scale,), (("scale",), {})
 
 
-@dist.biject_to.register(Scored)
-def _by_score(support: Scored) -> "FromScore":
-    return FromScore(support.scale)
+@dist.biject_to.register(PositiveByNormalScore)
+def _by_score(support: PositiveByNormalScore) -> "NormalScoreToHalfNormal":
+    return NormalScoreToHalfNormal(support.scale)
 
 
-class FromScore(transforms.Transform):
+class NormalScoreToHalfNormal(transforms.Transform):
     """From a normal score to the value of that score."""
 
     domain = constraints.real
@@ -98,11 +98,11 @@ class FromScore(transforms.Transform):
 
     def __call__(self, x: Array) -> Array:
         """The value of a score."""
-        return self.scale * folded(jnp.asarray(x))
+        return self.scale * half_normal_of_score(jnp.asarray(x))
 
     @override
     def _inverse(self, y: Array) -> Array:
-        return unfolded(jnp.asarray(y) / self.scale)
+        return score_of_half_normal(jnp.asarray(y) / self.scale)
 
     @override
     def log_abs_det_jacobian(
@@ -116,7 +116,7 @@ class FromScore(transforms.Transform):
 
 
 @jax.custom_jvp
-def folded(z: Float[Array, "..."]) -> Float[Array, "..."]:
+def half_normal_of_score(z: Float[Array, "..."]) -> Float[Array, "..."]:
     r"""The half-normal quantile of a normal score: $\Phi^{-1}((1+\Phi(z))/2)$."""
     # Each half is computed from the tail that is small there. Beyond the smallest number of its
     # precision the tail of the right half is that of its asymptote.
@@ -126,14 +126,14 @@ def folded(z: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(z < 0.0, 2.0**0.5 * erfinv(ndtr(z)), high)
 
 
-@folded.defjvp
+@half_normal_of_score.defjvp
 def _slope_of_folded(z: tuple, dz: tuple) -> tuple[Array, Array]:
-    x = folded(*z)
+    x = half_normal_of_score(*z)
     return x, 0.5 * jnp.exp(0.5 * (x**2 - z[0] ** 2)) * dz[0]
 
 
 @jax.custom_jvp
-def unfolded(x: Float[Array, "..."]) -> Float[Array, "..."]:
+def score_of_half_normal(x: Float[Array, "..."]) -> Float[Array, "..."]:
     r"""The normal score of a half-normal value: $\Phi^{-1}(2\Phi(x) - 1)$."""
     half = 2.0**-0.5
     tail = erfc(half * x)
@@ -142,13 +142,13 @@ def unfolded(x: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(x < 0.5, ndtri(erf(half * x)), high)
 
 
-@unfolded.defjvp
+@score_of_half_normal.defjvp
 def _slope_of_unfolded(x: tuple, dx: tuple) -> tuple[Array, Array]:
-    z = unfolded(*x)
+    z = score_of_half_normal(*x)
     return z, 2.0 * jnp.exp(0.5 * (z**2 - x[0] ** 2)) * dx[0]
 
 
-# --- A prior in words, for reports ----------------------------------------------------------------
+# --- Description for reports ----------------------------------------------------------------------
 
 
 def describe_prior(prior: dist.Distribution) -> str:
@@ -156,7 +156,7 @@ def describe_prior(prior: dist.Distribution) -> str:
     try:
         return _description(prior)
     except Exception:
-        # A report must not fail because a distribution of the user's own describes itself badly.
+        # A report must not fail because of a user-defined distribution.
         return type(prior).__name__
 
 
@@ -179,7 +179,7 @@ def _name(prior: dist.Distribution) -> str:
 
 
 def _arguments(prior: dist.Distribution) -> list[str]:
-    """What stands between the parentheses."""
+    """The arguments of a distribution, as texts."""
     if _is_truncated(prior):
         bounds = zip(("low", "high"), support_bounds(prior), strict=True)
         said = [f"{key}={bound:g}" for key, bound in bounds if math.isfinite(bound)]
@@ -198,7 +198,7 @@ def _arguments(prior: dist.Distribution) -> list[str]:
 
 
 def _fields(values: Mapping[str, object]) -> str:
-    """What of these is numbers, as `loc=1, scale=2`."""
+    """The numeric values among these, as `loc=1, scale=2`."""
     numbers = {
         key: np.asarray(value)
         for key, value in values.items()
@@ -225,14 +225,14 @@ def _text(numbers: np.ndarray) -> str:
     return f"<array {numbers.shape}>"
 
 
-# --- What is believed before any data: one NumPyro distribution for every named parameter ---------
+# --- The table: one NumPyro distribution for every named parameter --------------------------------
 
 
 class Beta(dist.Beta):
     """The Beta distribution, two Python numbers until it is used."""
 
-    # NumPyro's own turns them into an array at once, in the precision of that moment: a table of
-    # priors would start the array library on import and stay in single precision for ever.
+    # NumPyro's own converts them to arrays at once, in the current precision: a table of priors
+    # would start JAX on import and stay in single precision.
 
     def __init__(
         self,
@@ -258,7 +258,9 @@ class Priors(dict[str, dist.Distribution]):
 
     def _repr_html_(self) -> str:
         rows = tuple((n, notation(n).meaning, describe_prior(x)) for n, x in self.items())
-        return Card("Priors", (), (Grid(("parameter", "meaning", "prior"), rows),))._repr_html_()
+        return DisplaySummary(
+            "Priors", (), (DisplayTable(("parameter", "meaning", "prior"), rows),)
+        )._repr_html_()
 
 
 _ROWS: dict[str, dist.Distribution] = {
@@ -285,7 +287,7 @@ _ROWS: dict[str, dist.Distribution] = {
     "normal_tilt_x": dist.Normal(0.0, 2.0),
     "normal_tilt_y": dist.Normal(0.0, 2.0),
     # Populations of materials or patches (models/hierarchical.py): the paper, section 2, for the
-    # index; for the others the location is believed as one material is, and two members may well
+    # index; for the others the prior of the location is that of one material, and two members may
     # differ by half a unit of log or log odds.
     "roughness_location": dist.HalfNormal(0.2),
     "roughness_spread": dist.HalfNormal(0.5),
@@ -295,7 +297,7 @@ _ROWS: dict[str, dist.Distribution] = {
     "absorption_spread": dist.HalfNormal(0.5),
     "refractive_index_location": dist.TruncatedNormal(1.45, 0.2, low=1.2, high=2.0),
     "refractive_index_spread": dist.HalfNormal(0.1),
-    # Spectra (models/gp_spectral.py). The level is believed as one color is. Of 58 measured
+    # Spectra (models/gp_spectral.py). The level has the prior of one wavelength. Of 58 measured
     # dielectrics, n(450 nm) - n(650 nm) is .011 in the median, and .006 to .029 for nine in ten;
     # amplitudes of .02 to .03 and lengths of 300 to 400 nm explain them best. The presets' log a
     # varies by 0 to 1 over the visible, in bands of pigments some tens of nm wide.
@@ -332,65 +334,34 @@ _ROWS: dict[str, dist.Distribution] = {
 }
 
 PRIORS = Priors(_ROWS)
-"""What is believed before any data, by the name of the parameter."""
+"""Default prior of each parameter, by its name."""
 
+_INDICES = (
+    *("refractive_index", "refractive_index_location", "cauchy_a"),
+    *("refractive_index_level", "refractive_index_level_location"),
+    *("coat_refractive_index", "film_refractive_index"),
+)
 RANGES: dict[str, tuple[float, float]] = {
-    "roughness": (0.0, math.inf),
-    "subsurface_fraction": (0.0, 1.0),
-    "absorption": (0.0, math.inf),
-    "refractive_index": (1.0, math.inf),
-    "roughness_across": (0.0, math.inf),
-    "albedo": (0.0, 1.0),
-    "polarized_fraction": (0.0, 1.0),
-    "cauchy_a": (1.0, math.inf),
-    "cauchy_b": (0.0, math.inf),
+    **{
+        name: support_bounds(prior)
+        for name, prior in _ROWS.items()
+        if isinstance(prior, dist.HalfNormal | dist.LogNormal | dist.Beta)
+    },
+    **dict.fromkeys(_INDICES, (1.0, math.inf)),
     "sellmeier_strength": (0.0, math.inf),
     "sellmeier_resonance": (0.0, 0.1),
-    "coat_refractive_index": (1.0, math.inf),
-    "coat_absorbance": (0.0, math.inf),
-    "film_refractive_index": (1.0, math.inf),
-    "film_thickness": (0.0, math.inf),
-    "roughness_location": (0.0, math.inf),
-    "roughness_spread": (0.0, math.inf),
-    "subsurface_fraction_location": (0.0, 1.0),
-    "subsurface_fraction_spread": (0.0, math.inf),
-    "absorption_location": (0.0, math.inf),
-    "absorption_spread": (0.0, math.inf),
-    "refractive_index_location": (1.0, math.inf),
-    "refractive_index_spread": (0.0, math.inf),
-    "refractive_index_level": (1.0, math.inf),
-    "refractive_index_level_location": (1.0, math.inf),
-    "refractive_index_level_spread": (0.0, math.inf),
-    "refractive_index_amplitude": (0.0, math.inf),
-    "refractive_index_length": (0.0, math.inf),
-    "absorption_level": (0.0, math.inf),
-    "absorption_level_location": (0.0, math.inf),
-    "absorption_level_spread": (0.0, math.inf),
-    "absorption_amplitude": (0.0, math.inf),
-    "absorption_length": (0.0, math.inf),
-    "dolp_gain": (0.0, 1.0),
     "beam_overlap_zenith": (0.0, 90.0),
-    "channel_gain_ratio": (0.0, math.inf),
-    "leakage": (0.0, math.inf),
-    "discrepancy_amplitude": (0.0, math.inf),
-    "concentration_scale": (0.0, math.inf),
-    "logit_scale": (0.0, math.inf),
-    "normal_scale": (0.0, math.inf),
-    "stokes_scale": (0.0, math.inf),
-    "stokes_error_factor": (0.0, math.inf),
-    "exposure": (0.0, math.inf),
-    "intensity_scale": (0.0, math.inf),
 }
-"""Physical range of a parameter; one that is not listed may take any real value."""
+"""Physical range of a parameter, that of its prior unless stated; others may take any value."""
 
 
-# --- Which prior each parameter of a model gets, and which ones are refused -----------------------
+# --- Resolution and validation --------------------------------------------------------------------
 
 
 class PriorTable(Mapping[str, dist.Distribution]):
     """The priors that a model may read: the table with a caller's replacements."""
 
-    # It notes which names are read, so that a model need not list its parameters.
+    # It records the names that are read, so that a model need not list its parameters.
 
     def __init__(self, overrides: Mapping[str, dist.Distribution] | None = None) -> None:
         if not isinstance(overrides, Mapping | None):
@@ -409,7 +380,7 @@ class PriorTable(Mapping[str, dist.Distribution]):
 
     @override
     def __getitem__(self, name: str) -> dist.Distribution:
-        return in_this_precision(self.row(name))
+        return cast_prior(self.row(name))
 
     def row(self, name: str) -> dist.Distribution:
         """The prior as it was given."""
@@ -431,10 +402,10 @@ class PriorTable(Mapping[str, dist.Distribution]):
         return len(self._rows)
 
 
-def in_this_precision(prior: dist.Distribution) -> dist.Distribution:
+def cast_prior(prior: dist.Distribution) -> dist.Distribution:
     """A copy of a prior in the floating type of this fit."""
-    # Distributions keep what they have computed once, in the precision of that day; a copy made
-    # from their arguments alone does not.
+    # Distributions cache lazy attributes in the precision of their first use; a copy made from the
+    # arguments alone does not.
 
     def convert(argument: object) -> object:
         if hasattr(argument, "dtype") and jnp.issubdtype(argument.dtype, jnp.floating):
@@ -471,7 +442,7 @@ def check_support(name: str, prior: dist.Distribution, where: str) -> None:
 
 
 def _in_range(least: float, most: float) -> str:
-    """What to give instead, in words."""
+    """A hint which distribution to give instead."""
     if (least, most) == (0.0, 1.0):
         return "give a Beta distribution, or a truncated one"
     if least == 0.0 and math.isinf(most):
@@ -520,7 +491,7 @@ def _check_shape(name: str, prior: dist.Distribution, where: str) -> None:
         )
     if prior.batch_shape and prior.batch_shape[-1] != 1:
         raise FitError(
-            f"it is {prior.batch_shape[-1]} distributions side by side",
+            f"it is a batch of {prior.batch_shape[-1]} distributions",
             where=where,
             hint="give one, or one per wavelength in shape (wavelength, 1): views share it",
         )

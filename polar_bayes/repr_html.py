@@ -1,14 +1,14 @@
-"""How a notebook shows values of this package: one small card in one style, and no script.
+"""HTML representations of values in a notebook: one style, no script.
 
-Colors are the notebook's own, so that cards suit light and dark themes. Every text is escaped:
-names of captures, materials and parameters come from files. `repr` is untouched: a terminal, a
-log and a saved result show what one would write to make the value again.
+Colors are the notebook's own, so that they suit light and dark themes. Every text is escaped, since
+names of captures, materials and parameters come from files. `repr` is not changed: a terminal, a
+log and a saved result show the expression that makes the value.
 """
 
 import dataclasses
 import html
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import override
 
 from polar_bayes.errors import one_line
@@ -33,12 +33,12 @@ STYLE = """<style>
 .pb-card.good { border-left: 5px solid #009e73; }
 .pb-card.bad { border-left: 5px solid #d55e00; }
 </style>"""
-"""One for all cards; a page may hold it many times."""
+"""Repeated in each representation, since a notebook may show any of them alone."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Grid:
-    """Rows of texts under heads; the first cell of a row names it."""
+class DisplayTable:
+    """A table of texts with column heads; the first cell of a row is its label."""
 
     heads: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -47,10 +47,10 @@ class Grid:
     @property
     def html(self) -> str:
         """As an HTML table."""
-        head = "".join(f'<th scope="col">{escaped(text)}</th>' for text in self.heads)
+        head = "".join(f'<th scope="col">{_escaped(text)}</th>' for text in self.heads)
         rows = "".join(
-            f'<tr><th scope="row">{escaped(first)}</th>'
-            f"{''.join(f'<td>{escaped(cell)}</td>' for cell in cells)}</tr>"
+            f'<tr><th scope="row">{_escaped(first)}</th>'
+            f"{''.join(f'<td>{_escaped(cell)}</td>' for cell in cells)}</tr>"
             for first, *cells in self.rows
         )
         kind = ' class="numbers"' if self.numeric else ""
@@ -58,7 +58,7 @@ class Grid:
 
     @property
     def text(self) -> str:
-        """In columns of a terminal, numbers to the right."""
+        """As aligned columns for a terminal, numbers to the right."""
         lines = [self.heads, *self.rows]
         widths = [max(len(line[at]) for line in lines) for at in range(len(self.heads))]
         return "\n".join(
@@ -71,91 +71,82 @@ class Grid:
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Card:
+class DisplaySummary:
     """A title, sentences and tables: HTML in a notebook, text everywhere else."""
 
     title: str
-    said: tuple[str, ...] = ()
-    grids: tuple[Grid, ...] = ()
+    sentences: tuple[str, ...] = ()
+    tables: tuple[DisplayTable, ...] = ()
     good: bool | None = None
 
     @override
     def __repr__(self) -> str:
-        parts = ["\n".join([one_line(self.title), *self.said]), *(grid.text for grid in self.grids)]
-        return "\n\n".join(parts)
+        text = "\n".join([one_line(self.title), *self.sentences])
+        return "\n\n".join([text, *(table.text for table in self.tables)])
 
     def _repr_html_(self) -> str:
-        said = "".join(f"<p>{escaped(sentence)}</p>" for sentence in self.said)
-        return framed(
-            f"<h4>{escaped(self.title)}</h4>{said}{''.join(grid.html for grid in self.grids)}",
-            self.good,
-        )
+        parts = [f"<h4>{_escaped(self.title)}</h4>"]
+        parts += [f"<p>{_escaped(sentence)}</p>" for sentence in self.sentences]
+        parts += [table.html for table in self.tables]
+        return _card("".join(parts), self.good)
 
 
 class HTMLRepr:
-    """A frozen value that a notebook shows as a card: its fields, and theirs."""
+    """A frozen dataclass whose fields, nested ones included, a notebook shows as HTML."""
 
     def _repr_html_(self) -> str:
-        more = self.more_on_card()
-        grids = "".join(grid.html for grid in more)
-        return framed(f"{_title(self)}{_fields(self, reads=not more)}{grids}")
+        title = f"<h4>{_escaped(type(self).__name__)}</h4><p><small>{_summary(self)}</small></p>"
+        tables = self.extra_tables()
+        fields = _fields(self, with_parameters=not tables)
+        return _card(title + fields + "".join(table.html for table in tables))
 
-    def more_on_card(self) -> tuple[Grid, ...]:
+    def extra_tables(self) -> tuple[DisplayTable, ...]:
         """Tables below the fields."""
         return ()
 
 
-def framed(inside: str, good: bool | None = None) -> str:
-    """HTML in the frame of a card."""
+def _card(inside: str, good: bool | None = None) -> str:
     kind = {None: "", True: " good", False: " bad"}[good]
     return f'<div class="pb-card{kind}">{STYLE}{inside}</div>'
 
 
-def escaped(text: object) -> str:
+def _escaped(text: object) -> str:
     """Any text as HTML that runs nothing, on one line."""
     return html.escape(one_line(str(text)))
 
 
-def _title(value: object) -> str:
-    return f"<h4>{escaped(type(value).__name__)}</h4><p><small>{_about(value)}</small></p>"
+def _summary(value: object) -> str:
+    """The first line of the docstring of a value's class."""
+    return _escaped((inspect.getdoc(type(value)) or "").partition("\n")[0])
 
 
-def _about(value: object) -> str:
-    """The first line of its documentation."""
-    return escaped((inspect.getdoc(type(value)) or "").partition("\n")[0])
-
-
-def _fields(value: object, *, reads: bool = True) -> str:
+def _fields(value: object, *, with_parameters: bool = True) -> str:
     """A row for each field of a dataclass, and the parameters that it reads."""
-    rows = [
-        (field.name.replace("_", " "), _cell(getattr(value, field.name)))
+    rows = {
+        field.name.replace("_", " "): _cell(getattr(value, field.name))
         for field in dataclasses.fields(value)  # type: ignore[arg-type]
         if field.repr
-    ]
-    read = getattr(value, "parameters", ()) if reads else ()
-    rows += [("reads", ", ".join(f"<code>{escaped(name)}</code>" for name in read))] if read else []
+    }
+    parameters: tuple[str, ...] = getattr(value, "parameters", ()) if with_parameters else ()
+    if parameters:
+        rows["reads"] = ", ".join(f"<code>{_escaped(name)}</code>" for name in parameters)
     cells = "".join(
-        f'<tr><th scope="row">{escaped(name)}</th><td>{cell}</td></tr>' for name, cell in rows
+        f'<tr><th scope="row">{_escaped(name)}</th><td>{cell}</td></tr>'
+        for name, cell in rows.items()
     )
     return f"<table><tbody>{cells}</tbody></table>" if rows else ""
 
 
 def _cell(value: object) -> str:
+    """A value as HTML; members of a tuple or mapping on lines of their own."""
     if value is None:
         return "<small>none</small>"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        name = f"{escaped(type(value).__name__)} <small>{_about(value)}</small>"
+        name = f"{_escaped(type(value).__name__)} <small>{_summary(value)}</small>"
         inside = _fields(value)
         return f"<details><summary>{name}</summary>{inside}</details>" if inside else name
-    parts = list(_parts(value))
-    if parts:
-        return "<br>".join(parts)
-    return escaped(f"{value:g}" if isinstance(value, float) else value)
-
-
-def _parts(value: object) -> Iterator[str]:
-    """Members of a tuple or mapping, each as a cell of its own."""
-    if isinstance(value, Mapping):
-        yield from (f"{escaped(key)}: {_cell(item)}" for key, item in value.items())
-    elif isinstance(value, tuple):
-        yield from map(_cell, value)
+    if isinstance(value, Mapping) and value:
+        return "<br>".join(f"{_escaped(key)}: {_cell(item)}" for key, item in value.items())
+    if isinstance(value, tuple) and value:
+        return "<br>".join(map(_cell, value))
+    return _escaped(f"{value:g}" if isinstance(value, float) else value)

@@ -1,6 +1,6 @@
-"""Named set-ups: what a user would say about a measurement, as scene, links and limits.
+"""Named measurement set-ups: scene, links and view limit.
 
-`scene="goniometer"` in a fit picks one of these; every part of it can still be replaced.
+`scene="goniometer"` in a fit selects one of these; every part of it can be replaced.
 """
 
 import dataclasses
@@ -28,11 +28,11 @@ __all__ = [
 
 @dataclasses.dataclass(frozen=True)
 class Setup(HTMLRepr):
-    """One way to measure.
+    """A measurement set-up.
 
     Args:
         scene: The optics.
-        links: For each variable that such a capture may hold, how it scatters.
+        links: Likelihood link of each variable that such a capture may hold.
         largest_view_zenith: Views beyond it are set aside and counted. Unit degree.
     """
 
@@ -48,8 +48,8 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             SCENES["camera"],
             {"q": StokesLink(), "u": StokesLink(), "intensity": StudentTLink()},
         ),
-        # How much light fell on a place of a picture is known of no pixel by itself, so brightness
-        # would tell nothing; its noise is known in every pixel.
+        # The irradiance of a pixel is unknown, so brightness carries no information; the noise of
+        # every pixel is known.
         "picture": Setup(
             SCENES["picture"],
             {"q": StokesLink(stated_errors=True), "u": StokesLink(stated_errors=True)},
@@ -83,7 +83,7 @@ LEVELS = (0.025, 0.5, 0.975)
 def prior_table(
     scene: str | Scene | None = None, *, priors: Mapping[str, dist.Distribution] | None = None
 ) -> pd.DataFrame:
-    """What is believed before any data.
+    """The priors as a table.
 
     Args:
         scene: The name of a set-up, whose links' noise is listed too, or a scene; by default every
@@ -91,7 +91,7 @@ def prior_table(
         priors: Distributions that replace or extend `polar_bayes.PRIORS`, as for `polar_bayes.fit`.
 
     Returns:
-        A row for each parameter: symbol, meaning, unit, prior (in words), and its quantiles q2.5,
+        A row for each parameter: symbol, meaning, unit, prior (as text), and its quantiles q2.5,
         q50 and q97.5 (unit of the parameter), of 10,000 draws with a fixed seed.
 
     Raises:

@@ -1,7 +1,8 @@
-"""Materials to simulate: plausible values, not measurements.
+"""Simulated captures of known truth: presets of materials, protocols of views, and `simulate`.
 
-Refractive indices at 450, 550 and 650 nm follow published dispersion (water, BK7 glass and PMMA
-to 0.002); a leaf absorbs blue and red and leaves green, a ripe fruit leaves red.
+The presets are plausible values, not measurements. Refractive indices at 450, 550 and 650 nm follow
+published dispersion (water, BK7 glass and PMMA to 0.002); a leaf absorbs blue and red and leaves
+green, a ripe fruit leaves red.
 
 A value is one number, one for each wavelength, or an image (y, x): its rank says which.
 """
@@ -94,7 +95,7 @@ def find_preset(name: str) -> Material:
     return PRESETS[name]
 
 
-# --- Where to look from: the paper's protocol of about 40 views -----------------------------------
+# --- Protocol of views ----------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,8 +148,8 @@ class Protocol:
 
         Returns:
             view_zenith, view_azimuth, light_zenith and light_azimuth, each (view,), in degree.
-            The zeniths step evenly from near the normal to the largest, the azimuths in turn, so
-            that every azimuth sees the whole range.
+            The zeniths step evenly from near the normal to the largest, the azimuths alternate, so
+            that every azimuth covers the whole range.
         """
         steps = np.arange(1, self.views + 1) / self.views
         azimuths = np.resize(np.asarray(self.azimuths, float), self.views)
@@ -160,8 +161,7 @@ class Protocol:
         }
 
 
-# --- What a simulated capture is drawn from: parameters and noise, checked, and the image they spa
-
+# --- Validation of parameters and noise -----------------------------------------------------------
 
 NEUTRAL: Mapping[str, np.ndarray] = {
     "dolp_gain": np.asarray(1.0),
@@ -192,7 +192,7 @@ def checked_parameters(
             hint=f"give any of {', '.join(scene.parameters)}",
         )
     known = material.at(wavelengths if wavelengths.size else np.asarray(550.0))
-    given = {name: _numbers(_parameter(name), value) for name, value in overrides.items()}
+    given = {name: _numbers(f"parameters[{name!r}]", value) for name, value in overrides.items()}
     available = {**NEUTRAL, **known, **given}
     missing = [name for name in scene.parameters if name not in available]
     if missing:
@@ -202,21 +202,20 @@ def checked_parameters(
             hint=f"give parameters={{{missing[0]!r}: <a number>}}",
         )
     truth = {name: available[name] for name in scene.parameters}
+    spectrum = f", or one per wavelength ({wavelengths.size})" if wavelengths.size else ""
     for name, value in truth.items():
-        where = _parameter(name)
-        _check_range(where, name, value)
-        if is_vector(name):
-            _check_shape(where, value, value.ndim <= 1, "give one number for each function")
-            continue
-        color = wavelengths.size > 0 and value.shape == wavelengths.shape
-        each = f", or one per wavelength ({wavelengths.size})" if wavelengths.size else ""
-        hint = f"give one number{each}, or an image (y, x)"
-        _check_shape(where, value, color or _is_number_or_image(value), hint)
+        has_shape = value.ndim <= 1
+        hint = "give one number for each function"
+        if not is_vector(name):
+            is_spectrum = wavelengths.size > 0 and value.shape == wavelengths.shape
+            has_shape = is_spectrum or _is_number_or_image(value)
+            hint = f"give one number{spectrum}, or an image (y, x)"
+        _check_value(f"parameters[{name!r}]", name, value, has_shape, hint)
     return truth
 
 
 def checked_noise(
-    links: Mapping[str, AbstractLink], usual: Mapping[str, float], overrides: Mapping[str, Value]
+    links: Mapping[str, AbstractLink], defaults: Mapping[str, float], overrides: Mapping[str, Value]
 ) -> dict[str, np.ndarray | None]:
     """A value for every noise parameter of the links."""
     parameters = noise_parameters(links)
@@ -227,29 +226,28 @@ def checked_noise(
             where="simulate: noise",
             hint=f"give any of {', '.join(parameters)}",
         )
-    given: dict[str, Value | None] = {"exposure": None, **usual, **overrides}
+    given: dict[str, Value | None] = {"exposure": None, **defaults, **overrides}
     levels: dict[str, np.ndarray | None] = {}
     for name in parameters:
-        where = f"simulate: noise[{name!r}]"
+        where = f"noise[{name!r}]"
         if name not in given:
             raise FitError(
-                "it has no value", where=where, hint=f"give noise={{{name!r}: <number>}}"
+                "it has no value",
+                where=f"simulate: {where}",
+                hint=f"give noise={{{name!r}: <number>}}",
             )
         value = given[name]
-        if value is None:
-            levels[name] = None
-            continue
-        level = levels[name] = _numbers(where, value)
-        _check_range(where, name, level, above=True)
-        hint = "give one number, or an image (y, x)"
-        _check_shape(where, level, _is_number_or_image(level), hint)
+        levels[name] = level = None if value is None else _numbers(where, value)
+        if level is not None:
+            has_shape, hint = _is_number_or_image(level), "give one number, or an image (y, x)"
+            _check_value(where, name, level, has_shape, hint, is_open=True)
     return levels
 
 
-def image_of(
+def image_shape(
     parameters: Mapping[str, np.ndarray], noise: Mapping[str, np.ndarray | None]
 ) -> tuple[int, ...]:
-    """The image that parameters and noise span together."""
+    """The shape of the image that parameters and noise define; empty without one."""
     named = [(f"parameters[{name!r}]", value) for name, value in parameters.items()]
     named += [(f"noise[{name!r}]", level) for name, level in noise.items() if level is not None]
     images = [(name, value.shape) for name, value in named if value.ndim == 2]
@@ -269,17 +267,13 @@ def is_vector(name: str) -> bool:
     return np.ndim(NEUTRAL.get(name, 0.0)) > 0
 
 
-def _parameter(name: str) -> str:
-    return f"simulate: parameters[{name!r}]"
-
-
 def _numbers(where: str, value: Value) -> np.ndarray:
     try:
         return np.asarray(value, float)
     except (TypeError, ValueError):
         raise CaptureError(
             "it is no array of numbers",
-            where=where,
+            where=f"simulate: {where}",
             hint="give a number, or rows of numbers that are equally long",
         ) from None
 
@@ -288,26 +282,30 @@ def _is_number_or_image(value: np.ndarray) -> bool:
     return value.ndim == 0 or (value.ndim == 2 and value.size > 0)
 
 
-def _check_shape(where: str, value: np.ndarray, fits: bool, hint: str) -> None:
-    if not fits:
-        raise CaptureError(f"its shape is {value.shape}", where=where, hint=hint)
-
-
-def _check_range(where: str, name: str, value: np.ndarray, *, above: bool = False) -> None:
-    """Refuse what is outside the physical range; with `above`, its lower end as well."""
+def _check_value(
+    where: str,
+    name: str,
+    value: np.ndarray,
+    has_shape: bool,
+    hint: str,
+    *,
+    is_open: bool = False,
+) -> None:
+    """Refuse values outside the physical range (which may be open below), or of a wrong shape."""
     low, high = RANGES.get(name, (-np.inf, np.inf))
-    inside = np.isfinite(value) & ((value > low) if above else (value >= low)) & (value <= high)
-    if not inside.all():
-        sign = "<" if above else "<="
+    valid = np.isfinite(value) & ((value > low) if is_open else (value >= low)) & (value <= high)
+    if not valid.all():
+        sign = "<" if is_open else "<="
         raise CaptureError(
-            f"{value[~inside].flat[0]:g} is outside {low:g} {sign} value <= {high:g}",
-            where=where,
+            f"{value[~valid].flat[0]:g} is outside {low:g} {sign} value <= {high:g}",
+            where=f"simulate: {where}",
             hint="give a finite number in that range",
         )
+    if not has_shape:
+        raise CaptureError(f"its shape is {value.shape}", where=f"simulate: {where}", hint=hint)
 
 
-# --- Captures of known truth: the forward story of a model, told without data ---------------------
-
+# --- Captures of known truth ----------------------------------------------------------------------
 
 NOISE: Mapping[str, float] = {
     "concentration_scale": 300.0,
@@ -359,13 +357,13 @@ def simulate(
         seed: The same seed gives the same capture.
 
     Returns:
-        A validated capture with dims ([y, x,] view[, wavelength]). The truth rides along as
-        `true_<parameter>`, with dims (y, x) where it is an image; readings at full scale are
+        A validated capture with dims ([y, x,] view[, wavelength]). The true values are in
+        `true_<parameter>`, with dims (y, x) where they are an image; readings at full scale are
         flagged `saturated`. Links that read stated errors find them as `<reading>_error`.
 
     Raises:
         CaptureError: No such preset, a seed, parameter or noise outside its range, or shapes that
-            are not told above or do not agree.
+            are not listed above or do not agree.
         SceneError: No such scene, or a parameter that it does not have.
         FitError: A link that does not describe its variable, or noise that no link reads.
 
@@ -394,9 +392,9 @@ def simulate(
     wavelengths = np.asarray(protocol.wavelengths, float)
     truth = checked_parameters(setup.scene, material, wavelengths, parameters or {})
     levels = checked_noise(links, NOISE, noise or {})
-    image = image_of(truth, levels)
+    image = image_shape(truth, levels)
     with jax.enable_x64(True):
-        recorded = _record(setup.scene, links, _blank(protocol, links, image), truth, levels, seed)
+        recorded = _record(setup.scene, links, _layout(protocol, links, image), truth, levels, seed)
     name = preset if isinstance(preset, str) else "simulated"
     attributes: dict[str, str | int] = {"name": name, "seed": seed}
     if isinstance(scene, str):  # a fit then takes the same set-up unless told otherwise
@@ -424,56 +422,60 @@ def _checked_links(links: Mapping[str, AbstractLink]) -> dict[str, AbstractLink]
 def _record(
     scene: Scene,
     links: Mapping[str, AbstractLink],
-    blank: Observations,
+    layout: Observations,
     truth: Mapping[str, np.ndarray],
     noise: Mapping[str, np.ndarray | None],
     seed: int,
 ) -> dict[str, np.ndarray]:
-    """Readings with the dims of `blank`: intensity first, since noise depends on it."""
+    """Readings with the dims of `layout`: intensity first, since noise depends on it."""
     key_intensity, key_rest = jax.random.split(jax.random.key(seed))
-    axes = len(blank.shape)
-    parameters = {name: jnp.asarray(_in_front(x, axes - 1)) for name, x in truth.items()}
-    prediction = scene.predict(parameters, blank.geometry)
-    prediction = {n: jnp.broadcast_to(x, blank.shape) for n, x in prediction.items()}
+    axes = len(layout.shape)
+    parameters = {name: jnp.asarray(_align_image(x, axes - 1)) for name, x in truth.items()}
+    prediction = scene.predict(parameters, layout.geometry)
+    prediction = {n: jnp.broadcast_to(x, layout.shape) for n, x in prediction.items()}
     exposure = BRIGHT_LEVEL / jnp.quantile(prediction["intensity"], BRIGHT_QUANTILE)
     levels = {
-        name: exposure if level is None else jnp.asarray(_in_front(level, axes))
+        name: exposure if level is None else jnp.asarray(_align_image(level, axes))
         for name, level in noise.items()
     }
     recorded: dict[str, Array] = {}
-    data = blank
+    data = layout
     if "intensity" in links:
         link = links["intensity"]
-        intensity = link.distribution("intensity", prediction, blank, levels).sample(key_intensity)
+        intensity = link.distribution("intensity", prediction, layout, levels).sample(key_intensity)
         intensity = jnp.clip(intensity, 0.0, FULL_SCALE)
         recorded["intensity"] = intensity
         recorded["saturated"] = intensity >= FULL_SCALE
-        data = _with_intensity(blank, intensity, recorded["saturated"])
+        data = dataclasses.replace(
+            layout,
+            brightness=jnp.clip(intensity / FULL_SCALE, 0.0, 1.0),
+            saturated=recorded["saturated"],
+        )
     for name, key in zip(links, jax.random.split(key_rest, len(links)), strict=True):
         if name != "intensity":
             recorded[name] = links[name].distribution(name, prediction, data, levels).sample(key)
-    recorded |= _possible(recorded)
+    recorded |= _physical(recorded)
     for name in (name for name, link in links.items() if link.reads_errors):
-        recorded[f"{name}_error"] = blank.errors[name]
+        recorded[f"{name}_error"] = layout.errors[name]
     return {name: np.asarray(value) for name, value in recorded.items()}
 
 
-def _in_front(value: np.ndarray, axes: int) -> np.ndarray:
-    """An image with axes of length 1 behind it, so many in all; other values as they are."""
+def _align_image(value: np.ndarray, axes: int) -> np.ndarray:
+    """An image with trailing axes of length 1, so that it has `axes` axes; others unchanged."""
     return value.reshape(value.shape + (1,) * (axes - 2)) if value.ndim == 2 else value
 
 
-def _possible(recorded: Mapping[str, Array]) -> dict[str, Array]:
-    """The polarization as an instrument reports it: noise carries it no further than fully."""
+def _physical(recorded: Mapping[str, Array]) -> dict[str, Array]:
+    """The polarization as an instrument reports it: its degree is at most one."""
     stokes = {name: recorded[name] for name in ("q", "u") if name in recorded}
     length = jnp.sqrt(sum(value**2 for value in stokes.values()))
-    possible = {name: value / jnp.maximum(length, 1.0) for name, value in stokes.items()}
+    physical = {name: value / jnp.maximum(length, 1.0) for name, value in stokes.items()}
     if "dop" in recorded:
-        possible["dop"] = jnp.clip(recorded["dop"], 0.0, 1.0)
-    return possible
+        physical["dop"] = jnp.clip(recorded["dop"], 0.0, 1.0)
+    return physical
 
 
-def _blank(
+def _layout(
     protocol: Protocol, links: Mapping[str, AbstractLink], image: tuple[int, ...]
 ) -> Observations:
     """The layout of the capture before anything was recorded."""
@@ -496,11 +498,6 @@ def _blank(
         saturated=jnp.zeros(shape, bool),
         dims=dims,
     )
-
-
-def _with_intensity(data: Observations, intensity: Array, saturated: Array) -> Observations:
-    brightness = jnp.clip(intensity / FULL_SCALE, 0.0, 1.0)
-    return dataclasses.replace(data, brightness=brightness, saturated=saturated)
 
 
 def _label(

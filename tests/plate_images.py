@@ -10,10 +10,10 @@ from textbook import plate_q
 
 import polar_bayes as pb
 from polar_bayes.capture.schema import validate
-from polar_bayes.inference.batch_fit import PixelLaplace
-from polar_bayes.inference.batching import Stack, stack
-from polar_bayes.maps.blocks import Plan, fit_block, set_aside
-from polar_bayes.maps.fit_map import blank, cut, number_pixels, plan_map
+from polar_bayes.inference.batch_laplace import PixelLaplace
+from polar_bayes.inference.batching import ObservationBatch, batch_pixels
+from polar_bayes.maps.blocks import Plan, fit_block, mask_missing
+from polar_bayes.maps.fit_map import blank, cut, plan_map, with_pixel_numbers
 
 NOISE = 0.02
 # Away from Brewster's angle q stays so far from -1 that ordinary noise is never clipped.
@@ -92,14 +92,14 @@ def planned(
     )
 
 
-def stacked(capture: xr.Dataset, plan: Plan) -> Stack:
+def stacked(capture: xr.Dataset, plan: Plan) -> ObservationBatch:
     """The pixels of an image in a row."""
-    return stack(plan.observe(validate(set_aside(capture))))
+    return batch_pixels(plan.observe(validate(mask_missing(capture))))
 
 
 def mapped(capture: xr.Dataset, plan: Plan, block: int = 4096) -> xr.Dataset:
     """Maps made block by block."""
-    numbered = number_pixels(capture)
+    numbered = with_pixel_numbers(capture)
     maps = blank(numbered, plan).copy(deep=True)
     for place in cut(numbered, block):
         for name, values in fit_block(numbered.isel(place), plan).items():

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.inference.psis import LEVELS
 
 CENTER, PRIOR_SD, NOISE = 0.5, 0.1, 0.05
@@ -91,13 +91,13 @@ def _readings(
 
 
 def _fits(count: int, failed: tuple[int, ...]) -> dict:
-    status, approach = np.full(count, Status.GOOD), np.full(count, Approach.IMPORTANCE)
-    approach[::4] = Approach.NUTS
-    status[list(failed)], approach[list(failed)] = Status.NOT_CONVERGED, Approach.NONE
+    status, approach = np.full(count, Status.GOOD), np.full(count, MethodUsed.IMPORTANCE)
+    approach[::4] = MethodUsed.NUTS
+    status[list(failed)], approach[list(failed)] = Status.NOT_CONVERGED, MethodUsed.NONE
     k = np.where(np.arange(count) % 10 == 0, 0.9, 0.2)
     draws = np.linspace(100.0, 500.0, count)
     k[list(failed)] = draws[list(failed)] = np.nan
-    words = {"status": Status, "approach": Approach}
+    words = {"status": Status, "approach": MethodUsed}
     flags = {name: " ".join(each.name.lower() for each in kinds) for name, kinds in words.items()}
     return {
         "status": ("simulation", status, {"flag_meanings": flags["status"]}),

@@ -5,13 +5,13 @@ import json
 import numpy as np
 import xarray as xr
 
-from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.inference.psis import LEVELS
 
 LEVELS_HERE = np.array(LEVELS)
 
 
-def flags(names: type[Status] | type[Approach], values: np.ndarray) -> tuple:
+def flags(names: type[Status] | type[MethodUsed], values: np.ndarray) -> tuple:
     words = " ".join(each.name.lower() for each in names)
     said = {"flag_values": [int(each) for each in names], "flag_meanings": words}
     return ("y", "x"), values.astype(np.int8), said
@@ -30,7 +30,7 @@ def make_maps(
     """Uniform posteriors of that width about the means, (y, x) or (y, x, wavelength)."""
     shape = next(iter(means.values())).shape[:2]
     status = np.full(shape, Status.GOOD) if status is None else status
-    told = np.where(np.isin(status, (Status.GOOD, Status.NOT_TRUSTED)), Approach.IMPORTANCE, 0)
+    told = np.where(np.isin(status, (Status.GOOD, Status.NOT_TRUSTED)), MethodUsed.IMPORTANCE, 0)
     found: dict = {}
     for name, mean in means.items():
         axes = ("y", "x", "wavelength")[: mean.ndim]
@@ -42,7 +42,7 @@ def make_maps(
         found[f"{name}_quantile"] = (("quantile", *axes), np.float32(mean + width * steps))
     found["pareto_k"] = (("y", "x"), np.where(status == Status.NOT_TRUSTED, 0.9, 0.2))
     found["status"] = flags(Status, status)
-    found["approach"] = flags(Approach, told if approach is None else approach)
+    found["approach"] = flags(MethodUsed, told if approach is None else approach)
     about = {"method": "pixels", "settings": {"weighted": weighted}, "seed": 3, **provenance}
     coords: dict = {"quantile": LEVELS_HERE}
     coords |= {"wavelength": list(wavelengths)} if wavelengths else {}

@@ -27,8 +27,8 @@ from test_architecture import LAYERS
 import polar_bayes as pb
 from polar_bayes.capture.schema import CONTRACT
 from polar_bayes.cli import commands
-from polar_bayes.inference import joint_fit as fitting
-from polar_bayes.inference.joint_fit import fit
+from polar_bayes.inference import fitting, problem
+from polar_bayes.inference.fitting import fit
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
@@ -43,7 +43,6 @@ RUN = ("README.md", "quickstart.md", "extending.md")
 TINY = pb.methods.Laplace(
     chains=2, draws=50
 )  # the sampler itself runs where a page states settings
-FEW = {"STARTS": 4, "PRIOR_DRAWS": 100, "BLOCK": 100}
 CHANGED = (
     "jax_enable_x64",
     "jax_compilation_cache_dir",
@@ -132,8 +131,8 @@ def test_the_python_of_a_page_runs(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pb, "fit", fits)
-    for constant, value in FEW.items():
-        monkeypatch.setattr(fitting, constant, value)
+    monkeypatch.setattr(fitting, "PRIOR_DRAWS", 100)
+    monkeypatch.setattr(problem, "BLOCK", 100)
     namespace: dict[str, object] = {"__name__": page.stem}
     for line, code in blocks(page, "python"):
         exec(compile("\n" * line + code, str(page), "exec"), namespace)

@@ -172,7 +172,7 @@ CASES: dict[str, Callable] = {
     "hierarchical": of_groups("hierarchical", (), material=True, method=QUICK_NUTS),
     "gp_spectral": of_groups("gp_spectral", (450.0, 550.0, 650.0), method=QUICK_NUTS),
     "map laplace": map_of(),
-    "map tempered": map_of(method=pb.methods.PixelTempering()),
+    "map tempered": map_of(method=pb.methods.PixelSMC()),
     "calibration": calibration,
     "identify": identification,
     "profile": curve,

@@ -9,7 +9,7 @@ from cases import each
 from numpyro import distributions as dist
 from numpyro.distributions import biject_to
 
-from polar_bayes.priors import PRIORS, HalfNormal, folded, unfolded
+from polar_bayes.priors import PRIORS, HalfNormal, half_normal_of_score, score_of_half_normal
 
 SCALE = 0.01
 SCORES = (-37.0, -20.0, -9.0, -5.0, -1.0, -1e-3, 0.0, 1e-3, 1.0, 5.0, 9.0, 20.0, 36.0)
@@ -44,8 +44,12 @@ def test_values_and_slopes_agree_with_fifty_digits(z: float, dtype: type) -> Non
         exact = mpmath.sqrt(mpmath.pi / 2) * mpmath.ncdf(float(given))
     slope = mpmath.exp((exact**2 - mpmath.mpf(float(given)) ** 2) / 2) / 2
     allowed = 30.0 * float(np.finfo(dtype).eps) * max(1.0, z**2)
-    assert float(folded(jnp.asarray(given))) == pytest.approx(float(exact), rel=allowed)
-    assert float(jax.grad(folded)(jnp.asarray(given))) == pytest.approx(float(slope), rel=allowed)
+    assert float(half_normal_of_score(jnp.asarray(given))) == pytest.approx(
+        float(exact), rel=allowed
+    )
+    assert float(jax.grad(half_normal_of_score)(jnp.asarray(given))) == pytest.approx(
+        float(slope), rel=allowed
+    )
 
 
 @each("dtype", [np.float64, np.float32])
@@ -64,9 +68,11 @@ def test_what_is_far_out_is_finite_and_comes_back(z: float, dtype: type) -> None
     rounding = 40.0 * float(np.finfo(dtype).eps) * (1.0 + z**2)
     assert float(log_density(at)) == pytest.approx(normal, abs=rounding)
     assert np.isfinite([jax.grad(log_density)(at), jax.grad(jax.grad(log_density))(at)]).all()
-    value = folded(at)
+    value = half_normal_of_score(at)
     if value > np.finfo(dtype).tiny:
-        assert float(unfolded(value)) == pytest.approx(z, abs=40.0 * rounding / (1.0 + abs(z)))
+        assert float(score_of_half_normal(value)) == pytest.approx(
+            z, abs=40.0 * rounding / (1.0 + abs(z))
+        )
 
 
 def test_scores_of_draws_are_standard_normal() -> None:

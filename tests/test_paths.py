@@ -23,7 +23,7 @@ def write(capture, path: Path) -> None:
 
 
 def leftovers(folder: Path) -> list[str]:
-    return [path.name for path in folder.rglob("*") if path.name.startswith(paths.UNFINISHED)]
+    return [path.name for path in folder.rglob("*") if path.name.startswith(paths.TEMPORARY_PREFIX)]
 
 
 def test_an_older_file_keeps_its_mode(capture, tmp_path):
@@ -118,7 +118,7 @@ def _noting(did, sync):
 
 
 def test_an_interrupt_removes_what_is_not_finished(capture, tmp_path):
-    with paths.replacing(tmp_path / "plate.nc", lambda _: True) as unfinished:
+    with paths.atomic_write(tmp_path / "plate.nc", lambda _: True) as unfinished:
         unfinished.write_bytes(b"half")
         assert leftovers(tmp_path)
         assert interrupts.clean_up() == []

@@ -194,7 +194,11 @@ def test_a_discrete_distribution_is_refused(prior):
         ("roughness", dist.HalfNormal(0.2).expand([4]).to_event(1), "one draw of it has shape"),
         ("subsurface_fraction", dist.Dirichlet(jnp.ones(3)), "one draw of it has shape"),
         ("discrepancy_weights", dist.Normal(0.0, 1.0), "one draw of it has shape"),
-        ("refractive_index", dist.Uniform(1.2, jnp.array([1.8, 2.0])), "2 distributions side"),
+        (
+            "refractive_index",
+            dist.Uniform(1.2, jnp.array([1.8, 2.0])),
+            "a batch of 2 distributions",
+        ),
     ],
 )
 def test_a_distribution_of_the_wrong_shape_is_refused(name, prior, words):

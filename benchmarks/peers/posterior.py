@@ -34,9 +34,7 @@ class Posterior:
 
     @functools.cached_property
     def request(self) -> Request:
-        return resolve(
-            self.capture, "per_material", "laplace", SCENE, None, None, None, 0, "double"
-        )
+        return resolve(self.capture, "per_material", SCENE, None, None, None, 0, "double")
 
     @functools.cached_property
     def data(self) -> Observations:

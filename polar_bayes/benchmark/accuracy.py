@@ -23,15 +23,16 @@ from polar_bayes.benchmark.run import (
     OVERRIDES,
     AbstractOverride,
     Trial,
-    problem_of,
     run_fresh,
     run_trial,
 )
 from polar_bayes.design.setup import request_provenance
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, Schema, holds, load_tree
-from polar_bayes.inference.methods import LADDER
-from polar_bayes.inference.request import Method, Request, resolve
+from polar_bayes.inference.method import AbstractMethod
+from polar_bayes.inference.methods import STUDY_METHODS
+from polar_bayes.inference.problem import make_problem
+from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -74,7 +75,7 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
 def accuracy(
     capture: xr.Dataset,
     *,
-    methods: Mapping[str, Method] | None = None,
+    methods: Mapping[str, AbstractMethod] | None = None,
     overrides: Iterable[AbstractOverride] = OVERRIDES,
     reference: Reference | None = None,
     fresh: bool = True,
@@ -90,7 +91,7 @@ def accuracy(
 
     Args:
         capture: A Dataset of the capture schema; validated here.
-        methods: Methods by name; by default `polar_bayes.methods.LADDER`.
+        methods: Methods by name; by default `polar_bayes.methods.STUDY_METHODS`.
         overrides: What else is changed, one at a time, on every method; `()` for the methods alone.
         reference: How well the reference posterior must be known.
         fresh: True runs every trial in a process of its own, so that the first time includes all
@@ -115,15 +116,15 @@ def accuracy(
         SceneError: No such scene.
         FitError: A prior, link or setting cannot be used, or there is no reference.
     """
-    request = resolve(
-        capture, model, "nuts", scene, priors, links, largest_view_zenith, seed, "double"
-    )
+    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
     show = progress or no_progress
-    trials = _trials(request, LADDER if methods is None else methods, tuple(overrides))
+    trials = _trials(request, STUDY_METHODS if methods is None else methods, tuple(overrides))
     show("reference", 0.0)
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), REFERENCE_FOLD)
-        reference_run = run_reference(reference or Reference(), problem_of(request, key))
+        key_search, key_draws = jax.random.split(key)
+        problem = make_problem(request, key_search)
+        reference_run = run_reference(reference or Reference(), problem, key_draws)
     show("reference", 1.0)
     rows = []
     for number, trial in enumerate(trials.values()):
@@ -147,18 +148,18 @@ Trials = dict[tuple[str, str], Trial | PolarBayesError]
 
 
 def _trials(
-    request: Request, methods: Mapping[str, Method], overrides: tuple[AbstractOverride, ...]
+    request: Request, methods: Mapping[str, AbstractMethod], overrides: tuple[AbstractOverride, ...]
 ) -> Trials:
     """Every method as given, then with every override that changes something."""
     if not isinstance(methods, Mapping) or not methods:
         raise FitError(
             "there is no method",
             where="accuracy: methods",
-            hint="give methods by name, as in LADDER",
+            hint="give methods by name, as in STUDY_METHODS",
         )
     trials: Trials = {}
     for name, method in methods.items():
-        if not isinstance(method, Method):
+        if not isinstance(method, AbstractMethod):
             raise FitError(
                 f"a {type(method).__name__} is not a method",
                 where=f"accuracy: methods[{name!r}]",

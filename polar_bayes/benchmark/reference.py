@@ -7,20 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.stats
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from polar_bayes.benchmark.run import labeled
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT
 from polar_bayes.errors import FitError
 from polar_bayes.inference.auto import missed_mode_weight
-from polar_bayes.inference.mcse import errors_of
-from polar_bayes.inference.method import PosteriorDraws
-from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
+from polar_bayes.inference.mode_methods import Nuts
 from polar_bayes.inference.problem import Problem
-from polar_bayes.inference.request import Method
-from polar_bayes.inference.run_method import answer, with_answer_draws, with_draws
-from polar_bayes.inference.smc import PixelTempering
+from polar_bayes.inference.smc import PixelSMC
 from polar_bayes.inference.weighted import Tempered
+from polar_bayes.progress import no_progress
 
 # --- Distances from the reference -----------------------------------------------------------------
 
@@ -98,7 +96,7 @@ class Reference:
     def tempered(self) -> Tempered:
         """The method that is tried where chains do not agree."""
         goal = 4.0 / self.error**2  # half of it is lost where draws are chosen by weight
-        settings = with_answer_draws(PixelTempering(walks=1024, draws=4096), 4.0 * goal)
+        settings = Tempered(PixelSMC(num_chains=1024, draws=4096)).with_draws(4.0 * goal).settings
         return Tempered(dataclasses.replace(settings, effective_draws=goal))
 
 
@@ -126,14 +124,14 @@ class ReferenceRun(NamedTuple):
         return float(max(self.mean_error.max(), self.sd_error.max()))
 
 
-def run_reference(settings: Reference, problem: Problem) -> ReferenceRun:
+def run_reference(settings: Reference, problem: Problem, key: Array) -> ReferenceRun:
     """Chains that are lengthened until their own error is small enough."""
     # Where they do not agree, or some of them missed a mode, tempered draws are tried, where the
     # capture allows it.
-    runs = [_run_until(settings, "NUTS", settings.chains, problem)]
+    runs = [_run_until(settings, "NUTS", settings.chains, problem, key)]
     if runs[0].doubts:
         with contextlib.suppress(FitError):  # several patches or colors
-            runs.append(_run_until(settings, "tempered draws", settings.tempered, problem))
+            runs.append(_run_until(settings, "tempered draws", settings.tempered, problem, key))
     return best_reference(runs)
 
 
@@ -142,29 +140,33 @@ def best_reference(runs: Sequence[ReferenceRun]) -> ReferenceRun:
     return min(runs, key=lambda run: (len(run.biases), not run.error < np.inf, run.error))
 
 
-def _run_until(settings: Reference, name: str, method: Method, problem: Problem) -> ReferenceRun:
+def _run_until(
+    settings: Reference, name: str, method: AbstractMethod, problem: Problem, key: Array
+) -> ReferenceRun:
     """Four times the draws, until the error is as small as the settings ask."""
-    run = _run(settings, name, method, problem)
+    run = _run(settings, name, method, problem, key)
     for _ in range(settings.longer):
-        longer = with_draws(method, 4.0)
+        longer = method.scale_draws(4.0)
         if run.error <= settings.error or longer is None:
             break
         method = longer
-        run = _run(settings, name, method, problem)
+        run = _run(settings, name, method, problem, key)
     return run
 
 
-def _run(settings: Reference, name: str, method: Method, problem: Problem) -> ReferenceRun:
-    found = answer(method, problem)
-    labels, draws = labeled(problem.program, found.z, problem.data)
-    mean_error, sd_error = errors_of(found, lambda z: labeled(problem.program, z, problem.data)[1])
+def _run(
+    settings: Reference, name: str, method: AbstractMethod, problem: Problem, key: Array
+) -> ReferenceRun:
+    found = method.run(problem, key, no_progress)
+    labels, draws = labeled(problem, found.z)
+    mean_error, sd_error = found.standard_errors(lambda z: labeled(problem, z)[1])
     first, second = (
         half.reshape(len(draws), -1) for half in np.split(draws, [draws.shape[1] // 2], axis=1)
     )
-    biases = list(found.problems)
+    biases = found.doubts
     if found.r_hat > LARGEST_R_HAT:
         biases.append(f"its R-hat is {found.r_hat:.3f}")
-    if isinstance(method, Nuts) and (weight := missed_mode_weight(found.z, problem)) > 0.0:
+    if found.method == "nuts" and (weight := missed_mode_weight(found.z, problem)) > 0.0:
         biases.append(f"a mode of weight {weight:.2g} was not visited by every chain")
     run = ReferenceRun(
         labels, draws, name, mean_error, sd_error, distances(first, second), found, tuple(biases)

@@ -7,7 +7,6 @@ runs what one file holds and writes what came of it to the other.
 
 import abc
 import dataclasses
-import functools
 import math
 import os
 import pickle
@@ -22,22 +21,20 @@ from typing import override
 import cloudpickle
 import jax
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from polar_bayes.diagnostics.parameters import scalars
 from polar_bayes.effects.choose import choose_effects
-from polar_bayes.effects.variants import Effect, parameter_ranks, simplify
+from polar_bayes.effects.variants import Effect, parts_of, simplify
 from polar_bayes.errors import FitError, PolarBayesError
-from polar_bayes.inference.compile import LRUCache
-from polar_bayes.inference.method import PosteriorDraws
-from polar_bayes.inference.problem import Problem, compile_model
-from polar_bayes.inference.program import Program, parameters_of
-from polar_bayes.inference.request import Method, Request
+from polar_bayes.inference.compile import LRUCache, cache_key
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
+from polar_bayes.inference.problem import Problem, make_problem
+from polar_bayes.inference.request import Request
+from polar_bayes.inference.resampling import CHAINS, numpy_generator
 from polar_bayes.inference.result import posterior_of
-from polar_bayes.inference.run_method import answer, draws_of, with_draws
 from polar_bayes.interrupts import on_interrupt
-from polar_bayes.observation.data import Observations, observe
-from polar_bayes.paths import unfinished_folder
+from polar_bayes.paths import temporary_folder
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import no_progress
@@ -49,13 +46,16 @@ except ImportError:  # not on Windows, where memory is then not known
 
 MEBIBYTE = 2**20
 
+POINT_DRAWS = 1000
+"""Of the normal distribution around a point estimate."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
     """What is run."""
 
     request: Request
-    method: Method
+    method: AbstractMethod
     seed: int
 
 
@@ -77,39 +77,45 @@ def run_trial(trial: Trial) -> Measured:
     before = _memory()
     with jax.enable_x64(trial.request.precision == "double"):
         begin = time.perf_counter()
-        found, program, data = _run(trial, trial.seed)
-        labels, draws = labeled(program, found.z, data)
+        found, labels, draws = _run(trial, trial.seed)
         first = time.perf_counter() - begin
         peak = _memory()
         begin = time.perf_counter()
-        again, program, data = _run(trial, trial.seed + 1)
-        labeled(program, again.z, data)
+        _run(trial, trial.seed + 1)
         seconds = time.perf_counter() - begin
-    bare = dataclasses.replace(found, z=np.zeros(0), stats={}, weighted=None)
+    bare = dataclasses.replace(
+        found, problems=found.doubts, z=np.zeros(0), stats={}, weighted=None, covariance=None
+    )
     return Measured(labels, draws, bare, first, seconds, peak, before)
 
 
-def problem_of(request: Request, key: Array) -> Problem:
-    """The capture of a request, ready to be fitted."""
-    data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
-    if request.precision == "single":
-        data = data.in_single_precision()
-    compiled_model = compile_model(request, request.scene, data)
-    return Problem(request, compiled_model, data, key, no_progress)
-
-
 def labeled(
-    program: Program, z: np.ndarray, data: Observations
-) -> tuple[tuple[str, ...], np.ndarray]:
-    """Parameters of draws: their labels, and (parameter, chain, draw)."""
-    drawn = parameters_of(program, z.astype(data.brightness.dtype), data)
-    found = scalars(posterior_of(program, drawn))
+    problem: Problem, z: Float[np.ndarray, "chain draw size"]
+) -> tuple[tuple[str, ...], Float[np.ndarray, "parameter chain draw"]]:
+    """Labels and values of the parameters of draws."""
+    found = scalars(posterior_of(problem.program, problem.constrain(z)))
     return tuple(each.label for each in found), np.stack([each.draws for each in found])
 
 
-def _run(trial: Trial, seed: int) -> tuple[PosteriorDraws, Program, Observations]:
-    problem = problem_of(trial.request, jax.random.key(seed))
-    return answer(trial.method, problem), problem.program, problem.data
+def _run(trial: Trial, seed: int) -> tuple[PosteriorDraws, tuple[str, ...], np.ndarray]:
+    """The draws of a method, and their parameters with labels."""
+    key_search, key_draws = jax.random.split(jax.random.key(seed))
+    problem = make_problem(trial.request, key_search)
+    found = trial.method.run(problem, key_draws, no_progress)
+    if found.covariance is not None:
+        found = sample_point(found, key_draws)
+    return found, *labeled(problem, found.z)
+
+
+def sample_point(found: PosteriorDraws, key: Array) -> PosteriorDraws:
+    """Draws of the normal distribution that the standard errors of a point estimate stand for."""
+    # What the readings do not determine has no standard error, and is drawn without any width.
+    covariance = np.asarray(found.covariance)
+    free = np.isinf(np.diagonal(covariance))
+    finite = np.where(free[:, None] | free, 0.0, covariance)
+    shape = CHAINS, POINT_DRAWS // CHAINS
+    z = numpy_generator(key).multivariate_normal(found.z[0, 0], finite, shape)
+    return dataclasses.replace(found, z=z, stats={}, effective_draws=float(POINT_DRAWS))
 
 
 def _memory() -> float:
@@ -128,7 +134,7 @@ LAST_WORDS = 300
 
 def run_fresh(trial: Trial) -> Measured:
     """Run a trial in a new process, with compiled programs of earlier ones out of reach."""
-    with unfinished_folder(Path(tempfile.gettempdir())) as folder:
+    with temporary_folder(Path(tempfile.gettempdir())) as folder:
         given, made = folder / "trial", folder / "measured"
         given.write_bytes(cloudpickle.dumps(trial))
         words = [sys.executable, "-m", "polar_bayes.benchmark.run", str(given), str(made)]
@@ -172,7 +178,7 @@ def _work(given: Path, made: Path) -> None:
 # --- Overrides of the request or method: facets, effects, precision, number of draws --------------
 
 
-Overridden = tuple[Request, Method]
+Overridden = tuple[Request, AbstractMethod]
 
 NEARLY = 0.1
 """Relative difference between the draws that an override is called by and those that there are."""
@@ -188,7 +194,7 @@ class AbstractOverride(abc.ABC):
         """What it is called beside the method: `facets / 2`."""
 
     @abc.abstractmethod
-    def apply(self, request: Request, method: Method) -> Overridden | None:
+    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
         """What is fitted then.
 
         Args:
@@ -228,12 +234,12 @@ class DrawsOverride(AbstractOverride):
         return _times("draws", self.factor)
 
     @override
-    def apply(self, request: Request, method: Method) -> Overridden | None:
+    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
         try:
-            changed = with_draws(method, self.factor)
+            changed = method.scale_draws(self.factor)
         except FitError:  # as few as the method allows
             return None
-        before, after = draws_of(method), None if changed is None else draws_of(changed)
+        before, after = method.num_draws, None if changed is None else changed.num_draws
         if changed is None or not before or not after:
             return None
         # Numbers are rounded, or have a least: what is called so must be so.
@@ -251,7 +257,7 @@ class PrecisionOverride(AbstractOverride):
         return "single precision"
 
     @override
-    def apply(self, request: Request, method: Method) -> Overridden | None:
+    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
         if request.precision == "single":
             return None
         return dataclasses.replace(request, precision="single"), method
@@ -282,10 +288,10 @@ class FacetsOverride(AbstractOverride):
         return _times("facets", self.factor)
 
     @override
-    def apply(self, request: Request, method: Method) -> Overridden | None:
+    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
         changed = [
             Effect("", key_path, part, self._of(part))
-            for key_path, part in parameter_ranks(request.scene)
+            for key_path, part in parts_of(request.scene)
             if isinstance(part, FacetQuadrature)
         ]
         scene = simplify(request.scene, changed)
@@ -314,9 +320,8 @@ class EffectsOverride(AbstractOverride):
         return "chosen effects"
 
     @override
-    def apply(self, request: Request, method: Method) -> Overridden | None:
-        choose = functools.partial(_chosen, request, self.tolerance)
-        _, scene = _CHOSEN.of((id(request), self.tolerance), choose)
+    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
+        scene = _choose(request, self.tolerance)
         if isinstance(scene, PolarBayesError):
             raise scene
         return None if scene == request.scene else (_with_scene(request, scene), method)
@@ -335,28 +340,35 @@ OVERRIDES: tuple[AbstractOverride, ...] = (
 PRIOR = "prior of "
 """How a request says that a prior is the user's own."""
 
-_CHOSEN: LRUCache[tuple[Request, Scene | PolarBayesError]] = LRUCache(2)
-"""Choices take minutes and serve every method; each is stored with its request. One that failed
-would fail again."""
+_CHOSEN: LRUCache[Scene | PolarBayesError] = LRUCache(2)
+"""Choices take minutes, and every method asks. One that failed would fail again."""
 
 
-def _chosen(request: Request, tolerance: float) -> tuple[Request, Scene | PolarBayesError]:
+def _choose(request: Request, tolerance: float) -> Scene | PolarBayesError:
+    """The scene that `polar_bayes.choose_effects` chooses, or why it cannot."""
     plain = simplify(request.scene, ())
     own = [name.removeprefix(PRIOR) for name in request.swapped if name.startswith(PRIOR)]
-    try:
-        scene = choose_effects(
-            request.capture,
-            scene=plain,
-            tolerance=tolerance,
-            model=request.model,
-            priors={name: request.priors[name] for name in own},
-            links=request.links,
-            largest_view_zenith=request.largest_view_zenith,
-            seed=request.seed,
-        )
-    except PolarBayesError as error:
-        return request, error
-    return request, simplify(scene, ())
+    priors = {name: request.priors[name] for name in own}
+    limits = tolerance, request.largest_view_zenith, request.seed
+    key = cache_key(request.model, plain, priors, request.links, request.capture, *limits)
+
+    def choose() -> Scene | PolarBayesError:
+        try:
+            scene = choose_effects(
+                request.capture,
+                scene=plain,
+                tolerance=tolerance,
+                model=request.model,
+                priors=priors,
+                links=request.links,
+                largest_view_zenith=request.largest_view_zenith,
+                seed=request.seed,
+            )
+        except PolarBayesError as error:
+            return error
+        return simplify(scene, ())
+
+    return _CHOSEN.of(key, choose)
 
 
 def _with_scene(request: Request, scene: Scene) -> Request:

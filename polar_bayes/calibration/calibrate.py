@@ -21,18 +21,18 @@ from polar_bayes.calibration.runner import (
     join,
     needs_mcmc,
 )
-from polar_bayes.calibration.store import Store, fingerprint_of
+from polar_bayes.calibration.store import BlockStore, fingerprint_of
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import PixelLaplace, candidates_of
+from polar_bayes.inference.batch_engine import engine_key
+from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_programs import key_of
-from polar_bayes.inference.batch_result import Approach, Status
-from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.mode_methods import Nuts
 from polar_bayes.inference.program import Values
-from polar_bayes.inference.psis import LARGEST_TRUSTED, LEVELS
+from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE, dims_of, shape_of
-from polar_bayes.inference.smc import PixelTempering
+from polar_bayes.inference.smc import PixelSMC
 from polar_bayes.interrupts import on_interrupt
 from polar_bayes.maps.blocks import as_completed, workers
 from polar_bayes.observation.data import Observations
@@ -46,8 +46,8 @@ from polar_bayes.progress import Counter, no_progress, with_counter
 METHODS: dict[str, Method] = {
     "laplace": PixelLaplace(weighted=False),
     "importance": PixelLaplace(draws=512),
-    "tempered": PixelTempering(),
-    "nuts": PixelNuts(start=PixelTempering()),
+    "tempered": PixelSMC(),
+    "nuts": PixelNuts(start=PixelSMC()),
 }
 MIN_SIMULATIONS = 20
 
@@ -142,7 +142,7 @@ def calibrate(
     def resolved(differing: Mapping[str, Any]) -> Request:
         model, scene, priors, links = {**arguments, **differing}.values()
         limit = largest_view_zenith
-        return resolve(capture, model, "laplace", scene, priors, links, limit, seed, "double")
+        return resolve(capture, model, scene, priors, links, limit, seed, "double")
 
     request = resolved({})
     settings = _settings(method, request)
@@ -154,7 +154,7 @@ def calibrate(
             where="calibrate: truth",
             hint="give models whose parameters have the same names and shapes",
         )
-    blocks = None if store is None else Store(as_path(store, "store"), fingerprint_of(plan))
+    blocks = None if store is None else BlockStore(as_path(store, "store"), fingerprint_of(plan))
     done = blocks.begin(resume=resume) if blocks is not None else []
     stored = np.concatenate([*(block.numbers for block in done), []])
     missing = np.setdiff1d(np.arange(simulations), stored).astype(int)
@@ -189,8 +189,8 @@ def make_plan(
     request: Request, generative_request: Request | None, settings: Method, readings: bool
 ) -> Plan:
     """What is done to every block; without a generative request, the fitted model simulates."""
-    spec_key = key_of(request, candidates_of(settings), request.largest_view_zenith)
-    generative_key = "" if generative_request is None else key_of(generative_request)
+    spec_key = engine_key(request, request.largest_view_zenith)
+    generative_key = "" if generative_request is None else engine_key(generative_request)
     capture_key = tokenize(request.capture)
     key = tokenize(spec_key, generative_key, repr(settings), readings, capture_key)
     return Plan(request, generative_request, settings, readings, spec_key, key)
@@ -200,7 +200,7 @@ def _fit_all(
     plan: Plan,
     missing: np.ndarray,
     total: int,
-    store: Store | None,
+    store: BlockStore | None,
     scheduler: str | None,
     progress: Counter,
 ) -> list[Block]:
@@ -279,7 +279,7 @@ def _assemble(
     fits: dict[str, tuple] = {
         name: ("simulation", x) for name, x in simulated.outcome._asdict().items()
     }
-    for name, flags in {"status": Status, "approach": Approach}.items():
+    for name, flags in {"status": Status, "approach": MethodUsed}.items():
         meanings = " ".join(flag.name.lower() for flag in flags)
         fits[name] = (*fits[name], {"flag_meanings": meanings})
     quantiles = {name: np.moveaxis(x, 1, 0) for name, x in simulated.quantiles.items()}
@@ -307,7 +307,7 @@ def _assemble(
 
 def _chosen_readings(simulated: Block, data: Observations) -> dict[str, tuple]:
     """Axes of the readings that were ranked, and Pareto k of leaving them out."""
-    k_name = f"Pareto k of the weights without it; above {LARGEST_TRUSTED} they say little"
+    k_name = f"Pareto k of the weights without it; above {MAX_PARETO_K} they say little"
     chosen: dict[str, tuple] = {}
     for name, entry in simulated.entry.items():
         k = simulated.left_out_k[name]

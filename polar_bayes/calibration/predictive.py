@@ -23,7 +23,7 @@ from jaxtyping import Array
 from numpyro import handlers
 
 from polar_bayes.calibration.scores import randomized_pit
-from polar_bayes.inference.batching import Stack, batched, batches
+from polar_bayes.inference.batching import ObservationBatch, batched, batches
 from polar_bayes.inference.compile import LRUCache
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.inference.psis import smooth
@@ -47,19 +47,24 @@ class PredictivePit:
     """PIT values of readings, filled in fit by fit; NaN where a fit has failed."""
 
     def __init__(
-        self, program: Program, captures: Stack, replicated: Values, numbers: np.ndarray, seed: int
+        self,
+        program: Program,
+        captures: ObservationBatch,
+        replicated: Values,
+        numbers: np.ndarray,
+        seed: int,
     ) -> None:
         self._program, self._captures = program, captures.in_precision(np.float32)
         self._names = tuple(sorted(replicated))
         count = len(numbers)
-        valid = np.asarray(captures.own.valid).reshape(count, -1)
+        valid = np.asarray(captures.batched.valid).reshape(count, -1)
         uniform = np.array(
             [np.random.default_rng([seed, n, 1]).random(1 + 3 * len(replicated)) for n in numbers]
         )
         self._first, uniform = uniform[:, 0], uniform[:, 1:].reshape(count, 3, -1)
         self.entry = {n: _choose(valid, uniform[:, 0, at]) for at, n in enumerate(self._names)}
         self._uniform = {n: uniform[:, 1:, at] for at, n in enumerate(self._names)}
-        fitted = self._captures.own.readings
+        fitted = self._captures.batched.readings
         self._observed = {
             n: np.stack(
                 [_take(np.asarray(x[n], np.float32), self.entry[n]) for x in (replicated, fitted)],
@@ -106,7 +111,7 @@ class PredictivePit:
         predict = _PREDICTORS.of(
             (self._program, self._names), lambda: _predictor(self._program, self._names)
         )
-        shared = jax.tree.map(jnp.asarray, self._captures.shared)
+        shared = jax.tree.map(jnp.asarray, self._captures.static)
         entry = {name: np.maximum(x[at], 0).astype(np.int32) for name, x in self.entry.items()}
         states = (entry, latent, self._keys[at])
         parts: list = []
@@ -170,7 +175,7 @@ def _predictor(program: Program, names: tuple[str, ...]) -> Callable:
         keys = jax.random.split(key, DRAWS)
         return jax.lax.map(of_draw, (latent, keys), batch_size=DRAW_BATCH)
 
-    return batched(predict, side_by_side=1)
+    return batched(predict, lanes=1)
 
 
 def _choose(valid: np.ndarray, uniform: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.inference.batching import Stack, together
+from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.compile import JitOnce, LRUCache
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.observation.data import Observations
@@ -23,7 +23,7 @@ class Simulations(NamedTuple):
     """True parameters, and the captures simulated from them."""
 
     truth: Values
-    captures: Stack
+    captures: ObservationBatch
 
 
 def draw_captures(
@@ -44,7 +44,7 @@ def redraw_readings(
     """Draw the readings of the same true parameters once more."""
     read = _READERS.of(program, lambda: _reader(program))
     captures = drawn.captures
-    found = read(np.asarray(numbers, np.uint32), key, data, captures.own, captures.shared)
+    found = read(np.asarray(numbers, np.uint32), key, data, captures.batched, captures.static)
     return jax.tree.map(np.asarray, found)
 
 
@@ -77,7 +77,7 @@ def _reader(program: Program) -> Callable[..., Values]:
             key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
             z = program.from_prior(key_truth, data)
             key_noise = jax.random.fold_in(key_noise, 1)
-            return program.describe(key_noise, z, together(capture, shared)).predictive
+            return program.describe(key_noise, z, eqx.combine(capture, shared)).predictive
 
         return jax.lax.map(read, (numbers, own))
 
@@ -97,7 +97,7 @@ def _recorded(data: Observations, readings: Mapping[str, Any]) -> Observations:
     )
 
 
-def _batch(data: Observations, recorded: tuple) -> Stack:
+def _batch(data: Observations, recorded: tuple) -> ObservationBatch:
     """Captures as a batch: what was drawn and the masks differ, all else is the same."""
 
     def drawn(capture: Observations) -> tuple:
@@ -112,4 +112,4 @@ def _batch(data: Observations, recorded: tuple) -> Stack:
     )
     own, shared = eqx.partition(eqx.tree_at(drawn, plain, (*recorded, valid)), is_drawn)
     views = valid.reshape(shape[0], -1, shape[-1]).any(axis=1).sum(axis=-1)
-    return Stack(own, shared, views)
+    return ObservationBatch(own, shared, views)

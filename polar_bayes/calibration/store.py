@@ -1,4 +1,4 @@
-"""Finished blocks in a folder: what a calibration that is broken off does not lose."""
+"""Finished blocks of a calibration in a folder, from which an interrupted one resumes."""
 
 import contextlib
 import dataclasses
@@ -24,10 +24,10 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_result import Outcome
 from polar_bayes.inference.request import Request
 from polar_bayes.interrupts import resume_hint
-from polar_bayes.paths import UNFINISHED, move_into_place, unfinished_folder
+from polar_bayes.paths import TEMPORARY_PREFIX, replace_file, temporary_folder
 from polar_bayes.priors import describe_prior
 
-# --- What a calibration asks, in texts that are the same in every process: who resumes must ask it
+# --- Fingerprint of a calibration: one text per topic, the same in every process ------------------
 
 
 ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
@@ -35,12 +35,12 @@ LIBRARIES = ("polar_bayes", "jax", "jaxlib", "numpyro", "numpy", "scipy")
 
 
 def fingerprint_of(plan: Plan) -> dict[str, str]:
-    """All that fixes the numbers of a calibration, but how many simulations there are."""
-    told = _asked(plan.generative_request) if plan.generative_request is not None else {}
+    """One text per topic that determines the fits; their number may differ between runs."""
+    truth = _topics(plan.generative_request) if plan.generative_request is not None else {}
     return {
         "capture": digest(jax.tree.leaves(plan.data), plan.data.dims, tuple(plan.data.readings)),
-        **_asked(plan.request),
-        "truth": " ".join(f"{topic}: {text}" for topic, text in told.items()),
+        **_topics(plan.request),
+        "truth": " ".join(f"{topic}: {text}" for topic, text in truth.items()),
         "method": repr(plan.settings),
         "seed": str(plan.request.seed),
         "readings": str(plan.readings),
@@ -48,17 +48,12 @@ def fingerprint_of(plan: Plan) -> dict[str, str]:
     }
 
 
-def differing(asked: Mapping[str, str], begun: Mapping[str, str]) -> list[str]:
-    """Topics in which two questions differ."""
-    return [topic for topic in {**asked, **begun} if asked.get(topic) != begun.get(topic)]
-
-
 def digest(*parts: Any) -> str:
-    """A short text of arrays, numbers, texts and functions, nested in any way."""
-    return hashlib.sha256(_told(parts).encode()).hexdigest()[:16]
+    """A short hash of arrays, numbers, texts and functions, nested in any way."""
+    return hashlib.sha256(_text(parts).encode()).hexdigest()[:16]
 
 
-def _asked(request: Request) -> dict[str, str]:
+def _topics(request: Request) -> dict[str, str]:
     priors = (
         f"{name}={describe_prior(prior)} {digest(_values(prior))}"
         for name, prior in sorted(request.priors.items())
@@ -74,67 +69,66 @@ def _asked(request: Request) -> dict[str, str]:
 
 
 def _values(prior: dist.Distribution) -> list[str]:
-    """What it holds; in which order changes from process to process."""
-    return sorted(_told(np.asarray(leaf)) for leaf in jax.tree.leaves(prior))
+    """The arrays that a distribution holds; their order differs between processes."""
+    return sorted(_text(np.asarray(leaf)) for leaf in jax.tree.leaves(prior))
 
 
-def _told(part: Any) -> str:
+def _text(part: Any) -> str:
     if isinstance(part, np.ndarray | np.generic | jax.Array):
         array = np.asarray(part)
-        said = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
-        return f"{array.dtype}{array.shape}{said}"
+        values = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+        return f"{array.dtype}{array.shape}{values}"
     if isinstance(part, Mapping):
-        return f"{{{', '.join(f'{key}: {_told(part[key])}' for key in sorted(part, key=str))}}}"
+        return f"{{{', '.join(f'{key}: {_text(part[key])}' for key in sorted(part, key=str))}}}"
     if isinstance(part, tuple | list):
-        return f"[{', '.join(map(_told, part))}]"
+        return f"[{', '.join(map(_text, part))}]"
     if isinstance(part, set | frozenset):
-        return f"<{', '.join(sorted(map(_told, part)))}>"
+        return f"<{', '.join(sorted(map(_text, part)))}>"
     if isinstance(part, dist.Distribution):
-        return f"{describe_prior(part)}{_told(_values(part))}"
+        return f"{describe_prior(part)}{_text(_values(part))}"
     if isinstance(part, types.CodeType):
-        return _told([part.co_code.hex(), part.co_names, part.co_varnames, part.co_consts])
-    return _told_callable(part) if callable(part) else ADDRESS.sub("", repr(part))
+        return _text([part.co_code.hex(), part.co_names, part.co_varnames, part.co_consts])
+    return _text_of_callable(part) if callable(part) else ADDRESS.sub("", repr(part))
 
 
-def _told_callable(part: Callable) -> str:
-    """What a function, or an object that acts as one, is made of."""
-    kind = type(part)
+def _text_of_callable(part: Callable) -> str:
+    """The code and values of a function, or of a callable object."""
     if isinstance(part, functools.partial):
-        return _told([part.func, part.args, part.keywords])
+        return _text([part.func, part.args, part.keywords])
     if isinstance(part, types.MethodType):
-        return _told([part.__func__, part.__self__])
+        return _text([part.__func__, part.__self__])
     if isinstance(part, types.FunctionType):
         # One that calls itself encloses itself.
         cells = inspect.getclosurevars(part).nonlocals
         closed = {name: x for name, x in cells.items() if x is not part}
         given = [part.__defaults__, part.__kwdefaults__ or {}]
-        return f"{part.__qualname__}{_told([part.__code__, closed, given])}"
+        return f"{part.__qualname__}{_text([part.__code__, closed, given])}"
     if isinstance(part, Messenger):
-        return f"{kind.__name__}{_told(vars(part))}"
+        return f"{type(part).__name__}{_text(vars(part))}"
     if dataclasses.is_dataclass(part) and not isinstance(part, type):
         own = {each.name: getattr(part, each.name) for each in dataclasses.fields(part)}
-        return f"{kind.__qualname__}{_told([own, kind.__call__])}"
+        return f"{type(part).__qualname__}{_text([own, type(part).__call__])}"
     return ADDRESS.sub("", repr(part))
 
 
-# --- Finished blocks in a folder: what a calibration that is broken off does not lose -------------
+# --- Blocks on the disk ---------------------------------------------------------------------------
 
 
-QUESTION, BLOCKS = "question.json", "*.npz"
+QUESTION = "question.json"
 
 
-class Store:
-    """Blocks on the disk, each in a file that is there whole or not at all."""
+class BlockStore:
+    """A folder of blocks, each in a file that is there whole or not at all."""
 
     # A file is moved to its place when it is on the disk, and its archive holds a checksum of each
-    # array. What a crash left unfinished, or what cannot be read, counts as not there: its
-    # simulations are fitted again, to the same bits.
+    # array. An unfinished or damaged file is ignored: its simulations are fitted again, to the same
+    # bits.
 
-    def __init__(self, folder: Path, question: Mapping[str, str]) -> None:
-        self._folder, self._question = folder, dict(question)
+    def __init__(self, folder: Path, fingerprint: Mapping[str, str]) -> None:
+        self._folder, self._fingerprint = folder, dict(fingerprint)
 
     def begin(self, *, resume: bool) -> list[Block]:
-        """Make the folder, or find what is in it."""
+        """Make the folder, or read the blocks in it."""
         where, head = str(self._folder), self._folder / QUESTION
         if not resume and self._folder.exists():
             raise FitError(
@@ -145,34 +139,42 @@ class Store:
             names = [path.name for path in self._folder.iterdir()]
         if head.name in names:
             self._check(head)
-        elif any(not name.startswith(UNFINISHED) for name in names):
+        elif any(not name.startswith(TEMPORARY_PREFIX) for name in names):
             raise FitError("it holds no calibration", where=where, hint="give another --out")
-        else:  # new, or broken off before it said what is asked
-            told = json.dumps(self._question, indent=1, sort_keys=True).encode()
+        else:  # new, or interrupted before the fingerprint was written
+            text = json.dumps(self._fingerprint, indent=1, sort_keys=True).encode()
             with self._whole(QUESTION) as unfinished:
-                unfinished.write_bytes(told)
-        found = (read_block(path) for path in sorted(self._folder.glob(BLOCKS)))
+                unfinished.write_bytes(text)
+        found = (read_block(path) for path in sorted(self._folder.glob("*.npz")))
         return [block for block in found if block is not None]
 
     def add(self, block: Block) -> None:
-        """Keep a block."""
+        """Write a block; arrays are named by their path, such as `pit/roughness`."""
         first, last = int(block.numbers.min()), int(block.numbers.max())
-        with self._whole(f"{first:08d}-{last:08d}.npz") as unfinished:
-            with unfinished.open("wb") as file:
-                np.savez(file, allow_pickle=False, **_flat(block._asdict()))
+        arrays = {
+            jax.tree_util.keystr(path, simple=True, separator="/"): np.asarray(x)
+            for path, x in jax.tree_util.tree_leaves_with_path(block)
+        }
+        with (
+            self._whole(f"{first:08d}-{last:08d}.npz") as unfinished,
+            unfinished.open("wb") as file,
+        ):
+            np.savez(file, allow_pickle=False, **arrays)
 
     def resume_hint(self) -> str:
-        """What an interrupt leaves, for the user."""
+        """The sentence that an interrupt leaves for the user."""
         return resume_hint(self._folder)
 
     def _check(self, head: Path) -> None:
+        """Refuse a folder of another fingerprint."""
         try:
             begun = json.loads(head.read_text())
         except (OSError, ValueError) as error:
             raise FitError(
                 "it cannot be read", where=str(head), hint="give another --out"
             ) from error
-        others = differing(self._question, begun)
+        topics = {**self._fingerprint, **begun}
+        others = [topic for topic in topics if self._fingerprint.get(topic) != begun.get(topic)]
         if others:
             raise FitError(
                 f"it was begun with another {', another '.join(others)}".replace(
@@ -184,14 +186,14 @@ class Store:
 
     @contextlib.contextmanager
     def _whole(self, name: str) -> Iterator[Path]:
-        """A file to write to, which then takes its place at once."""
-        with self._written(), unfinished_folder(self._folder) as unfinished:
+        """A file to write to, which is then moved into its place."""
+        with self._written(), temporary_folder(self._folder) as unfinished:
             yield unfinished / name
-            move_into_place(unfinished / name, self._folder / name)
+            replace_file(unfinished / name, self._folder / name)
 
     @contextlib.contextmanager
     def _written(self) -> Iterator[None]:
-        """What the operating system says, as one line."""
+        """Errors of the operating system, as one line."""
         try:
             yield
         except OSError as error:
@@ -203,34 +205,17 @@ class Store:
 
 
 def read_block(path: Path) -> Block | None:
-    """A block from a file."""
+    """A block from a file; None where the file is damaged."""
+    parts: dict[str, Any] = {name: {} for name in Block._fields}
     try:
         # NumPy does not close a file that it opens and cannot read.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            flat = {name: file[name] for name in file.files}
-        return _block(flat)
-    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile):
+            for key in file.files:
+                name, _, entry = key.partition("/")
+                if entry:
+                    parts[name][entry] = file[key]
+                else:
+                    parts[name] = file[key]
+        return Block(**{**parts, "outcome": Outcome(**parts["outcome"])})
+    except (OSError, ValueError, TypeError, EOFError, KeyError, zipfile.BadZipFile):
         return None
-
-
-def _flat(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Arrays by path, such as `pit/roughness`."""
-    found: dict[str, np.ndarray] = {}
-    for name, value in values.items():
-        value = value._asdict() if isinstance(value, Outcome) else value
-        if isinstance(value, Mapping):
-            found |= {f"{name}/{key}": np.asarray(each) for key, each in value.items()}
-        else:
-            found[name] = np.asarray(value)
-    return found
-
-
-def _block(flat: Mapping[str, np.ndarray]) -> Block:
-    parts: dict[str, Any] = {name: {} for name in Block._fields}
-    for path, array in flat.items():
-        name, _, key = path.partition("/")
-        if key:
-            parts[name][key] = array
-        else:
-            parts[name] = array
-    return Block(**{**parts, "outcome": Outcome(**parts["outcome"])})

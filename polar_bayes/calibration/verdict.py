@@ -20,7 +20,7 @@ from polar_bayes.diagnostics.coverage import INTERVALS, coverage_columns
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_result import Status
-from polar_bayes.inference.psis import LARGEST_TRUSTED
+from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
 
 MOST_UNTRUSTED = 0.5
@@ -136,7 +136,7 @@ def calibration_readings(calibration: xr.DataTree) -> pd.DataFrame:
         pareto_k = calibration["readings"][f"{name}_pareto_k"].to_numpy()
         for group, test in READING_TESTS.items():
             pit = calibration[group][name].to_numpy()
-            untrusted = float(np.sum(pareto_k[np.isfinite(pit)] > LARGEST_TRUSTED))
+            untrusted = float(np.sum(pareto_k[np.isfinite(pit)] > MAX_PARETO_K))
             rows[f"{name}, {test}"] = {
                 "reading": name,
                 "test": test,
@@ -215,7 +215,7 @@ def _reading_sentences(calibration: xr.DataTree) -> list[str]:
     ]
     sentences += [
         f"{label}: in {int(row['untrusted'])} of {int(row['answered'])} fits the weights "
-        f"without it say little (Pareto k above {LARGEST_TRUSTED:g})."
+        f"without it say little (Pareto k above {MAX_PARETO_K:g})."
         for label, row in table.iterrows()
         if row["untrusted"] > 0
     ]

@@ -16,7 +16,7 @@ import xarray as xr
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, PolarBayesError
-from polar_bayes.paths import existing_file, replacing, system_error
+from polar_bayes.paths import atomic_write, existing_file, system_error
 
 MARK = b"\npolar_bayes sha256 "
 TAIL = 4096
@@ -50,7 +50,7 @@ def read_netcdf[Data: (xr.Dataset, xr.DataTree)](
 
 
 def write_netcdf(data: xr.Dataset | xr.DataTree, path: Path) -> None:
-    """Write a netCDF-4 file with a checksum, at a path that `polar_bayes.paths.replacing` gives."""
+    """Write a netCDF-4 file with a checksum, at a path of `polar_bayes.paths.atomic_write`."""
     data.to_netcdf(path, engine="netcdf4", format="NETCDF4")
     digest = _digest(path, path.stat().st_size)
     with path.open("ab") as file:
@@ -116,7 +116,7 @@ def save_capture(capture: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a capture to a netCDF-4 file.
 
     It is written to a temporary file that then replaces `path`, so a failure leaves the older file
-    (`polar_bayes.paths.replacing`).
+    (`polar_bayes.paths.atomic_write`).
 
     Args:
         capture: The capture; it is validated first.
@@ -127,7 +127,7 @@ def save_capture(capture: xr.Dataset, path: str | os.PathLike[str]) -> None:
         OutputError: The file cannot be written, or is none that may be replaced.
     """
     checked = validate(capture)
-    with replacing(path, is_capture) as unfinished:
+    with atomic_write(path, is_capture) as unfinished:
         write_netcdf(checked, unfinished)
 
 

@@ -170,7 +170,9 @@ def accuracy(
     **settings: Any,
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
-    settings["methods"] = {name: pb.methods.LADDER[name] for name in methods or pb.methods.LADDER}
+    settings["methods"] = {
+        name: pb.methods.STUDY_METHODS[name] for name in methods or pb.methods.STUDY_METHODS
+    }
     if no_overrides:
         settings["overrides"] = ()
     study = pb.accuracy(pb.load_capture(capture), **settings)

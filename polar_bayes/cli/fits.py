@@ -25,7 +25,7 @@ from polar_bayes.cli.options import (
     seed_option,
     view_limit_option,
 )
-from polar_bayes.paths import written
+from polar_bayes.paths import write_errors
 from polar_bayes.progress import stages
 
 DEMO = "polar-bayes demo"
@@ -53,7 +53,7 @@ def demo(out: Path, seed: int) -> int:
 
 def _make_folder(folder: Path) -> None:
     """The folder of a demo: new, empty, or that of an earlier demo."""
-    with written(folder):
+    with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         names = {path.name for path in folder.iterdir()}
     if not names:
@@ -136,9 +136,7 @@ def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: A
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
     given: dict[str, Any] = {} if draws is None else {"draws": draws}
-    chosen = (
-        pb.methods.PixelLaplace(**given) if method == "laplace" else pb.methods.PixelTempering()
-    )
+    chosen = pb.methods.PixelLaplace(**given) if method == "laplace" else pb.methods.PixelSMC()
     maps = pb.maps.map_file(capture, out, method=chosen, **settings)
     counts = ", ".join(
         f"{count} {what}" for what, count in pb.maps.count_pixels(maps).items() if count

@@ -232,7 +232,7 @@ def _extended(
     links = {**problem.request.links, **new}
     limit, seed = problem.request.largest_view_zenith, problem.request.seed
     request = resolve(
-        views.capture, model, "laplace", problem.request.scene, priors, links, limit, seed, "double"
+        views.capture, model, problem.request.scene, priors, links, limit, seed, "double"
     )
     data = observe(request.capture, largest_view_zenith=limit)
     recorded = jnp.broadcast_to(problem.data.brightness, problem.data.shape)

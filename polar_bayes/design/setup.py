@@ -60,9 +60,7 @@ def make_design_problem(
     seed: int,
 ) -> DesignProblem:
     """Check the arguments of a public function and compile the model; call it with x64 enabled."""
-    request = resolve(
-        capture, model, "laplace", scene, priors, links, largest_view_zenith, seed, "double"
-    )
+    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     program = compile_program(request.bind(request.scene), data)
     prior = from_prior(program, jax.random.key(seed), PRIOR_DRAWS, data)

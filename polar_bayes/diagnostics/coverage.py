@@ -13,7 +13,7 @@ from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.batch_result import Status
 from polar_bayes.inference.batching import IMAGE
 from polar_bayes.maps.fit_map import cut
-from polar_bayes.maps.lazy import at_hand
+from polar_bayes.maps.lazy import ensure_loaded
 
 INTERVALS = {50: (0.25, 0.75), 80: (0.1, 0.9), 95: (0.025, 0.975)}
 """Percent, and the levels of both ends."""
@@ -76,7 +76,7 @@ def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
             where=_name_of(truth),
             hint=f"give a simulated capture, with one of {', '.join(sorted(names))} as `true_...`",
         )
-    maps = at_hand(maps)
+    maps = ensure_loaded(maps)
     counts: dict[str, np.ndarray] = {}
     for place in cut(maps, BLOCK):
         for name, true in known.items():

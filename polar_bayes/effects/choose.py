@@ -23,7 +23,7 @@ from polar_bayes.effects.variants import (
     KeyPath,
     effects_of,
     find_effects,
-    parameter_ranks,
+    parts_of,
     simplify,
 )
 from polar_bayes.errors import FitError, SceneError
@@ -63,7 +63,7 @@ class UserChoice:
 
     def protects(self, effect: Effect, full: Scene) -> bool:
         """Whether leaving out the effect would remove a part that is to be kept."""
-        rest = [part for _, part in parameter_ranks(effect.apply(full))]
+        rest = [part for _, part in parts_of(effect.apply(full))]
         return any(kept.part not in rest for kept in self.keep)
 
 
@@ -158,7 +158,7 @@ def select_effects(single: SingleComparisons, choice: UserChoice) -> Selection:
         options[worst.key_path].remove(worst)
         reasons[worst] = f"with all others that could go, {baseline.describe(combined)}"
     replaced = {effect.key_path: effect for effect in dropped}
-    left = [part for _, part in parameter_ranks(scene)]
+    left = [part for _, part in parts_of(scene)]
     kept = {e: e.key_path not in replaced and e.part in left for e in single.comparisons}
     for effect in kept.keys() - reasons.keys() - set(dropped):
         if effect.key_path in replaced:
@@ -443,9 +443,7 @@ def choose_effects(
             where="choose_effects",
             hint="give posterior standard deviations above 0, such as 0.1",
         )
-    request = resolve(
-        capture, model, "laplace", scene, None, links, largest_view_zenith, seed, "double"
-    )
+    request = resolve(capture, model, scene, None, links, largest_view_zenith, seed, "double")
     named = not isinstance(scene, Scene)
     full = simplify(FULL_SCENES[request.scene_name] if named else request.scene, ())
     effects = effects_of(full)

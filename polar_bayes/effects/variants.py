@@ -38,7 +38,7 @@ class Effect:
 def effects_of(scene: Scene) -> tuple[Effect, ...]:
     """Every effect of a scene, in the order of its fields."""
     found: dict[Scene, tuple[KeyPath, Part, Part | None]] = {}
-    for key_path, part in parameter_ranks(scene):
+    for key_path, part in parts_of(scene):
         for replacement in part.simpler():
             simpler = simplify(scene, [Effect("", key_path, part, replacement)])
             if simpler != scene and len(key_path) >= len(found.get(simpler, ((),))[0]):
@@ -81,12 +81,12 @@ def find_effects(name: str, effects: Iterable[Effect], where: str) -> tuple[Effe
     return found
 
 
-def parameter_ranks(value: object, key_path: KeyPath = ()) -> Iterator[tuple[KeyPath, Part]]:
+def parts_of(value: object, key_path: KeyPath = ()) -> Iterator[tuple[KeyPath, Part]]:
     """Every part inside a value, itself included, outermost first, with its key path."""
     if isinstance(value, Part):
         yield key_path, value
     for step, inner in _inside(value):
-        yield from parameter_ranks(inner, (*key_path, step))
+        yield from parts_of(inner, (*key_path, step))
 
 
 def _inside(value: object) -> Iterator[tuple[str | int, object]]:

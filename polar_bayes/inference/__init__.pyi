@@ -4,5 +4,5 @@ from .files import (
     load_result as load_result,
     save_result as save_result,
 )
-from .fit import fit as fit
+from .fitting import fit as fit
 from .spectrum import predict_spectrum as predict_spectrum

@@ -1,4 +1,4 @@
-"""The cheapest method that is good enough, found by trying: from cheap to exact."""
+"""Automatic choice of a method: the cheapest whose own diagnostics accept its draws."""
 
 import dataclasses
 import math
@@ -7,33 +7,40 @@ from typing import Any, NamedTuple, override
 
 import numpy as np
 import xarray as xr
+from jaxtyping import Array
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import OutOfTimeError, run_until
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.initialization import JointInit
-from polar_bayes.inference.mcse import count_scalars, draws_needed, expected_error
-from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
-from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.mcse import LARGEST_R_HAT, draws_needed, largest_error
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws, flatten
+from polar_bayes.inference.mode_methods import Nuts
 from polar_bayes.inference.problem import Problem
-from polar_bayes.inference.psis import LARGEST_TRUSTED
-from polar_bayes.inference.request import Method
+from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.resampling import max_effective_size
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.inference.run_method import answer, draws_of, with_answer_draws, with_draws
-from polar_bayes.inference.smc import PixelTempering
+from polar_bayes.inference.smc import PixelSMC
 from polar_bayes.inference.weighted import Importance, Tempered
-
-# --- Whether chains have been at every mode: where all began at one, R-hat cannot see the others
-
+from polar_bayes.progress import Progress
 
 HEAVY_MODE = 0.01
 """Laplace weight of a mode that chains must have visited."""
 
+RESERVE = 8
+"""Times as many weighted draws as normal posteriors need: long tails need more."""
+
+MOST_DRAWS = 2**17
+"""Weighted draws beyond which chains are the better way."""
+
+MARGIN, MOST_TIMES = 1.5, 16.0
+"""Draws of a second try: more than the first error asks for, but not above so many times."""
+
 
 def missed_mode_weight(z: np.ndarray, problem: Problem) -> float:
     """Weight of the heaviest mode to which some chain never came nearest."""
-    initialization = problem.initialization
+    # Where all chains began at one mode, R-hat cannot see the others.
+    initialization = problem.initialize()
     if not isinstance(initialization, JointInit):
         return 0.0
     modes = initialization.modes
@@ -49,19 +56,12 @@ def missed_mode_weight(z: np.ndarray, problem: Problem) -> float:
     return float(np.max(modes.weight[heavy], where=~visited, initial=0.0))
 
 
-# --- The cheapest method that is good enough, found by trying: from cheap to exact ----------------
+def expected_error(draws: PosteriorDraws, problem: Problem) -> float:
+    """Monte Carlo error of a mean or standard deviation that 1% of the fits exceed.
 
-
-LARGEST_R_HAT = 1.01
-
-RESERVE = 8
-"""Times as many weighted draws as normal posteriors need: long tails need more."""
-
-MOST_DRAWS = 2**17
-"""Weighted draws beyond which chains are the better way."""
-
-MARGIN, MOST_TIMES = 1.5, 16.0
-"""Draws of a second try: more than the first error asks for, but not above so many times."""
+    In posterior standard deviations; the largest of all parameters.
+    """
+    return largest_error(*draws.standard_errors(lambda z: flatten(problem.constrain(z))))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,8 +78,8 @@ class Auto(AbstractMethod):
         tolerance: Largest error of a posterior mean or standard deviation, in posterior standard
             deviations, above 0 and at most 1.
         seconds: Of the whole fit, counted from the call of `fit`, > 0. What is not done by then is
-            abandoned, fits beside this one included, which are made by the method that was taken;
-            only the first method always ends.
+            abandoned, comparison fits included, which are made by the method that was taken; only
+            the first method always ends.
 
     Raises:
         FitError: A setting is out of range.
@@ -100,123 +100,134 @@ class Auto(AbstractMethod):
                 f"seconds is {self.seconds}", where="Auto", hint="give a time above 0, such as 60"
             )
 
-    def rungs(self, problem: Problem) -> dict[str, Method]:
+    def candidates(self, problem: Problem) -> dict[str, AbstractMethod]:
         """What is tried for a capture, cheapest first, each with as many draws as it takes.
 
-        Weighted draws are left out where even the best weights could not meet the tolerance.
+        Weighted draws are left out where even equal weights could not meet the tolerance.
 
         Args:
-            bench: The capture.
+            problem: The capture and its model.
 
         Returns:
-            Settings by name.
-
-        Raises:
-            Nothing.
+            Methods by name.
         """
-        needed = draws_needed(self.tolerance, count_scalars(problem.program, problem.data))
+        needed = draws_needed(self.tolerance, problem.num_parameters)
         chains = Nuts(effective_draws=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
-        if any(name != "view" and length > 1 for name, length in problem.data.dims):
+        if not problem.is_one_spectrum_point:
             return {"nuts": chains}
         weighted = min(RESERVE * needed, MOST_DRAWS)
-        tempering = with_answer_draws(PixelTempering(), weighted)
-        enough = min(needed, 0.5 * tempering.answer_draws)
-        tempering = dataclasses.replace(tempering, effective_draws=enough)
-        importance = Importance(draws=max(2048, 2 * weighted))
-        rungs: dict[str, Method] = {"importance": importance, "tempered": Tempered(tempering)}
+        settings = Tempered(PixelSMC()).with_draws(weighted).settings
+        enough = min(needed, 0.5 * settings.answer_draws)
+        methods: dict[str, AbstractMethod] = {
+            "importance": Importance(draws=max(2048, 2 * weighted)),
+            "tempered": Tempered(dataclasses.replace(settings, effective_draws=enough)),
+        }
         able = {
-            name: rung
-            for name, rung in rungs.items()
-            if max_effective_size(draws_of(rung) or 0) >= needed
+            name: method
+            for name, method in methods.items()
+            if max_effective_size(method.num_draws or 0) >= needed
         }
         return able | {"nuts": chains}
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
-        deadline = problem.begun + self.seconds
-        steps: list[Step] = []
-        best: tuple[Step, PosteriorDraws] | None = None
-        waiting = list(self.rungs(problem).items())
+    def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
+        deadline = problem.start_time + self.seconds
+        attempts: list[Attempt] = []
+        best: tuple[Attempt, PosteriorDraws] | None = None
+        waiting = list(self.candidates(problem).items())
         again = False
         while waiting:
             name, method = waiting.pop(0)
             # The first one always ends: there is nothing else to return.
-            step, found = self._try(name, method, problem, deadline if steps else np.inf)
-            steps.append(step)
-            # Of two in doubt the dearer one is nearer to exact.
-            if found is not None and (best is None or step.error <= best[0].error):
-                best = step, dataclasses.replace(found, beside=method, deadline=deadline)
-            if step.taken:
+            until = deadline if attempts else np.inf
+            attempt, draws = self._try(name, method, problem, key, progress, until)
+            attempts.append(attempt)
+            # Of two in doubt the more expensive one is nearer to exact.
+            if draws is not None and (best is None or attempt.error <= best[0].error):
+                best = (
+                    attempt,
+                    dataclasses.replace(draws, comparison_method=method, deadline=deadline),
+                )
+            if attempt.taken:
                 break
-            again = not again and np.isfinite(step.error)
+            again = not again and np.isfinite(attempt.error)
             if again:
-                times = MARGIN * (step.error / self.tolerance) ** 2
+                times = MARGIN * (attempt.error / self.tolerance) ** 2
                 # Powers of two: of a layout, few numbers of draws are ever compiled.
-                more = with_draws(method, min(2.0 ** math.ceil(math.log2(times)), MOST_TIMES))
+                more = method.scale_draws(min(2.0 ** math.ceil(math.log2(times)), MOST_TIMES))
                 waiting[:0] = [] if more is None else [(name, more)]
         if best is None:
             raise FitError(
-                "; ".join(f"{step.name}: {step.why}" for step in steps),
+                "; ".join(f"{attempt.name}: {attempt.why}" for attempt in attempts),
                 where="method='auto'",
                 hint="give more seconds, or check the capture against the prior predictive",
             )
-        return self._told(*best, steps)
+        return self._report(*best, attempts)
 
     def _try(
-        self, name: str, method: Method, problem: Problem, deadline: float
-    ) -> tuple["Step", PosteriorDraws | None]:
-        """One rung, judged by its own diagnostics, or abandoned at the deadline."""
+        self,
+        name: str,
+        method: AbstractMethod,
+        problem: Problem,
+        key: Array,
+        progress: Progress,
+        deadline: float,
+    ) -> tuple["Attempt", PosteriorDraws | None]:
+        """One method, judged by its own diagnostics, or abandoned at the deadline."""
         begin = time.perf_counter()
-        try:
-            return run_until(
-                deadline,
-                problem.progress,
-                lambda progress: self._judged(name, method, problem.reporting(progress)),
-            )
-        except (FitError, OutOfTimeError) as failure:
-            return Step(name, time.perf_counter() - begin, why=str(failure)), None
 
-    def _judged(self, name: str, method: Method, problem: Problem) -> tuple["Step", PosteriorDraws]:
-        """A rung's own diagnostics."""
-        begin = time.perf_counter()
-        found = answer(method, problem)
-        error = expected_error(found, problem.program, problem.data)
-        doubts = _doubts(found, problem)
+        def run(progress: Progress) -> tuple[Attempt, PosteriorDraws]:
+            begin = time.perf_counter()
+            draws = method.run(problem, key, progress)
+            return self._judge(name, draws, problem, begin), draws
+
+        try:
+            return run_until(deadline, progress, run)
+        except (FitError, OutOfTimeError) as failure:
+            return Attempt(name, time.perf_counter() - begin, why=str(failure)), None
+
+    def _judge(self, name: str, draws: PosteriorDraws, problem: Problem, begin: float) -> "Attempt":
+        error = expected_error(draws, problem)
+        doubts = _bias_doubts(draws, problem)
         biased = bool(doubts)
         if not error <= self.tolerance:
             doubts.append(f"its Monte Carlo error may be {error:.2g} posterior sd")
-        return Step(
+        return Attempt(
             name,
             time.perf_counter() - begin,
             why="; ".join(doubts),
-            error=np.inf if biased else error,  # a doubt weighs more than any noise
+            error=np.inf if biased else error,  # bias weighs more than any noise
             monte_carlo=error,
             taken=not doubts,
-            r_hat=found.r_hat,
-            k_hat=found.k_hat,
-            effective_draws=found.effective_draws,
-        ), found
+            r_hat=draws.r_hat,
+            k_hat=draws.k_hat,
+            effective_draws=draws.effective_draws,
+        )
 
-    def _told(self, step: "Step", found: PosteriorDraws, steps: list["Step"]) -> PosteriorDraws:
-        """The answer with what was tried, and a problem where none was good enough."""
-        problems = list(found.problems)
-        if not step.taken:
+    def _report(
+        self, attempt: "Attempt", draws: PosteriorDraws, attempts: list["Attempt"]
+    ) -> PosteriorDraws:
+        """The draws with what was tried, and a problem where nothing was good enough."""
+        problems = list(draws.problems)
+        if not attempt.taken:
             problems.append(
                 f"no method met the tolerance of {self.tolerance:g} posterior sd within "
-                f"{self.seconds:g} s: {step.name} came nearest, and {step.why or 'was not judged'}"
+                f"{self.seconds:g} s: {attempt.name} came nearest, and "
+                f"{attempt.why or 'was not judged'}"
             )
-        said = {
+        summary = {
             "tolerance": self.tolerance,
             "seconds": self.seconds,
-            "chosen": step.name,
-            "met": step.taken,
-            "expected_error": _plain(step.monte_carlo),
-            "steps": [_as_said(each) for each in steps],
+            "chosen": attempt.name,
+            "met": attempt.taken,
+            "expected_error": _rounded(attempt.monte_carlo),
+            "steps": [each.as_metadata() for each in attempts],
         }
-        return dataclasses.replace(found, problems=problems, said=found.said | {"auto": said})
+        metadata = draws.metadata | {"auto": summary}
+        return dataclasses.replace(draws, problems=problems, metadata=metadata)
 
 
-class Step(NamedTuple):
+class Attempt(NamedTuple):
     """One method that was tried."""
 
     name: str
@@ -229,30 +240,27 @@ class Step(NamedTuple):
     k_hat: float = np.nan
     effective_draws: float = np.nan
 
+    def as_metadata(self) -> dict[str, Any]:
+        """What JSON can hold."""
+        numbers = ("seconds", "monte_carlo", "r_hat", "k_hat", "effective_draws")
+        texts = {"name": self.name, "taken": self.taken, "why": self.why}
+        return texts | {name: _rounded(getattr(self, name)) for name in numbers}
 
-def _doubts(found: PosteriorDraws, problem: Problem) -> list[str]:
-    """Why an answer may be biased."""
-    doubts = list(found.problems)
-    if found.k_hat > LARGEST_TRUSTED and not doubts:
-        doubts.append(f"its Pareto k-hat is {found.k_hat:.2f}")
-    if found.r_hat > LARGEST_R_HAT:
-        doubts.append(f"its R-hat is {found.r_hat:.3f}")
-    if found.kind == "nuts" and (share := missed_mode_weight(found.z, problem)) > 0.0:
-        doubts.append(f"a mode of weight {share:.2g} was not visited by every chain")
+
+def _bias_doubts(draws: PosteriorDraws, problem: Problem) -> list[str]:
+    """Why draws may be biased."""
+    doubts = draws.doubts
+    if draws.k_hat > MAX_PARETO_K and not doubts:
+        doubts.append(f"its Pareto k-hat is {draws.k_hat:.2f}")
+    if draws.r_hat > LARGEST_R_HAT:
+        doubts.append(f"its R-hat is {draws.r_hat:.3f}")
+    if draws.method == "nuts" and (weight := missed_mode_weight(draws.z, problem)) > 0.0:
+        doubts.append(f"a mode of weight {weight:.2g} was not visited by every chain")
     return doubts
 
 
-def _as_said(step: Step) -> dict[str, Any]:
-    numbers = ("seconds", "monte_carlo", "r_hat", "k_hat", "effective_draws")
-    said = {"name": step.name, "taken": step.taken, "why": step.why}
-    return said | {name: _plain(getattr(step, name)) for name in numbers}
-
-
-def _plain(value: float) -> float | None:
+def _rounded(value: float) -> float | None:
     return round(float(value), 4) if np.isfinite(value) else None
-
-
-# --- What the automatic choice did and why, in sentences ------------------------------------------
 
 
 def auto_sentences(result: xr.DataTree) -> list[str]:
@@ -269,24 +277,24 @@ def auto_sentences(result: xr.DataTree) -> list[str]:
         FitError: It is no fit, or does not hold together.
     """
     check_fit(result)
-    told = provenance_of(result).get("auto")
-    if not told:
+    summary = provenance_of(result).get("auto")
+    if not summary:
         return []
     sentences = []
-    for step in told["steps"]:
-        took = f"{step['name']} ({step['seconds']:.1f} s)"
+    for step in summary["steps"]:
+        name = f"{step['name']} ({step['seconds']:.1f} s)"
         if step["taken"]:
             error = step.get("monte_carlo")
             within = "an unknown number of" if error is None else f"{error:.2g}"
             sentences.append(
-                f"{took} was taken: its means and standard deviations are expected within "
-                f"{within} posterior sd, and {told['tolerance']:g} were asked for."
+                f"{name} was taken: its means and standard deviations are expected within "
+                f"{within} posterior sd, and {summary['tolerance']:g} were asked for."
             )
         else:
-            sentences.append(f"{took} was not taken: {step['why']}.")
-    if not told["met"]:
+            sentences.append(f"{name} was not taken: {step['why']}.")
+    if not summary["met"]:
         sentences.append(
-            f"Nothing was good enough; these are the numbers of {told['chosen']}, which came "
+            f"Nothing was good enough; these are the numbers of {summary['chosen']}, which came "
             "nearest. Give more seconds or a larger tolerance, or doubt them."
         )
     return sentences

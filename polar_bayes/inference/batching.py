@@ -1,7 +1,7 @@
-"""The pixels of an image in a row: what is each one's own, and what all of them share.
+"""Batches of pixels: arrays that differ between pixels, and arrays that all of them share.
 
-A batch has a fixed number of pixels, so that every batch of every image runs the same program, and
-only as many of them are computed as are wanted.
+A batch has a fixed number of pixels, so every batch of every image runs the same compiled program,
+which computes only as many of its pixels as are wanted.
 """
 
 import dataclasses
@@ -20,97 +20,98 @@ from polar_bayes.physics.geometry import Geometry
 
 IMAGE = ("y", "x")
 
+AnyArray = Array | np.ndarray
+
+LANES = 16
+"""Pixels of a batch that are computed together: their data fit into the cache of one core."""
+
 
 @dataclasses.dataclass(frozen=True)
-class Stack:
-    """Readings of many pixels."""
+class ObservationBatch:
+    """Readings of many pixels: `batched` arrays begin with the pixel axis, `static` ones do not."""
 
-    own: Observations
-    shared: Observations
+    batched: Observations
+    static: Observations
     views: np.ndarray
 
     def __len__(self) -> int:
         return len(self.views)
 
     def take(self, index: np.ndarray) -> Observations:
-        """The own arrays of some pixels, in that order."""
-        return jax.tree.map(lambda x: x[index], self.own)
+        """The batched arrays of some pixels, in that order."""
+        return jax.tree.map(lambda x: x[index], self.batched)
 
-    def subset(self, index: np.ndarray) -> "Stack":
+    def subset(self, index: np.ndarray) -> "ObservationBatch":
         """Some of the pixels, in that order."""
-        return Stack(self.take(index), self.shared, self.views[index])
+        return ObservationBatch(self.take(index), self.static, self.views[index])
 
-    def in_precision(self, dtype: Any) -> "Stack":
+    def in_precision(self, dtype: Any) -> "ObservationBatch":
         """The same readings in another floating type."""
-        own, shared = (jax.tree.map(lambda x: _cast(x, dtype), t) for t in (self.own, self.shared))
-        return Stack(own, shared, self.views)
+
+        def cast(x: np.ndarray) -> np.ndarray:
+            return x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x
+
+        batched, static = (jax.tree.map(cast, part) for part in (self.batched, self.static))
+        return ObservationBatch(batched, static, self.views)
 
     def pixel(self, index: int = 0) -> Observations:
         """One pixel as a capture of its own."""
-        own = jax.tree.map(lambda x: jnp.asarray(x[index]), self.own)
-        return together(own, jax.tree.map(jnp.asarray, self.shared))
+        batched = jax.tree.map(lambda x: jnp.asarray(x[index]), self.batched)
+        return eqx.combine(batched, jax.tree.map(jnp.asarray, self.static))
 
 
-def stack(image: Observations, own_directions: frozenset[str] = frozenset()) -> Stack:
-    """Put the pixels of an image, or of a block of it, in a row."""
+def batch_pixels(
+    image: Observations, batched_directions: frozenset[str] = frozenset()
+) -> ObservationBatch:
+    """Flatten an image, or a block of it, to a batch of pixels."""
     rows, columns = image.shape[:2]
 
-    def row(x: Array) -> np.ndarray:
+    def of_pixels(x: Array) -> np.ndarray:
         whole = np.broadcast_to(np.asarray(x), (rows, columns, *x.shape[2:]))
         return whole.reshape(rows * columns, *x.shape[2:])
 
-    def common(x: Array) -> np.ndarray:
+    def of_all(x: Array) -> np.ndarray:
         return np.asarray(x).reshape(x.shape[2:])
 
-    def parts(take: Callable, is_own: bool) -> Observations:
-        """Own or shared arrays; None stands where the other part has them."""
-        angles: dict[str, Any] = {
-            name: take(x) if x is not None and (name in own_directions) == is_own else None
-            for name, x in image.geometry._asdict().items()
-        }
-        trust = image.confidence
-        has_trust = trust is not None and ("normal_confidence" in own_directions) == is_own
-        readings: dict[str, Any] = {
-            n: take(x) if is_own else None for n, x in image.readings.items()
-        }
-        errors: dict[str, Any] = {n: take(x) if is_own else None for n, x in image.errors.items()}
-        units: dict[str, Any] = {
-            name: None if is_own else np.asarray(getattr(image, name))
-            for name in ("full_scale", "intensity_unit")
-        }
-        masks: dict[str, Any] = {
-            name: take(getattr(image, name)) if is_own else None
-            for name in ("brightness", "valid", "saturated")
-        }
+    def part(is_batched: bool) -> Observations:
+        """One of the two parts; None stands where the other part has the array."""
+
+        def take(x: Array | None, belongs: bool) -> Any:
+            if x is None or belongs != is_batched:
+                return None
+            return of_pixels(x) if is_batched else of_all(x)
+
+        angles = {n: take(x, n in batched_directions) for n, x in image.geometry._asdict().items()}
         return Observations(
             geometry=Geometry(**angles),
-            readings=readings,
-            errors=errors,
+            readings={n: take(x, True) for n, x in image.readings.items()},
+            errors={n: take(x, True) for n, x in image.errors.items()},
+            brightness=take(image.brightness, True),
+            full_scale=take(image.full_scale, False),
+            intensity_unit=take(image.intensity_unit, False),
+            valid=take(image.valid, True),
+            saturated=take(image.saturated, True),
             dims=tuple(axis for axis in image.dims if axis[0] not in IMAGE),
-            confidence=take(trust) if has_trust else None,
-            **units,
-            **masks,
+            confidence=take(image.confidence, "normal_confidence" in batched_directions),
         )
 
     valid = np.broadcast_to(np.asarray(image.valid), image.shape)
     views = np.any(valid, axis=tuple(range(2, valid.ndim - 1))).sum(axis=-1).ravel()
-    return Stack(parts(row, True), parts(common, False), views)
+    return ObservationBatch(part(True), part(False), views)
 
 
-def together(own: Observations, shared: Observations) -> Observations:
-    """One pixel's own arrays and the shared ones as one capture."""
-    return eqx.combine(own, shared)
+def take_rows[T](values: T, which: np.ndarray) -> T:
+    """Some pixels of arrays that all begin with the pixel axis."""
+    return jax.tree.map(lambda x: np.asarray(x)[which], values)
 
 
-def _cast(x: np.ndarray, dtype: Any) -> np.ndarray:
-    return x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x
+def put_rows[T](values: T, which: np.ndarray, new: T) -> None:
+    """Replace some pixels of arrays that all begin with the pixel axis."""
+    for whole, part in zip(jax.tree.leaves(values), jax.tree.leaves(new), strict=True):
+        whole[which] = part
 
 
 # --- A function of one pixel as a compiled program of a batch -------------------------------------
-
-
-CLIMBING = 16
-"""Pixels of a batch that climb side by side: what they need stays in a core's own cache."""
 
 
 def batches(count: int, size: int) -> Iterator[np.ndarray]:
@@ -119,18 +120,25 @@ def batches(count: int, size: int) -> Iterator[np.ndarray]:
         yield np.minimum(np.arange(begin, begin + size), count - 1)
 
 
-def batched(function: Callable, *, given: int = 0, side_by_side: int = CLIMBING) -> Callable:
+def map_batches(function: Callable[[np.ndarray], Any], count: int, size: int) -> Any:
+    """Results of a function of the indices of one batch, joined along the pixel axis."""
+    parts = [jax.tree.map(np.asarray, function(index)) for index in batches(count, size)]
+    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
+
+
+def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> Callable:
     """A function of one pixel, mapped over a batch, compiled."""
-    # Its first arguments, as many as `given`, are the same for all pixels; so is how many pixels of
-    # the batch are wanted, which comes before the batch. The others fill it up, and cost nothing.
+    # The compiled program takes: arguments that are the same for all pixels, as many as `given`;
+    # the number of pixels that are wanted; the batched and the static readings; and the state of
+    # each pixel. Pixels beyond the wanted number only fill the batch and are not computed.
 
     def run(*arguments: Any) -> Any:
-        common, (wanted, own, shared, *states) = arguments[:given], arguments[given:]
-        grouped = jax.tree.map(lambda x: x.reshape(-1, side_by_side, *x.shape[1:]), (own, states))
+        common, (wanted, own, static, *states) = arguments[:given], arguments[given:]
+        grouped = jax.tree.map(lambda x: x.reshape(-1, lanes, *x.shape[1:]), (own, states))
 
         def group(at: Array) -> Any:
-            def of_pixel(mine: Any, state: Any) -> Any:
-                return function(*common, together(mine, shared), *state)
+            def of_pixel(pixel: Any, state: Any) -> Any:
+                return function(*common, eqx.combine(pixel, static), *state)
 
             return jax.vmap(of_pixel)(*jax.tree.map(lambda x: x[at], grouped))
 
@@ -141,7 +149,7 @@ def batched(function: Callable, *, given: int = 0, side_by_side: int = CLIMBING)
         empty = jax.tree.map(
             lambda x: jnp.zeros((count, *x.shape), x.dtype), jax.eval_shape(group, jnp.int32(0))
         )
-        filled = jax.lax.fori_loop(0, -(-wanted // side_by_side), fill, empty)
+        filled = jax.lax.fori_loop(0, -(-wanted // lanes), fill, empty)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), filled)
 
     return JitOnce(run)

@@ -20,7 +20,7 @@ import xarray as xr
 from polar_bayes.capture.files import is_result, open_netcdf, read_netcdf, write_netcdf
 from polar_bayes.errors import FitError, OutputError
 from polar_bayes.inference.result import GEOMETRY, PROVENANCE, provenance_of
-from polar_bayes.paths import existing_file, replacing
+from polar_bayes.paths import atomic_write, existing_file
 
 Problems = Iterator[tuple[str, str]]
 """Where a tree departs from its schema, and what is wrong there."""
@@ -460,7 +460,7 @@ def save_result(result: xr.DataTree | xr.Dataset, path: str | os.PathLike[str]) 
     if not isinstance(result, xr.DataTree | xr.Dataset):
         what = f"a {type(result).__name__} is no result"
         raise FitError(what, where="save_result", hint="give what polar_bayes.fit returned")
-    with replacing(path, is_result) as unfinished:
+    with atomic_write(path, is_result) as unfinished:
         try:
             write_netcdf(result, unfinished)
         except (OSError, RuntimeError, OutputError):

@@ -10,7 +10,7 @@ An initializer holds what is compiled for one layout, and serves every capture o
 import abc
 import dataclasses
 import functools
-from typing import Any, NamedTuple, override
+from typing import Any, override
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,6 @@ from polar_bayes.inference import hierarchical_reparam, laplace, nuts
 from polar_bayes.inference.group_model import GroupModel, find_group_model, find_groups
 from polar_bayes.inference.hierarchical_reparam import FittedReparam, HierarchicalReparam
 from polar_bayes.inference.optimize import (
-    SETTLED,
     Modes,
     ValueAndGradient,
     find_modes,
@@ -42,15 +41,6 @@ Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 """Unconstrained draws (chain, draw, size), and statistics, each (chain, draw)."""
 
 
-class Drawn(NamedTuple):
-    """What became of one posterior."""
-
-    z: np.ndarray
-    stats: dict[str, np.ndarray]
-    problems: list[str]
-    goals_reached: bool | None
-
-
 class AbstractInit(abc.ABC):
     """Where draws start."""
 
@@ -62,38 +52,12 @@ class AbstractInit(abc.ABC):
         """Newton decrement: distance to the mode in posterior standard deviations."""
         return float(self.said["newton_decrement"])
 
-    def draw(self, key: Array, method: nuts.Nuts | laplace.Laplace, progress: Progress) -> Drawn:
-        """Do what the method asks.
-
-        Args:
-            key: Random key.
-            method: Settings.
-            progress: Called with the name of a stage and the fraction of it that is done.
-
-        Returns:
-            The draws.
-        """
-        if isinstance(method, laplace.Laplace):
-            problems = []
-            if self.decrement > SETTLED:
-                problems.append(
-                    f"the mode is not settled (Newton decrement {self.decrement:.2g} posterior "
-                    "standard deviations): use method='nuts'"
-                )
-            return Drawn(*self.laplace(key, method), problems, None)
-        key_first, key_chains = jax.random.split(key)
-        target = self.target(key_first, method.chains)
-        z, stats, mixed = nuts.sample(
-            target, key_chains, method, lambda done: progress("sampling", done)
-        )
-        return Drawn(z, stats, [], mixed)
-
     @abc.abstractmethod
     def target(self, key: Array, chains: int) -> nuts.Target:
         """The density for NUTS, with starting points and metric."""
 
     @abc.abstractmethod
-    def laplace(self, key: Array, settings: laplace.Laplace) -> Draws:
+    def laplace(self, key: Array, settings: laplace.LaplaceSettings) -> Draws:
         """Draws from the normal approximation at the mode of largest weight."""
 
 
@@ -118,7 +82,7 @@ class JointInit(AbstractInit):
         )
 
     @override
-    def laplace(self, key: Array, settings: laplace.Laplace) -> Draws:
+    def laplace(self, key: Array, settings: laplace.LaplaceSettings) -> Draws:
         program, guide = self.initializer.program, self.initializer.guide
         return laplace.sample(program, guide, self.data, self.potential, self.modes, key, settings)
 
@@ -147,7 +111,7 @@ class HierarchicalInit(AbstractInit):
         )
 
     @override
-    def laplace(self, key: Array, settings: laplace.Laplace) -> Draws:
+    def laplace(self, key: Array, settings: laplace.LaplaceSettings) -> Draws:
         shape = (settings.chains, settings.draws, self.fitted.reparam.size)
         noise = np.asarray(jax.random.normal(key, shape))
         return self._to_program(noise), laplace.weigh(self.fitted.potential, noise, noise)
@@ -159,7 +123,7 @@ class HierarchicalInit(AbstractInit):
 class AbstractInitializer(abc.ABC):
     """The search for modes in all captures of one layout."""
 
-    def expect(self, data: Observations, method: nuts.Nuts) -> None:
+    def expect(self, data: Observations, method: nuts.NutsSettings) -> None:
         """Begin to compile the sampler, in parallel with the search, where its shapes are known."""
         del data, method
 
@@ -181,7 +145,7 @@ class JointInitializer(AbstractInitializer):
         return laplace.compiled_guide(self.program)
 
     @override
-    def expect(self, data: Observations, method: nuts.Nuts) -> None:
+    def expect(self, data: Observations, method: nuts.NutsSettings) -> None:
         size = self.program.size
         target = nuts.Target(
             samplers=self.samplers,

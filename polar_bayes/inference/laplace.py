@@ -28,20 +28,11 @@ from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.optimize import Modes, ValueAndGradient
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
-from polar_bayes.repr_html import HTMLRepr
 
 
 @dataclasses.dataclass(frozen=True)
-class Laplace(HTMLRepr):
-    """Settings of the approximation.
-
-    Args:
-        draws: Draws from the fitted normal distribution, in `chains` groups for ArviZ.
-        chains: Groups; the draws are independent, so they only serve diagnostics.
-
-    Raises:
-        FitError: Fewer than 50 draws or than 1 chain.
-    """
+class LaplaceSettings:
+    """Number of draws, and groups of them; `Laplace` explains each."""
 
     draws: int = 500
     chains: int = 4
@@ -67,7 +58,7 @@ def sample(
     potential: ValueAndGradient,
     modes: Modes,
     key: Array,
-    settings: Laplace,
+    settings: LaplaceSettings,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Draws (chain, draw, size) from NumPyro's guide at the heaviest mode, and statistics."""
     location, factor, order = guide(
@@ -114,24 +105,6 @@ def _guide(
 
 
 # --- Robust least squares, without priors and without noise models --------------------------------
-
-
-@dataclasses.dataclass(frozen=True)
-class Point(HTMLRepr):
-    """Settings of the least squares.
-
-    Args:
-        starts: Prior draws from which it descends; the best end is kept.
-
-    Raises:
-        FitError: Fewer than one start.
-    """
-
-    starts: int = 16
-
-    def __post_init__(self) -> None:
-        if self.starts < 1:
-            raise FitError(f"starts is {self.starts}", where="Point", hint="give at least 1")
 
 
 class Estimate(NamedTuple):

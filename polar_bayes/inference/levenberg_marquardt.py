@@ -1,20 +1,24 @@
-"""From a start to the peak of one pixel's posterior, a step at a time.
+"""Levenberg-Marquardt on the expected information: posterior modes of many pixels at once.
 
-Every function is of one pixel, so that a batch is a map over pixels and nothing else: what a
-pixel gets does not depend on who climbs beside it.
+A damped step minimizes the potential (minus the log posterior density) with the curvature of
+Fisher scoring in single precision first, and with exact second derivatives in double precision
+at the end. Functions are of one pixel and mapped over a batch, so a pixel's result does not depend
+on the other pixels of its batch.
 
-A library factors a batch of 4 by 4 matrices one call at a time; written out, the arithmetic of a
-thousand pixels runs side by side. `benchmarks/pixels.py` has the ratio.
+Two choices are for speed. Cholesky factors of matrices as small as 4 by 4 are written out, because
+a library factors a batch of them one call at a time. Derivatives are taken by forward mode along
+one coordinate at a time, so that parts of the model that do not depend on a coordinate are absent
+from its program. `benchmarks/pixels.py` has the measurements.
 
-A pixel has few coordinates and many readings. Each coordinate is pushed through the model by
-itself, so that what it does not touch is absent from the program: the fraction, for example,
-never differentiates the Fresnel equations. Measured against reverse mode in
-`benchmarks/pixels.py`.
+Source:
+    Marquardt (1963), J. SIAM 11(2), 431-441; Schraudolph (2002), Neural Computation 14(7),
+    1723-1738: the generalized Gauss-Newton matrix.
 """
 
 import functools
+import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -22,8 +26,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpyro import distributions as dist
-from numpyro.infer.util import compute_log_probs
+from numpyro import handlers
+from numpyro.infer.util import compute_log_probs, potential_energy
 
+from polar_bayes.inference.batch_engine import BATCH, BatchEngine
+from polar_bayes.inference.batching import (
+    AnyArray,
+    ObservationBatch,
+    batched,
+    map_batches,
+    put_rows,
+    take_rows,
+)
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 
@@ -65,20 +79,18 @@ def _lower(rows: list[list[Array]]) -> Array:
     return jnp.stack([jnp.stack([*row, *[zero] * (len(rows) - len(row))]) for row in rows])
 
 
-# --- Slopes and curvatures of one pixel's posterior, by forward differentiation alone -------------
+# --- Derivatives of one pixel's log posterior density, in forward mode ----------------------------
 
 
-MOST_APART = 6
-"""Most coordinates that are pushed through one by one. Programs grow with their square, and with
-more of them it takes longer to compile than it saves."""
-
-AnyArray = Array | np.ndarray
+MAX_UNROLLED = 6
+"""Most coordinates that are differentiated one by one. Programs grow with the square of their
+number, and beyond it compilation takes longer than the program saves."""
 
 Coordinates = tuple[Float[Array, ""], ...]
 """The unconstrained vector as numbers, so that each can be differentiated by itself."""
 
 
-class Slopes(NamedTuple):
+class Derivatives(NamedTuple):
     """The potential (minus the log posterior density) around a point."""
 
     value: Float[AnyArray, ""]
@@ -86,48 +98,50 @@ class Slopes(NamedTuple):
     curvature: Float[AnyArray, "size size"]
 
 
-def score(program: Program, z: Float[Array, " size"], data: Observations) -> Slopes:
-    """Value, gradient and the curvature of scoring."""
+def scoring_derivatives(
+    program: Program, z: Float[Array, " size"], data: Observations
+) -> Derivatives:
+    """Value, gradient and the curvature of Fisher scoring."""
     # $$ H = \sum_i J_i^T \, \frac{\partial^2 (-\log p_i)}{\partial\eta^2} \, J_i + H_{prior} $$
-    # where $\eta_i(z)$ are the arguments of the distribution of reading i and $J_i$ their slopes.
-    # What is left out is the curvature of $\eta$ itself, times residuals.
-    # Source: Schraudolph (2002), Neural Computation 14(7), 1723-1738: the generalized Gauss-Newton
-    # matrix; with normal noise it is that of Gauss and Newton, and Fisher's.
+    # where $\eta_i(z)$ are the arguments of the distribution of reading i and $J_i$ their Jacobian.
+    # The curvature of $\eta$ itself, times residuals, is omitted. This is the generalized
+    # Gauss-Newton matrix (Schraudolph 2002), the Fisher information under normal noise.
     coordinates = tuple(z)
     pixel = _Pixel(program, data)
     arguments, likelihoods = pixel.arguments(coordinates), pixel.likelihoods(coordinates)
-    slopes = _slopes(lambda *c: pixel.arguments(c), coordinates)
-    value, gradient, curvature = _expand(pixel.prior, coordinates)
+    jacobians = _jacobian(lambda *c: pixel.arguments(c), coordinates)
+    value, gradient, curvature = _derivatives(pixel.prior, coordinates)
     for at, (own, likelihood) in enumerate(zip(arguments, likelihoods, strict=True)):
         active = pixel.active(at, coordinates)
         value = value - jnp.sum(likelihood(own))
-        first = jax.grad(lambda a, f=likelihood: jnp.sum(f(a)))
-        downhill = first(own)
-        bend = {a: jax.jvp(first, (own,), (_unit(own, a),))[1] for a in active}
-        jacobian = [slopes[k][at] for k in range(program.size)]
-        # The barrier keeps the compiler from finding all this anew for each of the sums below.
-        downhill, bend, jacobian = jax.lax.optimization_barrier((downhill, bend, jacobian))
+        gradient_of = jax.grad(lambda a, f=likelihood: jnp.sum(f(a)))
+        first = gradient_of(own)
+        units = {a: [jnp.full_like(x, float(k == a)) for k, x in enumerate(own)] for a in active}
+        second = {a: jax.jvp(gradient_of, (own,), (unit,))[1] for a, unit in units.items()}
+        jacobian = [jacobians[k][at] for k in range(program.size)]
+        # The barrier keeps the compiler from computing these again for each of the sums below.
+        first, second, jacobian = jax.lax.optimization_barrier((first, second, jacobian))
         gradient = gradient - jnp.stack(
-            [sum(jnp.sum(j[a] * downhill[a]) for a in active) for j in jacobian]
+            [sum(jnp.sum(j[a] * first[a]) for a in active) for j in jacobian]
         )
-        for a in active:
-            for b in active:
-                curvature = curvature - _outer(
-                    [j[a] * bend[a][b] for j in jacobian], [j[b] for j in jacobian]
-                )
-    return Slopes(value, gradient, curvature)
+        for a, b in itertools.product(active, active):
+            rows = [[jnp.sum(i[a] * second[a][b] * j[b]) for j in jacobian] for i in jacobian]
+            curvature = curvature - jnp.stack([jnp.stack(row) for row in rows])
+    return Derivatives(value, gradient, curvature)
 
 
-def expand(program: Program, z: Float[Array, " size"], data: Observations) -> Slopes:
+def exact_derivatives(
+    program: Program, z: Float[Array, " size"], data: Observations
+) -> Derivatives:
     """Value, gradient and exact second derivatives."""
-    return Slopes(*_expand(_Pixel(program, data).potential, tuple(z)))
+    return Derivatives(*_derivatives(_Pixel(program, data).potential, tuple(z)))
 
 
 class _Pixel:
     """A program and its data as functions of coordinates, one number each."""
 
-    # Each is traced once, however often it is differentiated: the model is walked by NumPyro, and
-    # that is slow.
+    # Each function is traced once, however often it is differentiated: tracing a model with NumPyro
+    # is slow.
 
     def __init__(self, program: Program, data: Observations) -> None:
         self._program = program
@@ -145,27 +159,21 @@ class _Pixel:
         ]
 
     def active(self, at: int, coordinates: Coordinates) -> list[int]:
-        """Which arguments of an observed site any coordinate moves at all."""
+        """Which arguments of the distribution of an observed site depend on any coordinate."""
 
         def argument(which: int, *coordinates: Array) -> Array:
             return self.arguments(coordinates)[at][which]
 
         count = len(self.arguments(coordinates)[at])
-        return [a for a in range(count) if _moves(functools.partial(argument, a), coordinates)]
+        return [a for a in range(count) if _depends(functools.partial(argument, a), coordinates)]
 
     def _potential(self, *coordinates: Array) -> Array:
         return self._program.potential_at(self._sites(coordinates), self._data)
 
     def _prior(self, *coordinates: Array) -> Array:
-        """The part of the potential that no reading has a share in."""
-        unconstrained = self._sites(coordinates)
-        log_probs, _ = self._told(unconstrained)
-        stretch = jnp.zeros(())
-        for name, value in unconstrained.items():
-            bijection = dist.biject_to(self._program.supports[name])
-            stretch = stretch + jnp.sum(bijection.log_abs_det_jacobian(value, bijection(value)))
-        prior = sum(x for name, x in log_probs.items() if name not in self._program.observed)
-        return -prior - stretch
+        """Minus the log prior density of the coordinates."""
+        prior = handlers.block(self._program.model, hide=list(self._program.observed))
+        return potential_energy(prior, (self._data,), {}, self._sites(coordinates))
 
     def _arguments(self, coordinates: Coordinates) -> list[list[Array]]:
         """For each observed site, the arguments of its distribution, a value for each reading."""
@@ -183,7 +191,11 @@ class _Pixel:
         return jax.tree.unflatten(tree, whole).log_prob(value)
 
     def _observed(self, coordinates: Coordinates) -> list[tuple[dist.Distribution, Array]]:
-        _, trace = self._told(self._sites(coordinates))
+        latent = {
+            name: dist.biject_to(self._program.supports[name])(value)
+            for name, value in self._sites(coordinates).items()
+        }
+        _, trace = compute_log_probs(self._program.model, (self._data,), {}, latent)
         return [(trace[name]["fn"], trace[name]["value"]) for name in self._program.observed]
 
     def _sites(self, coordinates: Coordinates) -> dict[str, Array]:
@@ -195,64 +207,48 @@ class _Pixel:
             start += count
         return found
 
-    def _told(self, unconstrained: Mapping[str, Array]) -> tuple[dict[str, Array], dict]:
-        latent = {
-            name: dist.biject_to(self._program.supports[name])(value)
-            for name, value in unconstrained.items()
-        }
-        return compute_log_probs(self._program.model, (self._data,), {}, latent)
-
 
 def _is_number(x: Array) -> bool:
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
-def _along(function: Callable, k: int) -> Callable:
-    """The slope of a function of coordinates along one of them."""
+def _directional(function: Callable, k: int) -> Callable:
+    """The derivative of a function of coordinates along one of them."""
 
-    def slope(*coordinates: Array) -> Array:
+    def derivative(*coordinates: Array) -> Array:
         def of_one(x: Array) -> Array:
             return function(*coordinates[:k], x, *coordinates[k + 1 :])
 
         return jax.jvp(of_one, (coordinates[k],), (jnp.ones_like(coordinates[k]),))[1]
 
-    return slope
+    return derivative
 
 
-def _slopes(function: Callable, coordinates: Coordinates) -> list:
-    """The slopes of a tree of arrays along every coordinate."""
+def _jacobian(function: Callable, coordinates: Coordinates) -> list:
+    """The derivatives of a tree of arrays along every coordinate."""
     size = len(coordinates)
-    if size <= MOST_APART:
-        return [_along(function, k)(*coordinates) for k in range(size)]
+    if size <= MAX_UNROLLED:
+        return [_directional(function, k)(*coordinates) for k in range(size)]
     whole = jax.jacfwd(lambda z: function(*z))(jnp.stack(coordinates))
     return [jax.tree.map(lambda x, k=k: x[..., k], whole) for k in range(size)]
 
 
-def _expand(function: Callable, coordinates: Coordinates) -> tuple[Array, Array, Array]:
+def _derivatives(function: Callable, coordinates: Coordinates) -> tuple[Array, Array, Array]:
     size = len(coordinates)
-    if size > MOST_APART:
+    if size > MAX_UNROLLED:
         z = jnp.stack(coordinates)
         value, gradient = jax.value_and_grad(lambda z: function(*z))(z)
         return value, gradient, jax.hessian(lambda z: function(*z))(z)
-    first = [_along(function, k) for k in range(size)]
+    first = [_directional(function, k) for k in range(size)]
     rows: list[list[Array]] = [[] for _ in range(size)]
     for i in range(size):
         rows[i] = [rows[j][i] for j in range(i)]
-        rows[i] += [_along(first[i], j)(*coordinates) for j in range(i, size)]
-    gradient = jnp.stack([slope(*coordinates) for slope in first])
+        rows[i] += [_directional(first[i], j)(*coordinates) for j in range(i, size)]
+    gradient = jnp.stack([each(*coordinates) for each in first])
     return function(*coordinates), gradient, jnp.stack([jnp.stack(row) for row in rows])
 
 
-def _unit(arguments: list[Array], which: int) -> list[Array]:
-    """A step of one argument alone."""
-    return [jnp.full_like(x, float(at == which)) for at, x in enumerate(arguments)]
-
-
-def _outer(left: list[Array], right: list[Array]) -> Array:
-    return jnp.stack([jnp.stack([jnp.sum(x * y) for y in right]) for x in left])
-
-
-def _moves(function: Callable, coordinates: Coordinates) -> bool:
+def _depends(function: Callable, coordinates: Coordinates) -> bool:
     """True where the result depends on the coordinates, as the program is written."""
     moved: list[bool] = []
 
@@ -271,96 +267,207 @@ def _moves(function: Callable, coordinates: Coordinates) -> bool:
     return any(moved)
 
 
-# --- From a start to the peak of one pixel's posterior, a step at a time --------------------------
+# --- Damped steps of one pixel --------------------------------------------------------------------
 
 
-LONGEST = 3.0  # of a step, in an unconstrained coordinate: further the model is another one
+MAX_STEP = 3.0  # in an unconstrained coordinate: the model changes too much beyond
 FIRST_DAMPING = 1e-2
 LEAST_DAMPING = 1e-8
-FIRMER, LOOSER = 10.0, 0.1
+DAMPING_UP, DAMPING_DOWN = 10.0, 0.1
 ROUNDING = 8.0  # of the potential, in units of its last digit, that count as no change
 
-Curvature = Callable[[Program, Array, Observations], Slopes]
+DerivativesOf = Callable[[Program, Array, Observations], Derivatives]
 
 
 class LMState(NamedTuple):
-    """Where one pixel is."""
+    """State of the minimization of one pixel."""
 
     z: Float[AnyArray, " size"]
-    slopes: Slopes
+    derivatives: Derivatives
     damping: Float[AnyArray, ""]
     decrement: Float[AnyArray, ""]
     steps: Int[AnyArray, ""]
     settled: Bool[AnyArray, ""]
 
 
-class Peak(NamedTuple):
-    """A mode, and the normal distribution that fits there."""
+class NormalApproximation(NamedTuple):
+    """A mode, and the normal distribution there; its covariance is `root.T @ root`."""
 
     z: Float[AnyArray, " size"]
     value: Float[AnyArray, ""]
-    widths: Float[AnyArray, "size size"]
+    root: Float[AnyArray, "size size"]
     decrement: Float[AnyArray, ""]
     condition: Float[AnyArray, ""]
 
 
-def stand(z: Float[np.ndarray, "pixel size"]) -> LMState:
-    """Climbers at their starts; their first step looks around and stays where it is."""
+def init(z: Float[np.ndarray, "pixel size"]) -> LMState:
+    """States at the starts; the first step only evaluates the derivatives there."""
     count, size = z.shape
-    far, unit = (
-        np.full(count, np.inf, z.dtype),
-        np.broadcast_to(np.eye(size, dtype=z.dtype), (count, size, size)),
-    )
+    unknown = np.full(count, np.inf, z.dtype)
+    identity = np.broadcast_to(np.eye(size, dtype=z.dtype), (count, size, size))
     return LMState(
         z=z,
-        slopes=Slopes(far, np.zeros_like(z), unit),
+        derivatives=Derivatives(unknown, np.zeros_like(z), identity),
         damping=np.full(count, FIRST_DAMPING, z.dtype),
-        decrement=far,
+        decrement=unknown,
         steps=np.zeros(count, np.int32),
         settled=np.zeros(count, bool),
     )
 
 
 def step(
-    program: Program, curvature: Curvature, goal: float, climber: LMState, data: Observations
+    program: Program, derivatives_of: DerivativesOf, goal: float, state: LMState, data: Observations
 ) -> LMState:
-    """One damped step, taken only where it leads down."""
-    # Source: Marquardt (1963), J. SIAM 11(2), 431-441.
-    value, gradient, bend = climber.slopes
-    scale = jnp.maximum(jnp.abs(jnp.diagonal(bend)), jnp.finfo(value.dtype).tiny)
-    half = inverse(cholesky(bend + climber.damping * jnp.diag(scale)))
-    whitened = half @ gradient
+    """One damped step, taken only where it decreases the potential."""
+    value, gradient, curvature = state.derivatives
+    scale = jnp.maximum(jnp.abs(jnp.diagonal(curvature)), jnp.finfo(value.dtype).tiny)
+    root = inverse(cholesky(curvature + state.damping * jnp.diag(scale)))
+    whitened = root @ gradient
     decrement = jnp.sqrt(whitened @ whitened)
-    move = -(half.T @ whitened)
-    move = move * jnp.minimum(1.0, LONGEST / jnp.maximum(jnp.max(jnp.abs(move)), LONGEST))
-    possible = jnp.all(jnp.isfinite(move))
-    z = climber.z + jnp.where(possible, move, 0.0)
-    tried = curvature(program, jnp.asarray(z), data)
+    move = -(root.T @ whitened)
+    move = move * jnp.minimum(1.0, MAX_STEP / jnp.maximum(jnp.max(jnp.abs(move)), MAX_STEP))
+    is_possible = jnp.all(jnp.isfinite(move))
+    z = state.z + jnp.where(is_possible, move, 0.0)
+    proposed = derivatives_of(program, jnp.asarray(z), data)
     slack = ROUNDING * jnp.finfo(value.dtype).eps * (1.0 + jnp.abs(value))
-    whole = jnp.isfinite(tried.value) & jnp.all(jnp.isfinite(tried.gradient))
+    is_finite = jnp.isfinite(proposed.value) & jnp.all(jnp.isfinite(proposed.gradient))
     is_first = ~jnp.isfinite(value)
-    better = possible & whole & ((tried.value <= value + slack) | is_first)
-    looser = jnp.where(
-        is_first, climber.damping, jnp.maximum(LOOSER * climber.damping, LEAST_DAMPING)
+    accepted = is_possible & is_finite & ((proposed.value <= value + slack) | is_first)
+    less = jnp.where(
+        is_first, state.damping, jnp.maximum(DAMPING_DOWN * state.damping, LEAST_DAMPING)
     )
-    firmer = FIRMER * jnp.maximum(climber.damping, LEAST_DAMPING)
+    more = DAMPING_UP * jnp.maximum(state.damping, LEAST_DAMPING)
     moved = LMState(
-        z=jnp.where(better, z, climber.z),
-        slopes=jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, climber.slopes),
-        damping=jnp.where(better, looser, firmer),
-        decrement=jnp.where(possible & ~is_first, decrement, jnp.inf),
-        steps=climber.steps + ~is_first,
-        settled=better & ~is_first & (decrement < goal) & (climber.damping <= FIRST_DAMPING),
+        z=jnp.where(accepted, z, state.z),
+        derivatives=jax.tree.map(
+            lambda new, old: jnp.where(accepted, new, old), proposed, state.derivatives
+        ),
+        damping=jnp.where(accepted, less, more),
+        decrement=jnp.where(is_possible & ~is_first, decrement, jnp.inf),
+        steps=state.steps + ~is_first,
+        settled=accepted & ~is_first & (decrement < goal) & (state.damping <= FIRST_DAMPING),
     )
-    return jax.tree.map(lambda new, old: jnp.where(climber.settled, old, new), moved, climber)
+    return jax.tree.map(lambda new, old: jnp.where(state.settled, old, new), moved, state)
 
 
-def crown(z: Float[Array, " size"], slopes: Slopes) -> Peak:
-    """The last step, with exact curvature, and what it leaves."""
-    value, gradient, bend = slopes
-    half = inverse(cholesky(bend))
-    whitened = half @ gradient
-    covariance = half.T @ half
-    condition = jnp.max(jnp.sum(jnp.abs(bend), 0)) * jnp.max(jnp.sum(jnp.abs(covariance), 0))
+@jax.jit
+@jax.vmap
+def finalize(z: Float[Array, " size"], derivatives: Derivatives) -> NormalApproximation:
+    """The last step, with exact curvature, and the normal approximation at its end."""
+    value, gradient, curvature = derivatives
+    root = inverse(cholesky(curvature))
+    whitened = root @ gradient
+    covariance = root.T @ root
+    condition = jnp.max(jnp.sum(jnp.abs(curvature), 0)) * jnp.max(jnp.sum(jnp.abs(covariance), 0))
     decrement = jnp.sqrt(whitened @ whitened)
-    return Peak(z - half.T @ whitened, value - 0.5 * decrement**2, half, decrement, condition)
+    mode = z - root.T @ whitened
+    return NormalApproximation(mode, value - 0.5 * decrement**2, root, decrement, condition)
+
+
+# --- Modes of a batch of pixels -------------------------------------------------------------------
+
+
+PRIOR_DRAWS = 32
+"""Draws from the prior among which a starting point is chosen unless settings say otherwise."""
+
+RESTARTS = (1, 3, 7)
+"""Ranks of the prior draws from which pixels without a good mode start again."""
+
+SINGLE_PASSES, EXACT_PASSES = (5, 4), (1, 1, 1, 2, 4, 8, 16)
+"""Steps of each pass; pixels that have converged leave between passes. The first exact pass only
+evaluates the derivatives, which is enough for most pixels."""
+
+SINGLE_GOAL = 1e-4
+"""The Newton decrement, in posterior sds, at which steps in single precision stop."""
+
+GOALS = {"double": 1e-4, "single": 1e-2}
+"""The decrement at which a pixel has converged; single precision resolves it no better."""
+
+
+class ModeSearch(NamedTuple):
+    """Result of a mode search in a batch of pixels."""
+
+    mode: NormalApproximation
+    steps: np.ndarray
+    converged: np.ndarray
+
+
+def find_modes(
+    engine: BatchEngine, pixels: ObservationBatch, rank: int = 0, candidates: int = PRIOR_DRAWS
+) -> ModeSearch:
+    """The mode of every pixel, from the prior draw with the `rank`-th highest density."""
+
+    def advance(state: LMState, which: np.ndarray, count: int, *, single: bool) -> LMState:
+        some = pixels.subset(which), take_rows(state, which)
+        return engine.run(_stepping, single, *some, given=(np.int32(count),), single=single)
+
+    start = engine.run(_starts, candidates, pixels, given=(np.int32(rank),), single=True)
+    fast = jax.tree.map(np.array, init(start))
+    for count in SINGLE_PASSES:
+        left = np.flatnonzero(~fast.settled)
+        if left.size:
+            put_rows(fast, left, advance(fast, left, count, single=True))
+    is_finite = np.isfinite(fast.z).all(axis=-1, keepdims=True)
+    state = init(np.where(is_finite, fast.z, start).astype(engine.dtype))
+    first, *further = EXACT_PASSES
+    state = jax.tree.map(np.array, advance(state, np.arange(len(pixels)), first, single=False))
+    found = jax.tree.map(np.array, _finalized(engine, state))
+    goal = GOALS[engine.precision]
+    for count in further:
+        left = np.flatnonzero(~(found.decrement < goal))
+        if not left.size:
+            break
+        moved = advance(state, left, count, single=False)
+        put_rows((state, found), left, (moved, _finalized(engine, moved)))
+    converged = (found.decrement < goal) & np.isfinite(found.root).all(axis=(1, 2))
+    return ModeSearch(found, fast.steps + state.steps, converged)
+
+
+def find_modes_again(engine: BatchEngine, pixels: ObservationBatch) -> ModeSearch:
+    """The mode of every pixel; those that did not converge start again elsewhere."""
+    found = jax.tree.map(np.array, find_modes(engine, pixels))
+    for rank in RESTARTS:
+        left = np.flatnonzero(~found.converged)
+        if not left.size:
+            break
+        again = find_modes(engine, pixels.subset(left), rank)
+        put_rows(found, left[again.converged], take_rows(again, again.converged))
+    return found
+
+
+def _starts(engine: BatchEngine, candidates: int) -> Callable:
+    """A program that chooses the prior draw of some rank."""
+    draws = engine.prior_draws(candidates).astype(np.float32)
+
+    def start(rank: Array, data: Observations) -> Array:
+        values = jax.vmap(lambda z: engine.single_program.potential(z, data))(draws)
+        order = jnp.argsort(jnp.where(jnp.isnan(values), jnp.inf, values))
+        return jnp.asarray(draws)[order[rank]]
+
+    return batched(start, given=1)
+
+
+def _stepping(engine: BatchEngine, single: bool) -> Callable:
+    """A program of any number of steps."""
+    goal = SINGLE_GOAL if single else 0.1 * GOALS[engine.precision]
+    program = engine.single_program if single else engine.program
+    derivatives_of = scoring_derivatives if single else exact_derivatives
+
+    def several(count: Array, data: Observations, state: LMState) -> LMState:
+        def goes_on(at: tuple[Array, LMState]) -> Array:
+            return (at[0] < count) & ~at[1].settled
+
+        def advance(at: tuple[Array, LMState]) -> tuple[Array, LMState]:
+            return at[0] + 1, step(program, derivatives_of, goal, at[1], data)
+
+        return jax.lax.while_loop(goes_on, advance, (jnp.zeros_like(count), state))[1]
+
+    return batched(several, given=1)
+
+
+def _finalized(engine: BatchEngine, state: LMState) -> NormalApproximation:
+    def of_batch(index: np.ndarray) -> NormalApproximation:
+        return finalize(*take_rows((state.z, state.derivatives), index))
+
+    with jax.enable_x64(engine.precision == "double"):
+        return map_batches(of_batch, len(state.z), BATCH)

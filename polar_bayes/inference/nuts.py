@@ -21,7 +21,6 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import JitOnce, LRUCache
 from polar_bayes.inference.mcse import measure
 from polar_bayes.inference.optimize import Modes, ValueAndGradient
-from polar_bayes.repr_html import HTMLRepr
 
 Progress = Callable[[float], None]
 
@@ -33,25 +32,8 @@ MAX_SAMPLERS = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class Nuts(HTMLRepr):
-    """Settings of the sampler.
-
-    Args:
-        chains: Independent chains, at least 2.
-        warmup: Draws spent on step size and metric, per chain. None: 300; 150 for many patches,
-            whose metric is known before.
-        draws: Draws kept at least, per chain.
-        most_draws: Draws kept at most, per chain; set it to `draws` for a fixed length.
-        effective_draws: Goal for the bulk and tail effective sample size of every coordinate.
-        target_acceptance: Higher means smaller steps, range [0.5, 1). None: 0.9 for one material,
-            0.98 for a few patches, 0.7 for many, whose coordinates are close to normal.
-        max_tree_depth: A trajectory has at most 2 ** this steps.
-        threads: Chains that run at once.
-        block: Draws between two looks at the progress, per chain.
-
-    Raises:
-        FitError: A setting is out of range.
-    """
+class NutsSettings:
+    """Numbers of chains and draws, and goals; `Nuts` explains each."""
 
     chains: int = 4
     warmup: int | None = None
@@ -112,7 +94,7 @@ class Target(NamedTuple):
     acceptance: float = 0.9
     warmup: int = 300
 
-    def sampler(self, settings: Nuts) -> "_Sampler":
+    def sampler(self, settings: NutsSettings) -> "_Sampler":
         """The compiled sampler; the target supplies what the settings leave open."""
         warmup, acceptance = settings.warmup, settings.target_acceptance
         return self.samplers.of(
@@ -129,7 +111,7 @@ class Target(NamedTuple):
 def sample(
     target: Target,
     key: Array,
-    settings: Nuts,
+    settings: NutsSettings,
     progress: Progress = lambda _: None,
 ) -> tuple[np.ndarray, dict[str, np.ndarray], bool]:
     """Draws (chain, draw, size), statistics by name, and whether the chains reached the goals."""
@@ -174,7 +156,7 @@ def sample(
     return z, stats, converged
 
 
-def expect(target: Target, settings: Nuts) -> None:
+def expect(target: Target, settings: NutsSettings) -> None:
     """Begin to compile what `sample` will need, in parallel with whatever follows."""
     sampler = target.sampler(settings)
     if not sampler.advance.is_begun:
@@ -182,7 +164,7 @@ def expect(target: Target, settings: Nuts) -> None:
         sampler.advance.begin(state, target.given)
 
 
-def _converged(rounds: list[Step], settings: Nuts) -> bool:
+def _converged(rounds: list[Step], settings: NutsSettings) -> bool:
     """Whether every coordinate has reached the goals; both are invariant to monotone maps."""
     z = np.concatenate([steps.z for steps in rounds], axis=1)
     bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))

@@ -1,79 +1,149 @@
-"""One capture, ready to be fitted: what every method finds on its bench."""
+"""One capture and the model that is fitted to it: what every method is given.
+
+All that is compiled belongs to the layout of the capture, and serves the next capture of that
+layout; `Problem` adds the readings and the posterior modes that were found for them.
+"""
 
 import dataclasses
 import functools
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from polar_bayes.inference import laplace
-from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache, cache_key, layout_of
+from polar_bayes.inference.compile import (
+    TRACING_LOCK,
+    JitOnce,
+    LRUCache,
+    cache_key,
+    layout_of,
+)
 from polar_bayes.inference.initialization import AbstractInit, AbstractInitializer, make_initializer
-from polar_bayes.inference.program import Model, Program, compile_program
-from polar_bayes.inference.request import Request
-from polar_bayes.observation.data import Observations
-from polar_bayes.physics.scene import Scene
-from polar_bayes.progress import Progress
+from polar_bayes.inference.program import (
+    Draw,
+    Model,
+    Program,
+    Values,
+    compile_program,
+    parameters_of,
+)
+from polar_bayes.inference.request import Request, bind_model
+from polar_bayes.observation.data import Observations, observe
+from polar_bayes.progress import Progress, no_progress
 
-# --- A model on captures of one layout, with all that is compiled of it; kept from fit to fit -----
+MAX_LAYOUTS = 8
+"""Models by layout that stay compiled."""
 
+MAX_PROGRAMS = 16
+"""Further programs that methods have made of one of them, by settings, that stay compiled."""
 
-MOST_KEPT = 8
+DENSITY_BLOCK = 1024
+"""Draws whose density one call computes: one compiled program serves any number."""
+
+SIDE_BY_SIDE = 64
+"""Of these, draws that are vectorized over."""
+
+BLOCK = 500
+"""Draws that one call predicts."""
+
+KEYS = 1 << 15
+"""Random keys are split in multiples of this number: one compiled program serves any number."""
+
+THREADS = 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CompiledModel:
     """What fits of one model to captures of one layout have in common."""
 
+    bind: Callable[[], Model]
     model: Model
     program: Program
     layout: Observations
+    precision: str
+    programs: LRUCache[Any] = dataclasses.field(default_factory=lambda: LRUCache(MAX_PROGRAMS))
+    """Further compiled programs of the model, which methods keep here by keys of their own."""
 
     @functools.cached_property
     def initializer(self) -> AbstractInitializer:
-        """What searches for peaks."""
+        """The search for posterior modes."""
         with TRACING_LOCK:
             return make_initializer(self.model, self.program, self.layout)
 
     @functools.cached_property
+    def single(self) -> Program:
+        """The same model in single precision."""
+        if self.precision == "single":
+            return self.program
+        with jax.enable_x64(False), TRACING_LOCK:
+            return compile_program(self.bind(), self.layout.in_single_precision())
+
+    @functools.cached_property
     def least_squares(self) -> Callable[[Array, Observations], laplace.Estimate]:
-        """The least squares from some starts, compiled."""
+        """Least squares from several starts, compiled."""
         return JitOnce(lambda starts, data: laplace.estimate(self.program, data, starts))
 
+    @functools.cached_property
+    def log_densities(self) -> Callable[[Array, Observations], Array]:
+        """Log posterior density of a block of unconstrained vectors, compiled."""
 
-_KEPT: LRUCache[CompiledModel] = LRUCache(MOST_KEPT)
+        def compute(z: Array, data: Observations) -> Array:
+            return jax.lax.map(
+                lambda z: -self.program.potential_jit(z, data), z, batch_size=SIDE_BY_SIDE
+            )
+
+        with TRACING_LOCK:
+            return JitOnce(compute)
 
 
-def compile_model(request: Request, scene: Scene, data: Observations) -> CompiledModel:
+_COMPILED: LRUCache[CompiledModel] = LRUCache(MAX_LAYOUTS)
+
+
+def compile_model(request: Request, data: Observations) -> CompiledModel:
     """The compiled model of a capture and of every other one of its layout, from the cache."""
-    key = cache_key(
-        request.model, scene, request.priors, request.links, request.precision, layout_of(data)
-    )
+    parts = request.model, request.scene, request.priors, request.links
+    key = cache_key(*parts, request.precision, layout_of(data))
 
     def make() -> CompiledModel:
-        model = request.bind(scene)
-        return CompiledModel(model, compile_program(model, data), data)
+        bind = functools.partial(bind_model, *parts)
+        model = bind()
+        return CompiledModel(bind, model, compile_program(model, data), data, request.precision)
 
     with TRACING_LOCK:
-        return _KEPT.of(key, make)
+        return _COMPILED.of(key, make)
 
 
-# --- One capture, ready to be fitted: what every method finds on its bench ------------------------
+@dataclasses.dataclass
+class _ModeSearch:
+    """What a problem's search for modes has found so far."""
+
+    found: AbstractInit | None = None
+    seconds: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
-    """A capture with the programs that fit it."""
+    """A posterior to draw from.
 
-    request: Request
+    Args:
+        compiled_model: Programs of the model for the layout of the capture.
+        data: The capture.
+        key: Random key of the search for modes.
+        start_time: When the fit was asked for, on the clock of `time.perf_counter`, unit second;
+            time limits count from there.
+    """
+
     compiled_model: CompiledModel
     data: Observations
     key: Array
-    progress: Progress
-    begun: float = dataclasses.field(default_factory=time.perf_counter)
+    start_time: float = dataclasses.field(default_factory=time.perf_counter)
+    _search: _ModeSearch = dataclasses.field(default_factory=_ModeSearch, init=False, repr=False)
 
     @property
     def program(self) -> Program:
@@ -81,25 +151,128 @@ class Problem:
         return self.compiled_model.program
 
     @property
-    def key_of_draws(self) -> Array:
-        """Random key of what comes after the search for modes."""
-        return jax.random.split(self.key)[1]
-
-    @functools.cached_property
-    def initialization(self) -> AbstractInit:
-        """The peaks of the posterior, searched for once however many methods ask."""
-        return self.compiled_model.initializer.find(
-            self.data, jax.random.split(self.key)[0], self.progress
-        )
-
-    def reporting(self, progress: Progress) -> "Problem":
-        """The same with another callback; the peaks go with it where they are found already."""
-        other = dataclasses.replace(self, progress=progress)
-        if "initialization" in self.__dict__:
-            other.__dict__["initialization"] = self.initialization
-        return other
-
-    @property
     def dtype(self) -> np.dtype:
         """Floating type of the fit."""
         return np.dtype(self.data.brightness.dtype)
+
+    @property
+    def search_seconds(self) -> float:
+        """Time that the search for modes took; 0 where no method has asked for it."""
+        return self._search.seconds
+
+    @property
+    def is_one_spectrum_point(self) -> bool:
+        """Whether the capture is of one material in one color."""
+        return all(name == "view" or length == 1 for name, length in self.data.dims)
+
+    @functools.cached_property
+    def num_parameters(self) -> int:
+        """How many numbers the model estimates, derived ones included."""
+        z = jax.ShapeDtypeStruct((self.program.size,), self.dtype)
+        with TRACING_LOCK:
+            found = jax.eval_shape(self.program.parameters, z, self.data)
+        return sum(int(np.prod(x.shape)) for x in jax.tree.leaves(found))
+
+    def initialize(self, progress: Progress = no_progress) -> AbstractInit:
+        """The posterior modes and what surrounds them, found once however many methods ask.
+
+        Args:
+            progress: Called with the name of a stage and the fraction of it that is done.
+
+        Returns:
+            Modes, starting points and metric.
+
+        Raises:
+            FitError: No start reached a mode.
+        """
+        if self._search.found is None:
+            begun = time.perf_counter()
+            found = self.compiled_model.initializer.find(self.data, self.key, progress)
+            self._search.seconds = time.perf_counter() - begun
+            self._search.found = found
+        return self._search.found
+
+    def log_density(self, z: Float[np.ndarray, "draw size"]) -> Float[np.ndarray, " draw"]:
+        """Log posterior density of unconstrained vectors, up to a constant.
+
+        Args:
+            z: Unconstrained vectors, shape (draw, size).
+
+        Returns:
+            Log densities, shape (draw,); minus infinity where there is none.
+        """
+        count, parts = len(z), []
+        for begin in range(0, count, DENSITY_BLOCK):
+            index = np.minimum(np.arange(begin, begin + DENSITY_BLOCK), count - 1)
+            found = self.compiled_model.log_densities(jnp.asarray(z[index]), self.data)
+            parts.append(np.asarray(found, float))
+        whole = np.concatenate(parts)[:count]
+        return np.where(np.isnan(whole), -np.inf, whole)
+
+    def constrain(self, z: Float[np.ndarray, "chain draw size"]) -> Values:
+        """Parameters of draws, in their supports.
+
+        Args:
+            z: Unconstrained vectors, shape (chain, draw, size).
+
+        Returns:
+            Arrays of shape (chain, draw, ...), by name.
+        """
+        return parameters_of(self.program, z.astype(self.dtype), self.data)
+
+    def prepare_predictions(self) -> None:
+        """Begin to compile what `predict` needs, in parallel with whatever follows."""
+        keys = jax.random.key_data(jax.random.key(0))
+        self.program.described.begin(
+            jax.ShapeDtypeStruct((BLOCK, *keys.shape), keys.dtype),
+            jax.ShapeDtypeStruct((BLOCK, self.program.size), self.dtype),
+            self.data,
+        )
+
+    def predict(self, key: Array, z: Float[np.ndarray, "chain draw size"]) -> Draw:
+        """Parameters, densities and predicted readings of draws.
+
+        Args:
+            key: Random key of the predicted readings.
+            z: Unconstrained vectors, shape (chain, draw, size).
+
+        Returns:
+            Arrays of shape (chain, draw, ...), by group and name.
+        """
+        flat = z.reshape(-1, self.program.size).astype(self.dtype)
+        # The key of a draw depends on its index alone, so a round number serves any number of them.
+        every = jax.random.split(key, KEYS * -(-len(flat) // KEYS))
+        keys = np.asarray(jax.random.key_data(every))
+
+        # Posterior and prior have different lengths; blocks of one length compile once, and run on
+        # threads as the chains do.
+        def run(start: int) -> Draw:
+            index = np.minimum(np.arange(start, start + BLOCK), len(flat) - 1)
+            with jax.enable_x64(self.dtype == np.float64):  # a thread does not inherit it
+                of_block, drawn = jnp.asarray(keys[index]), jnp.asarray(flat[index])
+                return jax.tree.map(np.asarray, self.program.described(of_block, drawn, self.data))
+
+        first = run(0)  # compiled before the threads start
+        joined = jax.tree.map(lambda x: np.empty((len(flat), *x.shape[1:]), x.dtype), first)
+
+        def fill(start: int, block: Draw) -> None:
+            for whole, part in zip(jax.tree.leaves(joined), jax.tree.leaves(block), strict=True):
+                whole[start : start + BLOCK] = part[: len(flat) - start]
+
+        fill(0, first)
+        with ThreadPoolExecutor(THREADS) as pool:
+            list(pool.map(lambda start: fill(start, run(start)), range(BLOCK, len(flat), BLOCK)))
+        return jax.tree.map(lambda x: x.reshape(*z.shape[:2], *x.shape[1:]), joined)
+
+
+def observe_request(request: Request) -> Observations:
+    """The capture of a request, in its precision."""
+    data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
+    return data.in_single_precision() if request.precision == "single" else data
+
+
+def make_problem(request: Request, key: Array, start_time: float | None = None) -> Problem:
+    """A request's posterior, ready for any method; compiled where its layout is new."""
+    data = observe_request(request)
+    begun = time.perf_counter() if start_time is None else start_time
+    return Problem(compile_model(request, data), data, key, begun)

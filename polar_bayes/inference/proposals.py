@@ -1,12 +1,16 @@
-"""Mixtures of Student t distributions, fitted to weighted draws: proposals for bent posteriors.
+"""Proposals for importance sampling: single ones for a batch of pixels, and mixtures.
 
-One normal or t distribution wastes most of its draws on a posterior that bends or has two modes; a
-few together follow it. Measured in `benchmarks/calibration.py`.
+A single proposal is a normal or Student t distribution. Population Monte Carlo (Cappe et al. 2004)
+fits it to the weighted draws of the previous round: normal first, then Student t, whose tails are
+longer than those of nearly every posterior, so that the weights are bounded. A mixture of Student t
+distributions (Cappe et al. 2008) also follows a posterior that is curved or has several modes.
+Draws of two mixtures are combined by multiple importance sampling with the balance heuristic
+(Veach & Guibas 1995). `benchmarks/calibration.py` has the measurements.
 
-Each round takes mean and covariance of the weighted draws of the last, and draws from a Student t
-distribution with both: its tails are longer than those of nearly every posterior, so weights are
-bounded where those of a normal distribution are not. A round takes a small part of the time of
-short chains.
+Source:
+    Cappe, Guillin, Marin & Robert (2004), J. Comput. Graph. Stat. 13(4), 907-929; Cappe, Douc,
+    Guillin, Marin & Robert (2008), Stat. Comput. 18, 447-459; Veach & Guibas (1995), SIGGRAPH,
+    419-428; Cornuet, Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), 798-812.
 """
 
 from typing import NamedTuple
@@ -18,23 +22,128 @@ import scipy.special
 from jax.scipy.linalg import solve_triangular
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
+from scipy.stats import qmc
 
-from polar_bayes.inference.levenberg_marquardt import AnyArray
+from polar_bayes.inference.batching import AnyArray, map_batches, take_rows
 from polar_bayes.inference.program import Values
-from polar_bayes.inference.psis import Points, even, mirrored
-from polar_bayes.inference.smc import spread
+from polar_bayes.inference.psis import effective_draws, effective_tails, smooth
+
+# --- One normal or Student t distribution for each pixel ------------------------------------------
+
+
+PROPOSAL_DEGREES_OF_FREEDOM = 6.0
+"""Of the Student t proposal: few enough for longer tails than those of a posterior, many enough to
+spend few draws on them."""
+
+
+class Points(NamedTuple):
+    """Quasi-random draws of a standard distribution, the same for all pixels."""
+
+    z: Float[np.ndarray, "draw size"]
+    log_density: Float[np.ndarray, " draw"]
+
+    def split(self, count: int) -> list["Points"]:
+        """The same in parts of one size."""
+        parts = (np.split(array, count) for array in self)
+        return [Points(*part) for part in zip(*parts, strict=True)]
+
+
+class Proposal(NamedTuple):
+    """A distribution in every pixel: its draws are `center + points.z @ root`."""
+
+    center: Float[np.ndarray, "pixel size"]
+    root: Float[np.ndarray, "pixel size size"]
+
+    def rotated(self, rotations: Float[np.ndarray, "pixel size size"]) -> "Proposal":
+        """The same distribution, whose points are first rotated, in each pixel differently."""
+        return Proposal(self.center, rotations @ self.root)
+
+    def draws(self, points: Points) -> Float[np.ndarray, "pixel draw size"]:
+        """Unconstrained vectors of all draws."""
+        return self.center[:, None] + points.z @ self.root
+
+
+def normal_points(count: int, size: int, seed: int) -> Points:
+    """Quasi-random points of the standard normal distribution."""
+    # Their radii are quantiles of the chi distribution, one of each, so that over all rotations of
+    # the points every quantile in every direction is right.
+    points = scipy.special.ndtri(_sobol(-(-count // 2), size, seed))
+    radius = np.linalg.norm(points, axis=-1)
+    share = (np.argsort(np.argsort(radius)) + 0.5) / len(points)
+    points *= (np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * size, share)) / radius)[:, None]
+    z = _antithetic(points)[:count]
+    return Points(z, -0.5 * np.sum(z**2, axis=-1))
+
+
+def student_t_points(count: int, size: int, seed: int) -> Points:
+    """Quasi-random points of a standard multivariate Student t distribution."""
+    freedom = PROPOSAL_DEGREES_OF_FREEDOM
+    share = _sobol(-(-count // 2), size + 1, seed)
+    chi_squared = 2.0 * scipy.special.gammaincinv(0.5 * freedom, share[:, :1])
+    z = _antithetic(scipy.special.ndtri(share[:, 1:]) / np.sqrt(chi_squared / freedom))[:count]
+    squares = np.sum(z**2, axis=-1) / freedom
+    return Points(z, -0.5 * (freedom + size) * np.log1p(squares))
+
+
+def _sobol(count: int, size: int, seed: int) -> Float[np.ndarray, "count size"]:
+    """Scrambled Sobol' points (Owen 1998, J. Complexity 14(4), 466-489), inside of (0, 1)."""
+    points = qmc.Sobol(size, rng=np.random.default_rng(seed)).random(count)
+    return np.clip(points, 1e-12, 1.0 - 1e-12)
+
+
+def _antithetic(points: Float[np.ndarray, "half size"]) -> Float[np.ndarray, "count size"]:
+    """Each point followed by its mirror image."""
+    return np.stack([points, -points], axis=1).reshape(-1, points.shape[1])
+
+
+def random_rotations(keys: np.ndarray, size: int) -> Float[np.ndarray, "pixel size size"]:
+    """A random rotation or reflection for each pixel (Mezzadri 2007, Notices of the AMS 54(5))."""
+    # Otherwise the error of a few points in a quantile would be the same in all pixels.
+    draw = jax.vmap(
+        lambda key: jax.random.bits(jax.random.wrap_key_data(key), (size, size), np.uint32)
+    )
+    # Integers are the same however a program was compiled, and for however many pixels.
+    share = (np.asarray(draw(keys)) + 0.5) / 2.0**32
+    q, r = np.linalg.qr(scipy.special.ndtri(share))
+    return q * np.sign(np.einsum("pii->pi", r))[:, None, :]
+
+
+def fit_t(
+    draws: Float[np.ndarray, "pixel draw size"], weights: Float[np.ndarray, "pixel draw"]
+) -> Proposal:
+    """A proposal with the mean and covariance of weighted draws."""
+    center = np.einsum("pd,pds->ps", weights, draws)
+    centered = draws - center[:, None]
+    covariance = np.einsum("pd,pds,pdt->pst", weights, centered, centered)
+    root = np.full_like(covariance, np.nan)
+    for pixel, matrix in enumerate(covariance):
+        try:
+            root[pixel] = np.linalg.cholesky(matrix).T
+        except np.linalg.LinAlgError:
+            continue  # stays NaN: no weight of this proposal is finite
+    return Proposal(center, root)
+
+
+# --- Mixtures of Student t distributions ----------------------------------------------------------
+
 
 DEGREES_OF_FREEDOM = 8.0
-"""Of the tails: longer than those of most posteriors, which bounds the weights."""
+"""Of each component: longer tails than those of most posteriors bound the weights."""
 
-STEPS = 15
-"""Of expectation and maximization; the mixture need not be the best one, only a good one."""
+EM_STEPS = 15
+"""Of expectation maximization; the mixture need not be the best one, only a good one."""
 
 WIDE_SHARE, WIDE_SCALE = 0.15, 2.0
-"""Of one more component around all draws: it shows a tail that they have too little of."""
+"""Of one more component around all draws: it reaches tails that the draws represent too little."""
 
 PRIOR_SCALE = 0.5
-"""Scale of a component that no draws belong to, in units of that of all draws."""
+"""Scale of a component without draws, in units of that of all draws."""
+
+LIFT = 1e-6
+"""Added to the diagonal of correlation matrices, which single precision rounds."""
+
+PIXELS = 16
+"""Pixels whose mixture densities are computed together: their draws fit into a core's cache."""
 
 
 class Mixture(NamedTuple):
@@ -48,7 +157,7 @@ class Mixture(NamedTuple):
 
 
 class Proposed(NamedTuple):
-    """Draws of a mixture for every pixel of a row."""
+    """Draws of a mixture for every pixel of a batch."""
 
     mixture: Mixture
     z: AnyArray
@@ -56,35 +165,65 @@ class Proposed(NamedTuple):
     log_posterior: AnyArray
 
 
+class WeightedSample(NamedTuple):
+    """Weighted draws of a batch of pixels."""
+
+    z: np.ndarray
+    parameters: Values
+    weights: np.ndarray
+    pareto_k: np.ndarray
+
+    @property
+    def ess(self) -> np.ndarray:
+        """Effective sample size, the least of the bulk and of both tails. (pixel,)."""
+        return np.minimum(effective_draws(self.weights), effective_tails(self.z, self.weights))
+
+
+def moments(
+    z: Float[Array, "draw size"], weights: Float[Array, " draw"]
+) -> tuple[Float[Array, " size"], Float[Array, "size size"]]:
+    """Mean of weighted draws, and the lower Cholesky factor of their covariance."""
+    center = weights @ z
+    centered = z - center
+    sd = jnp.sqrt(weights @ centered**2)
+    sd = jnp.where(sd > 0.0, sd, 1.0)
+    scaled = centered / sd
+    correlation = scaled.T @ (scaled * weights[:, None])
+    return center, sd[:, None] * jnp.linalg.cholesky(correlation + LIFT * jnp.eye(sd.size))
+
+
+def resample(weights: Float[Array, " draw"], count: int, key: Array) -> Array:
+    """Indices of `count` draws by systematic resampling."""
+    even = (jnp.arange(count) + jax.random.uniform(key)) / count
+    return jnp.clip(jnp.searchsorted(jnp.cumsum(weights), even), 0, len(weights) - 1)
+
+
 def fit_mixture(
     z: Float[Array, "draw size"], weights: Float[Array, " draw"], components: int, key: Array
 ) -> Mixture:
-    """Fit normal components by expectation and maximization."""
-    # Components shrink towards the whole as far as they have few draws.
-    # Source: Cappe, Douc, Guillin, Marin & Robert (2008), Stat. Comput. 18, 447-459: adaptive
-    # importance sampling by mixtures.
+    """Fit normal components by expectation maximization, shrunk towards all draws together."""
     size = z.shape[-1]
-    center, half = spread(z, weights)
+    center, half = moments(z, weights)
     x = (z - center) @ _inverse(half).T
-    worth = weights / jnp.sum(weights**2)  # they sum to what the draws are worth
+    counts = weights / jnp.sum(weights**2)  # their sum is the effective sample size
     begin = jax.random.choice(key, len(x), (components,), replace=False, p=weights)
     unit = PRIOR_SCALE * jnp.eye(size, dtype=z.dtype)
 
     def improve(_: int, parts: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         log_share, mean, scale = parts
         squares, log_volume = _whitened(x, mean, scale)
-        share = jax.nn.softmax(log_share - 0.5 * squares - log_volume, axis=-1) * worth[:, None]
-        held = jnp.sum(share, axis=0) + 1e-3
-        mean = (share.T @ x) / held[:, None]
-        apart = x[:, None] - mean
-        found = jnp.einsum("dk,dki,dkj->kij", share, apart, apart) / held[:, None, None]
-        own = (held / (held + size + 2.0))[:, None, None]
+        share = jax.nn.softmax(log_share - 0.5 * squares - log_volume, axis=-1) * counts[:, None]
+        total = jnp.sum(share, axis=0) + 1e-3
+        mean = (share.T @ x) / total[:, None]
+        centered = x[:, None] - mean
+        found = jnp.einsum("dk,dki,dkj->kij", share, centered, centered) / total[:, None, None]
+        own = (total / (total + size + 2.0))[:, None, None]
         covariance = own * found + (1.0 - own) * unit
-        return jnp.log(held / jnp.sum(held)), mean, jnp.linalg.cholesky(covariance)
+        return jnp.log(total / jnp.sum(total)), mean, jnp.linalg.cholesky(covariance)
 
     log_share = jnp.full(components, -jnp.log(components), z.dtype)
     scale = jnp.broadcast_to(jnp.linalg.cholesky(unit), (components, size, size))
-    log_share, mean, scale = jax.lax.fori_loop(0, STEPS, improve, (log_share, x[begin], scale))
+    log_share, mean, scale = jax.lax.fori_loop(0, EM_STEPS, improve, (log_share, x[begin], scale))
     wide = WIDE_SCALE * jnp.eye(size, dtype=z.dtype)
     shares = log_share + jnp.log1p(-WIDE_SHARE), jnp.log(jnp.full(1, WIDE_SHARE, z.dtype))
     return Mixture(
@@ -97,28 +236,49 @@ def fit_mixture(
 
 
 def draw_mixture(mixture: Mixture, count: int, key: Array) -> Float[Array, "draw size"]:
-    """Draws of the mixture with tails of Student's t, each component's share evenly."""
-    components, size = mixture.mean.shape
+    """Draws of the mixture, its components chosen by systematic resampling."""
     key_which, key_normal, key_tail = jax.random.split(key, 3)
-    even = (jnp.arange(count) + jax.random.uniform(key_which)) / count
-    which = jnp.searchsorted(jnp.cumsum(jnp.exp(mixture.log_share)), even)
-    which = jnp.clip(which, 0, components - 1)
-    dtype = mixture.mean.dtype
-    freedom = DEGREES_OF_FREEDOM
+    which = resample(jnp.exp(mixture.log_share), count, key_which)
+    dtype, freedom = mixture.mean.dtype, DEGREES_OF_FREEDOM
     tail = jax.random.gamma(key_tail, 0.5 * freedom, (count, 1), dtype) * 2.0 / freedom
-    noise = jax.random.normal(key_normal, (count, size), dtype) / jnp.sqrt(tail)
+    noise = jax.random.normal(key_normal, (count, mixture.mean.shape[-1]), dtype) / jnp.sqrt(tail)
     x = mixture.mean[which] + jnp.einsum("dij,dj->di", mixture.scale[which], noise)
     return mixture.center + x @ mixture.half.T
 
 
 def log_density(mixture: Mixture, z: Float[Array, "draw size"]) -> Float[Array, " draw"]:
-    """Log density of a mixture with tails of Student's t."""
+    """Log density of the mixture, up to a constant that all mixtures share."""
     freedom, size = DEGREES_OF_FREEDOM, z.shape[-1]
     x = (z - mixture.center) @ _inverse(mixture.half).T
     squares, log_volume = _whitened(x, mixture.mean, mixture.scale)
     each = -0.5 * (freedom + size) * jnp.log1p(squares / freedom) - log_volume
     whole = jnp.sum(jnp.log(jnp.diagonal(mixture.half)))
     return logsumexp(each + mixture.log_share, axis=-1) - whole
+
+
+def combine_samples(first: Proposed, second: Proposed) -> WeightedSample:
+    """The draws of two mixtures, weighted by the posterior over the mean density of both.
+
+    Multiple importance sampling with the balance heuristic: regions that one mixture covers badly
+    may be covered by the other, and a mixture that is too narrow shows in the other's draws.
+    """
+    z, parameters, log_posterior = jax.tree.map(
+        lambda *x: np.concatenate(x, axis=1), first[1:], second[1:]
+    )
+    with jax.enable_x64(False):
+        log_mean = map_batches(
+            lambda index: _log_means(*take_rows((first.mixture, second.mixture, z), index)),
+            len(z),
+            PIXELS,
+        )
+    return WeightedSample(z, parameters, *smooth(log_posterior - log_mean))
+
+
+@jax.jit
+@jax.vmap
+def _log_means(first: Mixture, second: Mixture, z: Array) -> Array:
+    """Log of the mean density of two mixtures at each draw of one pixel, up to a constant."""
+    return jnp.logaddexp(log_density(first, z), log_density(second, z))
 
 
 def _whitened(x: Array, mean: Array, scale: Array) -> tuple[Array, Array]:
@@ -134,59 +294,3 @@ def _whitened(x: Array, mean: Array, scale: Array) -> tuple[Array, Array]:
 def _inverse(scale: Array) -> Array:
     """Of a small triangle: with many right-hand sides, a library would share them among cores."""
     return solve_triangular(scale, jnp.eye(len(scale), dtype=scale.dtype), lower=True)
-
-
-# --- Proposals that learn from their own weighted draws, for pixels the normal one does not fit ---
-
-
-ADAPTED_DEGREES_OF_FREEDOM = 6.0
-"""Of the tails: few enough to outlast a posterior's, many enough to waste few draws on them."""
-
-TIMES = 2
-"""How many times the draws of the first look a round takes."""
-
-FEWEST_EFFECTIVE = 100
-"""Independent draws that the weighted ones of a round must be worth to be the answer."""
-
-
-class Proposal(NamedTuple):
-    """Where the draws of every pixel are taken: `center + points @ half`."""
-
-    center: Float[np.ndarray, "pixel size"]
-    half: Float[np.ndarray, "pixel size size"]
-
-    def turned(self, turns: Float[np.ndarray, "pixel size size"]) -> "Proposal":
-        """The same distribution, whose points are turned first, in each pixel by another way."""
-        return Proposal(self.center, turns @ self.half)
-
-    def places(self, points: Points) -> Float[np.ndarray, "pixel draw size"]:
-        """Unconstrained vectors of all draws."""
-        return self.center[:, None] + points.places @ self.half
-
-
-def heavy_points(count: int, size: int, seed: int) -> Points:
-    """Evenly spread points of a standard Student t distribution."""
-    share = even(-(-count // 2), size + 1, seed)
-    chi_squared = 2.0 * scipy.special.gammaincinv(0.5 * ADAPTED_DEGREES_OF_FREEDOM, share[:, :1])
-    half = scipy.special.ndtri(share[:, 1:]) / np.sqrt(chi_squared / ADAPTED_DEGREES_OF_FREEDOM)
-    places = mirrored(half)[:count]
-    squares = np.sum(places**2, axis=-1) / ADAPTED_DEGREES_OF_FREEDOM
-    return Points(places, -0.5 * (ADAPTED_DEGREES_OF_FREEDOM + size) * np.log1p(squares))
-
-
-def learn(
-    places: Float[np.ndarray, "pixel draw size"], weights: Float[np.ndarray, "pixel draw"]
-) -> Proposal:
-    """Mean and covariance of weighted draws."""
-    # Source: Cappe, Guillin, Marin & Robert (2004), J. Comput. Graph. Stat. 13(4), 907-929:
-    # population Monte Carlo.
-    center = np.einsum("pd,pds->ps", weights, places)
-    apart = places - center[:, None]
-    covariance = np.einsum("pd,pds,pdt->pst", weights, apart, apart)
-    half = np.full_like(covariance, np.nan)
-    for pixel, matrix in enumerate(covariance):
-        try:
-            half[pixel] = np.linalg.cholesky(matrix).T
-        except np.linalg.LinAlgError:
-            continue  # stays NaN, which no weight trusts
-    return Proposal(center, half)

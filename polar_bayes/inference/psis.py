@@ -1,22 +1,22 @@
-"""What a normal approximation is worth: its draws, weighed by the true posterior.
+"""Pareto-smoothed importance sampling (Vehtari et al. 2024) of many pixels at once.
 
-The weights say how far the approximation can be trusted (Pareto k) and, where it can, correct
-it. All pixels share one set of standard normal points, turned another way in each: what few points
-get wrong of a quantile would otherwise be wrong alike in all of them.
+Also the effective sample sizes and the marginals (means, sds, quantiles) of weighted draws.
+
+Source:
+    Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72): the weights and Pareto k; Zhang &
+    Stephens (2009), Technometrics 51(3), 316-325: the fit of the tail.
 """
 
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import scipy.special
 from jaxtyping import Float
-from scipy.stats import qmc
 
 from polar_bayes.inference.program import Values
 
-LARGEST_TRUSTED = 0.7
+MAX_PARETO_K = 0.7
 """Pareto k above which weighted draws say little, however many there are."""
 
 
@@ -24,60 +24,11 @@ TAIL = 0.05
 """Share of the posterior at either end whose Monte Carlo error counts as that of the tails."""
 
 
-class Points(NamedTuple):
-    """Draws of a standard distribution, the same for all pixels."""
-
-    places: Float[np.ndarray, "draw size"]
-    log_density: Float[np.ndarray, " draw"]
-
-    def split(self, count: int) -> list["Points"]:
-        """The same in parts of one size."""
-        parts = (np.split(array, count) for array in self)
-        return [Points(*part) for part in zip(*parts, strict=True)]
-
-
-def even(count: int, size: int, seed: int) -> Float[np.ndarray, "count size"]:
-    """Scrambled Sobol' points, clear of both ends of (0, 1)."""
-    points = qmc.Sobol(size, rng=np.random.default_rng(seed)).random(count)
-    return np.clip(points, 1e-12, 1.0 - 1e-12)
-
-
-def mirrored(points: Float[np.ndarray, "half size"]) -> Float[np.ndarray, "count size"]:
-    """Each point beside its mirror image."""
-    return np.stack([points, -points], axis=1).reshape(-1, points.shape[1])
-
-
-def turns(keys: np.ndarray, size: int) -> Float[np.ndarray, "pixel size size"]:
-    """A random rotation or reflection for each pixel, all equally likely."""
-    # Source: Mezzadri (2007), Notices of the AMS 54(5), 592-604.
-    draw = jax.vmap(
-        lambda key: jax.random.bits(jax.random.wrap_key_data(key), (size, size), np.uint32)
-    )
-    # Whole numbers are the same however a program was compiled, and for however many pixels.
-    share = (np.asarray(draw(keys)) + 0.5) / 2.0**32
-    q, r = np.linalg.qr(scipy.special.ndtri(share))
-    return q * np.sign(np.einsum("pii->pi", r))[:, None, :]
-
-
 class Smoothed(NamedTuple):
     """Weights of the draws of every pixel."""
 
     weights: Float[np.ndarray, "pixel draw"]
     pareto_k: Float[np.ndarray, " pixel"]
-
-
-def normal_points(count: int, size: int, seed: int) -> Points:
-    """Evenly spread standard normal points."""
-    # Their distances from the middle are quantiles of the chi distribution, one of each, so that
-    # over all turns of the points every quantile in every direction is right.
-    # Source: Owen (1998), J. Complexity 14(4), 466-489: scrambled Sobol' points.
-    points = scipy.special.ndtri(even(-(-count // 2), size, seed))
-    distance = np.linalg.norm(points, axis=-1)
-    rank = np.argsort(np.argsort(distance))
-    share = (rank + 0.5) / len(points)
-    points *= (np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * size, share)) / distance)[:, None]
-    places = mirrored(points)[:count]
-    return Points(places, -0.5 * np.sum(places**2, axis=-1))
 
 
 def smooth(log_ratios: Float[np.ndarray, "pixel draw"]) -> Smoothed:
@@ -163,7 +114,7 @@ def _interpolate(level: float, below: np.ndarray, ranked: np.ndarray) -> np.ndar
 
 
 def effective_draws(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarray, " pixel"]:
-    """How many draws of the posterior itself the weighted ones are worth (Kish)."""
+    """Effective sample size of weighted draws (Kish), as a number of independent draws."""
     return 1.0 / np.sum(weights**2, axis=-1)
 
 
@@ -184,21 +135,21 @@ def effective_tails(
             p, inside = (np.take_along_axis(x, at, axis=-1)[:, 0] for x in (within, squares))
             outside = squares[:, -1] - inside
             variance = inside * (1.0 - p) ** 2 + outside * p**2
-            with np.errstate(invalid="ignore"):  # weights may be no numbers
-                # One draw that is all there is: p is 1 and the variance 0, and it is worth itself.
-                told = np.where(p < 1.0, p * (1.0 - p) / np.where(p < 1.0, variance, 1.0), 1.0)
-                least = np.fmin(least, told)
+            with np.errstate(invalid="ignore"):  # weights may be NaN
+                # One draw with all the weight has p = 1 and variance 0; its sample size is 1.
+                size = np.where(p < 1.0, p * (1.0 - p) / np.where(p < 1.0, variance, 1.0), 1.0)
+                least = np.fmin(least, size)
     return least
 
 
-# --- Means, standard deviations and quantiles of a row of pixels: what maps show ------------------
+# --- Marginals of a batch of pixels: what maps show -----------------------------------------------
 
 
 LEVELS = (0.025, 0.1, 0.25, 0.5, 0.75, 0.9, 0.975)
 
 
 class Marginals:
-    """What a row of pixels has, filled in as answers come: NaN where a pixel has none."""
+    """Marginals of a batch of pixels, filled in as answers come: NaN where a pixel has none."""
 
     def __init__(self, count: int, sizes: Mapping[str, tuple[int, ...]]) -> None:
         self.mean = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
@@ -208,7 +159,7 @@ class Marginals:
         }
 
     def describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        """Take down some pixels."""
+        """Summarize the weighted draws of some pixels."""
         for name, mean in self.mean.items():
             draws = np.asarray(parameters[name], float)
             for own in np.ndindex(mean.shape[1:]):

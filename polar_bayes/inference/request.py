@@ -1,4 +1,4 @@
-"""What a caller asked of a fit, checked and with every default filled in."""
+"""What a caller asks to be fitted, checked and with every default filled in."""
 
 import dataclasses
 import functools
@@ -14,9 +14,6 @@ from numpyro.primitives import Messenger
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.compile import TRACING_LOCK, LRUCache, cache_key, layout_of
-from polar_bayes.inference.laplace import Laplace, Point
-from polar_bayes.inference.method import AbstractMethod
-from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.models.gp_spectral import gp_spectral
 from polar_bayes.models.hierarchical import Hierarchical
@@ -24,29 +21,25 @@ from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import PriorTable, in_this_precision, resolve_priors
+from polar_bayes.priors import PriorTable, cast_prior, resolve_priors
 from polar_bayes.setups import SETUPS, Setup, find_setup
 
-Method = Nuts | Laplace | Point | AbstractMethod
 MODELS: dict[str, Callable] = {
     "per_material": per_material,
     "hierarchical": Hierarchical(),
     "gp_spectral": gp_spectral,
 }
-METHODS: dict[str, Method] = {"nuts": Nuts(), "laplace": Laplace(), "point": Point()}
 
-_STORIES: LRUCache[ModelInfo] = LRUCache(32)
+_MODEL_INFO: LRUCache[ModelInfo] = LRUCache(32)
 
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """What the caller asked for, with every default filled in."""
+    """A capture, a model and all that fixes its posterior, with every default filled in."""
 
     capture: xr.Dataset
     model: Callable
     model_name: str
-    method: Method
-    method_name: str
     scene: Scene
     scene_name: str
     priors: dict[str, dist.Distribution]
@@ -60,14 +53,23 @@ class Request:
 
     def bind(self, scene: Scene) -> Callable[[Observations], None]:
         """The model with everything but its data in place."""
-        priors = {name: in_this_precision(prior) for name, prior in self.priors.items()}
-        return functools.partial(self.model, scene=scene, priors=priors, links=self.links)
+        return bind_model(self.model, scene, self.priors, self.links)
+
+
+def bind_model(
+    model: Callable,
+    scene: Scene,
+    priors: Mapping[str, dist.Distribution],
+    links: Mapping[str, AbstractLink],
+) -> Callable[[Observations], None]:
+    """A model with everything but its data in place, in the precision that is switched on."""
+    own = {name: cast_prior(prior) for name, prior in priors.items()}
+    return functools.partial(model, scene=scene, priors=own, links=links)
 
 
 def resolve(
     capture: xr.Dataset,
     model: str | Callable,
-    method: str | Method,
     scene: str | Scene | None,
     priors: Mapping[str, dist.Distribution] | None,
     links: AbstractLink | Mapping[str, AbstractLink] | None,
@@ -97,10 +99,10 @@ def resolve(
         raise FitError(f"precision is {precision!r}", where="fit", hint="give 'double' or 'single'")
     if not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed < 2**32:
         raise FitError(f"seed is {seed!r}", where="fit", hint="give an integer from 0 to 2**32 - 1")
-    story = model if callable(model) else _find(MODELS, "model", model)
+    function = model if callable(model) else _find_model(model)
     with jax.enable_x64(precision == "double"):
         data = observe(capture, largest_view_zenith=limit)
-        found = _read(story, data, setup.scene, priors, chosen)
+        found = _inspect(function, data, setup.scene, priors, chosen)
     swapped = {
         "scene": not isinstance(scene, str),
         "model": callable(model),
@@ -110,10 +112,8 @@ def resolve(
     }
     return Request(
         capture=capture,
-        model=story,
+        model=function,
         model_name=_name_of(model) if callable(model) else model,
-        method=method if isinstance(method, Method) else _find(METHODS, "method", method),
-        method_name=type(method).__name__.lower() if isinstance(method, Method) else method,
         scene=setup.scene,
         scene_name=scene if isinstance(scene, str) else "custom",
         priors=resolve_priors(found.priors, priors),
@@ -127,18 +127,26 @@ def resolve(
     )
 
 
-def _read(
+def _find_model(name: object) -> Callable:
+    if not isinstance(name, str) or name not in MODELS:
+        raise FitError(
+            "no such model", where=f"model={name!r}", hint=f"give one of {', '.join(MODELS)}"
+        )
+    return MODELS[name]
+
+
+def _inspect(
     model: Callable,
     data: Observations,
     scene: Scene,
     priors: Mapping[str, dist.Distribution] | None,
     links: Mapping[str, AbstractLink],
 ) -> ModelInfo:
-    """What the model says about itself, kept from the last capture of that layout."""
+    """Sites of the model, from the cache where a capture of that layout was fitted before."""
     table = PriorTable(priors)
     key = cache_key(model, scene, priors or {}, links, layout_of(data))
     with TRACING_LOCK:
-        return _STORIES.of(key, lambda: inspect_model(model, data, scene, table, links))
+        return _MODEL_INFO.of(key, lambda: inspect_model(model, data, scene, table, links))
 
 
 def _name_of(model: Callable) -> str:
@@ -149,14 +157,6 @@ def _name_of(model: Callable) -> str:
     if inner is not None:
         return f"{type(model).__name__}({_name_of(inner)})"
     return getattr(model, "__name__", type(model).__name__)
-
-
-def _find(table: Mapping[str, Any], kind: str, name: object) -> Any:
-    if not isinstance(name, str) or name not in table:
-        raise FitError(
-            f"no such {kind}", where=f"{kind}={name!r}", hint=f"give one of {', '.join(table)}"
-        )
-    return table[name]
 
 
 def _setup_around(scene: object, capture: xr.Dataset) -> Setup:

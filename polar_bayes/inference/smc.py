@@ -1,20 +1,27 @@
-r"""From the prior to the posterior of one capture, in small steps of temperature.
+r"""Adaptive tempered sequential Monte Carlo, waste-free (Dau & Chopin 2022).
 
 $$ p_t(z) \propto p(z) \, p(y|z)^t, \quad 0 = t_0 < t_1 < ... < 1 $$
 
-A crowd that begins as draws from the prior sees every mode before any of them is narrow, and keeps
-what the data leave open. After each step the crowd is thinned to a few by weight, and each of these
-walks on; all places along the walks are the next crowd, so that no evaluation of the model is lost.
-All walk in normal scores of the prior, where a step can reach a mode in a long tail. After the last
-step nothing is thinned: the crowd keeps its weights, and with them its smallest modes and wings.
+Particles start from the prior, so every mode has particles before any mode is narrow. At each stage
+bisection finds the next temperature, at which the effective sample size of the incremental weights
+is `target_ess` of the particles. A few particles are resampled systematically, each starts a chain
+of random-walk Metropolis steps, and all states of all chains are the next particles: no evaluation
+of the model is wasted. The last particles are not resampled but keep their weights.
 
-An unconstrained vector may have a long tail under its prior (the log of a roughness that may be
-zero): steps and mixtures that know one width for each coordinate then see either the middle or the
-tail. Scores have neither tail nor skew.
+Coordinates are normal scores of the prior. An unconstrained vector may have a long tail under its
+prior (the log of a roughness that may be zero), in which steps and mixtures with one width for each
+coordinate reach either the middle or the tail. Normal scores have neither tail nor skew.
+
+The particles are then the first sample to which rounds of adaptive importance sampling fit
+mixtures of Student t distributions (`proposals.py`).
+
+Source:
+    Dau & Chopin (2022), J. R. Stat. Soc. B 84(1), 114-148.
 """
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple, override
 
 import jax
 import jax.numpy as jnp
@@ -23,30 +30,43 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 from scipy.special import ndtr
 
-from polar_bayes.errors import FitError
-from polar_bayes.inference.program import Program
+from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine
+from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
+from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import batched, take_rows
+from polar_bayes.inference.levenberg_marquardt import NormalApproximation
+from polar_bayes.inference.program import Program, Values
+from polar_bayes.inference.proposals import (
+    Proposed,
+    WeightedSample,
+    combine_samples,
+    draw_mixture,
+    fit_mixture,
+    moments,
+    resample,
+)
+from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.observation.data import Observations
-from polar_bayes.repr_html import HTMLRepr
 
-# --- Coordinates in which each parameter's prior is standard normal: normal scores ----------------
+# --- Coordinates in which each parameter's prior is standard normal -------------------------------
 
 
 KNOTS = np.arange(-3.0, 3.01, 0.25, dtype=np.float32)
-"""Scores at which values are known; between them, and beyond the last, a map is linear."""
+"""Normal scores of the knots; between and beyond them the transform is linear."""
 
 FLATTEST = 1e-4
-"""Least slope of a map, in units of its mean one: it must have an inverse."""
+"""Least slope of a transform, in units of its mean slope: it must have an inverse."""
 
 
-class NormalScores(NamedTuple):
-    """A map of each coordinate to its normal score and back."""
+class NormalScoreTransform(NamedTuple):
+    """A transform of each unconstrained coordinate to its normal score, and its inverse."""
 
-    # Any increasing map would do: what is drawn and weighed allows for its slope. This one is the
-    # empirical one of draws from the prior, linear between few knots.
+    # Any increasing transform would do, since densities allow for its slope. This one is the
+    # empirical one of draws from the prior, linear between a few knots.
 
     values: Float[Array, "size knot"]
 
-    def score(self, z: Float[Array, "*draw size"]) -> Float[Array, "*draw size"]:
+    def forward(self, z: Float[Array, "*draw size"]) -> Float[Array, "*draw size"]:
         """Normal scores of unconstrained vectors."""
 
         def one(z: Array, values: Array) -> Array:
@@ -55,10 +75,10 @@ class NormalScores(NamedTuple):
 
         return jax.vmap(one, in_axes=(-1, 0), out_axes=-1)(z, self.values)
 
-    def place(
+    def inverse(
         self, u: Float[Array, "*draw size"]
     ) -> tuple[Float[Array, "*draw size"], Float[Array, "*draw"]]:
-        """Unconstrained vectors of normal scores, and the log of the volume of the map there."""
+        """Unconstrained vectors of normal scores, and the log Jacobian determinant there."""
 
         def one(u: Array, values: Array) -> tuple[Array, Array]:
             knots = jnp.asarray(KNOTS, u.dtype)
@@ -69,43 +89,45 @@ class NormalScores(NamedTuple):
         return z, jnp.sum(log_slope, axis=-1)
 
 
-def normal_scores(z: Float[Array, "draw size"]) -> NormalScores:
-    """The scores that make draws from a prior standard normal in every coordinate."""
+def fit_normal_scores(z: Float[Array, "draw size"]) -> NormalScoreTransform:
+    """The transform that makes draws from a prior standard normal in every coordinate."""
     # Source: van der Waerden (1952), Indag. Math. 14, 453-458: normal scores.
     values = _quantiles(z.T, ndtr(KNOTS.astype(float)))
     steps = jnp.diff(values)
     steps = jnp.maximum(steps, FLATTEST * jnp.mean(steps, axis=-1, keepdims=True))
-    return NormalScores(
+    return NormalScoreTransform(
         jnp.concatenate([values[:, :1], values[:, :1] + jnp.cumsum(steps, 1)], axis=1)
     )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ScoredProgram:
-    """A program whose vectors are normal scores; densities are those of the scores."""
+    """A program whose vectors are normal scores, and their densities."""
 
     program: Program
-    scores: NormalScores
+    transform: NormalScoreTransform
 
     def potential(self, u: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """Minus the log posterior density of the scores, up to a constant."""
-        z, log_volume = self.scores.place(u)
-        return self.program.potential(z, data) - log_volume
+        z, log_jacobian = self.transform.inverse(u)
+        return self.program.potential(z, data) - log_jacobian
 
     def prior_potential(self, u: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
-        """The part of the potential in which no reading has a share."""
-        z, log_volume = self.scores.place(u)
-        return self.program.prior_potential(z, data) - log_volume
+        """Minus the log prior density of the scores, up to a constant."""
+        z, log_jacobian = self.transform.inverse(u)
+        return self.program.prior_potential(z, data) - log_jacobian
 
     def parameters(self, u: Float[Array, " size"], data: Observations) -> dict[str, Array]:
-        """What the model is about."""
-        return self.program.parameters(self.scores.place(u)[0], data)
+        """The parameters of the model."""
+        return self.program.parameters(self.transform.inverse(u)[0], data)
 
 
-def place(scores: NormalScores, u: Float[np.ndarray, "pixel draw size"]) -> np.ndarray:
-    """Unconstrained vectors of many pixels, each with scores of its own."""
+def inverse_of_pixels(
+    transform: NormalScoreTransform, u: Float[np.ndarray, "pixel draw size"]
+) -> np.ndarray:
+    """Unconstrained vectors of many pixels, each with a transform of its own."""
     at = np.clip(np.searchsorted(KNOTS, u) - 1, 0, len(KNOTS) - 2)
-    values = np.asarray(scores.values)
+    values = np.asarray(transform.values)
     slopes = np.diff(values, axis=-1) / np.diff(KNOTS)
 
     def of(values: np.ndarray) -> np.ndarray:
@@ -115,130 +137,197 @@ def place(scores: NormalScores, u: Float[np.ndarray, "pixel draw size"]) -> np.n
 
 
 def _quantiles(x: Float[Array, "size draw"], shares: np.ndarray) -> Float[Array, "size share"]:
-    """As `jnp.quantile`, of numbers that are finite."""
-    # Whole numbers in the same order are sorted instead: XLA compares floating-point numbers at six
-    # times the cost.
-    whole = jnp.int64 if x.dtype == jnp.float64 else jnp.int32
+    """As `jnp.quantile`, of finite numbers."""
+    # Integers in the same order are sorted instead: XLA takes six times as long to compare
+    # floating-point numbers.
+    integer = jnp.int64 if x.dtype == jnp.float64 else jnp.int32
 
-    def turned(bits: Array) -> Array:
-        return jnp.where(bits < 0, bits ^ jnp.iinfo(whole).max, bits)
+    def ordered_bits(bits: Array) -> Array:
+        return jnp.where(bits < 0, bits ^ jnp.iinfo(integer).max, bits)
 
-    bits = jnp.sort(turned(jax.lax.bitcast_convert_type(x, whole)), axis=-1)
-    ordered = jax.lax.bitcast_convert_type(turned(bits), x.dtype)
-    place = shares * (x.shape[-1] - 1)
-    below = np.minimum(place.astype(int), x.shape[-1] - 2)
+    bits = jnp.sort(ordered_bits(jax.lax.bitcast_convert_type(x, integer)), axis=-1)
+    ordered = jax.lax.bitcast_convert_type(ordered_bits(bits), x.dtype)
+    position = shares * (x.shape[-1] - 1)
+    below = np.minimum(position.astype(int), x.shape[-1] - 2)
     low, high = ordered[:, below], ordered[:, below + 1]
-    return low + jnp.asarray(place - below, x.dtype) * (high - low)
+    return low + jnp.asarray(position - below, x.dtype) * (high - low)
 
 
 def _segment(x: Array, ends: Array, values: Array) -> tuple[Array, Array]:
-    """Number of the segment in which each x lies, and the slope of the map there."""
+    """Index of the segment in which each x lies, and the slope of the transform there."""
     at = jnp.clip(jnp.searchsorted(ends, x) - 1, 0, len(KNOTS) - 2)
     return at, (values[at + 1] - values[at]) / (KNOTS[1] - KNOTS[0])
 
 
-# --- From the prior to the posterior of one capture, in small steps of temperature ----------------
+# --- Settings, and weighted draws of many pixels --------------------------------------------------
 
 
-HALVINGS = 20
+BISECTIONS = 20
 """Of the interval in which the next temperature lies."""
 
-MOST_STAGES = 60
-"""Steps of temperature; what has not arrived by then has failed."""
+MAX_STAGES = 60
+"""Stages after which particles that have not reached temperature 1 count as failed."""
 
-ACCEPTED = 0.25
-"""Share of the steps of a walk that should be taken; the length of the next ones follows it."""
+TARGET_ACCEPTANCE = 0.25
+"""Share of accepted Metropolis steps to which the step size is adapted."""
 
-SIDE_BY_SIDE = 256
-"""First looks at a time: thousands together leave the cache of a core, and take twice as long."""
+PRIOR_BATCH = 256
+"""Prior draws that are evaluated together: thousands leave the cache of a core."""
 
-LIFT = 1e-6
-"""Added to the correlation matrix of a crowd, which single precision rounds."""
+DRAW_BATCH = 64
+"""Draws of one pixel that are evaluated together: more are shared among cores that then wait for
+each other."""
+
+FIRST_KEY = np.uint32(2**32 - 1)
+"""Number of the random key of the first particles; those of rounds count up from 0."""
 
 
 @dataclasses.dataclass(frozen=True)
-class PixelTempering(HTMLRepr):
-    """Tempered draws of every pixel, corrected by weights.
+class PixelSMC(AbstractPixelMethod):
+    """Tempered sequential Monte Carlo in every pixel, corrected by importance weights.
 
     Args:
-        walks: How many of the crowd walk on after each step of temperature, >= 16.
-        length: Places of each walk, its first included, >= 2; all together are the crowd.
-        looks: Draws from the prior for each of the crowd, >= 1: more find a narrow mode more often,
-            and the first step of temperature is longer.
-        effective_share: Share of the crowd that its weights must be worth after a step of
-            temperature, between 0.1 and 0.95.
-        draws: Of a mixture in every round, at least half the crowd. An answer has the draws of two
-            rounds.
+        num_chains: Particles that are resampled at each stage, >= 16; each starts a chain.
+        chain_length: States of each chain, its first included, >= 2; all states of all chains are
+            the particles.
+        init_factor: Draws from the prior for each particle, >= 1: more find a narrow mode more
+            often, and the first step of temperature is longer.
+        target_ess: Effective sample size of the incremental weights at each stage, as a share of
+            the number of particles, between 0.1 and 0.95.
+        draws: Of a mixture in every round, at least half the number of particles. An answer has
+            the draws of two rounds.
         components: Of the mixtures, >= 1.
         rounds: In which a mixture is fitted to the weighted draws, at most, >= 2.
-        crowds: What has not come to an answer in these rounds begins again from a new crowd, until
-            there were so many, >= 1.
-        effective_draws: Independent draws that the weighted ones must be worth, >= 1; in the middle
-            and in both tails.
+        num_attempts: Pixels without an answer after these rounds start again from new particles,
+            until there were so many attempts, >= 1.
+        effective_draws: Least effective sample size of an answer, of the bulk and of both tails,
+            >= 1.
 
     Raises:
         FitError: A setting is outside its range.
     """
 
-    walks: int = 256
-    length: int = 8
-    looks: int = 2
-    effective_share: float = 0.5
+    num_chains: int = 256
+    chain_length: int = 8
+    init_factor: int = 2
+    target_ess: float = 0.5
     draws: int = 1024
     components: int = 4
     rounds: int = 8
-    crowds: int = 3
+    num_attempts: int = 3
     effective_draws: float = 200.0
 
     def __post_init__(self) -> None:
-        least = {
-            "walks": 16,
-            "length": 2,
-            "looks": 1,
-            "components": 1,
-            "rounds": 2,
-            "crowds": 1,
-            "effective_draws": 1,
-        }
-        for name, lowest in least.items():
-            if getattr(self, name) < lowest:
-                raise FitError(
-                    f"{name} is {getattr(self, name)}",
-                    where="PixelTempering",
-                    hint=f"give {lowest} or more",
-                )
-        if not 0.1 <= self.effective_share <= 0.95:
-            raise FitError(
-                f"effective_share is {self.effective_share}",
-                where="PixelTempering",
-                hint="give a number from 0.1 to 0.95",
+        self._check_least(num_chains=16, chain_length=2, init_factor=1)
+        self._check_least(components=1, rounds=2, num_attempts=1, effective_draws=1)
+        if not 0.1 <= self.target_ess <= 0.95:
+            self._refuse(f"target_ess is {self.target_ess}", "give a number from 0.1 to 0.95")
+        if self.answer_draws < self.num_particles:
+            self._refuse(
+                f"draws is {self.draws}, of {self.num_particles} particles",
+                "give at least half of num_chains * chain_length",
             )
-        if 2 * self.draws < self.crowd:
-            raise FitError(
-                f"draws is {self.draws}, and the crowd {self.crowd}",
-                where="PixelTempering",
-                hint="give at least half of walks * length",
-            )
-        if self.effective_draws >= 2 * self.draws:
-            raise FitError(
-                f"effective_draws is {self.effective_draws}, and there are {2 * self.draws} draws",
-                where="PixelTempering",
-                hint="give fewer, or more draws",
+        if self.effective_draws >= self.answer_draws:
+            self._refuse(
+                f"effective_draws is {self.effective_draws}, of {self.answer_draws} draws",
+                "give fewer, or more draws",
             )
 
     @property
-    def crowd(self) -> int:
-        """Draws that are tempered."""
-        return self.walks * self.length
+    def num_particles(self) -> int:
+        """Particles of each stage."""
+        return self.num_chains * self.chain_length
 
     @property
     def answer_draws(self) -> int:
         """Weighted draws of an answer: those of two rounds."""
         return 2 * self.draws
 
+    @override
+    def fit(
+        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
+    ) -> None:
+        for _ in smc_draws(batch, self, at):
+            pass  # recorded in the batch
 
-class Crowd(NamedTuple):
-    """Draws on their way."""
+
+def smc_draws(
+    batch: BatchFit,
+    settings: PixelSMC,
+    at: np.ndarray,
+    count: Callable[[str], None] = lambda what: None,
+) -> Iterator[tuple[np.ndarray, WeightedSample]]:
+    """Weighted draws of some pixels as answers come; `count` is called before each computation."""
+    outcome = batch.outcome
+    outcome.status[at] = Status.NOT_CONVERGED
+    for attempt in range(settings.num_attempts):
+        left = at
+        for some, sample, is_enough in _attempt(batch, settings, at, attempt, count):
+            status = np.where(is_enough, Status.GOOD, Status.NOT_TRUSTED)
+            found = sample.parameters, sample.weights, sample.ess, MethodUsed.TEMPERED, status
+            batch.record(some, *found)
+            outcome.pareto_k[some] = sample.pareto_k
+            left = np.setdiff1d(left, some)
+            yield some, sample
+        at = left
+        if not at.size:
+            return
+
+
+def _attempt(
+    batch: BatchFit, settings: PixelSMC, at: np.ndarray, attempt: int, count: Callable[[str], None]
+) -> Iterator[tuple[np.ndarray, WeightedSample, np.ndarray]]:
+    """Particles from the prior, then mixtures until their draws have the effective sample size."""
+
+    def run(make: Callable, number: np.uint32, which: np.ndarray, *states: Any) -> Any:
+        return batch.engine.run(
+            make,
+            settings,
+            batch.pixels.subset(which),
+            *states,
+            batch.keys[which],
+            given=(number,),
+            batch=SMALL_BATCH,
+            single=True,
+        )
+
+    count("particles")
+    smc: Tempered = run(_particles, FIRST_KEY - np.uint32(attempt), at)
+    batch.outcome.steps[at] += smc.stages
+    left = np.flatnonzero((smc.temperature >= 1.0) & np.isfinite(smc.u).all(axis=(1, 2)))
+    repeated = np.arange(settings.answer_draws) % settings.num_particles
+    u = np.asarray(smc.u)[left][:, repeated]
+    weights = np.asarray(smc.weights)[left][:, repeated] / np.bincount(repeated)[repeated]
+    previous: Proposed | None = None
+    for number in range(attempt * settings.rounds, (attempt + 1) * settings.rounds):
+        if not left.size:
+            return
+        count("rounds")
+        transform = take_rows(smc.transform, left)
+        states = transform, np.float32(u), np.float32(weights)
+        drawn: Proposed = run(_mixture_draws, np.uint32(number), at[left], *states)
+        sample = combine_samples(drawn if previous is None else previous, drawn)
+        possible = np.isfinite(sample.weights).all(axis=-1)
+        enough = np.zeros(left.size, bool)
+        if previous is not None:  # its own weights do not show that one mixture is too narrow
+            enough = sample.ess >= settings.effective_draws
+            enough &= sample.pareto_k <= MAX_PARETO_K
+        is_last = number + 1 == (attempt + 1) * settings.rounds
+        answered = np.flatnonzero(enough | (is_last & possible))
+        if answered.size:
+            answer = take_rows(sample, answered)
+            z = inverse_of_pixels(take_rows(transform, answered), answer.z)
+            yield at[left[answered]], answer._replace(z=z), enough[answered]
+        goes_on = ~enough & possible
+        left, previous = left[goes_on], take_rows(drawn, goes_on)
+        u, weights = sample.z[goes_on], sample.weights[goes_on]
+
+
+# --- Compiled programs of one pixel ---------------------------------------------------------------
+
+
+class Particles(NamedTuple):
+    """Particles in normal scores, with their densities."""
 
     u: Float[Array, "draw size"]
     log_prior: Float[Array, " draw"]
@@ -246,110 +335,139 @@ class Crowd(NamedTuple):
 
 
 class Tempered(NamedTuple):
-    """A crowd that has arrived, or not."""
+    """Weighted particles at the last temperature, which is 1 unless there were too many stages."""
 
-    u: Float[Array | np.ndarray, "draw size"]
-    weights: Float[Array | np.ndarray, " draw"]
-    scores: NormalScores
-    temperature: Float[Array | np.ndarray, ""]
-    stages: Array | np.ndarray
+    u: Float[Array, "draw size"]
+    weights: Float[Array, " draw"]
+    transform: NormalScoreTransform
+    temperature: Float[Array, ""]
+    stages: Array
 
 
-def temper(program: Program, settings: PixelTempering, data: Observations, key: Array) -> Tempered:
-    """Draws that are spread about as the posterior is."""
-    # Source: Dau & Chopin (2022), J. R. Stat. Soc. B 84(1), 114-148: waste-free sequential Monte
-    # Carlo; Jasra, Stephens, Doucet & Tsagaris (2011), Scand. J. Stat. 38(1), 1-22: adaptive steps.
-    walks, count, size = settings.walks, settings.crowd, program.size
-    key_start, key_crowd, key_stages = jax.random.split(key, 3)
-    keys = jax.random.split(key_start, settings.looks * count)
-    z = jax.lax.map(lambda key: program.from_prior(key, data), keys, batch_size=SIDE_BY_SIDE)
-    scores = normal_scores(z)
-    scored = ScoredProgram(program, scores)
+def _particles(engine: BatchEngine, settings: PixelSMC) -> Callable:
+    """The program of tempered SMC in one pixel."""
 
-    def look(u: Array) -> Crowd:
+    def pixel(number: Array, data: Observations, key: Array) -> Tempered:
+        return temper(engine.single_program, settings, data, jax.random.fold_in(key, number))
+
+    return batched(pixel, given=1, lanes=1)
+
+
+def _mixture_draws(engine: BatchEngine, settings: PixelSMC) -> Callable:
+    """The program of one round: fit a mixture to weighted draws, and draw from it."""
+
+    def pixel(
+        number: Array,
+        data: Observations,
+        transform: NormalScoreTransform,
+        u: Array,
+        weights: Array,
+        key: Array,
+    ) -> Proposed:
+        key_fit, key_draw = jax.random.split(jax.random.fold_in(key, number))
+        mixture = fit_mixture(u, weights, settings.components, key_fit)
+        drawn = draw_mixture(mixture, settings.draws, key_draw)
+        scored = ScoredProgram(engine.single_program, transform)
+
+        def evaluate(u: Array) -> tuple[Values, Array]:
+            return scored.parameters(u, data), scored.potential(u, data)
+
+        parameters, values = jax.lax.map(evaluate, drawn, batch_size=DRAW_BATCH)
+        log_posterior = jnp.where(jnp.isnan(values), -jnp.inf, -values)
+        return Proposed(mixture, drawn, parameters, log_posterior)
+
+    return batched(pixel, given=1, lanes=1)
+
+
+def temper(program: Program, settings: PixelSMC, data: Observations, key: Array) -> Tempered:
+    """Tempered SMC from the prior to the posterior of one pixel."""
+    num_chains, count, size = settings.num_chains, settings.num_particles, program.size
+    key_init, key_first, key_stages = jax.random.split(key, 3)
+    keys = jax.random.split(key_init, settings.init_factor * count)
+    z = jax.lax.map(lambda key: program.from_prior(key, data), keys, batch_size=PRIOR_BATCH)
+    transform = fit_normal_scores(z)
+    scored = ScoredProgram(program, transform)
+
+    def evaluate(u: Array) -> Particles:
         prior = -scored.prior_potential(u, data)
         likelihood = -scored.potential(u, data) - prior
-        return Crowd(u, prior, jnp.where(jnp.isnan(likelihood), -jnp.inf, likelihood))
+        return Particles(u, prior, jnp.where(jnp.isnan(likelihood), -jnp.inf, likelihood))
 
-    def heat(crowd: Crowd, temperature: Array) -> tuple[Array, Array]:
-        """The next temperature, and the weights that it gives."""
-        rise = _rise(crowd.log_likelihood, 1.0 - temperature, settings.effective_share * count)
-        weights = jax.nn.softmax(jnp.where(rise > 0.0, rise * crowd.log_likelihood, 0.0))
+    def next_temperature(particles: Particles, temperature: Array) -> tuple[Array, Array]:
+        """The next temperature, and its incremental weights."""
+        rise = _largest_step(
+            particles.log_likelihood, 1.0 - temperature, settings.target_ess * count
+        )
+        weights = jax.nn.softmax(jnp.where(rise > 0.0, rise * particles.log_likelihood, 0.0))
         return jnp.minimum(temperature + rise, 1.0), weights
 
     def goes_on(state: tuple) -> Array:
         temperature, *_, stages = state
-        # The first crowd repeats itself, even where its weights arrive at once.
-        return ((temperature < 1.0) | (stages < 1)) & (stages < MOST_STAGES)
+        # The first particles hold duplicates, so at least one stage moves them.
+        return ((temperature < 1.0) | (stages < 1)) & (stages < MAX_STAGES)
 
     def stage(state: tuple) -> tuple:
-        temperature, weights, crowd, stride, key, stages = state
-        key, key_thin, key_walk = jax.random.split(key, 3)
-        half = spread(crowd.u, weights)[1]
+        temperature, weights, particles, step_size, key, stages = state
+        key, key_resample, key_chains = jax.random.split(key, 3)
+        root = moments(particles.u, weights)[1]
 
-        def walk(at: Crowd, key: Array) -> tuple[Crowd, tuple[Crowd, Array]]:
-            key_step, key_choice = jax.random.split(key)
+        def move(at: Particles, key: Array) -> tuple[Particles, tuple[Particles, Array]]:
+            key_step, key_accept = jax.random.split(key)
             noise = jax.random.normal(key_step, at.u.shape, at.u.dtype)
-            tried = jax.vmap(look)(at.u + stride * noise @ half.T)
-            gain = tried.log_prior - at.log_prior
-            gain += temperature * (tried.log_likelihood - at.log_likelihood)
-            taken = jnp.log(jax.random.uniform(key_choice, gain.shape, gain.dtype)) < gain
-            moved = jax.tree.map(lambda new, old: _choose(taken, new, old), tried, at)
-            return moved, (moved, jnp.mean(taken))
+            proposed = jax.vmap(evaluate)(at.u + step_size * noise @ root.T)
+            log_ratio = proposed.log_prior - at.log_prior
+            log_ratio += temperature * (proposed.log_likelihood - at.log_likelihood)
+            uniform = jax.random.uniform(key_accept, log_ratio.shape, log_ratio.dtype)
+            accepted = jnp.log(uniform) < log_ratio
+            moved = jax.tree.map(lambda new, old: _where(accepted, new, old), proposed, at)
+            return moved, (moved, jnp.mean(accepted))
 
-        first = _thin(crowd, weights, walks, key_thin)
-        keys = jax.random.split(key_walk, settings.length - 1)
-        _, (rest, accepted) = jax.lax.scan(walk, first, keys)
-        crowd = jax.tree.map(
+        first = _resampled(particles, weights, num_chains, key_resample)
+        keys = jax.random.split(key_chains, settings.chain_length - 1)
+        _, (rest, accepted) = jax.lax.scan(move, first, keys)
+        particles = jax.tree.map(
             lambda x, y: jnp.concatenate([x[None], y]).reshape(count, *x.shape[1:]), first, rest
         )
-        longer = jnp.exp(jnp.clip(2.0 * (jnp.mean(accepted) - ACCEPTED), -1.0, 1.0))
-        return *heat(crowd, temperature), crowd, stride * longer, key, stages + 1
+        factor = jnp.exp(jnp.clip(2.0 * (jnp.mean(accepted) - TARGET_ACCEPTANCE), -1.0, 1.0))
+        following = next_temperature(particles, temperature)
+        return *following, particles, step_size * factor, key, stages + 1
 
-    seen, one = jax.lax.map(look, scores.score(z), batch_size=SIDE_BY_SIDE), jnp.ones((), z.dtype)
-    temperature, weights = heat(seen, 0.0 * one)
-    crowd = _thin(seen, weights, count, key_crowd)
-    state = (*heat(crowd, temperature), crowd, 2.38 / size**0.5 * one, key_stages, jnp.int32(0))
-    temperature, weights, crowd, *_, stages = jax.lax.while_loop(goes_on, stage, state)
-    return Tempered(crowd.u, weights, scores, temperature, stages)
-
-
-def spread(
-    z: Float[Array, "draw size"], weights: Float[Array, " draw"]
-) -> tuple[Float[Array, " size"], Float[Array, "size size"]]:
-    """Mean of weighted draws, and the lower root of their covariance."""
-    center = weights @ z
-    apart = z - center
-    sd = jnp.sqrt(weights @ apart**2)
-    sd = jnp.where(sd > 0.0, sd, 1.0)
-    scaled = apart / sd
-    correlation = scaled.T @ (scaled * weights[:, None])
-    return center, sd[:, None] * jnp.linalg.cholesky(correlation + LIFT * jnp.eye(sd.size))
+    start = jax.lax.map(evaluate, transform.forward(z), batch_size=PRIOR_BATCH)
+    one = jnp.ones((), z.dtype)
+    temperature, weights = next_temperature(start, 0.0 * one)
+    particles = _resampled(start, weights, count, key_first)
+    state = (
+        *next_temperature(particles, temperature),
+        particles,
+        2.38 / size**0.5 * one,  # Gelman, Roberts & Gilks (1996), Bayesian Statistics 5, 599-607
+        key_stages,
+        jnp.int32(0),
+    )
+    temperature, weights, particles, *_, stages = jax.lax.while_loop(goes_on, stage, state)
+    return Tempered(particles.u, weights, transform, temperature, stages)
 
 
-def _rise(log_likelihood: Array, most: Array, effective: float) -> Array:
-    """The largest step of temperature after which weights are still worth so many draws."""
+def _largest_step(log_likelihood: Array, most: Array, target: float) -> Array:
+    """The largest step of temperature whose weights have this effective sample size."""
 
-    def is_worth(rise: Array) -> Array:
+    def is_enough(rise: Array) -> Array:
         log_weights = rise * log_likelihood
-        return 2.0 * logsumexp(log_weights) - logsumexp(2.0 * log_weights) >= jnp.log(effective)
+        return 2.0 * logsumexp(log_weights) - logsumexp(2.0 * log_weights) >= jnp.log(target)
 
-    def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+    def bisect(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        worth = is_worth(middle)
-        return jnp.where(worth, middle, low), jnp.where(worth, high, middle)
+        enough = is_enough(middle)
+        return jnp.where(enough, middle, low), jnp.where(enough, high, middle)
 
-    low, _ = jax.lax.fori_loop(0, HALVINGS, halve, (jnp.zeros_like(most), most))
-    return jnp.where(is_worth(most), most, low)
-
-
-def _thin(crowd: Crowd, weights: Array, count: int, key: Array) -> Crowd:
-    """So many of the crowd, each as often as it weighs, evenly."""
-    even = (jnp.arange(count) + jax.random.uniform(key)) / count
-    kept = jnp.clip(jnp.searchsorted(jnp.cumsum(weights), even), 0, len(weights) - 1)
-    return jax.tree.map(lambda x: x[kept], crowd)
+    low, _ = jax.lax.fori_loop(0, BISECTIONS, bisect, (jnp.zeros_like(most), most))
+    return jnp.where(is_enough(most), most, low)
 
 
-def _choose(taken: Array, new: Array, old: Array) -> Array:
-    return jnp.where(taken.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+def _resampled(particles: Particles, weights: Array, count: int, key: Array) -> Particles:
+    index = resample(weights, count, key)
+    return jax.tree.map(lambda x: x[index], particles)
+
+
+def _where(accepted: Array, new: Array, old: Array) -> Array:
+    return jnp.where(accepted.reshape(-1, *(1,) * (new.ndim - 1)), new, old)

@@ -19,7 +19,12 @@ from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import attributes_of, bounds_of, provenance_of
 from polar_bayes.models.gp_spectral import GpSpectral
-from polar_bayes.models.spectral_process import SPECTRA, SpectralProcess, around, widening_of
+from polar_bayes.models.spectral_process import (
+    SPECTRA,
+    SpectralProcess,
+    spectrum_around,
+    weight_scale,
+)
 from polar_bayes.physics.dispersion import AbstractDispersion, Cauchy, Sellmeier
 from polar_bayes.physics.scene import Scene
 
@@ -200,19 +205,19 @@ def _predict(
     old, at = (np.asarray(part, dtype) for part in (measured, distinct))
 
     def one(draw: dict[str, Array]) -> Array:
-        length, places = draw.get("length"), process.places(jnp.asarray(old))
-        widening = widening_of(name, draw["amplitude"] * process.scales(length, places))
+        length, knot_wavelengths = draw.get("length"), process.knot_wavelengths(jnp.asarray(old))
+        widening = weight_scale(name, draw["amplitude"] * process.scales(length, knot_wavelengths))
         both = jnp.concatenate([jnp.asarray(old), jnp.asarray(at)])
-        values = process.values(draw["weights"] / widening, length, places, both)
+        values = process.values(draw["weights"] / widening, length, knot_wavelengths, both)
         mean = jnp.mean(values[..., : old.size], axis=-1, keepdims=True)
         factor = process.remainder(
             None if length is None else length.astype(float),
-            places.astype(float),
+            knot_wavelengths.astype(float),
             jnp.asarray(distinct),
         )
         remainder = draw["noise"] @ factor.T
         departure = values[..., old.size :] - mean + remainder.astype(dtype)
-        return around(name, draw["level"][..., None], draw["amplitude"], departure, bounds)
+        return spectrum_around(name, draw["level"][..., None], draw["amplitude"], departure, bounds)
 
     flat = (-1, *level.shape[2:])
     count = level.shape[0] * level.shape[1]

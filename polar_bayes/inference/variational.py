@@ -1,8 +1,11 @@
-"""NumPyro's variational guides, fitted in the coordinates of the Laplace approximation."""
+"""Automatic differentiation variational inference, in coordinates of the Laplace approximation.
+
+Source:
+    Kucukelbir, Tran, Ranganath, Gelman & Blei (2017), JMLR 18(14), 1-45.
+"""
 
 import abc
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, override
 
@@ -24,6 +27,7 @@ from polar_bayes.inference.program import Program
 from polar_bayes.inference.psis import smooth
 from polar_bayes.inference.resampling import CHAINS
 from polar_bayes.observation.data import Observations
+from polar_bayes.progress import Progress
 
 PARTICLES = 8
 """Draws of the guide from which each step estimates its gradient."""
@@ -34,7 +38,7 @@ LAST = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class AbstractGuide(AbstractMethod):
-    """A family of distributions, of which the nearest to the posterior is sought.
+    """A family of distributions, of which the one nearest to the posterior is fitted.
 
     Args:
         steps: Of Adam, at least 100.
@@ -63,8 +67,8 @@ class AbstractGuide(AbstractMethod):
         """NumPyro's guide of a model of one vector, which starts at the mode."""
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
-        initialization = problem.initialization
+    def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
+        initialization = problem.initialize(progress)
         if not isinstance(initialization, JointInit):
             raise FitError(
                 "guides are fitted to one material only",
@@ -74,22 +78,20 @@ class AbstractGuide(AbstractMethod):
         modes = initialization.modes
         half = jnp.asarray(np.linalg.cholesky(modes.covariance[0]), problem.dtype)
         center = jnp.asarray(modes.z[0], problem.dtype)
-        fitted = _fitter(problem.program, self)
-        z, log_ratio, loss = (
-            np.asarray(x, float) for x in fitted(problem.key_of_draws, center, half, problem.data)
+        fitted = problem.compiled_model.programs.of(
+            self, lambda: _compile_guide(problem.program, self)
         )
-        problems = [] if np.isfinite(z).all() else ["the guide has left the posterior"]
-        smoothed = smooth(log_ratio.reshape(1, -1))
+        z, log_ratio, loss = (np.asarray(x, float) for x in fitted(key, center, half, problem.data))
         return PosteriorDraws(
-            kind="variational",
+            method="variational",
             z=z,
             stats={"log_weight": log_ratio},
-            problems=problems,
-            k_hat=float(smoothed.pareto_k[0]),
+            problems=[] if np.isfinite(z).all() else ["the guide has left the posterior"],
+            k_hat=float(smooth(log_ratio.reshape(1, -1)).pareto_k[0]),
             effective_draws=float(log_ratio.size),
             gradients=float(initialization.said["gradients"]) + float(self.steps * PARTICLES),
             densities=float(log_ratio.size),
-            said={"modes": initialization.said, "loss": float(loss)},
+            metadata={"modes": initialization.said, "loss": float(loss)},
         )
 
 
@@ -126,8 +128,7 @@ class FlowGuide(AbstractGuide):
         return autoguide.AutoBNAFNormal(model, init_loc_fn=start, num_flows=self.flows)
 
 
-@functools.lru_cache(maxsize=8)
-def _fitter(program: Program, settings: AbstractGuide) -> Callable[..., Any]:
+def _compile_guide(program: Program, settings: AbstractGuide) -> Callable[..., Any]:
     """From the mode to draws of the fitted guide, compiled; only the capture is an argument."""
 
     def run(key: Array, center: Array, half: Array, data: Observations) -> tuple:

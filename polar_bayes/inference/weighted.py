@@ -1,37 +1,42 @@
-"""The normal approximations of all modes together, their draws weighed by the posterior."""
+"""Importance sampling from Laplace mixtures, and adaptive tempered SMC, of one posterior.
+
+Source:
+    Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72): Pareto-smoothed importance sampling;
+    Dau & Chopin (2022), J. R. Stat. Soc. B 84(1), 114-148: waste-free sequential Monte Carlo.
+"""
 
 import collections
 import dataclasses
 import functools
-from typing import Any, override
+import math
+from typing import Self, override
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import tempered_draws
-from polar_bayes.inference.batch_programs import BatchEngine
-from polar_bayes.inference.batch_result import Row, Status, Weighted
-from polar_bayes.inference.batching import Stack
-from polar_bayes.inference.compile import TRACING_LOCK, LRUCache
+from polar_bayes.inference.batch_engine import BatchEngine
+from polar_bayes.inference.batch_method import BatchFit
+from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.initialization import STARTS, JointInit
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import Modes
 from polar_bayes.inference.problem import CompiledModel, Problem
-from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.proposals import Mixture, draw_mixture, log_density
-from polar_bayes.inference.psis import LARGEST_TRUSTED, effective_draws, smooth
-from polar_bayes.inference.resampling import choose, generator, log_densities
-from polar_bayes.inference.smc import PixelTempering
+from polar_bayes.inference.psis import MAX_PARETO_K, effective_draws, smooth
+from polar_bayes.inference.resampling import numpy_generator, systematic_resample
+from polar_bayes.inference.smc import PixelSMC, smc_draws
 from polar_bayes.observation.data import Observations
-from polar_bayes.progress import Progress, no_progress
+from polar_bayes.progress import Progress
 
-LEAST_SHARE = 1e-3
-"""Of the Laplace evidence: lighter modes get no draws."""
+LEAST_WEIGHT = 1e-3
+"""Share of the Laplace evidence; modes of less get no draws."""
 
 SIDE_BY_SIDE = 1024
-"""Draws whose density is computed together: that of all modes at once would fill the memory."""
+"""Draws whose proposal density is computed together: that of all at once would fill the memory."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +44,7 @@ class Importance(AbstractMethod):
     """Laplace with importance correction.
 
     Draws come from a mixture of Student t distributions with 8 degrees of freedom, one at each
-    mode that holds 0.1% of the Laplace evidence or more, as heavy as its evidence. Weighing them
+    mode that holds 0.1% of the Laplace evidence or more, as heavy as its evidence. Weighting them
     by the posterior corrects what the normal approximation gets wrong, as far as the mixture
     reaches; Pareto k-hat says how far.
 
@@ -57,64 +62,60 @@ class Importance(AbstractMethod):
             raise FitError(f"draws is {self.draws}", where="Importance", hint="give at least 256")
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
-        initialization = problem.initialization
+    def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
+        initialization = problem.initialize(progress)
         if not isinstance(initialization, JointInit):
             raise FitError(
-                "the weights of many patches together say nothing",
+                "importance weights of many patches together are useless",
                 where="Importance",
                 hint="use method='nuts'",
             )
-        proposal = _proposal(initialization.modes, problem.dtype)
-        key_draw, key_choice = jax.random.split(problem.key_of_draws)
-        places, proposed = (np.asarray(x) for x in _drawn(proposal, self.draws, key_draw))
-        ratios = log_densities(problem.program, places, problem.data) - proposed
-        weights, k_hat = (x[0] for x in smooth(ratios[None]))
-        worth = float(effective_draws(weights[None])[0])
-        said = {"modes": initialization.said}
-        evaluations = {
-            "gradients": float(initialization.said["gradients"]),
-            "densities": float(self.draws),
-        }
+        proposal = laplace_mixture(initialization.modes, problem.dtype)
+        key_draw, key_resample = jax.random.split(key)
+        z, log_proposal = (np.asarray(x) for x in _propose(proposal, self.draws, key_draw))
+        log_ratios = problem.log_density(z) - log_proposal
+        weights, k_hat = (x[0] for x in smooth(log_ratios[None]))
         if not np.isfinite(weights).all():
             raise FitError(
                 "the posterior density is zero at every draw",
                 where="Importance",
                 hint="use method='nuts'",
             )
-        index = choose(weights, worth, generator(key_choice))
+        effective = float(effective_draws(weights[None])[0])
+        index = systematic_resample(weights, effective, numpy_generator(key_resample))
         problems = []
-        if not k_hat <= LARGEST_TRUSTED:
+        if not k_hat <= MAX_PARETO_K:
             problems.append(
-                f"Pareto k-hat of the weights is {k_hat:.2f} (at most {LARGEST_TRUSTED}): they do "
+                f"Pareto k-hat of the weights is {k_hat:.2f} (at most {MAX_PARETO_K}): they do "
                 "not reach all of the posterior, so use method='nuts'"
             )
         return PosteriorDraws(
-            kind="importance",
-            z=places[index],
-            stats={"lp": (ratios + proposed)[index]},
+            method="importance",
+            z=z[index],
+            stats={"lp": (log_ratios + log_proposal)[index]},
             problems=problems,
-            weighted=(places, weights),
+            weighted=(z, weights),
             k_hat=float(k_hat),
-            effective_draws=worth,
-            said=said,
-            **evaluations,
+            effective_draws=effective,
+            gradients=float(initialization.said["gradients"]),
+            densities=float(self.draws),
+            metadata={"modes": initialization.said},
         )
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _drawn(proposal: Mixture, count: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    places = draw_mixture(proposal, count, key)
+def _propose(proposal: Mixture, count: int, key: Array) -> tuple[Array, Array]:
+    z = draw_mixture(proposal, count, key)
     densities = jax.lax.map(
-        lambda z: log_density(proposal, z[None])[0], places, batch_size=min(SIDE_BY_SIDE, count)
+        lambda z: log_density(proposal, z[None])[0], z, batch_size=min(SIDE_BY_SIDE, count)
     )
-    return places, densities
+    return z, densities
 
 
-def _proposal(modes: Modes, dtype: np.dtype) -> Mixture:
+def laplace_mixture(modes: Modes, dtype: np.dtype) -> Mixture:
     """A component for each heavy mode; always as many, so that one program draws from all."""
-    # There are never more modes than climbs; a mode has several components where there are fewer.
-    heavy = np.flatnonzero(modes.weight >= LEAST_SHARE)
+    # There are never more modes than starts; a mode has several components where there are fewer.
+    heavy = np.flatnonzero(modes.weight >= LEAST_WEIGHT)
     which = np.resize(heavy, max(STARTS, heavy.size))
     times = np.bincount(which, minlength=len(modes.weight))[which]
     share = modes.weight[which] / times
@@ -128,147 +129,129 @@ def _proposal(modes: Modes, dtype: np.dtype) -> Mixture:
     )
 
 
-# --- Draws led from the prior to the posterior, by what calibrations are made with ----------------
-
-
-MOST_KEPT = 4
+# --- Adaptive tempered SMC ------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class Tempered(AbstractMethod):
-    """Tempered draws of one material in one color, corrected by weights.
+    """Adaptive tempered SMC of one material in one color, corrected by weights.
 
-    A crowd that begins as draws from the prior sees all modes before any of them is narrow, and
-    nothing is differentiated.
+    Particles start from the prior, so they reach every mode before any of them is narrow; no
+    gradient is computed.
 
     Args:
-        settings: Of the crowd, and of the mixtures that are fitted to it; one fit alone has time
-            for more draws than each of thousands.
+        settings: Of the particles, and of the mixtures that are fitted to them; one fit alone has
+            time for more draws than each of thousands.
 
     Raises:
         FitError: A setting is outside its range.
     """
 
-    settings: PixelTempering = dataclasses.field(
-        default_factory=functools.partial(PixelTempering, draws=4096)
-    )
+    settings: PixelSMC = dataclasses.field(default_factory=functools.partial(PixelSMC, draws=4096))
+
+    @property
+    @override
+    def num_draws(self) -> int:
+        return self.settings.answer_draws
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
-        if any(name != "view" and length > 1 for name, length in problem.data.dims):
+    def scale_draws(self, factor: float) -> Self:
+        settings = self.settings
+        wanted = factor * settings.answer_draws
+        if wanted < settings.num_particles:
             raise FitError(
-                "draws are tempered of one material in one color only",
+                f"{wanted:g} draws are fewer than the {settings.num_particles} particles",
+                where="Tempered",
+                hint="give fewer particles, or more draws",
+            )
+        scaled = self.with_draws(wanted).settings
+        effective = settings.effective_draws * scaled.answer_draws / settings.answer_draws
+        return dataclasses.replace(
+            self, settings=dataclasses.replace(scaled, effective_draws=effective)
+        )
+
+    def with_draws(self, count: float) -> Self:
+        """The same method with at least so many weighted draws.
+
+        Args:
+            count: Above 0.
+
+        Returns:
+            Other settings.
+        """
+        half = math.ceil(0.5 * max(count, self.settings.num_particles))
+        effective = min(self.settings.effective_draws, float(half))
+        changed = dataclasses.replace(self.settings, draws=half, effective_draws=effective)
+        return dataclasses.replace(self, settings=changed)
+
+    @override
+    def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
+        if not problem.is_one_spectrum_point:
+            raise FitError(
+                "tempered draws are of one material in one color only",
                 where="Tempered",
                 hint="use method='nuts'",
             )
-        row = Row(1, lambda at, parameters, weights: None)
-        keys = np.asarray(jax.random.key_data(problem.key_of_draws))[None]
-        engine = _engine(problem)
-        found: Weighted | None = None
-        pixels = _alone(problem.data)
-        at = np.zeros(1, int)
-        for _, answer in tempered_draws(engine, self.settings, pixels, keys, at, row):
-            found = answer
-        problem.progress("tempering", 1.0)
-        if found is None:
-            raise FitError(
-                "the crowd did not arrive at the posterior", where="Tempered", hint="use 'nuts'"
-            )
-        return self._answer(problem, found, row, engine)
+        # Maps and calibrations fit many captures side by side; this is a batch of one.
+        settings, counts = self.settings, collections.Counter[str]()
 
-    def _answer(
-        self, problem: Problem, found: Weighted, row: Row, engine: "_Counting"
-    ) -> PosteriorDraws:
+        def count(what: str) -> None:
+            """Report progress; a fit that was abandoned ends here."""
+            progress("tempering", counts.total() / (settings.num_attempts * (settings.rounds + 1)))
+            counts[what] += 1
+
+        keys = np.asarray(jax.random.key_data(key))[None]
+        batch = BatchFit(_engine(problem.compiled_model), _batch_of_one(problem.data), keys)
+        answers = list(smc_draws(batch, settings, np.zeros(1, int), count))
+        progress("tempering", 1.0)
+        if not answers:
+            raise FitError(
+                "the particles did not arrive at the posterior", where="Tempered", hint="use 'nuts'"
+            )
+        found = answers[-1][1]
         z, weights = found.z[0].astype(float), found.weights[0].astype(float)
         weights = weights / weights.sum()
-        worth, k_hat = float(found.worth[0]), float(found.pareto_k[0])
-        index = choose(weights, worth, generator(problem.key_of_draws))
+        effective, k_hat = float(found.ess[0]), float(found.pareto_k[0])
+        index = systematic_resample(weights, effective, numpy_generator(key))
         problems = []
-        if row.status[0] != Status.GOOD:
+        if batch.outcome.status[0] != Status.GOOD:
             problems.append(
-                f"the weighted draws are worth {worth:.0f} independent ones (at least "
-                f"{self.settings.effective_draws:.0f}), with a Pareto k-hat of {k_hat:.2f} (at "
-                f"most {LARGEST_TRUSTED}): use method='nuts'"
+                f"the effective sample size of the weighted draws is {effective:.0f} (at least "
+                f"{settings.effective_draws:.0f}), with a Pareto k-hat of {k_hat:.2f} (at "
+                f"most {MAX_PARETO_K}): use method='nuts'"
             )
-        walks, length = self.settings.walks, self.settings.length
-        steps = int(row.outcome.steps[0]) * walks * (length - 1)
-        drawn = engine.counts["rounds"] * self.settings.draws
-        looked = engine.counts["crowds"] * self.settings.looks * self.settings.crowd
-        densities = looked + steps + drawn
+        stages, rounds = int(batch.outcome.steps[0]), counts["rounds"]
+        densities = (
+            counts["particles"] * settings.init_factor * settings.num_particles
+            + stages * settings.num_chains * (settings.chain_length - 1)
+            + rounds * settings.draws
+        )
         return PosteriorDraws(
-            kind="tempered",
+            method="tempered",
             z=z[index],
             stats={"log_weight": np.log(np.maximum(weights, 1e-300))[index]},
             problems=problems,
             weighted=(z, weights),
             k_hat=k_hat,
-            effective_draws=worth,
+            effective_draws=effective,
             gradients=0.0,
             densities=float(densities),
-            said={"stages": int(row.outcome.steps[0]), "rounds": engine.counts["rounds"]},
+            metadata={"stages": stages, "rounds": rounds},
         )
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Counting(BatchEngine):
-    """The programs of a layout, and how often one fit runs them; made for each fit."""
+def _engine(model: CompiledModel) -> BatchEngine:
+    """The programs of a model for batches."""
 
-    counts: collections.Counter = dataclasses.field(default_factory=collections.Counter)
-    progress: Progress = no_progress
+    def make() -> BatchEngine:
+        return BatchEngine(model.program, model.single, model.layout, model.precision)
 
-    @override
-    def temper(self, pixels: Stack, settings: PixelTempering, *others: Any) -> Any:
-        self._count("crowds", settings)
-        return super().temper(pixels, settings, *others)
-
-    @override
-    def propose(self, pixels: Stack, settings: PixelTempering, *others: Any) -> Any:
-        self._count("rounds", settings)
-        return super().propose(pixels, settings, *others)
-
-    def _count(self, what: str, settings: PixelTempering) -> None:
-        """Of every attempt, one crowd and some rounds; what is abandoned ends here."""
-        every = settings.crowds * (settings.rounds + 1)
-        self.progress("tempering", self.counts.total() / every)
-        self.counts[what] += 1
+    return model.programs.of("tempered", make)
 
 
-_ENGINES: LRUCache[tuple[CompiledModel, BatchEngine]] = LRUCache(MOST_KEPT)
-"""With what they were made for, so that its identity is not given to another."""
-
-
-def _engine(problem: Problem) -> _Counting:
-    """The programs of the bench's layout, kept from fit to fit, and counts that begin at zero."""
-    _, kept = _ENGINES.of(id(problem.compiled_model), functools.partial(_make, problem))
-    return _Counting(
-        kept.program,
-        kept.rough,
-        kept.candidates,
-        kept.precision,
-        kept.programs,
-        progress=problem.progress,
+def _batch_of_one(data: Observations) -> ObservationBatch:
+    """One capture as a batch that shares nothing."""
+    batched = jax.tree.map(lambda x: np.asarray(x)[None], data)
+    return ObservationBatch(
+        batched, jax.tree.map(lambda _: None, data), np.array([int(np.sum(data.valid))])
     )
-
-
-def _make(problem: Problem) -> tuple[CompiledModel, BatchEngine]:
-    candidates = np.zeros((1, problem.program.size))  # nothing climbs here
-    rough = _rough(problem)
-    with TRACING_LOCK:
-        return problem.compiled_model, BatchEngine(
-            problem.program, rough, candidates, problem.request.precision
-        )
-
-
-def _rough(problem: Problem) -> Program:
-    """The same model in single precision."""
-    if problem.request.precision == "single":
-        return problem.program
-    single = dataclasses.replace(problem.request, precision="single")
-    with jax.enable_x64(False), TRACING_LOCK:
-        return compile_program(single.bind(single.scene), problem.data.in_single_precision())
-
-
-def _alone(data: Observations) -> Stack:
-    """One capture as a row of one pixel, which shares nothing with others."""
-    own = jax.tree.map(lambda x: np.asarray(x)[None], data)
-    return Stack(own, jax.tree.map(lambda _: None, data), np.array([int(np.sum(data.valid))]))

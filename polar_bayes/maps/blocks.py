@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-import functools
+import enum
 import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -15,44 +15,48 @@ import xarray as xr
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import PixelMethod, candidates_of, fit_stack
-from polar_bayes.inference.batch_programs import ENGINE_LOCK, BatchEngine, EngineSpec, make_engine
-from polar_bayes.inference.batch_result import Approach, Outcome, Status, no_outcome
-from polar_bayes.inference.batching import IMAGE, stack
-from polar_bayes.inference.compile import TRACING_LOCK
+from polar_bayes.inference.batch_engine import BatchEngine, make_engine
+from polar_bayes.inference.batch_method import AbstractPixelMethod
+from polar_bayes.inference.batch_result import (
+    MethodUsed,
+    Outcome,
+    Status,
+    empty_outcome,
+)
+from polar_bayes.inference.batching import IMAGE, batch_pixels
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.inference.request import Request
-from polar_bayes.inference.result import dims_of
 from polar_bayes.observation.data import READINGS, Observations, observe
 from polar_bayes.physics.part import notation
 
-Layout = dict[str, tuple[tuple[str, ...], tuple[int, ...]]]
-"""By parameter: names and lengths of the axes that it has in one pixel."""
+ParameterAxes = dict[str, tuple[tuple[str, ...], tuple[int, ...]]]
 
 DIAGNOSTICS = {
     "pareto_k": "Pareto k of the importance weights",
-    "effective_draws": "independent draws that the weighted ones are worth",
+    "effective_draws": "effective sample size of the draws",
     "condition": "condition number of the curvature at the mode",
     "steps": "steps to the mode",
-    "approach": "how the numbers were found",
-    "status": "what became of the pixel",
+    "approach": "method by which the numbers were found",
+    "status": "status of the pixel",
 }
 
+FLAGS: dict[str, type[enum.IntEnum]] = {"approach": MethodUsed, "status": Status}
+
 NUMBER = "pixel_number"
-"""Variable of a block: where its pixels stand in the whole image, row by row."""
+"""Variable of a block: index of each pixel in the whole image, row by row."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plan:
-    """What is done to every block of one image; it can be sent to another process."""
+    """A checked request of a map, which can be sent to another process."""
 
     request: Request
-    settings: PixelMethod
+    settings: AbstractPixelMethod
     intensity_unit: float | None
     own_directions: frozenset[str]
     key: str
 
-    def observe(self, capture: xr.Dataset) -> Any:
+    def observe(self, capture: xr.Dataset) -> Observations:
         """A block, or one pixel, as arrays."""
         return observe(
             capture,
@@ -63,27 +67,17 @@ class Plan:
     @property
     def engine(self) -> BatchEngine:
         """The compiled programs, made at first use in each process."""
-        observe = functools.partial(self.pixel, "double")
-        with ENGINE_LOCK:
-            return make_engine(
-                EngineSpec(self.request, observe, candidates_of(self.settings), self.key)
-            )
 
-    @property
-    def layout(self) -> Layout:
-        """Own axes of every parameter that a map shows."""
-        return _layout_of(self)
+        def pixel() -> Observations:
+            with jax.enable_x64(True):
+                return self.observe(self.request.capture)
 
-    def pixel(self, precision: str) -> Observations:
-        """The pixel that stands for all, as arrays."""
-        with jax.enable_x64(True):
-            data = self.observe(self.request.capture)
-        return data if precision == "double" else data.in_single_precision()
+        return make_engine(self.key, self.request, pixel)
 
     @property
     def sizes(self) -> dict[str, tuple[int, ...]]:
-        """Lengths of the own axes of every parameter."""
-        return {name: own for name, (_, own) in self.layout.items()}
+        """Lengths of the axes of every parameter within a pixel."""
+        return {name: own for name, (_, own) in self.engine.parameter_axes.items()}
 
     def __eq__(self, other: object) -> bool:
         """The same programs, not the same readings."""
@@ -96,27 +90,19 @@ class Plan:
 
 def fit_block(block: xr.Dataset, plan: Plan) -> xr.Dataset:
     """Fit every pixel of a block."""
-    engine = plan.engine
-    numbers = block[NUMBER].transpose(*IMAGE).to_numpy()
+    numbers = block[NUMBER].transpose(*IMAGE).to_numpy().ravel()
+    found, axes = Marginals(numbers.size, plan.sizes), plan.engine.parameter_axes
     with jax.enable_x64(True):
-        readings = set_aside(block.drop_vars(NUMBER))
+        readings = mask_missing(block.drop_vars(NUMBER))
         if not readings["valid"].any():  # a corner of a picture; as a capture it would be refused
-            return _masked(block, plan)
-        pixels = stack(plan.observe(validate(readings)), plan.own_directions)
-    found, seed = Marginals(len(pixels), plan.sizes), plan.request.seed
-    outcome = fit_stack(engine, plan.settings, pixels, numbers.ravel(), seed, found.describe)
-    return maps_of(found, outcome, block, plan.layout)
+            return maps_of(found, empty_outcome(numbers.size, Status.MASKED), block, axes)
+        pixels = batch_pixels(plan.observe(validate(readings)), plan.own_directions)
+    seed = plan.request.seed
+    outcome = plan.settings.run_batch(plan.engine, pixels, numbers, seed, found.describe)
+    return maps_of(found, outcome, block, axes)
 
 
-def _masked(block: xr.Dataset, plan: Plan) -> xr.Dataset:
-    """The maps of a block in which nothing was read."""
-    count = block.sizes["y"] * block.sizes["x"]
-    outcome = no_outcome(count)
-    outcome.status[:] = Status.MASKED
-    return maps_of(Marginals(count, plan.sizes), outcome, block, plan.layout)
-
-
-def set_aside(capture: xr.Dataset) -> xr.Dataset:
+def mask_missing(capture: xr.Dataset) -> xr.Dataset:
     """A capture whose missing readings are marked as such."""
     valid = capture.get("valid", xr.DataArray(True)).astype(bool)
     for name in READINGS:
@@ -125,45 +111,37 @@ def set_aside(capture: xr.Dataset) -> xr.Dataset:
     return capture.assign(valid=valid)
 
 
-def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, layout: Layout) -> xr.Dataset:
+def maps_of(
+    found: Marginals, outcome: Outcome, block: xr.Dataset, axes: ParameterAxes
+) -> xr.Dataset:
     """The marginals of a block as labeled maps."""
     shape = tuple(block.sizes[dim] for dim in IMAGE)
     variables: dict[str, Any] = {}
-    for name, (own, sizes) in layout.items():
+    for name, (own, sizes) in axes.items():
         symbol, meaning, unit = notation(name)
-        for ending, words, values, first in (
+        for ending, statistic, values, first in (
             ("", "mean of", found.mean[name], ()),
             ("_sd", "standard deviation of", found.sd[name], ()),
             ("_quantile", "quantiles of", found.quantiles[name], ("quantile",)),
         ):
             whole = values.reshape(*values.shape[: len(first)], *shape, *sizes)
-            said = {"units": unit, "long_name": f"{words} {meaning}", "symbol": symbol}
-            variables[f"{name}{ending}"] = ((*first, *IMAGE, *own), np.float32(whole), said)
+            labels = {"units": unit, "long_name": f"{statistic} {meaning}", "symbol": symbol}
+            variables[f"{name}{ending}"] = ((*first, *IMAGE, *own), np.float32(whole), labels)
     for name, meaning in DIAGNOSTICS.items():
-        said = {"units": "1", "long_name": meaning}
-        variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), said)
-    for name, names in (("approach", Approach), ("status", Status)):
-        flags: dict[str, Any] = {
-            "long_name": DIAGNOSTICS[name],
-            "flag_values": [int(each) for each in names],
-            "flag_meanings": " ".join(each.name.lower() for each in names),
-        }
-        variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), flags)
+        attrs: dict[str, Any] = {"units": "1", "long_name": meaning}
+        if name in FLAGS:
+            flags = list(FLAGS[name])
+            attrs = {
+                "long_name": meaning,
+                "flag_values": [int(each) for each in flags],
+                "flag_meanings": " ".join(each.name.lower() for each in flags),
+            }
+        variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), attrs)
     coords = {dim: block.coords[dim] for dim in (*IMAGE, "wavelength") if dim in block.coords}
     return xr.Dataset(variables, coords={**coords, "quantile": list(LEVELS)})
 
 
-@functools.lru_cache(maxsize=4)
-def _layout_of(plan: Plan) -> Layout:
-    engine, pixel = plan.engine, plan.pixel(plan.request.precision)
-    program = engine.program
-    with jax.enable_x64(engine.precision == "double"), TRACING_LOCK:
-        shapes = jax.eval_shape(program.parameters, np.zeros(program.size, engine.dtype), pixel)
-    dims = dims_of(program)
-    return {name: (tuple(dims[name]), x.shape) for name, x in shapes.items()}
-
-
-# --- Who fits the blocks: threads of this process, or the workers of a cluster --------------------
+# --- Threads of this process, or workers of a cluster ---------------------------------------------
 
 
 AHEAD = 2

@@ -1,4 +1,4 @@
-"""An image in, maps out: the public verb of this room."""
+"""Maps of an image: every pixel fitted by itself."""
 
 import dataclasses
 import json
@@ -9,9 +9,10 @@ import xarray as xr
 from numpyro import distributions as dist
 
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.batch_fit import FEWEST_VIEWS, PixelLaplace, PixelMethod
-from polar_bayes.inference.batch_programs import key_of
-from polar_bayes.inference.batch_result import Status, no_outcome
+from polar_bayes.inference.batch_engine import engine_key
+from polar_bayes.inference.batch_laplace import PixelLaplace
+from polar_bayes.inference.batch_method import AbstractPixelMethod
+from polar_bayes.inference.batch_result import MIN_VIEWS, Status, empty_outcome
 from polar_bayes.inference.batching import IMAGE
 from polar_bayes.inference.psis import Marginals
 from polar_bayes.inference.request import resolve
@@ -22,7 +23,7 @@ from polar_bayes.maps.blocks import (
     as_completed,
     fit_block,
     maps_of,
-    set_aside,
+    mask_missing,
     workers,
 )
 from polar_bayes.observation.data import ANGLES
@@ -35,7 +36,7 @@ BLOCK = 4096
 """Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
 
 CHUNK = 65536
-"""Pixels that are looked at together: a chunk of a store."""
+"""Pixels of a chunk of a store, which are read together."""
 
 
 @with_counter("pixels")
@@ -43,7 +44,7 @@ def fit_pixels(
     capture: xr.Dataset,
     *,
     model: str | Callable = "per_material",
-    method: PixelMethod | None = None,
+    method: AbstractPixelMethod | None = None,
     scene: str | Scene | None = None,
     priors: Mapping[str, dist.Distribution] | None = None,
     links: AbstractLink | Mapping[str, AbstractLink] | None = None,
@@ -63,8 +64,8 @@ def fit_pixels(
         capture: A capture with dims y and x. In chunks (Dask), it is read block by block, and the
             maps come in the same chunks, computed when they are asked for.
         model: See `polar_bayes.fit`; the other arguments too.
-        method: What is done in each pixel; by default `PixelLaplace()`. `PixelTempering()` sees
-            all modes of a pixel, at many times the cost; `PixelNuts()` runs chains in each.
+        method: By default `PixelLaplace()`. `PixelSMC()` explores all modes of a pixel, at many
+            times the cost; `PixelNuts()` runs chains in each.
         scene: A name in `SETUPS` or a `Scene`.
         priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
         links: One link for the polarization, or a mapping from variable to link.
@@ -75,9 +76,9 @@ def fit_pixels(
 
     Returns:
         For each parameter its mean `<name>`, `<name>_sd` and `<name>_quantile`, each (y, x, ...);
-        `pareto_k`, `effective_draws`, `condition`, `steps`, `approach` (how the numbers were
-        found) and `status` (what became of the pixel). NaN where a pixel has no answer; the
-        attribute `polar_bayes` says how the maps were made.
+        `pareto_k`, `effective_draws`, `condition`, `steps`, `approach` (the method by which the
+        numbers were found) and `status` of each pixel. NaN where a pixel has no answer; the
+        attribute `polar_bayes` holds the provenance.
 
     Raises:
         CaptureError: The capture is no image, or does not hold what a fit needs.
@@ -88,7 +89,7 @@ def fit_pixels(
         capture, model, method, scene, priors, links, largest_view_zenith, seed, precision
     )
     if capture.chunks:
-        numbered = number_pixels(capture)
+        numbered = with_pixel_numbers(capture)
         maps = xr.map_blocks(fit_block, numbered, args=[plan], template=blank(capture, plan))
     else:
         maps = _at_once(capture, plan, progress)
@@ -97,7 +98,7 @@ def fit_pixels(
 
 
 def count_pixels(maps: xr.Dataset) -> dict[str, int]:
-    """What became of the pixels of a map.
+    """The number of pixels of each status.
 
     Args:
         maps: Of `fit_pixels`, or opened from a store.
@@ -114,8 +115,8 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
             "it holds no maps", where="count_pixels", hint="give what fit_pixels returns"
         )
     counts = dict.fromkeys(Status, 0)
-    for place in cut(maps, CHUNK):
-        found = checked_status(maps.isel(place)).to_numpy()
+    for region in cut(maps, CHUNK):
+        found = checked_status(maps.isel(region)).to_numpy()
         for each in Status:
             counts[each] += int(np.sum(found == each))
     return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
@@ -143,7 +144,7 @@ def checked_status(maps: xr.Dataset) -> xr.DataArray:
 def plan_map(
     capture: xr.Dataset,
     model: str | Callable,
-    method: PixelMethod | None,
+    method: AbstractPixelMethod | None,
     scene: str | Scene | None,
     priors: Mapping[str, dist.Distribution] | None,
     links: AbstractLink | Mapping[str, AbstractLink] | None,
@@ -151,13 +152,13 @@ def plan_map(
     seed: int,
     precision: str,
 ) -> Plan:
-    """Check what is asked of a map, on one of its pixels."""
+    """Check the request of a map on one of its pixels."""
     settings = PixelLaplace() if method is None else method
-    if not isinstance(settings, PixelMethod):
+    if not isinstance(settings, AbstractPixelMethod):
         raise FitError(
-            f"{method!r} is no way to fit pixels",
+            f"{method!r} is no method for pixels",
             where="fit_pixels: method",
-            hint="give settings such as PixelLaplace(draws=512) or PixelTempering()",
+            hint="give settings such as PixelLaplace(draws=512) or PixelSMC()",
         )
     missing = [dim for dim in IMAGE if dim not in capture.dims]
     if missing:
@@ -167,46 +168,41 @@ def plan_map(
             hint="give an image with dims y and x, or use polar_bayes.fit",
         )
     pixel, limit = _fullest_pixel(capture), largest_view_zenith
-    request = resolve(pixel, model, "laplace", scene, priors, links, limit, seed, precision)
+    request = resolve(pixel, model, scene, priors, links, limit, seed, precision)
     own = frozenset(
         name
         for name in (*ANGLES, "normal_confidence")
         if name in capture and set(IMAGE) & set(capture[name].dims)
     )
     unit = _intensity_unit(capture)
-    return Plan(request, settings, unit, own, key_of(request, settings, sorted(own), unit is None))
+    return Plan(
+        request, settings, unit, own, engine_key(request, settings, sorted(own), unit is None)
+    )
 
 
-def number_pixels(capture: xr.Dataset) -> xr.Dataset:
-    """An image whose pixels know where they stand, row by row, in chunks like its own."""
-    rows, columns = (capture.sizes[dim] for dim in IMAGE)
-    along = [
-        xr.Variable((dim,), np.arange(n)) for dim, n in zip(IMAGE, (rows, columns), strict=True)
-    ]
-    if capture.chunks:
-        along = [
-            each.chunk({dim: capture.chunks[dim]}) for dim, each in zip(IMAGE, along, strict=True)
-        ]
-    return capture.assign({NUMBER: along[0] * columns + along[1]})
-
-
-def numbered_block(block: xr.Dataset, place: Mapping[str, slice], columns: int) -> xr.Dataset:
-    """A block of an image so many columns wide, whose pixels know where they stand in the whole."""
-    y, x = (xr.Variable((d,), np.arange(place[d].start, place[d].stop)) for d in IMAGE)
+def with_pixel_numbers(
+    block: xr.Dataset, region: Mapping[str, slice] | None = None, columns: int = 0
+) -> xr.Dataset:
+    """A block, by default a whole image, with the index of each pixel in the image, row by row."""
+    if region is None:
+        region, columns = {dim: slice(0, block.sizes[dim]) for dim in IMAGE}, block.sizes["x"]
+    y, x = (xr.Variable((d,), np.arange(region[d].start, region[d].stop)) for d in IMAGE)
+    if block.chunks:
+        y, x = y.chunk(y=block.chunks["y"]), x.chunk(x=block.chunks["x"])
     return block.assign({NUMBER: y * columns + x})
 
 
 def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
-    """Maps of the image before any pixel is fitted: names, axes, types and attributes."""
+    """Maps of the image without values: names, axes, types and attributes."""
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
-    nothing = no_outcome(1)
-    nothing.status[:] = Status.NOT_FITTED
-    tiny = maps_of(Marginals(1, plan.sizes), nothing, corner, plan.layout)
+    nothing = empty_outcome(1, Status.NOT_FITTED)
+    tiny = maps_of(Marginals(1, plan.sizes), nothing, corner, plan.engine.parameter_axes)
     one = tiny.isel({dim: 0 for dim in IMAGE}, drop=True)
     whole = one.expand_dims({dim: capture.sizes[dim] for dim in IMAGE})
     whole = whole.assign_coords({dim: capture[dim] for dim in IMAGE if dim in capture.coords})
     whole = xr.Dataset(
-        {n: v.transpose(*tiny[n].dims) for n, v in whole.items()}, attrs={PROVENANCE: said_of(plan)}
+        {n: v.transpose(*tiny[n].dims) for n, v in whole.items()},
+        attrs={PROVENANCE: provenance_json(plan)},
     )
     chunks = {dim: capture.chunks[dim] for dim in IMAGE if dim in capture.chunks}
     return whole.chunk(chunks) if chunks else whole
@@ -227,16 +223,16 @@ def _at_once(capture: xr.Dataset, plan: Plan, progress: Counter | None) -> xr.Da
     maps = blank(capture, plan).copy(deep=True)
     every, done = capture.sizes["y"] * capture.sizes["x"], 0
     with workers(None) as (pool, count):
-        tasks = ((place,) for place in cut(capture))
+        tasks = ((region,) for region in cut(capture))
 
-        def fit(place: dict[str, slice]) -> xr.Dataset:
-            block = numbered_block(capture.isel(place), place, capture.sizes["x"])
+        def fit(region: dict[str, slice]) -> xr.Dataset:
+            block = with_pixel_numbers(capture.isel(region), region, capture.sizes["x"])
             return fit_block(block, plan)
 
         blocks = as_completed(pool, count, fit, tasks)
-        for (place,), block in blocks:
+        for (region,), block in blocks:
             for name, values in block.items():
-                maps[name][place] = values
+                maps[name][region] = values
             done += block.sizes["y"] * block.sizes["x"]
             if progress is not None:
                 progress(done, every)
@@ -248,7 +244,7 @@ def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
     rows = capture.sizes["y"]
     best, most = None, 0
     for y in range(rows):
-        row = set_aside(capture.isel(y=y).load())
+        row = mask_missing(capture.isel(y=y).load())
         views = row["valid"].any([d for d in row["valid"].dims if d not in ("x", "view")])
         counts = views.sum("view")
         found, x = int(counts.max()), int(counts.argmax("x")) if "x" in counts.dims else 0
@@ -256,9 +252,9 @@ def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
             best, most = row.isel(x=x), found
         if most == capture.sizes["view"]:
             break
-    if best is None or most < FEWEST_VIEWS:
+    if best is None or most < MIN_VIEWS:
         raise CaptureError(
-            f"no pixel has {FEWEST_VIEWS} valid views",
+            f"no pixel has {MIN_VIEWS} valid views",
             where=str(capture.attrs.get("name", "capture")),
             hint="check `valid` and the readings: NaN counts as missing",
         )
@@ -269,15 +265,15 @@ def _intensity_unit(capture: xr.Dataset) -> float | None:
     """The largest intensity of the whole image, where it states no saturation level."""
     if "intensity" not in capture or "saturation_level" in capture["intensity"].attrs:
         return None
-    readings = set_aside(capture)
+    readings = mask_missing(capture)
     largest = float(readings["intensity"].where(readings["valid"]).max())
     return largest if largest > 0.0 else 1.0
 
 
-def said_of(plan: Plan) -> str:
-    """How maps are made, as JSON."""
+def provenance_json(plan: Plan) -> str:
+    """Provenance of maps, as JSON."""
     request = plan.request
-    about = {
+    provenance = {
         "method": "pixels",
         "fitted_by": type(plan.settings).__name__,
         "settings": dataclasses.asdict(plan.settings),
@@ -293,4 +289,4 @@ def said_of(plan: Plan) -> str:
         "precision": request.precision,
         "intensity_unit": plan.intensity_unit,
     }
-    return json.dumps(about, sort_keys=True)
+    return json.dumps(provenance, sort_keys=True)

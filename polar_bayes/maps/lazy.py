@@ -1,4 +1,4 @@
-"""Images and maps in files, opened lazily; every broken part of one is an error of one line."""
+"""Images and maps in files, opened lazily; a damaged part of one is an error of one line."""
 
 import json
 import os
@@ -23,7 +23,7 @@ MOST_BYTES = 2**31
 """Maps in chunks (Dask) that are computed at once, into memory."""
 
 REQUEST = "request_sha256"
-"""Root attribute of a map from its first moment: the fingerprint of what was asked."""
+"""Root attribute of a map from its beginning: the fingerprint of its request."""
 
 FINISHED = "capture_sha256"
 """Root attribute that is written last: a map that holds it is finished. Digest of the readings."""
@@ -31,7 +31,7 @@ FINISHED = "capture_sha256"
 COPY = "copy the store again, or make the map again"
 
 LEDGER = ".progress"
-"""Ending of the ledger beside an unfinished map."""
+"""Ending of the name of the ledger, which lies next to an unfinished map."""
 
 
 def open_capture(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -68,7 +68,7 @@ def open_image(path: Path) -> xr.Dataset:
 
 
 def check_whole(path: Path) -> None:
-    """Refuse a store with holes, which would read as missing readings; once for the whole map."""
+    """Refuse a store with missing chunks, which would read as missing readings."""
     for name in READINGS:
         if path.suffix != ".zarr" or not (path / name).is_dir():
             continue
@@ -110,7 +110,7 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def _check_maps(maps: xr.Dataset, store: Path) -> None:
-    """Refuse metadata that no map has, before anything trips over them."""
+    """Refuse metadata that no map has."""
     if not _has_provenance(maps):
         raise FitError("its provenance cannot be read", where=str(store), hint=COPY)
     if "quantile" in maps.dims and not np.array_equal(maps["quantile"], LEVELS):
@@ -139,12 +139,12 @@ def _has_provenance(maps: xr.Dataset) -> bool:
 
 
 def _has_meanings(flags: xr.Variable) -> bool:
-    """Whether every value of a flag has a word."""
-    words = str(flags.attrs.get("flag_meanings", "")).split()
-    values = flags.attrs.get("flag_values", list(range(len(words))))
+    """Whether every value of a flag has a meaning."""
+    meanings = str(flags.attrs.get("flag_meanings", "")).split()
+    values = flags.attrs.get("flag_values", list(range(len(meanings))))
     listed = list(values) if isinstance(values, list | tuple | np.ndarray) else [values]
     are_whole = all(isinstance(value, int | np.integer) for value in listed)
-    return 0 < len(words) == len(listed) and are_whole
+    return 0 < len(meanings) == len(listed) and are_whole
 
 
 def _missing(array: Path, error: type[PolarBayesError]) -> tuple[int, int]:
@@ -191,7 +191,7 @@ class _Guarded(BackendArray):
         self, variable: xr.Variable, where: str, error: type[PolarBayesError], hint: str
     ) -> None:
         self.shape, self.dtype = variable.shape, variable.dtype
-        self._variable, self._where, self._error, self._mend = variable, where, error, hint
+        self._variable, self._where, self._error, self._hint = variable, where, error, hint
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(
@@ -204,22 +204,22 @@ class _Guarded(BackendArray):
         except Exception as cause:  # codecs raise nearly every type for a broken chunk
             parts = zip(self._variable.dims, key, self.shape, strict=True)
             ranges = [f"{dim}={_range(part, n)}" for dim, part, n in parts if dim in IMAGE]
-            place = f"[{', '.join(ranges)}]" if ranges else ""
+            region = f"[{', '.join(ranges)}]" if ranges else ""
             raise self._error(
-                f"it cannot be read ({cause})", where=f"{self._where}{place}", hint=self._mend
+                f"it cannot be read ({cause})", where=f"{self._where}{region}", hint=self._hint
             ) from cause
 
 
 def _range(part: slice | np.ndarray | int, length: int) -> str:
-    """Where along an axis values were asked for."""
+    """The range of an axis that was requested."""
     if isinstance(part, slice):
         return "{}:{}".format(*part.indices(length))
     return str(part) if np.ndim(part) == 0 else f"{np.min(part)}:{np.max(part) + 1}"
 
 
-def at_hand(maps: xr.Dataset) -> xr.Dataset:
-    """Maps whose values can be looked at again and again."""
-    # Those in chunks (Dask) would be fitted anew at each look: they are computed, once.
+def ensure_loaded(maps: xr.Dataset) -> xr.Dataset:
+    """Maps whose values can be read repeatedly."""
+    # Maps in chunks (Dask) would be fitted again at each access, so they are computed once.
     if not any(variable.chunks for variable in maps.variables.values()):
         return maps
     if maps.nbytes > MOST_BYTES:

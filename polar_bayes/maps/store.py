@@ -1,9 +1,9 @@
 """Maps of images that do not fit into memory: block by block from file to file, resumable.
 
-A map is a Zarr store that appears whole, without values, under a fingerprint of what was asked
-(`opening.REQUEST`). Each block is on the disk before its line is in the ledger beside the store
-(`ledger.py`). The attribute `opening.FINISHED` is written last. Nothing is written to a store that
-does not hold the fingerprint, and nothing is removed but the ledger and folders of our own.
+A map is a Zarr store that appears whole, without values, under a fingerprint of its request
+(`lazy.REQUEST`). Each block is on the disk before its line is in the ledger next to the store. The
+attribute `lazy.FINISHED` is written last. Nothing is written to a store that does not hold the
+fingerprint, and nothing is removed but the ledger and unfinished folders of this package.
 """
 
 import contextlib
@@ -27,15 +27,22 @@ from polar_bayes.inference.batch_result import Status
 from polar_bayes.inference.batching import IMAGE
 from polar_bayes.interrupts import on_interrupt, resume_hint
 from polar_bayes.maps.blocks import Plan, as_completed, fit_block, workers
-from polar_bayes.maps.fit_map import blank, cut, fit_pixels, numbered_block, plan_map, said_of
+from polar_bayes.maps.fit_map import (
+    blank,
+    cut,
+    fit_pixels,
+    plan_map,
+    provenance_json,
+    with_pixel_numbers,
+)
 from polar_bayes.maps.lazy import FINISHED, LEDGER, REQUEST, check_whole, open_image, open_map
 from polar_bayes.paths import (
     as_path,
-    is_same_place,
-    move_into_place,
+    is_same_file,
     output_error,
+    replace_file,
     sync,
-    unfinished_folder,
+    temporary_folder,
 )
 from polar_bayes.progress import Counter, with_counter
 
@@ -44,11 +51,12 @@ from polar_bayes.progress import Counter, with_counter
 
 MAGIC = b"polar_bayes map "
 BEGUN_OTHERWISE = "it was begun with another capture or other settings"
-REPEAT = "repeat the command as it was, or give another --out"
+OTHER_OUT = "give another --out"
+REPEAT = f"repeat the command as it was, or {OTHER_OUT}"
 
 
 class Entry(NamedTuple):
-    """A block that is done."""
+    """A finished block: digests of its readings and of its chunks."""
 
     readings: str
     chunks: str
@@ -58,7 +66,7 @@ class Ledger:
     """A file next to the store: a head with the request's fingerprint, then a line per block."""
 
     # A line is added after the chunks of its block are on the disk. A line without an end was cut
-    # off by a crash and counts as not there; any other line that fails its checksum is an error.
+    # off by a crash and is ignored; any other line that fails its checksum is an error.
 
     def __init__(self, opened: BinaryIO, file: Path, request: str) -> None:
         self._opened, self._file, self._size = opened, file, 0
@@ -66,13 +74,13 @@ class Ledger:
         self.entries: dict[str, Entry] = {}
 
     def read(self) -> None:
-        """Read what is there; a file that holds anything else is refused and left as it is."""
+        """Read the entries; a file that holds anything else is refused and left as it is."""
         where = str(self._file)
         content = self._opened.read()
         if self._head.startswith(content):  # empty, or cut off within the head
             return
         if not content.startswith(MAGIC):
-            hint = "move that file away, or give another --out"
+            hint = f"move that file away, or {OTHER_OUT}"
             raise OutputError("it is not the ledger of a map", where=where, hint=hint)
         if not content.startswith(self._head):
             raise FitError(BEGUN_OTHERWISE, where=where, hint=REPEAT)
@@ -82,45 +90,44 @@ class Ledger:
             body, _, checksum = line.rpartition(b" ")
             fields = body.rsplit(b" ", 2)
             if len(fields) != 3 or checksum != _checksum(body):
-                raise OutputError(
-                    f"line {number} is damaged",
-                    where=where,
-                    hint="remove that file to fit all blocks again, or give another --out",
-                )
+                hint = f"remove that file to fit all blocks again, or {OTHER_OUT}"
+                raise OutputError(f"line {number} is damaged", where=where, hint=hint)
             label, readings, chunks = (field.decode("ascii") for field in fields)
             self.entries[label] = Entry(readings, chunks)
 
     def begin(self) -> None:
-        """Cut off what a crash left of a line; write the head where there is none."""
+        """Cut off an incomplete last line; write the head where there is none."""
         self._opened.truncate(self._size)
         if self._size == 0:
             self._append(self._head)
             sync(self._file.parent)
 
     def add(self, label: str, entry: Entry) -> None:
-        """A block is on the disk."""
-        if not self._is_in_place():
-            raise taken_over(_store_of(self._file))
-        self._append(_line(label, entry))
+        """Record a block that is on the disk."""
+        if not self.is_in_place():
+            raise taken_over(self._file.with_suffix(""))
+        body = f"{label} {entry.readings} {entry.chunks}".encode()
+        self._append(body + b" " + _checksum(body) + b"\n")
         self.entries[label] = entry
 
     def end(self) -> None:
-        """Nothing is left to do."""
-        if self._is_in_place():
+        """Remove the ledger of a finished map."""
+        if self.is_in_place():
             self._file.unlink()
             sync(self._file.parent)
+
+    def is_in_place(self) -> bool:
+        """Whether the file is still the one that was opened."""
+        try:
+            return os.path.samestat(os.fstat(self._opened.fileno()), os.stat(self._file))
+        except FileNotFoundError:
+            return False
 
     def _append(self, text: bytes) -> None:
         self._opened.seek(0, os.SEEK_END)
         while text:  # an unbuffered file may take less than it is given
             text = text[self._opened.write(text) :]
         os.fsync(self._opened.fileno())
-
-    def _is_in_place(self) -> bool:
-        try:
-            return os.path.samestat(os.fstat(self._opened.fileno()), os.stat(self._file))
-        except FileNotFoundError:
-            return False
 
 
 @contextlib.contextmanager
@@ -131,8 +138,8 @@ def locked_ledger(file: Path, request: str, *, resume: bool) -> Iterator[Ledger]
     try:
         _lock(opened, file)
         ledger = Ledger(opened, file, request)
-        if not ledger._is_in_place():
-            raise taken_over(_store_of(file))
+        if not ledger.is_in_place():
+            raise taken_over(file.with_suffix(""))
         yield ledger
     except BaseException:
         if is_new and os.fstat(opened.fileno()).st_size == 0:
@@ -148,32 +155,30 @@ def _open(file: Path, *, resume: bool) -> tuple[BinaryIO, bool]:
         with contextlib.suppress(FileExistsError):
             return file.open("x+b", buffering=0), True
         if not resume:
-            hint = "give another --out, or --resume"
+            hint = f"{OTHER_OUT}, or --resume"
             raise OutputError("it is there already", where=str(file), hint=hint)
         if file.is_file():
             return file.open("r+b", buffering=0), False
     except OSError as error:
         raise output_error(error, file) from error
-    hint = "move it away, or give another --out"
+    hint = f"move it away, or {OTHER_OUT}"
     raise OutputError("it is not the ledger of a map", where=str(file), hint=hint)
 
 
 def _lock(opened: BinaryIO, file: Path) -> None:
+    flags = portalocker.LockFlags.EXCLUSIVE | portalocker.LockFlags.NON_BLOCKING
     try:
-        portalocker.lock(
-            opened, portalocker.LockFlags.EXCLUSIVE | portalocker.LockFlags.NON_BLOCKING
-        )
+        portalocker.lock(opened, flags)
     except portalocker.AlreadyLocked as error:
-        hint = "wait until it has finished, or give another --out"
-        raise OutputError(
-            "another process is writing it", where=str(_store_of(file)), hint=hint
-        ) from error
+        what, hint = "another process is writing it", f"wait until it has finished, or {OTHER_OUT}"
+        raise OutputError(what, where=str(file.with_suffix("")), hint=hint) from error
     except portalocker.LockException as error:
-        raise OutputError(
-            f"it cannot be locked ({error})",
-            where=str(file),
-            hint="give an --out on a file system that has locks",
-        ) from error
+        hint = "give an --out on a file system that has locks"
+        raise OutputError(f"it cannot be locked ({error})", where=str(file), hint=hint) from error
+
+
+def _checksum(body: bytes) -> bytes:
+    return f"{zlib.crc32(body):08x}".encode()
 
 
 def taken_over(store: Path) -> OutputError:
@@ -185,19 +190,6 @@ def taken_over(store: Path) -> OutputError:
     )
 
 
-def _store_of(file: Path) -> Path:
-    return file.with_suffix("")
-
-
-def _line(label: str, entry: Entry) -> bytes:
-    body = f"{label} {entry.readings} {entry.chunks}".encode()
-    return body + b" " + _checksum(body) + b"\n"
-
-
-def _checksum(body: bytes) -> bytes:
-    return f"{zlib.crc32(body):08x}".encode()
-
-
 # --- Maps of images that do not fit into memory: block by block from file to file, resumable ------
 
 
@@ -205,14 +197,14 @@ BLOCK = 65536
 """Most pixels of a block, and of a chunk on the disk: few files, little memory."""
 
 PARTS, LEAST = 4, 1024
-"""Blocks of a smaller image, so that every core has work; but none has fewer pixels."""
+"""Blocks of a smaller image, so that every core has work, and the fewest pixels of one."""
 
 READ = frozenset((*(row.name for row in CONTRACT), WAVELENGTH.name, *LABELS))
-"""What a fit reads of a capture; known truths and variables of the user's own are not among it."""
+"""Variables of a capture that a fit reads; known truths and other variables are not among them."""
 
 METADATA = "zarr.json"
 
-Place = dict[str, slice]
+Region = dict[str, slice]
 
 DEFAULTS: dict[str, Any] = {
     name: parameter.default
@@ -229,7 +221,7 @@ def map_file(
     scheduler: str | None = None,
     resume: bool = False,
     progress: Counter | None = None,
-    **asked: Any,
+    **settings: Any,
 ) -> xr.Dataset:
     """Fit every pixel of an image in a file, and write the maps to another.
 
@@ -245,24 +237,24 @@ def map_file(
         resume: Go on with a map that was broken off; what is done stays. Blocks whose files are
             missing or altered are fitted again. A finished map of the same capture is returned.
         progress: Called with the pixels that are done, and all.
-        asked: Arguments of `polar_bayes.fit_pixels`.
+        settings: Arguments of `polar_bayes.fit_pixels`.
 
     Returns:
         The maps, opened lazily.
 
     Raises:
         CaptureError: The capture cannot be read, or is not what a fit needs.
-        FitError: Something asked for cannot be used; or, to resume, the map was begun otherwise or
+        FitError: A setting cannot be used; or, to resume, the map was begun with others or
             the capture has changed since.
-        OutputError: The store cannot be written, is there already, is (to resume) no map of ours or
-            not as it was written, or another process is writing it.
+        OutputError: The store cannot be written, is there already, is (to resume) not a map of
+            this package or not as it was written, or another process is writing it.
     """
     source, store = as_path(capture, "capture"), as_path(out, "out")
     check_apart(source, store)
     image = open_image(source)
     check_whole(source)
     with _in_capture(source):
-        plan = plan_map(image, **(DEFAULTS | asked))
+        plan = plan_map(image, **(DEFAULTS | settings))
     target = _MapStore(store, image, plan)
     file = store.with_name(f"{store.name}{LEDGER}")
     with locked_ledger(file, target.request, resume=resume) as ledger:
@@ -283,32 +275,32 @@ def map_file(
 
 
 def check_apart(source: Path, store: Path) -> None:
-    """Refuse a store that is the source, or in it, or around it; or that has nowhere to stand."""
-    where, hint = str(store), "give another --out"
+    """Refuse a store that is the source, inside it or around it, or whose folder is missing."""
+    where = str(store)
     with _written(store):
         one, other = source.resolve(), store.resolve()
         is_nested = other.is_relative_to(one) or one.is_relative_to(other)
-        if is_nested or is_same_place(source, store):
+        if is_nested or is_same_file(source, store):
             what = "it is the capture, inside it, or around it"
-            raise OutputError(what, where=where, hint=hint)
+            raise OutputError(what, where=where, hint=OTHER_OUT)
         if not store.parent.is_dir():
             raise OutputError("its folder is not there", where=where, hint="make the folder first")
 
 
 def fit_file_block(
-    source: Path, place: Place, plan: Plan, opened: xr.Dataset | None = None
+    source: Path, region: Region, plan: Plan, opened: xr.Dataset | None = None
 ) -> tuple[xr.Dataset, str]:
     """Fit one block of a capture, which a worker opens: its maps, and a digest of its readings."""
     image = open_image(source) if opened is None else opened
-    block = _read(image, place)
-    with _in_capture(source, place):
-        return fit_block(numbered_block(block, place, image.sizes["x"]), plan), _digest(block)
+    block = _read(image, region)
+    with _in_capture(source, region):
+        return fit_block(with_pixel_numbers(block, region, image.sizes["x"]), plan), _digest(block)
 
 
 @contextlib.contextmanager
-def _in_capture(source: Path, place: Place | None = None) -> Iterator[None]:
-    """What is wrong with a capture, with its name and the block."""
-    where = str(source) if place is None else f"{source}: block {_label(place)}"
+def _in_capture(source: Path, region: Region | None = None) -> Iterator[None]:
+    """Errors of a capture, with its name and the block."""
+    where = str(source) if region is None else f"{source}: block {_label(region)}"
     try:
         yield
     except CaptureError as error:
@@ -317,9 +309,9 @@ def _in_capture(source: Path, place: Place | None = None) -> Iterator[None]:
         raise CaptureError(error.what, where=f"{where}: {error.where}", hint=error.hint) from error
 
 
-def _read(image: xr.Dataset, place: Place) -> xr.Dataset:
-    """A block of a capture in memory: what a fit reads of it."""
-    return image[[name for name in image.data_vars if name in READ]].isel(place).load()
+def _read(image: xr.Dataset, region: Region) -> xr.Dataset:
+    """The variables of a block of a capture that a fit reads, in memory."""
+    return image[[name for name in image.data_vars if name in READ]].isel(region).load()
 
 
 def _digest(block: xr.Dataset) -> str:
@@ -336,62 +328,58 @@ def _digest(block: xr.Dataset) -> str:
 
 
 class _MapStore:
-    """One map that is being made: its request, its blocks, and the files of its store."""
+    """An unfinished map: its request, its blocks, and the files of its store."""
 
     def __init__(self, store: Path, image: xr.Dataset, plan: Plan) -> None:
         self._store, self._image, self._plan = store, image, plan
         self._maps = blank(image, plan)
-        self._places = list(cut(image, _block(image)))
-        self._chunks = {dim: part.stop for dim, part in self._places[0].items()}
+        self._regions = list(cut(image, _block(image)))
+        self._chunks = {dim: part.stop for dim, part in self._regions[0].items()}
         pixel = plan.request.capture.drop_attrs(deep=False)
         read = pixel[sorted(READ & set(pixel.data_vars))].to_dict()
-        asked = [said_of(plan), dict(image.sizes), self._chunks, read]
-        text = json.dumps(asked, sort_keys=True, default=str)
+        parts = [provenance_json(plan), dict(image.sizes), self._chunks, read]
+        text = json.dumps(parts, sort_keys=True, default=str)
         self.request = hashlib.sha256(text.encode()).hexdigest()
 
     def is_finished(self, *, resume: bool) -> bool:
-        """Whether the store is a finished map; one that is not of this request is refused."""
+        """Whether the store is a finished map; a store of another request is refused."""
         where = str(self._store)
         if not os.path.lexists(self._store):
             return False
         if not resume:
-            hint = "give another --out, or --resume"
+            hint = f"{OTHER_OUT}, or --resume"
             raise OutputError("it is there already", where=where, hint=hint)
         attributes = _metadata(self._store)["attributes"]
         if REQUEST not in attributes:
-            hint = "give another --out"
-            raise OutputError("it is not a map that can be resumed", where=where, hint=hint)
+            what = "it is not a map that can be resumed"
+            raise OutputError(what, where=where, hint=OTHER_OUT)
         if attributes[REQUEST] != self.request:
             raise FitError(BEGUN_OTHERWISE, where=where, hint=REPEAT)
         return FINISHED in attributes
 
     def check_finished(self) -> None:
-        """Refuse a finished map of readings that have changed, or that has lost chunks."""
-        where, hint = str(self._store), "give another --out"
-        readings = [_digest(_read(self._image, place)) for place in self._places]
+        """Refuse a finished map of readings that have changed, or with missing chunks."""
+        where = str(self._store)
+        readings = [_digest(_read(self._image, region)) for region in self._regions]
         if _metadata(self._store)["attributes"][FINISHED] != self._combined(readings):
-            raise FitError("the capture has changed since it was made", where=where, hint=hint)
-        files = [file for place in self._places for file in self._files(place)]
+            what = "the capture has changed since it was made"
+            raise FitError(what, where=where, hint=OTHER_OUT)
+        files = [file for region in self._regions for file in self._files(region)]
         if missing := sum(not file.is_file() for file in files):
             what = f"{missing} of {len(files)} chunks are missing"
-            raise OutputError(what, where=where, hint="copy the store again, or give another --out")
+            raise OutputError(what, where=where, hint=f"copy the store again, or {OTHER_OUT}")
 
     def check_readings(self, ledger: Ledger) -> None:
-        """Refuse to go on where the readings of a block that is done have changed."""
-        for place in self._places:
-            label = _label(place)
-            if label not in ledger.entries:
-                continue
-            if _digest(_read(self._image, place)) != ledger.entries[label].readings:
-                raise FitError(
-                    f"the capture has changed since block {label} was fitted",
-                    where=str(self._store),
-                    hint="give another --out",
-                )
+        """Refuse to resume where the readings of a finished block have changed."""
+        for region in self._regions:
+            entry = ledger.entries.get(_label(region))
+            if entry is not None and _digest(_read(self._image, region)) != entry.readings:
+                what = f"the capture has changed since block {_label(region)} was fitted"
+                raise FitError(what, where=str(self._store), hint=OTHER_OUT)
 
     def begin(self, ledger: Ledger) -> None:
-        """Put the store without values in its place, or see that it is as it was put there."""
-        with _written(self._store), unfinished_folder(self._store.parent) as folder:
+        """Put the store without values in its place, or check that it is as it was put there."""
+        with _written(self._store), temporary_folder(self._store.parent) as folder:
             empty = folder / self._store.name
             self._write_blank(empty)
             files = sorted(path.relative_to(empty) for path in empty.rglob("*") if path.is_file())
@@ -407,7 +395,7 @@ class _MapStore:
             sync(self._store.parent)
 
     def _write_blank(self, path: Path) -> None:
-        """The store with names, axes and attributes; what is not written reads as not fitted."""
+        """The store with names, axes and attributes; chunks not yet written read as not fitted."""
         compressors = (ZstdCodec(), Crc32cCodec())
         encoding: dict = {str(name): {"compressors": compressors} for name in self._maps.variables}
         encoding["status"]["fill_value"] = int(Status.NOT_FITTED)
@@ -425,79 +413,69 @@ class _MapStore:
         """Refuse a store whose metadata or axes are not those that were written."""
         found = self._store / file
         if not found.is_file() or found.read_bytes() != (empty / file).read_bytes():
-            raise OutputError(
-                "it is missing, or not as it was written",
-                where=f"{self._store}: {file}",
-                hint="give another --out",
-            )
+            what, where = "it is missing, or not as it was written", f"{self._store}: {file}"
+            raise OutputError(what, where=where, hint=OTHER_OUT)
 
     def run(
         self, ledger: Ledger, source: Path, scheduler: str | None, progress: Counter | None
     ) -> None:
-        """Fit and write every block that is not on the disk as the ledger says."""
-        places = [place for place in self._places if not self._is_done(ledger, place)]
-        every = sum(map(_size, self._places))
-        done = every - sum(map(_size, places))
+        """Fit and write every block that the ledger does not hold or whose files have changed."""
+        regions = [region for region in self._regions if not self._is_done(ledger, region)]
+        every = sum(map(_size, self._regions))
+        done = every - sum(map(_size, regions))
         with workers(scheduler) as (executor, count):
             opened = self._image if scheduler is None else None  # a cluster opens it for itself
-            tasks = ((source, place, self._plan, opened) for place in places)
-            for (_, place, *_), (block, readings) in as_completed(
+            tasks = ((source, region, self._plan, opened) for region in regions)
+            for (_, region, *_), (block, readings) in as_completed(
                 executor, count, fit_file_block, tasks
             ):
                 with _written(self._store):
-                    self._write(block, place)
-                    entry = Entry(readings, _contents(self._files(place)))
-                    ledger.add(_label(place), entry)
-                done += _size(place)
+                    self._write(block, region)
+                    entry = Entry(readings, _contents(self._files(region)))
+                    ledger.add(_label(region), entry)
+                done += _size(region)
                 if progress is not None:
                     progress(done, every)
 
-    def _is_done(self, ledger: Ledger, place: Place) -> bool:
-        entry = ledger.entries.get(_label(place))
-        files = self._files(place)
+    def _is_done(self, ledger: Ledger, region: Region) -> bool:
+        entry, files = ledger.entries.get(_label(region)), self._files(region)
         if entry is None or not all(file.is_file() for file in files):
             return False
         with _written(self._store):
             return _contents(files) == entry.chunks
 
-    def _write(self, block: xr.Dataset, place: Place) -> None:
+    def _write(self, block: xr.Dataset, region: Region) -> None:
         """Write a block and wait until it is on the disk."""
         values = block.drop_vars(list(block.coords))
-        region = {dim: part for dim, part in place.items()}
         values.to_zarr(self._store, region=region, consolidated=False, write_empty_chunks=True)
-        files = self._files(place)
-        folders = {
-            folder
-            for file in files
-            for folder in file.parents
-            if folder.is_relative_to(self._store)
-        }
+        files = self._files(region)
+        folders = {up for file in files for up in file.parents if up.is_relative_to(self._store)}
         for path in (*files, *sorted(folders)):
             sync(path)
 
-    def _files(self, place: Place) -> list[Path]:
+    def _files(self, region: Region) -> list[Path]:
         """Chunk files of a block: one of each array, as the default names of Zarr have it."""
         found = []
         for name, variable in self._maps.data_vars.items():
-            at = [place[d].start // self._chunks[d] if d in IMAGE else 0 for d in variable.dims]
+            at = [region[d].start // self._chunks[d] if d in IMAGE else 0 for d in variable.dims]
             found.append(self._store.joinpath(str(name), "c", *map(str, at)))
         return found
 
     def finish(self, ledger: Ledger) -> None:
-        """Say in the store itself that it is finished, and of which readings."""
-        readings = [ledger.entries[_label(place)].readings for place in self._places]
-        with _written(self._store), unfinished_folder(self._store.parent) as folder:
+        """Mark the store as finished, with a digest of the readings."""
+        readings = [ledger.entries[_label(region)].readings for region in self._regions]
+        with _written(self._store), temporary_folder(self._store.parent) as folder:
             metadata = _metadata(self._store)
             if metadata["attributes"].get(REQUEST) != self.request:
                 raise taken_over(self._store)
             metadata["attributes"][FINISHED] = self._combined(readings)
             unfinished = folder / METADATA
             unfinished.write_text(json.dumps(metadata, indent=2))
-            move_into_place(unfinished, self._store / METADATA)
+            replace_file(unfinished, self._store / METADATA)
 
     def _combined(self, readings: Iterable[str]) -> str:
         """Digest of the readings of all blocks."""
-        labels = map(_label, self._places)
+        labels = map(_label, self._regions)
         text = "\n".join(f"{label} {one}" for label, one in zip(labels, readings, strict=True))
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -511,32 +489,30 @@ def _contents(files: Iterable[Path]) -> str:
 
 
 def _metadata(store: Path) -> dict[str, Any]:
-    """Metadata of a store, without attributes where there are none that can be read."""
-    try:
+    """Metadata of a store, without attributes where they cannot be read."""
+    found: Any = {}
+    with contextlib.suppress(OSError, ValueError):
         found = json.loads((store / METADATA).read_text())
-    except (OSError, ValueError):
-        found = None
     found = found if isinstance(found, dict) else {}
-    is_known = isinstance(found.get("attributes"), dict)
-    return found if is_known else {**found, "attributes": {}}
+    return found if isinstance(found.get("attributes"), dict) else {**found, "attributes": {}}
 
 
-def _label(place: Place) -> str:
-    return " ".join(f"{dim}={part.start}:{part.stop}" for dim, part in place.items())
+def _label(region: Region) -> str:
+    return " ".join(f"{dim}={part.start}:{part.stop}" for dim, part in region.items())
 
 
-def _size(place: Place) -> int:
-    return math.prod(part.stop - part.start for part in place.values())
+def _size(region: Region) -> int:
+    return math.prod(part.stop - part.start for part in region.values())
 
 
 def _block(image: xr.Dataset) -> int:
-    """Most pixels of a block; it follows from the image alone, so that work can be resumed."""
+    """Most pixels of a block; it depends on the image alone, so resumed maps have the same."""
     return min(BLOCK, max(LEAST, image.sizes["y"] * image.sizes["x"] // PARTS))
 
 
 @contextlib.contextmanager
 def _written(store: Path) -> Iterator[None]:
-    """What the system or the libraries below say of a store that cannot be written, as one line."""
+    """Errors of the system or the libraries below, as one line."""
     try:
         yield
     except PolarBayesError:

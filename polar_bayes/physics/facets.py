@@ -306,7 +306,7 @@ class Microsurface:
         )
 
 
-def gather(
+def sum_facets(
     sample: Facets, weight: Array, power: Diattenuation, *, least: float | None = None
 ) -> Light:
     """Light of all facets together."""

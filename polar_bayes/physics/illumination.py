@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.facets import Microsurface, Window, above_horizon, gather, inside_disc
+from polar_bayes.physics.facets import Microsurface, Window, above_horizon, inside_disc, sum_facets
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.microfacet import SlopeEllipse
 from polar_bayes.physics.part import Part, check_part, like, parameters_of, squared_rule, unit_rule
@@ -20,8 +20,8 @@ from polar_bayes.physics.stokes import (
     Light,
     LinearPolarization,
     in_turned_frame,
-    let_in,
     mirror_light,
+    transmit_inward,
 )
 
 # Directions in a disc, by angle from its center and by azimuth, when counting the light that
@@ -100,7 +100,7 @@ class AbstractIllumination(Part):
         cos_light = cos_degrees(rays.light_zenith)
         passing = stack.per_ray().transmission(cos_light, sin_degrees(rays.light_zenith) ** 2)
         per_ray = {name: value[..., None] for name, value in parameters.items()}
-        light = let_in(passing, cos_light, self.incident(per_ray, rays))
+        light = transmit_inward(passing, cos_light, self.incident(per_ray, rays))
         return rays, light._replace(intensity=irradiance * light.intensity)
 
 
@@ -160,7 +160,7 @@ class PointSource(AbstractIllumination):
     def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
         cos_light = cos_degrees(geometry.light_zenith)
         passing = stack.transmission(cos_light, sin_degrees(geometry.light_zenith) ** 2)
-        return let_in(passing, cos_light, self.incident(parameters, geometry))
+        return transmit_inward(passing, cos_light, self.incident(parameters, geometry))
 
     @override
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
@@ -225,7 +225,7 @@ class AbstractExtendedSource(AbstractIllumination):
         )
         lit = sample.weight * seen
         # A trace, far below any reading: no facet may be left where grooves are far too deep.
-        light = gather(sample, lit, power, least=float(jnp.finfo(lit.dtype).eps) ** 1.75)
+        light = sum_facets(sample, lit, power, least=float(jnp.finfo(lit.dtype).eps) ** 1.75)
         return light._replace(intensity=stack.scale / cos_view * light.intensity)
 
 

@@ -167,7 +167,9 @@ def mirror_light(
     return Light(stack.scale * total, first / lit, second / lit)
 
 
-def let_in(passing: Diattenuation, cos_light: Array, incident: tuple[Array, Array] | None) -> Light:
+def transmit_inward(
+    passing: Diattenuation, cos_light: Array, incident: tuple[Array, Array] | None
+) -> Light:
     """Light that passes the surface into the body, in the frame of the light."""
     contrast = passing.contrast * passing.sin_squared
     if incident is None:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polar_bayes.physics.facets import FacetQuadrature, Facets, Microsurface, gather, seen
+from polar_bayes.physics.facets import FacetQuadrature, Facets, Microsurface, seen, sum_facets
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.illumination import AbstractIllumination, PointSource
 from polar_bayes.physics.microfacet import (
@@ -80,7 +80,7 @@ class RoughExit(AbstractExit):
         sample = Facets(*jax.lax.optimization_barrier(tuple(sample)))
         passing = stack.per_facet().transmission(sample.cos_incidence, sample.sin_squared)
         area = jnp.sum(sample.weight, axis=-2)
-        light = gather(sample, sample.weight, passing)
+        light = sum_facets(sample, sample.weight, passing)
         light = light._replace(intensity=light.intensity / area)
         return Light(*jax.lax.optimization_barrier(tuple(light)))
 

@@ -24,8 +24,8 @@ from polar_bayes.calibration.verdict import (
 )
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.errors import FitError, one_line
-from polar_bayes.inference.batch_result import Approach, Status
-from polar_bayes.inference.psis import LARGEST_TRUSTED
+from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, text
 from polar_bayes.reporting import plots_calibration as figures
@@ -259,7 +259,7 @@ def _readings(
         "spread": column("rank_spread", ".3f"),
         "untrusted": column("untrusted", ",.0f"),
     }
-    caption = text.caption("calibration.reading", level=level, largest_trusted=LARGEST_TRUSTED)
+    caption = text.caption("calibration.reading", level=level, largest_trusted=MAX_PARETO_K)
     table = page.make_table(
         "reading",
         caption,
@@ -280,7 +280,7 @@ def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterato
     status = text.caption("calibration.status")
     tables: dict[str, tuple[type[enum.IntEnum], Mapping[str, str], str]] = {
         "status": (Status, STATUSES, status),
-        "approach": (Approach, text.APPROACHES, "How the numbers of each fit were found."),
+        "approach": (MethodUsed, text.APPROACHES, "How the numbers of each fit were found."),
     }
     for name, (known, meanings, caption) in tables.items():
         if name not in fits:
@@ -314,8 +314,8 @@ def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
         k = fits["pareto_k"].to_numpy()
         known = k[~np.isnan(k)]
         if known.size:
-            above = int(np.sum(known > LARGEST_TRUSTED))
-            facts[f"Pareto k above {LARGEST_TRUSTED:g}"] = (
+            above = int(np.sum(known > MAX_PARETO_K))
+            facts[f"Pareto k above {MAX_PARETO_K:g}"] = (
                 f"{above:,} of {known.size:,} fits that know it "
                 f"({text.count_percent(above, known.size)})"
             )

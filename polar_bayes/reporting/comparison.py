@@ -52,11 +52,12 @@ def plot_comparison(comparison: FitComparison) -> Figure:
     for axes, label in zip(panels, labels, strict=True):
         for name, row in finite.xs(label, level="parameter").iterrows():
             at, color = -fits.index(str(name)), colors[str(name)]
-            ends, dashes = [row["q2.5"], row["q97.5"]], (1, 0)
+            ends = [row["q2.5"], row["q97.5"]]
+            line: Any = "-"
             if not np.isfinite(ends).all():  # a point fit
                 ends = [row["mean"] - 2.0 * row["sd"], row["mean"] + 2.0 * row["sd"]]
-                dashes = (2, 1)
-            axes.plot(ends, [at, at], color=color, lw=2.0, ls=(0, dashes), solid_capstyle="butt")
+                line = (0, (2, 1))
+            axes.plot(ends, [at, at], color=color, lw=2.0, ls=line, solid_capstyle="butt")
             axes.plot([row["mean"]], [at], "o", color=color, ms=4.5)
         axes.set(ylim=(0.6 - len(fits), 0.4), yticks=[])
         axes.spines["left"].set_visible(False)

@@ -15,12 +15,11 @@ from matplotlib.figure import Figure
 from polar_bayes.diagnostics.coverage import BLOCK, INTERVALS, map_coverage, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
-from polar_bayes.inference.batch_fit import FEWEST_VIEWS
-from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.batch_result import MIN_VIEWS, Status
 from polar_bayes.inference.batching import IMAGE
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.fit_map import checked_status, cut
-from polar_bayes.maps.lazy import at_hand
+from polar_bayes.maps.lazy import ensure_loaded
 from polar_bayes.physics.part import notation
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts
@@ -30,7 +29,7 @@ from polar_bayes.reporting.text import APPROACHES, DASH, SLIGHT, count_percent, 
 STATUSES = {
     "good": "an answer that the checks let pass",
     "masked": "no valid reading",
-    "too few views": f"fewer than {FEWEST_VIEWS} valid views",
+    "too few views": f"fewer than {MIN_VIEWS} valid views",
     "not converged": "no answer was reached; NaN",
     "not trusted": "numbers that no check confirms, by the approach in the next table",
     "not fitted": "called good without finite numbers, or never written",
@@ -210,7 +209,7 @@ def map_page(
     if any(name not in maps for name in TRUST):
         raise FitError("it holds no maps", where="report", hint="give what fit_pixels returns")
     _check_uncorrected(maps, truth, uncorrected)
-    maps, provenance = at_hand(maps), provenance_of(maps)
+    maps, provenance = ensure_loaded(maps), provenance_of(maps)
     counts = count_cases(maps)
     headline, passed = text.map_headline(counts)
     is_weighted = _is_weighted(provenance, default=True)

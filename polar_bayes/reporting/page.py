@@ -19,9 +19,9 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 
-from polar_bayes.paths import check_output, move_into_place, unfinished_folder, written
+from polar_bayes.paths import check_output, replace_file, temporary_folder, write_errors
 from polar_bayes.reporting.style import FIXED_STYLE
-from polar_bayes.repr_html import Grid
+from polar_bayes.repr_html import DisplayTable
 
 PAGE = "index.html"
 MARK, MARK_BYTES = b'<meta name="generator" content="polar_bayes">', 1024
@@ -82,10 +82,10 @@ class Table:
         """True where a page would be mostly this table."""
         return len(self.rows) > LONG_TABLE
 
-    def grid(self, max_rows: int) -> Grid:
+    def grid(self, max_rows: int) -> DisplayTable:
         """The first rows, for a notebook or a terminal."""
         rows = tuple((row.name, *row.cells) for row in self.rows[:max_rows])
-        return Grid(self.columns, rows, numeric=True)
+        return DisplayTable(self.columns, rows, numeric=True)
 
 
 type Cells = Mapping[str, Callable[[pd.Series], str]]
@@ -246,17 +246,17 @@ def write_page(
     folder: Path, page: str, others: Mapping[str, Callable[[Path], object]] | None = None
 ) -> Path:
     """Write a page and the files that belong to it; an older report in the folder is replaced."""
-    with written(folder):
+    with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     is_report = _is_page(folder / PAGE)
     names = (*(others or {}), PAGE)
     files = {name: check_output(folder / name, lambda _: is_report) for name in names}
-    with written(folder), unfinished_folder(folder) as unfinished:
+    with write_errors(folder), temporary_folder(folder) as unfinished:
         (unfinished / PAGE).write_text(page, encoding="utf-8")
         for name, write in (others or {}).items():
             write(unfinished / name)
         for name, file in files.items():
-            move_into_place(unfinished / name, file)
+            replace_file(unfinished / name, file)
     return folder / PAGE
 
 

@@ -37,49 +37,6 @@ MAX_ROWS = 6
 COLUMNS = 3
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Curve:
-    """One wavelength of one material: readings and predictions, each by view."""
-
-    title: str
-    zenith: np.ndarray
-    azimuth: np.ndarray
-    light_zenith: np.ndarray
-    observed: np.ndarray
-    fitted: np.ndarray
-    saturated: np.ndarray
-    levels: np.ndarray
-    center: np.ndarray
-
-    def at(self, views: np.ndarray) -> "Curve":
-        """The same with some of the views, sorted by zenith."""
-        order = np.flatnonzero(views & np.isfinite(self.zenith))
-        order = order[np.argsort(self.zenith[order], kind="stable")]
-        arrays = {
-            field.name: getattr(self, field.name)[..., order]
-            for field in dataclasses.fields(self)
-            if field.name != "title"
-        }
-        return Curve(title=self.title, **arrays)
-
-    def minus_center(self) -> "Curve":
-        """Readings and predictions as distances from the fitted curve."""
-        return dataclasses.replace(
-            self,
-            observed=self.observed - self.center,
-            levels=self.levels - self.center,
-            center=np.zeros_like(self.center),
-        )
-
-    @property
-    def is_smooth(self) -> bool:
-        """True where neighbors in zenith belong to one curve: one light, or the light follows."""
-        if self.zenith.size < 3:
-            return False
-        follows = np.allclose(self.light_zenith, self.zenith, atol=1.0)
-        return bool(np.ptp(self.light_zenith) < 0.5) or follows
-
-
 def variables(result: xr.DataTree) -> list[str]:
     """The recorded variables of a result that can be drawn, polarization first."""
     check_fit(result)
@@ -96,8 +53,8 @@ def _missing(result: xr.DataTree, name: str) -> str:
     return "" if result["observed_data"].to_dataset()[name].sizes.get("view") else "view"
 
 
-def curves(result: xr.DataTree, name: str) -> list[Curve]:
-    """One recorded variable and its prediction, split by material and wavelength."""
+def curves(result: xr.DataTree, name: str) -> list[xr.Dataset]:
+    """One recorded variable and its prediction by view, for each material and wavelength."""
     if name not in variables(result):
         lacks = f", for it has no {_missing(result, name)}" if name in QUANTITIES else ""
         raise FitError(
@@ -105,55 +62,54 @@ def curves(result: xr.DataTree, name: str) -> list[Curve]:
             where="figure",
             hint=f"choose one of {', '.join(variables(result)) or 'none'}",
         )
-    observed = result["observed_data"].to_dataset()[name]
-    lead = [str(dim) for dim in observed.dims if dim != "view"]
+    observed = result["observed_data"].to_dataset()[name].astype(float)
     constants = result["constant_data"].to_dataset()
+    predicted = result["posterior_predictive"][name].astype(float)
+    levels = predicted.quantile(LEVELS, SAMPLE_DIMS, skipna=False)
+    if predicted.sizes["chain"] * predicted.sizes["draw"] == 1:
+        # A point fit has a single draw, whose quantiles would look like certainty.
+        levels = levels * np.nan
+    turn = constants["view_azimuth"] - constants["light_azimuth"]
+    data = xr.Dataset(
+        {
+            "observed": observed,
+            "fitted": constants["valid"].astype(bool),
+            "saturated": constants["saturated"].astype(bool),
+            "center": result["noise_free"][name].astype(float).median(SAMPLE_DIMS, skipna=False),
+            "levels": levels,
+            "zenith": constants["view_zenith"],
+            "light_zenith": constants["light_zenith"],
+            "azimuth": np.abs((turn + 180.0) % 360.0 - 180.0),
+        }
+    ).map(lambda variable: variable.broadcast_like(observed))
+    lead = [str(dim) for dim in observed.dims if dim != "view"]
+    found = []
+    for scalar in scalars(xr.Dataset({"x": observed.isel(view=0).expand_dims(SAMPLE_DIMS)})):
+        title = ", ".join(style.coordinate_label(dim, scalar.labels[dim]) for dim in lead)
+        curve = data.isel(scalar.index).transpose(..., "view")
+        found.append(curve.assign_attrs(title=title))
+    return found
 
-    def by_view(values: xr.DataArray) -> np.ndarray:
-        return values.broadcast_like(observed).transpose(*lead, "view").to_numpy()
 
-    values = by_view(observed).astype(float)
-    center, draws = (
-        result[group][name]
-        .transpose(*SAMPLE_DIMS, *lead, "view")
-        .to_numpy()
-        .astype(float)
-        .reshape(-1, *values.shape)
-        for group in ("noise_free", "posterior_predictive")
+def minus_center(curve: xr.Dataset) -> xr.Dataset:
+    """Readings and predictions as distances from the fitted curve."""
+    return curve.assign(
+        {name: curve[name] - curve["center"] for name in ("observed", "levels", "center")}
     )
-    center = np.median(center, axis=0)
-    # A point fit has a single draw, whose quantiles would look like certainty.
-    levels = np.full((len(LEVELS), *center.shape), np.nan)
-    if len(draws) > 1:
-        levels = np.quantile(draws, LEVELS, axis=0)
-    angles = {key: by_view(constants[key]) for key in GEOMETRY}
-    fitted, saturated = (by_view(constants[key]).astype(bool) for key in ("valid", "saturated"))
-    azimuth = np.abs((angles["view_azimuth"] - angles["light_azimuth"] + 180.0) % 360.0 - 180.0)
-    titles = _titles(observed, lead)
-    return [
-        Curve(
-            title=titles[place],
-            zenith=angles["view_zenith"][place],
-            azimuth=azimuth[place],
-            light_zenith=angles["light_zenith"][place],
-            observed=values[place],
-            fitted=fitted[place],
-            saturated=saturated[place],
-            levels=levels[(slice(None), *place)],
-            center=center[place],
-        )
-        for place in np.ndindex(values.shape[:-1])
-    ]
 
 
-def _titles(observed: xr.DataArray, lead: list[str]) -> Mapping[tuple[int, ...], str]:
-    first = xr.Dataset({"x": observed.isel(view=0, drop=True).expand_dims(SAMPLE_DIMS)})
-    return {
-        tuple(scalar.index[dim] for dim in lead): ", ".join(
-            style.coordinate_label(dim, scalar.labels[dim]) for dim in lead
-        )
-        for scalar in scalars(first)
-    }
+def _at(curve: xr.Dataset, views: np.ndarray) -> xr.Dataset:
+    """Some of the views, sorted by zenith."""
+    chosen = curve.isel(view=np.flatnonzero(views & np.isfinite(curve["zenith"].to_numpy())))
+    return chosen.isel(view=np.argsort(chosen["zenith"].to_numpy(), kind="stable"))
+
+
+def _is_smooth(curve: xr.Dataset) -> bool:
+    """True where neighbors in zenith belong to one curve: one light, or the light follows."""
+    zenith, light = curve["zenith"].to_numpy(), curve["light_zenith"].to_numpy()
+    if zenith.size < 3:
+        return False
+    return bool(np.ptp(light) < 0.5 or np.allclose(light, zenith, atol=1.0))
 
 
 @style.styled
@@ -194,12 +150,14 @@ def plot_residuals(result: xr.DataTree, name: str) -> Figure:
     Raises:
         FitError: The result has no such variable.
     """
-    residuals = [curve.minus_center() for curve in curves(result, name)]
+    residuals = [minus_center(curve) for curve in curves(result, name)]
     label = f"{SHORT[name]} minus fit"
     return _draw_readings(result, residuals, label, label)
 
 
-def _draw_readings(result: xr.DataTree, found: list[Curve], label: str, short_label: str) -> Figure:
+def _draw_readings(
+    result: xr.DataTree, found: list[xr.Dataset], label: str, short_label: str
+) -> Figure:
     azimuths = _azimuths(found)
     if len(azimuths) > 1:
         shown = found[:MAX_ROWS]
@@ -212,7 +170,7 @@ def _draw_readings(result: xr.DataTree, found: list[Curve], label: str, short_la
     for axes, curve in panels:
         drawn |= _draw_curve(axes, curve, limit)
     style.set_tick_style(figure.axes)
-    zenith = np.concatenate([curve.zenith for curve in found])
+    zenith = np.concatenate([curve["zenith"] for curve in found])
     zenith = zenith[np.isfinite(zenith)]
     low, high = (float(zenith.min()), float(zenith.max())) if zenith.size else (0.0, 90.0)
     margin = max(0.03 * (high - low), 1.0)
@@ -226,27 +184,27 @@ def _draw_readings(result: xr.DataTree, found: list[Curve], label: str, short_la
     return figure
 
 
-type Panels = list[tuple[Axes, Curve]]
+type Panels = list[tuple[Axes, xr.Dataset]]
 
 
 def _panels_by_azimuth(
-    shown: list[Curve], azimuths: list[float], label: str
+    shown: list[xr.Dataset], azimuths: list[float], label: str
 ) -> tuple[Figure, Panels]:
     """A row for each curve, a column for each azimuth."""
     figure = style.NotebookFigure(figsize=(8.2, 1.75 * len(shown) + 0.9), layout="constrained")
     axes = figure.subplots(len(shown), len(azimuths), sharex=True, sharey=True, squeeze=False)
     panels: Panels = []
     for row, curve in zip(axes, shown, strict=True):
-        lines = [style.label_text(line, 24) for line in (label, curve.title) if line]
+        lines = [style.label_text(line, 24) for line in (label, curve.attrs["title"]) if line]
         row[0].set_ylabel("\n".join(lines))
         for each, azimuth in zip(row, azimuths, strict=True):
-            panels.append((each, curve.at(np.round(curve.azimuth) == azimuth)))
+            panels.append((each, _at(curve, np.round(curve["azimuth"].to_numpy()) == azimuth)))
     for each, azimuth in zip(axes[0], azimuths, strict=True):
         each.set_title(_azimuth_title(azimuth))
     return figure, panels
 
 
-def _panels_by_curve(shown: list[Curve], label: str) -> tuple[Figure, Panels]:
+def _panels_by_curve(shown: list[xr.Dataset], label: str) -> tuple[Figure, Panels]:
     """One panel for each curve, whatever its azimuths."""
     columns = {1: 1, 2: 2, 4: 2}.get(len(shown), COLUMNS)
     rows = -(-len(shown) // columns)
@@ -255,8 +213,8 @@ def _panels_by_curve(shown: list[Curve], label: str) -> tuple[Figure, Panels]:
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     panels: Panels = []
     for each, curve in zip(axes.flat, shown, strict=False):
-        panels.append((each, curve.at(np.ones(curve.zenith.shape, bool))))
-        each.set_title(style.wrap(style.label_text(curve.title), 34))
+        panels.append((each, _at(curve, np.ones(curve.sizes["view"], bool))))
+        each.set_title(style.wrap(style.label_text(curve.attrs["title"]), 34))
     for row in axes:
         row[0].set_ylabel(label)
     for each in axes.flat[len(shown) :]:
@@ -266,9 +224,9 @@ def _panels_by_curve(shown: list[Curve], label: str) -> tuple[Figure, Panels]:
     return figure, panels
 
 
-def _azimuths(found: list[Curve]) -> list[float]:
+def _azimuths(found: list[xr.Dataset]) -> list[float]:
     """The distinct azimuths between view and light, to the degree; none if there are many."""
-    azimuths = np.concatenate([curve.azimuth for curve in found])
+    azimuths = np.concatenate([curve["azimuth"] for curve in found])
     distinct = sorted(set(np.round(azimuths[np.isfinite(azimuths)])), reverse=True)
     return [float(each) for each in distinct] if len(distinct) <= MAX_AZIMUTHS else []
 
@@ -278,19 +236,17 @@ def _azimuth_title(azimuth: float) -> str:
     return f"azimuth {azimuth:g}°{side}"
 
 
-def _draw_curve(axes: Axes, curve: Curve, limit: float) -> set[str]:
+def _draw_curve(axes: Axes, curve: xr.Dataset, limit: float) -> set[str]:
     """Draw one panel; returns the keys of the legend entries that it uses."""
     drawn = _draw_prediction(axes, curve)
     markers = _reading_markers()
-    observed = np.isfinite(curve.observed)
-    for key, chosen in (
-        ("reading", observed & ~curve.saturated),
-        ("saturated", observed & curve.saturated),
-    ):
+    zenith, readings = curve["zenith"].to_numpy(), curve["observed"].to_numpy()
+    observed, saturated = np.isfinite(readings), curve["saturated"].to_numpy()
+    for key, chosen in (("reading", observed & ~saturated), ("saturated", observed & saturated)):
         if chosen.any():
-            axes.plot(curve.zenith[chosen], curve.observed[chosen], zorder=5, **markers[key])
+            axes.plot(zenith[chosen], readings[chosen], zorder=5, **markers[key])
             drawn.add(key)
-    masked = curve.zenith[~observed]
+    masked = zenith[~observed]
     if masked.size:
         transform = axes.get_xaxis_transform()
         height = np.full(masked.size, 0.03)
@@ -302,21 +258,23 @@ def _draw_curve(axes: Axes, curve: Curve, limit: float) -> set[str]:
     return drawn
 
 
-def _draw_prediction(axes: Axes, curve: Curve) -> set[str]:
-    if not curve.zenith.size:
+def _draw_prediction(axes: Axes, curve: xr.Dataset) -> set[str]:
+    zenith, levels = curve["zenith"].to_numpy(), curve["levels"].to_numpy()
+    if not zenith.size:
         return set()
-    line: dict[str, Any] = {"lw": 1.4} if curve.is_smooth else {"marker": "_", "ms": 7, "mew": 1.4}
-    ls = "-" if curve.is_smooth else ""
-    axes.plot(curve.zenith, curve.center, color=BLUE, zorder=3, ls=ls, **line)
+    is_smooth = _is_smooth(curve)
+    line: dict[str, Any] = {"marker": "_", "ms": 7, "mew": 1.4, "ls": ""}
+    line = {"lw": 1.4} if is_smooth else line
+    axes.plot(zenith, curve["center"].to_numpy(), color=BLUE, zorder=3, **line)
     # Where a reading is missing, so may be its error: the scatter there is not known.
-    known = curve.fitted & np.isfinite(curve.levels).all(axis=0)
+    known = curve["fitted"].to_numpy() & np.isfinite(levels).all(axis=0)
     if not known.any():
         return {"median"}
-    zenith, levels = curve.zenith[known], curve.levels[:, known]
+    zenith, levels = zenith[known], levels[:, known]
     for inner, share, width in ((0, 0.78, 2.0), (1, 0.5, 4.5)):
         low, high = levels[inner], levels[-1 - inner]
         color = lighten(BLUE, share)
-        if curve.is_smooth:
+        if is_smooth:
             axes.fill_between(zenith, low, high, color=color, lw=0)
         else:
             axes.vlines(zenith, low, high, color=color, lw=width)

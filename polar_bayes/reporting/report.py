@@ -26,7 +26,7 @@ from polar_bayes.reporting.fit_page import fit_page, parameter_table, read_fit
 from polar_bayes.reporting.page import Page, Table, write_page
 from polar_bayes.reporting.plots_calibration import parameter_ranks
 from polar_bayes.reporting.style import in_default_style
-from polar_bayes.repr_html import Card
+from polar_bayes.repr_html import DisplaySummary
 
 MAX_ROWS = 40
 """Rows of a table in a notebook or a terminal."""
@@ -96,7 +96,7 @@ def render(result: Any, **options: Any) -> str:
     return kind.page(result, **given).html
 
 
-def show(result: xr.DataTree | xr.Dataset) -> Card:
+def show(result: xr.DataTree | xr.Dataset) -> DisplaySummary:
     """What a result says, for the last line of a cell.
 
     Args:
@@ -117,16 +117,16 @@ def show(result: xr.DataTree | xr.Dataset) -> Card:
 
 def _make_card(
     provenance: Mapping[str, Any], kind: str, sentences: list[str], table: Table, passed: bool
-) -> Card:
+) -> DisplaySummary:
     """`leaf: fit`, sentences and the first rows of a table."""
     total = len(table.rows)
     more = [f"The first {MAX_ROWS} of {total} rows."] if total > MAX_ROWS else []
     title = f"{text.capture_name(provenance)}: {kind}"
     lines = tuple(filter(None, [*sentences, *more]))
-    return Card(title, lines, (table.grid(MAX_ROWS),), passed)
+    return DisplaySummary(title, lines, (table.grid(MAX_ROWS),), passed)
 
 
-def _fit_card(result: xr.DataTree) -> Card:
+def _fit_card(result: xr.DataTree) -> DisplaySummary:
     fit = read_fit(result)
     sentences = [
         fit.headline(),
@@ -139,7 +139,7 @@ def _fit_card(result: xr.DataTree) -> Card:
     return _make_card(fit.provenance, "fit", sentences, parameter_table(fit), converged)
 
 
-def _map_card(result: xr.Dataset) -> Card:
+def _map_card(result: xr.Dataset) -> DisplaySummary:
     table = maps.parameter_table(result, maps.parameter_titles(map_scalars(result)))
     counts = maps.count_cases(result)
     headline, passed = text.map_headline(counts)
@@ -147,7 +147,7 @@ def _map_card(result: xr.Dataset) -> Card:
     return _make_card(provenance_of(result), "map", sentences, table, passed)
 
 
-def _calibration_card(calibration: xr.DataTree) -> Card:
+def _calibration_card(calibration: xr.DataTree) -> DisplaySummary:
     table = calibration_table(calibration)
     ranks = rank_table(table, parameter_ranks(calibration, table))
     _, passed = text.calibration_headline(table, None)
@@ -155,7 +155,7 @@ def _calibration_card(calibration: xr.DataTree) -> Card:
     return _make_card(provenance_of(calibration), "calibration", sentences, ranks, passed)
 
 
-def _accuracy_card(result: xr.DataTree) -> Card:
+def _accuracy_card(result: xr.DataTree) -> DisplaySummary:
     study = accuracy_dataset(result)
     sentences = [*accuracy_sentences(study), text.reference_sentence(study)]
     passed = not study.attrs["reference_doubts"]
@@ -172,7 +172,7 @@ class Kind:
     name: str
     applies: Callable[[Any], bool]
     page: Callable[..., Page]
-    card: Callable[[Any], Card] = _fit_card
+    card: Callable[[Any], DisplaySummary] = _fit_card
     options: tuple[str, ...] = ()
     file: str = ""
 

@@ -24,8 +24,8 @@ from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.population import Population
 from polar_bayes.diagnostics.predictive import PitBand, PredictiveCheck, pit_band
 from polar_bayes.errors import one_line
-from polar_bayes.inference.batch_fit import FEWEST_VIEWS
-from polar_bayes.inference.psis import LARGEST_TRUSTED
+from polar_bayes.inference.batch_result import MIN_VIEWS
+from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.reporting.style import QUANTITIES, coordinate_labels, short_title
 
 # --- Numbers as text, with the digits that they deserve -------------------------------------------
@@ -510,9 +510,9 @@ def pixel_sentences(counts: pd.DataFrame) -> list[str]:
         )
     phrases = {
         "masked": "masked: no reading there is valid.",
-        "too few views": f"read in fewer than {FEWEST_VIEWS} views and not fitted.",
+        "too few views": f"read in fewer than {MIN_VIEWS} views and not fitted.",
         "not converged": "not converged: no start led to an answer, and the maps are NaN there.",
-        "not trusted": f"not trusted: Pareto k is above {LARGEST_TRUSTED:g}, or the effective "
+        "not trusted": f"not trusted: Pareto k is above {MAX_PARETO_K:g}, or the effective "
         "sample size is too small, and no other method confirmed them. The maps show their numbers "
         "there; do not quote them.",
         "not fitted": "not fitted: they are called good without finite numbers, or were never "
@@ -625,9 +625,9 @@ def reference_sentence(result: xr.DataTree | xr.Dataset) -> str:
     """What the reference is, and how accurate it is."""
     study = accuracy_dataset(result).attrs
     sentence = (
-        f"The reference is {study['reference_draws']:,} draws of {study['reference']}, worth "
-        f"{study['reference_effective_draws']:,.0f} independent ones; its own Monte Carlo error is "
-        f"at most {study['reference_error']:.2g} posterior sd."
+        f"The reference is {study['reference_draws']:,} draws of {study['reference']} with an "
+        f"effective sample size of {study['reference_effective_draws']:,.0f}; its own Monte Carlo "
+        f"error is at most {study['reference_error']:.2g} posterior sd."
     )
     doubts = study["reference_doubts"]
     return f"{sentence} Against it speaks: {doubts}." if doubts else sentence

@@ -16,14 +16,13 @@ import polar_bayes as pb
 from polar_bayes.benchmark import run
 from polar_bayes.benchmark.accuracy import AS_GIVEN
 from polar_bayes.benchmark.reference import ReferenceRun, best_reference, run_reference
-from polar_bayes.benchmark.run import AbstractOverride, Trial, problem_of, run_fresh
-from polar_bayes.effects.variants import parameter_ranks
-from polar_bayes.inference.mcse import errors_of, standard_errors
+from polar_bayes.benchmark.run import AbstractOverride, Trial, run_fresh
+from polar_bayes.effects.variants import parts_of
+from polar_bayes.inference.mcse import standard_errors
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
-from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.resampling import choose
-from polar_bayes.inference.run_method import draws_of
+from polar_bayes.inference.resampling import systematic_resample
 
 LINKS = {"q": pb.links.StokesLink()}
 ROUGHLY = pb.benchmark.Reference(error=0.05, longer=0)
@@ -44,7 +43,7 @@ class Biased(AbstractMethod):
     draws: int = 4000
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
+    def run(self, problem, key, progress) -> PosteriorDraws:
         mean, covariance = of_line(np.asarray(problem.data.readings["q"]))
         sd = np.sqrt(np.diagonal(covariance))
         random = np.random.default_rng(0)
@@ -57,7 +56,7 @@ class Broken(AbstractMethod):
     """A method that never has an answer."""
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
+    def run(self, problem, key, progress) -> PosteriorDraws:
         raise pb.FitError("it cannot be", where="Broken", hint="nothing")
 
 
@@ -141,7 +140,7 @@ def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
         raise pb.FitError("no peak", where="choose_effects", hint="nothing")
 
     monkeypatch.setattr(run, "choose_effects", refuse)
-    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
     for method in (pb.methods.Laplace(), pb.methods.Nuts()):
         with pytest.raises(pb.FitError, match="no peak"):
             pb.benchmark.EffectsOverride().apply(request, method)
@@ -171,10 +170,10 @@ def test_without_processes_of_their_own_first_times_and_memory_are_not_told(stud
 
 @pytest.mark.thorough
 def test_facets_are_turned_where_there_are_any():
-    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
     changed, method = pb.benchmark.FacetsOverride(0.5).apply(request, pb.methods.Nuts())
     before, after = (
-        [part for _, part in parameter_ranks(scene) if isinstance(part, pb.physics.FacetQuadrature)]
+        [part for _, part in parts_of(scene) if isinstance(part, pb.physics.FacetQuadrature)]
         for scene in (request.scene, changed.scene)
     )
     assert len(before) == len(after) > 0
@@ -189,21 +188,21 @@ def test_facets_are_turned_where_there_are_any():
 
 
 def test_an_override_of_draws_turns_what_its_name_says_or_nothing():
-    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
     quarter = pb.benchmark.DrawsOverride(0.25)
-    for name, method in pb.methods.LADDER.items():
+    for name, method in pb.methods.STUDY_METHODS.items():
         changed = quarter.apply(request, method)
         assert (changed is None) == (name in ("point", "nuts short"))  # no draws, or too few
         if changed is not None:
-            assert draws_of(changed[1]) == pytest.approx(0.25 * draws_of(method), abs=1)
+            assert changed[1].num_draws == pytest.approx(0.25 * method.num_draws, abs=1)
     # A crowd and a half, of which half would be three quarters: fewer than the crowd.
-    few = pb.methods.Tempered(pb.methods.PixelTempering(draws=1536))
+    few = pb.methods.Tempered(pb.methods.PixelSMC(draws=1536))
     assert pb.benchmark.DrawsOverride(0.5).apply(request, few) is None
     enough = pb.benchmark.DrawsOverride(0.5).apply(
-        request, pb.methods.Tempered(pb.methods.PixelTempering(draws=3072))
+        request, pb.methods.Tempered(pb.methods.PixelSMC(draws=3072))
     )
     assert enough is not None
-    assert draws_of(enough[1]) == 3072
+    assert enough[1].num_draws == 3072
 
 
 @pytest.mark.thorough
@@ -219,8 +218,8 @@ def test_every_override_has_a_name_of_its_own():
 
 
 def test_where_chains_miss_a_mode_tempered_draws_are_the_reference():
-    request = resolve(capture(), squared, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    reference = run_reference(ROUGHLY, problem_of(request, jax.random.key(0)))
+    request = resolve(capture(), squared, "paper", None, LINKS, 90.0, 0, "double")
+    reference = run_reference(ROUGHLY, make_problem(request, jax.random.key(0)), jax.random.key(1))
     assert reference.method == "tempered draws"
     assert not reference.doubts
     # Its own error is that of the weights, too.
@@ -253,9 +252,9 @@ def test_draws_chosen_by_weight_have_the_error_of_their_weights_too():
         z = 1.5 * random.standard_normal((count, 1))
         weights = np.exp(-0.5 * z[:, 0] ** 2 * (1.0 - 1.0 / 1.5**2))
         weights /= weights.sum()
-        chosen = z[choose(weights, 1.0 / np.sum(weights**2), random)]
+        chosen = z[systematic_resample(weights, 1.0 / np.sum(weights**2), random)]
         found = PosteriorDraws("tempered", chosen, {}, weighted=(z, weights))
-        mean, _ = errors_of(found, lambda z: np.moveaxis(z, -1, 0))
+        mean, _ = found.standard_errors(lambda z: np.moveaxis(z, -1, 0))
         told.append(mean[0])
         seen.append(chosen.mean())
     # A standard normal, of which the weights alone lose 0.0197 and choosing as many as they are
@@ -269,8 +268,8 @@ def test_the_tempered_reference_draws_what_its_own_error_takes():
     settings = pb.benchmark.Reference(error=0.02).tempered.settings
     assert settings.effective_draws == pytest.approx(4.0 / 0.02**2)
     least = 4 * settings.effective_draws
-    assert least <= settings.answer_draws < least + settings.crowd
-    assert settings.crowd == 8192
+    assert least <= settings.answer_draws < least + settings.num_particles
+    assert settings.num_particles == 8192
 
 
 @each(
@@ -304,7 +303,7 @@ def test_a_process_of_its_own_finds_no_compiled_programs(monkeypatch):
 
 @pytest.mark.thorough
 def test_a_trial_runs_in_a_process_of_its_own():
-    request = resolve(capture(), line, "nuts", "paper", None, LINKS, 90.0, 0, "double")
+    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
     found = run_fresh(Trial(request, pb.methods.Laplace(draws=50), 0))
     assert found.labels == ("level", "slope")
     assert found.draws.shape == (2, 4, 50)

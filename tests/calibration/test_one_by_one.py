@@ -13,16 +13,17 @@ from plates import LINKS, PLATE, plate_capture, plates
 from spectral_plates import spectral_plate
 
 import polar_bayes as pb
-from polar_bayes.calibration import runner
 from polar_bayes.calibration.calibrate import METHODS, _settings
 from polar_bayes.calibration.runner import Method
 from polar_bayes.errors import FitError
-from polar_bayes.inference import hierarchical_reparam
-from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference import hierarchical_reparam, problem
+from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.method import thin_draws
 from polar_bayes.inference.problem import compile_model
 from polar_bayes.inference.program import PIECE, parameters_of
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
+from polar_bayes.progress import no_progress
 
 COUNT, PATCHES, VIEWS, NOISE = 80, 3, 4, 0.5
 SHORT = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
@@ -81,7 +82,7 @@ def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
         assert np.abs(table[f"held_{percent}"] - share).max() < 3.3 * error
     assert exact["truth"]["level"].dims == ("simulation", "patch")
     assert (exact["fits"]["status"] == Status.GOOD).all()
-    assert (exact["fits"]["approach"] == Approach.LAPLACE).all()
+    assert (exact["fits"]["approach"] == MethodUsed.LAPLACE).all()
 
 
 @pytest.mark.thorough
@@ -109,7 +110,7 @@ def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Datase
     found = pb.calibrate(capture, simulations=20, model=population, method=SHORT, **ASKED)
     fits = found["fits"].to_dataset()
     assert (fits["status"] == Status.NOT_TRUSTED).all()  # 100 draws are not worth 400
-    assert (fits["approach"] == Approach.NUTS).all()
+    assert (fits["approach"] == MethodUsed.NUTS).all()
     assert (fits["effective_draws"] < 400.0).all()
     assert np.isfinite(found["prior_sbc"]["level"]).all()
     said = pb.calibration.calibration_verdict(found)
@@ -122,7 +123,7 @@ def test_fits_without_draws_are_counted(
     capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever a fit raises for want of a peak: it is not left out, and has no rank."""
-    inner = runner.CompiledModel.initializer.func
+    inner = problem.CompiledModel.initializer.func
     refused = []
 
     class Refusing:
@@ -136,7 +137,7 @@ def test_fits_without_draws_are_counted(
             return self._grounds.find(data, key, progress)
 
     monkeypatch.setattr(
-        runner.CompiledModel, "initializer", property(lambda self: Refusing(inner(self)))
+        problem.CompiledModel, "initializer", property(lambda self: Refusing(inner(self)))
     )
     laplace = pb.methods.Laplace(draws=50, chains=1)
     found = pb.calibrate(capture, simulations=24, model=population, method=laplace, **ASKED)
@@ -155,7 +156,7 @@ def test_chains_are_those_of_a_fit_where_weighted_draws_do_not_reach(capture: xr
     def taken(
         method: str | Method | None, capture: xr.Dataset, scene: str | pb.Scene = PLATE
     ) -> Method:
-        request = resolve(capture, "per_material", "laplace", scene, None, LINKS, None, 0, "double")
+        request = resolve(capture, "per_material", scene, None, LINKS, None, 0, "double")
         return _settings(method, request)
 
     assert taken(None, one) == METHODS["tempered"]
@@ -168,15 +169,12 @@ def test_chains_are_those_of_a_fit_where_weighted_draws_do_not_reach(capture: xr
 
 def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
     """The same posterior: mean and spread against the closed form."""
-    request = resolve(capture, population, SHORT, PLATE, None, LINKS, None, 0, "double")
+    request = resolve(capture, population, PLATE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
-    compiled_model = compile_model(request, PLATE, data)
+    compiled_model = compile_model(request, data)
     settings = pb.methods.Laplace(draws=4000, chains=1)
-    told = runner._fit(
-        compiled_model.initializer, compiled_model.program, settings, data, jax.random.key(1)
-    )
-    assert told is not None
-    _, parameters = told
+    here = problem.Problem(compiled_model, data, jax.random.key(1))
+    parameters = here.constrain(settings.run(here, jax.random.key(2), no_progress).z)
     q = np.asarray(data.readings["q"])
     # Patch means are normal around the location with the variance of a patch and of its mean.
     spread = 1.0 + NOISE**2 / VIEWS
@@ -189,9 +187,9 @@ def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
 
 @pytest.mark.thorough
 def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None:
-    request = resolve(capture, population, SHORT, PLATE, None, LINKS, None, 0, "double")
+    request = resolve(capture, population, PLATE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
-    program = compile_model(request, PLATE, data).program
+    program = compile_model(request, data).program
     z = np.random.default_rng(1).normal(size=(2, PIECE + 3, program.size))
     found = parameters_of(program, z, data)
     assert found["level"].shape[:2] == z.shape[:2]
@@ -202,7 +200,7 @@ def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None
 def test_draws_are_thinned_by_what_they_are_worth() -> None:
     draws = {"x": np.arange(200.0).reshape(2, 100), "y": np.zeros((2, 100, 3))}
     draws["x"][0, 40] = np.nan
-    few = runner._thin(draws, effective=21.0)  # every tenth: 200 / 21, rounded up
+    few = thin_draws(draws, effective=21.0)  # every tenth: 200 / 21, rounded up
     assert few["x"].tolist() == [x for x in range(0, 200, 10) if x != 40]
     assert few["y"].shape == (19, 3)
-    assert len(runner._thin(draws, effective=500.0)["x"]) == 199
+    assert len(thin_draws(draws, effective=500.0)["x"]) == 199

@@ -45,7 +45,7 @@ def read():
     drawn = draw_captures(program, data, numbers, jax.random.key(3))
     again = redraw_readings(program, data, drawn, numbers, jax.random.key(3))
     readings = PredictivePit(rough, drawn.captures, again, numbers, seed=4)
-    q = np.asarray(drawn.captures.own.readings["q"])[:, valid.to_numpy()]
+    q = np.asarray(drawn.captures.batched.readings["q"])[:, valid.to_numpy()]
     variance = 1.0 / (1.0 / 0.3**2 + q.shape[1] / NOISE**2)
     mean = variance * q.sum(axis=1) / NOISE**2
     random = np.random.default_rng(5)
@@ -61,7 +61,7 @@ def test_they_stand_where_the_exact_prediction_has_them(read) -> None:
     rows = np.arange(FITS)
     fresh = again["q"][rows, place]
     exact = stats.norm.cdf(fresh, mean, np.sqrt(variance + NOISE**2))
-    left = np.asarray(drawn.captures.own.readings["q"])[rows, place]
+    left = np.asarray(drawn.captures.batched.readings["q"])[rows, place]
     precision = 1.0 / variance - 1.0 / NOISE**2
     without = (mean / variance - left / NOISE**2) / precision
     exact_left = stats.norm.cdf(left, without, np.sqrt(1.0 / precision + NOISE**2))

@@ -30,7 +30,7 @@ def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys
     told = capsys.readouterr().out
     assert told.splitlines()[0].split()[:2] == ["error", "worst"]
     assert told.splitlines()[-1] == pb.benchmark.accuracy_sentences(make_accuracy())
-    assert set(studied["rungs"]) == set(pb.methods.LADDER)
+    assert set(studied["rungs"]) == set(pb.methods.STUDY_METHODS)
     assert "dials" not in studied
     assert pb.benchmark.accuracy_table(pb.benchmark.load_accuracy(out)).equals(
         pb.benchmark.accuracy_table(make_accuracy())
@@ -84,7 +84,7 @@ def test_the_automatic_choice_says_what_it_did(
         return fit(capture, **settings | {"method": "point"})
 
     monkeypatch.setattr(pb, "fit", quick)
-    monkeypatch.setattr(pb, "auto_sentences", lambda result: ["point (0.1 s) was taken."])
+    monkeypatch.setattr(pb.inference, "auto_sentences", lambda result: ["point (0.1 s) was taken."])
     words = ["fit", str(plate), "--out", str(tmp_path / "fit.nc"), "--method", "auto"]
     assert main([*words, "--tolerance", "0.2", "--seconds", "30"]) in (0, 2)
     assert "point (0.1 s) was taken." in capsys.readouterr().err

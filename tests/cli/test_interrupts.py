@@ -21,7 +21,7 @@ import polar_bayes as pb
 from polar_bayes import interrupts
 from polar_bayes.benchmark import run
 from polar_bayes.cli.entry import SIGNALS, run_until_signal
-from polar_bayes.paths import unfinished_folder
+from polar_bayes.paths import temporary_folder
 
 LIMIT = 5.0
 """Seconds that a command may take to end."""
@@ -145,7 +145,7 @@ def script(text: str, folder: Path) -> subprocess.Popen:
         from pathlib import Path
         from polar_bayes.cli import process
         from polar_bayes.interrupts import on_interrupt
-        from polar_bayes.paths import unfinished_folder
+        from polar_bayes.paths import temporary_folder
 
         def ready():
             print("ready", flush=True)
@@ -161,7 +161,7 @@ def script(text: str, folder: Path) -> subprocess.Popen:
 def test_cleanups_run_and_their_sentences_are_said_in_one_line(tmp_path: Path) -> None:
     text = """
         def work():
-            with unfinished_folder(Path()) as folder, on_interrupt(lambda: "out: --resume goes on"):
+            with temporary_folder(Path()) as folder, on_interrupt(lambda: "out: --resume goes on"):
                 (folder / "half").write_text("a part")
                 with on_interrupt(lambda: 1 / 0):  # a cleanup that fails spoils no other
                     ready()
@@ -177,7 +177,7 @@ def test_a_thread_that_still_writes_leaves_nothing_behind(tmp_path: Path) -> Non
     ends = threading.Event()
 
     def write() -> None:
-        with contextlib.suppress(OSError), unfinished_folder(tmp_path) as folder:
+        with contextlib.suppress(OSError), temporary_folder(tmp_path) as folder:
             for number in itertools.count():
                 (folder / f"{number}").write_text("a part")
                 if ends.is_set():

@@ -121,7 +121,8 @@ def test_a_demo_writes_in_no_folder_of_anothers(held, plate, tmp_path, capsys):
 
 def test_names_of_options_are_those_of_the_tables():
     from polar_bayes.calibration.calibrate import METHODS as CALIBRATION_METHODS
-    from polar_bayes.inference.request import METHODS, MODELS
+    from polar_bayes.inference.methods import METHODS
+    from polar_bayes.inference.request import MODELS
 
     known = {
         cli_options.MODEL: MODELS,
@@ -129,7 +130,7 @@ def test_names_of_options_are_those_of_the_tables():
         cli_options.MATERIAL: pb.simulation.PRESETS,
         cli_options.FIT_METHOD: METHODS,
         cli_options.CALIBRATION_METHOD: CALIBRATION_METHODS,
-        cli_options.STUDY_METHOD: pb.methods.LADDER,
+        cli_options.STUDY_METHOD: pb.methods.STUDY_METHODS,
     }
     for kind, table in known.items():
         assert kind.names == tuple(table), kind.kind

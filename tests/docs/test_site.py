@@ -4,6 +4,7 @@ All in one file, so that one worker executes the notebooks and builds the site f
 """
 
 import functools
+import inspect
 import os
 import subprocess
 import sys

@@ -10,13 +10,14 @@ from plates import LINKS, plate_capture
 import polar_bayes as pb
 from polar_bayes.design.setup import label_coordinates
 from polar_bayes.effects.compare_scenes import Baseline, compile_density, fit_laplace
+from polar_bayes.inference.optimize import find_mode
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 
 
 def request_of(capture, scene, links=LINKS, model="per_material"):
-    return resolve(capture, model, "laplace", scene, None, links, None, 0, "double")
+    return resolve(capture, model, scene, None, links, None, 0, "double")
 
 
 def no_progress(stage: str, fraction: float) -> None:

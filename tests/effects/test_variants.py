@@ -7,7 +7,7 @@ import pytest
 from cases import each
 
 import polar_bayes as pb
-from polar_bayes.effects.variants import effects_of, find_effects, parameter_ranks, simplify
+from polar_bayes.effects.variants import effects_of, find_effects, parts_of, simplify
 from polar_bayes.physics.instrument import AbstractInstrumentTerm
 from polar_bayes.physics.part import Part
 from polar_bayes.physics.scene import FULL_SCENES
@@ -84,12 +84,10 @@ def test_every_replacement_of_every_part_is_an_effect() -> None:
 def test_each_changes_one_part_and_leaves_the_rest() -> None:
     for effect in effects_of(ROUGH):
         simpler = effect.apply(ROUGH)
-        gone = {part for _, part in parameter_ranks(ROUGH)} - {
-            part for _, part in parameter_ranks(simpler)
-        }
+        gone = {part for _, part in parts_of(ROUGH)} - {part for _, part in parts_of(simpler)}
         assert effect.part in gone
         assert effect.replacement is None or effect.replacement in dict(
-            (part, place) for place, part in parameter_ranks(simpler)
+            (part, place) for place, part in parts_of(simpler)
         )
 
 

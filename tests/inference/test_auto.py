@@ -17,13 +17,13 @@ from plates import plate_capture
 from toy_models import capture, funnel, line, of_line
 
 import polar_bayes as pb
-from polar_bayes.benchmark.run import problem_of
-from polar_bayes.inference import joint_fit as fitting
+from polar_bayes.inference import fitting
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
-from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.request import resolve
+from polar_bayes.progress import no_progress
 
-LINKS = {"q": pb.links.StokesLink()}
+LINKS, KEY = {"q": pb.links.StokesLink()}, jax.random.key(0)
 
 
 @pytest.fixture(autouse=True)
@@ -45,7 +45,7 @@ class Made(AbstractMethod):
     fails: str = ""
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
+    def run(self, problem, key, progress) -> PosteriorDraws:
         if self.fails:
             raise pb.FitError(self.fails, where="Made", hint="nothing")
         z = np.random.default_rng(0).normal(size=(4, self.draws // 4, problem.program.size))
@@ -65,10 +65,10 @@ class Reporting(Made):
     """Takes half a second, and says so."""
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
+    def run(self, problem, key, progress) -> PosteriorDraws:
         time.sleep(0.5)
-        problem.progress("sampling", 0.5)
-        return super().draw(problem)
+        progress("sampling", 0.5)
+        return super().run(problem, key, progress)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,9 +79,9 @@ class Stuck(Made):
     released: ClassVar[threading.Event] = threading.Event()
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
+    def run(self, problem, key, progress) -> PosteriorDraws:
         self.released.wait(self.seconds)
-        return super().draw(problem)
+        return super().run(problem, key, progress)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -98,9 +98,10 @@ class Handing(Made):
     seconds: float = np.inf
 
     @override
-    def draw(self, problem: Problem) -> PosteriorDraws:
+    def run(self, problem, key, progress) -> PosteriorDraws:
         deadline = time.perf_counter() + self.seconds
-        return dataclasses.replace(super().draw(problem), beside=self.other, deadline=deadline)
+        draws = super().run(problem, key, progress)
+        return dataclasses.replace(draws, comparison_method=self.other, deadline=deadline)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,13 +111,13 @@ class Given(pb.methods.Auto):
     given: tuple[tuple[str, AbstractMethod], ...] = ()
 
     @override
-    def rungs(self, problem: Problem):
+    def candidates(self, problem: Problem):
         return dict(self.given)
 
 
 def problem(model) -> Problem:
-    request = resolve(capture(), model, "nuts", "paper", None, LINKS, 90.0, 0, "double")
-    return problem_of(request, jax.random.key(0))
+    request = resolve(capture(), model, "paper", None, LINKS, 90.0, 0, "double")
+    return make_problem(request, jax.random.key(0))
 
 
 def fitted(*rungs, **settings):
@@ -206,11 +207,13 @@ def test_what_is_stuck_is_abandoned_and_the_best_answer_so_far_is_returned():
     """Neither compilation nor compiled programs can be interrupted."""
     rungs = (("rung 0", Made(k_hat=0.9)), ("rung 1", Stuck()), ("rung 2", Made()))
     here = problem(line)
-    Given(given=rungs[:1]).draw(here)  # what judges draws is compiled
+    Given(given=rungs[:1]).run(here, KEY, no_progress)  # what judges draws is compiled
     begin = time.perf_counter()
-    found = Given(given=rungs, seconds=1.0).draw(dataclasses.replace(here, begun=begin))
+    found = Given(given=rungs, seconds=1.0).run(
+        dataclasses.replace(here, start_time=begin), KEY, no_progress
+    )
     assert time.perf_counter() - begin < 0.5 * Stuck.seconds
-    said = found.said["auto"]
+    said = found.metadata["auto"]
     assert [step["why"] for step in said["steps"]] == [
         "its Pareto k-hat is 0.90",
         "abandoned when the time was up",
@@ -258,9 +261,9 @@ def test_the_time_is_kept_on_a_busy_machine():
 def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left():
     taken, here = Made(), problem(line)
     auto = Given(given=(("rung 0", Made(k_hat=0.9)), ("rung 1", taken)), seconds=600.0)
-    found = auto.draw(here)
-    assert found.beside == taken
-    assert found.deadline == here.begun + 600.0
+    found = auto.run(here, KEY, no_progress)
+    assert found.comparison_method == taken
+    assert found.deadline == here.start_time + 600.0
 
 
 @pytest.mark.thorough
@@ -297,8 +300,12 @@ def test_comparisons_that_are_stuck_are_abandoned_and_told():
 @pytest.mark.thorough
 def test_tolerances_that_weighted_draws_cannot_meet_are_left_to_chains():
     here = problem(line)
-    assert list(pb.methods.Auto(tolerance=0.03).rungs(here)) == ["importance", "tempered", "nuts"]
-    assert list(pb.methods.Auto(tolerance=0.01).rungs(here)) == ["nuts"]
+    assert list(pb.methods.Auto(tolerance=0.03).candidates(here)) == [
+        "importance",
+        "tempered",
+        "nuts",
+    ]
+    assert list(pb.methods.Auto(tolerance=0.01).candidates(here)) == ["nuts"]
 
 
 def test_where_every_rung_fails_the_fit_is_refused():

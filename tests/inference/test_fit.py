@@ -116,7 +116,7 @@ def test_laplace_is_numpyros_guide(capture: xr.Dataset) -> None:
     """Mean and covariance against `AutoLaplaceApproximation` with its own exact Hessian."""
     settings = pb.methods.Laplace(draws=50_000, chains=1)
     ours = pb.fit(capture, scene=PLATE, links=LINKS, method=settings, seed=1)
-    request = resolve(capture, "per_material", settings, PLATE, None, LINKS, None, 1, "double")
+    request = resolve(capture, "per_material", PLATE, None, LINKS, None, 1, "double")
     data = observe(request.capture)
     program = compile_program(request.bind(PLATE), data)
     guide = AutoLaplaceApproximation(program.model)
@@ -315,16 +315,16 @@ def test_progress_reports_every_stage(capture: xr.Dataset) -> None:
 def test_a_comparison_that_fails_is_told_and_costs_nothing(
     capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from polar_bayes.inference import joint_fit as fitting
+    from polar_bayes.inference import fitting
 
-    whole = fitting.compile_model
+    whole = fitting.make_problem
 
-    def fails_without_instrument(request, scene, data):
-        if scene.instrument is None:
+    def fails_without_instrument(request, *others):
+        if request.scene.instrument is None:
             raise pb.FitError("no peak", where="fit", hint="nothing")
-        return whole(request, scene, data)
+        return whole(request, *others)
 
-    monkeypatch.setattr(fitting, "compile_model", fails_without_instrument)
+    monkeypatch.setattr(fitting, "make_problem", fails_without_instrument)
     result = pb.fit(capture, scene="goniometer", method="laplace", seed=1)
     assert "without_discrepancy" in result.children
     assert "without_instrument" not in result.children

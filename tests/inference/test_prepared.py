@@ -23,8 +23,8 @@ from spectral_plates import spectral_plate
 
 import polar_bayes as pb
 from polar_bayes.effects.choose import ChosenScene
-from polar_bayes.inference import hierarchical_reparam, initialization, optimize, request
-from polar_bayes.inference import joint_fit as fitting
+from polar_bayes.inference import fitting as fitting
+from polar_bayes.inference import hierarchical_reparam, initialization, optimize, problem, request
 from polar_bayes.inference.compile import LRUCache, cache_key
 from polar_bayes.inference.optimize import ignore_line_search_warnings
 from polar_bayes.inference.problem import compile_model
@@ -59,7 +59,7 @@ def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Itera
     monkeypatch.setattr(hierarchical_reparam, "MOST_STARTS", 4)
     monkeypatch.setattr(hierarchical_reparam, "TYPICAL_DRAWS", 20)
     monkeypatch.setattr(fitting, "PRIOR_DRAWS", 20)
-    monkeypatch.setattr(fitting, "BLOCK", 50)
+    monkeypatch.setattr(problem, "BLOCK", 50)
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
@@ -124,7 +124,7 @@ def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
     """`fit` splits a round number of keys; the first of them must be those of any number."""
     key = jax.random.key(5)
     many, few = (
-        jax.random.key_data(jax.random.split(key, count)) for count in (fitting.KEYS, 1234)
+        jax.random.key_data(jax.random.split(key, count)) for count in (problem.KEYS, 1234)
     )
     assert np.array_equal(many[:1234], few)
 
@@ -164,12 +164,12 @@ def compiled_model(capture: xr.Dataset, *, precision: str = "double", **asked: o
             ("links", LINKS),
         )
     )
-    wish = resolve(capture, model, NUTS, scene, priors, links, None, 0, precision)
+    wish = resolve(capture, model, scene, priors, links, None, 0, precision)
     with jax.enable_x64(precision == "double"):
         data = observe(wish.capture)
         if precision == "single":
             data = data.in_single_precision()
-        return compile_model(wish, wish.scene, data)
+        return compile_model(wish, data)
 
 
 def held(value: float) -> handlers.condition:
@@ -229,7 +229,7 @@ def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
         return inspect_model(model, data, *others)
 
     monkeypatch.setattr(request, "inspect_model", with_progress)
-    asked = (shifted(0.25), "nuts", PLATE, None, LINKS, None, 0, "double")
+    asked = (shifted(0.25), PLATE, None, LINKS, None, 0, "double")
     first, again = (resolve(one(seed), *asked) for seed in (1, 2))
     assert told == [(6,)]
     assert first.declared == again.declared == {"mean": "Normal"}
@@ -260,7 +260,8 @@ def test_how_a_scene_was_chosen_does_not_count() -> None:
 
 
 SOURCE = """
-import dataclasses, jax, helper_of_mine, polar_bayes
+import dataclasses, jax, helper_of_mine
+from polar_bayes.observation.links import StokesLink
 SCALE = 2.0
 def inner(x):
     return [helper_of_mine.shift(SCALE * y) for y in x]
@@ -269,7 +270,7 @@ def jitted(x):
     return x + 1
 def model(data, scene, priors, links):
     return jax.vmap(lambda x: jitted(inner(x)))(data)
-class Link(polar_bayes.links.StokesLink):
+class Link(StokesLink):
     def reading(self, values):
         return values
 @dataclasses.dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Every rung on posteriors that are known."""
 
-import dataclasses
 from collections.abc import Iterator
 
 import jax
@@ -10,20 +9,21 @@ from cases import each
 from toy_models import capture, funnel, line, of_line, squared
 
 import polar_bayes as pb
-from polar_bayes.benchmark.run import labeled, problem_of
+from polar_bayes.benchmark.run import labeled, sample_point
 from polar_bayes.errors import FitError
-from polar_bayes.inference.auto import missed_mode_weight
-from polar_bayes.inference.mcse import draws_needed, expected_error, quantile
+from polar_bayes.inference.auto import expected_error, missed_mode_weight
+from polar_bayes.inference.mcse import draws_needed, quantile
 from polar_bayes.inference.optimize import Modes
+from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.run_method import answer, draws_of, with_answer_draws, with_draws
-from polar_bayes.inference.weighted import _engine, _proposal
+from polar_bayes.inference.weighted import counting_engine, laplace_mixture
+from polar_bayes.progress import no_progress
 
 SMALL = {
     "point": pb.methods.Point(starts=2),
     "laplace": pb.methods.Laplace(draws=1000),
     "importance": pb.methods.Importance(),
-    "tempered": pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)),
+    "tempered": pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)),
     "normal guide": pb.methods.NormalGuide(steps=400, draws=1000),
     "flow guide": pb.methods.FlowGuide(steps=400, draws=1000),
     "nuts": pb.methods.Nuts(effective_draws=2000.0),
@@ -40,14 +40,18 @@ def compile_fast_rather_than_fast_code() -> Iterator[None]:
 
 def problem(model, seed: int = 0):
     request = resolve(
-        capture(), model, "nuts", "paper", None, {"q": pb.links.StokesLink()}, 90.0, 0, "double"
+        capture(), model, "paper", None, {"q": pb.links.StokesLink()}, 90.0, 0, "double"
     )
-    return problem_of(request, jax.random.key(seed))
+    return make_problem(request, jax.random.split(jax.random.key(seed))[0])
+
+
+def run(method, problem, seed: int = 0):
+    return method.run(problem, jax.random.split(jax.random.key(seed))[1], no_progress)
 
 
 def test_the_ladder_holds_every_method_that_is_tested_here():
-    assert set(pb.methods.LADDER) == {*SMALL, "nuts short", "nuts long"}
-    assert {type(method) for method in pb.methods.LADDER.values()} == {
+    assert set(pb.methods.STUDY_METHODS) == {*SMALL, "nuts short", "nuts long"}
+    assert {type(method) for method in pb.methods.STUDY_METHODS.values()} == {
         type(m) for m in SMALL.values()
     }
 
@@ -56,9 +60,9 @@ def test_the_ladder_holds_every_method_that_is_tested_here():
 @each("name", [name for name in SMALL if name not in WITHOUT_PRIOR])
 def test_a_normal_posterior_is_found_by_every_rung(name):
     here = problem(line)
-    found = answer(SMALL[name], here)
+    found = run(SMALL[name], here)
     assert not found.problems
-    labels, draws = labeled(here.program, found.z, here.data)
+    labels, draws = labeled(here, found.z)
     assert labels == ("level", "slope")
     mean, covariance = of_line(capture()["q"].to_numpy())
     sd = np.sqrt(np.diagonal(covariance))
@@ -76,8 +80,8 @@ def test_a_normal_posterior_is_found_by_every_rung(name):
 def test_gradients_of_a_warm_up_are_counted_as_they_were_made():
     here = problem(line)
     method = pb.methods.Nuts(chains=2, warmup=60, draws=50, most_draws=50, block=50)
-    found = answer(method, here)
-    climbing = here.initialization.said["gradients"]
+    found = run(method, here)
+    climbing = here.initialize().said["gradients"]
     before = sum(found.stats["warmup_steps"][:, 0])
     assert before >= 60 * 2  # a draw takes one step at least
     assert found.gradients == climbing + before + found.stats["n_steps"].sum()
@@ -86,8 +90,8 @@ def test_gradients_of_a_warm_up_are_counted_as_they_were_made():
 @pytest.mark.thorough
 def test_a_point_fit_has_the_width_of_its_standard_errors():
     here = problem(line)
-    found = answer(SMALL["point"], here)
-    _, draws = labeled(here.program, found.z, here.data)
+    found = sample_point(run(SMALL["point"], here), jax.random.key(1))
+    _, draws = labeled(here, found.z)
     q = capture()["q"].to_numpy()
     x = np.linspace(-1.0, 1.0, len(q))
     slope, level = np.polyfit(x, q, 1)
@@ -98,9 +102,9 @@ def test_a_point_fit_has_the_width_of_its_standard_errors():
 @each("name", ["importance", "tempered"])
 def test_both_modes_are_weighed_alike(name):
     here = problem(squared)
-    found = answer(SMALL[name], here)
+    found = run(SMALL[name], here)
     assert not found.problems
-    _, draws = labeled(here.program, found.z, here.data)
+    _, draws = labeled(here, found.z)
     share = float(np.mean(draws[-1] > 0.0))  # the root is the last in the alphabet
     assert abs(share - 0.5) < 5.0 * 0.5 / np.sqrt(min(found.effective_draws, draws[0].size))
 
@@ -109,20 +113,20 @@ def test_every_mode_of_weight_gets_draws():
     weight = np.array([0.25, 0.2, 0.2, 0.15, 0.1, 0.0995, 0.0005])
     z = np.arange(7.0)[:, None] * np.ones(2)
     modes = Modes(z, np.tile(np.eye(2), (7, 1, 1)), weight, np.zeros(7), 16, 9)
-    mixture = _proposal(modes, np.dtype(float))
+    mixture = laplace_mixture(modes, np.dtype(float))
     at, share = np.asarray(mixture.mean)[:, 0], np.exp(np.asarray(mixture.log_share))
     held = np.array([share[at == number].sum() for number in range(7)])
     np.testing.assert_allclose(held[:6], weight[:6] / weight[:6].sum(), rtol=1e-12)
     assert held[6] == 0.0
     # One program serves any number of modes.
     one = Modes(z[:1], modes.covariance[:1], np.ones(1), np.zeros(1), 16, 0)
-    assert _proposal(one, np.dtype(float)).mean.shape == mixture.mean.shape
+    assert laplace_mixture(one, np.dtype(float)).mean.shape == mixture.mean.shape
 
 
 @pytest.mark.thorough
 def test_chains_that_missed_a_mode_are_told():
     here = problem(squared)
-    both = answer(SMALL["importance"], here)
+    both = run(SMALL["importance"], here)
     assert missed_mode_weight(both.z, here) == 0.0
     at = here.program.unravel(np.arange(here.program.size))["root"]
     one = both.z.copy()
@@ -137,7 +141,7 @@ def test_chains_that_missed_a_mode_are_told():
 
 @pytest.mark.thorough
 def test_weights_that_do_not_reach_all_of_a_posterior_are_a_problem():
-    found = answer(SMALL["importance"], problem(funnel))
+    found = run(SMALL["importance"], problem(funnel))
     assert found.k_hat > 0.7
     assert any("Pareto k-hat" in problem for problem in found.problems)
 
@@ -148,12 +152,10 @@ def test_the_expected_error_is_the_one_that_is_seen():
     sd, seen, expected = np.sqrt(np.diagonal(covariance)), [], []
     here = problem(line)
     for seed in range(40):
-        other = dataclasses.replace(here, key=jax.random.key(seed))
-        other.__dict__["initialization"] = here.initialization
-        found = answer(pb.methods.Importance(draws=1024), other)
-        _, draws = labeled(here.program, found.z, here.data)
+        found = run(pb.methods.Importance(draws=1024), here, seed)
+        _, draws = labeled(here, found.z)
         seen.append(np.max(np.abs(draws.mean(axis=(1, 2)) - mean) / sd))
-        expected.append(expected_error(found, here.program, here.data))
+        expected.append(expected_error(found, here))
     # 1% of fits exceed it: of 40, four or more in one of ten thousand runs.
     assert np.sum(np.array(seen) > expected) < 4
     assert np.max(seen) > 0.3 * np.mean(expected)
@@ -168,44 +170,47 @@ def test_as_many_draws_are_needed_as_the_tolerance_says():
 
 def test_draws_that_are_no_numbers_have_an_infinite_error():
     here = problem(line)
-    found = answer(SMALL["laplace"], here)
+    found = run(SMALL["laplace"], here)
     found.z[0, 0, 0] = np.nan
-    assert np.isposinf(expected_error(found, here.program, here.data))
+    assert np.isposinf(expected_error(found, here))
 
 
 @pytest.mark.thorough
 def test_each_tempered_fit_counts_for_itself_with_the_same_programs():
     here = problem(line)
-    first, second = _engine(here), _engine(here)
+    model = here.compiled_model
+    first, second = (counting_engine(model, no_progress) for _ in range(2))
     assert first.programs is second.programs
     first.counts["rounds"] += 3
     assert second.counts["rounds"] == 0
 
 
 def test_draws_are_scaled_and_settings_kept():
-    assert with_draws(pb.methods.Laplace(draws=500), 2.0) == pb.methods.Laplace(draws=1000)
-    chains = with_draws(pb.methods.Nuts(warmup=77), 2.0)
+    assert pb.methods.Laplace(draws=500).scale_draws(2.0) == pb.methods.Laplace(draws=1000)
+    chains = pb.methods.Nuts(warmup=77).scale_draws(2.0)
     assert (chains.draws, chains.most_draws, chains.effective_draws) == (1000, 16000, 900.0)
     assert chains.warmup == 77
-    tempered = with_draws(pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)), 4.0).settings
+    tempered = pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)).scale_draws(4.0).settings
     assert (tempered.draws, tempered.effective_draws) == (16384, 800.0)
-    assert draws_of(pb.methods.Tempered(tempered)) == tempered.answer_draws == 32768
-    fewer = with_draws(pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)), 0.25).settings
+    assert pb.methods.Tempered(tempered).num_draws == tempered.answer_draws == 32768
+    fewer = pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)).scale_draws(0.25).settings
     assert (fewer.draws, fewer.effective_draws) == (1024, 50.0)
-    with pytest.raises(FitError, match="512 draws are fewer than the crowd of 2048"):
-        with_draws(pb.methods.Tempered(pb.methods.PixelTempering(draws=1024)), 0.25)
-    assert with_draws(pb.methods.Point(), 2.0) is None
+    with pytest.raises(FitError, match="512 draws are fewer than the 2048 particles"):
+        pb.methods.Tempered(pb.methods.PixelSMC(draws=1024)).scale_draws(0.25)
+    assert pb.methods.Point().scale_draws(2.0) is None
 
 
 @pytest.mark.thorough
 def test_tempered_answers_have_as_many_draws_as_are_asked_for():
-    settings = pb.methods.PixelTempering()
+    settings = pb.methods.PixelSMC()
     for count, draws in ((1.0, 2048), (2048, 2048), (2049, 2050), (5000, 5000)):
-        assert with_answer_draws(settings, count).answer_draws == draws
+        assert pb.methods.Tempered(settings).with_draws(count).num_draws == draws
     auto, here = pb.methods.Auto(tolerance=0.1), problem(line)
     needed = draws_needed(0.1, 2)
-    rungs = auto.rungs(here)
-    assert 8 * needed <= rungs["tempered"].settings.answer_draws < 8 * needed + settings.crowd
+    rungs = auto.candidates(here)
+    assert (
+        8 * needed <= rungs["tempered"].settings.answer_draws < 8 * needed + settings.num_particles
+    )
     assert rungs["tempered"].settings.effective_draws == needed
     assert rungs["importance"].draws == 16 * needed
 

@@ -46,7 +46,8 @@ def test_by_keyword(capture: xr.Dataset) -> None:
 def test_by_an_edited_file(capture: xr.Dataset, tmp_path: Path) -> None:
     text = (MODELS / "per_material.py").read_text()
     edited = text.replace(
-        "draw_own(name, data, priors)", "draw_own(name, data, OWN if name in OWN else priors)"
+        "draw_independent(name, data, priors)",
+        "draw_independent(name, data, OWN if name in OWN else priors)",
     ).replace(
         "def per_material(", 'OWN = {"subsurface_fraction": dist.Beta(1.0, 30.0)}\n\n\ndef mine('
     )

@@ -17,7 +17,7 @@ from toy_models import line
 
 import polar_bayes as pb
 from polar_bayes.inference import compile
-from polar_bayes.inference import joint_fit as fitting
+from polar_bayes.inference import fitting as fitting
 from polar_bayes.inference.compile import JitOnce, LRUCache, bytes_of
 
 
@@ -66,7 +66,7 @@ def test_the_sampler_is_compiled_beside_the_search_and_once(
     programs: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The program that is begun before any state of a chain is known is the one that runs."""
-    monkeypatch.setattr("polar_bayes.inference.problem._KEPT", LRUCache(1))
+    monkeypatch.setattr("polar_bayes.inference.problem._COMPILED", LRUCache(1))
     plastic = pb.simulate(
         "plastic", seed=0, protocol=pb.simulation.Protocol(views=9, wavelengths=())
     )

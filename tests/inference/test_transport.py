@@ -50,7 +50,7 @@ def capture() -> xr.Dataset:
 
 @pytest.fixture(scope="module")
 def made(capture: xr.Dataset):
-    request = resolve(capture, normal_normal, "nuts", SCENE, None, LINKS, None, 0, "double")
+    request = resolve(capture, normal_normal, SCENE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
     program = compile_program(request.bind(SCENE), data)
     groups = find_groups(program, data)

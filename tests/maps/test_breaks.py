@@ -22,7 +22,7 @@ SCRIPT = """
 import sys
 import polar_bayes as pb
 from plate_images import ASKED
-from polar_bayes.pixels import store
+from polar_bayes.maps import store
 store.BLOCK = 512
 capture, out, resume, scheduler = sys.argv[1:]
 pb.maps.map_file(

@@ -9,12 +9,12 @@ import xarray as xr
 from cases import each
 from plate_images import ASKED, NAMES, mapped, planned, plate_image
 
-from polar_bayes.inference.batch_fit import PixelLaplace
+from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.maps import fit_map as verb
 from polar_bayes.maps.blocks import Plan, fit_block
-from polar_bayes.maps.fit_map import fit_pixels, number_pixels
+from polar_bayes.maps.fit_map import fit_pixels, with_pixel_numbers
 
 # Chains too short to be believed are as good as any to compare bits.
 SHORT = PixelLaplace(
@@ -37,7 +37,7 @@ def plan(image: xr.Dataset) -> Plan:
 @pytest.fixture(scope="module")
 def whole(image: xr.Dataset, plan: Plan) -> xr.Dataset:
     maps = mapped(image, plan)
-    for approach in (Approach.IMPORTANCE, Approach.ADAPTED, Approach.NUTS):
+    for approach in (MethodUsed.IMPORTANCE, MethodUsed.ADAPTED, MethodUsed.NUTS):
         assert (maps["approach"] == approach).any(), approach
     return maps
 
@@ -60,18 +60,18 @@ def test_blocks_of_any_size_give_the_same_bits(
 @pytest.mark.thorough
 def test_a_block_in_which_nothing_was_read_is_masked(image: xr.Dataset, plan: Plan) -> None:
     """A corner of a picture, for example, beside what is shown."""
-    nothing = number_pixels(image.assign(valid=xr.zeros_like(image["q"], bool))).isel(y=[1])
+    nothing = with_pixel_numbers(image.assign(valid=xr.zeros_like(image["q"], bool))).isel(y=[1])
     maps = fit_block(nothing, plan)
     assert (maps["status"] == Status.MASKED).all()
-    assert (maps["approach"] == Approach.NONE).all()
+    assert (maps["approach"] == MethodUsed.NONE).all()
     assert all(np.isnan(maps[name]).all() for name in (*NAMES, "pareto_k"))
 
 
 def test_a_pixel_alone_gets_the_same_bits(image: xr.Dataset, plan: Plan, whole: xr.Dataset) -> None:
-    sampled = np.argwhere((whole["approach"] == Approach.NUTS).values)[-1]
+    sampled = np.argwhere((whole["approach"] == MethodUsed.NUTS).values)[-1]
     for y, x in ((0, 0), (2, 42), sampled):
         place = {"y": slice(y, y + 1), "x": slice(x, x + 1)}
-        alone = fit_block(number_pixels(image).isel(place), plan)
+        alone = fit_block(with_pixel_numbers(image).isel(place), plan)
         assert_same_bits(alone, whole.isel(place))
 
 
@@ -138,7 +138,7 @@ def test_bad_pixels_are_told_apart_and_poison_no_neighbor(
     for (y, x), status in gone.items():
         pixel = maps.isel(y=y, x=x)
         assert pixel["status"] == status
-        assert pixel["approach"] == Approach.NONE
+        assert pixel["approach"] == MethodUsed.NONE
         assert pixel["steps"] == 0
         for name in (*NAMES, "pareto_k", "effective_draws", "condition"):
             assert np.isnan(pixel[name])
@@ -163,8 +163,8 @@ def test_bad_pixels_are_told_apart_and_poison_no_neighbor(
 def test_another_seed_moves_draws_not_modes(image: xr.Dataset, whole: xr.Dataset) -> None:
     few = image.isel(y=slice(1), x=slice(20))
     other = mapped(few, planned(few, SHORT, seed=1))
-    there = (other["approach"] == Approach.IMPORTANCE).values
-    there &= (whole["approach"].isel(y=slice(1), x=slice(20)) == Approach.IMPORTANCE).values
+    there = (other["approach"] == MethodUsed.IMPORTANCE).values
+    there &= (whole["approach"].isel(y=slice(1), x=slice(20)) == MethodUsed.IMPORTANCE).values
     assert there.sum() > 5
     name = NAMES[0]
     one, two = (m[name].isel(y=slice(1), x=slice(20)).values[there] for m in (whole, other))

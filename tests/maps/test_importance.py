@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from polar_bayes.inference.psis import effective_draws, normal_points, smooth, summarize, turns
+from polar_bayes.inference.proposals import normal_points, random_rotations
+from polar_bayes.inference.psis import effective_draws, smooth, summarize
 
 
 def theirs(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +170,7 @@ def test_one_draw_with_all_the_weight_is_the_answer() -> None:
 
 @each(("center", "spread"), [(0.0, 0.5), (0.4, 0.7), (-0.3, 0.9)])
 def test_weighted_draws_of_a_wide_normal_are_a_narrow_one(center: float, spread: float) -> None:
-    draws = normal_points(4096, 1, seed=10).places.T
+    draws = normal_points(4096, 1, seed=10).z.T
     log_ratios = stats.norm(center, spread).logpdf(draws) - stats.norm().logpdf(draws)
     found = smooth(log_ratios)
     assert found.pareto_k[0] < 0.1  # its ratios are bounded
@@ -191,7 +192,7 @@ def test_weighted_draws_of_a_wide_normal_are_a_narrow_one(center: float, spread:
 @each("count", [64, 256, 1024])
 @each("size", [1, 2, 4, 7])
 def test_points_are_standard_normal(count: int, size: int) -> None:
-    points = normal_points(count, size, seed=11).places
+    points = normal_points(count, size, seed=11).z
     assert points.shape == (count, size)
     assert np.isfinite(points).all()
     assert np.abs(points.mean(axis=0)).max() < 1e-14
@@ -205,7 +206,7 @@ def test_points_are_standard_normal(count: int, size: int) -> None:
 
 @pytest.mark.thorough
 def test_the_same_seed_gives_the_same_points() -> None:
-    one, two, other = (normal_points(128, 3, seed).places for seed in (1, 1, 2))
+    one, two, other = (normal_points(128, 3, seed).z for seed in (1, 1, 2))
     assert one.tobytes() == two.tobytes()
     assert not np.isclose(one, other).all(axis=0).any()
 
@@ -213,33 +214,33 @@ def test_the_same_seed_gives_the_same_points() -> None:
 @each("size", [1, 2, 5])
 def test_turns_keep_lengths_and_favor_no_direction(size: int) -> None:
     keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(12), 4000)))
-    found = turns(keys, size)
+    found = random_rotations(keys, size)
     unit = np.broadcast_to(np.eye(size), found.shape)
     np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), unit, atol=1e-12)
     # Entries of a random direction have mean 0 and mean square 1 / size: 5 standard errors.
     assert np.abs(found.mean(axis=0)).max() < 5.0 / np.sqrt(4000.0 * size)
     assert np.abs((found**2).mean(axis=0) - 1.0 / size).max() < 5.0 * 0.5 / np.sqrt(4000.0)
-    assert turns(keys[7:8], size)[0].tobytes() == found[7].tobytes()
+    assert random_rotations(keys[7:8], size)[0].tobytes() == found[7].tobytes()
 
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("compiled_in_haste")
 def test_turns_do_not_depend_on_how_many_there_are_or_how_they_were_compiled() -> None:
     keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(15), 13)))
-    in_haste = turns(keys, 3)
+    in_haste = random_rotations(keys, 3)
     jax.config.update("jax_disable_most_optimizations", False)
     for count in (1, 2, 11):
-        assert turns(keys[:count], 3).tobytes() == in_haste[:count].tobytes()
+        assert random_rotations(keys[:count], 3).tobytes() == in_haste[:count].tobytes()
 
 
 @pytest.mark.thorough
 def test_what_few_points_get_wrong_of_a_quantile_averages_out_over_pixels() -> None:
     """Without turns a half interval holds some percent less, or more, in all pixels alike."""
     size, pixels = 4, 2000
-    points = normal_points(256, size, seed=13).places
+    points = normal_points(256, size, seed=13).z
     keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(14), pixels)))
     lengthwise = np.ones(size) / size**0.5
-    draws = points @ (turns(keys, size) @ lengthwise)[:, :, None]
+    draws = points @ (random_rotations(keys, size) @ lengthwise)[:, :, None]
     even = np.full((pixels, 256), 1.0 / 256)
     _, _, (low, high) = summarize(draws[..., 0], even, (0.25, 0.75))
     held = stats.norm.cdf(high) - stats.norm.cdf(low)

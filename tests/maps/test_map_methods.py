@@ -9,13 +9,13 @@ import xarray as xr
 from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, plate_image
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.reporting.text import APPROACHES
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
-TEMPERING = pb.methods.PixelTempering(walks=64, draws=256, effective_draws=100.0)
+TEMPERING = pb.methods.PixelSMC(num_chains=64, draws=256, effective_draws=100.0)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def tempered(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
 @pytest.mark.thorough
 def test_tempered_maps_are_those_of_a_grid(image: xr.Dataset, tempered: xr.Dataset) -> None:
     assert (tempered["status"] == Status.GOOD).all()
-    assert (tempered["approach"] == Approach.TEMPERED).all()
+    assert (tempered["approach"] == MethodUsed.TEMPERED).all()
     apart = []
     for y, x in np.ndindex(3, 4):
         truth = on_a_grid(image["q"].values[y, x], NOISE, VIEWS)
@@ -47,7 +47,7 @@ def test_tempered_maps_are_those_of_a_grid(image: xr.Dataset, tempered: xr.Datas
 @pytest.mark.thorough
 def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, tempered: xr.Dataset) -> None:
     chains = pb.fit_pixels(image.isel(y=[0], x=[0, 1]), method=pb.methods.PixelNuts(), **ASKED)
-    assert (chains["approach"] == Approach.NUTS).all()
+    assert (chains["approach"] == MethodUsed.NUTS).all()
     assert (chains["status"] == Status.GOOD).all()
     for name in NAMES:
         one, other = chains[name].values[0], tempered[name].values[0, :2]
@@ -59,10 +59,10 @@ def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, tempered: xr.Datase
 
 
 def test_the_map_says_how_it_was_made(tempered: xr.Dataset, tmp_path: Path) -> None:
-    assert json.loads(tempered.attrs[PROVENANCE])["fitted_by"] == "PixelTempering"
+    assert json.loads(tempered.attrs[PROVENANCE])["fitted_by"] == "PixelSMC"
     page = pb.report(tempered, tmp_path / "report").read_text()
     assert "tempered draws of each pixel" in page
-    assert len(APPROACHES) == len(Approach)  # each has a color
+    assert len(APPROACHES) == len(MethodUsed)  # each has a color
     assert "all by tempered draws" in page
 
 

@@ -17,10 +17,11 @@ from polar_bayes.models.per_material import per_material
 from scipy import optimize, stats
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_fit import PixelLaplace
+from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import Approach, Status
-from polar_bayes.inference.batching import Stack
+from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.inference.levenberg_marquardt import find_modes
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.maps.blocks import Plan
@@ -90,12 +91,14 @@ def _guide_covariance(program: Program, z: jax.Array, data) -> jax.Array:
     return (half @ half.T)[jnp.ix_(order, order)]
 
 
-def assert_modes_agree(plan: Plan, pixels: Stack, covariance: Callable | None = None) -> int:
+def assert_modes_agree(
+    plan: Plan, pixels: ObservationBatch, covariance: Callable | None = None
+) -> int:
     """Of all pixels that arrived; how many did."""
-    found = plan.engine.climb(pixels)
+    found = find_modes(plan.engine, pixels)
     twin = Twin(plan.engine.program)
     for number in np.flatnonzero(found.converged):
-        z, half = found.peak.z[number], found.peak.widths[number]
+        z, half = found.mode.z[number], found.mode.root[number]
         data = pixels.pixel(number)
         # From a start two posterior widths away the climb back is SciPy's own.
         mode = twin.mode(z + np.full(z.size, 2.0 / z.size**0.5) @ half, data)
@@ -185,7 +188,7 @@ def test_a_map_without_weights_is_the_laplace_fit_of_its_pixel() -> None:
     maps = mapped(image, plan).isel(y=0, x=1)
     pixel = image.isel(y=0, x=1, drop=True)
     fit = pb.fit(pixel, method=pb.methods.Laplace(draws=40_000, chains=1), seed=1, **ASKED)
-    assert maps["approach"] == Approach.LAPLACE
+    assert maps["approach"] == MethodUsed.LAPLACE
     assert maps["status"] == Status.GOOD
     for name in NAMES:
         draws = fit["posterior"][name].to_numpy().ravel()
@@ -224,8 +227,8 @@ def test_single_precision_finds_the_same_maps(image: xr.Dataset, maps: xr.Datase
     corner = image.isel(y=slice(10), x=slice(10))
     single = mapped(corner, planned(corner, PixelLaplace(sampler=None), precision="single"))
     double = maps.isel(y=slice(10), x=slice(10))
-    weighted = (double["approach"] == Approach.IMPORTANCE).values
-    weighted &= (single["approach"] == Approach.IMPORTANCE).values
+    weighted = (double["approach"] == MethodUsed.IMPORTANCE).values
+    weighted &= (single["approach"] == MethodUsed.IMPORTANCE).values
     assert weighted.mean() > 0.75  # the others are for the sampler, which is not asked here
     for name in NAMES:
         sd = double[f"{name}_sd"].values
@@ -248,7 +251,7 @@ def test_a_map_says_what_it_holds_and_how_it_was_made(plan: Plan, maps: xr.Datas
         assert maps[name].dtype == np.float32
         assert (np.diff(maps[f"{name}_quantile"].values, axis=0) >= 0.0).all()
     assert maps["status"].attrs["flag_meanings"].split()[Status.GOOD] == "good"
-    assert maps["approach"].attrs["flag_meanings"].split()[Approach.NUTS] == "nuts"
+    assert maps["approach"].attrs["flag_meanings"].split()[MethodUsed.NUTS] == "nuts"
     said = json.loads(maps.attrs[PROVENANCE])
     assert said["seed"] == 0
     assert PixelLaplace(**{**said["settings"], "sampler": PixelNuts()}) == plan.settings
@@ -272,7 +275,7 @@ def masked(image: xr.Dataset) -> xr.Dataset:
             {"method": pb.methods.Nuts()},
             r"fit_pixels: method: Nuts\(.*give settings such as",
         ),
-        (lambda c: c, {"method": "laplace"}, r"'laplace' is no way to fit pixels; give settings"),
+        (lambda c: c, {"method": "laplace"}, r"'laplace' is no method for pixels; give settings"),
         (masked, {}, r"plates: no pixel has 2 valid views; check `valid`"),
         (lambda c: c.assign(q=c["q"] * np.nan), {}, r"plates: no pixel has 2 valid views"),
         (lambda c: c, {"precision": "half"}, r"precision is 'half'; give 'double' or 'single'"),

@@ -6,11 +6,11 @@ import pytest
 from arviz_stats.base import array_stats
 from plate_images import NAMES, VIEWS, on_a_grid, planned, plate_image, stacked
 
-from polar_bayes.inference.batch_fit import _keys
-from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_programs import BatchEngine, Settled
-from polar_bayes.inference.batching import Stack
-from polar_bayes.inference.levenberg_marquardt import Peak
+from polar_bayes.inference.batch_engine import BatchEngine
+from polar_bayes.inference.batch_method import random_keys
+from polar_bayes.inference.batch_nuts import PixelNuts, sample_chains
+from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.inference.levenberg_marquardt import ModeSearch, NormalApproximation, find_modes
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
@@ -19,16 +19,16 @@ WEAK = plate_image(1, 3, noise=0.15, views=VIEWS[[1, 4]], seed=7)
 
 
 def _sampled(
-    engine: BatchEngine, pixels: Stack, peak: Peak, numbers: np.ndarray
+    engine: BatchEngine, pixels: ObservationBatch, mode: NormalApproximation, numbers: np.ndarray
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    return engine.sample(pixels, peak.z, peak.widths, CHAINS, _keys(0, numbers))
+    return sample_chains(engine, CHAINS, pixels, mode.z, mode.root, random_keys(0, numbers))
 
 
 @pytest.fixture(scope="module")
-def made(compiled_in_haste: None) -> tuple[BatchEngine, Stack, Settled]:
+def made(compiled_in_haste: None) -> tuple[BatchEngine, ObservationBatch, ModeSearch]:
     plan = planned(WEAK)
     pixels = stacked(WEAK, plan)
-    settled = plan.engine.climb(pixels)
+    settled = find_modes(plan.engine, pixels)
     assert settled.converged.all()
     return plan.engine, pixels, settled
 
@@ -36,7 +36,7 @@ def made(compiled_in_haste: None) -> tuple[BatchEngine, Stack, Settled]:
 @pytest.fixture(scope="module")
 def sampled(made) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     engine, pixels, settled = made
-    return _sampled(engine, pixels, settled.peak, np.array([40, 50, 60]))
+    return _sampled(engine, pixels, settled.mode, np.array([40, 50, 60]))
 
 
 @pytest.mark.thorough
@@ -59,8 +59,8 @@ def test_a_skewed_pixel_has_the_posterior_of_a_grid(sampled) -> None:
 def test_draws_follow_the_number_of_a_pixel_not_its_place(made, sampled) -> None:
     engine, pixels, settled = made
     order = np.array([2, 0])
-    peak = jax.tree.map(lambda x: x[order], settled.peak)
-    draws, r_hat, effective = _sampled(engine, pixels.subset(order), peak, np.array([60, 40]))
+    mode = jax.tree.map(lambda x: x[order], settled.mode)
+    draws, r_hat, effective = _sampled(engine, pixels.subset(order), mode, np.array([60, 40]))
     for name, all_draws in sampled[0].items():
         assert draws[name].tobytes() == all_draws[order].tobytes(), name
     assert r_hat.tobytes() == sampled[1][order].tobytes()
@@ -69,9 +69,9 @@ def test_draws_follow_the_number_of_a_pixel_not_its_place(made, sampled) -> None
 
 def test_keys_differ_by_number_and_by_seed() -> None:
     numbers = np.array([0, 1, 2**31, 10**8])
-    one = _keys(0, numbers)
-    assert len({tuple(key) for key in (*one, *_keys(1, numbers))}) == 8
-    assert (_keys(0, numbers[::-1]) == one[::-1]).all()
+    one = random_keys(0, numbers)
+    assert len({tuple(key) for key in (*one, *random_keys(1, numbers))}) == 8
+    assert (random_keys(0, numbers[::-1]) == one[::-1]).all()
 
 
 @pytest.mark.thorough

@@ -16,26 +16,27 @@ from plate_images import VIEWS, on_a_grid, planned, plate_image, stacked
 from plates import plate_capture
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_fit import fit_stack, pool
+from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_programs import BatchEngine
-from polar_bayes.inference.batch_result import Approach, Status
-from polar_bayes.inference.batching import Stack
+from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.proposals import (
     DEGREES_OF_FREEDOM,
     Proposed,
+    combine_samples,
     draw_mixture,
     fit_mixture,
     log_density,
+    moments,
 )
 from polar_bayes.inference.psis import effective_draws, effective_tails, smooth
-from polar_bayes.inference.smc import PixelTempering, spread, temper
+from polar_bayes.inference.smc import PixelSMC, _mixture_draws, _particles, temper
 from polar_bayes.observation.data import Observations, observe
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
-SETTINGS = PixelTempering()
+SETTINGS = PixelSMC()
 WEAK = plate_image(1, 3, noise=0.15, views=VIEWS[[1, 4]], seed=7)
 FAR, WIDTH = 2.0, 0.02
 
@@ -64,13 +65,13 @@ def crowd(two_modes: tuple[Program, Observations]) -> tuple[np.ndarray, np.ndarr
         )
     assert float(found.temperature) == 1.0
     assert int(found.stages) >= 2
-    return np.asarray(found.scores.place(found.u)[0]), np.asarray(found.weights)
+    return np.asarray(found.transform.inverse(found.u)[0]), np.asarray(found.weights)
 
 
 def test_a_crowd_is_in_both_modes_and_wide_where_nothing_is_known(crowd: tuple) -> None:
     (x, y), weights = crowd[0].T, crowd[1]
     assert weights.sum() == pytest.approx(1.0, abs=1e-5)
-    assert 1.0 / np.sum(weights**2) >= 0.5 * SETTINGS.crowd - 1.0
+    assert 1.0 / np.sum(weights**2) >= 0.5 * SETTINGS.num_particles - 1.0
     # Two in a thousand million of a normal distribution are further out than six widths.
     assert weights @ (np.abs(np.abs(x) - FAR) > 6.0 * WIDTH) < 1e-5
     # 256 walks thinned at each of some stages: the share of a side scatters by about 0.1.
@@ -117,7 +118,7 @@ def test_the_density_of_a_mixture_is_that_of_its_parts() -> None:
 def test_spread_is_mean_and_covariance_of_weighted_draws() -> None:
     random = np.random.default_rng(1)
     z, weights = random.normal(size=(50, 3)) * [1.0, 1e-3, 1e3], random.dirichlet(np.ones(50))
-    center, half = (np.asarray(x) for x in spread(jnp.asarray(z), jnp.asarray(weights)))
+    center, half = (np.asarray(x) for x in moments(jnp.asarray(z), jnp.asarray(weights)))
     assert center == pytest.approx(np.average(z, axis=0, weights=weights))
     covariance = np.cov(z.T, aweights=weights, ddof=0)
     scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
@@ -129,7 +130,7 @@ Found = dict[int, tuple[dict[str, np.ndarray], np.ndarray]]
 """Of each pixel its draws by name, and their weights."""
 
 
-def fitted(engine: BatchEngine, settings: PixelTempering | PixelNuts, pixels: Stack):
+def fitted(engine: BatchEngine, settings: PixelSMC | PixelNuts, pixels: ObservationBatch):
     found: Found = {}
 
     def describe(at: np.ndarray, parameters: dict, weights: np.ndarray) -> None:
@@ -138,19 +139,21 @@ def fitted(engine: BatchEngine, settings: PixelTempering | PixelNuts, pixels: St
             found[int(pixel)] = draws, weights[row]
 
     numbers = np.arange(len(pixels))
-    return fit_stack(engine, settings, pixels, numbers, 0, describe), found
+    return settings.run_batch(engine, pixels, numbers, 0, describe), found
 
 
 @pytest.mark.thorough
 def test_an_engine_goes_when_nobody_holds_it() -> None:
     """Its programs are its own, one for each setting."""
     plan = planned(WEAK)
-    engine = BatchEngine(plan.engine.program, plan.engine.rough, np.zeros((8, 2)), "single")
-    first = engine._kept(engine._tempered, SETTINGS)
-    assert engine._kept(engine._tempered, SETTINGS) is first
-    assert engine._kept(engine._proposed, SETTINGS) is not first
+    engine = BatchEngine(
+        plan.engine.program, plan.engine.single_program, plan.engine.layout, "single"
+    )
+    first = engine.compiled(_particles, SETTINGS)
+    assert engine.compiled(_particles, SETTINGS) is first
+    assert engine.compiled(_mixture_draws, SETTINGS) is not first
     other = dataclasses.replace(SETTINGS, rounds=SETTINGS.rounds + 1)
-    assert engine._kept(engine._tempered, other) is not first
+    assert engine.compiled(_particles, other) is not first
     gone = weakref.ref(engine)
     del engine, first
     gc.collect()
@@ -162,13 +165,14 @@ def test_chains_begin_in_every_mode_and_tempered_draws_stay_where_they_do_not_mi
     plan = planned(WEAK)
     pixels = stacked(WEAK, plan).subset(np.zeros(32, int))
     with jax.enable_x64(False):
-        program = compile_program(two_sided, pixels.in_precision(np.float32).pixel())
-    engine = BatchEngine(program, program, np.zeros((8, 2)), "single")
+        layout = pixels.in_precision(np.float32).pixel()
+        program = compile_program(two_sided, layout)
+    engine = BatchEngine(program, program, layout, "single")
     chains = PixelNuts(start=SETTINGS)
     outcome, found = fitted(engine, chains, pixels)
-    sampled = outcome.approach == Approach.NUTS
+    sampled = outcome.approach == MethodUsed.NUTS
     assert (outcome.status == np.where(sampled, Status.GOOD, Status.NOT_TRUSTED)).all()
-    assert (outcome.approach[~sampled] == Approach.TEMPERED).all()
+    assert (outcome.approach[~sampled] == MethodUsed.TEMPERED).all()
     # Two chains begin on one side each other time: fewer than 6 or more than 26 do in one of 9000
     # cases, and all that do on the same side in one of 5000.
     assert 6 <= sampled.sum() <= 26
@@ -186,7 +190,7 @@ def test_skewed_pixels_have_the_posteriors_of_a_grid(chains: bool) -> None:
     pixels = stacked(WEAK, plan).subset(np.tile(np.arange(3), 8))
     outcome, found = fitted(plan.engine, settings, pixels)
     assert (outcome.status == Status.GOOD).all()
-    assert (outcome.approach == (Approach.NUTS if chains else Approach.TEMPERED)).all()
+    assert (outcome.approach == (MethodUsed.NUTS if chains else MethodUsed.TEMPERED)).all()
     assert (outcome.effective_draws >= SETTINGS.effective_draws).all()
     for pixel, q in enumerate(WEAK["q"].values[0]):
         for name, (mean, sd, _) in on_a_grid(q, 0.15, WEAK["view_zenith"].values).items():
@@ -206,17 +210,17 @@ def test_skewed_pixels_have_the_posteriors_of_a_grid(chains: bool) -> None:
 @each(
     ("settings", "said"),
     [
-        ({"walks": 4}, "walks is 4; give 16 or more"),
+        ({"num_chains": 4}, "num_chains is 4; give 16 or more"),
         ({"rounds": 1}, "rounds is 1; give 2 or more"),
-        ({"looks": 0}, "looks is 0; give 1 or more"),
-        ({"effective_share": 0.99}, "effective_share is 0.99; give a number from 0.1 to 0.95"),
-        ({"draws": 800}, "draws is 800, and the crowd 2048; give at least half of walks"),
-        ({"effective_draws": 5000.0}, "effective_draws is 5000.0, and there are 2048 draws"),
+        ({"init_factor": 0}, "init_factor is 0; give 1 or more"),
+        ({"target_ess": 0.99}, "target_ess is 0.99; give a number from 0.1 to 0.95"),
+        ({"draws": 800}, "draws is 800, of 2048 particles; give at least half of num_chains"),
+        ({"effective_draws": 5000.0}, "effective_draws is 5000.0, of 2048 draws"),
     ],
 )
 def test_mistakes_are_told(settings: dict, said: str) -> None:
     with pytest.raises(pb.FitError, match=said):
-        pb.methods.PixelTempering(**settings)
+        pb.methods.PixelSMC(**settings)
 
 
 def test_two_mixtures_are_weighed_as_one() -> None:
@@ -235,8 +239,8 @@ def test_two_mixtures_are_weighed_as_one() -> None:
         rows = jax.tree.map(lambda x: np.asarray(x)[None], mixture)
         log_posterior = -0.5 * np.sum(np.asarray(z) ** 2, axis=-1)[None]
         parts.append(Proposed(rows, np.asarray(z)[None], {"z": np.asarray(z)[None]}, log_posterior))
-    found = pool(*parts)
-    worth = found.worth[0]
+    found = combine_samples(*parts)
+    worth = found.ess[0]
     assert 1000.0 < worth < 2 * count
     told = found.weights[0] @ found.z[0]
     spread = found.weights[0] @ found.z[0] ** 2

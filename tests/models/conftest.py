@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import jax
 import pytest
 
-from polar_bayes.inference import hierarchical_reparam, initialization
-from polar_bayes.inference import joint_fit as fitting
+from polar_bayes.inference import fitting, hierarchical_reparam, initialization, problem
 
 
 @pytest.fixture
@@ -15,7 +14,7 @@ def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Itera
     monkeypatch.setattr(hierarchical_reparam, "MOST_STARTS", 4)
     monkeypatch.setattr(hierarchical_reparam, "TYPICAL_DRAWS", 50)
     monkeypatch.setattr(fitting, "PRIOR_DRAWS", 100)
-    monkeypatch.setattr(fitting, "BLOCK", 100)
+    monkeypatch.setattr(problem, "BLOCK", 100)
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)

@@ -3,8 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from cases import each
-from polar_bayes.models.sites import Bent
+from polar_bayes.models.sites import SoftClip
 
 LOW, HIGH = 1.2, 2.0
 INTERVALS = {"both": (LOW, HIGH), "one": (1.0, np.inf)}
@@ -12,7 +11,7 @@ INTERVALS = {"both": (LOW, HIGH), "one": (1.0, np.inf)}
 
 @each("interval", INTERVALS.values(), ids=INTERVALS)
 def test_it_goes_there_and_back_with_its_volume(interval: tuple[float, float]) -> None:
-    bent = Bent(*interval)
+    bent = SoftClip(*interval)
     x = jnp.linspace(0.9, 2.3, 57)
     y = bent(x)
     inside = (y - LOW > 1e-6) & (HIGH - y > 1e-6)  # closer, the way back has no digits left
@@ -26,14 +25,14 @@ def test_it_goes_there_and_back_with_its_volume(interval: tuple[float, float]) -
 def test_inside_nothing_moves() -> None:
     x = jnp.linspace(1.4, 1.8, 9)
     # At twenty widths of the bend, 0.01 each: exp(-20) of one.
-    np.testing.assert_allclose(Bent(LOW, HIGH)(x), x, atol=3e-11)
+    np.testing.assert_allclose(SoftClip(LOW, HIGH)(x), x, atol=3e-11)
 
 
 @each("double", [True, False])
 @each("interval", INTERVALS.values(), ids=INTERVALS)
 def test_value_slope_and_curvature_are_finite_far_out_and_at_the_bounds(interval, double) -> None:
     with jax.enable_x64(double):
-        bent = Bent(*interval)
+        bent = SoftClip(*interval)
         x = jnp.asarray(
             np.concatenate([np.linspace(-50.0, 50.0, 400), interval[:1], [HIGH, -1e6, 1e6]]), float
         )

@@ -198,7 +198,7 @@ HARD_COLORS = {
 @each("colors", HARD_COLORS.values(), ids=HARD_COLORS)
 def test_density_and_gradient_are_finite(colors: np.ndarray, precision: str) -> None:
     capture = spectral_plate((colors, smooth_index(colors)), error=0.01, seed=5, views=FEW_VIEWS)
-    request = resolve(capture, INDEX_ONLY, "laplace", PLATE, None, LINKS, None, 0, precision)
+    request = resolve(capture, INDEX_ONLY, PLATE, None, LINKS, None, 0, precision)
     with jax.enable_x64(precision == "double"):
         dtype = jnp.result_type(float)
         data = jax.tree.map(

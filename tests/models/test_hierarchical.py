@@ -60,7 +60,7 @@ def test_members_are_drawn_from_the_population(name: str) -> None:
     if name == "refractive_index":
         near[f"{name}_location"] = pb.PRIORS[f"{name}_location"]
     model = pb.models.Hierarchical(pooled=(name,))
-    request = resolve(capture, model, "nuts", None, near, None, None, 0, "double")
+    request = resolve(capture, model, None, near, None, None, 0, "double")
     data = observe(request.capture)
     held = {f"{name}_location": np.float64(location)} if name == "refractive_index" else {}
     told = handlers.substitute(request.bind(request.scene), data=held)

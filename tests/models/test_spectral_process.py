@@ -27,8 +27,10 @@ LENGTHS = (1e-2, 1.0, 60.0, 300.0, 1e5)
 def covariance(process: SpectralProcess, length: float, wavelength: np.ndarray) -> np.ndarray:
     """Of what the weights do, without drawing."""
     length, wavelength = jnp.asarray(length), jnp.asarray(wavelength)
-    places = process.places(wavelength)
-    each = process.values(jnp.eye(process.size(wavelength.size)), length, places, wavelength)
+    knot_wavelengths = process.knot_wavelengths(wavelength)
+    each = process.values(
+        jnp.eye(process.size(wavelength.size)), length, knot_wavelengths, wavelength
+    )
     return np.asarray(each.T @ each)
 
 
@@ -55,7 +57,9 @@ def test_twenty_knots_stand_for_two_hundred_wavelengths(length: float, error: fl
 def test_equal_wavelengths_have_equal_values() -> None:
     process, wavelength = SpectralProcess(), jnp.array([450.0, 550.0, 450.0, 650.0])
     weights = jax.random.normal(jax.random.key(0), (5, 4))
-    values = process.values(weights, jnp.asarray(100.0), process.places(wavelength), wavelength)
+    values = process.values(
+        weights, jnp.asarray(100.0), process.knot_wavelengths(wavelength), wavelength
+    )
     np.testing.assert_array_equal(values[:, 0], values[:, 2])
 
 
@@ -64,23 +68,23 @@ def test_prediction_is_that_of_tinygp(kernel: str) -> None:
     """The mean and the covariance at new wavelengths, given the values at the knots."""
     process, length = SpectralProcess(kernel), jnp.asarray(80.0)
     measured, new = jnp.asarray(IRREGULAR), jnp.linspace(380.0, 900.0, 23)
-    places = process.places(measured)
+    knot_wavelengths = process.knot_wavelengths(measured)
     weights = jax.random.normal(jax.random.key(1), (measured.size,))
-    known = process.values(weights, length, places, places)
+    known = process.values(weights, length, knot_wavelengths, knot_wavelengths)
     made = getattr(kernels, kernel)(scale=length)
-    theirs = GaussianProcess(made, places, diag=LEAST_NUGGET).condition(known, new).gp
-    mean = process.values(weights, length, places, new)
+    theirs = GaussianProcess(made, knot_wavelengths, diag=LEAST_NUGGET).condition(known, new).gp
+    mean = process.values(weights, length, knot_wavelengths, new)
     # Far outside, the smoothest kernel multiplies rounding by the inverse of the nugget.
     np.testing.assert_allclose(mean, theirs.loc, atol=2e-4 if kernel == "ExpSquared" else 1e-7)
-    factor = process.remainder(length, places, new)
+    factor = process.remainder(length, knot_wavelengths, new)
     np.testing.assert_allclose(factor @ factor.T, theirs.covariance, atol=2e-8)
 
 
 @pytest.mark.thorough
 def test_bands_widen_away_from_the_knots() -> None:
-    process, places = SpectralProcess(), jnp.array([450.0, 550.0, 650.0])
+    process, knot_wavelengths = SpectralProcess(), jnp.array([450.0, 550.0, 650.0])
     new = jnp.array([450.0, 500.0, 660.0, 700.0, 800.0, 3000.0])
-    factor = process.remainder(jnp.asarray(100.0), places, new)
+    factor = process.remainder(jnp.asarray(100.0), knot_wavelengths, new)
     spread = np.sqrt(np.diag(np.asarray(factor @ factor.T)))
     assert spread[0] < 2e-4  # the two nuggets
     assert spread[0] < spread[1]
@@ -100,8 +104,8 @@ def test_values_and_gradients_are_finite_at_hard_points(
     process = SpectralProcess(kernel)
 
     def loss(weights, amplitude, length, wavelength):
-        values = process.values(weights, length, process.places(wavelength), wavelength)
-        scales = process.scales(length, process.places(wavelength))
+        values = process.values(weights, length, process.knot_wavelengths(wavelength), wavelength)
+        scales = process.scales(length, process.knot_wavelengths(wavelength))
         return jnp.sum((amplitude * values - 1.0) ** 2) + jnp.sum(jnp.log(scales))
 
     compiled = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2)))
@@ -120,9 +124,11 @@ def test_values_and_gradients_are_finite_at_hard_points(
 def test_what_the_knots_leave_is_finite_at_hard_points() -> None:
     remainder = jax.jit(SpectralProcess().remainder)
     for name in ("two equal", "two hundred equal", "a thousandth apart", "two hundred"):
-        places = SpectralProcess().places(jnp.asarray(HARD[name]))
+        knot_wavelengths = SpectralProcess().knot_wavelengths(jnp.asarray(HARD[name]))
         for length in LENGTHS:
-            factor = remainder(jnp.asarray(length), places, jnp.linspace(380.0, 900.0, 40))
+            factor = remainder(
+                jnp.asarray(length), knot_wavelengths, jnp.linspace(380.0, 900.0, 40)
+            )
             assert np.isfinite(factor).all(), (name, length)
 
 
@@ -135,7 +141,7 @@ def test_a_function_of_length_and_a_kernel_object_are_kernels() -> None:
     fixed = SpectralProcess(kernels.Matern52(scale=80.0))
     assert not fixed.fits_length
     weights = jnp.eye(wavelength.size)
-    found = fixed.values(weights, None, fixed.places(wavelength), wavelength)
+    found = fixed.values(weights, None, fixed.knot_wavelengths(wavelength), wavelength)
     np.testing.assert_allclose(found.T @ found, named, atol=1e-12)
     sum_of_two = SpectralProcess(lambda scale: 0.5 * kernels.Exp(scale) + 0.5 * kernels.Exp(50.0))
     assert np.diag(covariance(sum_of_two, length, IRREGULAR)) == pytest.approx(1.0)

@@ -29,7 +29,7 @@ def test_it_stands_alone_and_its_anchors_lead_somewhere(page):
 
 def test_the_advice_comes_first_and_the_reference_with_it(page):
     assert page.text.index("use nuts for it") < page.text.index("Error against time")
-    assert "10,000 draws of NUTS, worth 5,000 independent ones" in page.text
+    assert "10,000 draws of NUTS with an effective sample size of 5,000" in page.text
     assert "is at most 0.012 posterior sd." in page.text
 
 

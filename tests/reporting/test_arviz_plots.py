@@ -14,7 +14,7 @@ from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.errors import FitError
-from polar_bayes.inference import joint_fit as fitting
+from polar_bayes.inference import fitting, problem
 
 METHODS = {
     "nuts": pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50),
@@ -26,7 +26,7 @@ METHODS = {
 }
 DEAR = {
     "flow guide": pb.methods.FlowGuide(steps=200, draws=200),
-    "tempered": pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)),
+    "tempered": pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)),
 }
 OF_DRAWS = (
     "plot_dist",
@@ -65,10 +65,9 @@ def result_of(name: str, fitted: dict[str, xr.DataTree]) -> xr.DataTree:
         capture = plate_capture(np.linspace(20.0, 80.0, 12), 0.02, seed=3)
         method = {**METHODS, **DEAR, "point": pb.methods.Point(starts=2)}[name]
         jax.config.update("jax_disable_most_optimizations", True)
-        few = {"STARTS": 4, "PRIOR_DRAWS": 100, "BLOCK": 100}
         with pytest.MonkeyPatch.context() as patch:
-            for constant, value in few.items():
-                patch.setattr(fitting, constant, value)
+            patch.setattr(fitting, "PRIOR_DRAWS", 100)
+            patch.setattr(problem, "BLOCK", 100)
             fitted[name] = pb.fit(capture, scene=PLATE, links=LINKS, method=method, seed=7)
         jax.config.update("jax_disable_most_optimizations", False)
     return fitted[name]

@@ -12,7 +12,7 @@ from synthetic_maps import make_maps
 from synthetic_results import make_result
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_result import Approach, Status
+from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.reporting.maps import count_cases
 from polar_bayes.reporting.report import render
 from polar_bayes.reporting.text import count_percent, map_headline
@@ -28,12 +28,12 @@ MEANS = {
 
 def mixed(**asked: object) -> xr.Dataset:
     """Of 200 pixels 160 are good: 100 by weights, 50 by a fitted proposal, 10 by NUTS."""
-    status, approach = np.full(200, Status.GOOD), np.full(200, Approach.IMPORTANCE)
-    approach[100:150], approach[150:160] = Approach.ADAPTED, Approach.NUTS
-    status[160:195], approach[160:195] = Status.MASKED, Approach.NONE
-    status[195:197], approach[195:197] = Status.TOO_FEW_VIEWS, Approach.NONE
-    status[197:199], approach[197:199] = Status.NOT_TRUSTED, Approach.LAPLACE
-    status[199], approach[199] = Status.NOT_CONVERGED, Approach.NONE
+    status, approach = np.full(200, Status.GOOD), np.full(200, MethodUsed.IMPORTANCE)
+    approach[100:150], approach[150:160] = MethodUsed.ADAPTED, MethodUsed.NUTS
+    status[160:195], approach[160:195] = Status.MASKED, MethodUsed.NONE
+    status[195:197], approach[195:197] = Status.TOO_FEW_VIEWS, MethodUsed.NONE
+    status[197:199], approach[197:199] = Status.NOT_TRUSTED, MethodUsed.LAPLACE
+    status[199], approach[199] = Status.NOT_CONVERGED, MethodUsed.NONE
     flags = {"status": status.reshape(SHAPE), "approach": approach.reshape(SHAPE)}
     return make_maps(MEANS, **flags, **asked)
 

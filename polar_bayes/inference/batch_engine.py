@@ -1,0 +1,141 @@
+"""Compiled programs of one model for batches of pixels, and how pixels pass through them.
+
+Programs are made by functions `make(engine, settings)` in the file of their algorithm. An engine
+compiles each once and keeps it, so all pixels of all images of one layout share the programs.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Hashable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from polar_bayes.inference.batching import ObservationBatch, map_batches
+from polar_bayes.inference.compile import TRACING_LOCK, LRUCache, cache_key
+from polar_bayes.inference.optimize import from_prior
+from polar_bayes.inference.program import Program, compile_program
+from polar_bayes.inference.request import Request
+from polar_bayes.inference.result import dims_of
+from polar_bayes.observation.data import Observations
+
+BATCH = 128
+"""Pixels that one call of a program takes."""
+
+SMALL_BATCH = 4
+"""The same where each pixel has chains or particles of its own."""
+
+MOST_PROGRAMS = 64
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BatchEngine:
+    """The model of one pixel, and the programs compiled of it.
+
+    `single_program` is the model in single precision; `layout` is a pixel of the same layout.
+    """
+
+    program: Program
+    single_program: Program
+    layout: Observations
+    precision: str
+    seed: int = 0
+    programs: LRUCache[Any] = dataclasses.field(default_factory=lambda: LRUCache(MOST_PROGRAMS))
+
+    @property
+    def dtype(self) -> Any:
+        """Floating type of the answer."""
+        return np.float64 if self.precision == "double" else np.float32
+
+    def compiled[S: Hashable](
+        self, make: Callable[["BatchEngine", S], Callable], settings: S
+    ) -> Callable:
+        """The program for these settings, made at its first use."""
+        return self.programs.of((make, settings), lambda: make(self, settings))
+
+    def run[S: Hashable](
+        self,
+        make: Callable[["BatchEngine", S], Callable],
+        settings: S,
+        pixels: ObservationBatch,
+        *states: Any,
+        given: tuple = (),
+        batch: int = BATCH,
+        single: bool = False,
+    ) -> Any:
+        """Run a program on all pixels; `given` arguments are the same for all of them."""
+        dtype = np.float32 if single else self.dtype
+        with jax.enable_x64(dtype == np.float64):
+            program = functools.partial(self.compiled(make, settings), *given)
+            pixels = pixels.in_precision(dtype)
+            static, count = jax.tree.map(jnp.asarray, pixels.static), len(pixels)
+
+            def of_batch(index: np.ndarray) -> Any:
+                wanted = np.int32(min(batch, count - index[0]))
+                state = jax.tree.map(lambda x: x[index], states)
+                return program(wanted, pixels.take(index), static, *state)
+
+            return map_batches(of_batch, count, batch)
+
+    @property
+    def parameter_axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
+        """By parameter: names and lengths of the axes that it has in one pixel."""
+
+        def find() -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
+            z = np.zeros(self.program.size, self.dtype)
+            with jax.enable_x64(self.precision == "double"), TRACING_LOCK:
+                shapes = jax.eval_shape(self.program.parameters, z, self.layout)
+            dims = dims_of(self.program)
+            return {name: (tuple(dims[name]), x.shape) for name, x in shapes.items()}
+
+        return self.programs.of("parameter axes", find)
+
+    def prior_draws(self, count: int) -> np.ndarray:
+        """Draws from the prior, the starting points of mode searches. (draw, size)."""
+
+        def draw() -> np.ndarray:
+            with jax.enable_x64(self.precision == "double"):
+                key = jax.random.key(self.seed)
+                return np.asarray(from_prior(self.program, key, count, self.layout))
+
+        return self.programs.of(("prior draws", count), draw)
+
+
+_ENGINES: LRUCache[BatchEngine] = LRUCache(4)
+
+
+def make_engine(key: str, request: Request, observe: Callable[[], Observations]) -> BatchEngine:
+    """The engine of a request, from the cache where it has one of this key."""
+
+    def make() -> BatchEngine:
+        data = observe()
+        layout = {"double": data, "single": data.in_single_precision()}
+
+        def program(precision: str) -> Program:
+            with jax.enable_x64(precision == "double"), TRACING_LOCK:
+                model = dataclasses.replace(request, precision=precision).bind(request.scene)
+                return compile_program(model, layout[precision])
+
+        precision = request.precision
+        exact, single = program(precision), program("single")
+        return BatchEngine(exact, single, layout[precision], precision, request.seed)
+
+    return _ENGINES.of(key, make)
+
+
+def engine_key(request: Request, *further: Any) -> str:
+    """A text that is the same for requests whose programs are the same."""
+    layout = [
+        (name, v.dims, v.shape, str(v.dtype)) for name, v in request.capture.variables.items()
+    ]
+    return cache_key(
+        request.model,
+        request.scene,
+        request.priors,
+        request.links,
+        (request.seed, request.precision),
+        layout,
+        *further,
+    )

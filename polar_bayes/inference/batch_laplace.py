@@ -1,0 +1,227 @@
+"""Laplace approximation of many pixels, corrected by importance sampling.
+
+Each pixel takes the first of these that can be trusted: quasi-random draws of the normal
+approximation at the mode, weighted by Pareto-smoothed importance sampling; draws of Student t
+proposals that are fitted to the weighted draws of the previous round (population Monte Carlo);
+draws of a sampler (`PixelNuts` or `PixelSMC`).
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple, override
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from polar_bayes.inference.batch_engine import BatchEngine
+from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
+from polar_bayes.inference.batch_nuts import PixelNuts
+from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import (
+    batched,
+    put_rows,
+    take_rows,
+)
+from polar_bayes.inference.levenberg_marquardt import (
+    PRIOR_DRAWS,
+    RESTARTS,
+    ModeSearch,
+    NormalApproximation,
+    find_modes,
+)
+from polar_bayes.inference.program import Values
+from polar_bayes.inference.proposals import (
+    Points,
+    Proposal,
+    fit_t,
+    normal_points,
+    random_rotations,
+    student_t_points,
+)
+from polar_bayes.inference.psis import MAX_PARETO_K, effective_draws, smooth
+from polar_bayes.observation.data import Observations
+
+HARD = 1024
+"""Pixels with further draws that are in memory at a time."""
+
+LANES = 8
+"""Pixels of a batch that are computed together where each has hundreds of draws."""
+
+SAME_MODE = 1e-3
+"""Two modes whose potentials differ by less count as one."""
+
+STUDENT_T_FACTOR = 2
+"""Draws of a Student t proposal for each draw of the normal approximation."""
+
+MIN_EFFECTIVE = 100
+"""Least effective sample size of the weighted draws of a round."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PixelLaplace(AbstractPixelMethod):
+    """The normal approximation of every pixel, checked and corrected.
+
+    Args:
+        draws: Of the approximation in each pixel, from which means and quantiles are taken; a
+            power of two, >= 64.
+        weighted: True weights them by the posterior, which corrects the approximation and
+            diagnoses it (Pareto k); False takes them as they are, without a diagnosis.
+        candidates: Prior draws among which the start of each pixel is chosen, >= 8.
+        rounds: In which the proposal of a pixel with Pareto k above 0.7 is fitted to its own
+            weighted draws, until k is below; >= 0. Without weights there are none.
+        sampler: The method of pixels whose k is still above, `PixelNuts` or `PixelSMC`; None
+            marks them only.
+
+    Raises:
+        FitError: A setting is outside its range.
+    """
+
+    draws: int = 256
+    weighted: bool = True
+    candidates: int = PRIOR_DRAWS
+    rounds: int = 3
+    sampler: AbstractPixelMethod | None = dataclasses.field(default_factory=PixelNuts)
+
+    memory_limit: ClassVar[int] = 4096
+
+    def __post_init__(self) -> None:
+        if self.draws < 64 or self.draws & (self.draws - 1):
+            self._refuse(f"draws is {self.draws}", "give 64, 128, 256 or so")
+        self._check_least(candidates=8, rounds=0)
+
+    @override
+    def fit(
+        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
+    ) -> None:
+        run = _Run(self, batch, at)
+        found = run.approximate()
+        run.record(found)
+        hard = np.flatnonzero(found.search.converged & ~found.is_trusted)
+        for begin in range(0, hard.size, HARD):
+            some = hard[begin : begin + HARD]
+            left = some[run.adapt(some, take_rows(found, some))]
+            if self.sampler is not None and left.size:
+                self.sampler.fit(batch, at[left], take_rows(found.search.mode, left))
+
+
+class Approximation(NamedTuple):
+    """Normal approximations of a batch of pixels, and their weighted draws."""
+
+    search: ModeSearch
+    parameters: Values
+    weights: np.ndarray
+    pareto_k: np.ndarray
+
+    @property
+    def is_trusted(self) -> np.ndarray:
+        """Whether the weights correct the errors of the approximation, (pixel,)."""
+        return self.search.converged & (self.pareto_k <= MAX_PARETO_K)
+
+
+class _Run:
+    """One run of `PixelLaplace` for some pixels of a batch."""
+
+    def __init__(self, settings: PixelLaplace, batch: BatchFit, at: np.ndarray) -> None:
+        self.settings, self.batch, self.at = settings, batch, at
+        self.engine, self.pixels = batch.engine, batch.pixels.subset(at)
+        size, draws = self.engine.program.size, settings.draws
+        self.points = normal_points(draws, size, batch.seed)
+        self.student_t = student_t_points(STUDENT_T_FACTOR * draws, size, batch.seed)
+        self.rotations = random_rotations(batch.keys[at], size)
+
+    def approximate(self) -> Approximation:
+        """Fit from the best candidate; untrusted pixels start again and keep the lower mode."""
+        candidates = self.settings.candidates
+        search = find_modes(self.engine, self.pixels, candidates=candidates)
+        found = jax.tree.map(np.array, self._weigh(np.arange(self.at.size), search))
+        for rank in RESTARTS:
+            untrusted = np.flatnonzero(~found.is_trusted)
+            if not untrusted.size:
+                break
+            old = take_rows(found.search, untrusted)
+            new = find_modes(self.engine, self.pixels.subset(untrusted), rank, candidates)
+            is_lower = new.mode.value < old.mode.value - SAME_MODE
+            better = np.flatnonzero(new.converged & (~old.converged | is_lower))
+            if better.size:
+                which = untrusted[better]
+                put_rows(found, which, self._weigh(which, take_rows(new, better)))
+        return found
+
+    def _weigh(self, which: np.ndarray, search: ModeSearch) -> Approximation:
+        """Draws of the normal approximations, and their weights where they are asked for."""
+        proposal = _proposal_at(search.mode).rotated(self.rotations[which])
+        parameters, ratios = self._draw(which, proposal, self.points)
+        if self.settings.weighted:
+            return Approximation(search, parameters, *smooth(ratios))
+        weights = np.full((which.size, self.settings.draws), 1.0 / self.settings.draws)
+        return Approximation(search, parameters, weights, np.zeros(which.size))
+
+    def _draw(
+        self, which: np.ndarray, proposal: Proposal, points: Points
+    ) -> tuple[Values, np.ndarray]:
+        """Draws of the proposal of every pixel, and their log importance ratios."""
+        states, given = (tuple(np.float32(x) for x in each) for each in (proposal, points))
+        some, weighted = self.pixels.subset(which), self.settings.weighted
+        return self.engine.run(_draws, weighted, some, *states, given=given, single=True)
+
+    def record(self, found: Approximation) -> None:
+        """Normal approximations, corrected by their weights where these can be trusted."""
+        at, outcome = self.at, self.batch.outcome
+        self.batch.record_modes(at, found.search)
+        converged, trusted = found.search.converged, found.is_trusted
+        method, effective = np.full(at.size, MethodUsed.LAPLACE), np.full(at.size, np.nan)
+        if self.settings.weighted:
+            outcome.pareto_k[at] = np.where(converged, found.pareto_k, np.nan)
+            effective = np.where(trusted, effective_draws(found.weights), np.nan)
+            method = np.where(trusted, MethodUsed.IMPORTANCE, MethodUsed.LAPLACE)
+        # Weights that cannot be trusted do not correct anything.
+        weights = np.where(trusted[:, None], found.weights, 1.0 / self.settings.draws)
+        status = np.where(trusted, Status.GOOD, Status.NOT_TRUSTED)
+        answers = found.parameters, weights, effective, method, status
+        self.batch.record(at[converged], *take_rows(answers, converged))
+
+    def adapt(self, which: np.ndarray, normal: Approximation) -> np.ndarray:
+        """Fit proposals to their own weighted draws; returns which have no answer after that."""
+        left, points, weights = np.arange(which.size), self.points, normal.weights
+        proposal = _proposal_at(normal.search.mode).rotated(self.rotations[which])
+        for _ in range(self.settings.rounds):
+            if not left.size:
+                break
+            some = which[left]
+            proposal = fit_t(proposal.draws(points), weights).rotated(self.rotations[some])
+            points = self.student_t
+            parts = [  # each as large as `self.points`: one program
+                self._draw(some, proposal, part) for part in points.split(STUDENT_T_FACTOR)
+            ]
+            parameters, ratios = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
+            weights, pareto_k = smooth(ratios)
+            effective = effective_draws(weights)
+            enough = (pareto_k <= MAX_PARETO_K) & (effective >= MIN_EFFECTIVE)
+            answers = take_rows((parameters, weights, effective), enough)
+            self.batch.record(self.at[some[enough]], *answers, MethodUsed.ADAPTED)
+            left, weights, proposal = take_rows((left, weights, proposal), ~enough)
+        return left
+
+
+def _proposal_at(mode: NormalApproximation) -> Proposal:
+    """The normal approximation as a proposal."""
+    return Proposal(np.asarray(mode.z), np.asarray(mode.root))
+
+
+def _draws(engine: BatchEngine, weighted: bool) -> Callable:
+    """The program that draws from the proposal of one pixel."""
+    program = engine.single_program
+
+    def draws(
+        points: Array, log_density: Array, data: Observations, center: Array, root: Array
+    ) -> tuple[Values, Array]:
+        z = center + points @ root
+        parameters = jax.vmap(lambda z: program.parameters(z, data))(z)
+        if not weighted:
+            return parameters, jnp.zeros(len(points))
+        values = jax.vmap(lambda z: program.potential(z, data))(z)
+        return parameters, -values - log_density
+
+    return batched(draws, given=2, lanes=LANES)

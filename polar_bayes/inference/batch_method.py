@@ -1,0 +1,108 @@
+"""The contract of methods that fit many pixels at once, and the fit of one batch of pixels."""
+
+import abc
+import dataclasses
+from typing import ClassVar, NoReturn, override
+
+import jax
+import numpy as np
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.batch_engine import BatchEngine
+from polar_bayes.inference.batch_result import (
+    MIN_VIEWS,
+    Describe,
+    MethodUsed,
+    Outcome,
+    Status,
+    empty_outcome,
+)
+from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.inference.levenberg_marquardt import ModeSearch, NormalApproximation
+from polar_bayes.inference.method import AbstractBatchMethod
+from polar_bayes.inference.program import Values
+
+
+class BatchFit:
+    """One fit of a batch of pixels: what is fitted, and the outcome as it is filled in."""
+
+    def __init__(
+        self,
+        engine: BatchEngine,
+        pixels: ObservationBatch,
+        keys: np.ndarray,
+        describe: Describe = lambda at, draws, weights: None,
+        seed: int = 0,
+    ) -> None:
+        self.engine, self.pixels, self.keys, self.seed = engine, pixels, keys, seed
+        self.outcome = empty_outcome(len(pixels))
+        self._describe = describe
+
+    def record_modes(self, at: np.ndarray, search: ModeSearch) -> None:
+        """Modes were found, and it is not known yet how good a normal approximation there is."""
+        found = search.converged
+        self.outcome.steps[at] = search.steps
+        self.outcome.condition[at] = np.where(found, search.mode.condition, np.nan)
+        self.outcome.status[at] = np.where(found, Status.NOT_TRUSTED, Status.NOT_CONVERGED)
+
+    def record(
+        self,
+        at: np.ndarray,
+        draws: Values,
+        weights: np.ndarray,
+        effective: np.ndarray,
+        method: MethodUsed | np.ndarray,
+        status: Status | np.ndarray = Status.GOOD,
+    ) -> None:
+        """Weighted draws of some pixels, and their effective sample size."""
+        self._describe(at, draws, weights)
+        self.outcome.effective_draws[at] = effective
+        self.outcome.approach[at] = method
+        self.outcome.status[at] = status
+
+
+def random_keys(seed: int, numbers: np.ndarray) -> np.ndarray:
+    """Random keys that depend on the number of each pixel alone, as arrays."""
+    base = jax.random.key(seed)
+    keys = jax.vmap(lambda number: jax.random.fold_in(base, number))(numbers.astype(np.uint32))
+    return np.asarray(jax.random.key_data(keys))
+
+
+@dataclasses.dataclass(frozen=True)
+class AbstractPixelMethod(AbstractBatchMethod[BatchEngine]):
+    """A method that fits many pixels side by side."""
+
+    memory_limit: ClassVar[int] = 1024
+    """Pixels whose draws are in memory at a time."""
+
+    @override
+    def run_batch(
+        self,
+        engine: BatchEngine,
+        observations: ObservationBatch,
+        numbers: np.ndarray,
+        seed: int,
+        describe: Describe,
+    ) -> Outcome:
+        batch = BatchFit(engine, observations, random_keys(seed, numbers), describe, seed)
+        batch.outcome.status[observations.views < MIN_VIEWS] = Status.TOO_FEW_VIEWS
+        batch.outcome.status[observations.views == 0] = Status.MASKED
+        at = np.flatnonzero(observations.views >= MIN_VIEWS)
+        for begin in range(0, at.size, self.memory_limit):
+            self.fit(batch, at[begin : begin + self.memory_limit])
+        return batch.outcome
+
+    @abc.abstractmethod
+    def fit(
+        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
+    ) -> None:
+        """Fit the pixels `at` these indices, and record their outcome; modes may be known."""
+
+    def _check_least(self, **least: int) -> None:
+        """Refuse settings below their least values."""
+        for name, lowest in least.items():
+            if getattr(self, name) < lowest:
+                self._refuse(f"{name} is {getattr(self, name)}", f"give {lowest} or more")
+
+    def _refuse(self, what: str, hint: str) -> NoReturn:
+        raise FitError(what, where=type(self).__name__, hint=hint)

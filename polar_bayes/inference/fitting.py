@@ -1,0 +1,280 @@
+"""The public verb of one capture: a capture in, an ArviZ DataTree out."""
+
+import dataclasses
+import inspect
+import json
+import math
+import platform
+import time
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
+from types import FunctionType
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+from numpyro import distributions as dist
+from numpyro.primitives import Messenger
+
+from polar_bayes.capture.schema import count
+from polar_bayes.errors import FitError
+from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_until
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
+from polar_bayes.inference.methods import find_method
+from polar_bayes.inference.optimize import from_prior
+from polar_bayes.inference.problem import BLOCK, THREADS, Problem, make_problem
+from polar_bayes.inference.request import MODELS, Request, resolve
+from polar_bayes.inference.result import assemble, posterior_of
+from polar_bayes.observation.links import AbstractLink
+from polar_bayes.physics.instrument import Discrepancy
+from polar_bayes.physics.scene import Scene
+from polar_bayes.priors import describe_prior, support_bounds
+from polar_bayes.progress import Progress, no_progress, with_progress
+
+PRIOR_DRAWS = 500
+
+DIAGNOSTICS = ("r_hat", "k_hat", "effective_draws")
+"""What a method states of its own draws, stored with the result; None where it states nothing."""
+
+
+@with_progress
+def fit(
+    capture: xr.Dataset,
+    *,
+    model: str | Callable = "per_material",
+    method: str | AbstractMethod = "nuts",
+    tolerance: float | None = None,
+    seconds: float | None = None,
+    scene: str | Scene | None = None,
+    priors: Mapping[str, dist.Distribution] | None = None,
+    links: AbstractLink | Mapping[str, AbstractLink] | None = None,
+    largest_view_zenith: float | None = None,
+    seed: int = 0,
+    precision: str = "double",
+    progress: Progress | None = None,
+) -> xr.DataTree:
+    """Fit one capture.
+
+    Args:
+        capture: A Dataset of the capture schema; validated here.
+        model: A name in `polar_bayes.inference.request.MODELS` or a callable
+            `model(data, scene, priors, links)`.
+        method: "nuts", "laplace", "point", "importance" (Laplace, its draws weighted by the
+            posterior), "tempered" (adaptive tempered SMC from the prior to the posterior; one
+            material in one color), "auto" (the cheapest of these that is good enough), or settings
+            such as `Nuts(draws=2000)`.
+        tolerance: Of "auto": largest error of a posterior mean or standard deviation, in posterior
+            standard deviations, above 0 and at most 1; by default 0.1.
+        seconds: Of "auto": wall time of the whole fit, by default 60. Only the first method always
+            ends; what is not done by then is abandoned, and the best answer so far is returned.
+        scene: A name in `SETUPS` or a `Scene`; by default the set-up that the capture names in
+            its attribute `setup`, else "paper".
+        priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
+        links: One link for the polarization, or a mapping from variable to link.
+        largest_view_zenith: Views beyond it are set aside and counted. Unit degree.
+        seed: The same seed gives the same result on the same machine, unless "auto" ran out of
+            time.
+        precision: "double" or "single".
+        progress: Called with the name of a stage and the fraction of it that is done.
+
+    Returns:
+        A DataTree with the groups posterior, sample_stats, log_likelihood, log_prior,
+        posterior_predictive, noise_free, prior, prior_predictive, observed_data and
+        constant_data, and effects for a scene of `polar_bayes.choose_effects`;
+        `polar_bayes.verdict` says whether it converged, and
+        `polar_bayes.inference.auto_sentences` what "auto" did and why.
+
+    Raises:
+        CaptureError: The capture does not hold what a fit needs.
+        SceneError: No such scene.
+        FitError: A model, method, prior or link cannot be used, or the memory is too small.
+    """
+    start_time = time.perf_counter()
+    chosen = find_method(method, tolerance, seconds)
+    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, precision)
+    with jax.enable_x64(precision == "double"):
+        return _fit(request, chosen, progress or no_progress, start_time)
+
+
+def _fit(
+    request: Request, method: AbstractMethod, progress: Progress, start_time: float
+) -> xr.DataTree:
+    key, key_comparisons, key_posterior, key_prior = jax.random.split(
+        jax.random.key(request.seed), 4
+    )
+    key_search, key_draws = jax.random.split(key)
+    problem = make_problem(request, key_search, start_time)
+    _check_room(problem, PRIOR_DRAWS)
+    method.prepare(problem)
+    problem.prepare_predictions()
+    timings, prepared = _Timings(start_time), time.perf_counter() - start_time
+    draws = method.run(problem, key_draws, progress)
+    timings.record("draws")
+    if problem.search_seconds:
+        timings.split("draws", "modes", prepared + problem.search_seconds)
+    _check_room(problem, draws.z[..., 0].size + PRIOR_DRAWS)
+    posterior = problem.predict(key_posterior, draws.z)
+    prior_z = from_prior(problem.program, key_prior, PRIOR_DRAWS, problem.data)
+    prior = problem.predict(key_prior, prior_z[None])
+    timings.record("prediction")
+
+    comparisons, failed = _fit_comparisons(request, method, draws, key_comparisons, progress)
+    if isinstance(request.scene.ledger, xr.Dataset):
+        comparisons["effects"] = request.scene.ledger  # how the scene was chosen
+    timings.record("comparisons")
+
+    stated = {name: getattr(draws, name) for name in DIAGNOSTICS}
+    provenance = {
+        **_provenance(request, method, problem),
+        "timings": {stage: round(seconds, 3) for stage, seconds in timings.seconds.items()},
+        "problems": draws.problems,
+        "method": draws.method,
+        **{name: value if math.isfinite(value) else None for name, value in stated.items()},
+        **draws.metadata,
+        **({"comparisons_failed": failed} if failed else {}),
+    }
+    return assemble(
+        problem.program,
+        request.capture,
+        problem.data,
+        posterior,
+        prior,
+        draws.stats,
+        comparisons,
+        provenance,
+    )
+
+
+class _Timings:
+    """Seconds of each stage, compilation included."""
+
+    def __init__(self, start_time: float) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = start_time
+
+    def record(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage] = now - self._last
+        self._last = now
+
+    def split(self, stage: str, first: str, seconds: float) -> None:
+        """Count so many seconds of a stage as those of its first part."""
+        self.seconds[first] = seconds
+        self.seconds[stage] -= seconds
+
+
+def _check_room(problem: Problem, draws: int) -> None:
+    """Refuse predictions of more draws than the memory can hold."""
+    data = problem.data
+    readings = len(problem.program.observed) * problem.dtype.itemsize * math.prod(data.shape)
+    # Noise-free readings, predicted ones and the density of each; in blocks, then all of them.
+    check_memory((draws + THREADS * BLOCK) * 3 * readings)
+
+
+def _fit_comparisons(
+    request: Request, method: AbstractMethod, draws: PosteriorDraws, key: Array, progress: Progress
+) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
+    """Posteriors of the same capture under simpler scenes, by name, and why others failed."""
+    is_point = draws.covariance is not None  # it has no intervals to compare
+    if is_point or not request.scene.has(Discrepancy):
+        return {}, {}
+    method = draws.comparison_method or method
+    scenes = {
+        "without_discrepancy": request.scene.without(Discrepancy),
+        "without_instrument": dataclasses.replace(request.scene, instrument=None),
+    }
+    found: dict[str, xr.Dataset] = {}
+    failed: dict[str, str] = {}
+    key_search, key_draws = jax.random.split(key)
+
+    def compare(progress: Progress) -> None:
+        problems: dict[str, Problem] = {}
+        for name, scene in scenes.items():
+            try:
+                problems[name] = make_problem(dataclasses.replace(request, scene=scene), key_search)
+                method.prepare(problems[name])
+            except FitError as error:  # a failed comparison must not cost the user the fit
+                failed[name] = str(error)
+        for number, (name, problem) in enumerate(problems.items()):
+            done = number / len(problems)
+            progress("comparing", done)
+            try:
+                one = method.run(
+                    problem, key_draws, lambda *_, done=done: progress("comparing", done)
+                )
+                found[name] = posterior_of(problem.program, problem.constrain(one.z))
+            except FitError as error:
+                failed[name] = str(error)
+
+    late = ""
+    try:
+        run_until(draws.deadline, progress, compare)
+    except OutOfTimeError as error:
+        late = str(error)
+    progress("comparing", 1.0)
+    done = dict(found)  # an abandoned thread may still write to its own
+    return done, {name: late for name in scenes if late and name not in done} | failed
+
+
+def _model_settings(model: Callable) -> dict[str, Any]:
+    """The fields of a model that is a value, in what JSON can hold."""
+    if not dataclasses.is_dataclass(model) or isinstance(model, type):
+        return {}
+    return json.loads(json.dumps(dataclasses.asdict(model), default=repr))
+
+
+def _model_source(model: Callable) -> str:
+    """The source of a model of the user's own, so that a result shows what was fitted."""
+    while isinstance(model, Messenger):
+        model = model.fn
+    ours = [known if isinstance(known, FunctionType) else type(known) for known in MODELS.values()]
+    if model in ours or type(model) in ours:
+        return ""
+    try:
+        return inspect.getsource(model if isinstance(model, FunctionType) else type(model))
+    except (OSError, TypeError):
+        return ""
+
+
+def _finite_bounds(prior: dist.Distribution) -> list[float | None]:
+    """Where the support of a prior ends; None, which JSON can hold, where it does not."""
+    return [bound if math.isfinite(bound) else None for bound in support_bounds(prior)]
+
+
+def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> dict[str, Any]:
+    """Everything that is needed to repeat the fit."""
+    data = problem.data
+    at_boundary = {
+        name: int(np.sum((np.asarray(link.reading(x)) != np.asarray(x)) & np.asarray(data.valid)))
+        for name, link in request.links.items()
+        for x in [data.readings[name]]
+    }
+    packages = ("polar_bayes", "jax", "numpyro", "arviz", "optimistix", "numpy", "xarray")
+    used = {"used": int(np.sum(data.valid)), "at_margin": at_boundary}
+    return {
+        "settings": dataclasses.asdict(method),
+        "model": request.model_name,
+        "model_settings": _model_settings(request.model),
+        "model_source": _model_source(request.model),
+        "scene": request.scene_name,
+        "scene_parts": repr(request.scene),
+        "priors": {name: describe_prior(prior) for name, prior in request.priors.items()},
+        "bounds": {name: _finite_bounds(prior) for name, prior in request.priors.items()},
+        "declared": request.declared,
+        "fixed": request.fixed,
+        "links": {name: repr(link) for name, link in request.links.items()},
+        "swapped": list(request.swapped),
+        "largest_view_zenith": request.largest_view_zenith,
+        "seed": request.seed,
+        "precision": request.precision,
+        "chain_method": "threads",
+        "versions": {name: version(name) for name in packages},
+        "machine": {"processor": platform.machine(), "python": platform.python_version()},
+        "counts": {**count(request.capture), **used},
+        "capture": {
+            str(key): value if isinstance(value, str | int | float) else str(value)
+            for key, value in request.capture.attrs.items()
+        },
+    }
