@@ -14,7 +14,7 @@ LINKS = {"q": pb.links.StokesLink()}
 METHODS = {
     "laplace": pb.methods.Laplace(draws=1000),
     "importance": pb.methods.Importance(),
-    "tempered": pb.methods.Tempered(pb.methods.PixelTempering(draws=4096)),
+    "tempered": pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)),
     "normal guide": pb.methods.NormalGuide(steps=400, draws=1000),
     "flow guide": pb.methods.FlowGuide(steps=400, draws=1000),
     "nuts": pb.methods.Nuts(effective_draws=2000.0),
