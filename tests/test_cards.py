@@ -3,6 +3,7 @@
 import dataclasses
 
 import pytest
+from cases import each
 from pages import EVIL, Page
 
 import polar_bayes as pb
@@ -22,7 +23,7 @@ VALUES = {
 }
 
 
-@pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
+@each("value", VALUES.values(), ids=VALUES)
 def test_a_card_is_balanced_html_and_runs_nothing(value) -> None:
     page = Page(value._repr_html_())
     assert page.open == []
@@ -39,6 +40,7 @@ def test_a_scene_shows_its_parts_and_parameters() -> None:
         assert name in text
 
 
+@pytest.mark.thorough
 def test_a_chosen_scene_is_shown_as_a_scene() -> None:
     scene = pb.setups.SETUPS["paper"].scene
     chosen = pb.effects.ChosenScene(
@@ -57,6 +59,7 @@ def test_priors_show_their_numbers() -> None:
     assert "object at" not in text
 
 
+@pytest.mark.thorough
 def test_text_stays_what_one_would_write() -> None:
     assert eval(repr(pb.Disc(half_width=5.0)), {"Disc": pb.Disc}) == pb.Disc(half_width=5.0)
     assert repr(pb.PRIORS) == repr(dict(pb.PRIORS))
@@ -86,6 +89,7 @@ def test_a_card_in_a_terminal() -> None:
 # --- priors as a table ----------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_the_priors_of_a_set_up_are_those_that_its_fit_reads() -> None:
     table = pb.setups.prior_table("goniometer")
     setup = pb.setups.SETUPS["goniometer"]
@@ -95,6 +99,7 @@ def test_the_priors_of_a_set_up_are_those_that_its_fit_reads() -> None:
     assert 1.2 < row["q2.5"] < row["q50"] < row["q97.5"] < 2.0
 
 
+@pytest.mark.thorough
 def test_a_replaced_prior_stands_in_the_table() -> None:
     mine = {"roughness": pb.PRIORS["leakage"]}
     assert (

@@ -2,12 +2,12 @@
 
 import pickle
 
-import pytest
+from cases import each
 
 from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
 
 
-@pytest.mark.parametrize("kind", [PolarBayesError, CaptureError, FitError, OutputError, SceneError])
+@each("kind", [PolarBayesError, CaptureError, FitError, OutputError, SceneError])
 def test_an_error_arrives_as_it_was_sent(kind):
     sent = kind("it is\ntorn", where="view 3", hint="measure it again")
     came = pickle.loads(pickle.dumps(sent))

@@ -21,6 +21,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from test_architecture import LAYERS
 
 import polar_bayes as pb
@@ -38,6 +39,7 @@ DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [README, ROOT / "CONTRIBUTING.md", *DOCS]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"`([^`\n]+)`")
+RUN = ("README.md", "quickstart.md", "extending.md")
 TINY = pb.methods.Laplace(
     chains=2, draws=50
 )  # the sampler itself runs where a page states settings
@@ -48,7 +50,7 @@ CHANGED = (
     "jax_persistent_cache_min_entry_size_bytes",
 )
 
-of_every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+of_every_page = each("page", PAGES, ids=lambda page: page.name)
 
 
 def blocks(page: Path, language: str) -> Iterator[tuple[int, str]]:
@@ -117,7 +119,11 @@ def settings_of_jax() -> Iterator[None]:
 @pytest.mark.usefixtures("settings_of_jax")
 @pytest.mark.parametrize(
     "page",
-    [page for page in PAGES if any(blocks(page, "python"))],
+    [
+        page if page.name in RUN else pytest.param(page, marks=pytest.mark.thorough)
+        for page in PAGES
+        if any(blocks(page, "python"))
+    ],
     ids=lambda page: page.name,
 )
 def test_the_python_of_a_page_runs(
@@ -221,7 +227,7 @@ def anchors(page: Path) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("page", [README, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.name)
+@each("page", [README, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.name)
 def test_the_links_of_a_page_lead_somewhere(page: Path) -> None:
     """Those of the site are resolved when it is built (tests/docs)."""
     for target in re.findall(r"\]\(([^)\s]+)\)", CODE.sub("", prose(page))):

@@ -179,6 +179,7 @@ CASES: dict[str, Callable] = {
     "next views": views,
     "effects": effects,
 }
+QUICK = ("point", "laplace", "identify")
 OPTIMIZED = {"point", "identify", "profile", "next views", "effects"}
 
 
@@ -195,8 +196,10 @@ def differences(case: str, found: dict, stored: dict) -> list[str]:
     return wrong
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [case if case in QUICK else pytest.param(case, marks=pytest.mark.thorough) for case in CASES],
+)
 def test_results_are_as_before(case):
     assert not differences(case, CASES[case](), json.loads(STORED.read_text())[case])
 

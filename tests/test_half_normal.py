@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from cases import each
 from numpyro import distributions as dist
 from numpyro.distributions import biject_to
 
@@ -30,7 +31,7 @@ def value_in_digits(z: float) -> mpmath.mpf:
         return high
 
 
-@pytest.mark.parametrize(
+@each(
     ("z", "dtype"),
     [(z, dtype) for z in SCORES for dtype in (np.float64, np.float32) if abs(z) < REACH[dtype]],
 )
@@ -51,8 +52,8 @@ def test_values_and_slopes_agree_with_fifty_digits(z: float, dtype: type) -> Non
     )
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("z", [*SCORES, *FAR])
+@each("dtype", [np.float64, np.float32])
+@each("z", [*SCORES, *FAR])
 def test_what_is_far_out_is_finite_and_comes_back(z: float, dtype: type) -> None:
     """Value, gradient and Hessian of the density of a score; where the value is not yet zero."""
     move = biject_to(HalfNormal(SCALE).support)
@@ -85,6 +86,7 @@ def test_scores_of_draws_are_standard_normal() -> None:
     assert (np.abs(below - shares) < 4.0 * np.sqrt(shares * (1 - shares) / 20_000)).all()
 
 
+@pytest.mark.thorough
 def test_the_table_samples_leakage_so() -> None:
     assert PRIORS["leakage"].support.eq(HalfNormal(SCALE).support)
     assert not PRIORS["leakage"].support.eq(HalfNormal(0.02).support)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import each
 from plates import plate_capture
 
 import polar_bayes as pb
@@ -55,9 +56,8 @@ def test_a_device_or_pipe_is_not_replaced(capture, tmp_path):
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
-@pytest.mark.parametrize(
-    "content", [b"angle,s,p\n1,2,3\n", b"\x89PNG\r\n", b"\x89HDF\r\n\x1a\n..."]
-)
+@pytest.mark.thorough
+@each("content", [b"angle,s,p\n1,2,3\n", b"\x89PNG\r\n", b"\x89HDF\r\n\x1a\n..."])
 def test_a_file_of_another_kind_is_not_replaced(capture, tmp_path, content):
     file = tmp_path / "mine"
     file.write_bytes(content)
@@ -67,6 +67,7 @@ def test_a_file_of_another_kind_is_not_replaced(capture, tmp_path, content):
     assert not leftovers(tmp_path)
 
 
+@pytest.mark.thorough
 def test_an_empty_file_may_be_written(capture, tmp_path):
     file = tmp_path / "made-by-mktemp.nc"
     file.touch(mode=0o600)
@@ -75,6 +76,7 @@ def test_an_empty_file_may_be_written(capture, tmp_path):
     assert pb.load_capture(file).sizes == capture.sizes
 
 
+@pytest.mark.thorough
 def test_a_circle_of_links_is_one_line(capture, tmp_path):
     one, other = tmp_path / "one.nc", tmp_path / "other.nc"
     one.symlink_to(other)
@@ -95,6 +97,7 @@ def test_an_input_is_found_under_any_name(capture, tmp_path):
         paths.check_output(tmp_path / "new.nc", lambda _: True, [tmp_path])
 
 
+@pytest.mark.thorough
 def test_what_is_moved_is_synced_before_and_its_folder_after(capture, tmp_path, monkeypatch):
     did = []
     monkeypatch.setattr(os, "fsync", lambda opened: did.append(Path(f"/proc/self/fd/{opened}")))

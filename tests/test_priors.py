@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
@@ -33,7 +34,7 @@ def refused(name, prior, parameters=tuple(PRIORS)):
 # --- the table ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "kind", "arguments"),
     [
         ("roughness", dist.HalfNormal, {"scale": 0.2}),
@@ -53,7 +54,7 @@ def test_the_prior_of_the_index_is_the_papers_truncated_normal():
     assert float(prior.base_dist.scale) == 0.15
 
 
-@pytest.mark.parametrize("name", PRIORS)
+@each("name", PRIORS)
 def test_every_row_stays_inside_the_range_of_its_parameter(name):
     low, high = support_bounds(PRIORS[name])
     least, most = RANGES.get(name, (-math.inf, math.inf))
@@ -66,19 +67,20 @@ def test_every_range_has_a_row():
     assert set(MATERIAL) <= set(RANGES)
 
 
-@pytest.mark.parametrize("name", SETUPS)
+@each("name", SETUPS)
 def test_every_parameter_of_every_setup_has_a_row(name):
     setup = SETUPS[name]
     needed = (*setup.scene.parameters, *noise_parameters(setup.links))
     assert tuple(resolve_priors(needed)) == needed
 
 
-@pytest.mark.parametrize("name", PRIORS)
+@each("name", PRIORS)
 def test_every_row_can_be_drawn_from(name):
     draws = np.asarray(PRIORS[name].sample(KEY, (100,)))
     assert np.all(np.isfinite(draws))
 
 
+@pytest.mark.thorough
 def test_the_tables_beta_is_numpyros():
     values = jnp.array([1e-6, 0.3, 1.0 - 1e-6])
     ours, theirs = PRIORS["subsurface_fraction"], dist.Beta(2.0, 2.0)
@@ -99,7 +101,7 @@ def test_an_override_replaces_its_row_and_no_other():
     assert tuple(resolved) == MATERIAL
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "prior"),
     [
         ("roughness", dist.Uniform(0.01, 0.5)),
@@ -122,6 +124,7 @@ def test_a_distribution_of_the_right_support_is_taken(name, prior):
     assert resolve_priors([name], {name: prior})[name] is prior
 
 
+@pytest.mark.thorough
 def test_a_parameter_of_a_users_own_takes_its_prior_from_the_caller():
     own = dist.Normal(0.0, 1.0).expand([3]).to_event(1)
     assert resolve_priors(["tilt"], {"tilt": own}) == {"tilt": own}
@@ -138,25 +141,26 @@ def test_a_misspelled_name_gets_a_suggestion_and_the_list():
     assert "the parameters are roughness, subsurface_fraction, absorption" in message
 
 
+@pytest.mark.thorough
 def test_a_name_of_another_model_is_refused_without_a_wild_guess():
     message = refused("zzz", dist.Normal(0.0, 1.0), MATERIAL)
     assert "did you mean" not in message
     assert "no such parameter in this model" in message
 
 
-@pytest.mark.parametrize("prior", [0.3, (0.0, 1.0), None, dist.Normal, np.zeros(2)])
+@each("prior", [0.3, (0.0, 1.0), None, dist.Normal, np.zeros(2)])
 def test_what_is_no_distribution_is_refused(prior):
     message = refused("roughness", prior)
     assert f"a {type(prior).__name__} is not a NumPyro distribution" in message
 
 
-@pytest.mark.parametrize("priors", [[dist.Normal(0.0, 1.0)], dist.Normal(0.0, 1.0), "roughness"])
+@each("priors", [[dist.Normal(0.0, 1.0)], dist.Normal(0.0, 1.0), "roughness"])
 def test_what_is_no_mapping_is_refused(priors):
     with pytest.raises(FitError, match=r"^priors: a \w+ does not name what it replaces; give"):
         resolve_priors(MATERIAL, priors)
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "prior"),
     [
         ("subsurface_fraction", dist.Normal(0.5, 0.1)),
@@ -179,12 +183,12 @@ def test_values_outside_the_physical_range_are_refused(name, prior):
     assert f"allows values outside {least:g} to {most:g}" in message
 
 
-@pytest.mark.parametrize("prior", [dist.Poisson(3.0), dist.Bernoulli(0.5)])
+@each("prior", [dist.Poisson(3.0), dist.Bernoulli(0.5)])
 def test_a_discrete_distribution_is_refused(prior):
     assert "is discrete" in refused("roughness", prior)
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "prior", "words"),
     [
         ("roughness", dist.HalfNormal(0.2).expand([4]).to_event(1), "one draw of it has shape"),
@@ -210,7 +214,7 @@ SHIFTED = dist.TransformedDistribution(
 )
 
 
-@pytest.mark.parametrize(
+@each(
     ("prior", "text"),
     [
         (dist.HalfNormal(0.2), "HalfNormal(scale=0.2)"),
@@ -256,6 +260,7 @@ def test_a_prior_reads_as_it_would_be_typed(prior, text):
     assert describe_prior(prior) == text
 
 
+@pytest.mark.thorough
 def test_a_prior_that_fails_to_describe_itself_still_has_a_name():
     class Broken(dist.Normal):
         @property
@@ -267,7 +272,8 @@ def test_a_prior_that_fails_to_describe_itself_still_has_a_name():
     assert describe_prior(broken) == "Broken"
 
 
-@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.thorough
+@each("name", PRIORS)
 def test_every_row_is_described_in_one_line(name):
     text = describe_prior(PRIORS[name])
     assert "(" in text

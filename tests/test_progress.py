@@ -102,6 +102,7 @@ def test_a_counting_bar_names_what_it_counts(notebook) -> None:
     assert "1/2" in notebook[1]["text/plain"]
 
 
+@pytest.mark.thorough
 def test_a_stage_is_text_and_nothing_else(notebook) -> None:
     with stages() as show:
         show("<script>alert(1)</script>", 0.5)
@@ -117,6 +118,7 @@ def test_what_a_run_calls_adds_no_bars_of_its_own(notebook) -> None:
     assert any("climbing" in picture["text/plain"] for picture in notebook)
 
 
+@pytest.mark.thorough
 def test_bars_go_where_a_run_breaks_off(notebook) -> None:
     @with_progress
     def breaks(*, progress=None) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cases import each
 
 import polar_bayes as pb
 
@@ -186,7 +187,7 @@ assert program.potential_energy is numpyro.infer.util.potential_energy  # there 
 """
 
 
-@pytest.mark.parametrize(
+@each(
     "imports",
     [
         "import arviz, polar_bayes",

@@ -3,13 +3,14 @@
 import inspect
 
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.setups import SETUPS, Setup, find_setup
 
-EVERY_SETUP = pytest.mark.parametrize("name", SETUPS)
+EVERY_SETUP = each("name", SETUPS)
 
 
 @EVERY_SETUP
@@ -57,7 +58,7 @@ def test_the_table_cannot_be_changed_by_accident():
         SETUPS["mine"] = SETUPS["paper"]
 
 
-@pytest.mark.parametrize("name", ["papper", "", "Paper", 3, None, ["paper"]])
+@each("name", ["papper", "", "Paper", 3, None, ["paper"]])
 def test_an_unknown_name_is_answered_with_the_known_ones(name):
     with pytest.raises(SceneError) as caught:
         find_setup(name)

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from toy_models import capture, line, of_line, squared
 
 import polar_bayes as pb
@@ -105,6 +106,7 @@ def test_errors_are_in_sds_of_the_reference(study):
     np.testing.assert_allclose(errors[0] - errors[1], 0.5, atol=0.1)
 
 
+@pytest.mark.thorough
 def test_the_reference_states_its_own_error(study):
     told = study["accuracy"].attrs
     assert told["reference"] == "NUTS"
@@ -121,6 +123,7 @@ def test_a_method_that_fails_is_a_row_that_says_why(study):
     assert not table.loc["broken", "on_front"]
 
 
+@pytest.mark.thorough
 def test_an_override_that_fails_is_a_row_that_says_why(study):
     table = pb.summary(study)
     for method in ("biased", "right", "broken"):
@@ -128,6 +131,7 @@ def test_an_override_that_fails_is_a_row_that_says_why(study):
         assert np.isnan(table.loc[f"{method}, stuck", "error"])
 
 
+@pytest.mark.thorough
 def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
     tries = []
 
@@ -154,6 +158,7 @@ def test_dials_turn_what_they_can_and_leave_the_rest_out(study):
     assert table.loc["right, draws / 10", "effective_draws"] == 400
 
 
+@pytest.mark.thorough
 def test_without_processes_of_their_own_first_times_and_memory_are_not_told(study):
     table = pb.summary(study)
     assert table["seconds_first"].isna().all()
@@ -163,6 +168,7 @@ def test_without_processes_of_their_own_first_times_and_memory_are_not_told(stud
     assert about["fresh_processes"] is False
 
 
+@pytest.mark.thorough
 def test_facets_are_turned_where_there_are_any():
     request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
     changed, method = pb.benchmark.FacetsOverride(0.5).apply(request, pb.methods.Nuts())
@@ -199,6 +205,7 @@ def test_an_override_of_draws_turns_what_its_name_says_or_nothing():
     assert enough[1].num_draws == 3072
 
 
+@pytest.mark.thorough
 def test_every_override_has_a_name_of_its_own():
     every: list[AbstractOverride] = [
         pb.benchmark.DrawsOverride(0.25), pb.benchmark.DrawsOverride(4.0),
@@ -226,6 +233,7 @@ def judged(biases: tuple[str, ...], error: float) -> ReferenceRun:
     return ReferenceRun(("x", "y"), np.zeros((2, 4, 9)), "made", errors, errors, None, None, biases)
 
 
+@pytest.mark.thorough
 def test_noise_is_no_reason_to_take_a_biased_reference():
     noisy, biased = judged((), 0.03)._replace(noise="its error is 0.03"), judged(("R-hat",), 0.001)
     assert len(noisy.doubts) == len(biased.doubts) == 1
@@ -235,6 +243,7 @@ def test_noise_is_no_reason_to_take_a_biased_reference():
     assert best_reference([unknown, noisy]) is best_reference([noisy, unknown]) is noisy
 
 
+@pytest.mark.thorough
 def test_draws_chosen_by_weight_have_the_error_of_their_weights_too():
     """Over 60 choices the error that is told is that of weights and choice together."""
     random = np.random.default_rng(0)
@@ -254,6 +263,7 @@ def test_draws_chosen_by_weight_have_the_error_of_their_weights_too():
     assert np.std(seen) < (1.0 + 4 * 0.09) * np.mean(told)
 
 
+@pytest.mark.thorough
 def test_the_tempered_reference_draws_what_its_own_error_takes():
     settings = pb.benchmark.Reference(error=0.02).tempered.settings
     assert settings.effective_draws == pytest.approx(4.0 / 0.02**2)
@@ -262,7 +272,7 @@ def test_the_tempered_reference_draws_what_its_own_error_takes():
     assert settings.num_particles == 8192
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "said"),
     [
         ({"methods": {}}, "there is no method"),
@@ -283,6 +293,7 @@ def test_settings_out_of_range_are_refused():
         pb.benchmark.FacetsOverride(-1.0)
 
 
+@pytest.mark.thorough
 def test_a_process_of_its_own_finds_no_compiled_programs(monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/somewhere")
     told = run._environment()
@@ -290,6 +301,7 @@ def test_a_process_of_its_own_finds_no_compiled_programs(monkeypatch):
     assert told["JAX_ENABLE_COMPILATION_CACHE"] == "false"
 
 
+@pytest.mark.thorough
 def test_a_trial_runs_in_a_process_of_its_own():
     request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
     found = run_fresh(Trial(request, pb.methods.Laplace(draws=50), 0))

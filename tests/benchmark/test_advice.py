@@ -18,6 +18,7 @@ def test_the_table_has_the_worst_parameter_of_every_row():
     assert list(table["resolved"]) == [True, True, True, True, False]
 
 
+@pytest.mark.thorough
 def test_the_larger_of_mean_and_sd_counts():
     study = make_accuracy()
     study["accuracy"]["sd_error"][1, 0] = -0.7
@@ -30,6 +31,7 @@ def test_the_front_holds_what_nothing_beats():
     assert list(pareto_front(seconds, error)) == [True, True, False, False, False, False]
 
 
+@pytest.mark.thorough
 def test_two_rows_that_are_alike_are_both_on_the_front():
     assert pareto_front(np.array([1.0, 1.0]), np.array([0.2, 0.2])).all()
 
@@ -41,6 +43,7 @@ def test_a_cheap_method_is_advised_for_all_but_what_it_gets_wrong():
     ]
 
 
+@pytest.mark.thorough
 def test_without_first_times_the_next_ones_count():
     assert (
         "60 times faster than nuts"
@@ -48,6 +51,7 @@ def test_without_first_times_the_next_ones_count():
     )
 
 
+@pytest.mark.thorough
 def test_a_cheap_method_that_is_good_for_all_is_advised_without_reserve():
     rows = ROWS | {("laplace", "as given"): ([0.08, 0.06, 0.02], 3.0, 0.1)}
     assert pb.benchmark.accuracy_sentences(make_accuracy(rows)) == [
@@ -55,6 +59,7 @@ def test_a_cheap_method_that_is_good_for_all_is_advised_without_reserve():
     ]
 
 
+@pytest.mark.thorough
 def test_times_that_hardly_differ_are_alike():
     rows = ROWS | {("nuts long", "as given"): ([0.02, 0.01, 0.01], 31.0, 9.0)}
     rows |= {("nuts", "as given"): ([0.05, 0.02, 0.02], 30.0, 9.0)}
@@ -64,6 +69,7 @@ def test_times_that_hardly_differ_are_alike():
     ]
 
 
+@pytest.mark.thorough
 def test_a_smaller_tolerance_asks_for_more():
     assert pb.benchmark.accuracy_sentences(make_accuracy(), tolerance=0.03) == [
         "nuts is within 0.03 sd here and 3.3 times faster than nuts long, but for "
@@ -83,6 +89,7 @@ def test_a_doubtful_reference_is_told_with_the_advice():
     assert said.startswith("Take it with care: of the reference itself, its R-hat is 1.300.")
 
 
+@pytest.mark.thorough
 def test_rows_without_an_answer_are_neither_advised_nor_on_the_front():
     rows = {("laplace", "as given"): ([np.nan] * 3, np.nan, np.nan)}
     study = make_accuracy(rows)
@@ -96,6 +103,7 @@ def test_what_holds_no_study_is_refused():
         pb.summary(study.drop_vars("mean_error"))
 
 
+@pytest.mark.thorough
 def test_a_tolerance_of_nothing_is_refused():
     with pytest.raises(pb.FitError, match="tolerance is 0"):
         pb.benchmark.accuracy_sentences(make_accuracy(), tolerance=0.0)

@@ -1,7 +1,7 @@
 """Distances from a reference against what normal distributions say of them."""
 
 import numpy as np
-import pytest
+from cases import each
 from scipy import stats
 
 from polar_bayes.benchmark.reference import distances
@@ -23,7 +23,7 @@ def test_a_shift_and_a_stretch_are_measured_in_sds_of_the_reference():
     np.testing.assert_allclose(found.wasserstein, [0.25, 0.5 * np.sqrt(2 / np.pi)], atol=2e-3)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@each("bad", [np.nan, np.inf])
 def test_a_draw_that_is_no_number_is_infinitely_far_and_spoils_no_other(bad):
     draws = np.stack([STANDARD, STANDARD])
     draws[0, 7] = bad

@@ -1,14 +1,14 @@
 """Bands of ranks: how often a uniform sample leaves them."""
 
 import numpy as np
-import pytest
+from cases import each
 from scipy import stats
 
 from polar_bayes.calibration.scores import MAX_POINTS, ecdf_band, histogram_band, uniformity
 
 
-@pytest.mark.parametrize("count", [20, 300, 700])
-@pytest.mark.parametrize("level", [0.05, 0.01])
+@each("count", [20, 300, 700])
+@each("level", [0.05, 0.01])
 def test_a_curve_leaves_its_band_exactly_where_the_test_fails(count: int, level: float) -> None:
     random, band = np.random.default_rng(count), ecdf_band(count, level)
     points = min(count, MAX_POINTS)

@@ -4,6 +4,7 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture
 from polar_bayes.models.per_material import per_material
@@ -28,7 +29,7 @@ def corrected(capture: xr.Dataset) -> xr.DataTree:
     return pb.calibrate(capture, simulations=COUNT, **ASKED)
 
 
-@pytest.mark.parametrize("method", ["importance", "tempered", "nuts"])
+@each("method", ["importance", "tempered", "nuts"])
 def test_what_is_right_passes(method: str, capture: xr.Dataset, corrected: xr.DataTree) -> None:
     """At a rate of false alarms of 5%, with a fixed seed; intervals within 3.3 standard errors."""
     calibration = corrected
@@ -44,7 +45,7 @@ def test_what_is_right_passes(method: str, capture: xr.Dataset, corrected: xr.Da
     assert (table["failed"] <= 3).all()  # chains that did not mix say so, and count as misses
 
 
-@pytest.mark.parametrize(
+@each(
     ("truth", "parameter"),
     [
         ({"priors": {"refractive_index": dist.Uniform(1.2, 2.0)}}, "refractive_index"),
@@ -89,6 +90,7 @@ def test_readings_of_a_right_model_pass(corrected: xr.DataTree) -> None:
     assert np.bincount(views, minlength=6).min() > 60  # all six, equally likely
 
 
+@pytest.mark.thorough
 def test_readings_see_a_wrong_noise(capture: xr.Dataset) -> None:
     truth = {"model": handlers.condition(per_material, data={"stokes_error_factor": 2.0})}
     table = pb.calibration.calibration_readings(
@@ -98,6 +100,7 @@ def test_readings_see_a_wrong_noise(capture: xr.Dataset) -> None:
     assert (table["rank_spread"] > 1.1).all()
 
 
+@pytest.mark.thorough
 def test_what_is_off_leaves_no_trace(capture: xr.Dataset, corrected: xr.DataTree) -> None:
     bare = pb.calibrate(capture, simulations=64, readings=False, **ASKED)
     assert set(bare.children) == {"prior_sbc", "truth", "marginals", "fits"}
@@ -107,6 +110,7 @@ def test_what_is_off_leaves_no_trace(capture: xr.Dataset, corrected: xr.DataTree
         xr.testing.assert_identical(bare[name].to_dataset(), some)
 
 
+@pytest.mark.thorough
 def test_a_simulation_does_not_depend_on_how_many_there_are(capture, corrected) -> None:
     few = pb.calibrate(capture, simulations=150, **ASKED)
     some = corrected["truth"].to_dataset().isel(simulation=slice(150))
@@ -117,6 +121,7 @@ def test_a_simulation_does_not_depend_on_how_many_there_are(capture, corrected) 
     )
 
 
+@pytest.mark.thorough
 def test_fits_that_fail_are_counted(capture: xr.Dataset) -> None:
     method = pb.methods.PixelNuts(chains=2, warmup=10, draws=50, largest_r_hat=1.01)
     calibration = pb.calibrate(capture, simulations=40, method=method, **ASKED)

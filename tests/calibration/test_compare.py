@@ -46,6 +46,7 @@ def test_scores_are_compared_fit_by_fit(compared) -> None:
     assert others.xs("b", level="method")["score_change"].isna().all()
 
 
+@pytest.mark.thorough
 def test_sentences_name_what_fails_and_what_mends_it(compared) -> None:
     said = pb.calibration.comparison_sentences(compared)
     assert said[0] == "Of 3 parameters 2 fail by laplace, none fails by importance."
@@ -54,6 +55,7 @@ def test_sentences_name_what_fails_and_what_mends_it(compared) -> None:
     assert len(said) == 3
 
 
+@pytest.mark.thorough
 def test_a_shift_alone_is_not_called_a_width() -> None:
     for shift in (-1.0, -0.4, 0.4, 1.0):
         tree = make_calibration(shifted={"roughness": shift}, count=4000)

@@ -85,6 +85,7 @@ def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
     assert (exact["fits"]["approach"] == MethodUsed.LAPLACE).all()
 
 
+@pytest.mark.thorough
 def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
     laplace, told = pb.methods.Laplace(draws=200, chains=1), {"model": population}
     asked = {"model": too_sure, "method": laplace, "truth": told, **ASKED}
@@ -93,6 +94,7 @@ def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
     assert (table["rank_spread"].drop("location") > 1.0).all()
 
 
+@pytest.mark.thorough
 def test_a_fit_does_not_depend_on_how_many_there_are(
     capture: xr.Dataset, exact: xr.DataTree
 ) -> None:
@@ -103,6 +105,7 @@ def test_a_fit_does_not_depend_on_how_many_there_are(
         xr.testing.assert_identical(few[group].to_dataset(), some)
 
 
+@pytest.mark.thorough
 def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Dataset) -> None:
     found = pb.calibrate(capture, simulations=20, model=population, method=SHORT, **ASKED)
     fits = found["fits"].to_dataset()
@@ -115,6 +118,7 @@ def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Datase
     assert any("the ranks judge the method, not the model" in sentence for sentence in said)
 
 
+@pytest.mark.thorough
 def test_fits_without_draws_are_counted(
     capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,6 +148,7 @@ def test_fits_without_draws_are_counted(
     assert (table["failed"] == lost.sum()).all()
 
 
+@pytest.mark.thorough
 def test_chains_are_those_of_a_fit_where_weighted_draws_do_not_reach(capture: xr.Dataset) -> None:
     one = plate_capture(np.linspace(30.0, 75.0, 6), 0.02, seed=1)
     colors = spectral_plate({450.0: 1.5, 650.0: 1.5}, error=0.02, seed=1)
@@ -180,6 +185,7 @@ def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
     assert draws.std() == pytest.approx(sd, rel=4.0 / np.sqrt(2.0 * draws.size))
 
 
+@pytest.mark.thorough
 def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None:
     request = resolve(capture, population, PLATE, None, LINKS, None, 0, "double")
     data = observe(request.capture)

@@ -81,6 +81,7 @@ def test_masked_entries_are_never_chosen(read) -> None:
         assert found.tolist() == [1 if chance < 0.5 else 2, -1]
 
 
+@pytest.mark.thorough
 def test_heavy_draws_are_repeated() -> None:
     weights = np.array([[0.5, 0.25, 0.25, 0.0], [0.25, 0.25, 0.25, 0.25]])
     found = _resample(weights, np.array([0.5, 0.5]))
@@ -89,6 +90,7 @@ def test_heavy_draws_are_repeated() -> None:
     assert np.ptp(counts[1]) <= 1
 
 
+@pytest.mark.thorough
 def test_a_model_whose_draws_do_not_say_all_is_told() -> None:
     """Of a pooled parameter the draws hold the value, not the coordinate that makes it."""
 
@@ -106,6 +108,7 @@ def test_a_model_whose_draws_do_not_say_all_is_told() -> None:
     assert unranked_reason(plain, plain, data, given) == ""
 
 
+@pytest.mark.thorough
 def test_readings_are_judged_by_themselves() -> None:
     good, bad = make_calibration(readings={}), make_calibration(readings={"dop": 0.7})
     for tree in (good, bad):

@@ -14,6 +14,7 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture
 from polar_bayes.models.per_material import per_material
@@ -106,6 +107,7 @@ def test_what_was_broken_off_goes_on_to_the_same_bits(capture, whole, begun, tmp
     assert json.loads(found.attrs["polar_bayes"])["fits found in the store"] >= 24
 
 
+@pytest.mark.thorough
 def test_more_or_fewer_simulations_are_the_same_question(capture, whole, begun, tmp_path) -> None:
     """A block that was cut short at 30 is not fitted again: the rest of it is."""
     store = copied(begun, tmp_path)
@@ -125,7 +127,7 @@ def test_a_damaged_block_is_fitted_again(capture, whole, begun, tmp_path) -> Non
     assert_same_bits(found, whole)
 
 
-@pytest.mark.parametrize(
+@each(
     ("other", "topic"),
     [
         ({"seed": 1}, "seed"),
@@ -147,6 +149,7 @@ def test_another_question_is_refused(capture, begun, other, topic) -> None:
         pb.calibrate(capture, store=begun, resume=True, **{**ASKED, **other})
 
 
+@pytest.mark.thorough
 def test_another_layout_is_refused(capture, begun) -> None:
     moved = capture.assign(view_zenith=capture["view_zenith"] + 1e-9)
     with pytest.raises(pb.FitError, match="it was begun with another capture; repeat"):
@@ -167,6 +170,7 @@ def test_what_cannot_be_gone_on_with_is_refused(capture, begun, tmp_path) -> Non
         pb.calibrate(capture, simulations=20, scheduler="tcp://127.0.0.1:9", **ASKED)
 
 
+@pytest.mark.thorough
 def test_a_plan_that_was_sent_makes_the_same_block(capture, whole, monkeypatch) -> None:
     """As a worker gets it."""
     sent = []
@@ -184,6 +188,7 @@ def test_a_plan_that_was_sent_makes_the_same_block(capture, whole, monkeypatch) 
         np.testing.assert_array_equal(pit, whole["loo_pit"][name].to_numpy()[[17, 3]])
 
 
+@pytest.mark.thorough
 def test_a_model_s_code_and_what_it_encloses_are_part_of_the_question() -> None:
     def make(offset: float):
         return lambda data: data + offset

@@ -53,6 +53,7 @@ def test_repeats_that_scatter_more_are_told_by_how_much() -> None:
     )
 
 
+@pytest.mark.thorough
 def test_repeats_that_scatter_less_are_no_alarm() -> None:
     means = 1.5 + 0.1 * SD * stats.norm.ppf((np.arange(12) + 0.5) / 12)
     words = pb.calibration.retest(fits({"refractive_index": means})).loc[
@@ -61,6 +62,7 @@ def test_repeats_that_scatter_less_are_no_alarm() -> None:
     assert "the rest of the intervals is what all repeats share" in words
 
 
+@pytest.mark.thorough
 def test_failed_repeats_are_counted() -> None:
     row = pb.calibration.retest(fits({"roughness": np.array([0.3, np.nan, 0.31, 0.29])})).iloc[0]
     assert (row["repeats"], row["failed"], row["pairs"]) == (3, 1, 3)
@@ -93,6 +95,7 @@ def test_intervals_hold_proxies_as_often_as_they_say() -> None:
     assert row["z_rms"] == pytest.approx(1.0, abs=3.9 / np.sqrt(2.0 * count))
 
 
+@pytest.mark.thorough
 def test_proxies_may_be_given_and_failed_fits_miss_them() -> None:
     found = fits({"roughness": np.array([0.3, 0.34, np.nan]), "absorption": np.zeros(3)})
     table = pb.calibration.proxy_coverage(found, {"roughness": 0.3})
@@ -108,6 +111,7 @@ def test_proxies_may_be_given_and_failed_fits_miss_them() -> None:
     assert each["below"].to_numpy()[1] == pytest.approx(stats.norm.cdf(-1.0), abs=0.01)
 
 
+@pytest.mark.thorough
 def test_one_entry_of_a_spectrum_may_have_a_proxy_of_its_own() -> None:
     draws = 1.5 + SD * DRAWS.reshape(1, 400, 1) + np.zeros((1, 400, 2))
     posterior = xr.Dataset(

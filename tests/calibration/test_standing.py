@@ -20,6 +20,7 @@ def test_the_truth_among_draws_of_its_own_distribution_is_uniform() -> None:
     assert stats.kstest(few, "uniform").pvalue > 1e-3
 
 
+@pytest.mark.thorough
 def test_ties_are_shared_evenly() -> None:
     random = np.random.default_rng(1)
     values = random.integers(0, 3, size=(4000, 20)).astype(float)
@@ -60,6 +61,7 @@ def test_each_fit_has_the_same_chance_whoever_takes_it_down() -> None:
     np.testing.assert_array_equal(whole.crps["roughness"][told], parts.crps["roughness"][told])
 
 
+@pytest.mark.thorough
 def test_the_chance_of_a_fit_follows_its_number() -> None:
     truth = {"roughness": np.arange(6.0), "absorption": np.zeros((6, 2))}
     draws = {"roughness": np.zeros((6, 30)), "absorption": np.zeros((6, 30, 2))}

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from cases import each
 from scipy import stats
 
 from polar_bayes.calibration.scores import uniformity
 
 
-@pytest.mark.parametrize("count", [50, 300, 1000])
+@each("count", [50, 300, 1000])
 def test_false_alarms_are_as_many_as_the_level_says(count: int) -> None:
     random = np.random.default_rng(count)
     p_values = np.array([uniformity(random.random(count)).p_value for _ in range(600)])
@@ -18,7 +19,7 @@ def test_false_alarms_are_as_many_as_the_level_says(count: int) -> None:
         assert alarms <= stats.binom.ppf(0.9999, 600, level)
 
 
-@pytest.mark.parametrize(
+@each(
     ("shape", "is_low", "is_narrow"),
     [((0.8, 1.2), False, None), ((1.2, 0.8), True, None), ((0.8, 0.8), None, True)],
 )
@@ -31,6 +32,7 @@ def test_what_is_not_uniform_is_found_and_told(shape, is_low, is_narrow) -> None
         assert (found.spread > 1.0) == is_narrow
 
 
+@pytest.mark.thorough
 def test_a_lump_that_keeps_mean_and_spread_is_found() -> None:
     """Moments alone would not see it."""
     random = np.random.default_rng(2)
@@ -40,6 +42,7 @@ def test_a_lump_that_keeps_mean_and_spread_is_found() -> None:
     assert uniformity(sample).p_value < 0.001
 
 
+@pytest.mark.thorough
 def test_numbers_at_both_ends_are_counted() -> None:
     assert uniformity(np.zeros(50)).p_value == pytest.approx(1e-4)
     assert uniformity(np.ones(50)).p_value == pytest.approx(1e-4)

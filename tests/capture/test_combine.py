@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 
 from polar_bayes.capture.combine import combine
 from polar_bayes.capture.files import load_capture, save_capture
@@ -29,8 +30,8 @@ def pair(make_capture):
     }
 
 
-@pytest.mark.parametrize("dim", ["material", "patch"])
-@pytest.mark.parametrize("spectral", [False, True])
+@each("dim", ["material", "patch"])
+@each("spectral", [False, True])
 def test_every_number_comes_through_and_the_rest_is_not_valid(make_capture, dim, spectral):
     pair = {
         "glass": validate(make_capture(spectral=spectral)),
@@ -73,6 +74,7 @@ def test_directions_are_those_of_each(pair):
     np.testing.assert_array_equal(zenith[1], pair["plexiglas"]["view_zenith"][[0, 1, 2, 2, 2]])
 
 
+@pytest.mark.thorough
 def test_attributes_that_all_share_are_kept(pair):
     pair["glass"].attrs |= {"setup": "goniometer", "operator": "Ada", "shots": 1, "lamp": 2}
     pair["plexiglas"].attrs |= {"setup": "goniometer", "operator": "Bob"}
@@ -85,6 +87,7 @@ def test_attributes_that_all_share_are_kept(pair):
     }
 
 
+@pytest.mark.thorough
 def test_what_one_does_not_say_has_its_plain_meaning(pair):
     no_progress = ["valid", "saturated", "interpolated", "normal_confidence", "true_roughness"]
     pair["plexiglas"] = pair["plexiglas"].drop_vars(no_progress)
@@ -98,6 +101,7 @@ def test_what_one_does_not_say_has_its_plain_meaning(pair):
     np.testing.assert_array_equal(both["true_absorption"], [np.nan, 0.3])
 
 
+@pytest.mark.thorough
 def test_trust_and_truth_take_the_dims_that_they_need(pair):
     views = np.array([0.2, 0.4, 0.6])
     pair["plexiglas"] = pair["plexiglas"].assign(
@@ -110,12 +114,14 @@ def test_trust_and_truth_take_the_dims_that_they_need(pair):
     )
 
 
+@pytest.mark.thorough
 def test_one_capture_and_three_combine_too(make_capture):
     assert combine({"leaf": make_capture()}).sizes["material"] == 1
     three = {name: make_capture(seed=i) for i, name in enumerate("abc")}
     assert combine(three, dim="patch").attrs["name"] == "a, b, c"
 
 
+@pytest.mark.thorough
 def test_a_label_that_selection_left_gives_way(make_capture):
     old = make_capture("material").assign_coords(material=["oak", "ash", "elm"])
     both = combine({"first": old.isel(material=0), "last": old.isel(material=2)})
@@ -128,6 +134,7 @@ def test_it_survives_a_file(pair, tmp_path):
     xr.testing.assert_identical(load_capture(tmp_path / "both.nc"), both)
 
 
+@pytest.mark.thorough
 def test_the_given_captures_are_left_alone(pair):
     before = {label: capture.copy(deep=True) for label, capture in pair.items()}
     combine(pair)["dop"][:] = 0.5
@@ -163,12 +170,12 @@ def test_the_measured_plates_combine(measured):
 # --- what does not fit --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dim", ["y", "view", "wavelength", "sample", None])
+@each("dim", ["y", "view", "wavelength", "sample", None])
 def test_another_dim_is_refused(pair, dim):
     assert "give 'material' or 'patch'" in refused(pair, "dim=", dim=dim)
 
 
-@pytest.mark.parametrize("captures", [{}, [], None, "glass.nc"])
+@each("captures", [{}, [], None, "glass.nc"])
 def test_nothing_to_combine_is_refused(captures):
     assert "give a mapping such as {'glass'" in refused(captures, "there is nothing to combine")
 
@@ -177,19 +184,21 @@ def test_a_label_is_text(pair):
     assert "name every capture" in refused({1: pair["glass"]}, "combine: 1 is no label")
 
 
-@pytest.mark.parametrize("leading", [("material",), ("patch",), ("y", "x")], ids=str)
+@pytest.mark.thorough
+@each("leading", [("material",), ("patch",), ("y", "x")], ids=str)
 def test_a_capture_of_several_is_refused(make_capture, leading):
     several = {"leaf": make_capture(), "oak": make_capture(*leading)}
     message = refused(several, f"combine: oak: it has the dim {leading[0]} already")
     assert f"select one with isel({leading[0]}=0)" in message
 
 
+@pytest.mark.thorough
 def test_an_invalid_capture_is_named(pair):
     pair["plexiglas"]["dop"][2] = 7.0
     assert refused(pair, "7 is outside").startswith("combine: plexiglas: dop[view=2]: ")
 
 
-@pytest.mark.parametrize("lacks", ["glass", "plexiglas"])
+@each("lacks", ["glass", "plexiglas"])
 def test_readings_must_be_the_same(pair, lacks):
     other = next(label for label in pair if label != lacks)
     pair[lacks] = pair[lacks].drop_vars(["intensity", "intensity_error"])
@@ -204,6 +213,7 @@ def test_something_must_be_left(pair):
     )
 
 
+@pytest.mark.thorough
 def test_wavelengths_must_be_the_same(make_capture):
     one, other = (make_capture(spectral=True) for _ in range(2))
     other = other.assign_coords(wavelength=[633.0, 500.0])
@@ -214,6 +224,7 @@ def test_wavelengths_must_be_the_same(make_capture):
     refused({"a": make_capture(), "b": labeled}, "wavelength is 633.0, that of a not stated")
 
 
+@pytest.mark.thorough
 def test_labels_of_views_must_be_the_same(pair):
     pair["glass"] = pair["glass"].assign_coords(view=np.arange(5))
     assert "drop_vars('view')" in refused(pair, "combine: plexiglas: view is not stated, that of g")

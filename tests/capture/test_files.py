@@ -9,6 +9,7 @@ import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 
 from polar_bayes.capture.files import load_capture, save_capture
 from polar_bayes.capture.schema import LEADING, validate
@@ -22,8 +23,8 @@ def assert_same(left, right):
         assert left[name].dtype == right[name].dtype
 
 
-@pytest.mark.parametrize("leading", LEADING, ids=str)
-@pytest.mark.parametrize("spectral", [False, True])
+@each("leading", LEADING, ids=str)
+@each("spectral", [False, True])
 def test_a_round_trip_is_identical(make_capture, tmp_path, leading, spectral):
     capture = validate(make_capture(*leading, spectral=spectral))
     save_capture(capture, tmp_path / "leaf.nc")
@@ -31,6 +32,7 @@ def test_a_round_trip_is_identical(make_capture, tmp_path, leading, spectral):
     assert os.listdir(tmp_path) == ["leaf.nc"]
 
 
+@pytest.mark.thorough
 def test_a_round_trip_keeps_labels_gaps_and_odd_text(make_capture, tmp_path):
     capture = make_capture("material", spectral=True)
     capture = capture.assign_coords(material=["../x", "<script>", "Öl 油"])
@@ -50,6 +52,7 @@ def test_a_capture_is_named_after_its_file_unless_it_has_a_name(make_capture, tm
     assert load_capture(tmp_path / "beech.nc").attrs["name"] == "beech"
 
 
+@pytest.mark.thorough
 def test_a_loaded_capture_needs_its_file_no_more(make_capture, tmp_path):
     path = tmp_path / "leaf.nc"
     save_capture(make_capture(), path)
@@ -58,7 +61,8 @@ def test_a_loaded_capture_needs_its_file_no_more(make_capture, tmp_path):
     assert np.isfinite(capture["dop"].values).all()
 
 
-@pytest.mark.parametrize("name", ["a b.nc", "x#mode=zarr.nc", "<script>.nc", "http:", "Öl\n.nc"])
+@pytest.mark.thorough
+@each("name", ["a b.nc", "x#mode=zarr.nc", "<script>.nc", "http:", "Öl\n.nc"])
 def test_odd_file_names_are_file_names(make_capture, tmp_path, name):
     save_capture(make_capture(), tmp_path / name)
     assert_same(load_capture(tmp_path / name), validate(make_capture()))
@@ -70,6 +74,7 @@ def test_an_older_capture_is_replaced(make_capture, tmp_path):
     assert_same(load_capture(tmp_path / "leaf.nc"), validate(make_capture(seed=2)))
 
 
+@pytest.mark.thorough
 def test_errors_name_the_file_and_the_view(make_capture, tmp_path):
     capture = make_capture()
     capture["dop"][3] = 1.5
@@ -110,6 +115,7 @@ def test_packed_integers_are_unpacked_and_gaps_are_seen(foreign):
     assert capture["valid"].dtype == bool
 
 
+@pytest.mark.thorough
 def test_time_units_do_nothing(foreign):
     foreign.createVariable("intensity", "f8", ("view",))[:] = 1.0
     foreign["intensity"].units = "days since 2000-01-01"
@@ -122,12 +128,14 @@ def test_text_is_no_reading(foreign):
         load_foreign(foreign)
 
 
+@pytest.mark.thorough
 def test_characters_are_no_reading(foreign):
     foreign.createVariable("dop", "S1", ("view",))[:] = np.array(list("01234"), dtype="S1")
     with pytest.raises(CaptureError, match="dop: it"):
         load_foreign(foreign)
 
 
+@pytest.mark.thorough
 def test_lists_of_unequal_length_are_no_reading(foreign):
     kind = foreign.createVLType(np.float64, "ragged")
     dop = foreign.createVariable("dop", kind, ("view",))
@@ -137,6 +145,7 @@ def test_lists_of_unequal_length_are_no_reading(foreign):
         load_foreign(foreign)
 
 
+@pytest.mark.thorough
 def test_records_are_no_reading(foreign):
     pair = np.dtype([("a", "f8"), ("b", "f8")])
     kind = foreign.createCompoundType(pair, "pair")
@@ -145,6 +154,7 @@ def test_records_are_no_reading(foreign):
         load_foreign(foreign)
 
 
+@pytest.mark.thorough
 def test_attributes_of_arrays_are_kept_as_text(foreign):
     foreign.createVariable("dop", "f8", ("view",))[:] = 0.5
     foreign["dop"].valid_range = np.array([0.0, 1.0])
@@ -164,7 +174,8 @@ def test_wrong_packing_is_a_clear_error(foreign):
 # --- files that cannot be read or written -----------------------------------------------------
 
 
-@pytest.mark.parametrize("path", [None, 3, "", "a\0b", b"leaf.nc"])
+@pytest.mark.thorough
+@each("path", [None, 3, "", "a\0b", b"leaf.nc"])
 def test_what_is_no_path_is_refused(make_capture, path):
     with pytest.raises(CaptureError, match=r"capture: .* is not a path; give the path of a file"):
         load_capture(path)
@@ -184,7 +195,7 @@ def test_files_that_are_not_there_or_empty_are_named(tmp_path):
         load_capture(tmp_path / ("x" * 300))
 
 
-@pytest.mark.parametrize("content", [b"view,dop\n1,2\n", b"\x89HDF\r\n\x1a\n", b"CDF\x01", b"PK"])
+@each("content", [b"view,dop\n1,2\n", b"\x89HDF\r\n\x1a\n", b"CDF\x01", b"PK"])
 def test_what_is_not_netcdf_is_refused(tmp_path, content):
     path = tmp_path / "leaf.nc"
     path.write_bytes(content)
@@ -192,6 +203,7 @@ def test_what_is_not_netcdf_is_refused(tmp_path, content):
         load_capture(path)
 
 
+@pytest.mark.thorough
 def test_a_file_without_rights_is_named(make_capture, tmp_path, monkeypatch):
     path = tmp_path / "leaf.nc"
     save_capture(make_capture(), path)
@@ -231,9 +243,7 @@ def flip(path, found, at=3):
     return damaged
 
 
-@pytest.mark.parametrize(
-    "part", ["dop", "view_zenith", "valid", "wavelength", "true_exposure", "patch", "note"]
-)
+@each("part", ["dop", "view_zenith", "valid", "wavelength", "true_exposure", "patch", "note"])
 def test_a_flipped_bit_is_an_error_and_no_value(make_capture, tmp_path, part):
     random = np.random.default_rng(0)
     capture = make_capture("patch", spectral=True).assign(true_exposure=((), 1.2345678901))
@@ -254,6 +264,7 @@ def test_a_flipped_bit_is_an_error_and_no_value(make_capture, tmp_path, part):
         load_capture(damaged)
 
 
+@pytest.mark.thorough
 def test_a_file_edited_elsewhere_has_no_checksum(make_capture, tmp_path):
     save_capture(make_capture(), tmp_path / "leaf.nc")
     with xr.open_dataset(tmp_path / "leaf.nc", engine="netcdf4") as opened:
@@ -267,7 +278,7 @@ def test_a_file_edited_elsewhere_has_no_checksum(make_capture, tmp_path):
     assert load_capture(tmp_path / "leaf.nc")["dop"][0] == 0.5
 
 
-@pytest.mark.parametrize(
+@each(
     ("damage", "what"),
     [
         (lambda content: content[:-1], "its checksum is wrong"),
@@ -291,7 +302,7 @@ def test_what_is_no_capture_is_not_written(make_capture, tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("HDF")])
+@each("error", [OSError(28, "No space left on device"), RuntimeError("HDF")])
 def test_a_failed_write_leaves_the_older_capture(make_capture, tmp_path, monkeypatch, error):
     path = tmp_path / "leaf.nc"
     save_capture(make_capture(seed=1), path)
@@ -321,6 +332,7 @@ except OutputError as error:
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on file sizes")
 def test_a_full_disk_is_an_error_and_leaves_the_older_capture(make_capture, tmp_path):
     """In a process of its own, since the netCDF library is left in disorder."""

@@ -7,6 +7,7 @@ library itself may hang on a flipped bit of its structure, which no reader above
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from mutations import (
     ODD_ATTRIBUTES,
     ODD_NUMBERS,
@@ -26,6 +27,11 @@ from polar_bayes.importers.detector import read_array, read_frame
 from polar_bayes.importers.goniometer import from_goniometer
 
 
+def sample(count):
+    """Seeds, of which the first one is always run."""
+    return [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in range(1, count))]
+
+
 def outcome(function, *arguments, **options):
     """What comes out of a door: None after a refusal in one line, anything else is returned."""
     try:
@@ -39,7 +45,7 @@ def outcome(function, *arguments, **options):
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate dimension names", "ignore:.*rename", "ignore:.*cast")
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", sample(8))
 def test_a_damaged_capture_is_refused_or_inside_the_contract(make_capture, tmp_path, seed):
     random = np.random.default_rng([1, seed])
     passed = 0
@@ -62,7 +68,7 @@ def test_a_damaged_capture_is_refused_or_inside_the_contract(make_capture, tmp_p
 # --- damaged tables ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", sample(4))
 def test_a_damaged_table_is_refused_or_all_numbers(tmp_path, seed):
     random = np.random.default_rng([2, seed])
     path = tmp_path / "table.txt"
@@ -88,7 +94,8 @@ def test_a_damaged_table_is_refused_or_all_numbers(tmp_path, seed):
     assert 100 < passed < 400
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.thorough
+@each("seed", range(4))
 def test_odd_readings_are_refused_or_inside_the_contract(seed):
     random = np.random.default_rng([3, seed])
     passed = 0
@@ -119,7 +126,7 @@ def test_odd_readings_are_refused_or_inside_the_contract(seed):
 # --- damaged files ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("format", ["NETCDF4", "NETCDF3_64BIT"])
+@each("format", ["NETCDF4", "NETCDF3_64BIT"])
 def test_a_file_cut_short_is_refused(make_capture, tmp_path, format):
     whole = tmp_path / "whole.nc"
     validate(make_capture("patch", spectral=True)).to_netcdf(whole, format=format)
@@ -145,7 +152,8 @@ FRAMES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.thorough
+@each("seed", range(2))
 def test_a_damaged_header_is_refused_or_of_the_same_size(tmp_path, seed):
     random = np.random.default_rng([4, seed])
     passed = 0
@@ -170,7 +178,7 @@ def test_a_damaged_header_is_refused_or_of_the_same_size(tmp_path, seed):
     assert 5 < passed < 300
 
 
-@pytest.mark.parametrize("frame", FRAMES, ids=str)
+@each("frame", FRAMES, ids=str)
 def test_a_whole_npy_file_is_read_as_it_was_saved(tmp_path, frame):
     np.save(tmp_path / "frame.npy", frame)
     found = read_array(tmp_path / "frame.npy", "frame")
@@ -178,7 +186,8 @@ def test_a_whole_npy_file_is_read_as_it_was_saved(tmp_path, frame):
     np.testing.assert_array_equal(found, frame, strict=True)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     ("shape", "what"),
     [
         ("(1000000000000, 8)", "cannot be read"),
@@ -198,6 +207,7 @@ def test_a_size_that_is_not_that_of_the_file_is_refused(tmp_path, shape, what):
         read_array(path, "frame")
 
 
+@pytest.mark.thorough
 def test_several_arrays_are_no_frame(tmp_path):
     np.savez(tmp_path / "frames.npz", np.zeros(3))
     (tmp_path / "frame.npy").write_bytes((tmp_path / "frames.npz").read_bytes())

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 
 from polar_bayes.capture.schema import CONTRACT, LEADING, Interval, count, validate
 from polar_bayes.errors import CaptureError
@@ -20,8 +21,8 @@ def refused(capture, what):
     return message
 
 
-@pytest.mark.parametrize("leading", LEADING, ids=str)
-@pytest.mark.parametrize("spectral", [False, True])
+@each("leading", LEADING, ids=str)
+@each("spectral", [False, True])
 def test_a_valid_capture_comes_out_canonical_and_stays_so(make_capture, leading, spectral):
     given = make_capture(*leading, spectral=spectral)
     capture = validate(given.transpose(*reversed(tuple(given.sizes))))
@@ -37,6 +38,7 @@ def test_a_valid_capture_comes_out_canonical_and_stays_so(make_capture, leading,
     xr.testing.assert_identical(validate(capture), capture)
 
 
+@pytest.mark.thorough
 def test_the_given_dataset_is_left_alone(make_capture):
     given = make_capture()
     before = given.copy(deep=True)
@@ -46,12 +48,13 @@ def test_the_given_dataset_is_left_alone(make_capture):
     xr.testing.assert_identical(given, before)
 
 
-@pytest.mark.parametrize("signal", ["dop", "q", "intensity"])
+@each("signal", ["dop", "q", "intensity"])
 def test_one_signal_is_enough(make_capture, signal):
     geometry = [row.name for row in CONTRACT if row.kind == "geometry"]
     assert signal in validate(make_capture()[[*geometry, signal]])
 
 
+@pytest.mark.thorough
 def test_geometry_may_differ_from_pixel_to_pixel(make_capture):
     capture = make_capture("y", "x")
     zenith = capture["view_zenith"].broadcast_like(capture["dop"])
@@ -77,11 +80,13 @@ def test_masked_entries_may_hold_anything(make_capture):
     np.testing.assert_array_equal(validate(capture)["dop"], capture["dop"])
 
 
+@pytest.mark.thorough
 def test_wavelengths_may_repeat_and_fall(make_capture):
     capture = make_capture(spectral=True).assign_coords(wavelength=[633.0, 633.0])
     np.testing.assert_array_equal(validate(capture)["wavelength"], [633.0, 633.0])
 
 
+@pytest.mark.thorough
 def test_labels_left_by_selection_are_kept(make_capture):
     capture = make_capture("material", spectral=True).assign_coords(material=["oak", "ash", "elm"])
     chosen = validate(capture.isel(material=1, wavelength=0))
@@ -100,6 +105,7 @@ def test_noise_may_carry_the_polarization_a_little_past_one(make_capture):
     assert "mark it valid=False" in message
 
 
+@pytest.mark.thorough
 def test_the_truth_may_be_unknown_but_not_infinite(make_capture):
     capture = make_capture("material")
     capture["true_roughness"][1] = np.nan
@@ -108,6 +114,7 @@ def test_the_truth_may_be_unknown_but_not_infinite(make_capture):
     assert "NaN where the truth is not known" in refused(capture, "true_roughness: .*infinite")
 
 
+@pytest.mark.thorough
 def test_the_units_of_a_truth_are_text(make_capture):
     capture = make_capture()
     capture["true_roughness"].attrs |= {"units": 1, "long_name": "slope"}
@@ -115,6 +122,7 @@ def test_the_units_of_a_truth_are_text(make_capture):
     assert attributes == {"units": "1", "long_name": "slope"}
 
 
+@pytest.mark.thorough
 def test_an_error_takes_the_units_of_the_intensity(make_capture):
     capture = make_capture()
     del capture["intensity_error"].attrs["units"]
@@ -133,7 +141,7 @@ def test_count_tells_what_was_masked_and_saturated(make_capture):
     assert count(bare) == {"views": 30, "masked": 0, "saturated": 0}
 
 
-@pytest.mark.parametrize("leading", LEADING, ids=str)
+@each("leading", LEADING, ids=str)
 def test_trust_in_the_normal_may_be_of_patches_of_views_or_of_both(make_capture, leading):
     capture = make_capture(*leading, spectral=True)
     sizes = {**{dim: capture.sizes[dim] for dim in leading}, "view": 5}
@@ -147,7 +155,8 @@ def test_trust_in_the_normal_may_be_of_patches_of_views_or_of_both(make_capture,
     assert message.endswith(f"or ({', '.join((*leading, 'view'))})")
 
 
-@pytest.mark.parametrize("value", [0.0, -0.1, 1.0001, np.nan, np.inf])
+@pytest.mark.thorough
+@each("value", [0.0, -0.1, 1.0001, np.nan, np.inf])
 def test_trust_in_the_normal_is_a_share_above_none(make_capture, value):
     capture = make_capture("patch")
     capture["normal_confidence"][1] = value
@@ -175,7 +184,7 @@ OUT_OF_RANGE = [
 ]
 
 
-@pytest.mark.parametrize(("name", "value", "what", "hint"), OUT_OF_RANGE)
+@each(("name", "value", "what", "hint"), OUT_OF_RANGE)
 def test_a_number_outside_its_range_is_named(make_capture, name, value, what, hint):
     capture = make_capture()
     capture[name][3] = value
@@ -184,6 +193,7 @@ def test_a_number_outside_its_range_is_named(make_capture, name, value, what, hi
     assert hint in message
 
 
+@pytest.mark.thorough
 def test_the_first_offending_pixel_is_named(make_capture):
     capture = make_capture("y", "x", spectral=True)
     capture["dop"][1, 2, 3, 0] = 7.0
@@ -196,7 +206,7 @@ def test_a_flag_is_zero_or_one(make_capture):
     assert "True or False" in refused(capture, r"valid\[view=2\]: 2 is outside")
 
 
-@pytest.mark.parametrize("name", [row.name for row in CONTRACT if row.kind == "geometry"])
+@each("name", [row.name for row in CONTRACT if row.kind == "geometry"])
 def test_missing_geometry_is_named(make_capture, name):
     message = refused(make_capture().drop_vars(name), f"{name}: it is missing")
     assert f"add {name} in degree" in message
@@ -207,7 +217,7 @@ def test_a_capture_without_readings_is_refused(make_capture):
     assert "add dop, q or intensity" in refused(make_capture()[geometry], "no reading is there")
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "needs"),
     [
         ("u", "q"),
@@ -224,7 +234,7 @@ def test_a_variable_without_its_companion_is_refused(make_capture, name, needs):
     assert f"add {needs} or drop {name}" in message
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "near"),
     [("view_zenit", "view_zenith"), ("DoP", "dop"), ("intensities", "intensity"), (7, "u")],
 )
@@ -236,13 +246,14 @@ def test_an_unknown_variable_gets_the_nearest_name(make_capture, name, near):
         assert f"nearest known name: {near})" in message
 
 
-@pytest.mark.parametrize("name", ["true_<script>", "true_../x", "true_", "true_a\nb", "true_ä"])
+@pytest.mark.thorough
+@each("name", ["true_<script>", "true_../x", "true_", "true_a\nb", "true_ä"])
 def test_a_truth_has_a_plain_name(make_capture, name):
     message = refused(make_capture().assign({name: 1.0}), "no such variable")
     assert "call it true_<name>" in message
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "units", "wanted"),
     [
         ("view_zenith", "radian", "degree"),
@@ -259,14 +270,15 @@ def test_wrong_units_are_refused(make_capture, name, units, wanted):
     assert f"convert it to units {wanted}" in message
 
 
-@pytest.mark.parametrize("units", ["degree", "degrees", "deg", " degree "])
+@pytest.mark.thorough
+@each("units", ["degree", "degrees", "deg", " degree "])
 def test_other_spellings_of_a_unit_are_understood(make_capture, units):
     capture = make_capture()
     capture["view_zenith"].attrs["units"] = units
     assert validate(capture)["view_zenith"].attrs["units"] == "degree"
 
 
-@pytest.mark.parametrize("dims", [("angle",), ("patch", "view"), ("y", "view"), ("wavelength",)])
+@each("dims", [("angle",), ("patch", "view"), ("y", "view"), ("wavelength",)])
 def test_wrong_dims_of_a_signal_are_refused(make_capture, dims):
     geometry = make_capture()[[row.name for row in CONTRACT if row.kind == "geometry"]]
     capture = geometry.assign(dop=(dims, np.full((5,) * len(dims), 0.5)))
@@ -284,6 +296,7 @@ def test_every_reading_has_the_same_dims(make_capture):
     assert message.endswith("give it (patch, view)")
 
 
+@pytest.mark.thorough
 def test_geometry_has_no_dim_of_its_own(make_capture):
     capture = make_capture("patch", spectral=True)
     capture["view_zenith"] = capture["view_zenith"].expand_dims(wavelength=2)
@@ -291,12 +304,13 @@ def test_geometry_has_no_dim_of_its_own(make_capture):
     assert message.endswith("give it (view) or (patch, view)")
 
 
+@pytest.mark.thorough
 def test_a_truth_has_no_dim_of_its_own(make_capture):
     capture = make_capture().assign(true_roughness=("leaf", [1.0, 2.0]))
     assert "any of (view)" in refused(capture, re.escape("true_roughness: its dims are (leaf)"))
 
 
-@pytest.mark.parametrize("dim", ["view", "patch", "wavelength"])
+@each("dim", ["view", "patch", "wavelength"])
 def test_an_empty_dim_is_refused(make_capture, dim):
     capture = make_capture("patch", spectral=True).isel({dim: slice(0, 0)})
     assert f"give at least one {dim}" in refused(capture, f"dim {dim}: its length is 0")
@@ -313,19 +327,20 @@ def test_the_dim_wavelength_has_a_coordinate(make_capture):
     assert "coordinate wavelength in nm" in refused(capture, "dim wavelength: it has no coordinate")
 
 
-@pytest.mark.parametrize("value", [0.0, -633.0, np.nan, np.inf])
+@each("value", [0.0, -633.0, np.nan, np.inf])
 def test_a_wavelength_is_above_zero(make_capture, value):
     capture = make_capture(spectral=True).assign_coords(wavelength=[633.0, value])
     assert "give nanometers above zero" in refused(capture, r"wavelength\[wavelength=1\]: ")
 
 
+@pytest.mark.thorough
 def test_a_wavelength_without_its_dim_is_one_number(make_capture):
     assert validate(make_capture().assign_coords(wavelength=633))["wavelength"].item() == 633.0
     capture = make_capture().assign_coords(wavelength=[633.0, 500.0])
     assert refused(capture, re.escape("wavelength: its dims are (wavelength)")).endswith("it ()")
 
 
-@pytest.mark.parametrize(
+@each(
     ("values", "what"),
     [
         (np.array(["a"] * 5), "str"),
@@ -335,13 +350,14 @@ def test_a_wavelength_without_its_dim_is_one_number(make_capture):
         (np.ones(5, dtype=bool), "bool"),
     ],
 )
-@pytest.mark.parametrize("name", ["dop", "view_zenith", "true_roughness"])
+@each("name", ["dop", "view_zenith", "true_roughness"])
 def test_only_real_numbers_are_readings(make_capture, name, values, what):
     message = refused(make_capture().assign({name: ("view", values)}), f"{name}: it holds {what}")
     assert "store floating-point numbers" in message
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     ("labels", "what"),
     [
         (["a", "", "b"], "neither a finite number nor printable text"),
@@ -357,6 +373,7 @@ def test_labels_tell_materials_apart(make_capture, labels, what):
     assert "or drop the coordinate" in refused(capture, f"material: .*{what}")
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:rename 'one' to 'view'")
 def test_one_label_cannot_stand_for_many_views(make_capture):
     capture = make_capture().assign_coords(one=1.0).rename(one="view")
@@ -364,14 +381,14 @@ def test_one_label_cannot_stand_for_many_views(make_capture):
     assert message.endswith("give it (view)")
 
 
-@pytest.mark.parametrize("level", [0.0, -1.0, np.nan, np.inf, "full", [1.0, 2.0]])
+@each("level", [0.0, -1.0, np.nan, np.inf, "full", [1.0, 2.0]])
 def test_a_saturation_level_is_above_zero(make_capture, level):
     capture = make_capture()
     capture["intensity"].attrs["saturation_level"] = level
     assert "at which the detector saturates" in refused(capture, "intensity: saturation_level is")
 
 
-@pytest.mark.parametrize(
+@each(
     ("given", "kept"),
     [
         (np.float32(0.5), 0.5),
@@ -393,25 +410,27 @@ def test_attributes_become_text_and_numbers(make_capture, given, kept):
     assert type(attribute) is type(kept)
 
 
-@pytest.mark.parametrize("value", [None, {"a": 1}, {1, 2}, object, 1j, [[1], [1, 2]], [None]])
+@each("value", [None, {"a": 1}, {1, 2}, object, 1j, [[1], [1, 2]], [None]])
 def test_other_attributes_are_refused(make_capture, value):
     message = refused(make_capture().assign_attrs(note=value), "attribute note: the value is a")
     assert "give a number or text" in message
 
 
-@pytest.mark.parametrize("name", ["_FillValue", "scale_factor", "a/b", "", "a b", 3, "x" * 101])
+@pytest.mark.thorough
+@each("name", ["_FillValue", "scale_factor", "a/b", "", "a b", 3, "x" * 101])
 def test_attribute_names_that_no_file_holds_are_refused(make_capture, name):
     capture = make_capture()
     capture["dop"].attrs[name] = 1.0
     assert "rename it" in refused(capture, "dop: the attribute name .* cannot be stored")
 
 
-@pytest.mark.parametrize("thing", [None, "leaf.nc", np.ones(3), {"dop": 1}, xr.DataArray([1.0])])
+@each("thing", [None, "leaf.nc", np.ones(3), {"dop": 1}, xr.DataArray([1.0])])
 def test_only_a_dataset_is_a_capture(thing):
     message = refused(thing, "is not a capture")
     assert "give an xarray.Dataset" in message
 
 
+@pytest.mark.thorough
 def test_an_interval_knows_its_ends():
     half_open = Interval(0.0, 90.0, open_high=True)
     assert str(half_open) == "0 <= value < 90"

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.capture import table_reader
 from polar_bayes.capture.table_reader import read_table
@@ -43,7 +44,7 @@ SAME_TABLE = {
 }
 
 
-@pytest.mark.parametrize("form", SAME_TABLE)
+@each("form", SAME_TABLE)
 def test_every_form_of_a_table_is_read_alike(write, form):
     table = read_table(write(SAME_TABLE[form]))
     assert table.names == ("angle", "level")
@@ -51,6 +52,7 @@ def test_every_form_of_a_table_is_read_alike(write, form):
     np.testing.assert_array_equal(table.columns["level"], [1.5, 2.5])
 
 
+@pytest.mark.thorough
 def test_columns_without_names_are_numbered(write):
     assert read_table(write("1 2 3\n")).names == ("column_1", "column_2", "column_3")
     assert read_table(write("a,,c\n1,2,3\n")).names == ("a", "column_2", "c")
@@ -62,6 +64,7 @@ def test_columns_are_chosen_by_name_in_the_order_asked(write):
     assert table.columns["c"] == [3.0]
 
 
+@pytest.mark.thorough
 def test_the_printed_digits_and_lines_are_kept(write):
     table = read_table(write("# head\nlevel,other\n1.20,239\n\n-3e2,1.5e-3\n"))
     np.testing.assert_allclose(table.steps["level"], [0.01, 100.0], rtol=1e-15)
@@ -69,6 +72,7 @@ def test_the_printed_digits_and_lines_are_kept(write):
     assert table.lines == (3, 5)
 
 
+@pytest.mark.thorough
 def test_a_header_of_another_time_is_read(write):
     assert read_table(write(b"Winkel (\xb0)\tI\n1\t2\n")).names == ("Winkel (°)", "I")
 
@@ -105,7 +109,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("content", "what", "hint"), REFUSED)
+@each(("content", "what", "hint"), REFUSED)
 def test_a_slip_is_named_with_its_line(write, content, what, hint):
     with pytest.raises(CaptureError, match=r"table\.txt: " + re.escape(what)) as caught:
         read_table(write(content))
@@ -133,6 +137,7 @@ def test_a_path_that_holds_no_table_is_named(tmp_path):
         read_table(None)
 
 
+@pytest.mark.thorough
 def test_a_table_without_rights_is_named(write, monkeypatch):
     path = write("1 2\n")
 
@@ -144,13 +149,14 @@ def test_a_table_without_rights_is_named(write, monkeypatch):
         read_table(path)
 
 
+@pytest.mark.thorough
 def test_a_long_table_is_read_in_reasonable_time(write):
     rows = 100_000
     table = read_table(write("angle,level\n" + "45.0,1.25\n" * rows))
     assert table.columns["level"].shape == (rows,)
 
 
-@pytest.mark.parametrize("name", ["s1.txt", "p1.txt"])
+@each("name", ["s1.txt", "p1.txt"])
 def test_a_measured_table_is_read(measured, name):
     table = read_table(measured / "glass_fresnel" / name)
     assert table.names == ("column_1", "column_2")

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from cases import each
 from synthetic_accuracy import make_accuracy
 
 import polar_bayes as pb
@@ -37,6 +38,7 @@ def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys
     assert "Error against time" in (report / "index.html").read_text()
 
 
+@pytest.mark.thorough
 def test_rungs_and_dials_are_chosen_and_json_is_json(plate, tmp_path, capsys, studied):
     words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--json", "--no-overrides"]
     assert main([*words, "--method", "laplace", "--method", "nuts", "--tolerance", "0.001"]) == 0
@@ -53,7 +55,8 @@ def test_a_method_that_is_not_there_is_refused(plate, tmp_path, capsys):
     assert "method='magic': no such method; give one of point, laplace" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     ("words", "said"),
     [
         (["--tolerance", "0.1"], "--tolerance needs --choose-effects or --method auto"),
@@ -66,6 +69,7 @@ def test_wishes_that_do_not_fit_the_method_are_refused(plate, tmp_path, capsys, 
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_the_automatic_choice_says_what_it_did(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from cases import each
 
 import polar_bayes as pb
 from polar_bayes.cli import main
@@ -16,6 +17,7 @@ def test_simulate_writes_what_fit_reads(tmp_path: Path, capsys: pytest.CaptureFi
     assert dict(capture.sizes) == {"view": 40, "wavelength": 3}
 
 
+@pytest.mark.thorough
 def test_the_table_has_a_row_per_parameter(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -116,7 +118,7 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("mistake", WRONG)
+@each("mistake", WRONG)
 def test_a_mistake_gets_one_line_and_exit_status_1(
     mistake: str, plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:

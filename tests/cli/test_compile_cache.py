@@ -63,6 +63,7 @@ def test_a_folder_that_others_can_write_to_is_not_used(
     )
 
 
+@pytest.mark.thorough
 def test_a_folder_of_another_user_is_not_used(base: Path, capsys, monkeypatch) -> None:
     (base / "polar_bayes").mkdir(parents=True)
     base.chmod(0o1777)  # as /tmp, where anybody could have made the folder in it
@@ -72,6 +73,7 @@ def test_a_folder_of_another_user_is_not_used(base: Path, capsys, monkeypatch) -
     assert "belongs to another user" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_a_folder_that_cannot_be_made_is_said(base: Path, capsys) -> None:
     base.write_text("a file")
     keep_compiled_programs()
@@ -106,6 +108,7 @@ console()
 """
 
 
+@pytest.mark.thorough
 def test_damaged_entries_are_one_line_however_many_there_are(base: Path) -> None:
     base.mkdir(mode=0o700)
     compiled = base / "polar_bayes" / "compiled"

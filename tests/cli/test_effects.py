@@ -25,6 +25,7 @@ def test_effects_prints_the_ledger_and_writes_it(
         assert ledger.sizes["effect"] == len(rows)
 
 
+@pytest.mark.thorough
 def test_effects_as_json_are_what_a_fit_of_the_chosen_scene_keeps(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

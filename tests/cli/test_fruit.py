@@ -51,6 +51,7 @@ def test_light_from_the_surface_is_s_and_light_from_below_is_p(
         assert found[f"orange: {region}"][0] < found[f"apple: {region}"][0]
 
 
+@pytest.mark.thorough
 def test_the_highlights_say_that_the_lamp_itself_is_polarized(frame: Path, tmp_path: Path) -> None:
     """Unpolarized light has a degree of at most .16 at that angle, however much is mirrored."""
     capture = pb.load_capture(imported(frame, tmp_path / "f.nc", "--bin", "16", "--window", "1"))
@@ -60,6 +61,7 @@ def test_the_highlights_say_that_the_lamp_itself_is_polarized(frame: Path, tmp_p
     assert float(capture["view_zenith"].isel(view=0).values[spot].max()) < 30.0
 
 
+@pytest.mark.thorough
 def test_the_map_of_the_fruit_separates_surface_from_body(
     frame: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import pytest
+from cases import each
 from plate_images import plate_image
 
 import polar_bayes as pb
@@ -89,7 +90,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc to see h
 
 
 @linux
-@pytest.mark.parametrize("number", BOTH)
+@each("number", BOTH)
 def test_a_signal_ends_a_fit_that_imports_or_compiles(
     plate: Path, tmp_path: Path, number: int
 ) -> None:
@@ -109,9 +110,9 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @linux
 @pytest.mark.thorough
-@pytest.mark.parametrize("number", BOTH)
-@pytest.mark.parametrize("moment", [0.0, 2.0, 10.0, 40.0])
-@pytest.mark.parametrize("name", ["fit", "map", "calibrate"])
+@each("number", BOTH)
+@each("moment", [0.0, 2.0, 10.0, 40.0])
+@each("name", ["fit", "map", "calibrate"])
 def test_a_signal_ends_every_long_command_at_any_moment(
     plate: Path, image: Path, tmp_path: Path, name: str, moment: float, number: int
 ) -> None:
@@ -156,6 +157,7 @@ def script(text: str, folder: Path) -> subprocess.Popen:
     return begun
 
 
+@pytest.mark.thorough
 def test_cleanups_run_and_their_sentences_are_said_in_one_line(tmp_path: Path) -> None:
     text = """
         def work():
@@ -170,6 +172,7 @@ def test_cleanups_run_and_their_sentences_are_said_in_one_line(tmp_path: Path) -
     assert not left_in(tmp_path)
 
 
+@pytest.mark.thorough
 def test_a_thread_that_still_writes_leaves_nothing_behind(tmp_path: Path) -> None:
     ends = threading.Event()
 
@@ -205,7 +208,8 @@ def hanging(limit: float) -> str:
     """
 
 
-@pytest.mark.parametrize("number", BOTH)
+@pytest.mark.thorough
+@each("number", BOTH)
 def test_a_second_signal_ends_at_once_what_hangs_while_it_cleans_up(
     tmp_path: Path, number: int
 ) -> None:
@@ -216,6 +220,7 @@ def test_a_second_signal_ends_at_once_what_hangs_while_it_cleans_up(
     assert stopped(process, number) == ""
 
 
+@pytest.mark.thorough
 def test_a_cleanup_that_hangs_is_given_up(tmp_path: Path) -> None:
     process = script(hanging(0.2), tmp_path)
     process.send_signal(signal.SIGTERM)
@@ -223,6 +228,7 @@ def test_a_cleanup_that_hangs_is_given_up(tmp_path: Path) -> None:
     assert (output, said, process.returncode) == ("cleaning\n", "", 143)
 
 
+@pytest.mark.thorough
 def test_a_signal_that_the_process_was_started_to_ignore_stays_ignored(tmp_path: Path) -> None:
     text = """
         import signal
@@ -236,6 +242,7 @@ def test_a_signal_that_the_process_was_started_to_ignore_stays_ignored(tmp_path:
     stopped(process, signal.SIGINT)
 
 
+@pytest.mark.thorough
 def test_the_process_ends_though_a_thread_is_still_busy(tmp_path: Path) -> None:
     text = """
         import sys, threading, time
@@ -260,6 +267,7 @@ def test_what_the_command_returns_or_raises_is_passed_on_and_handlers_are_put_ba
     assert [signal.getsignal(number) for number in SIGNALS] == before
 
 
+@pytest.mark.thorough
 def test_an_interrupt_ends_the_process_of_a_trial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from cases import each
 
 import polar_bayes as pb
 from polar_bayes.cli import main
@@ -40,8 +41,8 @@ ERRORS = {
 }
 
 
-@pytest.mark.parametrize("name", ERRORS)
-@pytest.mark.parametrize("traced", ["", "1"])
+@each("name", ERRORS)
+@each("traced", ["", "1"])
 def test_an_error_that_no_command_expects_is_one_line(
     name: str,
     traced: str,
@@ -95,6 +96,7 @@ def test_output_that_nobody_reads_ends_quietly(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.thorough
 def test_output_that_has_no_room_is_one_line(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         done = python(HELP, tmp_path, stdout=full.fileno())
@@ -121,6 +123,7 @@ NOISY = """
 """
 
 
+@pytest.mark.thorough
 def test_libraries_say_nothing_and_damaged_compiled_programs_are_one_line(tmp_path: Path) -> None:
     done = python(NOISY, tmp_path)
     assert done.returncode == 1

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plate_images import plate_image
 from synthetic_maps import make_maps
 
@@ -35,7 +36,7 @@ def test_a_map_has_a_page(files: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert "uncorrected" in page.read_text()
 
 
-@pytest.mark.parametrize(
+@each(
     ("options", "says"),
     [
         (["nowhere.zarr"], "nowhere.zarr: there is no such store"),

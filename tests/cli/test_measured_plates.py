@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from cases import each
 
 import polar_bayes as pb
 from polar_bayes.cli import main
@@ -22,7 +23,7 @@ PLATES = {
 }
 
 
-@pytest.mark.parametrize("plate", PLATES)
+@each("plate", PLATES)
 def test_a_measured_plate_from_table_to_interval(
     plate: str, measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

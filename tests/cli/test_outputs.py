@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import each
 from PIL import Image
 from synthetic_results import make_result
 
@@ -53,7 +54,7 @@ DESTROYING = {
 }
 
 
-@pytest.mark.parametrize("command", DESTROYING)
+@each("command", DESTROYING)
 def test_no_command_writes_over_its_input(command, inputs, monkeypatch, capsys):
     monkeypatch.chdir(inputs)
     before = {file.name: digest(file) for file in inputs.iterdir()}
@@ -64,8 +65,8 @@ def test_no_command_writes_over_its_input(command, inputs, monkeypatch, capsys):
     assert {file.name: digest(file) for file in inputs.iterdir()} == before
 
 
-@pytest.mark.parametrize("words", [("fit", "x.nc"), ("calibrate", "x.nc"), ("accuracy", "x.nc")])
-@pytest.mark.parametrize("other", ["y.nc", "t.csv", "g0.png"])
+@each("words", [("fit", "x.nc"), ("calibrate", "x.nc"), ("accuracy", "x.nc")])
+@each("other", ["y.nc", "t.csv", "g0.png"])
 def test_a_result_takes_the_place_of_no_other_file(words, other, inputs, monkeypatch, capsys):
     monkeypatch.chdir(inputs)
     before = digest(inputs / other)
@@ -74,10 +75,8 @@ def test_a_result_takes_the_place_of_no_other_file(words, other, inputs, monkeyp
     assert digest(inputs / other) == before
 
 
-@pytest.mark.parametrize(
-    "words", [("simulate",), ("fit", "x.nc"), ("map", "x.nc"), ("report", "x.nc"), ("demo",)]
-)
-@pytest.mark.parametrize("out", ["", "a\0b"])
+@each("words", [("simulate",), ("fit", "x.nc"), ("map", "x.nc"), ("report", "x.nc"), ("demo",)])
+@each("out", ["", "a\0b"])
 def test_no_path_is_one_line(words, out, inputs, monkeypatch, capsys):
     monkeypatch.chdir(inputs)
     assert main([*words, "--out", out]) == 1
@@ -86,7 +85,8 @@ def test_no_path_is_one_line(words, out, inputs, monkeypatch, capsys):
     assert told.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["index.html", "result.nc"])
+@pytest.mark.thorough
+@each("name", ["index.html", "result.nc"])
 def test_a_report_replaces_only_a_report(name, tmp_path):
     (tmp_path / name).write_text("mine")
     with pytest.raises(pb.OutputError, match=f"{name}: the file there holds something else"):
@@ -94,6 +94,7 @@ def test_a_report_replaces_only_a_report(name, tmp_path):
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine")]
 
 
+@pytest.mark.thorough
 def test_a_report_is_made_again_in_its_folder_beside_what_is_there(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     page = pb.report(make_result(), tmp_path)
@@ -107,7 +108,8 @@ def test_a_report_is_made_again_in_its_folder_beside_what_is_there(tmp_path):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("held", [{"capture.nc": "plate"}, {"fit.nc": "text"}, {"photo.png": "x"}])
+@pytest.mark.thorough
+@each("held", [{"capture.nc": "plate"}, {"fit.nc": "text"}, {"photo.png": "x"}])
 def test_a_demo_writes_in_no_folder_of_anothers(held, plate, tmp_path, capsys):
     for name, kind in held.items():
         (tmp_path / name).write_bytes(plate.read_bytes() if kind == "plate" else b"mine")
@@ -142,7 +144,7 @@ assert not {"jax", "numpyro", "arviz", "matplotlib"} & set(sys.modules), "loaded
 """
 
 
-@pytest.mark.parametrize(
+@each(
     "words",
     [
         ("fit", "nowhere.nc", "--out", "o.nc"),

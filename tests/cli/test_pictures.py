@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pictures
 import pytest
+from cases import each
 from pictures import BALL, LAMP
 
 import polar_bayes as pb
@@ -51,6 +52,7 @@ def test_frames_behind_a_polarizer(
     assert "480 views" in said
 
 
+@pytest.mark.thorough
 def test_a_mosaic_with_another_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
     frame = rng.integers(300, 600, pictures.SHAPE).astype(np.uint16)
@@ -95,7 +97,7 @@ def rim() -> np.ndarray:
     return np.stack([row, BALL.column + BALL.radius * np.cos(around)], axis=-1)
 
 
-@pytest.mark.parametrize(
+@each(
     ("words", "said"),
     [
         ([*LIGHT], "give one of --sphere or --rim, --normals"),

@@ -47,6 +47,7 @@ def test_expected_sds_are_those_of_a_fit(plate: xr.Dataset) -> None:
     )
 
 
+@pytest.mark.thorough
 def test_what_is_told_has_small_shares_of_the_prior(plate: xr.Dataset) -> None:
     assert (plate["prior_share"] > 0.0).all()
     assert (plate["prior_share"] < 0.05).all()
@@ -95,6 +96,7 @@ def of_glass(glass: xr.Dataset) -> xr.Dataset:
     return pb.identify(glass, scene=POLISHED, links={"dop": pb.links.BetaLink()})
 
 
+@pytest.mark.thorough
 def test_glass_does_not_tell_its_absorption(glass: xr.Dataset, of_glass: xr.Dataset) -> None:
     said = pb.verdict(of_glass).sentences
     assert any(line.startswith("absorption is not determined: ") for line in said)
@@ -103,6 +105,7 @@ def test_glass_does_not_tell_its_absorption(glass: xr.Dataset, of_glass: xr.Data
     assert flat[0].startswith("absorption is flat: the data exclude nothing below, down to 0.0")
 
 
+@pytest.mark.thorough
 def test_the_papers_sum_is_that_of_slopes_and_concentrations(
     glass: xr.Dataset, of_glass: xr.Dataset
 ) -> None:
@@ -131,11 +134,13 @@ def test_the_papers_sum_is_that_of_slopes_and_concentrations(
         assert row["paper_sd"] >= row["expected_sd"] * 0.99
 
 
+@pytest.mark.thorough
 def test_without_beta_noise_the_paper_says_nothing(plate: xr.Dataset) -> None:
     for name in ("paper_information", "exact_information", "paper_sd"):
         assert np.isnan(plate[name]).all()
 
 
+@pytest.mark.thorough
 def test_the_weakest_direction_is_said_where_its_parts_would_be_seen() -> None:
     """Only the difference of two parameters is read: their sum is the weakest direction."""
     weight = np.array([[0.7, 0.7], [0.7, -0.7]])
@@ -164,6 +169,7 @@ def test_the_weakest_direction_is_said_where_its_parts_would_be_seen() -> None:
     assert not any("weakest" in line for line in pb.verdict(found).sentences)
 
 
+@pytest.mark.thorough
 def test_a_prior_that_bends_the_other_way_stays_a_precision() -> None:
     draws = np.random.default_rng(0).normal(size=(500, 2)) * [1.0, 3.0]
     found = positive_definite(np.diag([1.0, -0.1]), draws)

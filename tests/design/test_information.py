@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from numpyro import distributions as dist
 
 import polar_bayes as pb
@@ -35,7 +36,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.thorough
+@each("case", CASES)
 def test_it_is_the_mean_square_of_scores(case: str) -> None:
     make, at = CASES[case]
     given = jnp.asarray(at)
@@ -50,7 +52,8 @@ def test_it_is_the_mean_square_of_scores(case: str) -> None:
     assert (np.abs(products.mean(axis=0) - told.information) < slack).all()
 
 
-@pytest.mark.parametrize("location", [0.95, 1.0, 1.05])
+@pytest.mark.thorough
+@each("location", [0.95, 1.0, 1.05])
 def test_a_saturated_reading_tells_less(location: float) -> None:
     """Readings are stopped at 1: simulated as the sensor does, the flag set where it stopped."""
     given = jnp.asarray([location, 0.05])
@@ -70,6 +73,7 @@ def test_a_saturated_reading_tells_less(location: float) -> None:
     assert told[0, 0] < whole[0, 0]
 
 
+@pytest.mark.thorough
 def test_views_masks_and_plates_keep_their_place() -> None:
     mean = jnp.linspace(0.1, 0.9, 6).reshape(2, 3)
     plain = MeanConcentrationBeta(mean, jnp.asarray(50.0))

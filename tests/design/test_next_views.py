@@ -6,6 +6,7 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
+from cases import each
 from design_lines import (
     ASKED,
     NOISE,
@@ -47,7 +48,7 @@ def test_a_line_is_best_seen_from_its_ends() -> None:
         np.testing.assert_allclose(row["interval_width"], 3.92 * row["expected_sd"], rtol=1e-4)
 
 
-@pytest.mark.parametrize(
+@each(
     "criterion",
     [pb.design.DOptimal(), pb.design.AOptimal(), pb.design.SingleParameter("level")],
     ids=repr,
@@ -94,6 +95,7 @@ def test_constraints_limit_the_views() -> None:
     assert np.abs(zeniths[:, None] - START).min() >= 12.0 - 1e-6
 
 
+@pytest.mark.thorough
 def test_light_and_viewer_keep_apart() -> None:
     constraints = pb.design.Constraints(from_light=10.0)
     there = np.array([[45.0, 0.0, 45.0, 0.0], [45.0, 180.0, 45.0, 0.0], [56.0, 0.0, 45.0, 0.0]])
@@ -114,6 +116,7 @@ def lamp(data, scene, priors, links):
         numpyro.sample("q", noise, obs=data.readings["q"])
 
 
+@pytest.mark.thorough
 def test_new_views_are_as_bright_as_predicted_and_old_ones_as_recorded() -> None:
     capture = line_capture(START)
     capture["intensity"] = ("view", [0.3, 0.6], {"saturation_level": 1.0})
@@ -126,6 +129,7 @@ def test_new_views_are_as_bright_as_predicted_and_old_ones_as_recorded() -> None
         on_a_line(readings={"q": None, "intensity": pb.links.StudentTLink()})
 
 
+@pytest.mark.thorough
 def test_a_fit_may_say_what_the_parameters_may_be() -> None:
     """A line tells the same of its parameters wherever they are, so only the draws differ."""
     drawn = np.random.default_rng(0).normal(0.0, 0.1, (2, 1, 30))
@@ -142,6 +146,7 @@ def test_a_fit_may_say_what_the_parameters_may_be() -> None:
         on_a_line(result=xr.DataTree.from_dict({"posterior": xr.Dataset(group)}))
 
 
+@pytest.mark.thorough
 def test_the_choice_is_said_in_words() -> None:
     found = on_a_line(count=2)
     assert pb.verdict(found).sentences[0] == (
@@ -152,7 +157,7 @@ def test_the_choice_is_said_in_words() -> None:
         pb.summary(xr.Dataset())
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "match"),
     [
         ({"count": 0}, "give whole numbers of at least 1"),
@@ -214,6 +219,7 @@ def test_what_is_expected_is_what_a_larger_capture_gives(plate: xr.Dataset) -> N
     assert (after < before).all()
 
 
+@pytest.mark.thorough
 def test_another_reading_can_be_added_even_at_the_ends(plate: xr.Dataset) -> None:
     """Brightness brings an exposure and a noise of its own, which the capture knows nothing of."""
     found = pb.next_views(
@@ -232,6 +238,7 @@ def test_another_reading_can_be_added_even_at_the_ends(plate: xr.Dataset) -> Non
     assert pb.verdict(found).sentences[0].count(", intensity") == 3
 
 
+@pytest.mark.thorough
 def test_one_wavelength_at_a_time(plate: xr.Dataset) -> None:
     two = xr.concat([plate, plate], dim="wavelength", data_vars=["q", "q_error"])
     two = two.assign_coords(wavelength=[450.0, 650.0])

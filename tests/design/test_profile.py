@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from design_lines import ASKED, NOISE, PRIOR, line, line_capture, precision_of, rows_of
 
 import polar_bayes as pb
@@ -28,7 +29,7 @@ def closed_form(capture, theta, weight):
     return height - 0.5 * weight * (level**2 + theta**2) / PRIOR**2, level
 
 
-@pytest.mark.parametrize(("kind", "weight"), [("posterior", 1.0), ("likelihood", PRIOR_WEIGHT)])
+@each(("kind", "weight"), [("posterior", 1.0), ("likelihood", PRIOR_WEIGHT)])
 def test_the_profile_of_a_line_is_its_parabola(slope: xr.Dataset, kind: str, weight: float) -> None:
     theta = slope["value"].to_numpy()
     height, level = closed_form(line_capture(ZENITHS), theta, weight)
@@ -54,6 +55,7 @@ def test_the_interval_is_that_of_the_normal_distribution(slope: xr.Dataset) -> N
     ]
 
 
+@pytest.mark.thorough
 def test_a_grid_of_ones_own_keeps_its_values() -> None:
     found = pb.profile(line_capture(ZENITHS), "level", model=line, values=[0.19, 0.21], **ASKED)
     assert {0.19, 0.21} < set(found["value"].to_numpy().round(12))
@@ -62,6 +64,7 @@ def test_a_grid_of_ones_own_keeps_its_values() -> None:
     assert said[0].startswith("level is flat: the data exclude nothing below as far as the grid")
 
 
+@pytest.mark.thorough
 def test_what_is_known_beside_the_readings_is_of_the_likelihood() -> None:
     problem = make_design_problem(line_capture(ZENITHS), line, ASKED["scene"], None, None, None, 0)
     z = jnp.array([0.3, -0.2])
@@ -73,6 +76,7 @@ def test_what_is_known_beside_the_readings_is_of_the_likelihood() -> None:
     np.testing.assert_allclose(sum(told), sum(bare), rtol=1e-5)
 
 
+@pytest.mark.thorough
 def test_a_gap_is_left_out_and_counted(slope: xr.Dataset) -> None:
     broken = slope.copy(deep=True)
     broken["converged"][1, 2] = False
@@ -81,7 +85,7 @@ def test_a_gap_is_left_out_and_counted(slope: xr.Dataset) -> None:
     )
 
 
-@pytest.mark.parametrize(
+@each(
     ("value", "expected"),
     [
         ([-3.84, 0.0, -3.84], (0.5, 1.5, False, False)),

@@ -4,6 +4,7 @@ import arviz_stats
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from synthetic_results import make_result, replace
 
 import polar_bayes as pb
@@ -41,6 +42,7 @@ def test_predictions_are_those_of_the_reports_and_of_arviz() -> None:
         np.testing.assert_allclose(loo[column], theirs.loc[loo.index, column], rtol=2e-3, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_all_variables_count_together() -> None:
     two = {**SMALL, "variables": ("dop", "intensity")}
     fit = make_result(**two)
@@ -70,6 +72,7 @@ def test_another_capture_is_refused() -> None:
         pb.diagnostics.compare_fits({"one": one, "other": fewer})
 
 
+@pytest.mark.thorough
 def test_other_views_or_variables_are_not_compared_by_predictions() -> None:
     whole = make_result(**SMALL)
     masked = replace(
@@ -85,7 +88,8 @@ def test_other_views_or_variables_are_not_compared_by_predictions() -> None:
     assert "They predict different readings" in compared.left_out[""]
 
 
-@pytest.mark.parametrize("fits", [{}, {"a": make_result(**SMALL)}, None])
+@pytest.mark.thorough
+@each("fits", [{}, {"a": make_result(**SMALL)}, None])
 def test_one_fit_is_not_compared(fits) -> None:
     with pytest.raises(FitError, match="there is nothing to compare"):
         pb.diagnostics.compare_fits(fits)

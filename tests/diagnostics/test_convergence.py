@@ -7,6 +7,7 @@ import arviz_stats
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from scipy import stats
 from synthetic_results import edit_provenance, make_result, replace
 
@@ -41,6 +42,7 @@ def test_table_agrees_with_arviz() -> None:
     np.testing.assert_allclose(ours.to_numpy(float), theirs.to_numpy(float), rtol=1e-10)
 
 
+@pytest.mark.thorough
 def test_material_parameters_come_first_and_vectors_last() -> None:
     labels = list(summary(make_result(discrepancy=True, wavelengths=(450.0, 532.5))).index)
     assert labels == [
@@ -55,11 +57,13 @@ def test_material_parameters_come_first_and_vectors_last() -> None:
     ]
 
 
+@pytest.mark.thorough
 def test_materials_are_named() -> None:
     labels = summary(make_result(materials=("leaf", "fruit"), wavelengths=(450.0,), views=6)).index
     assert "refractive_index[fruit, 450]" in labels
 
 
+@pytest.mark.thorough
 def test_two_readings_at_one_wavelength_keep_two_rows() -> None:
     table = summary(make_result(wavelengths=(450.0, 450.0), views=6))
     assert table.index.is_unique
@@ -81,6 +85,7 @@ def test_a_stuck_chain_is_named() -> None:
     assert any("R-hat above 1.01: roughness" in p and "sample longer" in p for p in judged.problems)
 
 
+@pytest.mark.thorough
 def test_a_parameter_that_never_moves_fails() -> None:
     tree = make_result(discrepancy=True)
     draws = np.full_like(posterior_of(tree, "exposure"), 0.7)
@@ -101,6 +106,7 @@ def test_too_few_effective_draws_fail() -> None:
     assert any("ESS below 400" in p and "most_draws" in p for p in judged.problems)
 
 
+@pytest.mark.thorough
 def test_long_lists_are_cut() -> None:
     problems = verdict(make_result(draws=60, discrepancy=True)).problems
     problem = next(problem for problem in problems if problem.startswith("Bulk ESS"))
@@ -117,8 +123,9 @@ def test_one_divergence_fails() -> None:
     assert "target_acceptance" in judged.problems[0]
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.thorough
+@each("method", ["nuts", "laplace", "point"])
+@each("bad", [np.nan, np.inf])
 def test_one_draw_that_is_not_finite_fails(method: str, bad: float) -> None:
     tree = make_result(method=method)
     draws = posterior_of(tree, "refractive_index")
@@ -130,7 +137,7 @@ def test_one_draw_that_is_not_finite_fails(method: str, bad: float) -> None:
     assert np.isfinite(summary(tree).loc["refractive_index[650]", "mean"])
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
+@each("method", ["nuts", "laplace", "point"])
 def test_what_the_fit_noted_itself_fails(method: str) -> None:
     tree = edit_provenance(make_result(method=method), problems=["it never ended"])
     judged = verdict(tree)
@@ -138,7 +145,8 @@ def test_what_the_fit_noted_itself_fails(method: str) -> None:
     assert judged.problems == ("It never ended.",)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     ("change", "words"),
     [
         ({"modes": {"weights": [0.9, 0.1]}}, "another mode, of weight 0.1"),
@@ -152,7 +160,8 @@ def test_cautions_do_not_fail(change: dict, words: str) -> None:
     assert any(words in caution for caution in judged.cautions)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     ("method", "words"),
     [
         ("laplace", "only the heaviest is described here; use method='nuts'"),
@@ -171,6 +180,7 @@ def test_another_mode_is_told_as_the_method_sees_it(method: str, words: str) -> 
     assert ("use method='nuts'" in caution) == (method in ("laplace", "variational"))
 
 
+@pytest.mark.thorough
 def test_the_method_is_called_as_it_was_stated() -> None:
     tree = make_result(method="laplace")
     assert method_of(tree) == "laplace"
@@ -180,6 +190,7 @@ def test_the_method_is_called_as_it_was_stated() -> None:
     assert method_of(edit_provenance(make_result(), method=None)) == "nuts"
 
 
+@pytest.mark.thorough
 def test_deep_trees_are_a_caution_once_they_are_many() -> None:
     tree = make_result()
     deep = np.zeros((4, 250), bool)
@@ -195,7 +206,7 @@ def laplace_tree(log_weight: np.ndarray) -> xr.DataTree:
     return replace(tree, "sample_stats", "log_weight", log_weight)
 
 
-@pytest.mark.parametrize(("width", "trusted"), [(0.3, False), (2.0, True)])
+@each(("width", "trusted"), [(0.3, False), (2.0, True)])
 def test_k_hat_has_the_right_sign(width: float, trusted: bool) -> None:
     """A standard normal: draws from a narrower one have unbounded weights, from a wider not."""
     z = np.random.default_rng(3).normal(0.0, width, (4, 1000))
@@ -219,14 +230,14 @@ def test_a_guide_is_judged_by_its_weights_as_laplace_is() -> None:
     assert not verdict(edit_provenance(tree, method="tempered")).cautions
 
 
-@pytest.mark.parametrize(
-    ("value", "cautious"), [(0.0, False), (np.nan, True), (np.inf, True), (-np.inf, True)]
-)
+@pytest.mark.thorough
+@each(("value", "cautious"), [(0.0, False), (np.nan, True), (np.inf, True), (-np.inf, True)])
 def test_k_hat_of_weights_that_are_all_alike(value: float, cautious: bool) -> None:
     judged = verdict(laplace_tree(np.full((4, 1000), value)))
     assert bool(judged.cautions) == cautious
 
 
+@pytest.mark.thorough
 def test_a_few_weights_of_zero_are_no_reason_to_worry() -> None:
     log_weight = np.random.default_rng(0).normal(0.0, 0.01, (4, 1000))
     log_weight[0, :3] = -np.inf
@@ -245,7 +256,7 @@ def test_a_point_fit_has_standard_errors_and_no_chains() -> None:
     assert judged.cautions[0].startswith("No standard error: exposure;")
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
+@each("method", ["nuts", "laplace", "point"])
 def test_json_is_valid_json(method: str) -> None:
     tree = make_result(method=method)
     said = json.loads(json.dumps(json_summary(tree), allow_nan=False))
@@ -264,6 +275,7 @@ def test_json_is_valid_json(method: str) -> None:
         assert key in said
 
 
+@pytest.mark.thorough
 def test_a_file_gives_the_same_table(tmp_path) -> None:
     tree = make_result(discrepancy=True)
     tree.to_netcdf(tmp_path / "r.nc", engine="netcdf4")
@@ -273,7 +285,7 @@ def test_a_file_gives_the_same_table(tmp_path) -> None:
     assert verdict(read) == verdict(tree)
 
 
-@pytest.mark.parametrize("wrong", [xr.DataTree(), "fit.nc", None])
+@each("wrong", [xr.DataTree(), "fit.nc", None])
 def test_what_is_no_result_is_refused(wrong: object) -> None:
     with pytest.raises(FitError, match="result: it holds no fit; give the tree"):
         summary(wrong)

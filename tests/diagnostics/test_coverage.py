@@ -51,6 +51,7 @@ def test_intervals_half_as_wide_hold_half_as_many() -> None:
     assert [row[f"held_{each}"] for each in (50, 80, 95)] == [0.25, 0.4, 0.475]
 
 
+@pytest.mark.thorough
 def test_ends_count_as_inside_in_the_precision_of_the_map() -> None:
     """0.3 in double precision lies below 0.3 in single precision."""
     maps = make_maps({"roughness": np.array([[0.3]])}, width=0.0)
@@ -72,6 +73,7 @@ def test_pixels_without_an_answer_are_counted_and_never_held() -> None:
     assert row["held_95_of_read"] == 5 / 10
 
 
+@pytest.mark.thorough
 def test_without_answers_there_is_no_share() -> None:
     maps = make_maps({"roughness": HALF}, status=np.full(HALF.shape, Status.NOT_CONVERGED))
     row = pb.diagnostics.map_coverage(maps, known(roughness=0.5)).loc["roughness"]
@@ -99,6 +101,7 @@ def test_every_wavelength_has_a_row_and_truths_may_have_fewer_axes() -> None:
     assert found["held_95"].tolist() == [0.95, 1.0, 0.0]
 
 
+@pytest.mark.thorough
 def test_the_image_may_be_read_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     maps, truth = make_maps({"roughness": HALF}), known(roughness=SPREAD)
     whole = pb.diagnostics.map_coverage(maps, truth)
@@ -106,6 +109,7 @@ def test_the_image_may_be_read_in_pieces(monkeypatch: pytest.MonkeyPatch) -> Non
     pd.testing.assert_frame_equal(pb.diagnostics.map_coverage(maps, truth), whole)
 
 
+@pytest.mark.thorough
 def test_maps_that_are_still_to_be_computed_are_computed_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -8,6 +8,7 @@ import pytest
 import scipy.special
 import scipy.stats
 import xarray as xr
+from cases import each
 from synthetic_results import make_result, pool
 
 from polar_bayes.diagnostics.population import (
@@ -77,7 +78,7 @@ def rng():
     return np.random.default_rng(7)
 
 
-@pytest.mark.parametrize("spreads", [[0.06], np.linspace(0.01, 0.3, 200)])
+@each("spreads", [[0.06], np.linspace(0.01, 0.3, 200)])
 def test_estimates_alone_are_what_the_readings_say(spreads, rng) -> None:
     """With the spread known, and with a spread that the members tell poorly."""
     value, mu, spread = exact_draws(READINGS, ERRORS, spreads, rng)
@@ -93,6 +94,7 @@ def test_estimates_alone_are_what_the_readings_say(spreads, rng) -> None:
         assert unpooled.shrinkage == pytest.approx(expected, abs=5.0 * of_precision * error**2)
 
 
+@pytest.mark.thorough
 def test_a_member_without_readings_says_nothing(rng) -> None:
     no_progress = 1e6
     value, mu, spread = exact_draws(READINGS, np.append(ERRORS[:-1], no_progress), [0.06, 0.1], rng)
@@ -102,11 +104,12 @@ def test_a_member_without_readings_says_nothing(rng) -> None:
     assert unpooled.shrinkage > 0.95
 
 
+@pytest.mark.thorough
 def test_a_member_that_does_not_move_has_no_estimate() -> None:
     assert np.isnan(unpooled_estimate(np.ones(9), np.zeros(9), np.ones(9))).all()
 
 
-@pytest.mark.parametrize("name", LINKS)
+@each("name", LINKS)
 def test_shrinkage_is_on_the_scale_of_the_population(name, rng) -> None:
     forward, back = LINKS[name]
     readings, errors = READINGS - 1.45, ERRORS[[0, 2, 3, 5, 2, 5]]
@@ -135,14 +138,15 @@ def test_pooling_factor_of_a_known_population(rng) -> None:
     assert row["meaning"] == "members differ by about 0.08"
 
 
-@pytest.mark.parametrize(("error", "low", "high"), [(1e-3, 0.0, 0.01), (10.0, 0.99, 1.0)])
+@pytest.mark.thorough
+@each(("error", "low", "high"), [(1e-3, 0.0, 0.01), (10.0, 0.99, 1.0)])
 def test_pooling_factor_from_none_to_all(error, low, high, rng) -> None:
     value, mu, s = exact_draws(READINGS, np.full(6, error), [0.1], rng, location=1.45)
     factor = population_summary(tree("refractive_index", value, mu, s))["pooling"].iloc[0]
     assert low - 0.01 <= factor <= high + 1e-9
 
 
-@pytest.mark.parametrize("name", LINKS)
+@each("name", LINKS)
 def test_a_new_member_is_drawn_from_the_population(name) -> None:
     location = 1.6 if name == "refractive_index" else 0.2
     flat = np.zeros(CHAINS * DRAWS)
@@ -152,6 +156,7 @@ def test_a_new_member_is_drawn_from_the_population(name) -> None:
     assert [row["new_q2.5"], row["new_q97.5"]] == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.thorough
 def test_a_new_member_is_cut_not_heaped_up_at_the_bounds() -> None:
     flat = np.zeros(CHAINS * DRAWS)
     value = np.array([[1.22], [1.25]]) + flat
@@ -166,7 +171,8 @@ def test_a_new_member_is_cut_not_heaped_up_at_the_bounds() -> None:
     assert np.array_equal(population.new_members(), population.new_members())
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     ("said", "bounds"),
     [(None, (1.0, np.inf)), ((1.2, None), (1.2, np.inf)), ((1.25, 10), (1.25, 10))],
 )
@@ -179,7 +185,7 @@ def test_bounds_come_from_the_prior_of_the_location(said, bounds) -> None:
     assert (found.low, found.high) == bounds
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "expected"),
     [
         ("refractive_index", 0.1),
@@ -196,6 +202,7 @@ def test_what_a_spread_means_in_the_unit_of_the_parameter(name, expected) -> Non
     assert ("a factor of about 1.11" in row["meaning"]) == (name == "roughness")
 
 
+@pytest.mark.thorough
 def test_every_wavelength_is_a_population_of_its_own() -> None:
     result = pool(
         make_result(materials=("a", "b", "c"), wavelengths=(450.0, 550.0), draws=50),
@@ -212,7 +219,8 @@ def test_every_wavelength_is_a_population_of_its_own() -> None:
     assert len(shrinkage(result)) == 9
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     "result",
     [
         make_result(wavelengths=(), views=8, draws=20),

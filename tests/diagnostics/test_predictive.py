@@ -4,6 +4,7 @@ import arviz_stats
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from scipy import stats
 from synthetic_results import SCALE, make_result, replace
 
@@ -21,6 +22,7 @@ def test_a_calibrated_fit_raises_no_more_alarms_than_it_should() -> None:
     assert alarms <= stats.binom.isf(0.002, 60, 0.05)
 
 
+@pytest.mark.thorough
 def test_pooled_pit_of_calibrated_fits_is_uniform() -> None:
     """Kolmogorov-Smirnov on one reading from each of 100 fits, at a false-alarm rate of 0.001."""
     values = [
@@ -30,7 +32,7 @@ def test_pooled_pit_of_calibrated_fits_is_uniform() -> None:
     assert stats.kstest(values, "uniform").pvalue > 1e-3
 
 
-@pytest.mark.parametrize(("noise", "first_side"), [(3.0, "above"), (0.25, "below")])
+@each(("noise", "first_side"), [(3.0, "above"), (0.25, "below")])
 def test_readings_that_scatter_otherwise_leave_the_band(noise: float, first_side: str) -> None:
     check = predictive_checks(make_result(noise=noise))["dop"]
     band = pit_band(check.loo.pit)
@@ -59,6 +61,7 @@ def test_leave_one_out_agrees_with_arviz() -> None:
     np.testing.assert_allclose(loo.pit, pit, atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_laplace_weights_correct_the_leave_one_out() -> None:
     """Draws from a wrong normal with their weights say what draws from the posterior say."""
     right = make_result(**SMALL, variables=("dop",))
@@ -83,6 +86,7 @@ def test_masked_set_aside_and_saturated_readings_are_left_out() -> None:
         assert check.count == keep.sum() < 40
 
 
+@pytest.mark.thorough
 def test_unsaturated_readings_are_compared_with_unsaturated_predictions() -> None:
     """Half of the prediction is at full scale; a reading in the middle of the rest is typical."""
     tree = make_result(**SMALL, variables=("intensity",))
@@ -96,7 +100,8 @@ def test_unsaturated_readings_are_compared_with_unsaturated_predictions() -> Non
     np.testing.assert_allclose(predictive_checks(tree)["intensity"].pit, 0.5, atol=0.15)
 
 
-@pytest.mark.parametrize("views", [2, 3, 5, 20])
+@pytest.mark.thorough
+@each("views", [2, 3, 5, 20])
 def test_few_readings(views: int) -> None:
     checks = predictive_checks(make_result(wavelengths=(), views=views))
     for check in checks.values():
@@ -105,6 +110,7 @@ def test_few_readings(views: int) -> None:
         assert pit_band(check.pit) is not None
 
 
+@pytest.mark.thorough
 def test_a_band_needs_two_values() -> None:
     assert pit_band(np.array([0.5])) is None
     assert pit_band(np.array([np.nan, 0.5])) is None
@@ -113,6 +119,7 @@ def test_a_band_needs_two_values() -> None:
     assert pit_band(np.full(50, 0.5)).rejects_uniformity
 
 
+@pytest.mark.thorough
 def test_many_readings_are_fast_and_calibrated() -> None:
     values = np.random.default_rng(1).uniform(size=20_000)
     band = pit_band(values)
@@ -120,6 +127,7 @@ def test_many_readings_are_fast_and_calibrated() -> None:
     assert len(band.at) < 1000
 
 
+@pytest.mark.thorough
 def test_constant_predictions_and_readings() -> None:
     tree = make_result(**SMALL, variables=("dop",))
     for group in ("posterior_predictive", "noise_free", "log_likelihood"):

@@ -4,6 +4,7 @@ import arviz_stats
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from scipy import stats
 from synthetic_results import PRIOR, make_result, replace
 
@@ -43,7 +44,7 @@ def with_prior_and_posterior(prior: np.ndarray, posterior: np.ndarray):
     return sensitivity(replace(tree, "posterior", "exposure", posterior.reshape(4, 250)))
 
 
-@pytest.mark.parametrize("scale", [np.log, np.exp, lambda x: x])
+@each("scale", [np.log, np.exp, lambda x: x])
 def test_the_verdict_is_the_same_for_a_parameter_and_its_logarithm(scale) -> None:
     rng = np.random.default_rng(1)
     prior, posterior = np.exp(rng.normal(0.0, 1.0, 500)), np.exp(rng.normal(0.5, 0.2, 1000))

@@ -20,6 +20,7 @@ import nbformat
 import pytest
 from browsers import WIDTHS, browser, console, open_page, sideways
 from bs4 import BeautifulSoup
+from cases import each
 from nbclient import NotebookClient
 
 import polar_bayes as pb
@@ -35,7 +36,14 @@ def executed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("notebooks")
 
 
-@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda source: source.stem)
+@pytest.mark.parametrize(
+    "source",
+    [
+        source if source.stem == "first_fit" else pytest.param(source, marks=pytest.mark.thorough)
+        for source in NOTEBOOKS
+    ],
+    ids=lambda source: source.stem,
+)
 def test_a_notebook_runs_without_a_warning(
     source: Path,
     executed: Path,
@@ -82,11 +90,13 @@ def pages(site: Path) -> list[Path]:
     return sorted(site.rglob("index.html"))  # not 404.html, which knows its place on a server only
 
 
+@pytest.mark.thorough
 def test_the_site_is_built_without_a_warning(site: Path) -> None:
     """Strictly: MkDocs and htmlproofer resolve every link, anchor and image of the site itself."""
     assert len(pages(site)) == len(NOTEBOOKS) + len(list((ROOT / "docs").rglob("*.md")))
 
 
+@pytest.mark.thorough
 def test_links_that_lead_elsewhere_are_well_formed(site: Path) -> None:
     for page in pages(site):
         soup = BeautifulSoup(page.read_text(), "html.parser")
@@ -99,6 +109,7 @@ def test_links_that_lead_elsewhere_are_well_formed(site: Path) -> None:
                 assert address.scheme in ("", "data"), f"{page}: {address.geturl()}"
 
 
+@pytest.mark.thorough
 def test_every_picture_says_in_words_what_it_shows(site: Path) -> None:
     for page in pages(site):
         for picture in BeautifulSoup(page.read_text(), "html.parser").find_all("img"):
@@ -106,6 +117,7 @@ def test_every_picture_says_in_words_what_it_shows(site: Path) -> None:
             assert len(words.removeprefix("Picture of the section:")) > 5, f"{page}: {picture}"
 
 
+@pytest.mark.thorough
 def test_the_reference_has_every_public_name_once(site: Path) -> None:
     headings = [
         heading.get_text().split()[0]
@@ -141,7 +153,8 @@ class Quiet(SimpleHTTPRequestHandler):
         """Say nothing."""
 
 
-@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.thorough
+@each("width", WIDTHS)
 def test_pages_fit_the_window_and_raise_no_error(
     site: Path, address: str, tmp_path: Path, width: int
 ) -> None:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 import polar_bayes as pb
 from polar_bayes.effects.compare_scenes import compile_and_count, run_seconds
@@ -154,7 +155,8 @@ def test_a_scene_with_everything_off_is_the_bare_formula_and_nothing_else(plain:
     assert plain == pytest.approx(operations(by_hand, PLAIN.parameters), rel=SAME)
 
 
-@pytest.mark.parametrize("name", ON)
+@pytest.mark.thorough
+@each("name", ON)
 def test_an_effect_costs_when_it_is_on_and_leaves_nothing_when_it_is_off(
     name: str, plain: float
 ) -> None:
@@ -165,6 +167,7 @@ def test_an_effect_costs_when_it_is_on_and_leaves_nothing_when_it_is_off(
     assert operations(scene.predict, scene.parameters) > (1.0 + SAME) * plain
 
 
+@pytest.mark.thorough
 def test_an_index_of_its_own_costs_less_than_a_law_of_dispersion(plain: float) -> None:
     scene = dataclasses.replace(PLAIN, dispersion=pb.physics.Cauchy())
     assert operations(scene.predict, scene.parameters) > plain

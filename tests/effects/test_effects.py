@@ -7,6 +7,7 @@ import linear
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plates import LINKS, plate_capture
 from synthetic_results import make_result
 
@@ -101,6 +102,7 @@ def test_two_that_are_light_alone_and_heavy_together_do_not_both_go(q: np.ndarra
     assert choice.ledger.attrs["combined_change"] == pytest.approx(min(first, second), rel=1e-3)
 
 
+@pytest.mark.thorough
 def test_a_looser_tolerance_drops_both(q: np.ndarray) -> None:
     both = exact(q, "angle_zero", "dark_level")
     choice = straight(q, tolerance=1.1 * both)
@@ -119,6 +121,7 @@ def test_what_the_user_keeps_stays_and_what_the_user_drops_goes(q: np.ndarray) -
     assert "By your choice DolpGain is left out." in ledger_sentences(choice.ledger)
 
 
+@pytest.mark.thorough
 def test_the_rule_asks_what_the_rest_changes_beside_what_the_user_drops(q: np.ndarray) -> None:
     choice = straight(q, drop="DolpGain", tolerance=1e6)
     names = ["body", "slope", "angle_zero", "dark_level"]
@@ -135,7 +138,7 @@ def test_a_parameter_that_the_user_names_is_not_given_up(q: np.ndarray) -> None:
     assert "it leaves nothing to judge" in choice.ledger["reason"].sel(effect="DarkLevel").item()
 
 
-@pytest.mark.parametrize(
+@each(
     ("options", "message"),
     [
         ({"keep": "Fog"}, "keep='Fog': the scene has no such effect; give one of AngleZero"),
@@ -151,6 +154,7 @@ def test_a_mistake_is_named(q: np.ndarray, options: dict, message: str) -> None:
         straight(q, **options)
 
 
+@pytest.mark.thorough
 def test_a_scene_without_effects_is_returned_as_it_is(plate: xr.Dataset) -> None:
     bare = pb.Scene(pb.SmoothSurface())
     choice = pb.choose_effects(plate, scene=bare, links=LINKS)
@@ -158,6 +162,7 @@ def test_a_scene_without_effects_is_returned_as_it_is(plate: xr.Dataset) -> None
     assert "no effect" in ledger_sentences(choice.ledger)[0]
 
 
+@pytest.mark.thorough
 def test_the_ledger_belongs_to_its_scene_alone(
     chosen: pb.effects.ChosenScene, full: pb.Scene
 ) -> None:
@@ -169,6 +174,7 @@ def test_the_ledger_belongs_to_its_scene_alone(
     assert again == chosen
 
 
+@pytest.mark.thorough
 def test_the_ledger_can_be_saved(chosen: pb.effects.ChosenScene, tmp_path) -> None:
     chosen.ledger.to_netcdf(tmp_path / "ledger.nc")
     with xr.open_dataset(tmp_path / "ledger.nc") as opened:
@@ -189,6 +195,7 @@ def test_a_fit_keeps_the_ledger(
     xr.testing.assert_equal(plain["posterior"].to_dataset(), result["posterior"].to_dataset())
 
 
+@pytest.mark.thorough
 def test_the_report_shows_the_ledger(chosen: pb.effects.ChosenScene) -> None:
     result = make_result(wavelengths=(), views=12, draws=100, variables=("dop",))
     assert 'id="effects"' not in render(result)

@@ -87,6 +87,7 @@ def test_on_a_plate_they_are_those_of_climbs_with_exact_gradients(
     assert np.abs(shift).max() > 0.1
 
 
+@pytest.mark.thorough
 def test_labels_are_those_of_the_tables_of_a_fit() -> None:
     capture = pb.simulate(
         "glass", scene="goniometer", protocol=pb.simulation.Protocol(wavelengths=(450.0, 550.0))
@@ -113,6 +114,7 @@ def test_labels_are_those_of_the_tables_of_a_fit() -> None:
     assert [label.partition("[")[0] for label in labels] == list(sites)
 
 
+@pytest.mark.thorough
 def test_noise_is_known_of_links_without_a_variance_too() -> None:
     """Log odds have no stated variance; to first order it is that of the odds' slope."""
     capture = pb.simulate("leaf", protocol=pb.simulation.Protocol(views=8, wavelengths=()), seed=1)

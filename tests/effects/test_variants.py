@@ -4,6 +4,7 @@ import dataclasses
 from typing import ClassVar, override
 
 import pytest
+from cases import each
 
 import polar_bayes as pb
 from polar_bayes.effects.variants import effects_of, find_effects, parts_of, simplify
@@ -102,6 +103,7 @@ def test_a_part_of_the_user_s_own_takes_part() -> None:
     assert effects["Fog"].instrument == pb.instrument.Instrument((pb.instrument.DolpGain(),))
 
 
+@pytest.mark.thorough
 def test_what_holds_nothing_any_more_is_left_out_too() -> None:
     bare = simplify(ROUGH, [e for e in effects_of(ROUGH) if e.path.startswith(("inst", "coat"))])
     assert bare.instrument is None
@@ -118,7 +120,8 @@ def test_a_part_and_what_is_inside_it_go_together() -> None:
     )
 
 
-@pytest.mark.parametrize("scene", [ROUGH, *FULL_SCENES.values()])
+@pytest.mark.thorough
+@each("scene", [ROUGH, *FULL_SCENES.values()])
 def test_no_two_effects_share_a_name_or_a_scene(scene: pb.Scene) -> None:
     effects = effects_of(scene)
     assert len({effect.name for effect in effects}) == len(effects)
@@ -126,6 +129,7 @@ def test_no_two_effects_share_a_name_or_a_scene(scene: pb.Scene) -> None:
     assert scene not in {effect.apply(scene) for effect in effects}
 
 
+@pytest.mark.thorough
 def test_equal_names_get_their_place() -> None:
     coats = (pb.ClearCoat("upper", "lacquer"), pb.ClearCoat())
     scene = pb.Scene(pb.SmoothSurface(), coat=pb.physics.CoatStack(coats))
@@ -139,7 +143,7 @@ def test_a_replacement_that_does_not_fit_is_refused() -> None:
         effects_of(pb.Scene(pb.RoughSurface(shadowing=Mistaken())))
 
 
-@pytest.mark.parametrize(
+@each(
     ("word", "found"),
     [
         ("AngleZero", ["AngleZero"]),
@@ -157,5 +161,6 @@ def test_an_unknown_effect_is_refused_with_the_names() -> None:
         find_effects("Fogg", effects_of(ROUGH), "drop")
 
 
+@pytest.mark.thorough
 def test_every_set_up_has_a_scene_with_everything_on() -> None:
     assert set(FULL_SCENES) == set(SETUPS)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from cases import each
 from hard_cases import multiprecision as twin
 from hard_cases.catalogue import MATERIALS, WAVELENGTH, Material, every_case
 
@@ -31,7 +32,7 @@ from polar_bayes.physics.subsurface import Lambertian, body_loss, half_space_los
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
 BOUND = {np.float64: 1e-10, np.float32: 1e-4}
-PRECISIONS = pytest.mark.parametrize("dtype", [np.float64, np.float32])
+PRECISIONS = each("dtype", [np.float64, np.float32])
 
 
 @pytest.fixture(autouse=True)
@@ -168,7 +169,7 @@ def test_lean(dtype: type) -> None:
 
 
 @PRECISIONS
-@pytest.mark.parametrize("distribution", [Beckmann(), GGX()])
+@each("distribution", [Beckmann(), GGX()])
 def test_distribution(distribution: Beckmann | GGX, dtype: type) -> None:
     """Where the density is within 1e-30 of its peak; below, Beckmann's stops falling."""
     kind = type(distribution).__name__.lower()
@@ -237,7 +238,7 @@ def test_scene_of_a_rough_surface(dtype: type) -> None:
 
 
 @PRECISIONS
-@pytest.mark.parametrize("mixing", [StokesMixing(), DopMixing(), DopMixing(signed=True)])
+@each("mixing", [StokesMixing(), DopMixing(), DopMixing(signed=True)])
 def test_scene_of_a_plate_over_a_diffuse_body(
     mixing: StokesMixing | DopMixing, dtype: type
 ) -> None:
@@ -398,7 +399,7 @@ def test_scene_in_polarized_light(dtype: type) -> None:
 
 
 @PRECISIONS
-@pytest.mark.parametrize("distribution", [Beckmann(), GGX()])
+@each("distribution", [Beckmann(), GGX()])
 def test_density_of_grooves(distribution: Beckmann | GGX, dtype: type) -> None:
     """Down to 1e-20 of the peak; at 1e-30 the exponent alone, 69, takes 69 roundings of a slope.
 

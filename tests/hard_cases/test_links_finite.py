@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from synthetic_observations import make_observations
 
 from polar_bayes.observation.links import (
@@ -62,8 +63,8 @@ LINKS = {
 }
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("name", LINKS)
+@each("dtype", [np.float64, np.float32])
+@each("name", LINKS)
 def test_density_gradient_and_hessian_of_a_link_are_finite(name, dtype):
     variable, link, predictions, readings, levels = LINKS[name]
     stopped = (False, True) if variable == "intensity" else (False,)

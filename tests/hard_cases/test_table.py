@@ -3,19 +3,17 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
+from cases import each
 from hard_cases.table import CASES, error
 
 PAGE = Path(__file__).parents[2] / "docs" / "hard_cases.md"
 BOUND = {np.float64: 1e-10, np.float32: 1e-4}
 
-of_every_case = pytest.mark.parametrize(
-    "case", CASES, ids=lambda case: f"{case.what}, {case.where}"
-)
+of_every_case = each("case", CASES, ids=lambda case: f"{case.what}, {case.where}")
 
 
 @of_every_case
-@pytest.mark.parametrize("dtype", BOUND, ids=["double", "single"])
+@each("dtype", BOUND, ids=["double", "single"])
 def test_ours_holds_where_the_textbook_may_not(case, dtype):
     assert error(case, case.ours, dtype) <= BOUND[dtype]
 

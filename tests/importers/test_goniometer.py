@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 
 from polar_bayes.capture.files import load_capture, save_capture
 from polar_bayes.capture.schema import count, validate
@@ -53,6 +54,7 @@ def test_q_is_positive_for_s_light_and_intensity_is_the_mean():
     assert from_goniometer(p, s)["q"].max() < 0.0
 
 
+@pytest.mark.thorough
 def test_incident_levels_put_the_channels_on_one_scale():
     (_, S), (_, P) = readings()
     plain = from_goniometer((ANGLES, S), (ANGLES, P))
@@ -95,6 +97,7 @@ def test_errors_follow_from_the_channels_by_monte_carlo():
     np.testing.assert_array_equal(capture["dop_error"], capture["q_error"])
 
 
+@pytest.mark.thorough
 def test_the_resolution_is_that_of_the_printed_digits(tmp_path):
     table = tmp_path / "plate.csv"
     table.write_text("angle,s,p\n40,10.0,5\n50,20,1.25\n")
@@ -122,6 +125,7 @@ def test_columns_files_and_arrays_give_the_same_capture(tmp_path):
     assert (columns.attrs["name"], columns.attrs["source"]) == ("both", "both.csv")
 
 
+@pytest.mark.thorough
 def test_the_order_of_the_rows_does_not_matter():
     s, p = readings()
     order = np.random.default_rng(0).permutation(ANGLES.size)
@@ -146,6 +150,7 @@ def test_a_missing_reading_is_interpolated_within_its_error():
     assert brightness.max() < 3.0
 
 
+@pytest.mark.thorough
 def test_interpolation_across_the_dark_angle_is_not_trusted():
     """Between readings beside Brewster's angle no curve finds the dip: the error must say so."""
     fine = np.arange(20.0, 81.0, 1.0)
@@ -155,6 +160,7 @@ def test_interpolation_across_the_dark_angle_is_not_trusted():
     assert deviation.max() < 3.0
 
 
+@pytest.mark.thorough
 def test_interpolation_stays_between_its_neighbors():
     s = (np.array([10.0, 20.0, 30.0, 40.0]), np.array([1.0, 1.0, 9.0, 9.0]))
     p = (np.arange(10.0, 41.0, 2.0), np.ones(16))
@@ -163,6 +169,7 @@ def test_interpolation_stays_between_its_neighbors():
     assert float(S.max()) <= 9.0 + 1e-12
 
 
+@pytest.mark.thorough
 def test_nothing_is_made_up_outside_the_range_of_a_channel():
     s, p = (np.array([30.0, 50.0]), np.array([4.0, 8.0])), (np.array([20.0, 40.0]), np.ones(2))
     capture = from_goniometer(s, p)
@@ -175,6 +182,7 @@ def test_nothing_is_made_up_outside_the_range_of_a_channel():
     assert float(capture["intensity"][2]) == pytest.approx((np.sqrt(32.0) + 1.0) / 2.0)
 
 
+@pytest.mark.thorough
 def test_angles_that_print_alike_are_one_angle():
     grid = np.arange(20.0, 80.0, 0.1)
     capture = from_goniometer((grid, grid), (np.linspace(20.0, 79.9, 600), grid))
@@ -185,6 +193,7 @@ def test_angles_that_print_alike_are_one_angle():
 # --- no light ---------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_a_reading_a_little_below_the_dark_level_is_no_light():
     angles = np.array([50.0, 55.0, 60.0])
     s, p = (angles, np.array([30.0, 40.0, 50.0])), (angles, np.array([2.0, 0.9, 3.0]))
@@ -203,6 +212,7 @@ def test_a_view_without_any_light_is_masked():
     assert np.isnan(capture["q"][0])
 
 
+@pytest.mark.thorough
 def test_interpolation_between_readings_of_no_light_stays_finite():
     s = (np.arange(50.0, 60.0), np.ones(10))
     capture = from_goniometer(s, (np.array([50.0, 54.0, 59.0]), np.array([1.0, 0.0, 2.0])))
@@ -270,7 +280,7 @@ OPTIONS = [
 ]
 
 
-@pytest.mark.parametrize(("options", "what", "hint"), OPTIONS)
+@each(("options", "what", "hint"), OPTIONS)
 def test_what_is_wrong_is_named_with_its_mend(options, what, hint):
     pattern = "|".join(map(re.escape, what.split("|")))
     with pytest.raises(CaptureError, match=pattern) as caught:
@@ -308,6 +318,7 @@ def test_measured_glass_is_close_to_fresnel(measured):
     )  # systematic errors dominate: the detector sees some s as p
 
 
+@pytest.mark.thorough
 def test_measured_plexiglas_is_close_to_fresnel(measured):
     table = measured / "plexiglas_fresnel" / "plexiglas_A.csv"
     capture = from_goniometer(table=table, angle="angle_deg", s="I_s_uA", p="I_p_uA")

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -50,6 +51,7 @@ def test_columns_of_other_names_are_said_and_the_rest_ignored(write):
     assert capture["dop"].values.tolist() == [0.02, 0.04]
 
 
+@pytest.mark.thorough
 def test_one_column_may_be_several_variables(write):
     columns = {"view_zenith": "angle", "light_zenith": "angle"}
     azimuths = {"view_azimuth": 180.0, "light_azimuth": 0.0}
@@ -73,7 +75,7 @@ def test_lines_of_the_same_directions_are_one_view_of_several_wavelengths(write)
     np.testing.assert_array_equal(capture["saturated"], np.array(expected) == 0.2)
 
 
-@pytest.mark.parametrize("dim", ["patch", "material"])
+@each("dim", ["patch", "material"])
 def test_patches_stand_side_by_side(write, dim):
     text = f"{dim},view_zenith,dop,true_roughness\n2,10,.1,.3\n1,20,.2,.4\n2,30,.3,.3\n"
     capture = from_table(write(text), constants=ANGLES)
@@ -84,21 +86,22 @@ def test_patches_stand_side_by_side(write, dim):
     assert capture.attrs["name"] == "leaf"
 
 
+@pytest.mark.thorough
 def test_long_numbers_of_patches_stay_apart(write):
     text = "patch,view_zenith,dop\n20261122,10,.1\n20261123,20,.2\n"
     capture = from_table(write(text), constants=ANGLES)
     assert capture["patch"].values.tolist() == ["20261122", "20261123"]
 
 
-@pytest.mark.parametrize(
-    ("number", "label"), [(1.5, "1.5"), (-0.0, "0"), (7, "7"), (1e300, "1e+300")]
-)
+@pytest.mark.thorough
+@each(("number", "label"), [(1.5, "1.5"), (-0.0, "0"), (7, "7"), (1e300, "1e+300")])
 def test_a_patch_may_be_a_constant(write, number, label):
     capture = from_table(write(PLAIN), constants={**ANGLES, "patch": number})
     assert capture["patch"].values.tolist() == [label]
     assert capture.sizes == {"patch": 1, "view": 3}
 
 
+@pytest.mark.thorough
 def test_readings_that_are_not_valid_are_not_looked_at(write):
     capture = from_table(write("view_zenith,dop,valid\n10,7,0\n20,.2,1\n"), constants=ANGLES)
     assert capture["valid"].values.tolist() == [False, True]
@@ -163,7 +166,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("text", "given", "what", "hint"), REFUSED)
+@each(("text", "given", "what", "hint"), REFUSED)
 def test_what_is_wrong_is_named_with_its_line(write, text, given, what, hint):
     with pytest.raises(CaptureError) as caught:
         from_table(write(text), **given)

@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pictures
 import pytest
+from cases import each
 from pictures import FULL, LAMP
 from PIL import Image
 
@@ -36,9 +37,7 @@ def sloping(shape=pictures.SHAPE):
     return clean * (0.5 + 0.4 * row / shape[0] - 0.2 * column / shape[1])
 
 
-@pytest.mark.parametrize(
-    "layout", [SONY, ((0.0, 45.0), (135.0, 90.0)), ((135.0, 0.0), (90.0, 45.0))]
-)
+@each("layout", [SONY, ((0.0, 45.0), (135.0, 90.0)), ((135.0, 0.0), (90.0, 45.0))])
 def test_a_mosaic_tells_what_four_frames_tell(layout):
     """Any order of the four polarizers: away from the edges linear light comes back whole."""
     known = {"shape": FLAT, "light": LAMP, "detector": QUIET, "bin": 4, "window": 1}
@@ -81,7 +80,8 @@ def test_a_ball_comes_back_in_the_plane_of_the_model():
         assert np.asarray(said[name])[valid].max() > 0.02
 
 
-@pytest.mark.parametrize("width", [2, 4, 8])
+@pytest.mark.thorough
+@each("width", [2, 4, 8])
 def test_the_noise_that_is_left_is_the_stated_one(width):
     """Scores of q over a frame of even light; neighbors share a little noise.
 
@@ -107,6 +107,7 @@ def test_the_noise_that_is_left_is_the_stated_one(width):
     assert capture.attrs["median_misfit"] < 3.0
 
 
+@pytest.mark.thorough
 def test_noise_below_the_dark_level_is_kept():
     """Cut off at zero, dark pixels would look brighter than they are."""
     rng = np.random.default_rng(5)
@@ -130,6 +131,7 @@ def test_a_full_pixel_masks_all_that_is_filled_in_from_it():
     assert not capture["valid"].values[capture["saturated"].values].any()
 
 
+@pytest.mark.thorough
 def test_a_frame_in_a_file(tmp_path):
     raw = np.rint(mosaic(sloping()) * 0.5).astype(np.uint8)
     Image.fromarray(raw).save(tmp_path / "plate.png")
@@ -143,7 +145,7 @@ def test_a_frame_in_a_file(tmp_path):
     assert file.drop_attrs().equals(array.drop_attrs())
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "said"),
     [
         ({"layout": ((0, 180), (90, 90))}, "the polarizer stood at 2 different angles"),

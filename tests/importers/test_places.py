@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,6 +22,7 @@ def unit(vector):
     return np.asarray(vector, float) / np.linalg.norm(vector)
 
 
+@pytest.mark.thorough
 @settings(deadline=None, max_examples=100)
 @given(VECTOR, VECTOR, VECTOR, st.floats(0.0, 6.3))
 def test_turning_the_camera_turns_nothing_but_its_own_axes(normal, view, light, turn):
@@ -62,7 +64,8 @@ def test_azimuths_count_counterclockwise_around_the_normal_from_the_light():
     assert behind.view_azimuth[0] == pytest.approx(180.0)  # the mirror side
 
 
-@pytest.mark.parametrize("light", [(0.3, 0.4, 0.8), (0.0, 0.0, 1.0)])
+@pytest.mark.thorough
+@each("light", [(0.3, 0.4, 0.8), (0.0, 0.0, 1.0)])
 def test_straight_on_the_frame_is_that_of_the_light(light):
     """Continuous with a camera opposite to the light, and finite where both are on the normal."""
     ray = unit(light)
@@ -76,6 +79,7 @@ def test_straight_on_the_frame_is_that_of_the_light(light):
     assert np.isfinite([found.cos_twice, found.sin_twice, found.view_azimuth]).all()
 
 
+@pytest.mark.thorough
 def test_what_is_seen_edge_on_is_not_seen():
     """No zenith reaches 90 degrees, which captures refuse."""
     found = local_geometry(
@@ -109,6 +113,7 @@ def test_a_sphere_points_away_from_its_center():
     assert np.isnan(found[3]).all()
 
 
+@pytest.mark.thorough
 def test_squares_that_the_outline_cuts_are_outside():
     shape = as_shape((pb.importers.Sphere(50.0, 60.0, 40.0),))
     at = np.array([50.0]), np.array([98.0])
@@ -135,13 +140,15 @@ def test_a_rim_tells_its_sphere(row, column, radius, around):
     )
 
 
+@pytest.mark.thorough
 def test_a_rim_may_stand_in_a_table(tmp_path):
     (tmp_path / "rim.csv").write_text("row,column\n10,50\n50,90\n90,50\n50,10\n")
     found = fit_sphere(tmp_path / "rim.csv")
     np.testing.assert_allclose([found.row, found.column, found.radius], [50.0, 50.0, 40.0])
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     ("rim", "said"),
     [
         (np.ones((3, 2)), "rim: it has 3 points; mark four points or more"),
@@ -164,7 +171,7 @@ def test_normals_over_a_square_are_averaged_and_gaps_spread():
     assert np.isnan(found[1]).all()
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "said"),
     [
         (lambda: pb.importers.Sphere(1.0, 2.0, 0.5), "Sphere: radius: it is 0.5; give 1 <= value"),

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pictures
 import pytest
+from cases import each
 from pictures import BALL, FULL, LAMP, SCENE, TRUTH, ball_normals, frames
 from PIL import Image
 
@@ -36,7 +37,7 @@ def check_same_light(capture):
     assert valid.sum() > 700  # of 960 pixels of the ball
 
 
-@pytest.mark.parametrize(
+@each(
     "angles",
     [
         FOUR,
@@ -67,6 +68,7 @@ def test_a_wrong_sense_of_the_angles_does_not_pass():
         check_same_light(capture)
 
 
+@pytest.mark.thorough
 def test_light_and_camera_may_stand_near():
     """Off the axis the lens turns the camera's axes with each ray."""
     camera, lamp = pb.importers.Position(3.0, -2.0, 60.0), pb.importers.Position(-30.0, 50.0, 45.0)
@@ -123,6 +125,7 @@ def test_surroundings_stand_where_each_place_mirrors_them():
     np.testing.assert_array_equal(capture["q"].values[both], lamp["q"].values[both])
 
 
+@pytest.mark.thorough
 def test_views_of_a_window_are_the_readings_next_to_each_other():
     known = {"shape": ball_normals(), "light": LAMP, "detector": QUIET}
     one = from_polarizer(frames(FOUR), FOUR, window=1, **known)
@@ -132,6 +135,7 @@ def test_views_of_a_window_are_the_readings_next_to_each_other():
     assert four["y"].values[:2].tolist() == [0.5, 2.5]
 
 
+@pytest.mark.thorough
 def test_what_fills_no_square_is_counted():
     capture = from_polarizer(
         frames(FOUR), FOUR, shape=ball_normals(), light=LAMP, detector=QUIET, bin=3, window=3
@@ -165,6 +169,7 @@ def test_dark_and_flat_frames_are_taken_out():
     assert np.nanmax(np.abs(spoiled["q"] - clean["q"])) > 0.05
 
 
+@pytest.mark.thorough
 def test_every_masked_reading_has_one_reason():
     raw = frames(FOUR)
     lamp = pb.importers.Direction(
@@ -190,6 +195,7 @@ def test_every_masked_reading_has_one_reason():
     assert np.isnan(capture["q"].where(~capture["valid"])).all()
 
 
+@pytest.mark.thorough
 def test_errors_are_those_of_many_exposures():
     """Scores of q and u of 6,000 readings with three unequal angles, whose errors go together.
 
@@ -223,6 +229,7 @@ def test_errors_are_those_of_many_exposures():
     assert "median_misfit" not in capture.attrs
 
 
+@pytest.mark.thorough
 def test_averaging_pixels_lowers_the_noise_but_not_what_stays_unknown():
     known = {"shape": ball_normals(), "light": LAMP, "window": 1}
     noisy = pb.importers.Detector(
@@ -241,7 +248,7 @@ def test_averaging_pixels_lowers_the_noise_but_not_what_stays_unknown():
     np.testing.assert_allclose(left, 1.0, rtol=0.1)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif", ".npy"])
+@each("suffix", [".png", ".tif", ".npy"])
 def test_files_hold_the_same_as_arrays(tmp_path, suffix):
     raw = np.rint(frames(FOUR)).astype(np.uint16)
     paths = [tmp_path / f"ball{angle:.0f}{suffix}" for angle in FOUR]
@@ -259,6 +266,7 @@ def test_files_hold_the_same_as_arrays(tmp_path, suffix):
     assert validate(files).identical(files)
 
 
+@pytest.mark.thorough
 def test_frames_of_8_bits_are_full_at_255():
     raw = np.rint(frames(FOUR, full=400.0))
     raw[1, 15, 24] = 255.0
@@ -280,7 +288,7 @@ def with_defaults(**asked):
     return from_polarizer(given.pop("frames"), given.pop("angles"), **given)
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "said"),
     [
         ({"angles": (0, 90, 180, 270)}, "the polarizer stood at 2 different angles"),
@@ -317,7 +325,7 @@ def test_a_mistake_is_told_with_its_mend(asked, said):
         with_defaults(**asked)
 
 
-@pytest.mark.parametrize(
+@each(
     ("field", "said"),
     [
         ({"gain": 0.0}, "gain: it is 0.0; give 0 < value"),
@@ -331,7 +339,7 @@ def test_a_detector_is_checked(field, said):
         pb.importers.Detector(**field)
 
 
-@pytest.mark.parametrize(
+@each(
     ("field", "said"),
     [
         ({"dark": np.ones((2, 2))}, "dark: it is (2, 2), the frames are (40, 48)"),
@@ -344,6 +352,7 @@ def test_dark_and_flat_frames_are_checked(field, said):
         with_defaults(detector=pb.importers.Detector(saturation_level=FULL, **field))
 
 
+@pytest.mark.thorough
 def test_a_picture_in_color_is_refused(tmp_path):
     path = tmp_path / "color.png"
     Image.new("RGB", (48, 40)).save(path)
@@ -354,6 +363,7 @@ def test_a_picture_in_color_is_refused(tmp_path):
         with_defaults(frames=[tmp_path / "broken.png"] * 4)
 
 
+@pytest.mark.thorough
 def test_files_that_hold_something_else_than_one_frame_of_counts_are_refused(tmp_path, monkeypatch):
     pages = [Image.fromarray(np.full((8, 8), 100 + k, np.uint8)) for k in range(4)]
     stacked, lossy = tmp_path / "angles.tif", tmp_path / "ball.jpg"

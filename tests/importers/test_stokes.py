@@ -59,6 +59,7 @@ def test_turning_axes_is_a_rotation(q, u, degrees, correlation, ratio):
     np.testing.assert_allclose(turn @ [q, u], [after.q[0, 0], after.u[0, 0]], atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_light_along_an_angle_is_q_in_axes_turned_by_it():
     along = image(np.cos(np.deg2rad(60.0)), np.sin(np.deg2rad(60.0)), 1.0, 1.0, 0.0)  # at 30
     rotated = along.rotated(np.cos(np.deg2rad(60.0)), np.sin(np.deg2rad(60.0)))
@@ -84,6 +85,7 @@ def test_covariance_is_that_of_many_drawn_readings():
     assert found.misfit.mean() == pytest.approx(1.0, abs=tolerance)
 
 
+@pytest.mark.thorough
 def test_readings_that_no_light_makes_do_not_fit():
     light = readings((0.0, 45.0, 90.0, 135.0), 200.0, 0.1, 0.1)
     light[0] += 30.0  # a frame that was exposed longer
@@ -129,6 +131,7 @@ def test_the_estimator_is_that_of_the_paper_for_any_ellipse_of_noise():
     np.testing.assert_allclose(error, np.sqrt(along), rtol=1e-10)
 
 
+@pytest.mark.thorough
 def test_unpolarized_light_has_a_finite_estimate():
     found, error = unbiased_dop(image(0.0, 0.0, 0.01, 0.04, 0.0))
     assert found[0, 0] == 0.0

@@ -113,6 +113,7 @@ def test_nuts_agrees_with_the_grid_everywhere(case: tuple[str, xr.Dataset, Grid]
             assert abs(grid.probability_below(name, quantile) - probability) < tolerance + step
 
 
+@pytest.mark.thorough
 def test_laplace_agrees_with_the_grid_where_the_posterior_is_near_normal() -> None:
     capture = CASES["near normal"]
     grid = grid_posterior(capture)

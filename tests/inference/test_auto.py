@@ -12,6 +12,7 @@ from typing import ClassVar, override
 import jax
 import numpy as np
 import pytest
+from cases import each
 from plates import plate_capture
 from toy_models import capture, funnel, line, of_line
 
@@ -135,6 +136,7 @@ def test_the_first_rung_that_is_good_enough_is_taken():
     assert "was taken: its means and standard deviations are expected within" in sentence
 
 
+@pytest.mark.thorough
 def test_what_a_method_says_of_its_draws_stays_with_the_result():
     said = json.loads(
         pb.fit(capture(), model=line, links=LINKS, method=Made(k_hat=2.0)).attrs["polar_bayes"]
@@ -142,7 +144,7 @@ def test_what_a_method_says_of_its_draws_stays_with_the_result():
     assert (said["k_hat"], said["effective_draws"], said["r_hat"]) == (2.0, 4000.0, None)
 
 
-@pytest.mark.parametrize(
+@each(
     ("rung", "why"),
     [
         (Made(k_hat=0.9), "its Pareto k-hat is 0.90"),
@@ -180,6 +182,7 @@ def test_where_nothing_is_good_enough_the_nearest_is_returned_and_flagged():
     assert "Nothing was good enough" in pb.inference.auto_sentences(result)[-1]
 
 
+@pytest.mark.thorough
 def test_of_two_in_doubt_the_dearer_one_is_returned():
     _, said = fitted(Made(k_hat=0.9), Made(k_hat=np.nan, r_hat=1.2))
     assert (said["auto"]["chosen"], said["auto"]["met"]) == ("rung 1", False)
@@ -191,6 +194,7 @@ def test_after_its_time_nothing_begins():
     assert not said["auto"]["met"]
 
 
+@pytest.mark.thorough
 def test_only_the_first_is_let_off_the_time_though_it_had_no_answer():
     """Chains that report progress after the time are stopped."""
     with pytest.raises(pb.FitError, match=r"rung 0: .*no peak.*rung 1: .*the time was up"):
@@ -219,6 +223,7 @@ def test_what_is_stuck_is_abandoned_and_the_best_answer_so_far_is_returned():
     assert "no method met the tolerance of 0.1 posterior sd within 1 s" in found.problems[-1]
 
 
+@pytest.mark.thorough
 def test_the_time_is_counted_from_when_the_fit_was_asked_for(monkeypatch: pytest.MonkeyPatch):
     at_once = fitting.resolve
 
@@ -252,6 +257,7 @@ def test_the_time_is_kept_on_a_busy_machine():
     assert took <= 1.2 * seconds + first["seconds"]
 
 
+@pytest.mark.thorough
 def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left():
     taken, here = Made(), problem(line)
     auto = Given(given=(("rung 0", Made(k_hat=0.9)), ("rung 1", taken)), seconds=600.0)
@@ -260,6 +266,7 @@ def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left()
     assert found.deadline == here.start_time + 600.0
 
 
+@pytest.mark.thorough
 def test_the_fit_beside_is_made_by_the_method_of_the_answer():
     """The instrument is told apart by comparing: never by choosing a method once more."""
     scene = pb.Scene(
@@ -271,6 +278,7 @@ def test_the_fit_beside_is_made_by_the_method_of_the_answer():
     assert result["without_instrument"].sizes["draw"] == 250
 
 
+@pytest.mark.thorough
 def test_comparisons_that_are_stuck_are_abandoned_and_told():
     scene = pb.Scene(
         pb.SmoothSurface(), instrument=pb.instrument.Instrument((pb.physics.Discrepancy(),))
@@ -289,6 +297,7 @@ def test_comparisons_that_are_stuck_are_abandoned_and_told():
     )
 
 
+@pytest.mark.thorough
 def test_tolerances_that_weighted_draws_cannot_meet_are_left_to_chains():
     here = problem(line)
     assert list(pb.methods.Auto(tolerance=0.03).candidates(here)) == [
@@ -315,6 +324,7 @@ def test_a_normal_posterior_is_met_by_the_cheapest():
     assert (np.abs(table["sd"] / sd - 1.0) < 0.2).all()
 
 
+@pytest.mark.thorough
 def test_a_funnel_is_left_to_higher_rungs():
     result = pb.fit(capture(), model=funnel, links=LINKS, method=pb.methods.Auto(0.5, 600.0))
     steps = json.loads(result.attrs["polar_bayes"])["auto"]["steps"]
@@ -322,7 +332,7 @@ def test_a_funnel_is_left_to_higher_rungs():
     assert len(steps) > 1
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "said"),
     [
         ({"method": "nuts", "tolerance": 0.1}, "tolerance needs method='auto'"),

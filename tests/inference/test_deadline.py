@@ -74,6 +74,7 @@ def test_work_done_in_time_is_as_if_called_directly() -> None:
     assert reports == [("half", 0.5, True)] * 2
 
 
+@pytest.mark.thorough
 def test_without_a_deadline_there_is_no_thread() -> None:
     here = threading.current_thread()
     found = run_until(float("inf"), no_progress, lambda _: threading.current_thread())
@@ -99,6 +100,7 @@ def test_after_the_deadline_nothing_begins(stuck: Stuck) -> None:
     assert not stuck.begun.is_set()
 
 
+@pytest.mark.thorough
 def test_an_error_of_the_work_is_raised_where_it_is_waited_for() -> None:
     def fail(progress: Progress) -> None:
         raise ZeroDivisionError("of the work")
@@ -123,6 +125,7 @@ def test_an_interrupt_of_the_caller_abandons_the_work(stuck: Stuck) -> None:
     assert stuck.said == ["no report", "no trace"]
 
 
+@pytest.mark.thorough
 def test_a_caller_waits_until_the_abandoned_thread_is_not_tracing() -> None:
     """NumPyro's handlers are those of the process: nobody may trace beside an abandoned trace."""
     tracing, ended = threading.Event(), threading.Event()

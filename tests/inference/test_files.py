@@ -10,6 +10,7 @@ import arviz_base as az
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import make_calibration
 from synthetic_results import edit_provenance, make_result, pool, replace
@@ -98,18 +99,22 @@ def check_mutations(trees, functions, random, count):
     return refused
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (1, 2))]
+)
 def test_a_damaged_fit_is_refused_in_one_line_or_works(seed):
     random = np.random.default_rng([11, seed])
     assert 15 < check_mutations(RESULTS, OF_FITS, random, 50) < 45
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.thorough
+@each("seed", range(2))
 def test_a_damaged_calibration_is_refused_in_one_line_or_works(seed):
     random = np.random.default_rng([12, seed])
     assert 20 < check_mutations([CALIBRATION], OF_CALIBRATIONS, random, 40) < 40
 
 
+@pytest.mark.thorough
 def test_a_damaged_study_is_refused_in_one_line_or_works():
     random = np.random.default_rng([13])
     assert 40 < check_mutations([make_accuracy()], OF_STUDIES, random, 120) < 120
@@ -118,7 +123,7 @@ def test_a_damaged_study_is_refused_in_one_line_or_works():
 # Matplotlib says that an axis from 1e-300 to 1e300 overflows; the figure is drawn all the same.
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning:matplotlib")
 @pytest.mark.thorough
-@pytest.mark.parametrize("seed", range(8))
+@each("seed", range(8))
 def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
     random = np.random.default_rng([14, seed])
     figures = (
@@ -147,7 +152,8 @@ def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
 # --- provenance -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("odd", ODD_ATTRIBUTES, ids=lambda odd: str(odd)[:9])
+@pytest.mark.thorough
+@each("odd", ODD_ATTRIBUTES, ids=lambda odd: str(odd)[:9])
 def test_provenance_that_is_no_mapping_is_refused(odd):
     tree = RESULTS[1].copy()
     tree.attrs["polar_bayes"] = odd
@@ -155,7 +161,7 @@ def test_provenance_that_is_no_mapping_is_refused(odd):
         pb.summary(tree)
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "what"),
     [
         ({"counts": {"views": "9"}}, "polar_bayes.counts.views: it is '9', not a count"),
@@ -175,6 +181,7 @@ def test_provenance_of_the_wrong_type_is_refused(change, what):
         pb.diagnostics.json_summary(tree)
 
 
+@pytest.mark.thorough
 def test_provenance_may_lack_anything():
     tree = RESULTS[0].copy()
     tree.attrs = {}
@@ -215,13 +222,14 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize(("change", "what"), REFUSED.values(), ids=REFUSED)
+@each(("change", "what"), REFUSED.values(), ids=REFUSED)
 def test_a_posterior_that_does_not_hold_together_is_refused(change, what):
     with pytest.raises(pb.FitError, match=f"result: .*{what}"):
         pb.verdict(_edited(change))
 
 
-@pytest.mark.parametrize("dim", ["row", "parameter"])
+@pytest.mark.thorough
+@each("dim", ["row", "parameter"])
 def test_a_study_of_nothing_is_refused(dim):
     study = make_accuracy()
     study["accuracy"] = xr.DataTree(study["accuracy"].to_dataset().isel({dim: slice(0)}))
@@ -229,7 +237,7 @@ def test_a_study_of_nothing_is_refused(dim):
         pb.benchmark.accuracy_sentences(study)
 
 
-@pytest.mark.parametrize("number", [1596, 2340, 2419])
+@each("number", [1596, 2340, 2419])
 def test_a_group_that_xarray_cannot_read_is_refused(number):
     """Cases of `benchmarks/fuzz.py`: edits that xarray allows, and whose group it then refuses."""
     whole = make_result(views=12, chains=2, draws=60)
@@ -238,6 +246,7 @@ def test_a_group_that_xarray_cannot_read_is_refused(number):
         pb.summary(tree)
 
 
+@pytest.mark.thorough
 def test_readings_and_predictions_belong_together():
     tree = _edited(lambda x: x.isel(view=slice(2)), "observed_data")
     with pytest.raises(pb.FitError, match="its view has 4 entries, that of observed_data 2"):
@@ -247,6 +256,7 @@ def test_readings_and_predictions_belong_together():
         pb.diagnostics.stack_readings(tree)
 
 
+@pytest.mark.thorough
 def test_other_kinds_of_tree_are_named(tmp_path):
     for function in (
         pb.summary,
@@ -295,7 +305,8 @@ def test_a_tree_that_arviz_made_is_summed_up():
 OPTIONAL = sorted(set(RESULTS[1].children) - {"posterior"})
 
 
-@pytest.mark.parametrize("group", OPTIONAL)
+@pytest.mark.thorough
+@each("group", OPTIONAL)
 def test_any_group_but_the_posterior_may_be_missing(group):
     tree = RESULTS[1].copy()
     del tree[group]
@@ -306,6 +317,7 @@ def test_any_group_but_the_posterior_may_be_missing(group):
             pb.plots.plot_readings(tree, "dop")
 
 
+@pytest.mark.thorough
 def test_a_report_leaves_out_what_a_result_lacks(tmp_path):
     tree = RESULTS[2].copy()
     for group in ("noise_free", "constant_data", "prior"):
@@ -315,6 +327,7 @@ def test_a_report_leaves_out_what_a_result_lacks(tmp_path):
     assert "roughness" in page
 
 
+@pytest.mark.thorough
 def test_comparisons_have_the_labels_of_the_fit():
     program = SimpleNamespace(
         auxiliary=(),
@@ -357,7 +370,7 @@ def test_a_file_gives_back_what_was_saved(tmp_path):
         assert set(read.children) == set(tree.children)
 
 
-@pytest.mark.parametrize("part", ["posterior/roughness", "posterior/wavelength", "provenance"])
+@each("part", ["posterior/roughness", "posterior/wavelength", "provenance"])
 def test_a_flipped_bit_is_an_error_and_no_value(tmp_path, part):
     tree = edit_provenance(RESULTS[0].copy(), model_source="x" * 80_000 + "rainy" + "x" * 80_000)
     pb.save(tree, tmp_path / "fit.nc")
@@ -370,6 +383,7 @@ def test_a_flipped_bit_is_an_error_and_no_value(tmp_path, part):
         pb.load(tmp_path / "damaged.nc")
 
 
+@pytest.mark.thorough
 def test_a_result_edited_elsewhere_has_no_checksum(tmp_path):
     pb.save(RESULTS[1], tmp_path / "fit.nc")
     with xr.open_datatree(tmp_path / "fit.nc", engine="netcdf4") as opened:
@@ -394,7 +408,8 @@ def _with_draws(method, name, values, **provenance):
     return replace(tree, "posterior", name, draws + values)
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace", "importance", "tempered"])
+@pytest.mark.thorough
+@each("method", ["nuts", "laplace", "importance", "tempered"])
 def test_draws_that_are_all_equal_are_a_problem(method):
     kind = "nuts" if method == "nuts" else "laplace"
     judged = pb.verdict(edit_provenance(_with_draws(kind, "roughness", 0.2), method=method))
@@ -402,8 +417,8 @@ def test_draws_that_are_all_equal_are_a_problem(method):
     assert any("All draws are equal: roughness; nothing is known" in p for p in judged.problems)
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace", "point"])
-@pytest.mark.parametrize(
+@each("method", ["nuts", "laplace", "point"])
+@each(
     ("name", "value", "provenance", "words"),
     [
         ("refractive_index", -1.0, {}, r"refractive_index \[1, inf\] 100% of its draws"),
@@ -419,6 +434,7 @@ def test_draws_that_their_prior_rules_out_are_a_problem(method, name, value, pro
     assert re.search(words, problem)
 
 
+@pytest.mark.thorough
 def test_one_draw_beyond_the_end_is_a_problem_and_rounding_is_none():
     tree = make_result(wavelengths=())
     draws = tree["posterior"]["roughness"].to_numpy().copy()
@@ -430,6 +446,7 @@ def test_one_draw_beyond_the_end_is_a_problem_and_rounding_is_none():
     assert not pb.verdict(replace(tree, "posterior", "roughness", draws)).passed
 
 
+@pytest.mark.thorough
 def test_a_name_that_the_users_own_model_declares_means_what_it_wants():
     tree = make_result(wavelengths=())
     tree = replace(tree, "posterior", "roughness", tree["posterior"]["roughness"].to_numpy() - 0.4)

@@ -8,6 +8,7 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.autoguide import AutoLaplaceApproximation
@@ -70,18 +71,21 @@ def test_a_result_survives_a_file(short: xr.DataTree, tmp_path) -> None:
         xr.testing.assert_identical(back[group].to_dataset(), short[group].to_dataset())
 
 
+@pytest.mark.thorough
 def test_threads_do_not_change_a_bit(short: xr.DataTree, capture: xr.Dataset) -> None:
     alone = pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50, threads=1)
     other = pb.fit(capture, scene=PLATE, links=LINKS, method=alone, seed=7)
     xr.testing.assert_equal(short["posterior"].to_dataset(), other["posterior"].to_dataset())
 
 
+@pytest.mark.thorough
 def test_another_seed_gives_other_draws(short: xr.DataTree, capture: xr.Dataset) -> None:
     other = pb.fit(capture, scene=PLATE, links=LINKS, method=SHORT, seed=8)
     name = "refractive_index"
     assert not np.array_equal(short["posterior"][name], other["posterior"][name])
 
 
+@pytest.mark.thorough
 def test_a_fit_that_is_too_short_says_so(short: xr.DataTree) -> None:
     verdict = pb.verdict(short)
     assert not verdict.passed
@@ -96,6 +100,7 @@ def test_the_global_precision_is_left_alone(capture: xr.Dataset) -> None:
     assert result["posterior"]["refractive_index"].dtype == np.float64
 
 
+@pytest.mark.thorough
 def test_single_precision_finds_the_same_posterior(capture: xr.Dataset) -> None:
     double = pb.fit(capture, scene=PLATE, links=LINKS, seed=1)
     single = pb.fit(capture, scene=PLATE, links=LINKS, seed=1, precision="single")
@@ -106,6 +111,7 @@ def test_single_precision_finds_the_same_posterior(capture: xr.Dataset) -> None:
         assert abs(one.mean() - two.mean()) < 4.0 * np.sqrt(2.0 / 450.0) * one.std()
 
 
+@pytest.mark.thorough
 def test_laplace_is_numpyros_guide(capture: xr.Dataset) -> None:
     """Mean and covariance against `AutoLaplaceApproximation` with its own exact Hessian."""
     settings = pb.methods.Laplace(draws=50_000, chains=1)
@@ -154,6 +160,7 @@ def conjugate(data, scene, priors, links) -> None:
         numpyro.sample("q", dist.Normal(mean, 0.5), obs=data.readings["q"])
 
 
+@pytest.mark.thorough
 def test_a_model_of_ones_own_with_a_known_posterior(capture: xr.Dataset) -> None:
     result = pb.fit(capture, model=conjugate, scene=PLATE, links=LINKS, seed=1)
     q = capture["q"].to_numpy()
@@ -166,9 +173,8 @@ def test_a_model_of_ones_own_with_a_known_posterior(capture: xr.Dataset) -> None
     assert provenance_of(result)["model"] == "conjugate"
 
 
-@pytest.mark.parametrize(
-    ("belief", "trusted"), [(dist.Normal(0.0, 1.0), True), (dist.StudentT(1.5, 0.0, 1.0), False)]
-)
+@pytest.mark.thorough
+@each(("belief", "trusted"), [(dist.Normal(0.0, 1.0), True), (dist.StudentT(1.5, 0.0, 1.0), False)])
 def test_laplace_says_where_it_is_not_to_be_trusted(
     capture: xr.Dataset, belief: dist.Distribution, trusted: bool
 ) -> None:
@@ -207,6 +213,7 @@ def test_masked_views_are_counted_and_do_not_matter(capture: xr.Dataset) -> None
     assert (result["log_likelihood"]["q"][..., 4] == 0.0).all()
 
 
+@pytest.mark.thorough
 def test_views_beyond_the_limit_are_set_aside_and_counted(capture: xr.Dataset) -> None:
     result = pb.fit(
         capture, scene=PLATE, links=LINKS, method="laplace", largest_view_zenith=60.0, seed=1
@@ -215,6 +222,7 @@ def test_views_beyond_the_limit_are_set_aside_and_counted(capture: xr.Dataset) -
     assert counts["used"] == int((capture["view_zenith"] <= 60.0).sum())
 
 
+@pytest.mark.thorough
 def test_two_views_have_a_proper_posterior() -> None:
     """A scene can match two readings exactly; a noise of zero must not swallow the posterior."""
     capture = plate_capture(np.array([40.0, 70.0]), 0.02, seed=4)
@@ -228,13 +236,14 @@ def test_two_views_have_a_proper_posterior() -> None:
     assert np.quantile(prior, 0.005) < np.median(scale) < np.quantile(prior, 0.995)
 
 
+@pytest.mark.thorough
 def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:
     before = capture.copy(deep=True)
     pb.fit(capture, scene=PLATE, links=LINKS, method="laplace", seed=1)
     xr.testing.assert_identical(before, capture)
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "says"),
     [
         ({"model": "per_leaf"}, r"model='per_leaf': no such model; give one of per_material"),
@@ -274,7 +283,7 @@ def test_an_image_is_refused_with_the_way_out(capture: xr.Dataset) -> None:
         pb.fit(image, scene=PLATE, links=LINKS)
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "says"),
     [
         ({"chains": 1}, "chains is 1; give at least 2"),
@@ -302,6 +311,7 @@ def test_progress_reports_every_stage(capture: xr.Dataset) -> None:
     assert all(0.0 <= fraction <= 1.0 for _, fraction in heard)
 
 
+@pytest.mark.thorough
 def test_a_comparison_that_fails_is_told_and_costs_nothing(
     capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

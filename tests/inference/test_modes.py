@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import each
 from scipy.stats import multivariate_normal
 
 from polar_bayes.inference.optimize import (
@@ -49,6 +50,7 @@ def test_a_normal_peak_is_found_with_its_width() -> None:
     np.testing.assert_allclose(end.covariance, SPREAD, rtol=1e-7)
 
 
+@pytest.mark.thorough
 def test_curvature_of_a_cubic_is_accurate_to_the_stated_error() -> None:
     def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
         return float(np.sum(np.exp(z))), np.exp(z)
@@ -78,6 +80,7 @@ def test_a_saddle_is_never_called_a_peak() -> None:
     assert distinct_modes([end]) is None
 
 
+@pytest.mark.thorough
 def test_a_wall_of_nan_ends_a_climb_without_a_peak() -> None:
     def nowhere(z: np.ndarray) -> tuple[float, np.ndarray]:
         return np.nan, np.full(z.size, np.nan)
@@ -85,7 +88,7 @@ def test_a_wall_of_nan_ends_a_climb_without_a_peak() -> None:
     assert distinct_modes([find_mode(nowhere, np.zeros(3))]) is None
 
 
-@pytest.mark.parametrize("seed", range(3))
+@each("seed", range(3))
 def test_the_order_of_the_starts_does_not_matter(seed: int) -> None:
     centers = np.array([[-6.0, 0.0], [6.0, 0.0]])
     potential = mixture_potential(centers, np.array([0.3, 0.7]))

@@ -13,6 +13,7 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
+from cases import each
 from compilations import compilations
 from numpyro import distributions as dist
 from numpyro import handlers
@@ -74,21 +75,26 @@ def compiled() -> Iterator[list[str]]:
 SPECTRAL = pb.models.GpSpectral(coupled=("refractive_index",))
 
 
+CASES = {
+    "hierarchical laplace": ("hierarchical", LAPLACE, several),
+    "nuts": ("per_material", NUTS, one),
+    "laplace": ("per_material", LAPLACE, one),
+    "point": ("per_material", pb.methods.Point(starts=2), one),
+    "hierarchical nuts": ("hierarchical", NUTS, several),
+    "spectral nuts": (SPECTRAL, NUTS, colors),
+}
+
+
 @pytest.mark.parametrize(
-    ("model", "method", "capture"),
+    "case",
     [
-        ("per_material", NUTS, one),
-        ("per_material", LAPLACE, one),
-        ("per_material", pb.methods.Point(starts=2), one),
-        ("hierarchical", NUTS, several),
-        ("hierarchical", LAPLACE, several),
-        (SPECTRAL, NUTS, colors),
+        case if case == "laplace" else pytest.param(case, marks=pytest.mark.thorough)
+        for case in CASES
     ],
-    ids=["nuts", "laplace", "point", "hierarchical nuts", "hierarchical laplace", "spectral nuts"],
 )
-def test_other_readings_compile_nothing(
-    model: object, method: object, capture: Callable[[int], xr.Dataset], compiled: list[str]
-) -> None:
+def test_other_readings_compile_nothing(case: str, compiled: list[str]) -> None:
+    model, method, capture = CASES[case]
+
     def fit(seed: int) -> xr.DataTree:
         asked = {"model": model, "method": method, "scene": PLATE, "links": LINKS}
         return pb.fit(capture(seed), seed=seed, **asked)
@@ -113,6 +119,7 @@ def test_what_was_compiled_for_others_gives_the_same_draws() -> None:
     xr.testing.assert_equal(before[name].to_dataset(), again[name].to_dataset())
 
 
+@pytest.mark.thorough
 def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
     """`fit` splits a round number of keys; the first of them must be those of any number."""
     key = jax.random.key(5)
@@ -122,6 +129,7 @@ def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
     assert np.array_equal(many[:1234], few)
 
 
+@pytest.mark.thorough
 def test_any_number_of_prior_draws_is_served_by_one_program(
     compiled: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,12 +212,13 @@ OTHER: dict[str, tuple[dict, dict]] = {
 }
 
 
-@pytest.mark.parametrize("what", SAME)
+@each("what", SAME)
 def test_the_same_question_shares_what_is_compiled(what: str) -> None:
     first, second = SAME[what]
     assert compiled_model(one(1), **first) is compiled_model(one(2), **second)
 
 
+@pytest.mark.thorough
 def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -228,17 +237,19 @@ def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
     assert told == [(6,), (7,)]
 
 
-@pytest.mark.parametrize("what", OTHER)
+@each("what", OTHER)
 def test_another_question_shares_nothing(what: str) -> None:
     first, second = OTHER[what]
     assert compiled_model(one(1), **first) is not compiled_model(one(1), **second)
 
 
+@pytest.mark.thorough
 def test_another_layout_shares_nothing() -> None:
     longer = plate_capture(np.linspace(30.0, 75.0, 7), 0.02, 1)
     assert compiled_model(one(1)) is not compiled_model(longer)
 
 
+@pytest.mark.thorough
 def test_how_a_scene_was_chosen_does_not_count() -> None:
     parts = {field.name: getattr(PLATE, field.name) for field in dataclasses.fields(PLATE)}
     chosen = [ChosenScene(**parts) for _ in range(2)]
@@ -299,6 +310,7 @@ def test_a_model_that_is_edited_and_loaded_again_is_another(
     del sys.modules["model_of_mine"], sys.modules["helper_of_mine"]
 
 
+@pytest.mark.thorough
 def test_the_last_few_are_kept() -> None:
     made: list[str] = []
     kept: LRUCache[str] = LRUCache(2)
@@ -311,6 +323,7 @@ def test_the_last_few_are_kept() -> None:
     assert made == ["a", "b", "c", "b"]  # c took the place of b, which was asked for before a
 
 
+@pytest.mark.thorough
 def test_fits_side_by_side_leave_warnings_as_they_were() -> None:
     """The first ends before the second does: neither may undo what the other needs."""
     first_ended, second_began = threading.Event(), threading.Event()

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 import pytest
+from cases import each
 from toy_models import capture, funnel, line, of_line, squared
 
 import polar_bayes as pb
@@ -55,7 +56,8 @@ def test_the_ladder_holds_every_method_that_is_tested_here():
     }
 
 
-@pytest.mark.parametrize("name", [name for name in SMALL if name not in WITHOUT_PRIOR])
+@pytest.mark.thorough
+@each("name", [name for name in SMALL if name not in WITHOUT_PRIOR])
 def test_a_normal_posterior_is_found_by_every_rung(name):
     here = problem(line)
     found = run(SMALL[name], here)
@@ -74,6 +76,7 @@ def test_a_normal_posterior_is_found_by_every_rung(name):
     assert not found.r_hat > 1.01
 
 
+@pytest.mark.thorough
 def test_gradients_of_a_warm_up_are_counted_as_they_were_made():
     here = problem(line)
     method = pb.methods.Nuts(chains=2, warmup=60, draws=50, most_draws=50, block=50)
@@ -84,6 +87,7 @@ def test_gradients_of_a_warm_up_are_counted_as_they_were_made():
     assert found.gradients == climbing + before + found.stats["n_steps"].sum()
 
 
+@pytest.mark.thorough
 def test_a_point_fit_has_the_width_of_its_standard_errors():
     here = problem(line)
     found = sample_point(run(SMALL["point"], here), jax.random.key(1))
@@ -94,7 +98,8 @@ def test_a_point_fit_has_the_width_of_its_standard_errors():
     np.testing.assert_allclose(draws.mean(axis=(1, 2)), [level, slope], atol=0.02)
 
 
-@pytest.mark.parametrize("name", ["importance", "tempered"])
+@pytest.mark.thorough
+@each("name", ["importance", "tempered"])
 def test_both_modes_are_weighed_alike(name):
     here = problem(squared)
     found = run(SMALL[name], here)
@@ -118,6 +123,7 @@ def test_every_mode_of_weight_gets_draws():
     assert laplace_mixture(one, np.dtype(float)).mean.shape == mixture.mean.shape
 
 
+@pytest.mark.thorough
 def test_chains_that_missed_a_mode_are_told():
     here = problem(squared)
     both = run(SMALL["importance"], here)
@@ -133,6 +139,7 @@ def test_chains_that_missed_a_mode_are_told():
     assert missed_mode_weight(both.z, problem(line)) == 0.0
 
 
+@pytest.mark.thorough
 def test_weights_that_do_not_reach_all_of_a_posterior_are_a_problem():
     found = run(SMALL["importance"], problem(funnel))
     assert found.k_hat > 0.7
@@ -154,6 +161,7 @@ def test_the_expected_error_is_the_one_that_is_seen():
     assert np.max(seen) > 0.3 * np.mean(expected)
 
 
+@pytest.mark.thorough
 def test_as_many_draws_are_needed_as_the_tolerance_says():
     assert quantile(1) == pytest.approx(2.5758, abs=1e-4)
     assert draws_needed(0.1, 3) == int(np.ceil((quantile(6) / 0.1) ** 2))
@@ -167,6 +175,7 @@ def test_draws_that_are_no_numbers_have_an_infinite_error():
     assert np.isposinf(expected_error(found, here))
 
 
+@pytest.mark.thorough
 def test_each_tempered_fit_counts_for_itself_with_the_same_programs():
     here = problem(line)
     model = here.compiled_model
@@ -191,6 +200,7 @@ def test_draws_are_scaled_and_settings_kept():
     assert pb.methods.Point().scale_draws(2.0) is None
 
 
+@pytest.mark.thorough
 def test_tempered_answers_have_as_many_draws_as_are_asked_for():
     settings = pb.methods.PixelSMC()
     for count, draws in ((1.0, 2048), (2048, 2048), (2049, 2050), (5000, 5000)):
@@ -205,7 +215,7 @@ def test_tempered_answers_have_as_many_draws_as_are_asked_for():
     assert rungs["importance"].draws == 16 * needed
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "said"),
     [
         (lambda: pb.methods.Importance(draws=10), "draws is 10"),

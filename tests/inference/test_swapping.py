@@ -6,6 +6,7 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.reparam import LocScaleReparam
@@ -41,6 +42,7 @@ def test_by_keyword(capture: xr.Dataset) -> None:
     assert "prior of refractive_index" in provenance_of(result)["swapped"]
 
 
+@pytest.mark.thorough
 def test_by_an_edited_file(capture: xr.Dataset, tmp_path: Path) -> None:
     text = (MODELS / "per_material.py").read_text()
     edited = text.replace(
@@ -84,6 +86,7 @@ def test_a_model_reads_priors_by_any_name(capture: xr.Dataset) -> None:
         fit(capture, model=index_above_one)
 
 
+@pytest.mark.thorough
 def test_by_condition(capture: xr.Dataset) -> None:
     held = handlers.condition(per_material, data={"refractive_index": np.float64(1.45)})
     result = fit(capture, model=held)
@@ -108,6 +111,7 @@ POOLED = Hierarchical(pooled=("subsurface_fraction",))
 MOVED = handlers.reparam(POOLED, config={"subsurface_fraction_base": LocScaleReparam(0.0)})
 
 
+@pytest.mark.thorough
 def test_by_reparam(plates: xr.Dataset) -> None:
     result = fit(plates, model=MOVED, method="laplace")
     assert provenance_of(result)["model"] == "reparam(Hierarchical)"
@@ -125,7 +129,7 @@ def test_by_reparam_the_posterior_stays(plates: xr.Dataset) -> None:
         assert abs(one.mean() - other.mean()) < 4.0 * np.sqrt(2.0 / 450.0) * one.std()
 
 
-@pytest.mark.parametrize("handler", [handlers.substitute, handlers.do])
+@each("handler", [handlers.substitute, handlers.do])
 def test_handlers_that_would_be_lost_are_refused(capture: xr.Dataset, handler) -> None:
     model = handler(per_material, data={"refractive_index": np.float64(1.45)})
     with pytest.raises(pb.FitError, match=r"use numpyro\.handlers\.condition"):
@@ -154,7 +158,7 @@ def with_counter(data, scene, priors, links):
     per_material(data, scene, priors, links)
 
 
-@pytest.mark.parametrize(
+@each(
     ("model", "said"),
     [
         (
@@ -172,6 +176,7 @@ def test_a_model_that_cannot_work_is_refused(capture: xr.Dataset, model, said: s
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.thorough
 def test_a_prior_that_the_model_does_not_read_is_refused(capture: xr.Dataset) -> None:
     with pytest.raises(pb.FitError, match="no such parameter in this model"):
         fit(capture, priors={"refractive_index_spread": dist.HalfNormal(0.1)})

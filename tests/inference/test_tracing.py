@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from compilations import compilations
 from plates import plate_capture
 from toy_models import line
@@ -27,6 +28,7 @@ def programs() -> Iterator[list[str]]:
         yield found
 
 
+@pytest.mark.thorough
 def test_what_was_begun_is_compiled_once(programs: list[str]) -> None:
     def twice_the_sum(x: jax.Array, y: jax.Array) -> jax.Array:
         return 2.0 * jnp.sum(x) + y
@@ -59,6 +61,7 @@ def test_an_error_of_the_compiler_is_told_where_the_program_is_wanted() -> None:
         run(jnp.ones(2))
 
 
+@pytest.mark.thorough
 def test_the_sampler_is_compiled_beside_the_search_and_once(
     programs: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,6 +117,7 @@ def slow_to_compile(gate: Gate, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax.stages.Lowered, "compile", compile_slowly)
 
 
+@pytest.mark.thorough
 def test_who_compiles_keeps_nobody_from_tracing(gate: Gate, slow_to_compile: None) -> None:
     def slow(x: jax.Array) -> jax.Array:
         return 2.0 * x
@@ -131,6 +135,7 @@ def test_who_compiles_keeps_nobody_from_tracing(gate: Gate, slow_to_compile: Non
         assert all(np.array_equal(each.result(60.0), np.full(3, 2.0)) for each in waiting)
 
 
+@pytest.mark.thorough
 def test_who_runs_for_the_first_time_keeps_nobody_from_tracing(gate: Gate) -> None:
     with ThreadPoolExecutor(1) as pool, ThreadPoolExecutor(1) as another:
         waiting = pool.submit(JitOnce(slow_to_run(gate)), np.ones(3))
@@ -144,6 +149,7 @@ def test_who_runs_for_the_first_time_keeps_nobody_from_tracing(gate: Gate) -> No
         assert np.array_equal(waiting.result(60.0), np.ones(3))
 
 
+@pytest.mark.thorough
 def test_what_waits_in_the_queue_is_compiled_by_who_needs_it(
     gate: Gate, slow_to_compile: None
 ) -> None:
@@ -187,6 +193,7 @@ def test_two_threads_never_trace_at_once_and_compile_a_program_once(programs: li
 # --- memory ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_the_memory_of_a_program_is_known_before_it_runs() -> None:
     def squares(x: jax.Array) -> jax.Array:
         return jnp.outer(x, x)
@@ -211,7 +218,8 @@ def test_a_program_that_the_memory_cannot_hold_is_refused_and_not_run(
     assert JitOnce(lambda x: x + 1.0)(jnp.ones(3))[0] == 2.0
 
 
-@pytest.mark.parametrize("method", ["point", "laplace", pb.methods.Importance()])
+@pytest.mark.thorough
+@each("method", ["point", "laplace", pb.methods.Importance()])
 def test_a_fit_is_refused_in_one_line_where_memory_is_short(
     method: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import distributions as dist
 from scipy import stats
 
@@ -78,6 +79,7 @@ def point(rng: np.random.Generator, *, exact: np.ndarray | None = None) -> Expan
     return ExpansionPoint(*map(jnp.asarray, parts))
 
 
+@pytest.mark.thorough
 def test_patches_find_their_coordinates(made) -> None:
     transport, data = made
     assert transport.groups.axis == "patch"
@@ -88,7 +90,8 @@ def test_patches_find_their_coordinates(made) -> None:
     np.testing.assert_array_equal(alone.readings["q"][0], data.readings["q"][3])
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.thorough
+@each("seed", range(5))
 def test_there_and_back_with_the_volume_of_the_map(made, seed: int) -> None:
     transport, data = made
     rng = np.random.default_rng(seed)
@@ -125,6 +128,7 @@ def test_where_readings_are_normal_members_are_independent_of_their_population(
     np.testing.assert_allclose(difference, difference[0], atol=1e-7)
 
 
+@pytest.mark.thorough
 def test_a_prior_that_differs_between_patches_keeps_them_together(made, capture) -> None:
     def uneven(data, scene, priors, links):
         width = jnp.linspace(0.1, 0.5, MEMBERS)[:, None]

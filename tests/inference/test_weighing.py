@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.inference.resampling import (
     CHAINS,
@@ -21,7 +22,7 @@ def test_each_draw_is_chosen_as_often_as_it_weighs():
     assert (np.abs(counts - 400 * weights) < 1.0).all()
 
 
-@pytest.mark.parametrize(("worth", "each"), [(1.0, FEWEST), (8000.0, 2000), (1e9, MOST)])
+@each(("worth", "each"), [(1.0, FEWEST), (8000.0, 2000), (1e9, MOST)])
 def test_as_many_are_chosen_as_the_weighted_ones_are_worth(worth, each):
     weights = np.full(5000, 1 / 5000)
     assert systematic_resample(weights, worth, np.random.default_rng(0)).shape == (CHAINS, each)

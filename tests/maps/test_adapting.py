@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import each
 from plate_images import NAMES, VIEWS, mapped, on_a_grid, planned, plate_image
 from scipy import stats
 
@@ -13,7 +14,7 @@ from polar_bayes.inference.proposals import Points, Proposal, fit_t, normal_poin
 WEAK = plate_image(3, 8, noise=0.15, views=VIEWS[[1, 4]], seed=7)
 
 
-@pytest.mark.parametrize("size", [1, 2, 5])
+@each("size", [1, 2, 5])
 def test_heavy_points_are_those_of_student(size: int) -> None:
     points = student_t_points(4096, size, seed=1)
     for column in points.z.T:
@@ -26,12 +27,14 @@ def test_heavy_points_are_those_of_student(size: int) -> None:
     np.testing.assert_array_equal(points.z[::2], -points.z[1::2])
 
 
+@pytest.mark.thorough
 def test_points_follow_the_seed() -> None:
     one, two, other = (student_t_points(128, 3, seed).z for seed in (1, 1, 2))
     assert (one == two).all()
     assert (one != other).all()
 
 
+@pytest.mark.thorough
 def test_parts_of_points_are_the_points() -> None:
     whole = normal_points(256, 2, seed=3)
     parts = whole.split(4)
@@ -54,6 +57,7 @@ def test_moments_are_those_of_the_weighted_draws() -> None:
     assert np.cov(drawn[0].T) == pytest.approx(found.root[0].T @ found.root[0], rel=0.02, abs=0.01)
 
 
+@pytest.mark.thorough
 def test_draws_without_a_volume_propose_nothing() -> None:
     places = np.random.default_rng(6).normal(size=(3, 64, 2))
     weights = np.full((3, 64), 1.0 / 64.0)
@@ -68,6 +72,7 @@ def test_draws_without_a_volume_propose_nothing() -> None:
     assert np.isnan(line).any() or np.abs(np.linalg.det(line)) < 1e-6
 
 
+@pytest.mark.thorough
 def test_where_a_normal_distribution_fails_the_posterior_of_a_grid_is_found() -> None:
     """Largest error of 4 Monte Carlo errors: 6e-5 a comparison, 1e-3 over all of them."""
     method = PixelLaplace(sampler=None)

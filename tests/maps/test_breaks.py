@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import xarray as xr
+from cases import each
 from plate_images import plate_image
 
 pytestmark = pytest.mark.thorough
@@ -70,7 +71,7 @@ def read(out: Path) -> xr.Dataset:
     return xr.open_zarr(out, consolidated=False).load()
 
 
-@pytest.mark.parametrize("moment", [0, 1, 5, 11])
+@each("moment", [0, 1, 5, 11])
 def test_a_killed_map_goes_on_to_the_bits_of_one_that_was_not(
     capture: Path, whole: xr.Dataset, tmp_path: Path, moment: int
 ) -> None:

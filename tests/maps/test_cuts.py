@@ -6,6 +6,7 @@ The programs are compiled as users compile them: rearranged arithmetic would sho
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plate_images import ASKED, NAMES, mapped, planned, plate_image
 
 from polar_bayes.inference.batch_laplace import PixelLaplace
@@ -49,13 +50,14 @@ def assert_same_bits(one: xr.Dataset, other: xr.Dataset) -> None:
         assert values.values.tobytes() == other[name].values.tobytes(), name
 
 
-@pytest.mark.parametrize("block", [100, 43, 17])
+@each("block", [100, 43, 17])
 def test_blocks_of_any_size_give_the_same_bits(
     image: xr.Dataset, plan: Plan, whole: xr.Dataset, block: int
 ) -> None:
     assert_same_bits(mapped(image, plan, block), whole)
 
 
+@pytest.mark.thorough
 def test_a_block_in_which_nothing_was_read_is_masked(image: xr.Dataset, plan: Plan) -> None:
     """A corner of a picture, for example, beside what is shown."""
     nothing = with_pixel_numbers(image.assign(valid=xr.zeros_like(image["q"], bool))).isel(y=[1])
@@ -73,6 +75,7 @@ def test_a_pixel_alone_gets_the_same_bits(image: xr.Dataset, plan: Plan, whole: 
         assert_same_bits(alone, whole.isel(place))
 
 
+@pytest.mark.thorough
 def test_a_mirrored_image_has_mirrored_modes(
     image: xr.Dataset, plan: Plan, whole: xr.Dataset
 ) -> None:
@@ -82,6 +85,7 @@ def test_a_mirrored_image_has_mirrored_modes(
         assert mirrored[name].values.tobytes() == whole[name].values.tobytes(), name
 
 
+@pytest.mark.thorough
 def test_chunks_on_threads_give_the_same_bits(image: xr.Dataset, whole: xr.Dataset) -> None:
     lazy = fit_pixels(image.chunk(y=2, x=15), method=SHORT, **ASKED)
     assert lazy.chunks["x"] == (15, 15, 13)

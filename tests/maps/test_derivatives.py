@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import handlers
 from plate_images import ASKED, plate_image
 from plates import PLATE
@@ -68,7 +69,7 @@ CASES: dict[str, tuple[Callable, int]] = {
 
 
 EVERY = [
-    pytest.param(name, marks=pytest.mark.thorough) if name.startswith("two links") else name
+    name if name == "two colors" else pytest.param(name, marks=pytest.mark.thorough)
     for name in CASES
 ]
 
@@ -120,6 +121,7 @@ def test_expanding_is_what_jax_does_backwards(name: str) -> None:
     assert_close(ours.curvature, hessian)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", EVERY)
 def test_scoring_has_the_same_value_and_gradient(name: str) -> None:
     here = case(name)
@@ -152,7 +154,8 @@ def readings(program: Program, z: jax.Array, data: Observations) -> jax.Array:
     return jnp.ravel(PLATE.predict(parameters, data.geometry)["q"])
 
 
-@pytest.mark.parametrize("name", ["known noise", "two colors"])
+@pytest.mark.thorough
+@each("name", ["known noise", "two colors"])
 def test_scoring_of_normal_noise_is_that_of_gauss_and_newton(name: str) -> None:
     here = case(name)
 
@@ -166,6 +169,7 @@ def test_scoring_of_normal_noise_is_that_of_gauss_and_newton(name: str) -> None:
     assert_close(ours.curvature, everywhere(expected, here))
 
 
+@pytest.mark.thorough
 def test_scoring_of_noise_of_unknown_scale_bends_in_both_arguments() -> None:
     here = case("noise of unknown scale")
 

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
@@ -31,8 +32,8 @@ TAILS = {
 }
 
 
-@pytest.mark.parametrize("count", [64, 128, 256, 1024])
-@pytest.mark.parametrize("tail", TAILS)
+@each("count", [64, 128, 256, 1024])
+@each("tail", TAILS)
 def test_weights_are_those_of_arviz(tail: str, count: int) -> None:
     log_ratios = TAILS[tail](np.random.default_rng(count), (5, count)) + 300.0
     ours = smooth(log_ratios)
@@ -41,6 +42,7 @@ def test_weights_are_those_of_arviz(tail: str, count: int) -> None:
     assert ours.pareto_k == pytest.approx(k, rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.thorough
 @given(seed=st.integers(0, 2**32 - 1), spread=st.floats(0.05, 20.0), shift=st.floats(-1e3, 1e3))
 @settings(max_examples=50, deadline=None)
 def test_weights_of_any_draws_are_those_of_arviz(seed: int, spread: float, shift: float) -> None:
@@ -63,6 +65,7 @@ def test_a_pixel_does_not_depend_on_its_neighbors() -> None:
         assert alone.pareto_k[0].tobytes() == together.pareto_k[number].tobytes()
 
 
+@pytest.mark.thorough
 def test_the_order_of_draws_does_not_matter() -> None:
     rng = np.random.default_rng(2)
     log_ratios = rng.normal(size=(1, 256))
@@ -87,7 +90,7 @@ def test_draws_where_the_posterior_is_zero_weigh_nothing() -> None:
     assert found.pareto_k[[0, 2]] == pytest.approx(k, rel=1e-6)
 
 
-@pytest.mark.parametrize("nothing", [-np.inf, np.nan, np.inf])
+@each("nothing", [-np.inf, np.nan, np.inf])
 def test_no_weights_where_no_ratio_is_finite(nothing: float) -> None:
     log_ratios = np.zeros((2, 128))
     log_ratios[0] = nothing
@@ -99,7 +102,7 @@ def test_no_weights_where_no_ratio_is_finite(nothing: float) -> None:
     assert np.isfinite(found.pareto_k[1])
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@each("dtype", [np.float32, np.float64])
 def test_an_exact_approximation_has_even_weights_and_no_tail(dtype: type) -> None:
     rng = np.random.default_rng(5)
     rounding = 0.2 * np.finfo(dtype).eps * rng.normal(size=(2, 256))
@@ -111,6 +114,7 @@ def test_an_exact_approximation_has_even_weights_and_no_tail(dtype: type) -> Non
     assert effective_draws(found.weights) == pytest.approx(256.0)
 
 
+@pytest.mark.thorough
 def test_single_precision_ratios_give_the_same_weights() -> None:
     log_ratios = np.random.default_rng(6).normal(size=(4, 256))
     one, two = smooth(log_ratios), smooth(log_ratios.astype(np.float32))
@@ -132,12 +136,14 @@ def test_even_weights_give_the_mean_the_sd_and_the_quantiles_of_the_draws() -> N
     assert quantiles == pytest.approx(np.quantile(draws, LEVELS, axis=-1, method="hazen"))
 
 
+@pytest.mark.thorough
 def test_a_level_beyond_the_outermost_middle_is_the_outermost_draw() -> None:
     draws = np.array([[3.0, 1.0, 2.0]])
     _, _, quantiles = summarize(draws, np.full((1, 3), 1.0 / 3.0), (0.0, 0.1, 0.9, 1.0))
     assert quantiles[:, 0].tolist() == [1.0, 1.0, 3.0, 3.0]
 
 
+@pytest.mark.thorough
 def test_draws_without_weight_change_nothing() -> None:
     rng = np.random.default_rng(8)
     draws, weights = rng.normal(size=(2, 100)), rng.dirichlet(np.ones(100), 2)
@@ -151,6 +157,7 @@ def test_draws_without_weight_change_nothing() -> None:
     assert np.abs(told[2] - plain[2]).max() <= gap
 
 
+@pytest.mark.thorough
 def test_one_draw_with_all_the_weight_is_the_answer() -> None:
     weights = np.zeros((1, 64))
     weights[0, 17] = 1.0
@@ -161,7 +168,7 @@ def test_one_draw_with_all_the_weight_is_the_answer() -> None:
     assert quantiles[0, 0] == pytest.approx(draws[0, 17])
 
 
-@pytest.mark.parametrize(("center", "spread"), [(0.0, 0.5), (0.4, 0.7), (-0.3, 0.9)])
+@each(("center", "spread"), [(0.0, 0.5), (0.4, 0.7), (-0.3, 0.9)])
 def test_weighted_draws_of_a_wide_normal_are_a_narrow_one(center: float, spread: float) -> None:
     draws = normal_points(4096, 1, seed=10).z.T
     log_ratios = stats.norm(center, spread).logpdf(draws) - stats.norm().logpdf(draws)
@@ -182,8 +189,8 @@ def test_weighted_draws_of_a_wide_normal_are_a_narrow_one(center: float, spread:
 # --- the points -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [64, 256, 1024])
-@pytest.mark.parametrize("size", [1, 2, 4, 7])
+@each("count", [64, 256, 1024])
+@each("size", [1, 2, 4, 7])
 def test_points_are_standard_normal(count: int, size: int) -> None:
     points = normal_points(count, size, seed=11).z
     assert points.shape == (count, size)
@@ -197,13 +204,14 @@ def test_points_are_standard_normal(count: int, size: int) -> None:
         assert stats.kstest(column, stats.norm.cdf).pvalue > 0.5  # spread more evenly than chance
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_points() -> None:
     one, two, other = (normal_points(128, 3, seed).z for seed in (1, 1, 2))
     assert one.tobytes() == two.tobytes()
     assert not np.isclose(one, other).all(axis=0).any()
 
 
-@pytest.mark.parametrize("size", [1, 2, 5])
+@each("size", [1, 2, 5])
 def test_turns_keep_lengths_and_favor_no_direction(size: int) -> None:
     keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(12), 4000)))
     found = random_rotations(keys, size)
@@ -215,6 +223,7 @@ def test_turns_keep_lengths_and_favor_no_direction(size: int) -> None:
     assert random_rotations(keys[7:8], size)[0].tobytes() == found[7].tobytes()
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("compiled_in_haste")
 def test_turns_do_not_depend_on_how_many_there_are_or_how_they_were_compiled() -> None:
     keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(15), 13)))
@@ -224,6 +233,7 @@ def test_turns_do_not_depend_on_how_many_there_are_or_how_they_were_compiled() -
         assert random_rotations(keys[:count], 3).tobytes() == in_haste[:count].tobytes()
 
 
+@pytest.mark.thorough
 def test_what_few_points_get_wrong_of_a_quantile_averages_out_over_pixels() -> None:
     """Without turns a half interval holds some percent less, or more, in all pixels alike."""
     size, pixels = 4, 2000

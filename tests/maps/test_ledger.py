@@ -96,6 +96,7 @@ def test_what_is_no_ledger_of_this_map_is_refused_and_left_alone(
         entries(other)
 
 
+@pytest.mark.thorough
 def test_a_ledger_in_which_nothing_was_written_is_not_left_behind(tmp_path: Path) -> None:
     file = tmp_path / "map.zarr.progress"
     with pytest.raises(ZeroDivisionError), locked_ledger(file, REQUEST, resume=True):
@@ -121,6 +122,7 @@ def test_a_second_process_is_refused_and_a_killed_one_leaves_no_lock(file: Path)
     assert entries(file) == ENTRIES
 
 
+@pytest.mark.thorough
 def test_a_ledger_that_was_taken_away_is_one_line(file: Path) -> None:
     with locked_ledger(file, REQUEST, resume=True) as ledger:
         file.rename(file.with_name("taken"))

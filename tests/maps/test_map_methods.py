@@ -28,6 +28,7 @@ def tempered(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
     return pb.fit_pixels(image, method=TEMPERING, **ASKED)
 
 
+@pytest.mark.thorough
 def test_tempered_maps_are_those_of_a_grid(image: xr.Dataset, tempered: xr.Dataset) -> None:
     assert (tempered["status"] == Status.GOOD).all()
     assert (tempered["approach"] == MethodUsed.TEMPERED).all()
@@ -43,6 +44,7 @@ def test_tempered_maps_are_those_of_a_grid(image: xr.Dataset, tempered: xr.Datas
     assert np.abs(apart).max() < 4.0
 
 
+@pytest.mark.thorough
 def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, tempered: xr.Dataset) -> None:
     chains = pb.fit_pixels(image.isel(y=[0], x=[0, 1]), method=pb.methods.PixelNuts(), **ASKED)
     assert (chains["approach"] == MethodUsed.NUTS).all()
@@ -64,6 +66,7 @@ def test_the_map_says_how_it_was_made(tempered: xr.Dataset, tmp_path: Path) -> N
     assert "all by tempered draws" in page
 
 
+@pytest.mark.thorough
 def test_files_give_the_same_map(image: xr.Dataset, tempered: xr.Dataset, tmp_path: Path) -> None:
     image.to_zarr(tmp_path / "image.zarr", consolidated=False)
     stored = pb.maps.map_file(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import handlers
 from numpyro.infer.autoguide import AutoLaplaceApproximation
 from plate_images import ASKED, NAMES, mapped, planned, plate_image, stacked
@@ -132,12 +133,14 @@ HARD = {
 }
 
 
-@pytest.mark.parametrize("hard", HARD)
+@pytest.mark.thorough
+@each("hard", HARD)
 def test_hard_pixels_have_them_too(plan: Plan, guide: Callable, hard: str) -> None:
     image = plate_image(2, 5, **HARD[hard], seed=4)
     assert assert_modes_agree(plan, stacked(image, plan), guide) == 10
 
 
+@pytest.mark.thorough
 def test_on_a_bent_ridge_some_arrive_and_the_others_say_that_they_did_not(
     plan: Plan, guide: Callable
 ) -> None:
@@ -202,6 +205,7 @@ def test_a_map_without_weights_is_the_laplace_fit_of_its_pixel() -> None:
 # --- what the intervals are worth -----------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_intervals_hold_the_truth_as_often_as_they_say(image: xr.Dataset, maps: xr.Dataset) -> None:
     # 900 plates drawn from the priors, readings from the model's own noise: a true map fails
     # once in 1000 (six comparisons).
@@ -261,7 +265,7 @@ def masked(image: xr.Dataset) -> xr.Dataset:
     return image.assign(valid=(("y", "x", "view"), valid))
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "settings", "says"),
     [
         (lambda c: c.isel(y=0, x=0), {}, r"plates: it has no axis y or x; give an image"),
@@ -286,7 +290,7 @@ def test_what_cannot_be_mapped_is_refused_with_the_mend(change, settings: dict, 
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
+@each(
     ("build", "says"),
     [
         (lambda: PixelLaplace(draws=100), r"PixelLaplace: draws is 100; give 64, 128, 256 or so"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plate_images import ASKED, plate_image
 from synthetic_maps import make_maps
 from zarr.codecs import Crc32cCodec, ZstdCodec
@@ -50,6 +51,7 @@ def test_a_capture_may_be_a_zarr_store_or_a_file(tmp_path: Path) -> None:
         pb.maps.open_capture(str(tmp_path / "leaf.nc"))
 
 
+@pytest.mark.thorough
 def test_a_capture_in_a_store_can_be_cut_into_chunks(tmp_path: Path) -> None:
     image = plate_image(4, 6)
     image.to_zarr(tmp_path / "leaf.zarr", consolidated=False)
@@ -132,7 +134,8 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.thorough
+@each("damage", DAMAGE)
 def test_a_damaged_capture_is_one_line(tmp_path: Path, damage: str) -> None:
     source = tmp_path / "plates.zarr"
     plate_image(3, 4).to_zarr(source, consolidated=False)

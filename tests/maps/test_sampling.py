@@ -39,6 +39,7 @@ def sampled(made) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     return _sampled(engine, pixels, settled.mode, np.array([40, 50, 60]))
 
 
+@pytest.mark.thorough
 def test_a_skewed_pixel_has_the_posterior_of_a_grid(sampled) -> None:
     draws, r_hat, effective = sampled
     assert (r_hat < 1.02).all()
@@ -54,6 +55,7 @@ def test_a_skewed_pixel_has_the_posterior_of_a_grid(sampled) -> None:
     assert skewest > 0.5  # or a normal distribution would have done
 
 
+@pytest.mark.thorough
 def test_draws_follow_the_number_of_a_pixel_not_its_place(made, sampled) -> None:
     engine, pixels, settled = made
     order = np.array([2, 0])
@@ -72,6 +74,7 @@ def test_keys_differ_by_number_and_by_seed() -> None:
     assert (random_keys(0, numbers[::-1]) == one[::-1]).all()
 
 
+@pytest.mark.thorough
 def test_the_two_chains_of_a_pixel_are_not_the_same(sampled) -> None:
     chains = sampled[0][NAMES[0]].reshape(3, CHAINS.chains, CHAINS.draws)
     assert (chains[:, 0] != chains[:, 1]).any(axis=-1).all()

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -61,6 +62,7 @@ def test_the_volume_is_that_of_the_derivative() -> None:
         assert float(jnp.linalg.slogdet(slopes)[1]) == pytest.approx(float(log_volume))
 
 
+@pytest.mark.thorough
 def test_many_pixels_are_placed_as_each_alone() -> None:
     random = np.random.default_rng(3)
     pixels = [fit_normal_scores(jnp.asarray(random.gumbel(size=(2000, 3)) * s)) for s in (1.0, 5.0)]
@@ -72,6 +74,7 @@ def test_many_pixels_are_placed_as_each_alone() -> None:
     assert inverse_of_pixels(together, u) == pytest.approx(alone, rel=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_coordinate_that_repeats_itself_keeps_an_inverse() -> None:
     """Half of the draws are one number, as those of a prior with an atom would be."""
     z = np.where(np.arange(2000) % 2, 1.0, RANDOM.normal(size=2000))[:, None]
@@ -82,7 +85,8 @@ def test_a_coordinate_that_repeats_itself_keeps_an_inverse() -> None:
     assert np.asarray(found.forward(found.inverse(u)[0])) == pytest.approx(np.asarray(u), abs=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.thorough
+@each("dtype", [np.float32, np.float64])
 def test_knots_are_at_the_quantiles_of_the_draws(dtype: type) -> None:
     draws = DRAWS.astype(dtype)
     values = np.asarray(jax.jit(fit_normal_scores)(draws).values)

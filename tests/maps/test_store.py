@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plate_images import ASKED, plate_image
 
 import polar_bayes as pb
@@ -129,6 +130,7 @@ def test_the_maps_are_those_that_are_made_in_memory(
     xr.testing.assert_equal(found, pb.fit_pixels(image, method=METHOD, **ASKED))
 
 
+@pytest.mark.thorough
 def test_whoever_is_stopped_before_the_store_is_whole_can_go_on(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -190,7 +192,8 @@ def test_what_is_the_users_own_is_never_touched(
         assert ledger_of(other).read_text() == "shopping list"
 
 
-@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.thorough
+@each("resume", [False, True])
 def test_the_capture_is_never_written_to(capture: Path, tmp_path: Path, resume: bool) -> None:
     source = copied(capture, tmp_path / "in" / "plates.zarr")
     (tmp_path / "link.zarr").symlink_to(source)
@@ -205,6 +208,7 @@ def test_the_capture_is_never_written_to(capture: Path, tmp_path: Path, resume: 
     assert left == [path.relative_to(capture) for path in sorted(capture.rglob("*"))]
 
 
+@pytest.mark.thorough
 def test_an_unfinished_map_is_not_opened_with_or_without_its_ledger(
     capture: Path, begun: Path, finished: Path, tmp_path: Path
 ) -> None:
@@ -220,7 +224,7 @@ def test_an_unfinished_map_is_not_opened_with_or_without_its_ledger(
     xr.testing.assert_identical(found.load(), pb.maps.open_map(finished).load())
 
 
-@pytest.mark.parametrize("damage", ["lost", "altered"])
+@each("damage", ["lost", "altered"])
 def test_a_block_whose_files_are_lost_or_altered_is_fitted_again(
     capture: Path, begun: Path, finished: Path, tmp_path: Path, damage: str
 ) -> None:
@@ -233,6 +237,7 @@ def test_a_block_whose_files_are_lost_or_altered_is_fitted_again(
     xr.testing.assert_identical(found.load(), pb.maps.open_map(finished).load())
 
 
+@pytest.mark.thorough
 def test_a_chunk_that_a_finished_map_lost_is_not_good(
     capture: Path, finished: Path, tmp_path: Path
 ) -> None:
@@ -299,7 +304,8 @@ def test_a_capture_that_changed_since_is_not_mixed_with_what_is_done(
     assert not ledger_of(ended).exists()
 
 
-@pytest.mark.parametrize("what", ["store", "ledger"])
+@pytest.mark.thorough
+@each("what", ["store", "ledger"])
 def test_what_another_process_took_away_is_one_line(
     capture: Path, tmp_path: Path, what: str
 ) -> None:
@@ -316,6 +322,7 @@ def test_what_another_process_took_away_is_one_line(
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.thorough
 def test_a_full_disk_is_one_line_and_loses_nothing(
     capture: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -335,6 +342,7 @@ def test_a_full_disk_is_one_line_and_loses_nothing(
     xr.testing.assert_identical(found.load(), pb.maps.open_map(finished).load())
 
 
+@pytest.mark.thorough
 def test_a_netcdf_file_is_read_once(
     capture: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -380,6 +388,7 @@ def test_a_store_that_is_broken_is_refused(capture: Path, tmp_path: Path) -> Non
         mapped(tmp_path / "nowhere.zarr", tmp_path / "map.zarr")
 
 
+@pytest.mark.thorough
 def test_a_broken_chunk_of_a_capture_is_one_line(capture: Path, tmp_path: Path) -> None:
     source = copied(capture, tmp_path / "plates.zarr")
     (source / "q_error" / "c" / "2" / "0" / "0").write_bytes(b"\x28\xb5")
@@ -398,6 +407,7 @@ def test_a_reading_that_cannot_be_is_named_with_its_block(capture: Path, tmp_pat
         mapped(source, tmp_path / "map.zarr")
 
 
+@pytest.mark.thorough
 def test_a_scheduler_that_does_not_answer_is_one_line(capture: Path, tmp_path: Path) -> None:
     with pytest.raises(pb.FitError, match="no scheduler answers there"):
         mapped(capture, tmp_path / "map.zarr", scheduler="tcp://127.0.0.1:9")

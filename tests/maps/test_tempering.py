@@ -10,6 +10,7 @@ import numpy as np
 import numpyro
 import pytest
 import scipy.stats
+from cases import each
 from numpyro import distributions as dist
 from plate_images import VIEWS, on_a_grid, planned, plate_image, stacked
 from plates import plate_capture
@@ -97,6 +98,7 @@ def test_weighted_draws_of_its_mixture_are_the_posterior(two_modes, crowd: tuple
     assert abs(weights[0] @ y**2 - 1.0) < 4.0 * np.sqrt(2.0 / worth)
 
 
+@pytest.mark.thorough
 def test_the_density_of_a_mixture_is_that_of_its_parts() -> None:
     random = np.random.default_rng(0)
     z = random.normal(size=(400, 2)) @ np.array([[1.0, 0.4], [0.0, 0.2]]) + np.array([3.0, -5.0])
@@ -140,6 +142,7 @@ def fitted(engine: BatchEngine, settings: PixelSMC | PixelNuts, pixels: Observat
     return settings.run_batch(engine, pixels, numbers, 0, describe), found
 
 
+@pytest.mark.thorough
 def test_an_engine_goes_when_nobody_holds_it() -> None:
     """Its programs are its own, one for each setting."""
     plan = planned(WEAK)
@@ -157,6 +160,7 @@ def test_an_engine_goes_when_nobody_holds_it() -> None:
     assert gone() is None
 
 
+@pytest.mark.thorough
 def test_chains_begin_in_every_mode_and_tempered_draws_stay_where_they_do_not_mix() -> None:
     plan = planned(WEAK)
     pixels = stacked(WEAK, plan).subset(np.zeros(32, int))
@@ -177,7 +181,8 @@ def test_chains_begin_in_every_mode_and_tempered_draws_stay_where_they_do_not_mi
     assert (np.abs(sides[~sampled] - 0.5) < 0.3).all()
 
 
-@pytest.mark.parametrize("chains", [False, True])
+@pytest.mark.thorough
+@each("chains", [False, True])
 def test_skewed_pixels_have_the_posteriors_of_a_grid(chains: bool) -> None:
     plan = planned(WEAK)
     settings = PixelNuts(draws=1000, start=SETTINGS) if chains else SETTINGS
@@ -202,7 +207,7 @@ def test_skewed_pixels_have_the_posteriors_of_a_grid(chains: bool) -> None:
             assert (error < 0.1 * sd).all()
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "said"),
     [
         ({"num_chains": 4}, "num_chains is 4; give 16 or more"),
@@ -244,6 +249,7 @@ def test_two_mixtures_are_weighed_as_one() -> None:
     assert np.abs(spread - 1.0).max() < 4.0 * np.sqrt(2.0 / worth)
 
 
+@pytest.mark.thorough
 def test_tails_are_worth_less_where_few_draws_tell_them() -> None:
     random = np.random.default_rng(3)
     z = random.normal(size=(2, 4000, 2))
@@ -259,6 +265,7 @@ def test_tails_are_worth_less_where_few_draws_tell_them() -> None:
     assert 300.0 < worth[0] < 700.0  # 20 draws for a tail of 5%: 20 / 0.05 = 400
 
 
+@pytest.mark.thorough
 def test_a_tail_that_one_draw_carries_is_worth_as_little_above_as_below() -> None:
     z = np.linspace(-1.0, 1.0, 1000)[None, :, None]
     heavy = np.full((1, 1000), 0.93 / 999)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,8 +22,8 @@ def positive(rng: np.random.Generator, size: int, condition: float, count: int =
     return 0.5 * (matrix + matrix.swapaxes(-1, -2))
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("size", SIZES)
+@each("dtype", [np.float32, np.float64])
+@each("size", SIZES)
 def test_factors_and_inverses_are_those_of_numpy(size: int, dtype: type) -> None:
     matrix = positive(np.random.default_rng(size), size, 100.0).astype(dtype)
     factor = np.asarray(FACTOR(matrix))
@@ -37,8 +38,9 @@ def test_factors_and_inverses_are_those_of_numpy(size: int, dtype: type) -> None
     assert (np.triu(half, 1) == 0.0).all()
 
 
-@pytest.mark.parametrize("size", [2, 4, 7])
-@pytest.mark.parametrize("condition", [1e6, 1e10, 1e13])
+@pytest.mark.thorough
+@each("size", [2, 4, 7])
+@each("condition", [1e6, 1e10, 1e13])
 def test_ill_conditioned_matrices_are_factored_to_rounding(size: int, condition: float) -> None:
     matrix = positive(np.random.default_rng(1), size, condition)
     factor = np.asarray(FACTOR(matrix))
@@ -80,8 +82,8 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("case", BAD)
+@each("dtype", [np.float32, np.float64])
+@each("case", BAD)
 def test_what_has_no_factor_gets_nan_and_no_repair(case: str, dtype: type) -> None:
     good = positive(np.random.default_rng(2), 3, 10.0, 1)[0]
     factor = np.asarray(FACTOR(np.stack([BAD[case], good]).astype(dtype)))
@@ -94,6 +96,7 @@ def test_what_has_no_factor_gets_nan_and_no_repair(case: str, dtype: type) -> No
     assert np.isfinite(half[1]).all()
 
 
+@pytest.mark.thorough
 def test_one_by_one_is_the_square_root() -> None:
     factor = cholesky(jnp.array([[4.0]]))
     assert factor.tolist() == [[2.0]]

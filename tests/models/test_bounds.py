@@ -3,14 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from cases import each
 from polar_bayes.models.sites import SoftClip
 
 LOW, HIGH = 1.2, 2.0
 INTERVALS = {"both": (LOW, HIGH), "one": (1.0, np.inf)}
 
 
-@pytest.mark.parametrize("interval", INTERVALS.values(), ids=INTERVALS)
+@each("interval", INTERVALS.values(), ids=INTERVALS)
 def test_it_goes_there_and_back_with_its_volume(interval: tuple[float, float]) -> None:
     bent = SoftClip(*interval)
     x = jnp.linspace(0.9, 2.3, 57)
@@ -29,8 +29,8 @@ def test_inside_nothing_moves() -> None:
     np.testing.assert_allclose(SoftClip(LOW, HIGH)(x), x, atol=3e-11)
 
 
-@pytest.mark.parametrize("double", [True, False])
-@pytest.mark.parametrize("interval", INTERVALS.values(), ids=INTERVALS)
+@each("double", [True, False])
+@each("interval", INTERVALS.values(), ids=INTERVALS)
 def test_value_slope_and_curvature_are_finite_far_out_and_at_the_bounds(interval, double) -> None:
     with jax.enable_x64(double):
         bent = SoftClip(*interval)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from arviz_stats.base import array_stats
+from cases import each
 from jax.flatten_util import ravel_pytree
 from polar_bayes.models.gp_spectral import gp_spectral
 from scipy import stats
@@ -55,7 +56,7 @@ def held_out(material: Mapping[float, float], held: float, seed: int) -> tuple[f
 
 
 @pytest.mark.thorough  # benchmarks/spectrum.py does the same with NUTS
-@pytest.mark.parametrize("held", [550.0, 633.0])
+@each("held", [550.0, 633.0])
 def test_real_materials_lie_in_the_bands_of_a_color_that_was_not_measured(held: float) -> None:
     """Five materials. If bands were exact, two misses of five have chance .023.
 
@@ -192,8 +193,9 @@ HARD_COLORS = {
 }
 
 
-@pytest.mark.parametrize("precision", ["double", "single"])
-@pytest.mark.parametrize("colors", HARD_COLORS.values(), ids=HARD_COLORS)
+@pytest.mark.thorough
+@each("precision", ["double", "single"])
+@each("colors", HARD_COLORS.values(), ids=HARD_COLORS)
 def test_density_and_gradient_are_finite(colors: np.ndarray, precision: str) -> None:
     capture = spectral_plate((colors, smooth_index(colors)), error=0.01, seed=5, views=FEW_VIEWS)
     request = resolve(capture, INDEX_ONLY, PLATE, None, LINKS, None, 0, precision)
@@ -217,6 +219,7 @@ def test_density_and_gradient_are_finite(colors: np.ndarray, precision: str) -> 
                 assert np.isfinite(gradient).all()
 
 
+@pytest.mark.thorough
 def test_two_equal_wavelengths_are_fitted_in_single_precision() -> None:
     colors = HARD_COLORS["two equal"]
     capture = spectral_plate((colors, np.array([1.51, 1.51])), error=0.01, seed=6)
@@ -232,6 +235,7 @@ def test_two_equal_wavelengths_are_fitted_in_single_precision() -> None:
     assert predicted.std(("chain", "draw"))[1] > index[..., 0].std()
 
 
+@pytest.mark.thorough
 def test_one_wavelength_has_the_prior_of_one_wavelength() -> None:
     """Without neighbors the model is `per_material`."""
     capture = spectral_plate({550.0: 1.51}, error=0.01, seed=6)
@@ -279,6 +283,7 @@ def patches() -> xr.Dataset:
     return xr.concat(parts, "patch", data_vars=["q", "q_error"], coords="minimal", compat="equals")
 
 
+@pytest.mark.thorough
 def test_every_patch_has_its_own_curve_around_a_pooled_level() -> None:
     model = dataclasses.replace(INDEX_ONLY, pooled=("refractive_index",))
     result = fit(patches(), model)
@@ -312,6 +317,7 @@ def test_a_law_of_dispersion_takes_the_place_of_a_process() -> None:
         pb.inference.predict_spectrum(result, [500.0])
 
 
+@pytest.mark.thorough
 def test_absorption_and_index_are_coupled_at_once() -> None:
     protocol = pb.simulation.Protocol(views=6, wavelengths=(450.0, 500.0, 550.0, 600.0))
     scene = pb.Scene(pb.SmoothSurface(), pb.Depolarizer(), pb.DopMixing())
@@ -335,7 +341,7 @@ def test_absorption_and_index_are_coupled_at_once() -> None:
 # --- what is refused ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "message"),
     [
         ({"coupled": ()}, r"coupled=\(\) names no spectra.*refractive_index, absorption"),
@@ -365,12 +371,13 @@ def test_a_scene_without_the_spectrum_is_refused() -> None:
         fit(THREE, model)
 
 
-@pytest.mark.parametrize("wavelengths", [[], [-500.0], [np.nan], [[500.0]], ["green"], None])
+@each("wavelengths", [[], [-500.0], [np.nan], [[500.0]], ["green"], None])
 def test_what_is_no_wavelength_is_refused(wavelengths: Any) -> None:
     with pytest.raises(pb.FitError, match=r"is no list of wavelengths.*above zero in nm"):
         pb.inference.predict_spectrum(xr.DataTree(), wavelengths)
 
 
+@pytest.mark.thorough
 def test_a_result_without_ties_between_colors_is_refused() -> None:
     result = fit(THREE, "per_material")
     with pytest.raises(pb.FitError, match="'per_material': the fit ties no color to another"):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from arviz_stats.base import array_stats
+from cases import each
 from numpyro import distributions as dist
 from numpyro import handlers
 from patches import patch_capture
@@ -46,7 +47,7 @@ class LogitNormal:
         return stats.norm(self.center, self.spread).cdf(np.log(x / (1.0 - x)))
 
 
-@pytest.mark.parametrize("name", ALL)
+@each("name", ALL)
 def test_members_are_drawn_from_the_population(name: str) -> None:
     capture = patch_capture(np.full(400, 1.45), views=2)
     location, spread = {"refractive_index": (1.3, 0.2)}.get(name, (0.3, 0.6))
@@ -132,6 +133,7 @@ def twin_draws(capture: xr.Dataset) -> tuple[dict[str, np.ndarray], float]:
     return {name: each.ravel() for name, each in draws.items()}, chain[..., 0].size / steps
 
 
+@pytest.mark.thorough
 def test_the_posterior_is_that_of_another_density_and_another_sampler() -> None:
     capture = plates([1.46, 1.5, 1.53], TWIN_ERROR, TWIN_VIEWS, seed=2)
     theirs, independent = twin_draws(capture)
@@ -166,7 +168,7 @@ CASES = {
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("case", CASES)
+@each("case", CASES)
 def test_every_degree_of_pooling_samples_without_divergences(case: str) -> None:
     index, error = CASES[case]
     result = fit(plates(index, error, seed=5), seed=1)
@@ -188,6 +190,7 @@ def test_many_members_keep_a_fixed_metric_and_converge() -> None:
     assert spread[0] < 0.03 < spread[1]  # fails once in 1000 true captures
 
 
+@pytest.mark.thorough
 def test_coordinates_of_members_stand_apart_and_the_choice_is_recorded() -> None:
     model = pb.models.Hierarchical(pooled=("refractive_index", "subsurface_fraction"))
     capture = plates(np.linspace(1.45, 1.55, 12), 0.01, seed=7)

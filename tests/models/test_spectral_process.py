@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from polar_bayes.models.spectral_process import KERNELS, LEAST_NUGGET, SpectralProcess
 from tinygp import GaussianProcess, kernels
 
@@ -37,20 +38,22 @@ def kernel_matrix(length: float, first: np.ndarray, second: np.ndarray) -> np.nd
     return np.exp(-0.5 * ((first[:, None] - second) / length) ** 2)
 
 
-@pytest.mark.parametrize("length", [20.0, 100.0, 1000.0])
+@each("length", [20.0, 100.0, 1000.0])
 def test_standard_weights_have_the_covariance_of_the_kernel(length: float) -> None:
     found = covariance(SpectralProcess(), length, IRREGULAR)
     # The nugget is all that is missing.
     np.testing.assert_allclose(found, kernel_matrix(length, IRREGULAR, IRREGULAR), atol=1e-9)
 
 
-@pytest.mark.parametrize(("length", "error"), [(60.0, 1e-3), (100.0, 1e-7), (300.0, 1e-8)])
+@pytest.mark.thorough
+@each(("length", "error"), [(60.0, 1e-3), (100.0, 1e-7), (300.0, 1e-8)])
 def test_twenty_knots_stand_for_two_hundred_wavelengths(length: float, error: float) -> None:
     many = np.linspace(400.0, 800.0, 200)
     found = covariance(SpectralProcess(), length, many)
     np.testing.assert_allclose(found, kernel_matrix(length, many, many), atol=error)
 
 
+@pytest.mark.thorough
 def test_equal_wavelengths_have_equal_values() -> None:
     process, wavelength = SpectralProcess(), jnp.array([450.0, 550.0, 450.0, 650.0])
     weights = jax.random.normal(jax.random.key(0), (5, 4))
@@ -60,7 +63,7 @@ def test_equal_wavelengths_have_equal_values() -> None:
     np.testing.assert_array_equal(values[:, 0], values[:, 2])
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@each("kernel", KERNELS)
 def test_prediction_is_that_of_tinygp(kernel: str) -> None:
     """The mean and the covariance at new wavelengths, given the values at the knots."""
     process, length = SpectralProcess(kernel), jnp.asarray(80.0)
@@ -77,6 +80,7 @@ def test_prediction_is_that_of_tinygp(kernel: str) -> None:
     np.testing.assert_allclose(factor @ factor.T, theirs.covariance, atol=2e-8)
 
 
+@pytest.mark.thorough
 def test_bands_widen_away_from_the_knots() -> None:
     process, knot_wavelengths = SpectralProcess(), jnp.array([450.0, 550.0, 650.0])
     new = jnp.array([450.0, 500.0, 660.0, 700.0, 800.0, 3000.0])
@@ -88,8 +92,9 @@ def test_bands_widen_away_from_the_knots() -> None:
     assert spread[-1] == pytest.approx(1.0, abs=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each("dtype", [jnp.float64, jnp.float32])
+@each(
     ("kernel", "cases"),
     [("ExpSquared", tuple(HARD)), *((k, ("two hundred",)) for k in KERNELS if k != "ExpSquared")],
 )
@@ -115,6 +120,7 @@ def test_values_and_gradients_are_finite_at_hard_points(
             assert all(np.isfinite(part).all() for part in gradient), (name, length)
 
 
+@pytest.mark.thorough
 def test_what_the_knots_leave_is_finite_at_hard_points() -> None:
     remainder = jax.jit(SpectralProcess().remainder)
     for name in ("two equal", "two hundred equal", "a thousandth apart", "two hundred"):
@@ -141,7 +147,7 @@ def test_a_function_of_length_and_a_kernel_object_are_kernels() -> None:
     assert np.diag(covariance(sum_of_two, length, IRREGULAR)) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "message"),
     [
         ({"kernel": "Matern42"}, "no stationary kernel 'Matern42'.*Exp, ExpSquared, Matern32"),

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.observation.data import ANGLES, READINGS, observe
@@ -44,8 +45,8 @@ def make_capture(*leading, wavelength=False, level=None, **replaced):
     return validate(capture)
 
 
-@pytest.mark.parametrize("leading", [(), ("material",), ("patch",), ("y", "x")], ids=str)
-@pytest.mark.parametrize("wavelength", [False, True])
+@each("leading", [(), ("material",), ("patch",), ("y", "x")], ids=str)
+@each("wavelength", [False, True])
 def test_axes_are_leading_then_wavelength_then_view(leading, wavelength):
     capture = make_capture(*leading, wavelength=wavelength)
     data = observe(capture)
@@ -66,18 +67,21 @@ def test_axes_are_leading_then_wavelength_then_view(leading, wavelength):
         assert data.geometry.wavelength is None
 
 
+@pytest.mark.thorough
 def test_the_order_of_the_captures_axes_does_not_matter():
     capture = make_capture("material", wavelength=True)
     turned = capture.transpose("wavelength", "view", "material")
     jax.tree.map(np.testing.assert_array_equal, observe(turned), observe(capture))
 
 
+@pytest.mark.thorough
 def test_a_single_wavelength_left_by_selection_is_no_axis():
     data = observe(make_capture(wavelength=True).isel(wavelength=1))
     assert data.dims == (("view", 4),)
 
 
-@pytest.mark.parametrize("name", READINGS)
+@pytest.mark.thorough
+@each("name", READINGS)
 def test_only_the_recorded_variables_appear(name):
     absent = dict.fromkeys([*READINGS, "q_error", "intensity_error"], None)
     kept = {"q": np.full(4, 0.1)} if name == "u" else {}  # u means nothing without q
@@ -89,7 +93,7 @@ def test_only_the_recorded_variables_appear(name):
 # --- what is missing ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("junk", [np.nan, np.inf, -np.inf, -7.0, 1e300])
+@each("junk", [np.nan, np.inf, -np.inf, -7.0, 1e300])
 def test_what_a_masked_entry_holds_reaches_nothing(junk):
     valid = np.array([True, False, True, True])
     plain = make_capture(valid=valid)
@@ -144,11 +148,13 @@ def test_a_stated_level_is_the_unit_and_the_full_scale():
     assert float(data.full_scale) == 1.0
 
 
+@pytest.mark.thorough
 def test_errors_of_the_intensity_come_in_its_unit():
     data = observe(make_capture(intensity=INTENSITY, intensity_error=np.full(4, 2.0)))
     np.testing.assert_array_equal(data.errors["intensity"], np.full(4, 0.05))
 
 
+@pytest.mark.thorough
 def test_the_largest_reading_is_that_of_the_whole_capture_not_of_the_views_below_the_limit():
     """Or adding grazing views would lower the concentration of all others."""
     capture = make_capture(intensity=INTENSITY)
@@ -157,6 +163,7 @@ def test_the_largest_reading_is_that_of_the_whole_capture_not_of_the_views_below
     assert float(upright.intensity_unit) == 40.0
 
 
+@pytest.mark.thorough
 def test_the_largest_reading_is_that_of_all_wavelengths_and_materials():
     capture = make_capture("material", wavelength=True)
     data = observe(capture)
@@ -170,12 +177,14 @@ def test_a_masked_spike_dims_no_other_view():
     np.testing.assert_array_equal(data.brightness, [0.2, 0.25, 0.5, 1.0])
 
 
+@pytest.mark.thorough
 def test_a_capture_without_light_stays_finite():
     data = observe(make_capture(intensity=np.zeros(4)))
     np.testing.assert_array_equal(data.brightness, np.zeros(4))
     assert float(data.intensity_unit) == 1.0
 
 
+@pytest.mark.thorough
 def test_a_capture_without_intensity_counts_every_view_as_bright():
     data = observe(make_capture(intensity=None, intensity_error=None))
     np.testing.assert_array_equal(data.brightness, np.ones(4))
@@ -195,6 +204,7 @@ def test_a_reading_at_the_stated_level_has_stopped_whether_flagged_or_not():
 # --- trust in the normal --------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_without_a_stated_trust_there_is_none():
     data = observe(make_capture())
     assert data.confidence is None
@@ -205,7 +215,7 @@ def trusted(dims, value, *leading, **options):
     return validate(make_capture(*leading, **options).assign(normal_confidence=(dims, value)))
 
 
-@pytest.mark.parametrize("leading", [(), ("material",), ("patch",), ("y", "x")], ids=str)
+@each("leading", [(), ("material",), ("patch",), ("y", "x")], ids=str)
 def test_trust_stands_beside_the_readings_and_broadcasts_with_them(leading):
     for dims in (leading, ("view",), (*leading, "view")):
         value = np.random.default_rng(1).uniform(0.1, 1.0, [SIZES[dim] for dim in dims])
@@ -227,6 +237,7 @@ def test_a_viewer_on_the_normal_looks_away_from_the_light():
     np.testing.assert_array_equal(data.geometry.view_azimuth, [190.0, 120.0, 120.0, 120.0])
 
 
+@pytest.mark.thorough
 def test_directions_may_differ_from_pixel_to_pixel():
     capture = make_capture("y", "x", wavelength=True)
     zeniths = np.linspace(1.0, 80.0, 24).reshape(2, 3, 4)

@@ -8,6 +8,7 @@ import mpmath as mp
 import numpy as np
 import numpyro
 import pytest
+from cases import each
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.util import log_density
@@ -19,7 +20,7 @@ from polar_bayes.observation.distributions import (
 )
 
 BOUND = {np.float64: 1e-10, np.float32: 1e-4}
-PRECISIONS = pytest.mark.parametrize("dtype", [np.float64, np.float32])
+PRECISIONS = each("dtype", [np.float64, np.float32])
 
 MEANS = (1e-6, 1e-4, 0.1, 0.5, 0.9, 1 - 1e-4)
 CONCENTRATIONS = (1e-3, 1.0, 5.0, 300.0, 1e5, 1e8)
@@ -109,7 +110,7 @@ def test_the_beta_gradient_agrees_with_fifty_digits(dtype):
 
 
 @PRECISIONS
-@pytest.mark.parametrize("degrees_of_freedom", DEGREES_OF_FREEDOM)
+@each("degrees_of_freedom", DEGREES_OF_FREEDOM)
 def test_the_sensor_log_density_agrees_with_fifty_digits(degrees_of_freedom, dtype):
     rows = sensor_cases(dtype)
     nu = mp.mpf(degrees_of_freedom)
@@ -134,7 +135,7 @@ def upper_tail(distance, nu):
 
 
 @PRECISIONS
-@pytest.mark.parametrize("degrees_of_freedom", [0.5, *DEGREES_OF_FREEDOM, 6.3])
+@each("degrees_of_freedom", [0.5, *DEGREES_OF_FREEDOM, 6.3])
 def test_the_log_survival_agrees_with_fifty_digits(degrees_of_freedom, dtype):
     steps = np.array([0.0, 1e-12, 1e-4, 0.1, 0.5, 1.0, 2.0, 5.0, 100.0, 1e4, 1e8])
     distances = np.concatenate([-steps, steps]).astype(dtype)
@@ -144,6 +145,7 @@ def test_the_log_survival_agrees_with_fifty_digits(degrees_of_freedom, dtype):
     assert_accurate(np.asarray(values), truth, distances, dtype)
 
 
+@pytest.mark.thorough
 @PRECISIONS
 def test_the_slope_of_the_log_survival_is_minus_the_hazard(dtype):
     distances = np.array([-50.0, -1.0, -1e-9, 0.0, 1e-9, 1.0, 50.0, 1e8], dtype)
@@ -176,6 +178,7 @@ def assert_finite(results, rows, dtype):
         assert not wrong.any(), f"{what} is not finite at {rows[wrong][:5]}"
 
 
+@pytest.mark.thorough
 @PRECISIONS
 def test_the_beta_is_finite_with_its_derivatives_up_to_the_margins(dtype):
     means = (1e-6, *MEANS, 1 - 1e-6)
@@ -183,6 +186,7 @@ def test_the_beta_is_finite_with_its_derivatives_up_to_the_margins(dtype):
     assert_finite(value_gradient_hessian(beta_log_density, rows), rows, dtype)
 
 
+@pytest.mark.thorough
 @PRECISIONS
 def test_the_sensor_is_finite_with_its_derivatives_at_the_stops_and_far_away(dtype):
     rows = sensor_cases(dtype)
@@ -192,6 +196,7 @@ def test_the_sensor_is_finite_with_its_derivatives_at_the_stops_and_far_away(dty
     assert_finite(results, rows, dtype)
 
 
+@pytest.mark.thorough
 def test_the_beta_equals_numpyros_at_moderate_values():
     means, concentrations, readings = np.meshgrid([0.1, 0.5, 0.9], [2.0, 30.0], [0.2, 0.5, 0.8])
     ours = MeanConcentrationBeta(means, concentrations)
@@ -203,6 +208,7 @@ def test_the_beta_equals_numpyros_at_moderate_values():
     np.testing.assert_allclose(ours.variance, theirs.variance, rtol=1e-14)
 
 
+@pytest.mark.thorough
 def test_the_sensor_equals_numpyros_student_t_between_the_stops():
     readings = np.linspace(0.1, 0.9, 9)
     ours = SensorStudentT(5.0, 0.4, 0.05, np.zeros(9, bool), 1.0)
@@ -217,9 +223,7 @@ def integrand(parameters, reading):
     return MeanConcentrationBeta(*parameters, validate_args=False).log_prob(reading)
 
 
-@pytest.mark.parametrize(
-    ("mean", "concentration"), [(0.5, 4.0), (0.1, 30.0), (0.9, 300.0), (0.3, 1e5)]
-)
+@each(("mean", "concentration"), [(0.5, 4.0), (0.1, 30.0), (0.9, 300.0), (0.3, 1e5)])
 def test_the_beta_integrates_to_one(mean, concentration):
     # The trapezoidal rule over the log odds converges exponentially; beyond 20 less than e^-40 is
     # left, and steps of 0.001 resolve a peak 0.007 wide. What remains is rounding.
@@ -233,8 +237,8 @@ def test_the_beta_integrates_to_one(mean, concentration):
 SENSOR = jax.jit(jax.vmap(lambda row: sensor_log_density(row, 5.0)))
 
 
-@pytest.mark.parametrize("location", [0.0, 0.02, 0.5, 1.0, 1.4])
-@pytest.mark.parametrize("scale", [0.05, 0.5])
+@each("location", [0.0, 0.02, 0.5, 1.0, 1.4])
+@each("scale", [0.05, 0.5])
 def test_the_sensor_integrates_to_one_with_the_mass_at_its_stops(location, scale):
     # The integrand's poles stand at least 0.05 sqrt(5) from the interval, so 200 nodes leave
     # 1.2 ** -400, far below rounding.
@@ -262,6 +266,7 @@ def assert_moments(draws, mean, variance):
         assert np.all(np.abs(values.mean(axis=0) - expected) <= SIGMAS * error)
 
 
+@pytest.mark.thorough
 def test_beta_draws_have_the_stated_mean_and_variance():
     mean, concentration = (grid.ravel() for grid in np.meshgrid([0.1, 0.5, 0.9], [1e-3, 5.0, 1e5]))
     distribution = MeanConcentrationBeta(mean, concentration)
@@ -271,13 +276,14 @@ def test_beta_draws_have_the_stated_mean_and_variance():
     assert_moments(draws, np.asarray(distribution.mean), np.asarray(distribution.variance))
 
 
+@pytest.mark.thorough
 def test_sensor_draws_have_the_mean_and_variance_of_student_t_far_from_the_stops():
     distribution = SensorStudentT(5.0, jnp.array([0.5, 0.8]), 0.002, False, jnp.inf)
     draws = sample(distribution, 2)
     assert_moments(draws, np.asarray(distribution.mean), 0.002**2 * 5.0 / 3.0)
 
 
-@pytest.mark.parametrize("location", [0.01, 0.97])
+@each("location", [0.01, 0.97])
 def test_sensor_draws_pile_up_at_the_stops_as_often_as_stated(location):
     distribution = SensorStudentT(5.0, location, 0.05, jnp.array([False, True]), 1.0)
     draws = sample(distribution, 3)
@@ -296,7 +302,7 @@ def make_sensor(parameter):
     return SensorStudentT(5.0, 0.5 * parameter, 0.05, False, jnp.inf)
 
 
-MAKERS = pytest.mark.parametrize("make", [make_beta, make_sensor])
+MAKERS = each("make", [make_beta, make_sensor])
 
 
 @MAKERS

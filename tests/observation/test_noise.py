@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import FitError
 from polar_bayes.observation.links import SMOOTHING, ConcentrationSchedule, ScaleSchedule
@@ -37,7 +38,8 @@ def test_scale_is_the_papers_formula_away_from_its_bounds():
     assert slack[1] < 1e-12
 
 
-@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0])
+@pytest.mark.thorough
+@each("exponent", [0.0, 0.5, 1.0])
 def test_a_dark_view_keeps_the_least_concentration(exponent):
     schedule = ConcentrationSchedule(brightness_exponent=exponent)
     found = schedule.concentration(jnp.asarray(200.0), jnp.asarray(0.0), jnp.asarray(1.0))
@@ -72,14 +74,15 @@ def test_the_bound_at_full_scale_has_no_corner():
     assert np.max(np.abs(np.diff(second))) < 0.05 * np.ptp(second)
 
 
-@pytest.mark.parametrize("schedule", [ConcentrationSchedule, ScaleSchedule])
+@pytest.mark.thorough
+@each("schedule", [ConcentrationSchedule, ScaleSchedule])
 def test_a_schedule_follows_the_precision_of_its_inputs(schedule):
     method = "concentration" if schedule is ConcentrationSchedule else "scale"
     inputs = (jnp.asarray(value, jnp.float32) for value in (1.0, 0.5, 0.5))
     assert getattr(schedule(), method)(*inputs).dtype == jnp.float32
 
 
-@pytest.mark.parametrize("schedule", [ConcentrationSchedule(), ScaleSchedule()])
+@each("schedule", [ConcentrationSchedule(), ScaleSchedule()])
 def test_a_schedule_is_a_constant_of_a_compiled_program(schedule):
     assert hash(schedule) == hash(type(schedule)())
     assert schedule == type(schedule)()
@@ -87,7 +90,7 @@ def test_a_schedule_is_a_constant_of_a_compiled_program(schedule):
         schedule.angle_exponent = 0.1
 
 
-@pytest.mark.parametrize(
+@each(
     ("schedule", "field", "value"),
     [
         (ConcentrationSchedule, "minimum", 0.0),

@@ -6,6 +6,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -74,6 +75,7 @@ def test_what_is_not_reflected_passes(theta: float, first: float, second: float)
     np.testing.assert_allclose(s_and_p(reflected) + s_and_p(passed), 1.0, atol=3e-14)
 
 
+@pytest.mark.thorough
 @given(theta=zenith, first=index, second=index)
 @RUN
 def test_as_much_passes_upwards_as_downwards(theta: float, first: float, second: float) -> None:
@@ -85,10 +87,8 @@ def test_as_much_passes_upwards_as_downwards(theta: float, first: float, second:
             np.testing.assert_allclose(one, other, rtol=1e-14)
 
 
-@pytest.mark.parametrize("theta", [0.0, 1e-6, 1.0, 40.0, 56.3, 75.0, 89.0, 89.999])
-@pytest.mark.parametrize(
-    "indexes", [(1.0, 1.5), (1.0, 1.0 + 1e-6), (1.4, 1.6), (1.6, 1.4), (1.5, 1.5001), (2.4, 1.0)]
-)
+@each("theta", [0.0, 1e-6, 1.0, 40.0, 56.3, 75.0, 89.0, 89.999])
+@each("indexes", [(1.0, 1.5), (1.0, 1.0 + 1e-6), (1.4, 1.6), (1.6, 1.4), (1.5, 1.5001), (2.4, 1.0)])
 def test_no_digit_is_lost_against_eighty(theta: float, indexes: tuple[float, float]) -> None:
     """Contrast and shortfall are quotients of differences; here they are taken in 80 digits.
 
@@ -124,7 +124,7 @@ def test_no_p_light_at_the_brewster_angle_of_two_media() -> None:
     assert abs(p) < 1e-17
 
 
-@pytest.mark.parametrize("n", [1.0, 1.5])
+@each("n", [1.0, 1.5])
 def test_alike_media_have_no_boundary(n: float) -> None:
     b = sin_degrees(50.0) ** 2
     above, below = media(50.0, n, n)
@@ -158,6 +158,7 @@ def test_a_film_turns_passing_light_as_its_fields_do(
     np.testing.assert_allclose(passed.cross, cross.real, atol=1e-12)
 
 
+@pytest.mark.thorough
 @given(theta=zenith, layers=st.lists(film, min_size=1, max_size=3), body=index)
 @RUN
 def test_clear_films_lose_no_light(theta: float, layers: list, body: float) -> None:
@@ -176,6 +177,7 @@ def test_a_film_without_thickness_is_not_there(theta: float, n: float, body: flo
         np.testing.assert_allclose(found.cross, law(air, below, b).cross, atol=1e-13)
 
 
+@pytest.mark.thorough
 @given(theta=zenith, thickness=st.floats(0.0, 30.0), body=index)
 @RUN
 def test_a_film_like_the_body_or_like_the_air_is_not_there(
@@ -196,6 +198,7 @@ def test_a_quarter_wave_of_the_mean_index_reflects_nothing() -> None:
     np.testing.assert_allclose(half.mean, (0.7 / 2.7) ** 2, rtol=1e-13)
 
 
+@pytest.mark.thorough
 def test_trapped_light_next_to_does_not_pass() -> None:
     """Squared sines in air beyond 1 belong to light that a boundary turns back as a whole."""
     beyond = jnp.asarray(1.2)

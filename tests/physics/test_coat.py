@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from scipy.integrate import quad
 
 from polar_bayes.errors import SceneError
@@ -89,7 +90,8 @@ def test_a_coat_adds_its_parameters_to_the_scene() -> None:
     assert named.parameters == ("lacquer_index", "lacquer_absorbance")
 
 
-@pytest.mark.parametrize("surface", [SmoothSurface(), RoughSurface()], ids=["smooth", "rough"])
+@pytest.mark.thorough
+@each("surface", [SmoothSurface(), RoughSurface()], ids=["smooth", "rough"])
 def test_known_numbers_and_parameters_of_that_value_are_alike(surface: object) -> None:
     fitted = Scene(surface, coat=CoatStack((ThinFilm(), ClearCoat())))
     known = Scene(surface, coat=CoatStack((ThinFilm(1.38, 230.0), ClearCoat(1.45, 0.3))))
@@ -98,7 +100,8 @@ def test_known_numbers_and_parameters_of_that_value_are_alike(surface: object) -
     )
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     "coat",
     [
         ClearCoat(1.0, 0.0),
@@ -117,6 +120,7 @@ def test_a_coat_without_effect_is_no_coat(coat: AbstractCoat) -> None:
     np.testing.assert_allclose(coated, bare, rtol=1e-8, atol=1e-14)
 
 
+@pytest.mark.thorough
 def test_a_body_under_a_coat_of_its_own_index() -> None:
     """T+(l) e^(-tau/mu_l) [T+, T-](v) e^(-tau/mu_v) A/(pi n^2 (1 - A Fi_tau)).
 
@@ -165,7 +169,7 @@ def test_fringes_move_with_color_and_angle() -> None:
     assert np.all(np.abs(found[:, 2:, 0] / bare[None, 2:, 0] - 1.0) > 1e-3)
 
 
-@pytest.mark.parametrize("coat", [ThinFilm(), CoatStack((ClearCoat(), ThinFilm()))], ids=str)
+@each("coat", [ThinFilm(), CoatStack((ClearCoat(), ThinFilm()))], ids=str)
 def test_a_film_needs_a_wavelength(coat: AbstractCoat) -> None:
     scene = Scene(SmoothSurface(), coat=coat)
     with pytest.raises(SceneError, match=r"ThinFilm: fringes .*; give the geometry a wavelength"):
@@ -177,6 +181,7 @@ def test_a_clear_coat_has_no_filter_in_the_program() -> None:
     assert ClearCoat(1.5, 0.1).layers({}, None)[0].absorbance is not None
 
 
+@pytest.mark.thorough
 def test_simpler_coats_leave_one_out() -> None:
     film, lacquer = ThinFilm(), ClearCoat()
     assert ClearCoat().simpler() == (None,)
@@ -184,7 +189,7 @@ def test_simpler_coats_leave_one_out() -> None:
     assert CoatStack((film,)).simpler() == (None,)
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "message"),
     [
         (lambda: ClearCoat(0.5), "ClearCoat: refractive_index: 0.5 is neither a number from 1 to"),

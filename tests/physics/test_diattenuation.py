@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -63,6 +64,7 @@ def test_at_normal_incidence_s_and_p_are_alike(first: tuple, second: tuple) -> N
         assert s == p == cross
 
 
+@pytest.mark.thorough
 @given(first=triple, second=triple)
 @RUN
 def test_contrast_and_shortfall_have_limits_at_normal_incidence(
@@ -74,7 +76,8 @@ def test_contrast_and_shortfall_have_limits_at_normal_incidence(
         np.testing.assert_allclose(getattr(here, field), getattr(there, field), atol=1e-4)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.thorough
+@each("dtype", [np.float32, np.float64])
 def test_precision_and_shape_are_the_inputs(dtype: type) -> None:
     power = Diattenuation(*(jnp.full((3, 2), x, dtype) for x in (0.3, 0.1, 0.2, 0.5)))
     for result in (power.times(power), power.plus(power), power.repeated(), power.scaled(2.0)):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.dispersion import AbstractDispersion, Cauchy, Sellmeier
@@ -37,7 +38,7 @@ PARTS = (RoughSurface(), Depolarizer(), StokesMixing())
 predict = jax.jit(Scene.predict, static_argnums=0)
 
 
-@pytest.mark.parametrize(
+@each(
     ("glass", "wavelength", "index"),
     [
         (BK7, 587.5618, 1.51680),
@@ -60,6 +61,7 @@ def test_cauchy_is_near_a_glass_over_the_visible() -> None:
     np.testing.assert_allclose(found, BK7.index({}, colors), atol=4e-4)
 
 
+@pytest.mark.thorough
 def test_cauchy_is_a_polynomial_in_the_inverse_square() -> None:
     found = Cauchy(1.45, 0.004, 1e-4).index({}, jnp.array([400.0, 500.0, 1000.0]))
     expected = [1.45 + 0.004 / x**2 + 1e-4 / x**4 for x in (0.4, 0.5, 1.0)]
@@ -68,6 +70,7 @@ def test_cauchy_is_a_polynomial_in_the_inverse_square() -> None:
     np.testing.assert_allclose(without, 1.45 + 0.004 / 0.16, rtol=1e-15)
 
 
+@pytest.mark.thorough
 def test_named_coefficients_are_read_from_the_parameters() -> None:
     named = Sellmeier(("b", 0.231792344, 1.01046945), (0.00600069867, "c", 103.560653))
     assert named.parameters == ("b", "c")
@@ -78,7 +81,8 @@ def test_named_coefficients_are_read_from_the_parameters() -> None:
     assert Cauchy("a", 0.0, "c").parameters == ("a", "c")
 
 
-@pytest.mark.parametrize("law", [Cauchy(), Sellmeier()], ids=["Cauchy", "Sellmeier"])
+@pytest.mark.thorough
+@each("law", [Cauchy(), Sellmeier()], ids=["Cauchy", "Sellmeier"])
 def test_a_law_is_one_index_for_each_wavelength(law: AbstractDispersion) -> None:
     index = law.index({k: jnp.asarray(v) for k, v in MATERIAL.items()}, COLORS)[:, 0]
     assert np.all(np.diff(index) < 0.0)
@@ -109,7 +113,7 @@ def test_a_law_needs_a_wavelength() -> None:
         scene.stokes(MATERIAL, VIEWS._replace(wavelength=None))
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "message"),
     [
         (lambda: Cauchy(a=0.9), "Cauchy: a: 0.9 is neither a number from 1 to 3"),

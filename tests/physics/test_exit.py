@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.physics import fresnel
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
@@ -19,7 +20,7 @@ VIEWS = Geometry(ZENITHS, jnp.full(4, 20.0), ZENITHS, jnp.full(4, 200.0))
 MATERIAL = {"roughness": jnp.array([0.3]), "roughness_across": jnp.array([0.1])}
 BARE = Stack(jnp.array([1.5]))
 COATED = Stack(jnp.array([1.5]), (Layer(jnp.array([1.4]), jnp.array([0.2])),))
-stacks = pytest.mark.parametrize("stack", [BARE, COATED], ids=["bare", "coated"])
+stacks = each("stack", [BARE, COATED], ids=["bare", "coated"])
 
 
 def test_through_a_plane_it_is_fresnels_law() -> None:
@@ -32,6 +33,7 @@ def test_through_a_plane_it_is_fresnels_law() -> None:
     np.testing.assert_array_equal(leaving.u, 0.0)
 
 
+@pytest.mark.thorough
 @stacks
 def test_a_smooth_way_out_of_a_rough_surface_is_that_of_a_plane(stack: Stack) -> None:
     plane = SmoothSurface().exit(MATERIAL, VIEWS, stack)
@@ -40,6 +42,7 @@ def test_a_smooth_way_out_of_a_rough_surface_is_that_of_a_plane(stack: Stack) ->
         jax.tree.map(np.testing.assert_array_equal, rough, plane)
 
 
+@pytest.mark.thorough
 @stacks
 def test_a_rough_way_out_tends_to_the_plane(stack: Stack) -> None:
     """Its difference falls with the square of the roughness."""
@@ -54,7 +57,7 @@ def test_a_rough_way_out_tends_to_the_plane(stack: Stack) -> None:
 
 
 @stacks
-@pytest.mark.parametrize("way_out", [RoughExit(), SmoothExit()], ids=["rough", "smooth"])
+@each("way_out", [RoughExit(), SmoothExit()], ids=["rough", "smooth"])
 def test_no_more_leaves_than_there_is_and_it_is_polarized_along_the_plane(
     way_out: object, stack: Stack
 ) -> None:
@@ -85,6 +88,7 @@ def test_a_scene_takes_its_way_out_from_the_surface() -> None:
     assert np.all(np.abs(rough.q[1:]) < np.abs(smooth.q[1:]))
 
 
+@pytest.mark.thorough
 def test_only_the_rough_way_out_has_something_simpler() -> None:
     assert RoughExit().simpler() == (SmoothExit(),)
     assert SmoothExit().simpler() == ()

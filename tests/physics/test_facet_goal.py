@@ -9,6 +9,7 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from facet_quadrature import INTEGRALS, ROUGHNESS, TRUTH, cases, measure, ours
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,8 +26,8 @@ BEYOND = (0.003, 0.5, 0.8)
 # The largest error of the default that the documentation states.
 STATED = {Beckmann(): 2e-4, GGX(): 8e-4}
 
-of_every_integral = pytest.mark.parametrize("integral", INTEGRALS)
-of_both = pytest.mark.parametrize("distribution", STATED, ids=repr)
+of_every_integral = each("integral", INTEGRALS)
+of_both = each("distribution", STATED, ids=repr)
 
 
 @functools.cache
@@ -52,6 +53,7 @@ def largest_error(
     return np.max(np.abs(found - truth(distribution, integral, roughness)))
 
 
+@pytest.mark.thorough
 @of_every_integral
 @of_both
 def test_thirty_two_facets_reach_a_thousandth(
@@ -63,6 +65,7 @@ def test_thirty_two_facets_reach_a_thousandth(
     assert largest_error(distribution, small, integral, ROUGHNESS) < 1e-3
 
 
+@pytest.mark.thorough
 @of_every_integral
 @of_both
 def test_the_default_holds_for_smoother_and_rougher_surfaces(
@@ -72,6 +75,7 @@ def test_the_default_holds_for_smoother_and_rougher_surfaces(
     assert largest_error(distribution, FacetQuadrature(), integral, BEYOND) < bound
 
 
+@pytest.mark.thorough
 @of_both
 def test_the_truth_is_the_renderers(
     uniform_sky: np.ndarray, distribution: AbstractMicrofacet
@@ -99,8 +103,9 @@ def test_rules_are_inside_and_whole(nodes: int) -> None:
         np.testing.assert_allclose(np.sum(weight), 1.0, rtol=1e-12)
 
 
+@pytest.mark.thorough
 @of_both
-@pytest.mark.parametrize("roughness", [1e-5, 0.01, 0.3, 1.5])
+@each("roughness", [1e-5, 0.01, 0.3, 1.5])
 def test_samples_reach_from_border_to_border(
     distribution: AbstractMicrofacet, roughness: float
 ) -> None:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature, sample_facets, seen
@@ -35,7 +36,8 @@ def polarization(surface: RoughSurface, views: Geometry) -> np.ndarray:
     return np.stack(both(MATERIAL))
 
 
-@pytest.mark.parametrize("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
+@pytest.mark.thorough
+@each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 def test_thirty_facets_are_enough(distribution: Beckmann | GGX) -> None:
     """The default, 6 x 5, is within .001 in degree of polarization; 16 x 16 within 3e-5."""
     truth, default, fine = (
@@ -46,8 +48,8 @@ def test_thirty_facets_are_enough(distribution: Beckmann | GGX) -> None:
     assert np.max(np.abs(fine - truth)) < 3e-5
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize("zenith", [0.0, 30.0, 80.0])
+@each("side", [1.0, -1.0])
+@each("zenith", [0.0, 30.0, 80.0])
 def test_no_facet_turns_its_back(zenith: float, side: float) -> None:
     view = jnp.array([side * zenith])
     facets = sample_facets(
@@ -63,7 +65,8 @@ def test_no_facet_turns_its_back(zenith: float, side: float) -> None:
     np.testing.assert_allclose(facets.cos_incidence**2 + facets.sin_squared, 1.0, rtol=1e-13)
 
 
-@pytest.mark.parametrize("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
+@pytest.mark.thorough
+@each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 def test_both_sides_of_the_normal_are_alike(distribution: Beckmann | GGX) -> None:
     surface = RoughSurface(distribution, UniformSky())
     left, right = (
@@ -72,7 +75,7 @@ def test_both_sides_of_the_normal_are_alike(distribution: Beckmann | GGX) -> Non
     np.testing.assert_allclose(left, right, atol=1e-12)
 
 
-@pytest.mark.parametrize("nodes", [{"along": 0}, {"across": 65}, {"along": 2.5}])
+@each("nodes", [{"along": 0}, {"across": 65}, {"along": 2.5}])
 def test_nodes_are_checked(nodes: dict) -> None:
     with pytest.raises(
         SceneError, match=r"FacetQuadrature: .* is no number of nodes; give a whole"

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -47,6 +48,7 @@ def test_no_light_is_lost(theta: float, n: float) -> None:
     assert mean + fresnel.transmission(at(theta)[0], n) == pytest.approx(1.0, abs=1e-13)
 
 
+@pytest.mark.thorough
 @given(theta=angle, n=index)
 @settings(deadline=None, max_examples=50)
 def test_exit_carries_the_opposite_of_reflection(theta: float, n: float) -> None:
@@ -69,12 +71,13 @@ def test_light_inside_meets_the_same_interface(theta: float, n: float) -> None:
     )
 
 
-@pytest.mark.parametrize("n", [1.0, 1.2, 1.333, 1.5, 2.0])
+@each("n", [1.0, 1.2, 1.333, 1.5, 2.0])
 def test_no_p_light_at_the_brewster_angle(n: float) -> None:
     theta = np.rad2deg(np.arctan(n))
     assert fresnel.reflection_polarization(*at(theta), n) == pytest.approx(1.0, abs=1e-14)
 
 
+@pytest.mark.thorough
 def test_exit_at_grazing_is_polarized_by_the_index_alone() -> None:
     n = np.array([1.2, 1.5, 2.0])
     found = fresnel.exit_polarization(0.0, 1.0, n)
@@ -94,9 +97,8 @@ def test_internal_reflection_of_common_indices() -> None:
     np.testing.assert_allclose(found, [0.0, 0.472, 0.596, 0.696], atol=5e-4)
 
 
-@pytest.mark.parametrize(
-    ("n", "bound"), [(1.00001, 3e-9), (1.0001, 3e-9), (1.01, 1e-13), (1.2, 2e-15), (2.0, 2e-15)]
-)
+@pytest.mark.thorough
+@each(("n", "bound"), [(1.00001, 3e-9), (1.0001, 3e-9), (1.01, 1e-13), (1.2, 2e-15), (2.0, 2e-15)])
 def test_hemisphere_has_enough_nodes(n: float, bound: float) -> None:
     def integrand(cosine: mp.mpf) -> mp.mpf:
         inner = mp.sqrt((n - 1) * (n + 1) + cosine**2)

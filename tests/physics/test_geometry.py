@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -33,6 +34,7 @@ def test_angles_broadcast_to_one_shape_and_one_float() -> None:
     assert geometry.wavelength is None
 
 
+@pytest.mark.thorough
 def test_a_lone_angle_is_one_view() -> None:
     geometry = Geometry.from_degrees(
         view_zenith=10.0, view_azimuth=180.0, light_zenith=10.0, light_azimuth=0.0
@@ -55,7 +57,7 @@ def test_on_the_normal_the_frame_comes_from_the_light() -> None:
     np.testing.assert_array_equal(geometry.view_azimuth, [200.0, 77.0])
 
 
-@pytest.mark.parametrize("angle", [0.0, 30.0, 45.0, 60.0, 89.0, 89.9999999])
+@each("angle", [0.0, 30.0, 45.0, 60.0, 89.0, 89.9999999])
 def test_sine_and_cosine_in_degrees(angle: float) -> None:
     complement = np.float64(90.0 - angle)
     np.testing.assert_allclose(sin_degrees(angle), np.sin(np.deg2rad(angle)), rtol=3e-16)
@@ -79,6 +81,7 @@ def test_mirror_facet_agrees_with_vectors(view: float, light: float, difference:
     np.testing.assert_allclose(found.across_s[0], 2 * in_plane * across, atol=1e-13)
 
 
+@pytest.mark.thorough
 @given(view=zenith, light=zenith, difference=azimuth)
 @settings(deadline=None, max_examples=60)
 def test_the_turned_axes_have_the_length_of_the_sine(
@@ -129,6 +132,7 @@ def test_mirror_slopes_agree_with_vectors(
     np.testing.assert_allclose(second @ twin.ray(view, turn), 0.0, atol=1e-15)
 
 
+@pytest.mark.thorough
 @given(view=zenith, light=zenith, turn=azimuth, difference=azimuth)
 @settings(deadline=None, max_examples=60)
 def test_turn_between_frames_agrees_with_vectors(
@@ -145,7 +149,8 @@ def test_turn_between_frames_agrees_with_vectors(
         np.testing.assert_allclose([cos, -sin], stokes[1:], atol=1e-9)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 30.0, 89.0])
+@pytest.mark.thorough
+@each("angle", [0.0, 1e-9, 30.0, 89.0])
 def test_frames_turn_smoothly_where_viewer_and_light_coincide(angle: float) -> None:
     here, there = (
         np.ravel(turn_between_frames(at(angle, angle, difference))) for difference in (0.0, 1e-7)
@@ -154,6 +159,7 @@ def test_frames_turn_smoothly_where_viewer_and_light_coincide(angle: float) -> N
     np.testing.assert_allclose(there, here, atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_the_wavelength_travels_with_the_directions() -> None:
     colors = [[450.0], [650.0]]
     geometry = Geometry.from_degrees(

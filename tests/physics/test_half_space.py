@@ -302,6 +302,7 @@ def test_absorption_has_a_floor_and_nothing_may_be_turned_back() -> None:
     assert light(0.3, None)[0] < light(0.3, 1.5)[0]
 
 
+@pytest.mark.thorough
 def test_materials_broadcast_against_views() -> None:
     view, azimuth = np.array([0.0, 30.0, 60.0]), np.array([180.0, 90.0, 30.0])
     absorption, n = np.array([[0.1], [2.0]]), np.array([[1.4], [1.6]])
@@ -312,7 +313,9 @@ def test_materials_broadcast_against_views() -> None:
     np.testing.assert_allclose(few, many, rtol=1e-12)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize(
+    "dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.thorough)]
+)
 def test_value_gradient_and_hessian_are_finite(dtype: type) -> None:
     """At both ends of every input, together; a Hessian times a vector hides nothing.
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature
@@ -14,7 +15,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
-DISTRIBUTIONS = pytest.mark.parametrize(
+DISTRIBUTIONS = each(
     ("code", "distribution"), [(0, Beckmann()), (1, GGX())], ids=["Beckmann", "GGX"]
 )
 
@@ -70,7 +71,7 @@ def test_uniform_sky_agrees_with_the_renderer(
 
 
 @DISTRIBUTIONS
-@pytest.mark.parametrize("half_width", [1.0, 5.0, 15.0])
+@each("half_width", [1.0, 5.0, 15.0])
 def test_disc_agrees_with_the_renderer(
     disc_source: np.ndarray, code: int, distribution: Beckmann | GGX, half_width: float
 ) -> None:
@@ -87,7 +88,8 @@ def test_disc_agrees_with_the_renderer(
     np.testing.assert_allclose(light.intensity[:, 0], rows[:, 5], rtol=1e-3)
 
 
-@pytest.mark.parametrize(("zenith", "half_width"), [(60.0, 5.0), (85.0, 15.0), (30.0, 15.0)])
+@pytest.mark.thorough
+@each(("zenith", "half_width"), [(60.0, 5.0), (85.0, 15.0), (30.0, 15.0)])
 def test_disc_agrees_with_brute_force(zenith: float, half_width: float) -> None:
     """A sum of point sources over the disc, 600 x 600 directions, cut at the horizon."""
     steps = 600
@@ -114,6 +116,7 @@ def test_disc_agrees_with_brute_force(zenith: float, half_width: float) -> None:
     np.testing.assert_allclose(found[1] / found[0], total[1] / total[0], atol=1e-4)
 
 
+@pytest.mark.thorough
 def test_light_entering_agrees_with_the_renderer(
     uniform_sky: np.ndarray, disc_source: np.ndarray
 ) -> None:
@@ -146,7 +149,8 @@ def test_a_small_disc_is_a_point() -> None:
     np.testing.assert_allclose(disc / solid_angle, point, rtol=1e-4, atol=1e-9)
 
 
-@pytest.mark.parametrize("source", [UniformSky(), Disc(15.0)])
+@pytest.mark.thorough
+@each("source", [UniformSky(), Disc(15.0)])
 def test_a_smooth_surface_mirrors_an_extended_source(source: UniformSky | Disc) -> None:
     material = {"roughness": 0.0, "refractive_index": 1.5}
     geometry = viewed(np.array([1.0, 30.0, 56.0, 70.0]))
@@ -156,6 +160,7 @@ def test_a_smooth_surface_mirrors_an_extended_source(source: UniformSky | Disc) 
     np.testing.assert_allclose(found, mirror, rtol=1e-4, atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_a_narrow_disc_takes_in_what_a_beam_does() -> None:
     stack, geometry = Stack(jnp.array([[1.5]])), viewed(np.array([40.0]))
     solid_angle = 2.0 * np.pi * (1.0 - np.cos(np.deg2rad(0.5)))
@@ -164,7 +169,7 @@ def test_a_narrow_disc_takes_in_what_a_beam_does() -> None:
     np.testing.assert_allclose(disc, beam, rtol=1e-4)
 
 
-@pytest.mark.parametrize("half_width", [0.0, -1.0, 91.0, float("nan")])
+@each("half_width", [0.0, -1.0, 91.0, float("nan")])
 def test_half_width_is_checked(half_width: float) -> None:
     with pytest.raises(SceneError, match=r"Disc: half_width=.* give degrees from 0.01 to 90"):
         Disc(half_width)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.geometry import Geometry
@@ -42,6 +43,7 @@ def channels(light: Light) -> tuple[np.ndarray, np.ndarray]:
     return light.intensity * (1 + light.q) / 2, light.intensity * (1 - light.q) / 2
 
 
+@pytest.mark.thorough
 def test_a_perfect_instrument_changes_nothing() -> None:
     instrument = Instrument(TERMS)
     jax.tree.map(np.testing.assert_allclose, instrument.aim(PERFECT, GEOMETRY), GEOMETRY)
@@ -59,6 +61,7 @@ def test_channel_gain_scales_the_ratio_of_channels() -> None:
     np.testing.assert_allclose(s_new * p, 1.2 * s * p_new, rtol=1e-13, atol=1e-15)
 
 
+@pytest.mark.thorough
 def test_channel_gain_is_a_diattenuator() -> None:
     """It turns the polarization, but fully polarized light stays fully polarized."""
     full = Light(jnp.ones(3), jnp.array([0.6, 0.0, -0.8]), jnp.array([0.8, 1.0, 0.6]))
@@ -66,6 +69,7 @@ def test_channel_gain_is_a_diattenuator() -> None:
     np.testing.assert_allclose(np.hypot(recorded.q, recorded.u), 1.0, rtol=1e-14)
 
 
+@pytest.mark.thorough
 def test_leakage_adds_the_other_channel() -> None:
     recorded = Leakage().record({"leakage": jnp.array([0.05])}, GEOMETRY, LIGHT)
     (s, p), (s_new, p_new) = channels(LIGHT), channels(recorded)
@@ -82,7 +86,8 @@ def test_dark_level_adds_unpolarized_light() -> None:
         )
 
 
-@pytest.mark.parametrize("level", [0.0, -0.1, -5.0])
+@pytest.mark.thorough
+@each("level", [0.0, -0.1, -5.0])
 def test_dark_level_survives_darkness(level: float) -> None:
     dark = Light(jnp.zeros(1), jnp.full(1, 0.5), jnp.zeros(1))
     recorded = DarkLevel().record({"dark_level": jnp.array([level])}, GEOMETRY, dark)
@@ -97,6 +102,7 @@ def test_angle_zero_shifts_both_zeniths_and_stops_before_grazing() -> None:
     np.testing.assert_allclose(aimed.view_zenith[0], -0.5)
 
 
+@pytest.mark.thorough
 def test_discrepancy_scales_the_ratio_of_channels_smoothly() -> None:
     term = Discrepancy()
     parameters = {
@@ -111,12 +117,13 @@ def test_discrepancy_scales_the_ratio_of_channels_smoothly() -> None:
     np.testing.assert_allclose(s_new * p, factor * s * p_new, rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize(("basis", "length"), [(4, 25.0), (8, 15.0), (1, 60.0)])
+@each(("basis", "length"), [(4, 25.0), (8, 15.0), (1, 60.0)])
 def test_discrepancy_has_the_amplitude_it_says(basis: int, length: float) -> None:
     functions = Discrepancy(basis, length).functions(jnp.linspace(0.0, 90.0, 400))
     np.testing.assert_allclose(np.mean(np.sum(functions**2, axis=0)), 1.0, rtol=5e-3)
 
 
+@pytest.mark.thorough
 def test_discrepancy_of_many_functions_is_the_kernel() -> None:
     """In the middle of the range the covariance is that of the squared exponential."""
     term = Discrepancy(basis=40, length=12.0)
@@ -127,6 +134,7 @@ def test_discrepancy_of_many_functions_is_the_kernel() -> None:
     np.testing.assert_allclose(covariance / covariance[1, 1], kernel, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_weights_may_have_leading_axes() -> None:
     parameters = {
         "discrepancy_amplitude": jnp.full((2, 3, 1), 0.2),
@@ -135,7 +143,7 @@ def test_weights_may_have_leading_axes() -> None:
     assert Discrepancy().record(parameters, GEOMETRY, LIGHT).q.shape == (2, 3, 4)
 
 
-@pytest.mark.parametrize("terms", [DolpGain(), [DolpGain()], (DolpGain,), ("DolpGain",)])
+@each("terms", [DolpGain(), [DolpGain()], (DolpGain,), ("DolpGain",)])
 def test_only_terms_make_an_instrument(terms: object) -> None:
     with pytest.raises(SceneError, match=r"Instrument: .* is no tuple of instrument terms; write"):
         Instrument(terms)
@@ -146,7 +154,7 @@ def test_a_term_acts_once() -> None:
         Instrument((DolpGain(), DolpGain()))
 
 
-@pytest.mark.parametrize("bad", [{"basis": 0}, {"basis": 2.5}, {"length": 0.0}])
+@each("bad", [{"basis": 0}, {"basis": 2.5}, {"length": 0.0}])
 def test_discrepancy_is_checked(bad: dict) -> None:
     with pytest.raises(SceneError, match=r"Discrepancy: .* make no smooth function"):
         Discrepancy(**bad)
@@ -176,7 +184,8 @@ def test_overlap_takes_nothing_from_steep_views_and_the_cosine_from_grazing_ones
     assert np.all(np.diff(shares) <= 0.0)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.thorough
+@each("dtype", [np.float64, np.float32])
 def test_overlap_and_its_derivatives_are_finite_up_to_grazing(dtype: type) -> None:
     def share(inputs: jax.Array) -> jax.Array:
         geometry = Geometry(inputs[:1], *(jnp.zeros(1, dtype) for _ in range(3)))
@@ -202,7 +211,8 @@ def test_an_analyzer_obeys_malus() -> None:
     np.testing.assert_array_equal(recorded.q, light.q)
 
 
-@pytest.mark.parametrize("angle", [0.0, 17.0, 45.0, -120.0])
+@pytest.mark.thorough
+@each("angle", [0.0, 17.0, 45.0, -120.0])
 def test_two_crossed_analyzers_share_the_light(angle: float) -> None:
     one, other = (Analyzer(a).record({}, GEOMETRY, TILTED) for a in (angle, angle + 90.0))
     np.testing.assert_allclose(one.intensity + other.intensity, TILTED.intensity, rtol=1e-14)
@@ -235,14 +245,15 @@ def test_light_meets_the_terms_in_their_order() -> None:
     np.testing.assert_allclose(last.intensity, [0.05, 0.14, 0.3, 0.105], rtol=1e-14)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     "term", [*TERMS, BeamOverlap(), Analyzer(30.0), Saturation(1.0)], ids=lambda t: type(t).__name__
 )
 def test_every_term_can_be_left_out(term: AbstractInstrumentTerm) -> None:
     assert term.simpler() == (None,)
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "message"),
     [
         (lambda: Analyzer("angle"), "Analyzer: 'angle' is no angle; give degrees, or a tuple"),

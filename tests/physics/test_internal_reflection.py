@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.physics import fresnel
 from polar_bayes.physics.coat import ClearCoat
@@ -24,11 +25,12 @@ VIEWS = Geometry.from_degrees(
 )
 MATERIAL = {"refractive_index": jnp.array([1.5]), "absorption": jnp.array([0.3])}
 INTERFACE = Interface(SmoothSurface(), Stack(MATERIAL["refractive_index"]))
-BODIES = pytest.mark.parametrize("body", [Lambertian, Unpolarized])
+BODIES = each("body", [Lambertian, Unpolarized])
 
 
+@pytest.mark.thorough
 @BODIES
-@pytest.mark.parametrize("albedo", [0.0, 0.3, 0.9, 1.0])
+@each("albedo", [0.0, 0.3, 0.9, 1.0])
 def test_light_comes_out_after_any_number_of_round_trips(body: type, albedo: float) -> None:
     """The closed form against 400 terms of the series; n^2 spreads the light over air."""
     inside = float(fresnel.internal_reflection(jnp.asarray(1.5)))
@@ -39,7 +41,7 @@ def test_light_comes_out_after_any_number_of_round_trips(body: type, albedo: flo
     np.testing.assert_array_equal(all_trips.q, once.q)
 
 
-@pytest.mark.parametrize("coat", [None, ClearCoat(1.3, 0.0), ClearCoat(1.9, 0.0)], ids=str)
+@each("coat", [None, ClearCoat(1.3, 0.0), ClearCoat(1.9, 0.0)], ids=str)
 def test_a_white_body_returns_all_that_enters(coat: ClearCoat | None) -> None:
     """Reflected and returned light together are the light, whatever clear coat there is.
 
@@ -77,6 +79,7 @@ def test_without_it_a_depolarizer_keeps_what_a_half_space_loses() -> None:
     )
 
 
+@pytest.mark.thorough
 def test_the_part_can_be_left_out() -> None:
     assert InternalReflection().simpler() == (None,)
     assert isinstance(Lambertian(0.5, InternalReflection()), DiffuseBody)
@@ -85,6 +88,7 @@ def test_the_part_can_be_left_out() -> None:
     )
 
 
+@pytest.mark.thorough
 def test_a_simpler_lambertian_keeps_its_round_trips() -> None:
     assert Lambertian(0.5, InternalReflection()).simpler() == (
         Unpolarized(0.5, InternalReflection()),

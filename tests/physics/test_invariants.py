@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -81,7 +82,7 @@ SCENES = {
 }
 SURFACES = {name: Scene(scene.surface, coat=scene.coat) for name, scene in SCENES.items()}
 
-every_scene = pytest.mark.parametrize("name", SCENES)
+every_scene = each("name", SCENES)
 RUN = settings(deadline=None, max_examples=60, derandomize=True)
 predict = jax.jit(Scene.predict, static_argnums=0)
 stokes_of = jax.jit(Scene.stokes, static_argnums=0)
@@ -201,7 +202,7 @@ MIRRORS = {
 }
 
 
-@pytest.mark.parametrize("name", MIRRORS)
+@each("name", MIRRORS)
 def test_a_surface_reflects_no_more_than_it_gets(name: str) -> None:
     """For every roughness, groove and angle, in s- and p-polarized light and in plain light.
 
@@ -227,9 +228,10 @@ def test_a_surface_reflects_no_more_than_it_gets(name: str) -> None:
                     assert share > 0.98
 
 
-@pytest.mark.parametrize("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
-@pytest.mark.parametrize("coat", [None, ClearCoat(1.3, 0.2)], ids=["bare", "coated"])
-@pytest.mark.parametrize("light", [0.0, 40.0, 70.0])
+@pytest.mark.thorough
+@each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
+@each("coat", [None, ClearCoat(1.3, 0.2)], ids=["bare", "coated"])
+@each("light", [0.0, 40.0, 70.0])
 def test_a_nearly_smooth_surface_reflects_what_a_plane_does(
     distribution: AbstractMicrofacet, coat: AbstractCoat | None, light: float
 ) -> None:
@@ -256,9 +258,7 @@ def states(scene: Scene, values: dict, direction: tuple) -> np.ndarray:
     return np.stack([none, s - none, diagonal - none], axis=1)
 
 
-@pytest.mark.parametrize(
-    "name", ["grooves under a polarized beam, lacquered", "nothing hidden, smooth way out"]
-)
+@each("name", ["grooves under a polarized beam, lacquered", "nothing hidden, smooth way out"])
 @given(values=parameters, direction=directions)
 @RUN
 def test_viewer_and_light_may_change_places(name: str, values: dict, direction: tuple) -> None:
@@ -301,8 +301,9 @@ def test_a_mirror_image_has_the_other_sign_of_u(name: str, values: dict, directi
 # --- limits ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
-@pytest.mark.parametrize("coat", [None, ThinFilm(1.38, 120.0)], ids=["bare", "filmed"])
+@pytest.mark.thorough
+@each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
+@each("coat", [None, ThinFilm(1.38, 120.0)], ids=["bare", "filmed"])
 def test_a_smooth_surface_under_a_sky_obeys_fresnel(
     distribution: AbstractMicrofacet, coat: AbstractCoat | None
 ) -> None:
@@ -322,7 +323,8 @@ def test_a_smooth_surface_under_a_sky_obeys_fresnel(
     np.testing.assert_allclose(found, mirror, rtol=bound, atol=bound * 1e-2)
 
 
-@pytest.mark.parametrize("name", list(SCENES)[1:3])
+@pytest.mark.thorough
+@each("name", list(SCENES)[1:3])
 @given(values=parameters, direction=directions)
 @settings(parent=RUN, max_examples=20)
 def test_a_coat_of_zero_effect_is_no_coat(name: str, values: dict, direction: tuple) -> None:

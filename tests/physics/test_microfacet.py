@@ -3,18 +3,17 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.physics.microfacet import GGX, SMOOTHEST, Beckmann
 
-DISTRIBUTIONS = pytest.mark.parametrize(
-    "distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"]
-)
+DISTRIBUTIONS = each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(400)
 SHARE, WEIGHT = 0.5 * (NODES + 1.0), 0.5 * WEIGHTS
 
 
 @DISTRIBUTIONS
-@pytest.mark.parametrize("roughness", [0.01, 0.1, 0.5, 1.5])
+@each("roughness", [0.01, 0.1, 0.5, 1.5])
 def test_facets_cover_the_surface(distribution: Beckmann | GGX, roughness: float) -> None:
     """The integral of D cos(m) over the hemisphere is one."""
     angle = 0.5 * np.pi * SHARE**2
@@ -23,8 +22,9 @@ def test_facets_cover_the_surface(distribution: Beckmann | GGX, roughness: float
     np.testing.assert_allclose(np.sum(density * measure), 1.0, rtol=1e-5)
 
 
+@pytest.mark.thorough
 @DISTRIBUTIONS
-@pytest.mark.parametrize("roughness", [0.0, 0.02, 0.3, 1.0])
+@each("roughness", [0.0, 0.02, 0.3, 1.0])
 def test_sampled_slopes_cover_the_surface(distribution: Beckmann | GGX, roughness: float) -> None:
     far = jnp.asarray(1e6)  # a tail is cut there: 1e-4 of the facets that are steepest across
     slope, weight = distribution.across(far, roughness, SHARE)
@@ -75,13 +75,14 @@ def test_shadowing_falls_towards_grazing(distribution: Beckmann | GGX) -> None:
     assert shadowing[-1] < 0.05
 
 
+@pytest.mark.thorough
 @DISTRIBUTIONS
 def test_roughness_has_a_floor(distribution: Beckmann | GGX) -> None:
     assert distribution.density(0.0, 0.0) == distribution.density(0.0, SMOOTHEST)
     assert np.isfinite(distribution.density(0.0, 0.0))
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@each("dtype", [np.float64, np.float32])
 def test_beckmann_never_underflows(dtype: type) -> None:
     density = Beckmann().density(dtype(10.0), dtype(0.001))
     assert 0.0 < density < 1e-20

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vector_optics as twin
+from cases import each
 
 from polar_bayes.physics.facets import FacetQuadrature, Microsurface, seen
 from polar_bayes.physics.geometry import Geometry, mirror_facet
@@ -17,7 +18,7 @@ from polar_bayes.physics.microfacet import (
 )
 
 DISTRIBUTIONS = {"Beckmann": Beckmann(), "GGX": GGX()}
-named = pytest.mark.parametrize("name", DISTRIBUTIONS)
+named = each("name", DISTRIBUTIONS)
 
 
 def surface(name: str, quadrature: FacetQuadrature | None = None) -> Microsurface:
@@ -36,7 +37,7 @@ def towards(rays: np.ndarray) -> Geometry:
 
 
 @named
-@pytest.mark.parametrize(("along", "across"), [(0.3, 0.3), (0.4, 0.1), (0.1, 1.0)])
+@each(("along", "across"), [(0.3, 0.3), (0.4, 0.1), (0.1, 1.0)])
 def test_facets_cover_the_surface(name: str, along: float, across: float) -> None:
     """The integral of D cos(m) over the hemisphere is one, grooves or not."""
     node, weight = np.polynomial.legendre.leggauss(200)
@@ -87,8 +88,9 @@ def test_visible_shares_of_grooves_agree_with_vectors(name: str) -> None:
     np.testing.assert_allclose(found, population.visible(rays), rtol=1e-12)
 
 
+@pytest.mark.thorough
 @named
-@pytest.mark.parametrize("view", [0.0, 40.0, 80.0])
+@each("view", [0.0, 40.0, 80.0])
 def test_seen_facets_show_the_area_of_the_plane(name: str, view: float) -> None:
     """The weights sum to cos(v)/G1(v); Beckmann's G1 is a fit within .6 %."""
     geometry = Geometry.from_degrees(
@@ -104,6 +106,7 @@ def test_seen_facets_show_the_area_of_the_plane(name: str, view: float) -> None:
         np.testing.assert_allclose(area * shares / np.cos(np.deg2rad(view)), 1.0, rtol=bound)
 
 
+@pytest.mark.thorough
 @named
 def test_equal_roughnesses_have_the_isotropic_density_and_share(name: str) -> None:
     geometry = Geometry(*(jnp.asarray(x) for x in ([30.0], [0.0], [60.0], [140.0])))

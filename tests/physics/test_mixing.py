@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polar_bayes.physics.mixing import AbstractMixing, DopMixing, StokesMixing
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization
 
-RULES = pytest.mark.parametrize("rule", [DopMixing(), DopMixing(signed=True), StokesMixing()])
+RULES = each("rule", [DopMixing(), DopMixing(signed=True), StokesMixing()])
 component = st.floats(-0.7, 0.7)
 
 
@@ -18,6 +19,7 @@ def light(intensity: float, q: float, u: float = 0.0) -> Light:
     return Light(*(jnp.array([x]) for x in (intensity, q, u)))
 
 
+@pytest.mark.thorough
 @RULES
 def test_fraction_0_is_the_surface_alone(rule: AbstractMixing) -> None:
     mixture = rule.mix(jnp.array([0.0]), light(0.2, 0.5, 0.1), light(7.0, -0.3))
@@ -82,8 +84,9 @@ def test_no_mixture_is_more_than_polarized(bright: float, angle: float, fraction
         assert np.hypot(mixture.q, mixture.u)[0] <= 1.0 + 1e-11
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("dark", [0.0, 1e-30, 1e-12])
+@pytest.mark.thorough
+@each("dtype", [np.float64, np.float32])
+@each("dark", [0.0, 1e-30, 1e-12])
 def test_a_dark_surface_keeps_its_polarization(dark: float, dtype: type) -> None:
     """At fraction 0 the reading is the surface's, however dark, and has finite derivatives."""
 
@@ -98,6 +101,7 @@ def test_a_dark_surface_keeps_its_polarization(dark: float, dtype: type) -> None
     assert np.all(np.isfinite(jax.hessian(reading)(inputs)))
 
 
+@pytest.mark.thorough
 def test_unpolarized_surface_points_along_s() -> None:
     mixture = DopMixing().mix(jnp.array([0.5]), light(1.0, 0.0), light(1.0, -0.4))
     assert mixture.q == pytest.approx(0.2, rel=1e-10)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -67,6 +68,7 @@ def test_a_facet_turns_the_field_as_vectors_do(
 FILM, COAT = (1.38, 230.0), (1.7, 0.3)
 
 
+@pytest.mark.thorough
 @given(view=direction, light=direction, degree=degree, angle=angle)
 @RUN
 def test_a_facet_under_a_film_or_coat_does_so_too(
@@ -147,6 +149,7 @@ def test_at_brewsters_angle_s_light_is_reflected_and_p_light_is_not() -> None:
     np.testing.assert_allclose(plain, [0.5 * power, 0.5 * power, 0.0], atol=1e-15)
 
 
+@pytest.mark.thorough
 @given(va=azimuth, la=azimuth, degree=degree, angle=angle)
 @RUN
 def test_at_normal_incidence_the_field_keeps_its_direction_in_the_laboratory(
@@ -158,6 +161,7 @@ def test_at_normal_incidence_the_field_keeps_its_direction_in_the_laboratory(
     np.testing.assert_allclose(found, 0.04 * np.array([1.0, q, u]), atol=1e-13)
 
 
+@pytest.mark.thorough
 @given(incidence=st.floats(0.0, 85.0), degree=degree, angle=angle)
 @RUN
 def test_in_the_plane_of_incidence_diagonal_light_keeps_its_share(
@@ -178,7 +182,8 @@ def test_in_the_plane_of_incidence_diagonal_light_keeps_its_share(
     np.testing.assert_allclose(found, expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("v", [0.0, 1e-3, 40.0, 85.0])
+@pytest.mark.thorough
+@each("v", [0.0, 1e-3, 40.0, 85.0])
 def test_nothing_jumps_where_viewer_and_light_coincide(v: float) -> None:
     """The mirror facet looks at both: its s axis is undefined there, but no reading is."""
     here = mirrored((v, 20.0), (v, 20.0), 1.5, 0.8, 25.0)
@@ -188,8 +193,9 @@ def test_nothing_jumps_where_viewer_and_light_coincide(v: float) -> None:
         np.testing.assert_allclose(near, here, atol=1e-8)
 
 
-@pytest.mark.parametrize("view", [(0.0, 20.0), (40.0, 20.0), (85.0, 20.0), (40.0, 200.0)], ids=str)
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.thorough
+@each("view", [(0.0, 20.0), (40.0, 20.0), (85.0, 20.0), (40.0, 200.0)], ids=str)
+@each("dtype", [np.float64, np.float32])
 def test_derivatives_exist_where_viewer_and_light_coincide(view: tuple, dtype: type) -> None:
     """The gradient over both directions, the polarization and the index; and it is a limit."""
 
@@ -208,6 +214,7 @@ def test_derivatives_exist_where_viewer_and_light_coincide(view: tuple, dtype: t
             np.testing.assert_allclose(gradient(row)[i], slope, atol=1e-8)
 
 
+@pytest.mark.thorough
 @given(incidence=zenith, n=index, degree=degree, angle=angle)
 @RUN
 def test_what_enters_is_what_the_transmittances_of_s_and_p_let_through(
@@ -229,6 +236,7 @@ def test_what_enters_is_what_the_transmittances_of_s_and_p_let_through(
     np.testing.assert_allclose(found, expected, atol=1e-13)
 
 
+@pytest.mark.thorough
 def test_p_light_enters_a_body_whole_at_brewsters_angle() -> None:
     source = PointSource(LinearPolarization(1.0, 90.0))
     light = source.entering(Stack(jnp.array([1.5])), at((0.0, 0.0), (BREWSTER, 0.0)), {})
@@ -243,7 +251,7 @@ def test_polarization_adds_its_parameters_and_can_be_left_out() -> None:
     assert LinearPolarization().simpler() == (None,)
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "message"),
     [
         (lambda: LinearPolarization(1.5), "LinearPolarization: degree: 1.5 is neither a number fr"),

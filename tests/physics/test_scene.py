@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
@@ -85,7 +86,8 @@ def test_named_scenes_read_these_parameters() -> None:
     )
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.thorough
+@each("name", SCENES)
 def test_leading_axes_of_parameters_and_geometry_broadcast(name: str) -> None:
     """Patches by wavelengths, each with its own parameters, seen in the same views."""
     scene = SCENES[name]
@@ -101,7 +103,8 @@ def test_leading_axes_of_parameters_and_geometry_broadcast(name: str) -> None:
         np.testing.assert_allclose(found[reading][1, 2], one[reading], rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.thorough
+@each("name", SCENES)
 def test_turning_everything_around_the_normal_changes_nothing(name: str) -> None:
     turned = VIEWS._replace(
         view_azimuth=VIEWS.view_azimuth + 123.0, light_azimuth=VIEWS.light_azimuth + 123.0
@@ -111,7 +114,8 @@ def test_turning_everything_around_the_normal_changes_nothing(name: str) -> None
         np.testing.assert_allclose(here[reading], there[reading], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.thorough
+@each("name", SCENES)
 def test_single_precision_stays_single_and_agrees(name: str) -> None:
     single = jax.tree.map(lambda angle: angle.astype(jnp.float32), VIEWS)
     small = {key: np.float32(value) for key, value in PARAMETERS.items()}
@@ -142,7 +146,7 @@ def operations(scene: Scene) -> list[str]:
     return [str(equation.primitive) for equation in program.eqns]
 
 
-@pytest.mark.parametrize("term", SCENES["goniometer"].instrument.terms, ids=lambda t: str(t)[:9])
+@each("term", SCENES["goniometer"].instrument.terms, ids=lambda t: str(t)[:9])
 def test_a_term_removed_is_absent_from_the_program(term: AbstractInstrumentTerm) -> None:
     scene = SCENES["goniometer"]
     rest = tuple(part for part in scene.instrument.terms if part != term)
@@ -173,6 +177,7 @@ def test_a_part_switched_off_costs_no_operation() -> None:
     assert flops(emptied) == flops(Scene(whole.surface, whole.subsurface, whole.mixing))
 
 
+@pytest.mark.thorough
 def test_the_instrument_is_not_in_the_optics() -> None:
     camera = SCENES["camera"]
     stokes, readings = stokes_of(camera, PARAMETERS, VIEWS), predict(camera, PARAMETERS, VIEWS)
@@ -181,6 +186,7 @@ def test_the_instrument_is_not_in_the_optics() -> None:
     np.testing.assert_array_equal(stokes_of(camera, optics_only, VIEWS), stokes)
 
 
+@pytest.mark.thorough
 def test_angle_zero_moves_the_geometry() -> None:
     scene = Scene(SmoothSurface(), instrument=Instrument((AngleZero(),)))
     shifted = scene.predict({**PARAMETERS, "angle_zero": 2.0}, VIEWS)
@@ -194,6 +200,7 @@ def test_angle_zero_moves_the_geometry() -> None:
     )
 
 
+@pytest.mark.thorough
 def test_figures_of_the_specification() -> None:
     """Two digits and a half of the degree of polarization under a uniform sky, n 1.5, Beckmann."""
     table = {
@@ -214,7 +221,7 @@ def test_figures_of_the_specification() -> None:
     np.testing.assert_allclose(found.T, list(table.values()), atol=1.2e-3)
 
 
-@pytest.mark.parametrize(
+@each(
     ("parts", "message"),
     [
         ({"surface": GGX()}, r"surface: GGX\(\) is no such part; give SmoothSurface\(\) or Ro"),
@@ -239,6 +246,7 @@ def test_missing_parameters_are_named() -> None:
         SCENES["camera"].predict({k: 1.5 for k in SCENES["paper"].parameters}, VIEWS)
 
 
+@pytest.mark.thorough
 def test_only_terms_that_are_there_can_be_removed() -> None:
     with pytest.raises(SceneError, match="no DarkLevel; name one of its instrument terms: DolpG"):
         SCENES["camera"].without(DarkLevel)
@@ -281,6 +289,7 @@ def test_parameters_are_the_materials_in_their_order_then_the_light_then_the_ins
     assert len(set(MATERIAL_PARAMETERS)) == len(MATERIAL_PARAMETERS)
 
 
+@pytest.mark.thorough
 def test_a_scene_of_everything_is_static_data_and_predicts() -> None:
     copy = pickle.loads(pickle.dumps(EVERYTHING))
     assert copy == EVERYTHING
@@ -321,6 +330,7 @@ def test_an_analyzer_of_each_view_is_read_in_its_order() -> None:
     np.testing.assert_allclose(found["intensity"], share * plain["intensity"], rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_an_extended_source_needs_no_direction_of_the_light() -> None:
     moved = VIEWS._replace(light_zenith=VIEWS.light_zenith + 20.0, light_azimuth=VIEWS.view_azimuth)
     for source in (UniformSky(), Disc(10.0)):

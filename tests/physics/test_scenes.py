@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
@@ -14,7 +15,8 @@ from polar_bayes.physics.scene import SCENES
 ZENITHS = np.linspace(2.0, 85.0, 43)
 
 
-@pytest.mark.parametrize("name", ["paper", "camera"])
+@pytest.mark.thorough
+@each("name", ["paper", "camera"])
 def test_twenty_facets_are_as_good_as_four_hundred(name: str) -> None:
     """The errors stated in `scenes.py`: far below the noise of any reading."""
     scene = SCENES[name]

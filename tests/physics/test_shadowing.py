@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -49,6 +50,7 @@ def test_correlated_heights_hide_less_but_never_less_than_one_direction(
     np.testing.assert_allclose(correlated, expected, rtol=1e-12)
 
 
+@pytest.mark.thorough
 @given(view=share)
 @RUN
 def test_where_one_direction_sees_all_the_rules_agree(view: float) -> None:
@@ -56,7 +58,8 @@ def test_where_one_direction_sees_all_the_rules_agree(view: float) -> None:
         np.testing.assert_allclose(rule.both(jnp.asarray(view), 1.0), view, rtol=1e-15)
 
 
-@pytest.mark.parametrize("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
+@pytest.mark.thorough
+@each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 def test_the_rules_order_the_brightness_of_a_surface_and_leave_its_polarization(
     distribution: Beckmann | GGX,
 ) -> None:

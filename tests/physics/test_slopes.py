@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -41,9 +42,7 @@ def scene(source: object, slopes: object, distribution: object = None, **parts: 
 
 
 POINT = scene(PointSource(), ALONG)
-SOURCES = pytest.mark.parametrize(
-    "source", [PointSource(), Disc(20.0), UniformSky()], ids=["point", "disc", "sky"]
-)
+SOURCES = each("source", [PointSource(), Disc(20.0), UniformSky()], ids=["point", "disc", "sky"])
 VIEWS = {
     "view_zenith": np.array([0.0, 30.0, 60.0, 80.0]),
     "view_azimuth": np.array([0.0, 20.0, -70.0, 160.0]),
@@ -70,7 +69,8 @@ def material(along: float, across: float, turn: float = 0.0) -> dict[str, float]
     }
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     ("source", "name"),
     [(PointSource(), "Beckmann"), (Disc(20.0), "GGX"), (UniformSky(), "GGX")],
     ids=["point", "disc", "sky"],
@@ -85,6 +85,7 @@ def test_equal_roughnesses_are_isotropic(source: object, name: str) -> None:
     np.testing.assert_allclose(both, one, rtol=1e-11, atol=1e-15)
 
 
+@pytest.mark.thorough
 @SOURCES
 def test_turning_sample_viewer_and_light_together_changes_nothing(source: object) -> None:
     still = stokes_of(scene(source, ALONG), material(0.4, 0.15, 25.0), seen())
@@ -107,6 +108,7 @@ def test_a_mirror_image_has_the_other_sign_of_u(source: object) -> None:
     assert np.max(np.abs(here[:, 2] / here[:, 0])) > 0.01
 
 
+@pytest.mark.thorough
 @SOURCES
 def test_along_an_axis_of_symmetry_there_is_no_u(source: object) -> None:
     """The viewer, the light and the grooves in one plane."""
@@ -144,7 +146,8 @@ GROOVES = np.array(
 )
 
 
-@pytest.mark.parametrize("name", DISTRIBUTIONS)
+@pytest.mark.thorough
+@each("name", DISTRIBUTIONS)
 def test_sky_and_way_out_agree_with_brute_force(name: str) -> None:
     """360,000 facets by vectors, to 1e-5, against 30 x 30; and what the default of 30 costs.
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
@@ -69,8 +70,9 @@ THICK = {
 }
 
 
-@pytest.mark.parametrize("theta", [0.0, 35.0, 60.0, 84.0])
-@pytest.mark.parametrize("name", THICK)
+@pytest.mark.thorough
+@each("theta", [0.0, 35.0, 60.0, 84.0])
+@each("name", THICK)
 def test_thick_layers_agree_with_every_bounce_followed(name: str, theta: float) -> None:
     """1,000 bounces leave nothing inside; s, p and the product of their fields, both ways."""
     indexes, absorbances = THICK[name]
@@ -131,6 +133,7 @@ def test_a_coat_without_effect_is_not_there(
     )
 
 
+@pytest.mark.thorough
 def test_splitting_a_coat_in_two_changes_nothing() -> None:
     c, b = at(jnp.array([0.0, 40.0, 80.0]))
     whole, halves = thick([1.0, 1.4, 1.7], [0.4]), thick([1.0, 1.4, 1.4, 1.7], [0.1, 0.3])
@@ -140,6 +143,7 @@ def test_splitting_a_coat_in_two_changes_nothing() -> None:
         )
 
 
+@pytest.mark.thorough
 def test_a_film_on_a_coat_adds_fields_then_powers() -> None:
     """The coat's upper boundary is the film; what comes back through it is added as power."""
     film, coat, body, absorbance = (1.38, 2.0), 1.5, 1.8, 0.2
@@ -196,10 +200,8 @@ def escape_by_brute_force(indexes: list, absorbances: list) -> float:
     return total / body**2
 
 
-@pytest.mark.parametrize("absorbance", [0.0, 1e-3, 0.3, 50.0])
-@pytest.mark.parametrize(
-    ("coat", "body"), [(1.3, 1.5), (1.7, 1.5), (1.5, 1.5), (1.01, 1.5), (1.5, 1.01), (1.3, 2.4)]
-)
+@each("absorbance", [0.0, 1e-3, 0.3, 50.0])
+@each(("coat", "body"), [(1.3, 1.5), (1.7, 1.5), (1.5, 1.5), (1.01, 1.5), (1.5, 1.01), (1.3, 2.4)])
 def test_escape_through_a_coat_agrees_with_brute_force(
     coat: float, body: float, absorbance: float
 ) -> None:
@@ -214,7 +216,8 @@ def test_escape_through_a_coat_agrees_with_brute_force(
     np.testing.assert_allclose(escape(thick(indexes, absorbances)), truth, rtol=bound)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     ("indexes", "bound"),
     [
         ([1.0, 1.7, 1.3, 1.6], 1e-9),
@@ -252,6 +255,7 @@ def test_absorption_in_a_coat_never_brings_light_back() -> None:
     assert shares[-1] <= 1.0
 
 
+@pytest.mark.thorough
 def test_shapes_broadcast_over_facets() -> None:
     stack = Stack(
         jnp.array([1.5, 1.6]), (Layer(jnp.array([1.3, 1.4]), jnp.asarray(0.1)),)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.physics.stokes import (
     TIP,
@@ -21,7 +22,7 @@ def test_stokes_vector_stands_on_the_last_axis() -> None:
     np.testing.assert_allclose(stokes[1, 1], [4.0, -1.0, 0.4])
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@each("dtype", [np.float64, np.float32])
 def test_unpolarized_light_has_finite_derivatives(dtype: type) -> None:
     zero = jnp.zeros(2, dtype)
 
@@ -33,11 +34,12 @@ def test_unpolarized_light_has_finite_derivatives(dtype: type) -> None:
     np.testing.assert_allclose(jax.hessian(length)(zero), np.eye(2) / TIP, rtol=1e-5)
 
 
+@pytest.mark.thorough
 def test_above_the_tip_the_length_is_exact() -> None:
     np.testing.assert_allclose(degree_of_linear_polarization(3e-7, 4e-7), 5e-7, rtol=1e-10)
 
 
-@pytest.mark.parametrize(
+@each(
     ("q", "u", "angle"),
     [(0.3, 0.0, 0.0), (0.0, 0.3, 45.0), (-0.3, 0.0, 90.0), (0.0, -0.3, -45.0), (0.0, 0.0, 0.0)],
 )
@@ -45,6 +47,7 @@ def test_angle_is_measured_from_s(q: float, u: float, angle: float) -> None:
     assert angle_of_linear_polarization(q, u) == pytest.approx(angle)
 
 
+@pytest.mark.thorough
 def test_angle_of_unpolarized_light_has_a_finite_gradient() -> None:
     gradient = jax.grad(angle_of_linear_polarization, (0, 1))(0.0, 0.0)
     assert np.all(np.isfinite(gradient))

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics import fresnel
@@ -44,6 +45,7 @@ def test_lambertian_body_agrees_with_the_renderer(plastic: np.ndarray) -> None:
     np.testing.assert_array_equal(found.u, 0.0)
 
 
+@pytest.mark.thorough
 def test_a_rough_way_out_depolarizes() -> None:
     smooth = Lambertian().light(MATERIAL, GEOMETRY, under(SmoothSurface()))
     rough = Lambertian().light(MATERIAL, GEOMETRY, under(RoughSurface(Beckmann())))
@@ -51,6 +53,7 @@ def test_a_rough_way_out_depolarizes() -> None:
     np.testing.assert_allclose(rough.q[0], 0.0, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_figures_of_the_specification() -> None:
     """At 85 degrees -.309 smooth; -.159 at alpha .3, with an error of .007."""
     smooth = under(SmoothSurface()).exit(MATERIAL, GEOMETRY).q[3]
@@ -60,6 +63,7 @@ def test_figures_of_the_specification() -> None:
     assert rough == pytest.approx(-0.159, abs=7e-3)
 
 
+@pytest.mark.thorough
 def test_unpolarized_is_as_bright_as_lambertian() -> None:
     lambertian = Lambertian(0.7).light(MATERIAL, GEOMETRY, under(SmoothSurface()))
     unpolarized = Unpolarized(0.7).light(MATERIAL, GEOMETRY, under(SmoothSurface()))
@@ -84,6 +88,7 @@ def test_a_black_depolarizer_keeps_the_polarization_of_the_exit() -> None:
     assert np.all(found.intensity < 1e-8)
 
 
+@pytest.mark.thorough
 def test_darker_bodies_are_more_polarized() -> None:
     """Umov's effect, for every absorption that the prior allows."""
     absorption = jnp.geomspace(1e-3, 20.0, 40)[:, None]
@@ -104,6 +109,7 @@ def test_half_space_agrees_with_the_closed_form_of_the_table(half_space: np.ndar
     np.testing.assert_allclose(behind, half_space[:, 6], rtol=1e-7)
 
 
+@pytest.mark.thorough
 def test_half_space_is_near_adding_doubling(half_space: np.ndarray) -> None:
     """Without an interface: the spherical albedo within .002 of the exact one."""
     bare = half_space[half_space[:, 0] == 1.0]
@@ -116,8 +122,8 @@ def test_absorption_has_a_floor() -> None:
     assert half_space_loss(jnp.array(0.0)) == half_space_loss(jnp.array(CLEAREST))
 
 
-@pytest.mark.parametrize("part", [Lambertian, Unpolarized])
-@pytest.mark.parametrize("albedo", [-0.1, 1.5, float("nan")])
+@each("part", [Lambertian, Unpolarized])
+@each("albedo", [-0.1, 1.5, float("nan")])
 def test_albedo_is_checked(part: type, albedo: float) -> None:
     with pytest.raises(SceneError, match=r"albedo: .* is neither a number from 0 to 1 nor a para"):
         part(albedo=albedo)

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -24,6 +25,7 @@ def at(view: float, light: float, difference: float) -> Geometry:
     return Geometry(*(jnp.array([x]) for x in (view, 0.0, light, difference)))
 
 
+@pytest.mark.thorough
 @given(view=zenith, light=zenith, difference=azimuth)
 @settings(deadline=None, max_examples=40)
 def test_viewer_and_light_may_change_places(view: float, light: float, difference: float) -> None:
@@ -48,7 +50,8 @@ def test_the_other_side_of_the_plane_is_a_mirror_image(
     np.testing.assert_allclose(left.u, -right.u, atol=1e-12)
 
 
-@pytest.mark.parametrize("distribution", [Beckmann(), GGX()])
+@pytest.mark.thorough
+@each("distribution", [Beckmann(), GGX()])
 def test_roughness_does_not_change_what_one_facet_polarizes(
     distribution: Beckmann | GGX,
 ) -> None:
@@ -63,7 +66,8 @@ def test_roughness_does_not_change_what_one_facet_polarizes(
         np.testing.assert_allclose(light.u, mirror.u, rtol=1e-14)
 
 
-@pytest.mark.parametrize("distribution", [Beckmann(), GGX()])
+@pytest.mark.thorough
+@each("distribution", [Beckmann(), GGX()])
 def test_a_smooth_exit_is_the_limit_of_a_rough_one(distribution: Beckmann | GGX) -> None:
     """GGX keeps a tail of steep facets at any roughness: its limit is reached more slowly."""
     views = Geometry(*(jnp.array([0.0, 30.0, 60.0, 80.0]) for _ in range(4)))
@@ -75,6 +79,7 @@ def test_a_smooth_exit_is_the_limit_of_a_rough_one(distribution: Beckmann | GGX)
     np.testing.assert_allclose(rough.intensity, smooth.intensity, rtol=10 * bound)
 
 
+@pytest.mark.thorough
 def test_intensity_of_a_highlight_grows_as_the_inverse_square_of_roughness() -> None:
     geometry = at(30.0, 30.0, 180.0)
     narrow, wide = (
@@ -83,6 +88,7 @@ def test_intensity_of_a_highlight_grows_as_the_inverse_square_of_roughness() -> 
     np.testing.assert_allclose(narrow.intensity, 100.0 * wide.intensity, rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_rough_exit_is_near_the_truth(height_field_exit: np.ndarray) -> None:
     """All orders of reflection in a height field change the polarization by up to .011."""
     roughness, zenith_ = height_field_exit[:, 1], height_field_exit[:, 2]
@@ -94,6 +100,7 @@ def test_rough_exit_is_near_the_truth(height_field_exit: np.ndarray) -> None:
     assert np.all(np.abs(found - truth) <= bound)
 
 
+@pytest.mark.thorough
 def test_rough_reflection_is_near_the_truth(height_field_sky: np.ndarray) -> None:
     """All orders of reflection in a height field change the polarization by up to .015."""
     rows = height_field_sky[height_field_sky[:, 3] == 0]
@@ -104,7 +111,7 @@ def test_rough_reflection_is_near_the_truth(height_field_sky: np.ndarray) -> Non
     assert np.all(np.abs(light.q - rows[:, 5] / rows[:, 4]) <= bound)
 
 
-@pytest.mark.parametrize(
+@each(
     ("part", "hint"),
     [
         ({"distribution": UniformSky()}, r"Beckmann\(\) or GGX\(\)"),

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vector_optics as twin
+from cases import each
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
@@ -67,7 +68,7 @@ LEVEL = {
 COMPILER_OPTIONS = Scene(
     RoughSurface(Beckmann(), BEAM, way_out=SmoothExit()), Lambertian(), StokesMixing()
 )  # compiles in no time
-EVERY_SCENE = pytest.mark.parametrize("name", LEVEL)
+EVERY_SCENE = each("name", LEVEL)
 
 
 def at(view: tuple[float, float], light: tuple[float, float]) -> Geometry:
@@ -121,6 +122,7 @@ def components(degree: float, angle: float) -> tuple[float, float]:
     return degree * np.cos(np.deg2rad(2 * angle)), degree * np.sin(np.deg2rad(2 * angle))
 
 
+@pytest.mark.thorough
 @EVERY_SCENE
 @given(view=direction, light=direction, tilts=tilt)
 @RUN
@@ -172,7 +174,7 @@ def test_a_mirror_facet_does_not_care_where_the_normal_is(
     np.testing.assert_allclose(found, expected, atol=1e-11 * sum(np.real(powers[:2])))
 
 
-@pytest.mark.parametrize("tilts", [(0.0, 12.0), (-9.0, 4.0), (20.0, -20.0)])
+@each("tilts", [(0.0, 12.0), (-9.0, 4.0), (20.0, -20.0)])
 def test_brightness_and_way_out_are_those_of_a_leaning_population(tilts: tuple) -> None:
     """Against a dense grid of facets around the true normal, in and out of the plane."""
     index, roughness = 1.5, 0.25
@@ -204,7 +206,8 @@ def test_brightness_and_way_out_are_those_of_a_leaning_population(tilts: tuple) 
 # --- no lean ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["grooves, polarized beam, body", "sky", "goniometer"])
+@pytest.mark.thorough
+@each("name", ["grooves, polarized beam, body", "sky", "goniometer"])
 def test_without_a_lean_nothing_changes(name: str) -> None:
     scene = (LEVEL | SCENES)[name]
     zenith = np.array([0.0, 1e-8, 1e-3, 30.0, 45.0, 80.0, 89.9, 89.9999999, 45.0])
@@ -245,6 +248,7 @@ def test_without_the_part_nothing_of_it_is_in_the_program() -> None:
 # --- where directions stop having a meaning -----------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_below_the_horizon_counts_as_grazing() -> None:
     slopes = (jnp.tan(jnp.deg2rad(-20.0)), jnp.zeros(()))
     zenith = jnp.array([60.0, 69.99, 70.5, 80.0, 89.9, 89.9995])
@@ -252,6 +256,7 @@ def test_below_the_horizon_counts_as_grazing() -> None:
     np.testing.assert_allclose(found, [80.0, 89.99, 89.999, 89.999, 89.999, 89.9995], rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_light_below_the_horizon_is_next_to_none() -> None:
     scene = leaning(SCENES["camera"])
     views = at((10.0, 180.0), (75.0, 0.0))
@@ -260,6 +265,7 @@ def test_light_below_the_horizon_is_next_to_none() -> None:
     assert 0.0 < float(dark[0]) < 1e-3 * float(bright[0])
 
 
+@pytest.mark.thorough
 def test_a_viewer_that_passes_the_true_normal_sees_no_jump() -> None:
     """In the plane, out of it, and exactly on the normal, where azimuth has no meaning.
 
@@ -274,6 +280,7 @@ def test_a_viewer_that_passes_the_true_normal_sees_no_jump() -> None:
         )
 
 
+@pytest.mark.thorough
 def test_slopes_are_those_of_differences() -> None:
     """Also for a viewer on the stated normal, as soon as the true one leans."""
     scene = leaning(COMPILER_OPTIONS)
@@ -292,6 +299,7 @@ def test_slopes_are_those_of_differences() -> None:
         np.testing.assert_allclose(slopes[..., i], difference, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.thorough
 def test_single_precision_stays_single_and_agrees() -> None:
     scene = leaning(COMPILER_OPTIONS)
     zenith = np.array([0.0, 20.0, 45.0, 70.0])
@@ -322,6 +330,7 @@ def test_the_instrument_acts_on_the_stated_angles() -> None:
     np.testing.assert_allclose(found["intensity"], lost * light.intensity, rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_the_tilts_are_of_the_material() -> None:
     scene = leaning(SCENES["camera"])
     assert {"normal_tilt_x", "normal_tilt_y"} <= set(MATERIAL_PARAMETERS)
@@ -336,6 +345,7 @@ def test_the_tilts_are_of_the_material() -> None:
     assert {"normal_tilt_x", "normal_tilt_y"} <= set(scene.optical_parameters)
 
 
+@pytest.mark.thorough
 def test_every_patch_leans_by_itself() -> None:
     scene = leaning(SCENES["camera"])
     views = Geometry.from_degrees(
@@ -361,13 +371,14 @@ def test_a_known_lean_is_no_parameter() -> None:
     np.testing.assert_allclose(found["q"], expected["q"], rtol=1e-14)
 
 
+@pytest.mark.thorough
 def test_the_ledger_of_effects_finds_it() -> None:
     found = {effect.name: effect for effect in effects_of(leaning(SCENES["camera"]))}
     assert found["TiltedNormal"].path == "normal"
     assert found["TiltedNormal"].apply(leaning(SCENES["camera"])) == SCENES["camera"]
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "message"),
     [
         (lambda: TiltedNormal(tilt_x=61.0), "TiltedNormal: tilt_x: 61.0 is neither a number from"),
@@ -416,6 +427,7 @@ def fitted(scene: Scene, count: int, readings: np.ndarray, views: Geometry) -> t
     return found.x, np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
 
 
+@pytest.mark.thorough
 def test_a_lean_is_found_and_without_it_the_material_is_wrong() -> None:
     """Signed Stokes and brightness of 24 views of a plastic, 1% noise, a sample 4 degrees off."""
     leaning_ = leaning(SHINY)

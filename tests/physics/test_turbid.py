@@ -34,6 +34,7 @@ ANY = body(polarized_fraction="polarized_fraction")
 stokes_of = jax.jit(Scene.stokes, static_argnums=0)
 
 
+@pytest.mark.thorough
 def test_a_body_agrees_with_the_monte_carlo() -> None:
     """Signed q and u within the .02 (pm up to .5) and .05 (pm 1) asked for; in fact a tenth of it.
 
@@ -77,12 +78,14 @@ def test_scattered_once_it_is_polarized_as_a_mirror_would() -> None:
     assert np.all(scattered[1:, 1] * mirrored[1:, 1] > 0.0)
 
 
+@pytest.mark.thorough
 def test_a_rough_way_out_tends_to_a_smooth_one() -> None:
     smooth = stokes_of(body(), BODY, VIEWS)
     rough = stokes_of(body(RoughSurface()), {**BODY, "roughness": 1e-4}, VIEWS)
     np.testing.assert_allclose(rough, smooth, rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.thorough
 def test_a_small_disc_is_a_beam_from_the_mirror_direction() -> None:
     views = Geometry.from_degrees(
         view_zenith=[20.0, 50.0, 70.0],
@@ -97,6 +100,7 @@ def test_a_small_disc_is_a_beam_from_the_mirror_direction() -> None:
     assert np.all(np.abs(disc / solid_angle - beam) < np.deg2rad(0.5) ** 2 * beam[:, :1])
 
 
+@pytest.mark.thorough
 def test_a_sky_agrees_with_a_renderer() -> None:
     """Total light of surface and body, within four standard errors of the table."""
     table = np.genfromtxt(
@@ -122,6 +126,7 @@ def test_a_sky_agrees_with_a_renderer() -> None:
         assert np.all(np.abs(total - rows[:, [4, 5, 6]]) < 4.0 * rows[:, [8, 9, 10]])
 
 
+@pytest.mark.thorough
 def test_two_crossed_beams_are_an_unpolarized_one() -> None:
     pair = [
         stokes_of(
@@ -142,6 +147,7 @@ def test_without_internal_reflection_the_body_is_darker() -> None:
     assert np.all(with_it > 1.05 * without)
 
 
+@pytest.mark.thorough
 def test_colors_broadcast() -> None:
     colors = {
         **BODY,

@@ -33,6 +33,7 @@ def test_the_advice_comes_first_and_the_reference_with_it(page):
     assert "is at most 0.012 posterior sd." in page.text
 
 
+@pytest.mark.thorough
 def test_an_error_that_the_reference_cannot_tell_is_marked(page):
     row = page.text[page.text.index("nuts long") :]
     assert "< 0.024" in row
@@ -44,6 +45,7 @@ def test_a_doubtful_reference_is_said_in_red():
     assert reference_sentence(study).endswith("Against it speaks: its R-hat is 1.3.")
 
 
+@pytest.mark.thorough
 def test_the_report_lies_beside_its_file(tmp_path):
     page = pb.report(make_accuracy(), tmp_path / "report")
     again = pb.load(page.parent / "accuracy.nc")
@@ -60,6 +62,7 @@ def test_a_fit_that_holds_a_study_shows_it():
     assert "use nuts for it" in text
 
 
+@pytest.mark.thorough
 def test_every_rung_as_given_is_named_and_nothing_is_cut_off():
     figure = pb.plots.plot_accuracy(make_accuracy())
     assert len(figure.axes) == 2
@@ -69,6 +72,7 @@ def test_every_rung_as_given_is_named_and_nothing_is_cut_off():
     assert not clipped(figure)
 
 
+@pytest.mark.thorough
 def test_names_that_lie_close_do_not_cover_each_other():
     rows = {
         (f"method {at}", "as given"): ([0.1, 0.1, 0.1], 1.0 + 0.02 * at, 1.0) for at in range(4)
@@ -80,6 +84,7 @@ def test_names_that_lie_close_do_not_cover_each_other():
         assert not any(box.overlaps(other) for other in boxes[:at])
 
 
+@pytest.mark.thorough
 def test_the_front_falls_from_left_to_right():
     (axes,) = pb.plots.plot_accuracy(make_accuracy(), times=["seconds_again"]).axes
     front = next(line for line in axes.lines if line.get_drawstyle() == "steps-post")
@@ -89,10 +94,12 @@ def test_the_front_falls_from_left_to_right():
     assert error[-1] == pytest.approx(0.02)
 
 
+@pytest.mark.thorough
 def test_without_first_times_one_panel_is_drawn():
     assert len(pb.plots.plot_accuracy(make_accuracy(fresh=False)).axes) == 1
 
 
+@pytest.mark.thorough
 def test_a_column_that_is_no_time_is_refused():
     with pytest.raises(pb.FitError, match="there is no time gradients"):
         pb.plots.plot_accuracy(make_accuracy(), times=["gradients"])

@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plates import LINKS, PLATE, plate_capture
 from synthetic_results import make_result
 
@@ -72,14 +73,15 @@ def result_of(name: str, fitted: dict[str, xr.DataTree]) -> xr.DataTree:
     return fitted[name]
 
 
-@pytest.mark.parametrize("plot", OF_DRAWS)
-@pytest.mark.parametrize("name", [each if name in DEAR else name for name, each in METHODS.items()])
+@each("plot", OF_DRAWS)
+@pytest.mark.parametrize("name", [m if name in DEAR else name for name, m in METHODS.items()])
 def test_arviz_draws_the_draws_of_every_method(name: str, plot: str, fitted) -> None:
     drawn = getattr(arviz_plots, plot)(result_of(name, fitted))
     assert drawn.viz["figure"].item().get_axes()
 
 
-@pytest.mark.parametrize("plot", OF_AN_ESTIMATE)
+@pytest.mark.thorough
+@each("plot", OF_AN_ESTIMATE)
 def test_arviz_draws_an_estimate(plot: str, fitted) -> None:
     assert getattr(arviz_plots, plot)(result_of("point", fitted))
 
@@ -97,8 +99,9 @@ def masked() -> xr.DataTree:
     return make_result(views=14, materials=("leaf", "fruit"), masked=(2, 5), limit=80.0)
 
 
-@pytest.mark.parametrize("plot", ["plot_ppc_pit", "plot_loo_pit", "plot_ppc_dist"])
-@pytest.mark.parametrize("name", ["dop", "intensity"])
+@pytest.mark.thorough
+@each("plot", ["plot_ppc_pit", "plot_loo_pit", "plot_ppc_dist"])
+@each("name", ["dop", "intensity"])
 def test_masked_readings_are_set_aside_for_arviz(masked, plot: str, name: str) -> None:
     stacked = pb.diagnostics.stack_readings(masked)
     assert getattr(arviz_plots, plot)(stacked, var_names=name)

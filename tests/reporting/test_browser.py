@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browsers import WIDTHS, browser, faults, open_page, printed
+from cases import each
 from pages import EVIL
 from selenium import webdriver
 from selenium.webdriver.common.by import By
@@ -60,8 +61,8 @@ def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: pb.report(make(), folder / name) for name, make in REPORTS.items()}
 
 
-@pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("name", REPORTS)
+@each("width", WIDTHS)
+@each("name", REPORTS)
 def test_a_report_opens_without_a_fault(driver, reports, name: str, width: int) -> None:
     open_page(driver, reports[name], width)
     assert faults(driver) == []
@@ -69,14 +70,16 @@ def test_a_report_opens_without_a_fault(driver, reports, name: str, width: int) 
     assert driver.execute_script("return document.images.length") > 0
 
 
-@pytest.mark.parametrize("name", [name for name in REPORTS if name != "evil"])
+@pytest.mark.thorough
+@each("name", [name for name in REPORTS if name != "evil"])
 def test_the_verdict_is_on_the_first_screen_of_a_phone(driver, reports, name: str) -> None:
     open_page(driver, reports[name], WIDTHS[0])
     place = driver.find_element(By.CSS_SELECTOR, "#verdict h2").rect["y"]
     assert place < 500
 
 
-@pytest.mark.parametrize("name", ["fit", "comparison"])
+@pytest.mark.thorough
+@each("name", ["fit", "comparison"])
 def test_a_table_scrolls_in_its_own_box(driver, reports, name: str) -> None:
     open_page(driver, reports[name], WIDTHS[0])
     boxes = driver.execute_script(
@@ -87,6 +90,7 @@ def test_a_table_scrolls_in_its_own_box(driver, reports, name: str) -> None:
     assert all("scroll" in kind and right <= WIDTHS[0] for kind, right in boxes)
 
 
+@pytest.mark.thorough
 def test_a_table_comes_down_as_a_file_without_network(driver, reports, tmp_path: Path) -> None:
     driver.execute_cdp_cmd(
         "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)}
@@ -104,7 +108,8 @@ def test_a_table_comes_down_as_a_file_without_network(driver, reports, tmp_path:
     assert [float(row["mean"]) for row in rows] == expected["mean"].tolist()  # every digit
 
 
-@pytest.mark.parametrize("name", ["fit", "comparison"])
+@pytest.mark.thorough
+@each("name", ["fit", "comparison"])
 def test_a_report_can_be_printed(driver, reports, name: str) -> None:
     open_page(driver, reports[name], WIDTHS[1])
     assert printed(driver).startswith(b"%PDF")
@@ -123,6 +128,7 @@ def test_a_report_can_be_printed(driver, reports, name: str) -> None:
     assert cut == 0
 
 
+@pytest.mark.thorough
 def test_a_fault_is_found(driver, tmp_path: Path) -> None:
     page = tmp_path / "bad.html"
     page.write_text(
@@ -135,6 +141,7 @@ def test_a_fault_is_found(driver, tmp_path: Path) -> None:
         assert words in found
 
 
+@pytest.mark.thorough
 def test_cards_run_nothing_in_a_notebook(driver, tmp_path: Path) -> None:
     page = tmp_path / "cards.html"
     cards = [pb.show(REPORTS["evil"]()), pb.setups.SETUPS["goniometer"].scene, pb.PRIORS]

@@ -66,6 +66,7 @@ def test_every_number_of_the_table_is_the_tree_s(page: Page, good: xr.DataTree) 
         assert f"{row['crps']:.3g}" in page.text
 
 
+@pytest.mark.thorough
 def test_readings_have_a_section_of_their_own(good: xr.DataTree) -> None:
     assert "Status of the fits" in Page(render(good)).text
     assert 'id="readings"' not in render(good)
@@ -81,6 +82,7 @@ def test_readings_have_a_section_of_their_own(good: xr.DataTree) -> None:
     assert any("Distribution of the ranks of readings" in x for x in page.values("alt"))
 
 
+@pytest.mark.thorough
 def test_failed_fits_are_counted_everywhere(page: Page) -> None:
     for said in (
         "3 of 400 fits: not converged.",
@@ -111,6 +113,7 @@ def test_every_figure_says_how_to_read_it(page: Page) -> None:
         assert said in page.text
 
 
+@pytest.mark.thorough
 def test_the_comparison_says_which_parameter_and_how(page: Page) -> None:
     assert "Of 3 parameters none fails by importance, 2 fail by laplace." in page.text
     assert "by laplace intervals are too narrow (p = 0.0001, 95% intervals hold" in page.text
@@ -118,6 +121,7 @@ def test_the_comparison_says_which_parameter_and_how(page: Page) -> None:
     assert "subsurface_fraction: " not in page.text
 
 
+@pytest.mark.thorough
 def test_many_parameters_stay_readable() -> None:
     names = tuple(f"parameter_{at}" for at in range(15))
     page = Page(render(make_calibration(names=names, count=60)))
@@ -127,6 +131,7 @@ def test_many_parameters_stay_readable() -> None:
     assert page.text.count("The same of parameter_12, parameter_13 and parameter_14.") == 4
 
 
+@pytest.mark.thorough
 def test_wavelengths_are_parameters_of_their_own() -> None:
     colors = (450.0, 650.0)
     page = Page(render(make_calibration(names=NAMES[:1], wavelengths=colors, count=60)))
@@ -134,6 +139,7 @@ def test_wavelengths_are_parameters_of_their_own() -> None:
     assert "2 parameters in 60 simulations" in page.text
 
 
+@pytest.mark.thorough
 def test_a_check_that_is_broken_on_purpose_says_so() -> None:
     page = Page(render(make_calibration(count=60, truth={"priors": "Uniform(0, 1)"})))
     assert "differs on purpose from what was fitted, in its priors" in page.text
@@ -158,11 +164,13 @@ def test_names_are_text_and_nothing_else(evil_page: str) -> None:
     assert "default-src 'none'" in evil_page
 
 
+@pytest.mark.thorough
 def test_every_table_scrolls_in_a_box_of_its_own(evil_page: str) -> None:
     tables = re.findall(r"<div class=\"scroll[^>]*>\s*<table id", evil_page)
     assert len(tables) == evil_page.count("<table") == 4
 
 
+@pytest.mark.thorough
 def test_a_calibration_without_an_answer_has_a_page() -> None:
     text = Page(render(make_calibration(count=30, failed=tuple(range(30))))).text
     assert "Not calibrated" in text
@@ -199,6 +207,7 @@ def test_arguments_that_do_not_apply_are_refused(tmp_path: Path, good: xr.DataTr
 # --- figures --------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_a_row_for_each_parameter(broken: xr.DataTree) -> None:
     figure = pb.plots.plot_calibration(broken)
     assert clipped(figure) == []
@@ -211,6 +220,7 @@ def test_a_row_for_each_parameter(broken: xr.DataTree) -> None:
         pb.plots.plot_calibration(xr.DataTree())
 
 
+@pytest.mark.thorough
 def test_positive_parameters_of_many_sizes_have_logarithmic_axes() -> None:
     tree = make_calibration(names=("concentration_scale",), count=60)
     for group, name in (("truth", "concentration_scale"), ("marginals", "concentration_scale")):
@@ -224,6 +234,7 @@ def test_positive_parameters_of_many_sizes_have_logarithmic_axes() -> None:
     assert not any("$" in label or "{" in label for label in labels)  # numbers, no formulas
 
 
+@pytest.mark.thorough
 def test_dots_mark_where_the_curve_leaves_its_band(broken: xr.DataTree) -> None:
     figure = pb.plots.plot_calibration(broken)
     marked = [any(line.get_marker() == "o" for line in axes.lines) for axes in figure.axes[::3]]

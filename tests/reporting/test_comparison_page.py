@@ -34,6 +34,7 @@ def test_the_verdict_names_the_better_fit_first(page: Page) -> None:
     assert page.text.index("predicts the readings best") < page.text.index("fit elpd difference")
 
 
+@pytest.mark.thorough
 def test_fits_that_cannot_be_told_apart_are_not_ranked() -> None:
     text = Page(render({"a": make_result(**SMALL), "b": worse(1e-3)})).text
     assert "The readings do not tell which of these fits predicts best." in text
@@ -47,6 +48,7 @@ def test_what_differs_is_listed_and_nothing_else(page: Page) -> None:
     assert "seed" not in rows
 
 
+@pytest.mark.thorough
 def test_intervals_that_do_not_overlap_are_named() -> None:
     moved = make_result(**SMALL)
     draws = moved["posterior"].to_dataset()["roughness"].to_numpy() + 5.0
@@ -62,6 +64,7 @@ def test_a_failed_fit_is_named_first() -> None:
     assert "b: No mode was reached." in text
 
 
+@pytest.mark.thorough
 def test_names_are_text_and_nothing_else() -> None:
     odd = edit_provenance(make_result(**SMALL), scene=EVIL, priors={EVIL: EVIL})
     page = Page(render({EVIL: odd, "b": make_result(**SMALL, method="point")}))
@@ -87,6 +90,7 @@ def test_the_command_compares_files(tmp_path: Path, capsys) -> None:
     assert (tmp_path / "both" / "index.html").exists()
 
 
+@pytest.mark.thorough
 def test_the_command_refuses_another_capture(tmp_path: Path, capsys) -> None:
     for name, seed in (("a", 0), ("b", 1)):
         pb.save(make_result(**SMALL, seed=seed), tmp_path / f"{name}.nc")
@@ -96,6 +100,7 @@ def test_the_command_refuses_another_capture(tmp_path: Path, capsys) -> None:
     assert not (tmp_path / "both").exists()
 
 
+@pytest.mark.thorough
 def test_a_picture_needs_numbers() -> None:
     empty = make_result(**SMALL)
     empty["posterior"] = empty["posterior"] * np.nan

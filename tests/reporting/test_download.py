@@ -6,6 +6,7 @@ import io
 import numpy as np
 import pandas as pd
 import pytest
+from cases import each
 from pages import Page
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import make_calibration
@@ -32,7 +33,7 @@ def test_numbers_keep_every_digit() -> None:
     assert found["parameter"].tolist() == ["r", "n"]
 
 
-@pytest.mark.parametrize("text", ["=1+2", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1"])
+@each("text", ["=1+2", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1"])
 def test_no_text_is_a_formula(text: str) -> None:
     table = pd.DataFrame({text: [text, "plain"]}, [text, "b"])
     data = base64.b64decode(csv_link(table, "name").partition(",")[2]).decode()
@@ -46,7 +47,8 @@ def test_a_row_of_two_names_has_two_columns() -> None:
     assert found["fit"].tolist() == ["'=a"]
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     "make",
     [
         lambda: make_result(**SMALL, discrepancy=True),

@@ -5,6 +5,7 @@ import functools
 import matplotlib
 import numpy as np
 import pytest
+from cases import each
 from clipping import clipped
 from matplotlib.figure import Figure
 from synthetic_results import edit_provenance, make_result, replace
@@ -39,7 +40,7 @@ def result_of(case: str):
     return make_result(**{"draws": 50, "views": 10, **CASES[case]})
 
 
-@pytest.mark.parametrize("case", CASES)
+@each("case", CASES)
 def test_readings_of_every_layout(case: str) -> None:
     result = result_of(case)
     for draw, name in ((plot_readings, "dop"), (plot_residuals, "intensity")):
@@ -48,7 +49,8 @@ def test_readings_of_every_layout(case: str) -> None:
         assert figure.legends[0].get_texts()
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     "draw",
     [
         plots_fit.plot_pairs,
@@ -57,7 +59,7 @@ def test_readings_of_every_layout(case: str) -> None:
         plots_fit.plot_pit,
     ],
 )
-@pytest.mark.parametrize(
+@each(
     "case",
     [
         "three wavelengths, four azimuths",
@@ -96,6 +98,7 @@ def test_saturated_masked_and_set_aside_views_are_marked() -> None:
     assert len(lines["x"]) == 1 + 4  # one masked, four beyond 78 degrees
 
 
+@pytest.mark.thorough
 def test_bands_hold_their_share_of_new_readings() -> None:
     curve = curves(make_result(wavelengths=(), draws=1000), "dop")[0]
     assert np.all(np.diff(curve.levels, axis=0) > 0.0)
@@ -105,6 +108,7 @@ def test_bands_hold_their_share_of_new_readings() -> None:
     np.testing.assert_allclose(moved.observed + curve.center, curve.observed)
 
 
+@pytest.mark.thorough
 def test_no_band_where_the_scatter_is_not_known() -> None:
     """A masked view has no stated error, so its predicted scatter means nothing."""
     result = make_result(wavelengths=(), limit=70.0, draws=100)
@@ -114,12 +118,13 @@ def test_no_band_where_the_scatter_is_not_known() -> None:
     assert axes.lines[0].get_xdata().max() > 80.0
 
 
+@pytest.mark.thorough
 def test_a_point_fit_has_a_curve_and_no_bands() -> None:
     figure = plot_readings(result_of("point"), "dop")
     assert not figure.axes[0].collections
 
 
-@pytest.mark.parametrize(
+@each(
     ("draw", "needed"),
     [
         (plots_fit.plot_pairs, "two material parameters with draws"),
@@ -133,6 +138,7 @@ def test_nothing_to_draw_is_an_error_of_one_line(draw, needed: str) -> None:
         draw(result_of("point"))
 
 
+@pytest.mark.thorough
 def test_parameters_that_do_not_move_are_left_out() -> None:
     result = make_result(draws=100, discrepancy=True)
     result = replace(result, "posterior", "roughness", np.full((4, 100), 0.2))
@@ -144,6 +150,7 @@ def test_parameters_that_do_not_move_are_left_out() -> None:
     assert clipped(plots_fit.plot_pairs(result)) == []
 
 
+@pytest.mark.thorough
 def test_figures_need_no_provenance() -> None:
     result = edit_provenance(make_result(draws=100, wavelengths=()))
     result.attrs.clear()

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from cases import each
 from pages import EVIL, Page
 from synthetic_results import edit_provenance, make_result, replace
 
@@ -31,6 +32,7 @@ def small() -> tuple[xr.DataTree, Page]:
     return result, Page(render(result))
 
 
+@pytest.mark.thorough
 def test_a_method_of_ones_own_has_its_own_name(small) -> None:
     result = edit_provenance(make_result(**SMALL, method="laplace"), method="my <b>own</b>")
     page = Page(render(result))
@@ -73,7 +75,8 @@ def test_every_section_of_a_sampled_fit(small) -> None:
         assert words in small[1].text
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     ("method", "absent", "present"),
     [
         ("laplace", ["R-hat"], ["Approximation", "Pareto k-hat", "What the prior said"]),
@@ -100,7 +103,8 @@ def test_a_failed_fit_says_so_first_and_claims_nothing_about_the_material() -> N
     assert "The data determine" not in text
 
 
-@pytest.mark.parametrize("method", ["nuts", "laplace"])
+@pytest.mark.thorough
+@each("method", ["nuts", "laplace"])
 def test_a_fit_without_a_single_finite_draw_still_has_a_page(method: str) -> None:
     result = make_result(**SMALL, method=method)
     for group in ("posterior", "posterior_predictive", "noise_free", "log_likelihood"):
@@ -139,6 +143,7 @@ def test_the_fit_without_discrepancy_is_called_overconfident(page: Page) -> None
     assert "Do not quote the numbers without the discrepancy term" in page.text
 
 
+@pytest.mark.thorough
 def test_it_is_not_called_narrower_where_it_is_not() -> None:
     result = make_result(**SMALL, discrepancy=True)
     plain = result["without_discrepancy"].to_dataset()
@@ -158,6 +163,7 @@ def test_it_is_not_called_narrower_where_it_is_not() -> None:
     assert said[3] == "Do not quote the numbers without the discrepancy term."
 
 
+@pytest.mark.thorough
 def test_a_comparison_that_failed_is_told() -> None:
     failed = {"without_discrepancy": "Fit: no mode was found; add views"}
     result = edit_provenance(make_result(**SMALL), comparisons_failed=failed)
@@ -172,6 +178,7 @@ def test_it_says_whether_intervals_can_be_trusted(small) -> None:
     assert "Trust the intervals with care" in scattered
 
 
+@pytest.mark.thorough
 def test_no_comparison_without_one(small) -> None:
     assert "Without the discrepancy" not in small[1].text
     assert "trusting the instrument" not in small[1].text
@@ -190,6 +197,7 @@ def test_the_folder_holds_page_and_result_and_nothing_else(tmp_path: Path) -> No
     assert render(read) == (folder / "index.html").read_text()
 
 
+@pytest.mark.thorough
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     for place in (tmp_path / "file", tmp_path / "file" / "below"):
@@ -199,13 +207,14 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
         assert str(place) in str(error.value)
 
 
-@pytest.mark.parametrize("wrong", [None, xr.DataTree(), "fit.nc"])
+@each("wrong", [None, xr.DataTree(), "fit.nc"])
 def test_what_is_no_result_leaves_no_folder(tmp_path: Path, wrong: object) -> None:
     with pytest.raises(FitError, match="it holds no fit"):
         report(wrong, tmp_path / "report")
     assert not (tmp_path / "report").exists()
 
 
+@pytest.mark.thorough
 def test_two_readings() -> None:
     assert "Predictive checks" in Page(render(make_result(**{**SMALL, "views": 2}))).text
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from synthetic_maps import make_maps
 from synthetic_results import make_result
 
@@ -78,6 +79,7 @@ def test_tables_count_pixels_by_status_and_approach(page: str) -> None:
     assert "laplace the normal approximation as it is 2 1.0% 0" in text
 
 
+@pytest.mark.thorough
 def test_parameters_are_described_over_the_good_pixels(page: str) -> None:
     # Good are the first 160 of 200 values from 0.2 to 0.4; the width of 95% is 0.95.
     assert "subsurface_fraction 0.28 0.21 0.35 0.29 0.95" in text_of(page)
@@ -104,6 +106,7 @@ def test_coverage_stands_beside_that_of_a_map_that_was_not_corrected(page: str) 
     assert "concentration_scale 95%" not in text
 
 
+@pytest.mark.thorough
 def test_without_a_truth_nothing_is_said_of_coverage() -> None:
     page = render(mixed())
     assert 'id="coverage"' not in page
@@ -111,6 +114,7 @@ def test_without_a_truth_nothing_is_said_of_coverage() -> None:
     assert "Map report: map" in page
 
 
+@pytest.mark.thorough
 def test_what_is_named_like_markup_is_text() -> None:
     page = render(
         mixed(scene=EVIL, model=EVIL, priors={EVIL: EVIL}, settings={EVIL: EVIL}), truth=truth(EVIL)
@@ -120,6 +124,7 @@ def test_what_is_named_like_markup_is_text() -> None:
     assert "default-src 'none'" in page
 
 
+@pytest.mark.thorough
 def test_every_parameter_is_drawn_four_at_a_time_and_a_few_wavelengths() -> None:
     colors = (400.0, 500.0, 600.0, 700.0)
     names = ("refractive_index", "roughness", "subsurface_fraction", "angle_zero", "dark_level")
@@ -138,6 +143,7 @@ def test_every_parameter_is_drawn_four_at_a_time_and_a_few_wavelengths() -> None
     assert all(b"<svg" in base64.b64decode(source) for source, _ in pictures)
 
 
+@pytest.mark.thorough
 def test_a_map_that_was_not_checked_says_so_and_an_empty_one_fails() -> None:
     unchecked = text_of(render(mixed(weighted=False)))
     assert "The approximation was taken as it is (weighted=False)" in unchecked
@@ -151,8 +157,9 @@ def test_a_map_that_was_not_checked_says_so_and_an_empty_one_fails() -> None:
         assert not re.search(r"\bnan\b", text_of(page))
 
 
-@pytest.mark.parametrize("name", ["roughness", "roughness_sd", "concentration_scale_quantile"])
-@pytest.mark.parametrize("number", [np.nan, np.inf])
+@pytest.mark.thorough
+@each("name", ["roughness", "roughness_sd", "concentration_scale_quantile"])
+@each("number", [np.nan, np.inf])
 def test_a_pixel_that_is_called_good_without_numbers_is_not(name: str, number: float) -> None:
     maps = make_maps(MEANS)
     assert map_headline(count_cases(maps))[0].startswith("Every pixel")
@@ -173,6 +180,7 @@ def test_a_pixel_that_is_called_good_without_numbers_is_not(name: str, number: f
     assert "Every pixel" not in page
 
 
+@pytest.mark.thorough
 def test_a_status_without_a_meaning_is_refused() -> None:
     maps = make_maps(MEANS)
     maps["status"][1, 1] = 77
@@ -180,6 +188,7 @@ def test_a_status_without_a_meaning_is_refused() -> None:
         pb.show(maps)
 
 
+@pytest.mark.thorough
 def test_shares_are_never_rounded_to_all_or_nothing() -> None:
     assert count_percent(99_999, 100_000) == "above 99.9%"
     assert count_percent(9_960, 10_000) == "above 99.5%"

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from clipping import clipped
 
 import polar_bayes as pb
@@ -31,7 +32,7 @@ def maps(rows: int = 20, columns: int = 30, wavelengths: tuple[float, ...] = ())
     return xr.Dataset(found, coords=coords)
 
 
-@pytest.mark.parametrize("wavelengths", [(), (450.0, 650.0)])
+@each("wavelengths", [(), (450.0, 650.0)])
 def test_every_parameter_has_its_mean_and_its_width(wavelengths: tuple[float, ...]) -> None:
     figure = pb.plots.plot_maps(maps(wavelengths=wavelengths))
     assert clipped(figure) == []
@@ -41,6 +42,7 @@ def test_every_parameter_has_its_mean_and_its_width(wavelengths: tuple[float, ..
     assert ("absorption a, 450 nm" in titles) == bool(wavelengths)
 
 
+@pytest.mark.thorough
 def test_a_pixel_without_numbers_is_not_drawn_as_good() -> None:
     image = maps()
     image["status"][:] = 0
@@ -52,6 +54,7 @@ def test_a_pixel_without_numbers_is_not_drawn_as_good() -> None:
     assert drawn[0, 0] == drawn[3, 4] == 5
 
 
+@pytest.mark.thorough
 def test_a_large_image_is_drawn_smaller() -> None:
     figure = pb.plots.plot_maps(maps(1700, 10))
     assert max(image.get_array().shape[0] for axes in figure.axes for image in axes.images) <= 800

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from clipping import clipped
 from synthetic_results import edit_provenance, make_result, pool
 
@@ -24,7 +25,8 @@ def pooled(count, *parameters, names=None, **settings):
     return pool(make_result(materials=materials, **chosen), *(parameters or ("refractive_index",)))
 
 
-@pytest.mark.parametrize("count", [2, 12, 35, 75])
+@pytest.mark.thorough
+@each("count", [2, 12, 35, 75])
 def test_members_of_every_number_are_drawn(count: int) -> None:
     figure = plot_shrinkage(pooled(count, views=4), "refractive_index")
     assert clipped(figure) == []
@@ -46,6 +48,7 @@ def test_members_stand_in_order_of_their_estimates() -> None:
     assert [text.get_text() for text in axes.get_yticklabels()] == names
 
 
+@pytest.mark.thorough
 def test_a_member_that_says_nothing_alone_is_drawn_as_such() -> None:
     result = pooled(4)
     posterior = result["posterior"].to_dataset()
@@ -60,6 +63,7 @@ def test_a_member_that_says_nothing_alone_is_drawn_as_such() -> None:
     assert "alone it says nothing" in said
 
 
+@pytest.mark.thorough
 def test_a_wide_population_of_a_positive_parameter_has_a_log_axis() -> None:
     result = pooled(6, "roughness")
     posterior = result["posterior"].to_dataset()
@@ -96,6 +100,7 @@ def test_the_page_has_a_section_on_populations(page: str) -> None:
     assert "Every member in numbers" in page
 
 
+@pytest.mark.thorough
 def test_populations_are_not_listed_as_instrument(page: str) -> None:
     # Of the parameter table: the material first, then what members share, then the instrument.
     part = page[page.index('id="parameter-table"') :]
@@ -105,11 +110,13 @@ def test_populations_are_not_listed_as_instrument(page: str) -> None:
     assert between < part.index("refractive_index_spread") < instrument < part.index("exposure")
 
 
+@pytest.mark.thorough
 def test_long_tables_scroll_and_say_so(page: str) -> None:
     assert 'class="scroll tall"' in page
     assert "53 rows: the table scrolls." in page
 
 
+@pytest.mark.thorough
 def test_no_section_where_nothing_is_pooled() -> None:
     for result in (
         make_result(wavelengths=(), views=8, draws=60),
@@ -121,6 +128,7 @@ def test_no_section_where_nothing_is_pooled() -> None:
         assert 'class="scroll tall"' not in text
 
 
+@pytest.mark.thorough
 def test_names_of_members_are_text() -> None:
     text = render(pooled(2, names=(EVIL, "a" * 300), views=4))
     assert 'id="population"' in text
@@ -128,6 +136,7 @@ def test_names_of_members_are_text() -> None:
     assert "<img src=x" not in text
 
 
+@pytest.mark.thorough
 def test_a_failed_fit_claims_nothing_about_its_population() -> None:
     text = render(edit_provenance(pooled(3), problems=["the mode is not settled"]))
     assert 'id="population-table"' in text
@@ -135,6 +144,7 @@ def test_a_failed_fit_claims_nothing_about_its_population() -> None:
     assert "pooling factor in brackets" not in text
 
 
+@pytest.mark.thorough
 def test_draws_that_are_not_finite_leave_a_page() -> None:
     result = pooled(3)
     posterior = result["posterior"].to_dataset()
@@ -145,6 +155,7 @@ def test_draws_that_are_not_finite_leave_a_page() -> None:
     assert "Shrinkage of" not in text
 
 
+@pytest.mark.thorough
 def test_sentences_of_many_colors_name_the_first_and_the_last() -> None:
     result = pooled(3, wavelengths=(450.0, 550.0, 650.0))
     found, table = populations(result), population_summary(result)
@@ -158,6 +169,7 @@ def test_sentences_of_many_colors_name_the_first_and_the_last() -> None:
     assert decided.count("refractive index, ") == 3
 
 
+@pytest.mark.thorough
 def test_tables_have_a_cell_for_every_head() -> None:
     result = pooled(3, "roughness", "refractive_index")
     found = populations(result)
@@ -171,7 +183,7 @@ def test_tables_have_a_cell_for_every_head() -> None:
 # --- what was swapped -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("swapped", "said"),
     [
         ([], "Nothing was swapped: all parts and priors are as shipped."),
@@ -191,6 +203,7 @@ def test_what_was_swapped_is_a_sentence(swapped, said) -> None:
     assert swapped_sentence({"swapped": swapped}) == said
 
 
+@pytest.mark.thorough
 def test_nothing_is_said_of_a_result_that_does_not_tell() -> None:
     assert swapped_sentence({}) == ""
 

@@ -1,45 +1,22 @@
 """A result at a glance: the report's words, and the tree stays what it is."""
 
-import numpy as np
 import pytest
 from pages import EVIL, Page
-from synthetic_accuracy import make_accuracy
-from synthetic_calibrations import make_calibration
-from synthetic_maps import make_maps
 from synthetic_results import make_result, replace
 
 import polar_bayes as pb
 from polar_bayes.errors import FitError
 
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
-RESULTS = {
-    "nuts": lambda: make_result(**SMALL),
-    "laplace": lambda: make_result(**SMALL, method="laplace"),
-    "point": lambda: make_result(**SMALL, method="point"),
-    "calibration": make_calibration,
-    "study": make_accuracy,
-    "maps": lambda: make_maps({"roughness": np.linspace(0.0, 1.0, 12).reshape(3, 4)}),
-}
-
-
-@pytest.mark.parametrize("make", RESULTS.values(), ids=RESULTS)
-def test_every_result_has_a_card(make) -> None:
-    result = make()
-    before = result.copy(deep=True)
-    card = pb.show(result)
-    page = Page(card._repr_html_())
-    assert page.open == []
-    assert page.tags.count("table") == 1
-    assert repr(card).splitlines()[0] in page.text
-    assert result.identical(before)
 
 
 def test_the_verdict_comes_before_the_numbers() -> None:
-    text = repr(pb.show(RESULTS["nuts"]()))
+    text = repr(pb.show(make_result(**SMALL)))
     assert text.startswith("leaf: fit\nThe fit converged.\nThe data determine")
     assert "refractive_index" in text.partition("parameter")[2]
 
 
+@pytest.mark.thorough
 def test_a_failed_fit_says_so_and_claims_nothing() -> None:
     result = make_result(**SMALL)
     draws = result["posterior"].to_dataset()["roughness"].to_numpy().copy()
@@ -56,6 +33,7 @@ def test_names_run_nothing() -> None:
     assert not {"script", "img"} & set(page.tags)
 
 
+@pytest.mark.thorough
 def test_a_long_table_is_cut_and_says_so() -> None:
     result = make_result(**{**SMALL, "views": 4}, materials=tuple(map(str, range(30))))
     assert "The first 40 of 121 rows." in repr(pb.show(result))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from clipping import clipped
 from synthetic_results import edit_provenance, make_result, replace
 
@@ -62,9 +63,8 @@ def test_a_law_of_dispersion_has_bands_between_and_beyond_the_colors() -> None:
         assert clipped(plot_spectrum(result, name, found)) == []
 
 
-@pytest.mark.parametrize(
-    "scene", ["Scene(dispersion=<function law at 0x7f>)", "Scene(dispersion=Mine(a=1))"]
-)
+@pytest.mark.thorough
+@each("scene", ["Scene(dispersion=<function law at 0x7f>)", "Scene(dispersion=Mine(a=1))"])
 def test_a_law_that_cannot_be_read_leaves_intervals(scene: str) -> None:
     assert spectra(with_law(scene))["refractive_index"][0].between.size == 0
 
@@ -99,6 +99,7 @@ def test_a_process_is_drawn_from_its_prediction(monkeypatch) -> None:
     assert len({axes.get_ylim() for axes in figure.axes}) == 1
 
 
+@pytest.mark.thorough
 def test_a_fit_that_cannot_be_predicted_has_intervals(monkeypatch) -> None:
     def predict(tree, wavelengths):
         raise FitError("the fit's kernel has no name", where="x", hint="y")
@@ -107,7 +108,8 @@ def test_a_fit_that_cannot_be_predicted_has_intervals(monkeypatch) -> None:
     assert spectra(make_result(**SMALL))["absorption"][0].between.size == 0
 
 
-@pytest.mark.parametrize(
+@pytest.mark.thorough
+@each(
     "settings",
     [{"wavelengths": ()}, {"wavelengths": (550.0,)}, {"method": "point"}],
     ids=["no wavelength", "one wavelength", "point fit"],
@@ -122,6 +124,7 @@ def test_no_spectrum_where_there_is_none(settings) -> None:
         plot_spectrum(result, "absorption")
 
 
+@pytest.mark.thorough
 def test_draws_that_are_not_finite_are_not_drawn() -> None:
     result = make_result(**SMALL)
     draws = result["posterior"]["absorption"].to_numpy().copy()

@@ -6,6 +6,7 @@ import matplotlib
 import matplotlib.style
 import numpy as np
 import pytest
+from cases import each
 from matplotlib import rcParams
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -44,11 +45,11 @@ def pooled():
     return pool(make_result(**SMALL, materials=("leaf", "fruit", "stone")), "roughness")
 
 
-every_plot = pytest.mark.parametrize("draw", DRAWN.values(), ids=DRAWN)
+every_plot = each("draw", DRAWN.values(), ids=DRAWN)
 
 
 def test_every_public_plot_is_tested_here() -> None:
-    assert set(DRAWN) == {name for name in pb.__all__ if name.startswith("plot_")}
+    assert set(DRAWN) == {name for name in pb.plots.__all__ if name.startswith("plot_")}
 
 
 @every_plot
@@ -72,6 +73,7 @@ def test_it_takes_the_style_that_is_chosen(draw) -> None:
     assert {to_hex(text.get_color()) for text in labels if text.get_text()} <= {"#ffffff"}
 
 
+@pytest.mark.thorough
 def test_single_settings_are_taken_too() -> None:
     with matplotlib.rc_context({"xtick.labelsize": 5.0, "axes.grid": True}):
         axes = DRAWN["plot_readings"]().axes[0]
@@ -79,6 +81,7 @@ def test_single_settings_are_taken_too() -> None:
     assert axes.get_xgridlines()[0].get_visible()
 
 
+@pytest.mark.thorough
 def test_a_style_of_arviz_is_taken() -> None:
     with matplotlib.style.context("arviz-variat"):
         figure = DRAWN["plot_pairs"]()
@@ -87,12 +90,14 @@ def test_a_style_of_arviz_is_taken() -> None:
     assert figure._repr_png_()
 
 
+@pytest.mark.thorough
 def test_names_stay_text_in_every_style() -> None:
     result = make_result(**SMALL, materials=("$x_{", "b"))
     with matplotlib.rc_context({"text.parse_math": True}):
         assert pb.plots.plot_readings(result, "dop")._repr_png_()
 
 
+@pytest.mark.thorough
 def test_a_report_is_the_same_in_every_style(tmp_path) -> None:
     result = make_result(**SMALL, method="point")
     with matplotlib.style.context("dark_background"):

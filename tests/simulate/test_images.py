@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.stats
 import xarray as xr
+from cases import each
 
 import polar_bayes as pb
 from polar_bayes.capture.schema import validate
@@ -42,7 +43,7 @@ def compiled_in_haste() -> Iterator[None]:
 # --- dims and truth -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("parameters", "noise"),
     [
         ({"refractive_index": INDEX}, {}),
@@ -51,7 +52,7 @@ def compiled_in_haste() -> Iterator[None]:
         ({"subsurface_fraction": FRACTION}, {"concentration_scale": 200.0 * LIGHT}),
     ],
 )
-@pytest.mark.parametrize("protocol", [GRAY, COLORED])
+@each("protocol", [GRAY, COLORED])
 def test_one_value_of_that_shape_makes_an_image(protocol, parameters, noise):
     capture = simulate("glass", scene=PLATE, protocol=protocol, parameters=parameters, noise=noise)
     xr.testing.assert_identical(validate(capture), capture)
@@ -72,6 +73,7 @@ def test_one_value_of_that_shape_makes_an_image(protocol, parameters, noise):
             assert truth.dims == ()
 
 
+@pytest.mark.thorough
 def test_stated_errors_are_there_for_every_pixel():
     links = {"q": StokesLink(stated_errors=True)}
     capture = simulate(
@@ -94,9 +96,8 @@ TERMS = {
 }
 
 
-@pytest.mark.parametrize(
-    "setup", ["paper", pytest.param("camera", marks=pytest.mark.thorough), "goniometer"]
-)
+@pytest.mark.thorough
+@each("setup", TERMS)
 def test_a_pixel_is_predicted_from_its_own_truth(setup):
     scene = SETUPS[setup].scene
     weights = {"discrepancy_weights": np.array([1.0, -1.0, 0.5, 0.2])}
@@ -143,6 +144,7 @@ class Repeated(Protocol):
         return {name: np.tile(angle, self.views // 5) for name, angle in GRAY.angles().items()}
 
 
+@pytest.mark.thorough
 def test_a_pixel_scatters_like_a_capture_of_its_truth():
     given = {"scene": PLATE, "links": LINKS, "noise": {"exposure": 0.7}}
     truth = {"refractive_index": columns(1.35, 1.65)}
@@ -178,6 +180,7 @@ def test_one_exposure_serves_the_whole_image():
     np.testing.assert_allclose(ratio.min(), ratio.max(), rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_shadow_is_noisier_in_dop():
     noise = {"exposure": columns(1.0, 0.02), "concentration_scale": 3000.0}
     capture = simulate("glass", scene=PLATE, links=LINKS, protocol=GRAY, noise=noise, seed=4)
@@ -197,6 +200,7 @@ def test_a_highlight_is_saturated_and_said_to_be():
     assert int(capture["saturated"].sum()) == capture["saturated"][1, 2].size
 
 
+@pytest.mark.thorough
 def test_noise_may_differ_from_pixel_to_pixel():
     given = {"scene": PLATE, "links": {"q": NormalLink()}, "protocol": GRAY}
     scales = (0.005, 0.02)  # none reaches the ends of q
@@ -224,7 +228,7 @@ HOLED = INDEX.copy()
 HOLED[1, 2] = np.nan
 
 
-@pytest.mark.parametrize(
+@each(
     ("parameters", "noise", "message"),
     [
         (
@@ -281,17 +285,20 @@ def test_what_is_no_image_is_told_in_one_line(parameters, noise, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.thorough
 def test_without_color_no_wavelength_is_spoken_of():
     with pytest.raises(CaptureError, match=r"give one number, or an image \(y, x\)$"):
         simulate("leaf", scene=PLATE, protocol=GRAY, parameters={"refractive_index": [1.4, 1.5]})
 
 
+@pytest.mark.thorough
 def test_weights_of_a_basis_are_the_same_for_all_pixels():
     weights = np.zeros((ROWS, COLUMNS))
     with pytest.raises(CaptureError, match=r"its shape is \(2, 4\); give one number for each"):
         simulate("leaf", scene="goniometer", parameters={"discrepancy_weights": weights})
 
 
+@pytest.mark.thorough
 def test_noise_that_no_link_reads_is_refused_as_an_image_too():
     with pytest.raises(FitError, match="no link reads normal_scale"):
         simulate(

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import CaptureError
 from polar_bayes.priors import PRIORS, RANGES
 from polar_bayes.simulation import PRESETS, REFERENCE_WAVELENGTHS, Material, find_preset
 
-EVERY_PRESET = pytest.mark.parametrize("name", PRESETS)
+EVERY_PRESET = each("name", PRESETS)
 
 
 @EVERY_PRESET
@@ -19,6 +20,7 @@ def test_a_preset_is_found_by_its_name_and_inside_every_range(name):
         assert np.all((value > low) & (value < high))
 
 
+@pytest.mark.thorough
 @EVERY_PRESET
 def test_the_prior_does_not_rule_a_preset_out(name):
     # Within the middle 99.8% of the prior: a simulated capture must not be a surprise to a fit.
@@ -39,12 +41,14 @@ def test_water_and_glass_have_the_published_index_in_the_green():
         assert PRESETS[name].refractive_index[1] == pytest.approx(index, abs=0.002)
 
 
+@pytest.mark.thorough
 def test_a_leaf_absorbs_blue_and_red_and_a_fruit_leaves_red():
     blue, green, red = PRESETS["leaf"].absorption
     assert green < min(blue, red)
     assert np.all(np.diff(PRESETS["fruit"].absorption) < 0.0)
 
 
+@pytest.mark.thorough
 def test_colors_between_the_reference_wavelengths_are_interpolated_and_the_ends_continue():
     material = Material(0.1, 0.2, (1.0, 2.0, 4.0), (1.5, 1.4, 1.3))
     values = material.at(np.array([400.0, 500.0, 600.0, 900.0]))
@@ -53,7 +57,7 @@ def test_colors_between_the_reference_wavelengths_are_interpolated_and_the_ends_
     assert values["roughness"].shape == values["subsurface_fraction"].shape == ()
 
 
-@pytest.mark.parametrize("name", ["leave", "", 3, None, ["leaf"]])
+@each("name", ["leave", "", 3, None, ["leaf"]])
 def test_an_unknown_name_is_answered_with_the_known_ones(name):
     with pytest.raises(CaptureError) as caught:
         find_preset(name)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import each
 
 from polar_bayes.errors import CaptureError
 from polar_bayes.simulation import Protocol
@@ -29,18 +30,20 @@ def test_every_azimuth_sees_the_whole_range():
         assert seen.max() > 75.0
 
 
+@pytest.mark.thorough
 def test_the_light_stands_still():
     angles = Protocol(views=3, light_zenith=30.0).angles()
     np.testing.assert_array_equal(angles["light_zenith"], np.full(3, 30.0))
     np.testing.assert_array_equal(angles["light_azimuth"], np.zeros(3))
 
 
+@pytest.mark.thorough
 def test_more_azimuths_than_views_are_not_all_used():
     angles = Protocol(views=2, azimuths=(180.0, 90.0, 0.0)).angles()
     np.testing.assert_array_equal(angles["view_azimuth"], [180.0, 90.0])
 
 
-@pytest.mark.parametrize(
+@each(
     ("field", "value"),
     [
         ("views", 1),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.stats
 import xarray as xr
+from cases import each
 from numpyro import distributions as dist
 
 from polar_bayes.capture.schema import validate
@@ -37,7 +38,7 @@ default_capture = functools.cache(simulate)
 # --- every material, every set-up -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@each("setup", SETUPS)
 def test_every_preset_in_every_setup_is_a_valid_capture(setup):
     for name in PRESETS:
         capture = simulate(name, scene=setup, seed=2)
@@ -57,6 +58,7 @@ def test_the_default_capture_follows_the_papers_protocol():
     np.testing.assert_array_equal(capture["wavelength"], [450.0, 550.0, 650.0])
 
 
+@pytest.mark.thorough
 def test_without_wavelengths_there_is_no_color():
     capture = simulate("glass", scene=PLATE, protocol=MANY)
     assert dict(capture.sizes) == {"view": 3000}
@@ -64,6 +66,7 @@ def test_without_wavelengths_there_is_no_color():
     assert float(capture["true_refractive_index"]) == PRESETS["glass"].refractive_index[1]
 
 
+@pytest.mark.thorough
 def test_stated_errors_come_with_the_links_that_read_them():
     capture = simulate("glass", scene="goniometer")
     np.testing.assert_array_equal(capture["q_error"], np.full((40, 3), STATED_ERROR))
@@ -97,7 +100,7 @@ def test_a_capture_does_not_depend_on_the_precision_of_the_caller():
 # --- the sensor -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["leaf", "glass"])
+@each("name", ["leaf", "glass"])
 def test_saturated_means_at_full_scale_and_nothing_else(name):
     capture = simulate(name, seed=3)
     full_scale = capture["intensity"].attrs["saturation_level"]
@@ -112,6 +115,7 @@ def test_the_bright_views_come_to_60_percent_of_full_scale():
     assert float(default_capture()["intensity"].quantile(0.9)) == pytest.approx(0.6, rel=0.05)
 
 
+@pytest.mark.thorough
 def test_a_stated_exposure_is_kept():
     arguments = {"scene": PLATE, "protocol": MANY, "links": {"intensity": StudentTLink()}}
     bright, dark = (
@@ -123,7 +127,8 @@ def test_a_stated_exposure_is_kept():
     np.testing.assert_allclose(bright["intensity"] / dark["intensity"], 2.0, rtol=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.thorough
+@each("seed", range(3))
 def test_strong_noise_stays_possible(seed):
     stokes = simulate("leaf", scene="camera", noise={"stokes_scale": 0.5}, seed=seed)
     assert float((stokes["q"] ** 2 + stokes["u"] ** 2).max()) <= 1.0 + 1e-15
@@ -145,6 +150,7 @@ def test_the_truth_of_the_preset_rides_along():
     assert capture["true_absorption"].dims == ("wavelength",)
 
 
+@pytest.mark.thorough
 def test_replaced_parameters_and_a_material_of_ones_own_ride_along_too():
     scene = Scene(SmoothSurface(), Unpolarized(), StokesMixing(), None, Instrument((DolpGain(),)))
     material = Material(0.1, 0.2, (0.3, 0.3, 0.3), (1.5, 1.5, 1.5))
@@ -157,6 +163,7 @@ def test_replaced_parameters_and_a_material_of_ones_own_ride_along_too():
     assert capture.attrs["name"] == "simulated"
 
 
+@pytest.mark.thorough
 def test_the_truth_of_an_angle_is_in_degrees():
     capture = simulate("glass", scene="goniometer")
     assert capture["true_angle_zero"].attrs["units"] == "degree"
@@ -193,6 +200,7 @@ def test_simulated_dop_scatters_as_the_beta_link_says():
     uniform(scipy.stats.beta.cdf(data.readings["dop"], first, second))
 
 
+@pytest.mark.thorough
 def test_simulated_intensity_scatters_as_the_student_t_link_says():
     link = StudentTLink()
     links, noise = {"intensity": link}, {"exposure": 1.0}
@@ -206,13 +214,15 @@ def test_simulated_intensity_scatters_as_the_student_t_link_says():
     uniform(share)
 
 
-@pytest.mark.parametrize("link", [StokesLink(), StokesLink(4.0, stated_errors=True), NormalLink()])
+@pytest.mark.thorough
+@each("link", [StokesLink(), StokesLink(4.0, stated_errors=True), NormalLink()])
 def test_simulated_stokes_parameters_scatter_as_their_link_says(link):
     capture = simulate("glass", scene=PLATE, links={"q": link}, protocol=MANY, seed=14)
     data, found = at_the_truth(capture, PLATE, link, "q")
     uniform(np.asarray(found.cdf(data.readings["q"])))
 
 
+@pytest.mark.thorough
 def test_simulated_dop_scatters_as_the_logit_normal_link_says():
     link = LogitNormalLink()
     capture = simulate("glass", scene=PLATE, links={"dop": link}, protocol=MANY, seed=15)
@@ -237,7 +247,7 @@ class OwnLink(AbstractLink):
         return dist.Normal(prediction[name], noise["own_scale"])
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "kind", "message"),
     [
         ({"preset": "leave"}, CaptureError, "^preset='leave': no such material; give one of leaf"),

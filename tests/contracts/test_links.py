@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from numpyro import distributions as dist
 from numpyro.infer.util import log_density
 from polar_bayes.models.per_material import per_material
 from synthetic_observations import make_observations
 
 from polar_bayes.errors import FitError
+from polar_bayes.observation import links
 from polar_bayes.observation.data import observe
 from polar_bayes.observation.links import (
     AbstractLink,
@@ -41,7 +43,7 @@ LINKS = [
     ("q", StokesLink(stated_errors=True)),
     ("intensity", StudentTLink()),
 ]
-EVERY_LINK = pytest.mark.parametrize(("name", "link"), LINKS, ids=lambda part: repr(part)[:60])
+EVERY_LINK = each(("name", "link"), LINKS, ids=lambda part: repr(part)[:60])
 
 ZENITHS = (0.0, 30.0, 55.0, 85.0)
 LEADING = (("wavelength", 3),)
@@ -83,7 +85,7 @@ def test_a_draw_has_one_finite_reading_per_view(name, link):
 
 
 @EVERY_LINK
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@each("dtype", [np.float64, np.float32])
 def test_density_and_gradient_are_finite_and_compiling_changes_nothing(name, link, dtype):
     data, reading = make_data(dtype), draw(name, link)[0].astype(dtype)
 
@@ -106,6 +108,7 @@ def test_density_and_gradient_are_finite_and_compiling_changes_nothing(name, lin
         np.testing.assert_allclose(total(*arguments)[1], density, rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.thorough
 @EVERY_LINK
 def test_draws_scatter_around_the_center(name, link):
     center = link.center(name, make_prediction(), make_noise(link))
@@ -128,11 +131,12 @@ def test_a_link_is_a_constant_of_a_compiled_program(name, link):
     twin = dataclasses.replace(link)
     assert link == twin
     assert hash(link) == hash(twin)
-    assert eval(repr(link)) == link  # what a report prints can be typed back in
+    assert eval(repr(link), vars(links)) == link  # what a report prints can be typed back in
     with pytest.raises(dataclasses.FrozenInstanceError):
         link.margin = 0.5
 
 
+@pytest.mark.thorough
 @EVERY_LINK
 def test_brightness_and_angle_of_one_view_do_not_reach_another(name, link):
     prediction, noise, reading = make_prediction(), make_noise(link), draw(name, link)[0]
@@ -185,8 +189,9 @@ def test_trust_of_one_view_is_its_precision(name, link):
         )
 
 
+@pytest.mark.thorough
 @EVERY_LINK
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@each("dtype", [np.float64, np.float32])
 def test_density_and_slopes_stay_finite_down_to_no_trust_at_all(name, link, dtype):
     data = trusting(make_data(dtype), TRUST.astype(dtype))
     reading = draw(name, link)[0].astype(dtype)
@@ -201,7 +206,7 @@ def test_density_and_slopes_stay_finite_down_to_no_trust_at_all(name, link, dtyp
         assert np.all(np.isfinite(slope))
 
 
-@pytest.mark.parametrize("link", [BetaLink(margin=1e-3), LogitNormalLink(margin=1e-3)])
+@each("link", [BetaLink(margin=1e-3), LogitNormalLink(margin=1e-3)])
 def test_readings_at_0_and_1_come_to_the_margin_and_others_stay(link):
     given = jnp.array([0.0, 1e-4, 0.3, 1.0 - 1e-4, 1.0])
     np.testing.assert_allclose(link.reading(given), [1e-3, 1e-3, 0.3, 0.999, 0.999], rtol=1e-15)
@@ -236,7 +241,7 @@ def test_only_the_link_of_stated_errors_reads_them():
     ]
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "message"),
     [
         (lambda: BetaLink(margin=0.0), "^BetaLink: margin is 0.0; give a number from 1e-6"),
@@ -280,6 +285,7 @@ class LaplaceLink(AbstractLink):
         return dist.Laplace(prediction[name], noise["laplace_scale"])
 
 
+@pytest.mark.thorough
 def test_a_link_of_a_users_own_simulates_and_fits_in_a_model():
     links = {"q": LaplaceLink(), "u": LaplaceLink()}
     scene = Scene(SmoothSurface(), Unpolarized(), StokesMixing())

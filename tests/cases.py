@@ -1,0 +1,103 @@
+"""Cases of one check, run in one test.
+
+`each` is written as `pytest.mark.parametrize` is. The cases are pytest's subtests of one test: a
+case that fails is reported under its name, with its own traceback, and the others still run.
+"""
+
+import contextlib
+import functools
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import pytest
+import xarray as xr
+
+Names = Iterable[object] | Callable[[Any], object] | None
+
+
+def _copy(value: Any) -> Any:
+    """A dataset, tree or dictionary of datasets, copied; anything else as it is."""
+    if isinstance(value, xr.Dataset | xr.DataTree):
+        return value.copy(deep=True)
+    if isinstance(value, dict) and all(isinstance(each, xr.Dataset) for each in value.values()):
+        return {name: each.copy(deep=True) for name, each in value.items()}
+    return value
+
+
+def _value_name(value: Any, ids: Names) -> str:
+    """Name of one value of a case."""
+    name = ids(value) if callable(ids) else None
+    if name is None:
+        name = getattr(value, "__name__", value)
+    return " ".join(str(name).split())[:80]
+
+
+def _cases(
+    names: str | Sequence[str], values: Iterable, ids: Names
+) -> list[tuple[str, dict[str, Any]]]:
+    """Name and arguments of every case."""
+    single = isinstance(names, str) and "," not in names
+    arguments = [n.strip() for n in names.split(",")] if isinstance(names, str) else names
+    rows = [(value,) if single else tuple(value) for value in values]
+    if ids is None or callable(ids):
+        case_names = [", ".join(_value_name(value, ids) for value in row) for row in rows]
+    else:
+        case_names = [str(name) for name in ids]
+    cases = [dict(zip(arguments, row, strict=True)) for row in rows]
+    return list(zip(case_names, cases, strict=True))
+
+
+@contextlib.contextmanager
+def _fresh(fixtures: dict[str, Any], number: int) -> Iterator[dict[str, Any]]:
+    """The fixtures of a test, such that a case leaves no trace in the next one."""
+    fixtures = {name: _copy(value) for name, value in fixtures.items()}
+    with contextlib.ExitStack() as stack:
+        if "monkeypatch" in fixtures:
+            fixtures["monkeypatch"] = stack.enter_context(pytest.MonkeyPatch.context())
+        if "tmp_path" in fixtures:
+            fixtures["tmp_path"] = fixtures["tmp_path"] / f"case{number}"
+            fixtures["tmp_path"].mkdir()
+        if "capsys" in fixtures:
+            fixtures["capsys"].readouterr()
+        yield fixtures
+
+
+def each(names: str | Sequence[str], values: Iterable, ids: Names = None) -> Callable:
+    """Decorator that runs a test once for each case, as subtests.
+
+    Args:
+        names: Arguments that the cases fill.
+        values: A value for each case; a tuple of them if there is more than one name.
+        ids: Names of the cases, or a function of one value.
+
+    Decorators above one another give every combination. In each case `monkeypatch` and
+    `tmp_path` are fresh; datasets, trees and dictionaries of datasets are copies.
+    """
+    outer = _cases(names, values, ids)
+
+    def decorate(test: Callable) -> Callable:
+        inner, function = getattr(test, "cases", [("", {})]), getattr(test, "one_case", test)
+        cases = [
+            (" / ".join(filter(None, (inner_name, name))), inner_arguments | arguments)
+            for inner_name, inner_arguments in inner
+            for name, arguments in outer
+        ]
+
+        @functools.wraps(function, updated=())  # pytest's hypothesis plugin looks for attributes
+        def every_case(subtests: pytest.Subtests, **fixtures: Any) -> None:
+            for number, (name, arguments) in enumerate(cases):
+                with subtests.test(name), _fresh(fixtures, number) as case_fixtures:
+                    function(**case_fixtures, **arguments)
+
+        filled = {name for _, arguments in cases for name in arguments}
+        parameters = inspect.signature(function).parameters
+        requested = [name for name in parameters if name not in filled]
+        every_case.__signature__ = inspect.Signature(
+            [inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY) for n in [*requested, "subtests"]]
+        )
+        every_case.cases, every_case.one_case = cases, function
+        every_case.pytestmark = getattr(test, "pytestmark", [])
+        return every_case
+
+    return decorate

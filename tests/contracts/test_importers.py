@@ -1,0 +1,73 @@
+"""Contract of the importers: a valid capture that survives a file, or a refusal in one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pictures
+import pytest
+import xarray as xr
+from cases import each
+
+import polar_bayes as pb
+
+FOUR = (0.0, 45.0, 90.0, 135.0)
+CAMERA = {
+    "shape": pictures.ball_normals(),
+    "light": pictures.LAMP,
+    "detector": pb.importers.Detector(saturation_level=pictures.FULL, gain=0.1, read_noise=2.0),
+}
+LINES = "view_zenith,dop\n10,.02\n20,.04\n"
+ANGLES = {"view_azimuth": 180.0, "light_zenith": 45.0, "light_azimuth": 0.0}
+
+
+def goniometer(folder: Path) -> xr.Dataset:
+    del folder
+    angles = np.arange(20.0, 81.0, 10.0)
+    return pb.from_goniometer((angles, 2.0 + angles), (angles, 1.0 + 0.5 * angles))
+
+
+def polarizer(folder: Path) -> xr.Dataset:
+    del folder
+    return pb.from_polarizer(pictures.frames(FOUR), FOUR, **CAMERA)
+
+
+def mosaic(folder: Path) -> xr.Dataset:
+    del folder
+    frames, raw = pictures.frames(FOUR), np.zeros(pictures.SHAPE)
+    for (row, column), angle in {(0, 0): 90.0, (0, 1): 45.0, (1, 0): 135.0, (1, 1): 0.0}.items():
+        raw[row::2, column::2] = frames[FOUR.index(angle)][row::2, column::2]
+    return pb.from_mosaic(raw, **CAMERA)
+
+
+def table(folder: Path) -> xr.Dataset:
+    (folder / "leaf.csv").write_text(LINES)
+    return pb.from_table(folder / "leaf.csv", constants=ANGLES)
+
+
+IMPORTERS = {"goniometer": goniometer, "polarizer": polarizer, "mosaic": mosaic, "table": table}
+
+
+@each("make", IMPORTERS.values(), ids=IMPORTERS)
+def test_every_importer_makes_a_valid_capture_that_survives_a_file(make, tmp_path: Path) -> None:
+    capture = make(tmp_path)
+    xr.testing.assert_identical(pb.capture.validate(capture), capture)
+    assert pb.capture.count(capture)["views"] > 0
+    assert capture.attrs["source"]
+    pb.save_capture(capture, tmp_path / "capture.nc")
+    loaded = pb.load_capture(tmp_path / "capture.nc")
+    xr.testing.assert_identical(loaded, capture.assign_attrs(name=loaded.attrs["name"]))
+
+
+REFUSED = {
+    "s": lambda: pb.from_goniometer((np.ones(3), np.ones(2)), (np.ones(3),) * 2),
+    "angles": lambda: pb.from_polarizer(pictures.frames(FOUR), (0.0, 0.0, 0.0), **CAMERA),
+    "frame": lambda: pb.from_mosaic(np.zeros((4, 4, 4)), **CAMERA),
+    "no_such_table": lambda: pb.from_table("no_such_table.csv"),
+}
+
+
+@each(("where", "call"), REFUSED.items(), ids=REFUSED)
+def test_every_importer_refuses_in_one_line_that_names_the_place(where, call) -> None:
+    with pytest.raises(pb.CaptureError, match=f"{where}.*: ") as caught:
+        call()
+    assert str(caught.value).isprintable()
