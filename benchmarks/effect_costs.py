@@ -39,7 +39,7 @@ ROUGH = pb.Scene(
             pb.instrument.ChannelGain(),
             pb.instrument.Leakage(),
             pb.instrument.DarkLevel(),
-            pb.physics.Discrepancy(),
+            pb.instrument.Discrepancy(),
         )
     ),
 )

@@ -3,10 +3,6 @@ from .compare import (
     FitComparison as FitComparison,
     stack_readings as stack_readings,
 )
-from .convergence import (
-    json_summary as json_summary,
-    summary as summary,
-    verdict as verdict,
-)
+from .convergence import json_summary as json_summary
 from .coverage import map_coverage as map_coverage
 from .population import population_summary as population_summary

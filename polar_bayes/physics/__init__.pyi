@@ -18,7 +18,6 @@ from .illumination import (
     PointSource as PointSource,
     UniformSky as UniformSky,
 )
-from .instrument import Discrepancy as Discrepancy
 from .microfacet import (
     AbstractMicrofacet as AbstractMicrofacet,
     AbstractShadowing as AbstractShadowing,

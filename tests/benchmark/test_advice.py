@@ -5,7 +5,7 @@ import pytest
 from synthetic_accuracy import ROWS, make_accuracy
 
 import polar_bayes as pb
-from polar_bayes.benchmark.advice import parameter_errors, pareto_front
+from polar_bayes.benchmark.advice import accuracy_table, parameter_errors, pareto_front
 
 
 def test_the_table_has_the_worst_parameter_of_every_row():
@@ -100,7 +100,7 @@ def test_rows_without_an_answer_are_neither_advised_nor_on_the_front():
 def test_what_holds_no_study_is_refused():
     study = make_accuracy()["accuracy"].to_dataset()
     with pytest.raises(pb.FitError, match="accuracy/mean_error: it is missing; give the tree as"):
-        pb.summary(study.drop_vars("mean_error"))
+        accuracy_table(study.drop_vars("mean_error"))
 
 
 @pytest.mark.thorough
@@ -112,11 +112,10 @@ def test_a_tolerance_of_nothing_is_refused():
 def test_a_study_survives_a_file(tmp_path):
     study = make_accuracy()
     pb.save(study, tmp_path / "accuracy.nc")
-    assert pb.benchmark.holds_accuracy(tmp_path / "accuracy.nc")
     again = pb.load(tmp_path / "accuracy.nc")
     assert pb.summary(again).equals(pb.summary(study))
     with pytest.raises(pb.FitError, match="it holds no fit"):
-        pb.load(tmp_path / "accuracy.nc")
+        pb.load(tmp_path / "accuracy.nc", "fit")
     pb.save(study["accuracy"].to_dataset(), tmp_path / "other.nc")
-    with pytest.raises(pb.FitError, match="it holds no accuracy study"):
-        pb.load(tmp_path / "other.nc")
+    with pytest.raises(pb.FitError, match="it holds no accuracy"):
+        pb.load(tmp_path / "other.nc", "accuracy")

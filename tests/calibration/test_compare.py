@@ -79,17 +79,11 @@ def test_calibrations_come_back_from_files(tmp_path: Path) -> None:
     read = pb.load(tmp_path / "sbc.nc")
     xr.testing.assert_identical(read["prior_sbc"].to_dataset(), tree["prior_sbc"].to_dataset())
     assert np.isnan(read["prior_sbc"]["roughness"].to_numpy()[1])
-    held = {
-        name: pb.calibration.holds_calibration(tmp_path / f"{name}.nc")
-        for name in ("sbc", "fit", "text")
-    }
-    assert held == {"sbc": True, "fit": False, "text": False}
-    assert not pb.calibration.holds_calibration(tmp_path / "nowhere.nc")
     for name, what in {
         "fit": "it holds no calibration",
         "text": "cannot be read as netCDF",
     }.items():
-        with pytest.raises(pb.FitError, match=f"{what}; give the file that `polar-bayes calibr"):
-            pb.load(tmp_path / f"{name}.nc")
+        with pytest.raises(pb.FitError, match=f"{what}; give the file that polar_bayes.save"):
+            pb.load(tmp_path / f"{name}.nc", "calibration")
     with pytest.raises(pb.CaptureError, match="there is no such file"):
         pb.load(tmp_path / "nowhere.nc")

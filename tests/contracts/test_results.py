@@ -16,22 +16,18 @@ import polar_bayes as pb
 
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 RESULTS = {
-    "fit by NUTS": (lambda: make_result(**SMALL), pb.load_result),
-    "Laplace fit": (lambda: make_result(**SMALL, method="laplace"), pb.load_result),
-    "point fit": (lambda: make_result(**SMALL, method="point"), pb.load_result),
-    "calibration": (make_calibration, pb.calibration.load_calibration),
-    "accuracy study": (make_accuracy, pb.benchmark.load_accuracy),
-    "map": (
-        lambda: make_maps({"roughness": np.linspace(0.0, 1.0, 12).reshape(3, 4)}),
-        lambda path: xr.open_dataset(path).load(),
-    ),
+    "fit": lambda: make_result(**SMALL),
+    "fit, Laplace": lambda: make_result(**SMALL, method="laplace"),
+    "fit, point": lambda: make_result(**SMALL, method="point"),
+    "calibration": make_calibration,
+    "accuracy": make_accuracy,
+    "map": lambda: make_maps({"roughness": np.linspace(0.0, 1.0, 12).reshape(3, 4)}),
 }
-every_result = each(("make", "load"), RESULTS.values(), ids=RESULTS)
+every_result = each(("name", "make"), RESULTS.items(), ids=RESULTS)
 
 
 @every_result
-def test_every_result_has_a_card_and_stays_what_it_is(make, load) -> None:
-    del load
+def test_every_result_has_a_card_and_stays_what_it_is(name, make) -> None:
     result = make()
     before = result.copy(deep=True)
     card = pb.show(result)
@@ -43,17 +39,26 @@ def test_every_result_has_a_card_and_stays_what_it_is(make, load) -> None:
 
 
 @every_result
-def test_every_result_survives_a_file_and_has_the_same_card(make, load, tmp_path: Path) -> None:
+def test_every_result_has_a_table_a_verdict_and_a_figure(name, make) -> None:
     result = make()
-    pb.save_result(result, tmp_path / "result.nc")
-    found = load(tmp_path / "result.nc")
+    assert len(pb.summary(result)) > 0
+    verdict = pb.verdict(result)
+    assert verdict.passed == (not verdict.problems)
+    assert all(sentence.endswith((".", "!")) for sentence in verdict.sentences)
+    assert pb.plot(result).get_axes()
+
+
+@every_result
+def test_every_result_survives_a_file_and_has_the_same_card(name, make, tmp_path: Path) -> None:
+    result = make()
+    pb.save(result, tmp_path / "result.nc")
+    found = pb.load(tmp_path / "result.nc", name.partition(",")[0])
     xr.testing.assert_equal(found, result)
     assert repr(pb.show(found)) == repr(pb.show(result))
 
 
 @every_result
-def test_every_result_has_a_page_that_stands_alone(make, load, tmp_path: Path) -> None:
-    del load
+def test_every_result_has_a_page_that_stands_alone(name, make, tmp_path: Path) -> None:
     page = pb.report(make(), tmp_path / "report").read_text()
     assert Page(page).open == []
     assert "<script" not in page
@@ -61,13 +66,8 @@ def test_every_result_has_a_page_that_stands_alone(make, load, tmp_path: Path) -
 
 
 def test_one_kind_of_result_is_not_taken_for_another(tmp_path: Path) -> None:
-    pb.save_result(make_calibration(), tmp_path / "calibration.nc")
-    pb.save_result(make_result(**SMALL), tmp_path / "fit.nc")
-    for load, name in (
-        (pb.load_result, "calibration.nc"),
-        (pb.benchmark.load_accuracy, "calibration.nc"),
-        (pb.calibration.load_calibration, "fit.nc"),
-        (pb.benchmark.load_accuracy, "fit.nc"),
-    ):
-        with pytest.raises(pb.FitError, match=name):
-            load(tmp_path / name)
+    pb.save(make_calibration(), tmp_path / "calibration.nc")
+    pb.save(make_result(**SMALL), tmp_path / "fit.nc")
+    for kind, name in (("fit", "calibration"), ("accuracy", "calibration"), ("calibration", "fit")):
+        with pytest.raises(pb.FitError, match=rf"{name}.nc: it holds no {kind}; give the file"):
+            pb.load(tmp_path / f"{name}.nc", kind)

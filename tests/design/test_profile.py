@@ -8,7 +8,12 @@ from cases import each
 from design_lines import ASKED, NOISE, PRIOR, line, line_capture, precision_of, rows_of
 
 import polar_bayes as pb
-from polar_bayes.design.profile import PRIOR_WEIGHT, likelihood_interval, log_density_parts
+from polar_bayes.design.profile import (
+    PRIOR_WEIGHT,
+    likelihood_interval,
+    log_density_parts,
+    profile_sentences,
+)
 from polar_bayes.design.setup import make_design_problem
 
 ZENITHS = np.array([20.0, 40.0, 60.0, 70.0])
@@ -109,4 +114,4 @@ def test_what_cannot_be_profiled_is_told() -> None:
     with pytest.raises(pb.FitError, match="values of slope: nan is not inside its prior"):
         pb.profile(capture, "slope", model=line, values=[np.nan], **ASKED)
     with pytest.raises(pb.FitError, match="profile: it has no variable"):
-        pb.verdict(xr.Dataset()).sentences
+        profile_sentences(xr.Dataset())

@@ -88,7 +88,7 @@ ON = {
             pb.instrument.BeamOverlap,
             pb.instrument.ChannelGain,
             pb.instrument.DarkLevel,
-            pb.physics.Discrepancy,
+            pb.instrument.Discrepancy,
             pb.instrument.DolpGain,
             pb.instrument.Leakage,
         )

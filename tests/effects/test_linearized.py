@@ -96,7 +96,7 @@ def test_labels_are_those_of_the_tables_of_a_fit() -> None:
         pb.SmoothSurface(),
         pb.Unpolarized(),
         pb.StokesMixing(),
-        instrument=pb.instrument.Instrument((pb.physics.Discrepancy(basis=4),)),
+        instrument=pb.instrument.Instrument((pb.instrument.Discrepancy(basis=4),)),
     )
     request = request_of(capture, scene)
     data = observe(request.capture)

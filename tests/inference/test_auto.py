@@ -270,7 +270,7 @@ def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left()
 def test_the_fit_beside_is_made_by_the_method_of_the_answer():
     """The instrument is told apart by comparing: never by choosing a method once more."""
     scene = pb.Scene(
-        pb.SmoothSurface(), instrument=pb.instrument.Instrument((pb.physics.Discrepancy(),))
+        pb.SmoothSurface(), instrument=pb.instrument.Instrument((pb.instrument.Discrepancy(),))
     )
     result = pb.fit(capture(), model=line, links=LINKS, scene=scene, method=Handing())
     assert result["posterior"].sizes["draw"] == 1000
@@ -281,7 +281,7 @@ def test_the_fit_beside_is_made_by_the_method_of_the_answer():
 @pytest.mark.thorough
 def test_comparisons_that_are_stuck_are_abandoned_and_told():
     scene = pb.Scene(
-        pb.SmoothSurface(), instrument=pb.instrument.Instrument((pb.physics.Discrepancy(),))
+        pb.SmoothSurface(), instrument=pb.instrument.Instrument((pb.instrument.Discrepancy(),))
     )
     asked = {"model": line, "links": LINKS, "scene": scene}
     late = pb.fit(capture(), method=Handing(seconds=-1.0), **asked)

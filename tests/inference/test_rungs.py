@@ -16,7 +16,7 @@ from polar_bayes.inference.mcse import draws_needed, quantile
 from polar_bayes.inference.optimize import Modes
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.weighted import counting_engine, laplace_mixture
+from polar_bayes.inference.weighted import laplace_mixture
 from polar_bayes.progress import no_progress
 
 SMALL = {
@@ -176,15 +176,6 @@ def test_draws_that_are_no_numbers_have_an_infinite_error():
 
 
 @pytest.mark.thorough
-def test_each_tempered_fit_counts_for_itself_with_the_same_programs():
-    here = problem(line)
-    model = here.compiled_model
-    first, second = (counting_engine(model, no_progress) for _ in range(2))
-    assert first.programs is second.programs
-    first.counts["rounds"] += 3
-    assert second.counts["rounds"] == 0
-
-
 def test_draws_are_scaled_and_settings_kept():
     assert pb.methods.Laplace(draws=500).scale_draws(2.0) == pb.methods.Laplace(draws=1000)
     chains = pb.methods.Nuts(warmup=77).scale_draws(2.0)
