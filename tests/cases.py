@@ -30,7 +30,8 @@ def _value_name(value: Any, ids: Names) -> str:
     name = ids(value) if callable(ids) else None
     if name is None:
         name = getattr(value, "__name__", value)
-    return " ".join(str(name).split())[:80]
+    readable = " ".join(str(name).split())[:80]
+    return readable.encode(errors="backslashreplace").decode()  # workers send names as UTF-8
 
 
 def _cases(

@@ -21,7 +21,7 @@ LAYERS = (
     ("polar_bayes.importers",),
     ("polar_bayes.physics",),
     ("polar_bayes.observation",),
-    ("polar_bayes.priors", "polar_bayes.setups", "polar_bayes.setups.prior_table"),
+    ("polar_bayes.priors", "polar_bayes.setups"),
     ("polar_bayes.models",),
     ("polar_bayes.simulation",),
     ("polar_bayes.inference",),

@@ -179,7 +179,7 @@ CASES: dict[str, Callable] = {
     "next views": views,
     "effects": effects,
 }
-QUICK = ("point", "laplace", "identify")
+QUICK = ("laplace",)
 OPTIMIZED = {"point", "identify", "profile", "next views", "effects"}
 
 

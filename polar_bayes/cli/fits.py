@@ -107,7 +107,7 @@ def fit(
             options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             scene = pb.choose_effects(data, progress=progress, **options)
-            click.echo(pb.verdict(scene.ledger).sentences, err=True)
+            click.echo("\n".join(pb.verdict(scene.ledger).sentences), err=True)
         settings |= {"tolerance": tolerance} if is_auto else {}
         result = pb.fit(data, scene=scene, progress=progress, **settings)
     pb.save(result, out)
@@ -169,7 +169,8 @@ def effects(
     if as_json:
         print_json(pb.effects.ledger_summary(ledger))
     else:
-        click.echo(f"{pb.summary(ledger)}\n\n{pb.verdict(ledger).sentences}")
+        print_frame(pb.summary(ledger))
+        click.echo("\n".join(["", *pb.verdict(ledger).sentences]))
 
 
 def _with_setup(capture: Any, setup: str | None) -> Any:

@@ -196,7 +196,7 @@ MAX_COLUMNS = 4
 UNCORRECTED = "bare normal approximation of each pixel"
 FITTED_BY = {
     "PixelLaplace": "normal approximation of each pixel, checked and corrected",
-    "PixelTempering": "tempered sequential Monte Carlo in each pixel",
+    "PixelSMC": "tempered sequential Monte Carlo in each pixel",
     "PixelNuts": "NUTS in each pixel",
 }
 

@@ -8,12 +8,18 @@ from matplotlib.figure import Figure
 from polar_bayes.benchmark.accuracy import is_accuracy
 from polar_bayes.calibration.files import is_calibration
 from polar_bayes.diagnostics.compare import FitComparison
+from polar_bayes.diagnostics.parameters import method_of
 from polar_bayes.errors import FitError
 from polar_bayes.reporting.accuracy import plot_accuracy
 from polar_bayes.reporting.comparison import plot_comparison
 from polar_bayes.reporting.maps import plot_maps
 from polar_bayes.reporting.plots_calibration import plot_calibration
-from polar_bayes.reporting.plots_curves import plot_readings, plot_residuals, plot_spectrum
+from polar_bayes.reporting.plots_curves import (
+    plot_readings,
+    plot_residuals,
+    plot_spectrum,
+    variables,
+)
 from polar_bayes.reporting.plots_fit import (
     plot_pairs,
     plot_pit,
@@ -47,8 +53,8 @@ def plot(result: Any) -> Figure:
             `polar_bayes.diagnostics.compare_fits` returned.
 
     Returns:
-        Prior and posterior of a fit; means and widths of a map; ranks of a calibration; error
-        against time of a study; intervals of compared fits.
+        Prior and posterior of a fit, or the readings of a point fit; means and widths of a map;
+        ranks of a calibration; error against time of a study; intervals of compared fits.
 
     Raises:
         FitError: It is none of these.
@@ -62,6 +68,8 @@ def plot(result: Any) -> Figure:
     if is_calibration(result):
         return plot_calibration(result)
     if isinstance(result, xr.DataTree):
+        if method_of(result) == "point":  # it has no draws
+            return plot_readings(result, variables(result)[0])
         return plot_prior_posterior(result)
     raise FitError(
         f"there is no figure of a {type(result).__name__}",

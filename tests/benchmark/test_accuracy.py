@@ -217,6 +217,7 @@ def test_every_override_has_a_name_of_its_own():
     assert len(set(names)) == len(names)
 
 
+@pytest.mark.thorough
 def test_where_chains_miss_a_mode_tempered_draws_are_the_reference():
     request = resolve(capture(), squared, "paper", None, LINKS, 90.0, 0, "double")
     reference = run_reference(ROUGHLY, make_problem(request, jax.random.key(0)), jax.random.key(1))

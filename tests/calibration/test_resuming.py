@@ -119,6 +119,7 @@ def test_more_or_fewer_simulations_are_the_same_question(capture, whole, begun, 
     assert fits == COUNT
 
 
+@pytest.mark.thorough
 def test_a_damaged_block_is_fitted_again(capture, whole, begun, tmp_path) -> None:
     store = copied(begun, tmp_path)
     victim = min(store.glob("*.npz"))
@@ -156,6 +157,7 @@ def test_another_layout_is_refused(capture, begun) -> None:
         pb.calibrate(moved, store=begun, resume=True, **ASKED)
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_gone_on_with_is_refused(capture, begun, tmp_path) -> None:
     with pytest.raises(pb.FitError, match="there already; give another --out, or --resume"):
         pb.calibrate(capture, store=begun, **ASKED)
@@ -204,13 +206,16 @@ import json
 import numpy as np
 import numpyro.distributions as dist
 from plates import plate_capture
-from polar_bayes.calibration.calibrate import METHODS, planned, _resolved
+from polar_bayes.calibration.calibrate import METHODS, make_plan
 from polar_bayes.calibration.store import fingerprint_of
+from polar_bayes.inference.request import resolve
 from test_resuming import ASKED
 capture = plate_capture(np.array([30.0, 42.0, 68.0, 80.0]), 0.03, seed=0)
 priors = {"refractive_index": dist.TruncatedNormal(1.5, 0.1, low=1.2)}
-request = _resolved(capture, {**ASKED, "priors": priors}, None, 0)
-print(json.dumps(fingerprint_of(planned(request, None, METHODS["tempered"], True))))
+asked = {**ASKED, "priors": priors}
+asked = [asked.get(name) for name in ("scene", "priors", "links")]
+request = resolve(capture, ASKED["model"], *asked, None, 0, "double")
+print(json.dumps(fingerprint_of(make_plan(request, None, METHODS["tempered"], True))))
 """
 
 

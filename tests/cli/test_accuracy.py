@@ -29,9 +29,9 @@ def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys
     assert main(["accuracy", str(plate), "--out", str(out)]) == 0
     told = capsys.readouterr().out
     assert told.splitlines()[0].split()[:2] == ["error", "worst"]
-    assert told.splitlines()[-1] == pb.benchmark.accuracy_sentences(make_accuracy())
-    assert set(studied["rungs"]) == set(pb.methods.STUDY_METHODS)
-    assert "dials" not in studied
+    assert told.splitlines()[-1] == " ".join(pb.benchmark.accuracy_sentences(make_accuracy()))
+    assert set(studied["methods"]) == set(pb.methods.STUDY_METHODS)
+    assert "overrides" not in studied
     assert pb.summary(pb.load(out)).equals(pb.summary(make_accuracy()))
     report = tmp_path / "report"
     assert main(["report", str(out), "--out", str(report)]) == 0

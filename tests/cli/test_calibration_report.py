@@ -37,7 +37,7 @@ def test_a_mistake_gets_one_line(
     for options, says in (
         (["nowhere.nc"], "nowhere.nc: there is no such file"),
         (["sbc.nc", "--beside", "nowhere.nc"], "nowhere.nc: there is no such file"),
-        (["sbc.nc", *twice], "two files of --beside have the same name"),
+        (["sbc.nc", *twice], "two of the files have the same name"),
     ):
         assert main(["report", *options, "--out", "report"]) == 1
         told = capsys.readouterr()

@@ -38,7 +38,7 @@ def test_a_fit_whose_diagnostics_fail_is_written_and_exits_with_2(
     short = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
     monkeypatch.setitem(methods.METHODS, "nuts", short)
     out = tmp_path / "fit.nc"
-    assert main(["fit", str(plate), "--out", str(out)]) == 2
+    assert main(["fit", str(plate), "--scene", "picture", "--out", str(out)]) == 2
     assert "problem: " in capsys.readouterr().err
     assert out.exists()
 
@@ -110,7 +110,7 @@ WRONG = {
         ["map", "PLATE", "--method", "tempered", "--draws", "256", "--out", "OUT"],
         "--draws needs --method laplace",
     ),
-    "report of a capture": (["report", "PLATE", "--out", "OUT"], "it holds no fit"),
+    "report of a capture": (["report", "PLATE", "--out", "OUT"], "it holds no result"),
     "preset": (["simulate", "--preset", "x", "--out", "OUT"], "no such material"),
     "views": (["simulate", "--views", "1", "--out", "OUT"], "views is 1"),
     "zenith": (["simulate", "--largest-view-zenith", "90", "--out", "OUT"], "below 90"),

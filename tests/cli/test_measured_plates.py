@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-from cases import each
 
 import polar_bayes as pb
 from polar_bayes.cli import main
@@ -23,7 +22,9 @@ PLATES = {
 }
 
 
-@each("plate", PLATES)
+@pytest.mark.parametrize(
+    "plate", [pytest.param("glass", marks=pytest.mark.thorough), "plexiglas"]
+)
 def test_a_measured_plate_from_table_to_interval(
     plate: str, measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

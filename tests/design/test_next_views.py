@@ -204,6 +204,7 @@ def plate() -> xr.Dataset:
     return plate_capture(np.array([30.0, 42.0, 75.0]), 0.02, seed=0)
 
 
+@pytest.mark.thorough
 def test_what_is_expected_is_what_a_larger_capture_gives(plate: xr.Dataset) -> None:
     """The expected sds after the views agree with `identify` where these views were measured."""
     found = pb.next_views(plate, draws=1, count=2, **PLATE_ASKED)

@@ -55,7 +55,7 @@ def test_the_interval_is_that_of_the_normal_distribution(slope: xr.Dataset) -> N
     assert not found["open_below"]
     assert not found["open_above"]
     low, high = (float(slope[end].sel(kind="likelihood")) for end in ("low", "high"))
-    assert pb.verdict(slope).sentences == [
+    assert list(pb.verdict(slope).sentences) == [
         f"slope is between {low:.4g} and {high:.4g} (95% interval of the likelihood ratio)."
     ]
 

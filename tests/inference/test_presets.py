@@ -4,16 +4,9 @@ import pytest
 
 import polar_bayes as pb
 
-COMPILER_OPTIONS = ("leaf",)
 
-
-@pytest.mark.parametrize(
-    "preset",
-    [
-        p if p in COMPILER_OPTIONS else pytest.param(p, marks=pytest.mark.thorough)
-        for p in pb.simulation.PRESETS
-    ],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("preset", pb.simulation.PRESETS)
 def test_every_preset_converges(preset: str) -> None:
     result = pb.fit(pb.simulate(preset, seed=0), seed=0)
     verdict = pb.verdict(result)

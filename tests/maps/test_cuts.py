@@ -50,6 +50,7 @@ def assert_same_bits(one: xr.Dataset, other: xr.Dataset) -> None:
         assert values.values.tobytes() == other[name].values.tobytes(), name
 
 
+@pytest.mark.thorough
 @each("block", [100, 43, 17])
 def test_blocks_of_any_size_give_the_same_bits(
     image: xr.Dataset, plan: Plan, whole: xr.Dataset, block: int
@@ -67,6 +68,7 @@ def test_a_block_in_which_nothing_was_read_is_masked(image: xr.Dataset, plan: Pl
     assert all(np.isnan(maps[name]).all() for name in (*NAMES, "pareto_k"))
 
 
+@pytest.mark.thorough
 def test_a_pixel_alone_gets_the_same_bits(image: xr.Dataset, plan: Plan, whole: xr.Dataset) -> None:
     sampled = np.argwhere((whole["approach"] == MethodUsed.NUTS).values)[-1]
     for y, x in ((0, 0), (2, 42), sampled):
@@ -110,6 +112,7 @@ def compiled_already(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verb.cut, "__defaults__", (20,))
 
 
+@pytest.mark.thorough
 def test_bad_pixels_are_told_apart_and_poison_no_neighbor(
     image: xr.Dataset, whole: xr.Dataset, compiled_already: None
 ) -> None:

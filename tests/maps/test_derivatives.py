@@ -69,7 +69,7 @@ CASES: dict[str, tuple[Callable, int]] = {
 
 
 EVERY = [
-    name if name == "two colors" else pytest.param(name, marks=pytest.mark.thorough)
+    name if name == "known noise" else pytest.param(name, marks=pytest.mark.thorough)
     for name in CASES
 ]
 
@@ -192,6 +192,7 @@ def test_scoring_of_noise_of_unknown_scale_bends_in_both_arguments() -> None:
     assert_close(ours.curvature, everywhere(expected, here))
 
 
+@pytest.mark.thorough
 def test_single_precision_stays_single() -> None:
     here = case("known noise")
     data = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, here.data)

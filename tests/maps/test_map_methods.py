@@ -61,7 +61,7 @@ def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, tempered: xr.Datase
 def test_the_map_says_how_it_was_made(tempered: xr.Dataset, tmp_path: Path) -> None:
     assert json.loads(tempered.attrs[PROVENANCE])["fitted_by"] == "PixelSMC"
     page = pb.report(tempered, tmp_path / "report").read_text()
-    assert "tempered draws of each pixel" in page
+    assert "tempered sequential Monte Carlo in each pixel" in page
     assert len(APPROACHES) == len(MethodUsed)  # each has a color
     assert "all by tempered draws" in page
 

@@ -115,6 +115,7 @@ def guide(plan: Plan) -> Callable:
     return lambda z, data: np.asarray(covariance(z, data))
 
 
+@pytest.mark.thorough
 def test_five_hundred_pixels_have_the_mode_and_the_covariance_of_numpyros_guide(
     plan: Plan, guide: Callable
 ) -> None:

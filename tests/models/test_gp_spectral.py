@@ -160,6 +160,7 @@ def twin_draws(capture: xr.Dataset) -> tuple[dict[str, np.ndarray], float]:
     return {name: each.ravel() for name, each in draws.items()}, chain[..., 0].size / steps
 
 
+@pytest.mark.thorough
 def test_the_posterior_is_that_of_another_density_and_another_sampler() -> None:
     colors = (TWIN_COLORS, smooth_index(TWIN_COLORS))
     capture = spectral_plate(colors, error=TWIN_ERROR, seed=21, views=np.linspace(35.0, 75.0, 6))

@@ -47,7 +47,13 @@ class LogitNormal:
         return stats.norm(self.center, self.spread).cdf(np.log(x / (1.0 - x)))
 
 
-@each("name", ALL)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "subsurface_fraction",
+        *(pytest.param(n, marks=pytest.mark.thorough) for n in ALL if n != "subsurface_fraction"),
+    ],
+)
 def test_members_are_drawn_from_the_population(name: str) -> None:
     capture = patch_capture(np.full(400, 1.45), views=2)
     location, spread = {"refractive_index": (1.3, 0.2)}.get(name, (0.3, 0.6))

@@ -16,6 +16,7 @@ from polar_bayes.diagnostics.parameters import posterior_scalars
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.reporting.report import render, report
 from polar_bayes.reporting.text import interval, join, numbers, overconfidence, percent
+from polar_bayes.results import load
 
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 
@@ -191,7 +192,7 @@ def test_the_folder_holds_page_and_result_and_nothing_else(tmp_path: Path) -> No
     assert sorted(path.name for path in folder.iterdir()) == ["index.html", "result.nc"]
     assert (folder / "index.html").read_text().startswith("<!DOCTYPE html>")
     # What was written gives the same numbers and the same page, byte for byte.
-    read = pb.load(folder / "result.nc")
+    read = load(folder / "result.nc")
     pd.testing.assert_frame_equal(summary(read), summary(result))
     assert render(read) == (folder / "index.html").read_text()
 
