@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cases import each
 
 import polar_bayes as pb
 
@@ -187,11 +186,11 @@ assert program.potential_energy is numpyro.infer.util.potential_energy  # there 
 """
 
 
-@each(
+@pytest.mark.parametrize(
     "imports",
     [
-        "import arviz, polar_bayes",
-        "import polar_bayes, arviz",
+        pytest.param("import arviz, polar_bayes", marks=pytest.mark.thorough),
+        pytest.param("import polar_bayes, arviz", marks=pytest.mark.thorough),
         "import arviz, numpyro, polar_bayes; polar_bayes.Scene",
     ],
 )

@@ -27,7 +27,7 @@ from polar_bayes.inference.batch_engine import engine_key
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
 from polar_bayes.inference.batch_result import MethodUsed, Status
-from polar_bayes.inference.mode_methods import Nuts
+from polar_bayes.inference.mode_methods import Nuts, Point
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
 from polar_bayes.inference.request import Request, resolve
@@ -88,7 +88,7 @@ def calibrate(
             approximation, its draws weighted by the posterior, corrected as in maps), "laplace"
             (the same unweighted). Where the capture has patches, materials or wavelengths, or the
             scene a discrepancy, the default is "nuts", and these chains are those of
-            `polar_bayes.fit`. Or settings, those of `polar_bayes.fit` (`Nuts`, `Laplace`) too.
+            `polar_bayes.fit`. Or the settings of any method of `pb.methods` but `Point`.
         scene: A name, a `Scene` or None.
         priors: Overrides.
         links: One link, a mapping or None.
@@ -170,6 +170,12 @@ def calibrate(
 
 
 def _settings(method: str | Method | None, request: Request) -> Method:
+    if isinstance(method, Point) or method == "point":
+        raise FitError(
+            "least squares make no draws whose intervals could be checked",
+            where="method='point'",
+            hint="give a method with draws, such as pb.methods.Laplace()",
+        )
     if isinstance(method, Method):
         return method
     if needs_mcmc(request) and method in (None, "nuts"):

@@ -7,7 +7,7 @@ Source:
 import dataclasses
 import functools
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from polar_bayes.inference.batch_nuts import PixelNuts
 from polar_bayes.inference.batch_result import Describe, Outcome
 from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.compile import TRACING_LOCK, LRUCache
-from polar_bayes.inference.mode_methods import Laplace, Nuts
+from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.problem import CompiledModel, compile_model
 from polar_bayes.inference.program import Program, Values, compile_program
 from polar_bayes.inference.psis import Marginals
@@ -30,8 +30,7 @@ from polar_bayes.inference.request import Request
 from polar_bayes.observation.data import READINGS, Observations, observe
 from polar_bayes.physics.instrument import Discrepancy
 
-SequentialMethod = Nuts | Laplace
-Method = AbstractPixelMethod | SequentialMethod
+Method = AbstractPixelMethod | AbstractMethod
 CHAINS_BLOCK = 4
 """Simulations of a block where they are fitted one after another: each may take half a minute."""
 
@@ -78,7 +77,12 @@ class Plan:
     @property
     def block(self) -> int:
         """Simulations of a block."""
-        return CHAINS_BLOCK if isinstance(self.settings, SequentialMethod) else BLOCK
+        return CHAINS_BLOCK if self.is_sequential else BLOCK
+
+    @property
+    def is_sequential(self) -> bool:
+        """Whether one capture is fitted after another."""
+        return isinstance(self.settings, AbstractMethod)
 
     @property
     def data(self) -> Observations:
@@ -127,19 +131,14 @@ class CompiledPlan:
         return make_engine(plan.recipe_key, plan.request, lambda: self.data)
 
     @property
-    def is_sequential(self) -> bool:
-        """Whether one capture is fitted after another."""
-        return isinstance(self.plan.settings, SequentialMethod)
-
-    @property
     def program(self) -> Program:
         """The model that is fitted."""
-        return self.model.program if self.is_sequential else self.batch_engine.program
+        return self.model.program if self.plan.is_sequential else self.batch_engine.program
 
     @property
     def single(self) -> Program:
         """The same in single precision."""
-        return self.model.single if self.is_sequential else self.batch_engine.single_program
+        return self.model.single if self.plan.is_sequential else self.batch_engine.single_program
 
     @functools.cached_property
     def generative_program(self) -> Program:
@@ -236,11 +235,8 @@ def _fit(
     plan: Plan, captures: ObservationBatch, numbers: np.ndarray, describe: Describe
 ) -> Outcome:
     """Fits of captures by what the settings say."""
-    settings, seed = plan.settings, plan.request.seed
-    if isinstance(settings, SequentialMethod):
-        model = plan.compiled.model
-        return settings.run_batch(model, captures, numbers, seed, describe)
-    return settings.run_batch(plan.compiled.batch_engine, captures, numbers, seed, describe)
+    engine: Any = plan.compiled.model if plan.is_sequential else plan.compiled.batch_engine
+    return plan.settings.run_batch(engine, captures, numbers, plan.request.seed, describe)
 
 
 def _thinning(settings: Method) -> int:

@@ -32,6 +32,7 @@ class MethodUsed(enum.IntEnum):
     ADAPTED = 3
     NUTS = 4
     TEMPERED = 5
+    VARIATIONAL = 6
 
 
 Describe = Callable[[np.ndarray, Values, np.ndarray], None]

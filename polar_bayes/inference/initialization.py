@@ -44,13 +44,13 @@ Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 class AbstractInit(abc.ABC):
     """Where draws start."""
 
-    said: dict[str, Any]
+    metadata: dict[str, Any]
     """Number of starts, failures and weights, for the provenance."""
 
     @property
     def decrement(self) -> float:
         """Newton decrement: distance to the mode in posterior standard deviations."""
-        return float(self.said["newton_decrement"])
+        return float(self.metadata["newton_decrement"])
 
     @abc.abstractmethod
     def target(self, key: Array, chains: int) -> nuts.Target:
@@ -69,7 +69,7 @@ class JointInit(AbstractInit):
     data: Observations
     potential: ValueAndGradient
     modes: Modes
-    said: dict[str, Any]
+    metadata: dict[str, Any]
 
     @override
     def target(self, key: Array, chains: int) -> nuts.Target:
@@ -93,7 +93,7 @@ class HierarchicalInit(AbstractInit):
 
     samplers: nuts.SamplerCache
     fitted: FittedReparam
-    said: dict[str, Any]
+    metadata: dict[str, Any]
 
     @override
     def target(self, key: Array, chains: int) -> nuts.Target:
@@ -160,14 +160,14 @@ class JointInitializer(AbstractInitializer):
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
         potential = CompiledPotential(self.program, data)
         modes = find_modes(potential, from_prior(self.program, key, STARTS, data), progress)
-        said = {
+        metadata = {
             "starts": modes.starts,
             "failures": modes.failures,
             "weights": [round(float(weight), 6) for weight in modes.weight[:8]],
             "newton_decrement": float(modes.decrement[0]),
             "gradients": potential.calls,
         }
-        return JointInit(self, data, potential, modes, said)
+        return JointInit(self, data, potential, modes, metadata)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -184,13 +184,13 @@ class HierarchicalInitializer(AbstractInitializer):
             self.group_model, self.reparam, data, key, progress
         )
         modes = fitted.modes
-        said = {
+        metadata = {
             "starts": modes.starts * self.reparam.groups.count,
             "failures": modes.failures,
             "patches_with_several": sum(len(each.weight) > 1 for each in modes.of_group),
             "newton_decrement": fitted.decrement,
         }
-        return HierarchicalInit(self.samplers, fitted, said)
+        return HierarchicalInit(self.samplers, fitted, metadata)
 
 
 def make_initializer(model: Model, program: Program, data: Observations) -> AbstractInitializer:

@@ -57,7 +57,7 @@ class Nuts(NutsSettings, AbstractMethod):
         )
         bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))
         warmup = np.sum(stats["warmup_steps"][:, 0])
-        search = float(initialization.said.get("gradients", np.nan))
+        search = float(initialization.metadata.get("gradients", np.nan))
         return PosteriorDraws(
             method="nuts",
             z=z,
@@ -66,7 +66,7 @@ class Nuts(NutsSettings, AbstractMethod):
             effective_draws=float(min(np.min(bulk), np.min(tail))),
             gradients=search + float(warmup + np.sum(stats["n_steps"])),
             densities=0.0,
-            metadata={"modes": initialization.said, "goals_reached": mixed},
+            metadata={"modes": initialization.metadata, "goals_reached": mixed},
         )
 
     @override
@@ -124,9 +124,9 @@ class Laplace(LaplaceSettings, AbstractMethod):
             problems=problems,
             k_hat=float(smooth(stats["log_weight"].reshape(1, -1)).pareto_k[0]),
             effective_draws=float(count),
-            gradients=float(initialization.said.get("gradients", np.nan)) + count,
+            gradients=float(initialization.metadata.get("gradients", np.nan)) + count,
             densities=0.0,
-            metadata={"modes": initialization.said},
+            metadata={"modes": initialization.metadata},
         )
 
 

@@ -89,9 +89,9 @@ class AbstractGuide(AbstractMethod):
             problems=[] if np.isfinite(z).all() else ["the guide has left the posterior"],
             k_hat=float(smooth(log_ratio.reshape(1, -1)).pareto_k[0]),
             effective_draws=float(log_ratio.size),
-            gradients=float(initialization.said["gradients"]) + float(self.steps * PARTICLES),
+            gradients=float(initialization.metadata["gradients"]) + float(self.steps * PARTICLES),
             densities=float(log_ratio.size),
-            metadata={"modes": initialization.said, "loss": float(loss)},
+            metadata={"modes": initialization.metadata, "loss": float(loss)},
         )
 
 

@@ -97,9 +97,9 @@ class Importance(AbstractMethod):
             weighted=(z, weights),
             k_hat=float(k_hat),
             effective_draws=effective,
-            gradients=float(initialization.said["gradients"]),
+            gradients=float(initialization.metadata["gradients"]),
             densities=float(self.draws),
-            metadata={"modes": initialization.said},
+            metadata={"modes": initialization.metadata},
         )
 
 

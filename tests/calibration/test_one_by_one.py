@@ -71,6 +71,7 @@ def exact(capture: xr.Dataset) -> xr.DataTree:
     return pb.calibrate(capture, simulations=COUNT, model=population, method=laplace, **ASKED)
 
 
+@pytest.mark.thorough
 def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
     table = pb.summary(exact)
     assert sorted(table.index) == ["level[0]", "level[1]", "level[2]", "location"]

@@ -82,6 +82,7 @@ def assert_same_bits(found: xr.DataTree, expected: xr.DataTree) -> None:
         xr.testing.assert_identical(found[name].to_dataset(), expected[name].to_dataset())
 
 
+@pytest.mark.thorough
 def test_what_was_broken_off_goes_on_to_the_same_bits(capture, whole, begun, tmp_path) -> None:
     store, seen, said = copied(begun, tmp_path), [], []
 
@@ -128,6 +129,7 @@ def test_a_damaged_block_is_fitted_again(capture, whole, begun, tmp_path) -> Non
     assert_same_bits(found, whole)
 
 
+@pytest.mark.thorough
 @each(
     ("other", "topic"),
     [

@@ -22,9 +22,7 @@ PLATES = {
 }
 
 
-@pytest.mark.parametrize(
-    "plate", [pytest.param("glass", marks=pytest.mark.thorough), "plexiglas"]
-)
+@pytest.mark.parametrize("plate", [pytest.param("glass", marks=pytest.mark.thorough), "plexiglas"])
 def test_a_measured_plate_from_table_to_interval(
     plate: str, measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -36,12 +36,10 @@ def executed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("notebooks")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "source",
-    [
-        source if source.stem == "first_fit" else pytest.param(source, marks=pytest.mark.thorough)
-        for source in NOTEBOOKS
-    ],
+    NOTEBOOKS,
     ids=lambda source: source.stem,
 )
 def test_a_notebook_runs_without_a_warning(

@@ -181,6 +181,7 @@ def test_the_ledger_can_be_saved(chosen: pb.effects.ChosenScene, tmp_path) -> No
         assert opened.load().identical(chosen.ledger)
 
 
+@pytest.mark.thorough
 def test_a_fit_keeps_the_ledger(
     chosen: pb.effects.ChosenScene, plate: xr.Dataset, tmp_path
 ) -> None:

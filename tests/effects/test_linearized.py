@@ -61,6 +61,7 @@ def test_in_a_linear_model_shift_and_width_are_exact(line: xr.Dataset) -> None:
     np.testing.assert_allclose(change.rms_move, np.sqrt(np.mean(moves**2)), rtol=1e-3)
 
 
+@pytest.mark.thorough
 def test_on_a_plate_they_are_those_of_climbs_with_exact_gradients(
     plate: xr.Dataset, full: pb.Scene
 ) -> None:

@@ -86,7 +86,10 @@ def unconstrain(name: str, values: np.ndarray) -> np.ndarray:
     return np.log(share) - np.log1p(-share)
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param("near normal", marks=pytest.mark.thorough), "far from normal"],
+)
 def case(request: pytest.FixtureRequest) -> tuple[str, xr.Dataset, Grid]:
     capture = CASES[request.param]
     return request.param, capture, grid_posterior(capture)

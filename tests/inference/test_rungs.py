@@ -81,7 +81,7 @@ def test_gradients_of_a_warm_up_are_counted_as_they_were_made():
     here = problem(line)
     method = pb.methods.Nuts(chains=2, warmup=60, draws=50, most_draws=50, block=50)
     found = run(method, here)
-    climbing = here.initialize().said["gradients"]
+    climbing = here.initialize().metadata["gradients"]
     before = sum(found.stats["warmup_steps"][:, 0])
     assert before >= 60 * 2  # a draw takes one step at least
     assert found.gradients == climbing + before + found.stats["n_steps"].sum()

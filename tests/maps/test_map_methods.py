@@ -58,6 +58,7 @@ def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, tempered: xr.Datase
         assert (np.abs(one - other) < 4.0 * error).all()
 
 
+@pytest.mark.thorough
 def test_the_map_says_how_it_was_made(tempered: xr.Dataset, tmp_path: Path) -> None:
     assert json.loads(tempered.attrs[PROVENANCE])["fitted_by"] == "PixelSMC"
     page = pb.report(tempered, tmp_path / "report").read_text()

@@ -244,6 +244,7 @@ def test_single_precision_finds_the_same_maps(image: xr.Dataset, maps: xr.Datase
 # --- what a map is and what is refused ------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_a_map_says_what_it_holds_and_how_it_was_made(plan: Plan, maps: xr.Dataset) -> None:
     for name in NAMES:
         assert maps[name].dims == maps[f"{name}_sd"].dims == ("y", "x")

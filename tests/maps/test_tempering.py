@@ -79,6 +79,7 @@ def test_a_crowd_is_in_both_modes_and_wide_where_nothing_is_known(crowd: tuple) 
     assert 0.6 < np.sqrt(weights @ y**2 - (weights @ y) ** 2) < 1.4
 
 
+@pytest.mark.thorough
 def test_weighted_draws_of_its_mixture_are_the_posterior(two_modes, crowd: tuple) -> None:
     program, data = two_modes
     count = 4096

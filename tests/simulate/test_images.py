@@ -43,17 +43,27 @@ def compiled_in_haste() -> Iterator[None]:
 # --- dims and truth -------------------------------------------------------------------------------
 
 
-@each(
-    ("parameters", "noise"),
-    [
-        ({"refractive_index": INDEX}, {}),
-        ({}, {"exposure": LIGHT}),
-        ({"refractive_index": INDEX.tolist(), "subsurface_fraction": 0.2}, {"exposure": LIGHT}),
-        ({"subsurface_fraction": FRACTION}, {"concentration_scale": 200.0 * LIGHT}),
-    ],
-)
-@each("protocol", [GRAY, COLORED])
+ONE_VALUE = [
+    ({"refractive_index": INDEX}, {}),
+    ({}, {"exposure": LIGHT}),
+    ({"refractive_index": INDEX.tolist(), "subsurface_fraction": 0.2}, {"exposure": LIGHT}),
+    ({"subsurface_fraction": FRACTION}, {"concentration_scale": 200.0 * LIGHT}),
+]
+
+
+@each(("protocol", "parameters", "noise"), [(GRAY, *ONE_VALUE[0]), (COLORED, *ONE_VALUE[3])])
 def test_one_value_of_that_shape_makes_an_image(protocol, parameters, noise):
+    check_image(protocol, parameters, noise)
+
+
+@pytest.mark.thorough
+@each(("parameters", "noise"), ONE_VALUE)
+@each("protocol", [GRAY, COLORED])
+def test_any_value_of_that_shape_makes_an_image(protocol, parameters, noise):
+    check_image(protocol, parameters, noise)
+
+
+def check_image(protocol, parameters, noise):
     capture = simulate("glass", scene=PLATE, protocol=protocol, parameters=parameters, noise=noise)
     xr.testing.assert_identical(validate(capture), capture)
     color = {"wavelength": 2} if protocol.wavelengths else {}
