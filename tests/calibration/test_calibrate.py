@@ -149,7 +149,7 @@ def test_fits_that_fail_are_counted(capture: xr.Dataset) -> None:
 def test_mistakes_are_told(capture: xr.Dataset) -> None:
     with pytest.raises(pb.FitError, match="simulations is 5; give 20 or more"):
         pb.calibrate(capture, simulations=5, **ASKED)
-    with pytest.raises(pb.FitError, match="point.*least squares make no draws"):
+    with pytest.raises(pb.FitError, match=r"point.*least squares make no draws"):
         pb.calibrate(capture, method=pb.methods.Point(), **ASKED)
     with pytest.raises(
         pb.FitError, match="no such method; give one of laplace, importance, tempered, nuts"

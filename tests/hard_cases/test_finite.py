@@ -155,7 +155,6 @@ RUNS = [
 # the beam's overlap, whose scenes compile longest, and parts that repeat are in the others.
 DOUBLE = {
     "goniometer",
-    "grooves under a sky, with a film",
     "grooves under a disc, of their own color",
     "a plate under film and coat",
 }

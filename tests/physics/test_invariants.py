@@ -83,7 +83,7 @@ SCENES = {
 SURFACES = {name: Scene(scene.surface, coat=scene.coat) for name, scene in SCENES.items()}
 
 every_scene = each("name", SCENES)
-RUN = settings(deadline=None, max_examples=60, derandomize=True)
+RUN = settings(deadline=None, max_examples=40, derandomize=True)
 predict = jax.jit(Scene.predict, static_argnums=0)
 stokes_of = jax.jit(Scene.stokes, static_argnums=0)
 
