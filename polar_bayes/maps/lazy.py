@@ -5,9 +5,9 @@ import os
 from pathlib import Path
 from typing import Any
 
+import lazy_loader
 import numpy as np
 import xarray as xr
-import zarr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
@@ -18,6 +18,8 @@ from polar_bayes.inference.psis import LEVELS
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.data import READINGS
 from polar_bayes.paths import as_path
+
+zarr = lazy_loader.load("zarr")  # 0.1 s that results of other kinds need not wait for
 
 MOST_BYTES = 2**31
 """Maps in chunks (Dask) that are computed at once, into memory."""
