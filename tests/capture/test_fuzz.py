@@ -195,7 +195,7 @@ def test_a_whole_npy_file_is_read_as_it_was_saved(tmp_path, frame):
         ("(" * 300 + ")" * 300, "cannot be read"),
         ("(3, 4", "cannot be read"),
         ("(3, -4)", "cannot be read"),
-        ("(3, 2)", "its header says 48 bytes of numbers"),
+        ("(3, 2)", "its header declares 48 bytes of numbers"),
     ],
 )
 def test_a_size_that_is_not_that_of_the_file_is_refused(tmp_path, shape, what):
