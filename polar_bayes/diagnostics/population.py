@@ -17,6 +17,7 @@ import scipy.stats
 import xarray as xr
 
 from polar_bayes.diagnostics.parameters import CENTRAL_95, Scalar, method_of, posterior_scalars
+from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import bounds_of, provenance_of
 from polar_bayes.priors import RANGES
 
@@ -156,6 +157,7 @@ def population_summary(result: xr.DataTree) -> pd.DataFrame:
     Source:
         Gelman & Pardoe (2006), Technometrics 48(2), 241-251: the pooling factor.
     """
+    check_fit(result)
     found = [] if method_of(result) == "point" else populations(result)
     labels = pd.Index([each.label for each in found], dtype=object)
     rows = [_summary_row(each) for each in found]

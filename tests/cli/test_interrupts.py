@@ -143,7 +143,7 @@ def script(text: str, folder: Path) -> subprocess.Popen:
     head = """
         import threading, time
         from pathlib import Path
-        from polar_bayes.cli import process
+        from polar_bayes.cli import entry as process
         from polar_bayes.interrupts import on_interrupt
         from polar_bayes.paths import temporary_folder
 

@@ -17,6 +17,7 @@ from synthetic_results import edit_provenance, make_result, pool, replace
 from tree_mutations import ODD_ATTRIBUTES, mutate, pick
 
 import polar_bayes as pb
+from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
@@ -259,7 +260,7 @@ def test_readings_and_predictions_belong_together():
 @pytest.mark.thorough
 def test_other_kinds_of_tree_are_named(tmp_path):
     for function in (
-        pb.summary,
+        convergence.summary,
         pb.diagnostics.stack_readings,
         pb.inference.auto_sentences,
         pb.diagnostics.population_summary,
