@@ -17,6 +17,7 @@ from synthetic_results import edit_provenance, make_result, pool, replace
 from tree_mutations import ODD_ATTRIBUTES, mutate, pick
 
 import polar_bayes as pb
+from polar_bayes.calibration.files import check_calibration
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.predictive import predictive_checks
@@ -271,10 +272,10 @@ def test_other_kinds_of_tree_are_named(tmp_path):
             ):
                 function(wrong)
     with pytest.raises(pb.FitError, match="calibration: it holds no calibration; give the tree"):
-        pb.summary(MANY)
+        check_calibration(MANY)
     pb.save(CALIBRATION, tmp_path / "sbc.nc")
-    with pytest.raises(pb.FitError, match=r"sbc\.nc: it holds no fit; give the file that `polar"):
-        pb.load(tmp_path / "sbc.nc")
+    with pytest.raises(pb.FitError, match=r"sbc\.nc: it holds no fit; give the file that"):
+        pb.load(tmp_path / "sbc.nc", "fit")
     with pytest.raises(pb.FitError, match="a str is no result"):
         pb.save("fit", tmp_path / "fit.nc")
     odd = MANY.copy()
