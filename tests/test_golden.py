@@ -105,45 +105,31 @@ def map_of(**settings):
 
 def calibration():
     tree = pb.calibrate(capture(8), simulations=40, method="laplace", seed=1, readings=False)
-    table = (
-        np.asarray(tree["prior_sbc"].ds.to_dataarray(), float).ravel()
-        if "prior_sbc" in tree
-        else []
-    )
-    return {f"rank {at}": (float(x), 0.0) for at, x in enumerate(np.asarray(table)[:40])}
+    ranks = np.asarray(tree["prior_sbc"].ds.to_dataarray(), float).ravel()
+    return {f"rank {at}": (float(x), 0.0) for at, x in enumerate(ranks[:40])}
+
+
+def finite_numbers(found, most: int | None = None, first: int | None = None):
+    """The finite numbers of a dataset: of variables with `most` at most, the `first` of each."""
+    return {
+        f"{name} {at}": (float(x), 0.0)
+        for name, values in found.data_vars.items()
+        if values.dtype.kind == "f" and (most is None or values.size <= most)
+        for at, x in enumerate(np.asarray(values, float).ravel()[:first])
+        if np.isfinite(x)
+    }
 
 
 def identification():
-    found = pb.identify(capture(10), seed=1)
-    numbers = {}
-    for name, values in found.data_vars.items():
-        if values.dtype.kind == "f" and values.size <= 64:
-            for at, x in enumerate(np.asarray(values, float).ravel()):
-                if np.isfinite(x):
-                    numbers[f"{name} {at}"] = (float(x), 0.0)
-    return numbers
+    return finite_numbers(pb.identify(capture(10), seed=1), most=64)
 
 
 def curve():
-    found = pb.profile(capture(10), "refractive_index", seed=1)
-    numbers = {}
-    for name, values in found.data_vars.items():
-        if values.dtype.kind == "f":
-            for at, x in enumerate(np.asarray(values, float).ravel()[:24]):
-                if np.isfinite(x):
-                    numbers[f"{name} {at}"] = (float(x), 0.0)
-    return numbers
+    return finite_numbers(pb.profile(capture(10), "refractive_index", seed=1), first=24)
 
 
 def views():
-    found = pb.next_views(capture(8), seed=1)
-    numbers = {}
-    for name, values in found.data_vars.items():
-        if values.dtype.kind == "f" and values.size <= 64:
-            for at, x in enumerate(np.asarray(values, float).ravel()):
-                if np.isfinite(x):
-                    numbers[f"{name} {at}"] = (float(x), 0.0)
-    return numbers
+    return finite_numbers(pb.next_views(capture(8), seed=1), most=64)
 
 
 def effects():
