@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from polar_bayes.physics import fresnel
 from polar_bayes.physics.boundary import Diattenuation
 from polar_bayes.physics.geometry import cos_degrees, sin_degrees
 from polar_bayes.physics.stack import Layer, Stack
@@ -41,21 +40,6 @@ def at(degrees: float) -> tuple:
 def one_by_one(power: Diattenuation) -> np.ndarray:
     difference = power.contrast * power.sin_squared
     return np.array([power.mean + difference, power.mean - difference, power.cross])
-
-
-@given(theta=zenith, n=index)
-@RUN
-def test_without_layers_it_is_fresnels_law(theta: float, n: float) -> None:
-    stack = Stack(jnp.asarray(n))
-    c, b = at(theta)
-    mean, contrast = fresnel.reflection(c, b, n)
-    found = reflect(stack, c, b)
-    np.testing.assert_allclose([found.mean, found.contrast], [mean, contrast], rtol=1e-13)
-    scaled = stack.relative_reflection(c, b).mean * stack.scale
-    np.testing.assert_allclose(scaled, mean, rtol=1e-12, atol=1e-300)
-    through = fresnel.transmission(c, n)
-    np.testing.assert_allclose(transmit(stack, c, b).mean, through, rtol=1e-13)
-    np.testing.assert_allclose(escape(stack), fresnel.escape(jnp.asarray(n)), rtol=1e-14)
 
 
 THICK = {
