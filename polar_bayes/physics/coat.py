@@ -7,20 +7,12 @@ import abc
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import override
+from typing import Annotated, override
 
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.part import (
-    Part,
-    Setting,
-    check_part,
-    check_setting,
-    names_in,
-    parameters_of,
-    value_of,
-)
+from polar_bayes.physics.part import Part, Range, Setting, check_part, value_of
 from polar_bayes.physics.stack import Layer
 
 
@@ -70,17 +62,8 @@ class ClearCoat(AbstractCoat):
         SceneError: A setting is neither a number in its range nor a name.
     """
 
-    refractive_index: Setting = "coat_refractive_index"
-    absorbance: Setting = "coat_absorbance"
-
-    def __post_init__(self) -> None:
-        check_setting(self.refractive_index, "ClearCoat: refractive_index", 1.0, 3.0)
-        check_setting(self.absorbance, "ClearCoat: absorbance", 0.0, 100.0)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return names_in(self.refractive_index, self.absorbance)
+    refractive_index: Annotated[Setting, Range(1.0, 3.0)] = "coat_refractive_index"
+    absorbance: Annotated[Setting, Range(0.0, 100.0)] = "coat_absorbance"
 
     @override
     def layers(
@@ -103,17 +86,8 @@ class ThinFilm(AbstractCoat):
         SceneError: A setting is neither a number in its range nor a name.
     """
 
-    refractive_index: Setting = "film_refractive_index"
-    thickness_nm: Setting = "film_thickness"
-
-    def __post_init__(self) -> None:
-        check_setting(self.refractive_index, "ThinFilm: refractive_index", 1.0, 3.0)
-        check_setting(self.thickness_nm, "ThinFilm: thickness_nm", 0.0, 1e5)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return names_in(self.refractive_index, self.thickness_nm)
+    refractive_index: Annotated[Setting, Range(1.0, 3.0)] = "film_refractive_index"
+    thickness_nm: Annotated[Setting, Range(0.0, 1e5)] = "film_thickness"
 
     @override
     def layers(
@@ -155,11 +129,6 @@ class CoatStack(AbstractCoat):
                 where="CoatStack",
                 hint="name the parameters apart: ClearCoat(absorbance='lacquer_absorbance')",
             )
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return parameters_of(*self.coats)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:

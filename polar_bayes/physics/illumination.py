@@ -14,7 +14,7 @@ from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import Microsurface, Window, above_horizon, inside_disc, sum_facets
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.microfacet import SlopeEllipse
-from polar_bayes.physics.part import Part, check_part, like, parameters_of, squared_rule, unit_rule
+from polar_bayes.physics.part import Part, check_part, like, squared_rule, unit_rule
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import (
     Light,
@@ -126,11 +126,6 @@ class PointSource(AbstractIllumination):
         if self.polarization is not None:
             allowed = "LinearPolarization(degree=1.0, angle=0.0) or None"
             check_part(self.polarization, "PointSource: polarization", LinearPolarization, allowed)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return parameters_of(self.polarization)
 
     @override
     def reflect(

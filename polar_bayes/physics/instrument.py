@@ -11,7 +11,7 @@ does not lean: the directions are then those that were stated, to the last bit o
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, override
+from typing import Annotated, ClassVar, NamedTuple, override
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,8 +19,8 @@ from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
-from polar_bayes.physics.stokes import Light, in_turned_frame
+from polar_bayes.physics.part import Part, Range, Setting, check_setting, parameters_of, value_of
+from polar_bayes.physics.stokes import Light, diattenuate, in_turned_frame
 from polar_bayes.repr_html import HTMLRepr
 
 __all__ = [
@@ -110,7 +110,7 @@ class Instrument(HTMLRepr):
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of all parameters, in the order of the terms."""
-        return tuple(name for term in self.terms for name in term.parameters)
+        return parameters_of(*self.terms)
 
     def aim(self, parameters: Mapping[str, Array], geometry: Geometry) -> Geometry:
         """Directions the light really takes; see `AbstractInstrumentTerm.aim`."""
@@ -238,8 +238,7 @@ class Analyzer(AbstractInstrumentTerm):
 
     angle: float | tuple[float, ...] = 0.0
 
-    parameters: ClassVar[tuple[str, ...]] = ()
-
+    @override
     def __post_init__(self) -> None:
         angles = self.angle if isinstance(self.angle, tuple) else (self.angle,)
         for angle in angles:
@@ -273,8 +272,7 @@ class Saturation(AbstractInstrumentTerm):
 
     level: float
 
-    parameters: ClassVar[tuple[str, ...]] = ()
-
+    @override
     def __post_init__(self) -> None:
         if isinstance(self.level, str) or not self.level > 0.0:
             raise SceneError(
@@ -286,15 +284,6 @@ class Saturation(AbstractInstrumentTerm):
     @override
     def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
         return light._replace(intensity=jnp.minimum(light.intensity, self.level))
-
-
-def diattenuate(light: Light, contrast: Array, balance: Array) -> Light:
-    r"""Light seen by channels s and p of sensitivity 1 + t and 1 - t.
-
-    $$ I' = I (1 + q t), \quad q' = \frac{q+t}{1+qt}, \quad u' = \frac{u\sqrt{1-t^2}}{1+qt} $$
-    """
-    total = 1.0 + light.q * contrast
-    return Light(light.intensity * total, (light.q + contrast) / total, light.u * balance / total)
 
 
 # --- A normal that leans away from the one that was stated: what a patch sees if it is not level
@@ -343,17 +332,8 @@ class TiltedNormal(Part):
         SceneError: A setting is neither a number in its range nor a name.
     """
 
-    tilt_x: Setting = "normal_tilt_x"
-    tilt_y: Setting = "normal_tilt_y"
-
-    def __post_init__(self) -> None:
-        check_setting(self.tilt_x, "TiltedNormal: tilt_x", -60.0, 60.0)
-        check_setting(self.tilt_y, "TiltedNormal: tilt_y", -60.0, 60.0)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return names_in(self.tilt_x, self.tilt_y)
+    tilt_x: Annotated[Setting, Range(-60.0, 60.0)] = "normal_tilt_x"
+    tilt_y: Annotated[Setting, Range(-60.0, 60.0)] = "normal_tilt_y"
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
@@ -371,7 +351,9 @@ class TiltedNormal(Part):
         Returns:
             The directions, and the turn of the viewer's frame as in `Direction`. Broadcast shape.
         """
-        slopes = self._slopes(parameters)
+        tilts = (value_of(tilt, parameters) for tilt in (self.tilt_x, self.tilt_y))
+        bounded = (jnp.deg2rad(jnp.clip(tilt, -LARGEST_TILT, LARGEST_TILT)) for tilt in tilts)
+        slopes = [jnp.tan(tilt) for tilt in bounded]
         view = lean(geometry.view_zenith, geometry.view_azimuth, *slopes)
         light = lean(geometry.light_zenith, geometry.light_azimuth, *slopes)
         inside = Geometry(
@@ -391,11 +373,6 @@ class TiltedNormal(Part):
         """
         cos, sin = turn
         return Light(light.intensity, *in_turned_frame(light.q, light.u, (cos, -sin)))
-
-    def _slopes(self, parameters: Mapping[str, Array]) -> tuple[Array, Array]:
-        tilts = (value_of(setting, parameters) for setting in (self.tilt_x, self.tilt_y))
-        bounded = [jnp.deg2rad(jnp.clip(tilt, -LARGEST_TILT, LARGEST_TILT)) for tilt in tilts]
-        return jnp.tan(bounded[0]), jnp.tan(bounded[1])
 
 
 def lean(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direction:
@@ -474,6 +451,7 @@ class Discrepancy(AbstractInstrumentTerm):
 
     parameters: ClassVar[tuple[str, ...]] = ("discrepancy_amplitude", "discrepancy_weights")
 
+    @override
     def __post_init__(self) -> None:
         if not (isinstance(self.basis, int) and self.basis >= 1 and self.length > 0.0):
             raise SceneError(

@@ -8,7 +8,7 @@ slopes of a facet, one after the other) serve extended sources and the way out o
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, override
+from typing import Annotated, ClassVar, NamedTuple, override
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
+from polar_bayes.physics.part import Part, Range, Setting, value_of
 
 # A roughness below this is taken as this: the width of a highlight is then 0.001 degree, which no
 # instrument resolves, and its peak brightness stays within single precision.
@@ -268,15 +268,12 @@ class AnisotropicSlopes(AbstractSlopes):
         SceneError: The azimuth is neither a number in its range nor a name.
     """
 
-    azimuth: Setting = 0.0
-
-    def __post_init__(self) -> None:
-        check_setting(self.azimuth, "AnisotropicSlopes: azimuth", -360.0, 360.0)
+    azimuth: Annotated[Setting, Range(-360.0, 360.0)] = 0.0
 
     @property
     @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return ("roughness", "roughness_across", *names_in(self.azimuth))
+    def parameters(self) -> tuple[str, ...]:
+        return ("roughness", "roughness_across", *super().parameters)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:

@@ -27,7 +27,7 @@ from polar_bayes.physics.instrument import (
 )
 from polar_bayes.physics.microfacet import Beckmann, HeightCorrelatedShadowing
 from polar_bayes.physics.mixing import AbstractMixing, DopMixing, StokesMixing
-from polar_bayes.physics.part import Part, check_part, notation, parameters_of
+from polar_bayes.physics.part import check_part, notation, parameters_of
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization, to_stokes
 from polar_bayes.physics.subsurface import AbstractSubsurface, Depolarizer, Lambertian, Unpolarized
@@ -126,11 +126,10 @@ class Scene(HTMLRepr):
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters that the scene reads: the material's, then all others."""
-        index = self.dispersion or _FREE_INDEX
-        read = parameters_of(
-            self.surface, self.subsurface, self.mixing, index, self.coat, self.normal
-        )
-        read = (*read, *(() if self.instrument is None else self.instrument.parameters))
+        index = ("refractive_index",) if self.dispersion is None else self.dispersion.parameters
+        optics = parameters_of(self.surface, self.subsurface, self.mixing)
+        rest = parameters_of(self.coat, self.normal, self.instrument)
+        read = tuple(dict.fromkeys((*optics, *index, *rest)))
         material = tuple(name for name in MATERIAL_PARAMETERS if name in read)
         return (*material, *(name for name in read if name not in MATERIAL_PARAMETERS))
 
@@ -284,16 +283,6 @@ class Scene(HTMLRepr):
             )
         dtype = jnp.result_type(geometry.dtype, *(parameters[name] for name in needed))
         return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}
-
-
-@dataclasses.dataclass(frozen=True)
-class _FreeIndex(Part):
-    """The index itself is a parameter, one for each wavelength."""
-
-    parameters: ClassVar[tuple[str, ...]] = ("refractive_index",)
-
-
-_FREE_INDEX = _FreeIndex()
 
 
 # --- Scenes by name, as they are used and with every effect on that such a set-up may have --------

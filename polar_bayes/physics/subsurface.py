@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar, override
+from typing import Annotated, ClassVar, override
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.half_space import CLEAREST, refract, scatter
-from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
+from polar_bayes.physics.part import Part, Range, Setting, value_of
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import Interface, InternalReflection
 
@@ -53,16 +53,8 @@ class DiffuseBody(AbstractSubsurface):
         SceneError: The albedo is neither a number from 0 to 1 nor a name.
     """
 
-    albedo: Setting = 1.0
+    albedo: Annotated[Setting, Range(0.0, 1.0)] = 1.0
     internal_reflection: InternalReflection | None = None
-
-    def __post_init__(self) -> None:
-        check_setting(self.albedo, f"{type(self).__name__}: albedo", 0.0, 1.0)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return names_in(self.albedo)
 
     def diffuse(
         self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
@@ -72,7 +64,7 @@ class DiffuseBody(AbstractSubsurface):
         entering = interface.entering(parameters, geometry).intensity
         brightness = albedo / jnp.pi * entering
         if self.internal_reflection is not None:
-            escape = self.internal_reflection.escape(interface)
+            escape = interface.escape()
             # 1 - A Fi, as a sum of two positive terms.
             not_trapped = (1.0 - albedo) + albedo * escape
             brightness = brightness / (parameters["refractive_index"] ** 2 * not_trapped)
@@ -148,7 +140,7 @@ class Depolarizer(AbstractSubsurface):
         if self.internal_reflection is None:
             not_trapped, kept = jnp.ones_like(lost), lost
         else:
-            escape = self.internal_reflection.escape(interface)
+            escape = interface.escape()
             # 1 - Fi Rd, as a sum of two positive terms.
             not_trapped = lost + (1.0 - lost) * escape
             kept = body_loss(parameters["absorption"], escape)
@@ -207,18 +199,15 @@ class TurbidMedium(AbstractSubsurface):
         SceneError: The fraction is neither a number from 0 to 1 nor a name.
     """
 
-    polarized_fraction: Setting = 0.5
+    polarized_fraction: Annotated[Setting, Range(0.0, 1.0)] = 0.5
     internal_reflection: InternalReflection | None = dataclasses.field(
         default_factory=InternalReflection
     )
 
-    def __post_init__(self) -> None:
-        check_setting(self.polarized_fraction, "TurbidMedium: polarized_fraction", 0.0, 1.0)
-
     @property
     @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return ("absorption", *names_in(self.polarized_fraction))
+    def parameters(self) -> tuple[str, ...]:
+        return ("absorption", *super().parameters)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:

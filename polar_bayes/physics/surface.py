@@ -177,11 +177,6 @@ class SmoothSurface(AbstractSurface):
     def __post_init__(self) -> None:
         check_part(self.beam, "SmoothSurface: beam", PointSource, "PointSource()")
 
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self.beam.parameters
-
     @override
     def light(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
         incident = self.beam.incident(parameters, geometry)
@@ -238,7 +233,7 @@ class RoughSurface(AbstractSurface):
 
     @property
     @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
+    def parameters(self) -> tuple[str, ...]:
         return parameters_of(self.distribution, self.slopes, self.illumination)
 
     @property
@@ -311,7 +306,3 @@ class InternalReflection(Part):
     @override
     def simpler(self) -> tuple[Part | None, ...]:
         return (None,)
-
-    def escape(self, interface: Interface) -> Array:
-        """Share of diffuse light that leaves, 1 - F_i. Broadcasts with (..., view), in (0, 1]."""
-        return interface.escape()
