@@ -93,24 +93,14 @@ class Diattenuation(NamedTuple):
 
 
 class Medium(NamedTuple):
-    """A medium on the path of light.
-
-    Args:
-        refractive_index: Refractive index. Broadcasts with (..., view[, facet]), 1, >= 1.
-        normal: Q, the index times the cosine inside. Same shape, 1.
-    """
+    """A medium on the path of light, with Q, the index times the cosine inside."""
 
     refractive_index: Array
     normal: Array
 
 
 class Film(NamedTuple):
-    """A layer thin enough for interference.
-
-    Args:
-        medium: What it is made of.
-        phase: exp(2 i delta), the phase of one round trip. Complex.
-    """
+    """A layer thin enough for interference, and the phase of one round trip, exp(2 i delta)."""
 
     medium: Medium
     phase: Array

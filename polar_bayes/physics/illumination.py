@@ -12,7 +12,14 @@ from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import Microsurface, Window, above_horizon, inside_disc, sum_facets
-from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
+from polar_bayes.physics.geometry import (
+    Geometry,
+    cos_degrees,
+    mirror_facet,
+    per_facet,
+    per_ray,
+    sin_degrees,
+)
 from polar_bayes.physics.microfacet import SlopeEllipse
 from polar_bayes.physics.part import Part, check_part, like, squared_rule, unit_rule
 from polar_bayes.physics.stack import Stack
@@ -61,12 +68,7 @@ class AbstractIllumination(Part):
 
     @abc.abstractmethod
     def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
-        """Irradiance that passes the interface into the body, in the frame of the light.
-
-        Args:
-            stack: What the surface is made of. Broadcasts with (..., view).
-            geometry: Directions. Shape (..., view), degree.
-            parameters: Material parameters by name, for those of the light itself.
+        """Irradiance that passes the interface into the body; arguments as in `reflect`.
 
         Returns:
             Power per area, for unit irradiance (point) or unit radiance (disc, sky), with its
@@ -76,9 +78,6 @@ class AbstractIllumination(Part):
     @abc.abstractmethod
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
         """Beams that stand for the source, for a body that asks where its light comes from.
-
-        Args:
-            geometry: Directions. Shape (..., view), degree.
 
         Returns:
             `(geometry, irradiance)` with a ray axis: directions of shape (..., view, ray), and what
@@ -98,9 +97,8 @@ class AbstractIllumination(Part):
         """Light that passes into the body, ray by ray; see `rays` and `entering`."""
         rays, irradiance = self.rays(geometry)
         cos_light = cos_degrees(rays.light_zenith)
-        passing = stack.per_ray().transmission(cos_light, sin_degrees(rays.light_zenith) ** 2)
-        per_ray = {name: value[..., None] for name, value in parameters.items()}
-        light = transmit_inward(passing, cos_light, self.incident(per_ray, rays))
+        passing = per_ray(stack).transmission(cos_light, sin_degrees(rays.light_zenith) ** 2)
+        light = transmit_inward(passing, cos_light, self.incident(per_ray(dict(parameters)), rays))
         return rays, light._replace(intensity=irradiance * light.intensity)
 
 
@@ -159,7 +157,7 @@ class PointSource(AbstractIllumination):
 
     @override
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
-        rays = geometry.per_ray()
+        rays = per_ray(geometry)
         return rays, jnp.ones_like(rays.light_zenith)
 
     @override
@@ -186,14 +184,11 @@ class AbstractExtendedSource(AbstractIllumination):
 
     @abc.abstractmethod
     def border(self, sin_view: Array, cos_view: Array) -> Window:
-        """Facets that mirror the viewer's ray into the source.
+        """Slopes of the facets that mirror the viewer's ray into the source.
 
         Args:
             sin_view: Sine of the view zenith. Shape (..., view), 1.
             cos_view: Its cosine. Same shape, 1, > 0.
-
-        Returns:
-            Window of slopes.
         """
 
     @override
@@ -207,13 +202,13 @@ class AbstractExtendedSource(AbstractIllumination):
     ) -> Light:
         sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
         sample = facets.sample(ellipse, geometry, self.border)
-        power = stack.per_facet().relative_reflection(sample.cos_incidence, sample.sin_squared)
+        power = per_facet(stack).relative_reflection(sample.cos_incidence, sample.sin_squared)
         cos_light = jnp.clip(sample.cos_light, 1e-6, 1.0)
         to_viewer = sin_view / cos_view
         seen = facets.shadowing.both(
             facets.visible(ellipse, to_viewer, jnp.zeros_like(to_viewer))[..., None, :],
             facets.visible(
-                ellipse.per_facet(),
+                per_facet(ellipse),
                 sample.light_in_plane / cos_light,
                 sample.light_out_of_plane / cos_light,
             ),
@@ -243,7 +238,7 @@ class UniformSky(AbstractExtendedSource):
         # up once and twice around to nothing, which is all that scattering knows of azimuth.
         cosine, weight = squared_rule(SKY_NODES)
         solid_angle = 0.5 * np.pi * weight
-        rays = geometry.per_ray()
+        rays = per_ray(geometry)
         zenith, azimuth = np.degrees(np.arccos(cosine)), 90.0 * np.arange(4.0)
         around = like(np.tile(azimuth, SKY_NODES), rays.view_azimuth)
         return (
@@ -293,7 +288,7 @@ class Disc(AbstractExtendedSource):
         cos_light = cos_light + jnp.asarray(sine_cosine, cos_view.dtype) * sin_view
         cos_light = jnp.clip(cos_light, 1e-4, 1.0)
         sin_squared = (1.0 - cos_light) * (1.0 + cos_light)
-        through = stack.per_ray().transmission(cos_light, sin_squared)
+        through = per_ray(stack).transmission(cos_light, sin_squared)
         passing = jnp.sum(cos_light * through.mean * like(solid_angle, cos_view), axis=-1)
         # Around the light's own plane the disc is nearly symmetric: what polarization is left
         # after averaging belongs to its middle.
@@ -301,7 +296,7 @@ class Disc(AbstractExtendedSource):
 
     @override
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
-        rays = geometry.per_ray()
+        rays = per_ray(geometry)
         sin_view, cos_view = sin_degrees(rays.view_zenith), cos_degrees(rays.view_zenith)
         cosine, along, solid_angle = (like(x, cos_view) for x in self._directions())
         across = jnp.sqrt(jnp.maximum((1.0 - cosine) * (1.0 + cosine) - along**2, 0.0))

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
+from polar_bayes.physics.geometry import Geometry, cos_degrees, double_angle, sin_degrees
 from polar_bayes.physics.part import Part, Range, Setting, check_setting, parameters_of, value_of
 from polar_bayes.physics.stokes import Light, diattenuate, in_turned_frame
 from polar_bayes.repr_html import HTMLRepr
@@ -294,16 +294,13 @@ LARGEST_TILT = 80.0
 
 
 class Direction(NamedTuple):
-    """A direction in the frame of the true normal.
+    """A direction in the frame of the true normal, in degrees.
 
-    Args:
-        zenith: Angle from the true normal. Shape (..., view), degree.
-        azimuth: Around the true normal. Shape (..., view), degree.
-        turn: Cosine and sine of twice the angle from the s axis of the stated normal to that of
-            the true one. Each (..., view).
+    `turn` is the cosine and sine of twice the angle from the s axis of the stated normal to that
+    of the true one.
     """
 
-    zenith: Array
+    zenith: Array  # (..., view)
     azimuth: Array
     turn: tuple[Array, Array]
 
@@ -342,15 +339,7 @@ class TiltedNormal(Part):
     def enter(
         self, parameters: Mapping[str, Array], geometry: Geometry
     ) -> tuple[Geometry, tuple[Array, Array]]:
-        """Directions in the frame of the true normal.
-
-        Args:
-            parameters: Material parameters by name. Each broadcasts with (..., view).
-            geometry: Directions in the stated frame. Shape (..., view), degree.
-
-        Returns:
-            The directions, and the turn of the viewer's frame as in `Direction`. Broadcast shape.
-        """
+        """Directions in the frame of the true normal, and the turn of the viewer's frame."""
         tilts = (value_of(tilt, parameters) for tilt in (self.tilt_x, self.tilt_y))
         bounded = (jnp.deg2rad(jnp.clip(tilt, -LARGEST_TILT, LARGEST_TILT)) for tilt in tilts)
         slopes = [jnp.tan(tilt) for tilt in bounded]
@@ -362,15 +351,7 @@ class TiltedNormal(Part):
         return inside, view.turn
 
     def leave(self, light: Light, turn: tuple[Array, Array]) -> Light:
-        """Light in the stated frame of the viewer.
-
-        Args:
-            light: Light in the true frame. Shape (..., view).
-            turn: As `enter` gave it.
-
-        Returns:
-            Light of the same shape.
-        """
+        """Light in the stated frame of the viewer, from that in the true one."""
         cos, sin = turn
         return Light(light.intensity, *in_turned_frame(light.q, light.u, (cos, -sin)))
 
@@ -406,12 +387,13 @@ def lean(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direc
     squared = along_s**2 + along_p**2
     sine = jnp.where(overhead, signed, jnp.sqrt(squared))
 
+    cos_turn, sin_turn = double_angle(along_s, along_p)
     steeper = jnp.rad2deg(jnp.arctan2(sine * cos - height * sin, height * cos + sine * sin))
     horizon = jnp.maximum(zenith, STEEPEST_ZENITH)
     return Direction(
         jnp.minimum(zenith + steeper, horizon),
         azimuth + jnp.rad2deg(jnp.arctan2(y, x)),
-        ((along_s - along_p) * (along_s + along_p) / squared, 2.0 * along_s * along_p / squared),
+        (cos_turn / squared, sin_turn / squared),
     )
 
 

@@ -214,14 +214,6 @@ class SlopeEllipse(NamedTuple):
     along: Array
     shear: Array | None
 
-    def per_facet(self) -> "SlopeEllipse":
-        """The same with an axis before the views, for many facets of each."""
-        return SlopeEllipse(
-            self.across[..., None, :],
-            self.along[..., None, :],
-            None if self.shear is None else self.shear[..., None, :],
-        )
-
 
 @dataclasses.dataclass(frozen=True)
 class AbstractSlopes(Part):
@@ -234,9 +226,6 @@ class AbstractSlopes(Part):
         Args:
             parameters: Material parameters by name. Each broadcasts with (..., view).
             geometry: Directions. Shape (..., view), degree.
-
-        Returns:
-            SlopeEllipse.
         """
 
 

@@ -322,33 +322,29 @@ SCENES: dict[str, Scene] = {
     ),
 }
 
+_FULL_SURFACE = RoughSurface(
+    Beckmann(), PointSource(), MANY_FACETS, shadowing=HeightCorrelatedShadowing()
+)
+
 FULL_SCENES: dict[str, Scene] = {
-    "paper": Scene(
-        surface=RoughSurface(
-            Beckmann(), PointSource(), MANY_FACETS, shadowing=HeightCorrelatedShadowing()
-        ),
-        subsurface=Depolarizer(),
-        mixing=DopMixing(),
+    "paper": dataclasses.replace(
+        SCENES["paper"],
+        surface=_FULL_SURFACE,
         instrument=Instrument((AngleZero(), DarkLevel())),
     ),
-    "camera": Scene(
-        surface=RoughSurface(
-            Beckmann(), PointSource(), MANY_FACETS, shadowing=HeightCorrelatedShadowing()
-        ),
+    "camera": dataclasses.replace(
+        SCENES["camera"],
+        surface=_FULL_SURFACE,
         subsurface=Lambertian(internal_reflection=InternalReflection()),
-        mixing=StokesMixing(),
         instrument=Instrument((AngleZero(), DolpGain(), DarkLevel())),
     ),
-    "picture": Scene(
-        surface=SmoothSurface(),
+    "picture": dataclasses.replace(
+        SCENES["picture"],
         subsurface=Lambertian(internal_reflection=InternalReflection()),
-        mixing=StokesMixing(),
         instrument=Instrument((DolpGain(),)),
     ),
-    "goniometer": Scene(
-        surface=SmoothSurface(),
-        subsurface=Unpolarized(),
-        mixing=StokesMixing(),
+    "goniometer": dataclasses.replace(
+        SCENES["goniometer"],
         instrument=Instrument(
             (AngleZero(), BeamOverlap(), ChannelGain(), Leakage(), Discrepancy())
         ),

@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from polar_bayes.physics import boundary
 from polar_bayes.physics.boundary import EVANESCENT, Diattenuation, Film, Medium
+from polar_bayes.physics.geometry import per_ray
 from polar_bayes.physics.part import like, squared_rule
 
 # Cosines and weights for integrals over the hemisphere: 24 Gauss-Legendre nodes in the square root
@@ -26,10 +27,10 @@ TRAPPED_SHARE = 1.0 - _FROM_END
 
 
 class Layer(NamedTuple):
-    """One layer on the body.
+    """One layer on the body; its arrays broadcast with (..., view).
 
     Args:
-        refractive_index: Refractive index. Broadcasts with (..., view), 1, >= 1.
+        refractive_index: Refractive index, 1, >= 1.
         absorbance: Minus the log of what passes at normal incidence; None for a clear layer.
         wavenumber: 4 pi thickness/wavelength for a film thin enough for interference, so that
             the phase of a round trip is wavenumber times Q; None for a thick layer.
@@ -50,14 +51,6 @@ class Stack(NamedTuple):
 
     refractive_index: Array
     layers: tuple[Layer, ...] = ()
-
-    def per_facet(self) -> "Stack":
-        """The same with an axis before the views, for many facets of each."""
-        return jax.tree.map(lambda array: array[..., None, :] if array.ndim else array, self)
-
-    def per_ray(self) -> "Stack":
-        """The same with a trailing axis, for many rays or quadrature nodes of each view."""
-        return jax.tree.map(lambda array: array[..., None] if array.ndim else array, self)
 
     def reflection(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
         """Share of the light that comes back from the whole stack."""
@@ -96,7 +89,7 @@ class Stack(NamedTuple):
         $$ 1 - F_e = \int_0^1 2\mu T_+(\mu)\, d\mu $$
         """
         cosine, weight = self._hemisphere()
-        through = self.per_ray().transmission(cosine, (1.0 - cosine) * (1.0 + cosine))
+        through = per_ray(self).transmission(cosine, (1.0 - cosine) * (1.0 + cosine))
         # A sum, since matrix products of accelerators drop digits in single precision.
         return jnp.sum(weight * through.mean, axis=-1)
 
@@ -111,7 +104,7 @@ class Stack(NamedTuple):
         if not self.layers:
             return self.hemispherical_transmission() / self.refractive_index**2
         cosine, weight = self._hemisphere()
-        left = self.per_ray()._not_returned(cosine**2, (1.0 - cosine) * (1.0 + cosine))
+        left = per_ray(self)._not_returned(cosine**2, (1.0 - cosine) * (1.0 + cosine))
         lost = jnp.sum(weight * left, axis=-1)
         if any(layer.absorbance is not None for layer in self.layers):
             lost = lost + self._absorbed_under_total_reflection()
@@ -122,7 +115,7 @@ class Stack(NamedTuple):
         lowest = [layer for layer in self.layers if layer.wavenumber is None][-1]
         end = jnp.minimum(self.refractive_index, lowest.refractive_index) ** 2
         beyond = (end - 1.0)[..., None] * like(TRAPPED_SHARE, self.refractive_index)
-        absorbed = self.per_ray()._not_returned(-beyond, 1.0 + beyond, reaches_air=False)
+        absorbed = per_ray(self)._not_returned(-beyond, 1.0 + beyond, reaches_air=False)
         return (end - 1.0) * jnp.sum(
             like(TRAPPED_WEIGHT, self.refractive_index) * absorbed, axis=-1
         )

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.physics.facets import FacetQuadrature, Facets, Microsurface, seen, sum_facets
-from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
+from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, per_facet, sin_degrees
 from polar_bayes.physics.illumination import AbstractIllumination, PointSource
 from polar_bayes.physics.microfacet import (
     AbstractMicrofacet,
@@ -78,7 +78,7 @@ class RoughExit(AbstractExit):
         sample = facets.sample(ellipse, geometry, seen)
         # A barrier keeps facets from being found anew for each of their readers; see `facets`.
         sample = Facets(*jax.lax.optimization_barrier(tuple(sample)))
-        passing = stack.per_facet().transmission(sample.cos_incidence, sample.sin_squared)
+        passing = per_facet(stack).transmission(sample.cos_incidence, sample.sin_squared)
         area = jnp.sum(sample.weight, axis=-2)
         light = sum_facets(sample, sample.weight, passing)
         light = light._replace(intensity=light.intensity / area)
@@ -98,19 +98,16 @@ def exit_through_plane(stack: Stack, geometry: Geometry) -> Light:
 
 @dataclasses.dataclass(frozen=True)
 class AbstractSurface(Part):
-    """An interface between air and the body. Parameters broadcast with (..., view).
+    """An interface between air and the body.
 
-    What a single facet is made of (the bare body, or layers on it) comes as a `Stack`.
+    Every method takes `parameters` (material parameters by name, each broadcasts with (..., view)),
+    `geometry` (directions of shape (..., view), in degrees) and `stack` (what a single facet is
+    made of: the bare body, or layers on it; broadcasts with (..., view)).
     """
 
     @abc.abstractmethod
     def light(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
         """Light that the interface reflects to the viewer.
-
-        Args:
-            parameters: Material parameters by name. Each broadcasts with (..., view).
-            geometry: Directions. Shape (..., view), degree.
-            stack: Layers and body. Broadcasts with (..., view).
 
         Returns:
             Light; q > 0 is polarized across the plane of the viewer. Shape (..., view).
@@ -119,11 +116,6 @@ class AbstractSurface(Part):
     @abc.abstractmethod
     def entering(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
         """Light that passes into the body.
-
-        Args:
-            parameters: Material parameters by name. Each broadcasts with (..., view).
-            geometry: Directions. Shape (..., view), degree.
-            stack: Layers and body. Broadcasts with (..., view).
 
         Returns:
             Power per area for unit irradiance, or for unit radiance of a disc or sky, and its
@@ -136,11 +128,6 @@ class AbstractSurface(Part):
     ) -> tuple[Geometry, Light]:
         """The same light ray by ray, for a body that asks where it comes from.
 
-        Args:
-            parameters: Material parameters by name. Each broadcasts with (..., view).
-            geometry: Directions. Shape (..., view), degree.
-            stack: Layers and body. Broadcasts with (..., view).
-
         Returns:
             `(rays, light)`: directions and light of shape (..., view, ray).
         """
@@ -148,11 +135,6 @@ class AbstractSurface(Part):
     @abc.abstractmethod
     def exit(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
         """What the interface does to unpolarized light on its way out to the viewer.
-
-        Args:
-            parameters: Material parameters by name. Each broadcasts with (..., view).
-            geometry: Directions. Shape (..., view), degree.
-            stack: Layers and body. Broadcasts with (..., view).
 
         Returns:
             Light whose intensity is the transmittance; q <= 0, along the plane of the viewer.
@@ -264,12 +246,7 @@ class RoughSurface(AbstractSurface):
 
 @dataclasses.dataclass(frozen=True)
 class Interface:
-    """A surface with all it is made of, as a body under it needs it.
-
-    Args:
-        surface: The surface.
-        stack: Layers and body. Broadcasts with (..., view).
-    """
+    """A surface with all it is made of, as a body under it needs it."""
 
     surface: AbstractSurface
     stack: Stack

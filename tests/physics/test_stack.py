@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from polar_bayes.physics.boundary import Diattenuation
-from polar_bayes.physics.geometry import cos_degrees, sin_degrees
+from polar_bayes.physics.geometry import cos_degrees, per_ray, sin_degrees
 from polar_bayes.physics.stack import Layer, Stack
 
 RUN = settings(deadline=None, max_examples=60, derandomize=True)
@@ -241,9 +241,8 @@ def test_absorption_in_a_coat_never_brings_light_back() -> None:
 
 @pytest.mark.thorough
 def test_shapes_broadcast_over_facets() -> None:
-    stack = Stack(
-        jnp.array([1.5, 1.6]), (Layer(jnp.array([1.3, 1.4]), jnp.asarray(0.1)),)
-    ).per_ray()
+    layers = (Layer(jnp.array([1.3, 1.4]), jnp.asarray(0.1)),)
+    stack = per_ray(Stack(jnp.array([1.5, 1.6]), layers))
     cosine = jnp.full((2, 5), 0.5)
     assert stack.reflection(cosine, 1.0 - cosine**2).mean.shape == (2, 5)
     assert stack.transmission(cosine, 1.0 - cosine**2).contrast.shape == (2, 5)
