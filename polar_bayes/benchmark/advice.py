@@ -110,14 +110,6 @@ def time_column(table: pd.DataFrame) -> str:
     return TIMES[0] if table[TIMES[0]].notna().any() else TIMES[1]
 
 
-def best_method(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> str | None:
-    """The fastest method as given that is good for every parameter."""
-    table = accuracy_table(result)
-    seconds = table[time_column(table)]
-    good = (table["override"] == AS_GIVEN) & (table["error"] <= tolerance) & seconds.notna()
-    return str(seconds[good].idxmin()) if good.any() else None
-
-
 def accuracy_sentences(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> list[str]:
     """Which method to use for this capture.
 

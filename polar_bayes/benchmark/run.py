@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 from subprocess import PIPE
-from typing import override
+from typing import ClassVar, override
 
 import cloudpickle
 import jax
@@ -210,7 +210,43 @@ class AbstractOverride(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True)
-class DrawsOverride(AbstractOverride):
+class _Factor(AbstractOverride):
+    """So many times of something that `what` names."""
+
+    factor: float
+    what: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        if not self.factor > 0.0:
+            raise FitError(
+                f"factor is {self.factor}", where=type(self).__name__, hint="give a number above 0"
+            )
+
+    @property
+    @override
+    def name(self) -> str:
+        if self.factor >= 1.0:
+            return f"{self.what} x {self.factor:g}"
+        return f"{self.what} / {1.0 / self.factor:g}"
+
+
+class _SceneOverride(AbstractOverride):
+    """Another scene."""
+
+    @abc.abstractmethod
+    def scene(self, request: Request) -> Scene:
+        """The scene that is fitted in place of the request's."""
+
+    @override
+    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
+        scene = self.scene(request)
+        if scene == request.scene:
+            return None
+        return dataclasses.replace(request, scene=scene), method
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawsOverride(_Factor):
     """So many times the draws; left out where a method cannot have about as many.
 
     Args:
@@ -220,18 +256,7 @@ class DrawsOverride(AbstractOverride):
         FitError: The factor is not above 0.
     """
 
-    factor: float
-
-    def __post_init__(self) -> None:
-        if not self.factor > 0.0:
-            raise FitError(
-                f"factor is {self.factor}", where="DrawsOverride", hint="give a number above 0"
-            )
-
-    @property
-    @override
-    def name(self) -> str:
-        return _times("draws", self.factor)
+    what: ClassVar[str] = "draws"
 
     @override
     def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
@@ -264,7 +289,7 @@ class PrecisionOverride(AbstractOverride):
 
 
 @dataclasses.dataclass(frozen=True)
-class FacetsOverride(AbstractOverride):
+class FacetsOverride(_Factor, _SceneOverride):
     """So many times the facets in each direction.
 
     Args:
@@ -274,28 +299,16 @@ class FacetsOverride(AbstractOverride):
         FitError: The factor is not above 0.
     """
 
-    factor: float
-
-    def __post_init__(self) -> None:
-        if not self.factor > 0.0:
-            raise FitError(
-                f"factor is {self.factor}", where="FacetsOverride", hint="give a number above 0"
-            )
-
-    @property
-    @override
-    def name(self) -> str:
-        return _times("facets", self.factor)
+    what: ClassVar[str] = "facets"
 
     @override
-    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
+    def scene(self, request: Request) -> Scene:
         changed = [
             Effect("", key_path, part, self._of(part))
             for key_path, part in parts_of(request.scene)
             if isinstance(part, FacetQuadrature)
         ]
-        scene = simplify(request.scene, changed)
-        return None if scene == request.scene else (_with_scene(request, scene), method)
+        return simplify(request.scene, changed)
 
     def _of(self, rule: FacetQuadrature) -> FacetQuadrature:
         along, across = (
@@ -305,7 +318,7 @@ class FacetsOverride(AbstractOverride):
 
 
 @dataclasses.dataclass(frozen=True)
-class EffectsOverride(AbstractOverride):
+class EffectsOverride(_SceneOverride):
     """Only the effects that `polar_bayes.choose_effects` keeps.
 
     Args:
@@ -320,11 +333,11 @@ class EffectsOverride(AbstractOverride):
         return "chosen effects"
 
     @override
-    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
+    def scene(self, request: Request) -> Scene:
         scene = _choose(request, self.tolerance)
         if isinstance(scene, PolarBayesError):
             raise scene
-        return None if scene == request.scene else (_with_scene(request, scene), method)
+        return scene
 
 
 OVERRIDES: tuple[AbstractOverride, ...] = (
@@ -369,14 +382,6 @@ def _choose(request: Request, tolerance: float) -> Scene | PolarBayesError:
         return simplify(scene, ())
 
     return _CHOSEN.of(key, choose)
-
-
-def _with_scene(request: Request, scene: Scene) -> Request:
-    return dataclasses.replace(request, scene=scene)
-
-
-def _times(what: str, factor: float) -> str:
-    return f"{what} x {factor:g}" if factor >= 1.0 else f"{what} / {1.0 / factor:g}"
 
 
 if __name__ == "__main__":
