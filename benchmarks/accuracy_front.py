@@ -101,7 +101,7 @@ def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]])
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {noise:.2g} |")
     lines += [
         "",
-        "| scene | advice | the fastest good method on another capture |",
+        "| scene | advice | the advised method on another capture |",
         "|---|---|---|",
     ]
     for name, found in studies.items():
