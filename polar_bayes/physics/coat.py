@@ -6,13 +6,12 @@ A coat lies on every facet of a rough surface alike. One of your own says which 
 import abc
 import dataclasses
 import math
-from collections.abc import Mapping
 from typing import Annotated, override
 
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.part import Part, Range, Setting, check_part, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, check_part, value_of
 from polar_bayes.physics.stack import Layer
 
 
@@ -21,9 +20,7 @@ class AbstractCoat(Part):
     """One or more layers on the body."""
 
     @abc.abstractmethod
-    def layers(
-        self, parameters: Mapping[str, Array], wavelength: Array | None
-    ) -> tuple[Layer, ...]:
+    def layers(self, parameters: Parameters, wavelength: Array | None) -> tuple[Layer, ...]:
         """Layers from the top down.
 
         Args:
@@ -66,9 +63,7 @@ class ClearCoat(AbstractCoat):
     absorbance: Annotated[Setting, Range(0.0, 100.0)] = "coat_absorbance"
 
     @override
-    def layers(
-        self, parameters: Mapping[str, Array], wavelength: Array | None
-    ) -> tuple[Layer, ...]:
+    def layers(self, parameters: Parameters, wavelength: Array | None) -> tuple[Layer, ...]:
         clear = self.absorbance == 0.0
         index = value_of(self.refractive_index, parameters)
         return (Layer(index, None if clear else value_of(self.absorbance, parameters)),)
@@ -90,9 +85,7 @@ class ThinFilm(AbstractCoat):
     thickness_nm: Annotated[Setting, Range(0.0, 1e5)] = "film_thickness"
 
     @override
-    def layers(
-        self, parameters: Mapping[str, Array], wavelength: Array | None
-    ) -> tuple[Layer, ...]:
+    def layers(self, parameters: Parameters, wavelength: Array | None) -> tuple[Layer, ...]:
         if wavelength is None:
             raise SceneError(
                 "fringes depend on the wavelength, and there is none",
@@ -136,7 +129,5 @@ class CoatStack(AbstractCoat):
         return tuple(CoatStack(coats) if coats else None for coats in others)
 
     @override
-    def layers(
-        self, parameters: Mapping[str, Array], wavelength: Array | None
-    ) -> tuple[Layer, ...]:
+    def layers(self, parameters: Parameters, wavelength: Array | None) -> tuple[Layer, ...]:
         return tuple(layer for coat in self.coats for layer in coat.layers(parameters, wavelength))

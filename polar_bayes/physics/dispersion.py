@@ -2,14 +2,13 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
 from typing import Annotated, override
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.part import Part, Range, Setting, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
 
 # Wavelengths are in nm outside and in micrometers inside, as coefficients are tabulated.
 NANOMETERS = 1e-3
@@ -20,7 +19,7 @@ class AbstractDispersion(Part):
     """A law for the refractive index over wavelength."""
 
     @abc.abstractmethod
-    def index(self, parameters: Mapping[str, Array], wavelength: Array) -> Array:
+    def index(self, parameters: Parameters, wavelength: Array) -> Array:
         """Refractive index.
 
         Args:
@@ -54,7 +53,7 @@ class Cauchy(AbstractDispersion):
     c: Annotated[Setting, Range(-1.0, 1.0)] = 0.0
 
     @override
-    def index(self, parameters: Mapping[str, Array], wavelength: Array) -> Array:
+    def index(self, parameters: Parameters, wavelength: Array) -> Array:
         a, b = value_of(self.a, parameters), value_of(self.b, parameters)
         inverse = 1.0 / (NANOMETERS * wavelength) ** 2
         if self.c == 0.0:
@@ -97,7 +96,7 @@ class Sellmeier(AbstractDispersion):
         super().__post_init__()
 
     @override
-    def index(self, parameters: Mapping[str, Array], wavelength: Array) -> Array:
+    def index(self, parameters: Parameters, wavelength: Array) -> Array:
         inverse = 1.0 / (NANOMETERS * wavelength) ** 2
         square = jnp.ones_like(inverse)
         for strength, resonance in zip(self.strengths, self.resonances, strict=True):

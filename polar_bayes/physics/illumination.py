@@ -3,7 +3,6 @@
 import abc
 import dataclasses
 import math
-from collections.abc import Mapping
 from typing import override
 
 import jax.numpy as jnp
@@ -21,7 +20,7 @@ from polar_bayes.physics.geometry import (
     sin_degrees,
 )
 from polar_bayes.physics.microfacet import SlopeEllipse
-from polar_bayes.physics.part import Part, check_part, like, squared_rule, unit_rule
+from polar_bayes.physics.part import Parameters, Part, check_part, like, squared_rule, unit_rule
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import (
     Light,
@@ -51,7 +50,7 @@ class AbstractIllumination(Part):
         ellipse: SlopeEllipse,
         stack: Stack,
         geometry: Geometry,
-        parameters: Mapping[str, Array],
+        parameters: Parameters,
     ) -> Light:
         """Light that facets mirror to the viewer.
 
@@ -67,7 +66,7 @@ class AbstractIllumination(Part):
         """
 
     @abc.abstractmethod
-    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Light:
         """Irradiance that passes the interface into the body; arguments as in `reflect`.
 
         Returns:
@@ -84,15 +83,13 @@ class AbstractIllumination(Part):
             each beam brings across itself. Broadcasts with them.
         """
 
-    def incident(
-        self, parameters: Mapping[str, Array], geometry: Geometry
-    ) -> tuple[Array, Array] | None:
+    def incident(self, parameters: Parameters, geometry: Geometry) -> tuple[Array, Array] | None:
         """Components q and u of the light in its own frame; None for unpolarized light."""
         del parameters, geometry
         return None
 
     def beams(
-        self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]
+        self, stack: Stack, geometry: Geometry, parameters: Parameters
     ) -> tuple[Geometry, Light]:
         """Light that passes into the body, ray by ray; see `rays` and `entering`."""
         rays, irradiance = self.rays(geometry)
@@ -132,7 +129,7 @@ class PointSource(AbstractIllumination):
         ellipse: SlopeEllipse,
         stack: Stack,
         geometry: Geometry,
-        parameters: Mapping[str, Array],
+        parameters: Parameters,
     ) -> Light:
         facet = mirror_facet(geometry)
         cos_view, cos_light = cos_degrees(geometry.view_zenith), cos_degrees(geometry.light_zenith)
@@ -150,7 +147,7 @@ class PointSource(AbstractIllumination):
         return mirrored._replace(intensity=density * seen / (4.0 * cos_view) * mirrored.intensity)
 
     @override
-    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Light:
         cos_light = cos_degrees(geometry.light_zenith)
         passing = stack.transmission(cos_light, sin_degrees(geometry.light_zenith) ** 2)
         return transmit_inward(passing, cos_light, self.incident(parameters, geometry))
@@ -161,9 +158,7 @@ class PointSource(AbstractIllumination):
         return rays, jnp.ones_like(rays.light_zenith)
 
     @override
-    def incident(
-        self, parameters: Mapping[str, Array], geometry: Geometry
-    ) -> tuple[Array, Array] | None:
+    def incident(self, parameters: Parameters, geometry: Geometry) -> tuple[Array, Array] | None:
         if self.polarization is None:
             return None
         q, u = self.polarization.stokes(parameters)
@@ -198,7 +193,7 @@ class AbstractExtendedSource(AbstractIllumination):
         ellipse: SlopeEllipse,
         stack: Stack,
         geometry: Geometry,
-        parameters: Mapping[str, Array],
+        parameters: Parameters,
     ) -> Light:
         sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
         sample = facets.sample(ellipse, geometry, self.border)
@@ -228,7 +223,7 @@ class UniformSky(AbstractExtendedSource):
         return above_horizon(sin_view, cos_view)
 
     @override
-    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Light:
         passing = jnp.pi * stack.hemispherical_transmission() + jnp.zeros_like(geometry.view_zenith)
         return Light(passing, jnp.zeros_like(passing), jnp.zeros_like(passing))
 
@@ -280,7 +275,7 @@ class Disc(AbstractExtendedSource):
         return (PointSource(),)
 
     @override
-    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Light:
         cosine, sine_cosine, solid_angle = self._directions()
         sin_view = sin_degrees(geometry.view_zenith)[..., None]
         cos_view = cos_degrees(geometry.view_zenith)[..., None]

@@ -10,7 +10,6 @@ does not lean: the directions are then those that were stated, to the last bit o
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, NamedTuple, override
 
 import jax.numpy as jnp
@@ -19,7 +18,15 @@ from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.geometry import Geometry, cos_degrees, double_angle, sin_degrees
-from polar_bayes.physics.part import Part, Range, Setting, check_setting, parameters_of, value_of
+from polar_bayes.physics.part import (
+    Parameters,
+    Part,
+    Range,
+    Setting,
+    check_setting,
+    parameters_of,
+    value_of,
+)
 from polar_bayes.physics.stokes import Light, diattenuate, in_turned_frame
 from polar_bayes.repr_html import HTMLRepr
 
@@ -49,7 +56,7 @@ class AbstractInstrumentTerm(Part):
     def simpler(self) -> tuple[Part | None, ...]:
         return (None,)
 
-    def aim(self, parameters: Mapping[str, Array], geometry: Geometry) -> Geometry:
+    def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
         """Directions the light really takes, from those that were read off.
 
         Args:
@@ -62,7 +69,7 @@ class AbstractInstrumentTerm(Part):
         del parameters
         return geometry
 
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         """Light as the instrument records it.
 
         Args:
@@ -112,13 +119,13 @@ class Instrument(HTMLRepr):
         """Names of all parameters, in the order of the terms."""
         return parameters_of(*self.terms)
 
-    def aim(self, parameters: Mapping[str, Array], geometry: Geometry) -> Geometry:
+    def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
         """Directions the light really takes; see `AbstractInstrumentTerm.aim`."""
         for term in self.terms:
             geometry = term.aim(parameters, geometry)
         return geometry
 
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         """Light as recorded; see `AbstractInstrumentTerm.record`."""
         for term in self.terms:
             light = term.record(parameters, geometry, light)
@@ -132,7 +139,7 @@ class AngleZero(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("angle_zero",)
 
     @override
-    def aim(self, parameters: Mapping[str, Array], geometry: Geometry) -> Geometry:
+    def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
         shift = parameters["angle_zero"]
         return geometry._replace(
             view_zenith=jnp.minimum(geometry.view_zenith + shift, STEEPEST_ZENITH),
@@ -147,7 +154,7 @@ class DolpGain(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("dolp_gain",)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         gain = parameters["dolp_gain"]
         return Light(light.intensity, gain * light.q, gain * light.u)
 
@@ -159,7 +166,7 @@ class ChannelGain(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("channel_gain_ratio",)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         ratio = parameters["channel_gain_ratio"]
         return diattenuate(
             light, (ratio - 1.0) / (ratio + 1.0), 2.0 * jnp.sqrt(ratio) / (ratio + 1.0)
@@ -176,7 +183,7 @@ class Leakage(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("leakage",)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         leakage = parameters["leakage"]
         kept = (1.0 - leakage) / (1.0 + leakage)
         return Light(light.intensity, kept * light.q, kept * light.u)
@@ -189,7 +196,7 @@ class DarkLevel(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("dark_level",)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         intensity = light.intensity + parameters["dark_level"]
         # A trace below rounding: a view without any light keeps its polarization, and a dark
         # level below zero does not divide by it.
@@ -211,7 +218,7 @@ class BeamOverlap(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("beam_overlap_zenith",)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         fills = cos_degrees(parameters["beam_overlap_zenith"])
         # In the smaller of the two ratios, since the eighth power of the other may overflow.
         view = cos_degrees(geometry.view_zenith)
@@ -251,7 +258,7 @@ class Analyzer(AbstractInstrumentTerm):
             check_setting(angle, "Analyzer: angle", -360.0, 360.0)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         twice = 2.0 * jnp.asarray(self.angle, light.q.dtype)
         passed = 1.0 + light.q * cos_degrees(twice) + light.u * sin_degrees(twice)
         return light._replace(intensity=0.5 * passed * light.intensity)
@@ -282,7 +289,7 @@ class Saturation(AbstractInstrumentTerm):
             )
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         return light._replace(intensity=jnp.minimum(light.intensity, self.level))
 
 
@@ -337,7 +344,7 @@ class TiltedNormal(Part):
         return (None,)
 
     def enter(
-        self, parameters: Mapping[str, Array], geometry: Geometry
+        self, parameters: Parameters, geometry: Geometry
     ) -> tuple[Geometry, tuple[Array, Array]]:
         """Directions in the frame of the true normal, and the turn of the viewer's frame."""
         tilts = (value_of(tilt, parameters) for tilt in (self.tilt_x, self.tilt_y))
@@ -443,7 +450,7 @@ class Discrepancy(AbstractInstrumentTerm):
             )
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         # Weights come as (..., basis, 1): the scene's view axis stands last, as in the functions.
         weights = parameters["discrepancy_weights"]
         smooth = jnp.sum(weights * self.functions(geometry.view_zenith), axis=-2)

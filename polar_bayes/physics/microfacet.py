@@ -7,7 +7,6 @@ slopes of a facet, one after the other) serve extended sources and the way out o
 
 import abc
 import dataclasses
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, NamedTuple, override
 
 import jax
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.part import Part, Range, Setting, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
 
 # A roughness below this is taken as this: the width of a highlight is then 0.001 degree, which no
 # instrument resolves, and its peak brightness stays within single precision.
@@ -220,7 +219,7 @@ class AbstractSlopes(Part):
     """The roughness of a surface, direction by direction."""
 
     @abc.abstractmethod
-    def ellipse(self, parameters: Mapping[str, Array], geometry: Geometry) -> SlopeEllipse:
+    def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
         """Slopes in the frame of each viewer.
 
         Args:
@@ -236,7 +235,7 @@ class IsotropicSlopes(AbstractSlopes):
     parameters: ClassVar[tuple[str, ...]] = ("roughness",)
 
     @override
-    def ellipse(self, parameters: Mapping[str, Array], geometry: Geometry) -> SlopeEllipse:
+    def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
         return SlopeEllipse(parameters["roughness"], parameters["roughness"], None)
 
 
@@ -269,7 +268,7 @@ class AnisotropicSlopes(AbstractSlopes):
         return (IsotropicSlopes(),)
 
     @override
-    def ellipse(self, parameters: Mapping[str, Array], geometry: Geometry) -> SlopeEllipse:
+    def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
         first = jnp.maximum(parameters["roughness"], SMOOTHEST)
         second = jnp.maximum(parameters["roughness_across"], SMOOTHEST)
         turn = value_of(self.azimuth, parameters) - geometry.view_azimuth

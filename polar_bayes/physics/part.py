@@ -20,6 +20,10 @@ Setting = float | str
 """A known number, or the name of a parameter that stands for it."""
 
 
+Parameters = Mapping[str, Array]
+"""Parameters by name, each of which broadcasts with (..., view)."""
+
+
 class Range(NamedTuple):
     """Range of the numbers of a field: `absorbance: Annotated[Setting, Range(0.0, 100.0)]`."""
 
@@ -68,7 +72,7 @@ class Part(HTMLRepr, abc.ABC):
         return ()
 
 
-def value_of(setting: Setting, parameters: Mapping[str, Array]) -> Array:
+def value_of(setting: Setting, parameters: Parameters) -> Array:
     """The number of a setting in the parameters' precision, or the parameter that it names."""
     if isinstance(setting, str):
         return parameters[setting]

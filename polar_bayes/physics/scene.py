@@ -27,7 +27,7 @@ from polar_bayes.physics.instrument import (
 )
 from polar_bayes.physics.microfacet import Beckmann, HeightCorrelatedShadowing
 from polar_bayes.physics.mixing import AbstractMixing, DopMixing, StokesMixing
-from polar_bayes.physics.part import check_part, notation, parameters_of
+from polar_bayes.physics.part import Parameters, check_part, notation, parameters_of
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization, to_stokes
 from polar_bayes.physics.subsurface import AbstractSubsurface, Depolarizer, Lambertian, Unpolarized
@@ -237,14 +237,14 @@ class Scene(HTMLRepr):
             )
         return dataclasses.replace(self, instrument=Instrument(rest) if rest else None)
 
-    def _optics(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
+    def _optics(self, parameters: Parameters, geometry: Geometry) -> Light:
         """Light in the stated frame of the viewer, for parameters that have a view axis."""
         if self.normal is None:
             return self._material(parameters, geometry)
         inside, turn = self.normal.enter(parameters, geometry)
         return self.normal.leave(self._material(parameters, inside), turn)
 
-    def _material(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
+    def _material(self, parameters: Parameters, geometry: Geometry) -> Light:
         """Surface, body and their mixture, in directions from the true normal."""
         if self.dispersion is not None:
             index = self.dispersion.index(parameters, self._wavelength(geometry))

@@ -15,7 +15,6 @@ thin film turns into circular light counts as unpolarized.
 """
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Annotated, NamedTuple, override
 
 import jax.numpy as jnp
@@ -30,7 +29,7 @@ from polar_bayes.physics.geometry import (
     sin_degrees,
     turn_between_frames,
 )
-from polar_bayes.physics.part import Part, Range, Setting, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
 from polar_bayes.physics.stack import Stack
 
 # Rounds the tip of the cone |(q, u)|: small against any reading, large enough that the Hessian at
@@ -126,7 +125,7 @@ class LinearPolarization(Part):
     def simpler(self) -> tuple[Part | None, ...]:
         return (None,)
 
-    def stokes(self, parameters: Mapping[str, Array]) -> tuple[Array, Array]:
+    def stokes(self, parameters: Parameters) -> tuple[Array, Array]:
         """The components q and u of the light, in its own frame."""
         degree = value_of(self.degree, parameters)
         angle = 2.0 * value_of(self.angle, parameters)

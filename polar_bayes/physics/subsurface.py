@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, override
 
 import jax
@@ -11,7 +10,7 @@ from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.half_space import CLEAREST, refract, scatter
-from polar_bayes.physics.part import Part, Range, Setting, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import Interface, InternalReflection
 
@@ -21,9 +20,7 @@ class AbstractSubsurface(Part):
     """A body that scatters. Parameters broadcast with (..., view)."""
 
     @abc.abstractmethod
-    def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
-    ) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         """Light from the body that reaches the viewer.
 
         Args:
@@ -57,7 +54,7 @@ class DiffuseBody(AbstractSubsurface):
     internal_reflection: InternalReflection | None = None
 
     def diffuse(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
+        self, parameters: Parameters, geometry: Geometry, interface: Interface
     ) -> tuple[Array, Light]:
         """Brightness inside, and what the way out does to it."""
         albedo = value_of(self.albedo, parameters)
@@ -80,9 +77,7 @@ class Unpolarized(DiffuseBody):
     """
 
     @override
-    def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
-    ) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         brightness, leaving = self.diffuse(parameters, geometry, interface)
         brightness = brightness * leaving.intensity
         return Light(brightness, jnp.zeros_like(brightness), jnp.zeros_like(brightness))
@@ -105,9 +100,7 @@ class Lambertian(DiffuseBody):
         return (Unpolarized(self.albedo, self.internal_reflection),)
 
     @override
-    def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
-    ) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         brightness, leaving = self.diffuse(parameters, geometry, interface)
         return leaving._replace(intensity=brightness * leaving.intensity)
 
@@ -133,9 +126,7 @@ class Depolarizer(AbstractSubsurface):
     parameters: ClassVar[tuple[str, ...]] = ("absorption",)
 
     @override
-    def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
-    ) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         lost = half_space_loss(parameters["absorption"])
         if self.internal_reflection is None:
             not_trapped, kept = jnp.ones_like(lost), lost
@@ -214,9 +205,7 @@ class TurbidMedium(AbstractSubsurface):
         return (Depolarizer(self.internal_reflection),)
 
     @override
-    def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
-    ) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         n = parameters["refractive_index"]
         rays, entering = interface.beams(parameters, geometry)
         view = refract(sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith), n)

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
 from typing import override
 
 import jax
@@ -21,7 +20,7 @@ from polar_bayes.physics.microfacet import (
     SeparableShadowing,
     SlopeEllipse,
 )
-from polar_bayes.physics.part import Part, check_part, parameters_of
+from polar_bayes.physics.part import Parameters, Part, check_part, parameters_of
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, mirror_light
 
@@ -106,7 +105,7 @@ class AbstractSurface(Part):
     """
 
     @abc.abstractmethod
-    def light(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         """Light that the interface reflects to the viewer.
 
         Returns:
@@ -114,7 +113,7 @@ class AbstractSurface(Part):
         """
 
     @abc.abstractmethod
-    def entering(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def entering(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         """Light that passes into the body.
 
         Returns:
@@ -124,7 +123,7 @@ class AbstractSurface(Part):
 
     @abc.abstractmethod
     def beams(
-        self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack
+        self, parameters: Parameters, geometry: Geometry, stack: Stack
     ) -> tuple[Geometry, Light]:
         """The same light ray by ray, for a body that asks where it comes from.
 
@@ -133,7 +132,7 @@ class AbstractSurface(Part):
         """
 
     @abc.abstractmethod
-    def exit(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def exit(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         """What the interface does to unpolarized light on its way out to the viewer.
 
         Returns:
@@ -160,22 +159,22 @@ class SmoothSurface(AbstractSurface):
         check_part(self.beam, "SmoothSurface: beam", PointSource, "PointSource()")
 
     @override
-    def light(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         incident = self.beam.incident(parameters, geometry)
         return mirror_light(stack, mirror_facet(geometry), geometry, incident)
 
     @override
-    def entering(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def entering(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         return self.beam.entering(stack, geometry, parameters)
 
     @override
     def beams(
-        self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack
+        self, parameters: Parameters, geometry: Geometry, stack: Stack
     ) -> tuple[Geometry, Light]:
         return self.beam.beams(stack, geometry, parameters)
 
     @override
-    def exit(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def exit(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         return exit_through_plane(stack, geometry)
 
 
@@ -224,22 +223,22 @@ class RoughSurface(AbstractSurface):
         return Microsurface(self.distribution, self.shadowing, self.quadrature)
 
     @override
-    def light(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         ellipse = self.slopes.ellipse(parameters, geometry)
         return self.illumination.reflect(self.facets, ellipse, stack, geometry, parameters)
 
     @override
-    def entering(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def entering(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         return self.illumination.entering(stack, geometry, parameters)
 
     @override
     def beams(
-        self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack
+        self, parameters: Parameters, geometry: Geometry, stack: Stack
     ) -> tuple[Geometry, Light]:
         return self.illumination.beams(stack, geometry, parameters)
 
     @override
-    def exit(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def exit(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         ellipse = self.slopes.ellipse(parameters, geometry)
         return self.way_out.light(self.facets, ellipse, stack, geometry)
 
@@ -251,15 +250,15 @@ class Interface:
     surface: AbstractSurface
     stack: Stack
 
-    def entering(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
+    def entering(self, parameters: Parameters, geometry: Geometry) -> Light:
         """Light that passes into the body; see `AbstractSurface.entering`."""
         return self.surface.entering(parameters, geometry, self.stack)
 
-    def beams(self, parameters: Mapping[str, Array], geometry: Geometry) -> tuple[Geometry, Light]:
+    def beams(self, parameters: Parameters, geometry: Geometry) -> tuple[Geometry, Light]:
         """The same ray by ray; see `AbstractSurface.beams`."""
         return self.surface.beams(parameters, geometry, self.stack)
 
-    def exit(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
+    def exit(self, parameters: Parameters, geometry: Geometry) -> Light:
         """What happens to light on its way out; see `AbstractSurface.exit`."""
         return self.surface.exit(parameters, geometry, self.stack)
 
