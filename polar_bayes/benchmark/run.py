@@ -128,32 +128,32 @@ def _memory() -> float:
 # --- A trial in a process of its own: nothing is compiled yet, nothing else takes memory ----------
 
 
-LAST_WORDS = 300
-"""Characters of what a process that broke down has said."""
+STDERR_TAIL = 300
+"""Characters of the standard error of a process that failed, for its message."""
 
 
 def run_fresh(trial: Trial) -> Measured:
-    """Run a trial in a new process, with compiled programs of earlier ones out of reach."""
+    """Run a trial in a new process, without the compiled programs of earlier ones."""
     with temporary_folder(Path(tempfile.gettempdir())) as folder:
-        given, made = folder / "trial", folder / "measured"
-        given.write_bytes(cloudpickle.dumps(trial))
-        words = [sys.executable, "-m", "polar_bayes.benchmark.run", str(given), str(made)]
+        source, target = folder / "trial", folder / "measured"
+        source.write_bytes(cloudpickle.dumps(trial))
+        command = [sys.executable, "-m", "polar_bayes.benchmark.run", str(source), str(target)]
         with subprocess.Popen(
-            words, env=_environment(), stdout=PIPE, stderr=PIPE, text=True
+            command, env=_environment(), stdout=PIPE, stderr=PIPE, text=True
         ) as process:
             with on_interrupt(process.kill):
                 try:
-                    _, said = process.communicate()
+                    _, stderr = process.communicate()
                 finally:
                     process.kill()  # an exception must not wait for it
-        if not made.exists():
+        if not target.exists():
             raise FitError(
-                f"its process ended with {process.returncode}: {said[-LAST_WORDS:].strip()}",
+                f"its process ended with {process.returncode}: {stderr[-STDERR_TAIL:].strip()}",
                 where="accuracy",
                 hint="try the same method with polar_bayes.fit, or a smaller capture",
             )
         # Written by the process that this one has just started.
-        found = pickle.loads(made.read_bytes())
+        found = pickle.loads(target.read_bytes())
     if isinstance(found, PolarBayesError):
         raise found
     return found
@@ -166,13 +166,13 @@ def _environment() -> dict[str, str]:
     return kept | {"PYTHONPATH": path, "JAX_ENABLE_COMPILATION_CACHE": "false"}
 
 
-def _work(given: Path, made: Path) -> None:
-    trial = pickle.loads(given.read_bytes())
+def _run_file(source: Path, target: Path) -> None:
+    """What the new process does."""
     try:
-        found: Measured | PolarBayesError = run_trial(trial)
+        found: Measured | PolarBayesError = run_trial(pickle.loads(source.read_bytes()))
     except PolarBayesError as error:
         found = error
-    made.write_bytes(cloudpickle.dumps(found))
+    target.write_bytes(cloudpickle.dumps(found))
 
 
 # --- Overrides of the request or method: facets, effects, precision, number of draws --------------
@@ -385,4 +385,4 @@ def _choose(request: Request, tolerance: float) -> Scene | PolarBayesError:
 
 
 if __name__ == "__main__":
-    _work(*map(Path, sys.argv[1:]))
+    _run_file(*map(Path, sys.argv[1:]))

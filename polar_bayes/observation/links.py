@@ -209,7 +209,12 @@ class _DopLink(AbstractLink):
     margin: float = 1e-4
 
     def __post_init__(self) -> None:
-        _check_range(self, "margin", 1e-6, 1e-3, ", the paper's range of epsilon")
+        if not 1e-6 <= self.margin <= 1e-3:
+            raise FitError(
+                f"margin is {self.margin}",
+                where=type(self).__name__,
+                hint="give a number from 1e-6 to 1e-3, the paper's range of epsilon",
+            )
 
     @override
     def reading(self, value: Float[Array, "... view"]) -> Float[Array, "... view"]:

@@ -3,9 +3,9 @@
 Terms aim first (the angles a light path really has), then record in the order given. Parameters
 reach a term with a trailing view axis.
 
-Directions are stated in the frame of an assumed normal. The optics is told them in the frame of the
-true one, and the Stokes components that come out are turned back. Nothing is lost where the normal
-does not lean: the directions are then those that were stated, to the last bit or two.
+Directions are stated in the frame of an assumed normal. The optics receives them in the frame of
+the true one, and the Stokes components that come out are turned back. Nothing is lost where the
+normal is not tilted: the directions are then those that were stated, to the last bit or two.
 """
 
 import dataclasses
@@ -293,10 +293,10 @@ class Saturation(AbstractInstrumentTerm):
         return light._replace(intensity=jnp.minimum(light.intensity, self.level))
 
 
-# --- A normal that leans away from the one that was stated: what a patch sees if it is not level
+# --- A tilted normal: what a patch sees if it is not level ----------------------------------------
 
 
-# Largest lean along either axis, in degrees: a sampler may ask for more, and gets this.
+# Largest tilt along either axis, in degrees: a sampler may ask for more, and gets this.
 LARGEST_TILT = 80.0
 
 
@@ -314,16 +314,16 @@ class Direction(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class TiltedNormal(Part):
-    r"""The true normal leans by small angles towards azimuth 0 and towards azimuth 90.
+    r"""The true normal is tilted by small angles towards azimuth 0 and towards azimuth 90.
 
     $$ n \propto (\tan t_x, \tan t_y, 1) $$
 
-    in the frame in which the directions are stated: seen along azimuth 90 the normal leans by t_x,
+    in the frame in which the directions are stated: seen along azimuth 90 the tilt is t_x,
     seen along azimuth 0 by t_y. The axes of the true frame are those of the stated one, carried
     along by the rotation that takes the stated normal to the true one the shortest way; so are the
     grooves of an anisotropic surface, and a sky or disc that lights it.
 
-    A direction that the lean carries below the horizon counts as grazing, 89.999 degrees (or as
+    A direction that the tilt carries below the horizon counts as grazing, 89.999 degrees (or as
     stated, where that is nearer to 90): the light it has left is next to none, and its slope with
     the tilt is zero. Exactly on the true normal, where azimuth has no meaning, the azimuth as
     stated is kept, and slopes are those along the stated plane.
@@ -350,8 +350,8 @@ class TiltedNormal(Part):
         tilts = (value_of(tilt, parameters) for tilt in (self.tilt_x, self.tilt_y))
         bounded = (jnp.deg2rad(jnp.clip(tilt, -LARGEST_TILT, LARGEST_TILT)) for tilt in tilts)
         slopes = [jnp.tan(tilt) for tilt in bounded]
-        view = lean(geometry.view_zenith, geometry.view_azimuth, *slopes)
-        light = lean(geometry.light_zenith, geometry.light_azimuth, *slopes)
+        view = tilted_direction(geometry.view_zenith, geometry.view_azimuth, *slopes)
+        light = tilted_direction(geometry.light_zenith, geometry.light_azimuth, *slopes)
         inside = Geometry(
             view.zenith, view.azimuth, light.zenith, light.azimuth, geometry.wavelength, light.turn
         )
@@ -363,14 +363,14 @@ class TiltedNormal(Part):
         return Light(light.intensity, *in_turned_frame(light.q, light.u, (cos, -sin)))
 
 
-def lean(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direction:
+def tilted_direction(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direction:
     r"""A direction as the normal (slope_x, slope_y, 1)/N sees it.
 
     $$ \frac{s - p c}{N}, \quad \frac{-t}{N} $$
 
     along the stated s axis and the one at right angles to it: their length is the sine of the
     angle from the true normal, and their angle is that between both s axes. The zenith is given
-    as the stated one plus a difference, which is exactly zero without a lean.
+    as the stated one plus a difference, which is exactly zero without a tilt.
     """
     # With p and t the slopes along and across the plane of the direction, s and c its sine and
     # cosine, the true normal's cross product with the direction has the components
@@ -385,7 +385,7 @@ def lean(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direc
     lift = (cos + towards * sin / (1.0 + length)) / length
     x, y = sin - towards * lift, -across * lift
 
-    # On the true normal only the plane as stated tells where the direction came from.
+    # On the true normal only the plane as stated says where the direction came from.
     squared = along_s**2 + along_p**2
     overhead = squared <= jnp.finfo(squared.dtype).eps ** 1.5
     signed = along_s

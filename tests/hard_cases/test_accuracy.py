@@ -15,7 +15,7 @@ from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.facets import FacetQuadrature, Microsurface
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.illumination import PointSource
-from polar_bayes.physics.instrument import STEEPEST_ZENITH, BeamOverlap, lean
+from polar_bayes.physics.instrument import STEEPEST_ZENITH, BeamOverlap, tilted_direction
 from polar_bayes.physics.microfacet import (
     GGX,
     AnisotropicSlopes,
@@ -145,7 +145,7 @@ def test_lean(dtype: type) -> None:
         normal = mp.matrix([*(mp.mpf(float(slope)) for slope in slopes), 1])
         normal /= mp.norm(normal)
         zenith, azimuth = directions[:, 1], directions[:, 2]
-        found = lean(zenith, azimuth, *slopes)
+        found = tilted_direction(zenith, azimuth, *slopes)
         assert found.zenith.dtype == dtype
         for i, (down, around) in enumerate(zip(zenith, azimuth, strict=True)):
             light, s = (
