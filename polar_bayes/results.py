@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from polar_bayes.benchmark.accuracy import STUDY
-from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences, accuracy_table
+from polar_bayes.benchmark.advice import STUDY, accuracy_dataset, accuracy_sentences, accuracy_table
 from polar_bayes.calibration.files import CALIBRATION, check_calibration
 from polar_bayes.calibration.scores import is_calibrated
 from polar_bayes.calibration.verdict import calibration_table, calibration_verdict
@@ -25,8 +24,7 @@ from polar_bayes.effects.choose import ledger_sentences, ledger_table
 from polar_bayes.errors import FitError, OutputError
 from polar_bayes.inference.batch_result import Status
 from polar_bayes.inference.files import FIT, check_fit
-from polar_bayes.maps.fit_map import count_pixels
-from polar_bayes.maps.lazy import open_map
+from polar_bayes.maps.lazy import count_pixels, open_map
 from polar_bayes.paths import as_path, atomic_write, existing_file
 
 MIN_GOOD_SHARE = 0.95

@@ -14,8 +14,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 from matplotlib.transforms import Bbox
 
-from polar_bayes.benchmark.accuracy import AS_GIVEN
 from polar_bayes.benchmark.advice import (
+    AS_GIVEN,
     RESOLVED,
     accuracy_dataset,
     accuracy_sentences,

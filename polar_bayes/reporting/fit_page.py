@@ -31,7 +31,7 @@ from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck, p
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, sensitivity
 from polar_bayes.effects.choose import ledger_sentences, ledger_table
 from polar_bayes.errors import one_line
-from polar_bayes.inference.auto import auto_sentences
+from polar_bayes.inference.files import auto_sentences
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table

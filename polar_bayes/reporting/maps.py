@@ -16,10 +16,9 @@ from polar_bayes.diagnostics.coverage import BLOCK, INTERVALS, map_coverage, map
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batch_result import MIN_VIEWS, Status
-from polar_bayes.inference.batching import IMAGE
+from polar_bayes.inference.batching import IMAGE, cut
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.maps.fit_map import checked_status, cut
-from polar_bayes.maps.lazy import ensure_loaded
+from polar_bayes.maps.lazy import checked_status, ensure_loaded
 from polar_bayes.physics.part import notation
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts
