@@ -27,6 +27,7 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import DASH, column, or_dash
+from polar_bayes.repr_html import Table
 
 METHOD, VARIATION = "method", "override"
 """Names of the dimensions of a study: a method, and what was changed of it."""
@@ -211,7 +212,7 @@ def accuracy_picture(study: xr.Dataset) -> page.Picture:
     return page.make_picture(plot_accuracy(study), *text.figure_caption("accuracy.figure_front"))
 
 
-def study_table(study: xr.Dataset) -> page.Table:
+def study_table(study: xr.Dataset) -> Table:
     """A row for each method and each variation of it."""
     noise = float(study.attrs["reference_error"])
     table = accuracy_table(study)
@@ -246,7 +247,7 @@ def study_table(study: xr.Dataset) -> page.Table:
     )
 
 
-def error_table(study: xr.Dataset) -> page.Table:
+def error_table(study: xr.Dataset) -> Table:
     """Errors of every parameter by the methods as given."""
     errors = parameter_errors(study)[study[VARIATION].to_numpy() == AS_GIVEN]
     cells: page.Cells = {str(name): column(name, ".2g") for name in errors.columns}

@@ -33,6 +33,7 @@ from polar_bayes.reporting.maps import count_table
 from polar_bayes.reporting.plots_calibration import MAX_INTERVALS, Ranks
 from polar_bayes.reporting.style import QUANTITIES
 from polar_bayes.reporting.text import DASH, column, number
+from polar_bayes.repr_html import Table
 
 MAX_PANELS = 12
 """Parameters of one figure: more would be too small to read."""
@@ -49,10 +50,10 @@ RANKS_COLUMN = "the ranks"
 
 
 def calibration_page(
-    calibration: xr.DataTree, beside: Mapping[str, xr.DataTree] | None = None
+    calibration: xr.DataTree, comparisons: Mapping[str, xr.DataTree] | None = None
 ) -> page.Page:
     """The page of a calibration, compared with others of the same layout."""
-    others = {one_line(str(name)): each for name, each in (beside or {}).items()}
+    others = {one_line(str(name)): each for name, each in (comparisons or {}).items()}
     provenance = provenance_of(calibration)
     method = one_line(str(provenance.get("method", "this calibration")))
     _check_others(others, method)
@@ -105,7 +106,7 @@ def calibration_page(
 
 def _check_others(others: Mapping[str, xr.DataTree], method: str) -> None:
     for name, each in others.items():
-        where = f"report: beside {name}"
+        where = f"report: comparisons, {name}"
         if not is_calibration(each):
             raise FitError(
                 "it is no calibration", where=where, hint="give what polar_bayes.calibrate returns"
@@ -117,7 +118,7 @@ def _check_others(others: Mapping[str, xr.DataTree], method: str) -> None:
     if len(others) > MAX_OTHERS:
         raise FitError(
             f"{len(others)} calibrations are too many for one figure",
-            where="report: beside",
+            where="report: comparisons",
             hint=f"give at most {MAX_OTHERS}",
         )
 
@@ -184,7 +185,7 @@ def _score_cells() -> page.Cells:
     }
 
 
-def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> page.Table:
+def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
     """Every parameter: uniform ranks, coverage, width and score."""
     level = significance_level(table)
     simulations = next(iter(ranks.values())).pit.size
@@ -204,7 +205,7 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> page.Table:
     return page.make_table("parameter", caption, cells, data, descriptions=titles, prose=prose)
 
 
-def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> page.Table:
+def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table:
     """Every parameter by every method."""
     first = one_line(str(compared.index.get_level_values("method")[0]))
 
@@ -273,7 +274,7 @@ def _readings(
     return [note, table, *pictures]
 
 
-def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterator[page.Table]:
+def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterator[Table]:
     """Numbers of fits by status and by approach."""
     fits = calibration["fits"].to_dataset()
     answered = np.all([np.isfinite(each.pit) for each in ranks.values()], axis=0)

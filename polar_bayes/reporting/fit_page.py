@@ -9,9 +9,9 @@ import pandas as pd
 import xarray as xr
 
 from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
+from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
-from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, Verdict, laplace_k_hat, verdict
-from polar_bayes.diagnostics.convergence import summary as summarize
+from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, Verdict, laplace_k_hat
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
     Scalar,
@@ -29,7 +29,6 @@ from polar_bayes.diagnostics.population import (
 )
 from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck, predictive_checks
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, sensitivity
-from polar_bayes.effects.choose import ledger_sentences, ledger_table
 from polar_bayes.errors import one_line
 from polar_bayes.inference.files import auto_sentences
 from polar_bayes.inference.result import provenance_of
@@ -37,6 +36,8 @@ from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table
 from polar_bayes.reporting.style import QUANTITIES, parameter_title
 from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
+from polar_bayes.repr_html import Row, Table
+from polar_bayes.results import summary, verdict
 
 SHARED_GROUP = "Populations and spectra"
 INSTRUMENT_GROUP = "Instrument and noise"
@@ -76,14 +77,14 @@ class Fit(NamedTuple):
         cells: page.Cells,
         data: pd.DataFrame,
         prose: Sequence[str] = (),
-    ) -> page.Table:
+    ) -> Table:
         """A table with a row for each parameter that the numbers have, in groups."""
         names = set(map(str, self.posterior.data_vars))
         titles, groups = {}, {}
         for scalar in self.scalars:
             if scalar.label in data.index:
                 titles[scalar.label] = parameter_title(scalar, self.posterior)
-                groups[scalar.label] = page.MAIN_GROUP if scalar.is_material else INSTRUMENT_GROUP
+                groups[scalar.label] = "" if scalar.is_material else INSTRUMENT_GROUP
                 if is_hyperparameter(scalar.name, names):
                     groups[scalar.label] = SHARED_GROUP
         data = data.loc[list(titles)]
@@ -111,7 +112,7 @@ class Fit(NamedTuple):
 
 def read_fit(result: xr.DataTree) -> Fit:
     """Summaries of a result, which is checked first."""
-    scalars, table = posterior_scalars(result), summarize(result)
+    scalars, table = posterior_scalars(result), convergence.summary(result)
     return Fit(
         result=result,
         posterior=result["posterior"].to_dataset(),
@@ -120,7 +121,7 @@ def read_fit(result: xr.DataTree) -> Fit:
         prior=sensitivity(result),
         method=method_of(result),
         provenance=provenance_of(result),
-        verdict=verdict(result, table),
+        verdict=convergence.verdict(result, table),
     )
 
 
@@ -173,7 +174,7 @@ def fit_page(result: xr.DataTree) -> page.Page:
 # --- Parameters -----------------------------------------------------------------------------------
 
 
-def parameter_table(fit: Fit) -> page.Table:
+def parameter_table(fit: Fit) -> Table:
     """Every parameter with its interval, the truth where known, and what the data determine."""
     if fit.method == "point":
         return _estimate_table(fit)
@@ -198,7 +199,7 @@ def _truth_cell(row: pd.Series) -> str:
     return f"{truth} (outside)" if is_outside else truth
 
 
-def _estimate_table(fit: Fit) -> page.Table:
+def _estimate_table(fit: Fit) -> Table:
     data = fit.summary[["mean", "sd"]].set_axis(["estimate", "standard_error"], axis="columns")
     data, has_truth = fit.with_truth(data)
     cells: dict[str, Callable[[pd.Series], str]] = {
@@ -215,7 +216,7 @@ def _estimate_table(fit: Fit) -> page.Table:
     return fit.table("parameter", caption, cells, data)
 
 
-def sensitivity_table(fit: Fit) -> page.Table:
+def sensitivity_table(fit: Fit) -> Table:
     """Prior against posterior, and how far a changed prior would change the posterior."""
     cells: page.Cells = {
         "prior 95%": lambda row: interval(row["prior_q2.5"], row["prior_q97.5"]),
@@ -270,7 +271,7 @@ def _population(fit: Fit, summary: pd.DataFrame, pooled: Sequence[Population]) -
     ]
 
 
-def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> page.Table:
+def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> Table:
     """Location, spread and the range of a new member, for every pooled parameter."""
 
     def with_interval(row: pd.Series, part: str) -> str:
@@ -295,9 +296,7 @@ def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> pag
     return page.make_table("population", caption, cells, summary, descriptions=members)
 
 
-def member_table(
-    result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Population]
-) -> page.Table:
+def member_table(result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Population]) -> Table:
     """Every member of every population, with and without it."""
     posterior = result["posterior"].to_dataset()
     titles = {
@@ -348,7 +347,7 @@ def _without(fit: Fit) -> Iterator[page.Block]:
         yield f"This comparison failed, so nothing is said of it: {one_line(reason)}."
 
 
-def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) -> page.Table:
+def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) -> Table:
     """The fit of the report next to the same fit without a part of the instrument."""
     data, has_truth = fit.with_truth(compared)
 
@@ -394,7 +393,7 @@ def _checks(result: xr.DataTree, checks: Mapping[str, PredictiveCheck]) -> list[
     return blocks
 
 
-def check_table(checks: Mapping[str, PredictiveCheck]) -> page.Table:
+def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
     """Residuals, coverage, and leave-one-out results of every variable."""
     has_draws = any(check.pit.size for check in checks.values())
     columns = ["variable", "readings", "residual RMS"]
@@ -406,10 +405,10 @@ def check_table(checks: Mapping[str, PredictiveCheck]) -> page.Table:
     for check in checks.values():
         cells = [str(check.count), f"{check.residual_rms:.3g}"]
         cells += _predictive_cells(check) if has_draws else []
-        rows.append(page.Row(check.name, QUANTITIES.get(check.name, check.name), tuple(cells)))
+        rows.append(Row(check.name, tuple(cells), QUANTITIES.get(check.name, "")))
         data[check.name] = _check_numbers(check)
     frame = pd.DataFrame.from_dict(data, "index")
-    return page.Table("check", caption, tuple(columns), tuple(rows), frame)
+    return Table(tuple(columns), tuple(rows), (), "check", caption, frame)
 
 
 def _check_numbers(check: PredictiveCheck) -> dict[str, float]:
@@ -449,7 +448,7 @@ def _convergence(fit: Fit, has_draws: bool) -> list[page.Block]:
     return blocks
 
 
-def convergence_table(fit: Fit) -> page.Table:
+def convergence_table(fit: Fit) -> Table:
     """R-hat, effective sample sizes and Monte Carlo error of every parameter."""
     cells: page.Cells = {
         "R-hat": column("r_hat", ".4f"),
@@ -507,15 +506,16 @@ def _effects(result: xr.DataTree) -> list[page.Block]:
     ledger = result["effects"].to_dataset()
     paths = map(str, ledger["path"].to_numpy())
     rows = tuple(
-        page.Row(str(name), path, tuple(row))
-        for path, (name, row) in zip(paths, ledger_table(ledger).iterrows(), strict=True)
+        Row(str(name), tuple(row), path)
+        for path, (name, row) in zip(paths, summary(ledger).iterrows(), strict=True)
     )
     reason = "kept or dropped, and why"
     columns = ("effect", "data", "shift", "sd", "operations", "time", reason)
     caption = text.caption("fit.effect", tolerance=ledger.attrs["tolerance"])
     single = [name for name in ledger.data_vars if ledger[name].dims == ("effect",)]
     data = ledger[single].to_dataframe()
-    return [*ledger_sentences(ledger), page.Table("effect", caption, columns, rows, data, [reason])]
+    table = Table(columns, rows, [reason], "effect", caption, data)
+    return [*verdict(ledger).findings, table]
 
 
 def _accuracy(result: xr.DataTree) -> list[page.Block]:
@@ -523,7 +523,7 @@ def _accuracy(result: xr.DataTree) -> list[page.Block]:
     if "accuracy" not in result.children:
         return []
     study = accuracy_dataset(result)
-    sentences = f"{accuracy_sentences(study)} {text.reference_sentence(study)}"
+    sentences = " ".join([*accuracy_sentences(study), text.reference_sentence(study)])
     return [sentences, accuracy_picture(study), study_table(study)]
 
 

@@ -24,6 +24,7 @@ from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts
 from polar_bayes.reporting.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import APPROACHES, DASH, SLIGHT, count_percent, number
+from polar_bayes.repr_html import Row, Table
 
 STATUSES = {
     "good": "an answer that the checks let pass",
@@ -316,13 +317,13 @@ def _wavelengths(maps: xr.Dataset) -> list[float]:
 # --- Tables ---------------------------------------------------------------------------------------
 
 
-def status_table(counts: pd.DataFrame) -> page.Table:
+def status_table(counts: pd.DataFrame) -> Table:
     """Pixels by status."""
     caption = "The status of each pixel. Only good ones count in the other tables."
     return count_table("status", caption, counts.sum(axis=1).to_frame("pixels"), STATUSES)
 
 
-def approach_table(counts: pd.DataFrame) -> page.Table:
+def approach_table(counts: pd.DataFrame) -> Table:
     """Pixels by approach, and how many of them are good."""
     caption = "How the numbers of each pixel were found, from the cheapest approach to the dearest."
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
@@ -330,9 +331,7 @@ def approach_table(counts: pd.DataFrame) -> page.Table:
     return count_table("approach", caption, data, APPROACHES)
 
 
-def count_table(
-    name: str, caption: str, data: pd.DataFrame, meanings: Mapping[str, str]
-) -> page.Table:
+def count_table(name: str, caption: str, data: pd.DataFrame, meanings: Mapping[str, str]) -> Table:
     """Counts by flag: how many there are, their share, and how many of them fulfil a condition."""
     what, *others = map(str, data.columns)
     total = int(data[what].sum())
@@ -348,7 +347,7 @@ def count_table(
     )
 
 
-def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> page.Table:
+def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
     """Every parameter over the good pixels: its value, its variation, its uncertainty."""
     data = {}
     for scalar in titles:
@@ -372,7 +371,7 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> page.Tabl
 
 
 def _group(scalar: Scalar) -> str:
-    return page.MAIN_GROUP if scalar.is_material else INSTRUMENT_GROUP
+    return "" if scalar.is_material else INSTRUMENT_GROUP
 
 
 def _over_good(maps: xr.Dataset, scalar: Scalar, ending: str) -> np.ndarray:
@@ -414,7 +413,7 @@ def _coverage(
     return conclusions, [coverage_table(titles, list(tables.values())), *counted]
 
 
-def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame]) -> page.Table:
+def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame]) -> Table:
     """How often the intervals hold the truth, next to those of a map that was not corrected."""
     ways = ["holds the truth"] if len(tables) == 1 else ["corrected", "uncorrected"]
     columns = [column for way in ways for column in (way, "within", "of all read")]
@@ -425,12 +424,13 @@ def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame])
             for table in tables:
                 cells += _coverage_cells(table, scalar.label, claimed)
             description = title if claimed == min(INTERVALS) else scalar.label
-            rows.append(page.Row(scalar.label, description, tuple(cells), _group(scalar)))
+            rows.append(Row(scalar.label, tuple(cells), description, _group(scalar)))
     caption = text.caption("map.coverage", slight=100 * SLIGHT)
     data = tables[0]
     for other in tables[1:]:
         data = data.join(other.add_suffix("_uncorrected"))
-    return page.Table("coverage", caption, ("parameter", "interval", *columns), tuple(rows), data)
+    columns = ["parameter", "interval", *columns]
+    return Table(tuple(columns), tuple(rows), (), "coverage", caption, data)
 
 
 def _coverage_cells(table: pd.DataFrame, label: str, claimed: int) -> list[str]:

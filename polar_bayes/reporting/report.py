@@ -21,10 +21,10 @@ from polar_bayes.reporting.accuracy import accuracy_page, study_table
 from polar_bayes.reporting.calibration_page import calibration_page, rank_table
 from polar_bayes.reporting.comparison import comparison_page
 from polar_bayes.reporting.fit_page import fit_page, parameter_table, read_fit
-from polar_bayes.reporting.page import Page, Table, write_page
+from polar_bayes.reporting.page import Page, write_page
 from polar_bayes.reporting.plots_calibration import parameter_ranks
 from polar_bayes.reporting.style import in_default_style
-from polar_bayes.repr_html import DisplaySummary
+from polar_bayes.repr_html import DisplaySummary, Table
 from polar_bayes.results import save
 
 MAX_ROWS = 40
@@ -33,7 +33,7 @@ MAX_ROWS = 40
 HINTS = {
     "truth": "leave it out: a fit carries the truth of its capture",
     "uncorrected": "leave it out: a fit carries the truth of its capture",
-    "beside": "leave it out, or give what polar_bayes.calibrate returns",
+    "comparisons": "leave it out, or give what polar_bayes.calibrate returns",
 }
 
 
@@ -44,7 +44,7 @@ def report(
     *,
     truth: xr.Dataset | None = None,
     uncorrected: xr.Dataset | None = None,
-    beside: Mapping[str, xr.DataTree] | None = None,
+    comparisons: Mapping[str, xr.DataTree] | None = None,
 ) -> Path:
     """Write the standard report of any result, or of several fits side by side: one `index.html`.
 
@@ -63,7 +63,7 @@ def report(
             against.
         uncorrected: Of maps, with `truth`: those of the same image by
             `PixelLaplace(weighted=False)`, whose coverage is compared.
-        beside: Of a calibration: others of the same layout, by a name such as their method
+        comparisons: Of a calibration: others of the same layout, by a name such as their method
             ("laplace"), with which it is compared.
 
     Returns:
@@ -77,7 +77,7 @@ def report(
             of a report.
     """
     folder = as_path(directory, "report")
-    page = render(result, truth=truth, uncorrected=uncorrected, beside=beside)
+    page = render(result, truth=truth, uncorrected=uncorrected, comparisons=comparisons)
     files = {}
     if file := _kind_of(result).file:
         files[file] = functools.partial(save, cast(xr.DataTree, result))
@@ -122,7 +122,7 @@ def _make_card(
     more = [f"The first {MAX_ROWS} of {total} rows."] if total > MAX_ROWS else []
     title = f"{text.capture_name(provenance)}: {kind}"
     lines = tuple(filter(None, [*sentences, *more]))
-    return DisplaySummary(title, lines, (table.grid(MAX_ROWS),), passed)
+    return DisplaySummary(title, lines, (table.first(MAX_ROWS),), passed)
 
 
 def _fit_card(result: xr.DataTree) -> DisplaySummary:
@@ -195,7 +195,7 @@ KINDS = (
         is_calibration,
         calibration_page,
         _calibration_card,
-        options=("beside",),
+        options=("comparisons",),
         file="calibration.nc",
     ),
     Kind("fits", lambda result: True, fit_page, _fit_card, file="result.nc"),
