@@ -59,10 +59,7 @@ def calibrate(
         data, readings=not no_readings, store=store, resume=resume, **settings
     )
     pb.save(calibration, out)
-    table, verdict = (
-        pb.summary(calibration),
-        pb.verdict(calibration).sentences,
-    )
+    table, verdict = (pb.summary(calibration), pb.verdict(calibration).sentences)
     tables = {"parameters": table}
     if "predictive_pit" in calibration.children:
         tables["readings"] = pb.calibration.calibration_readings(calibration)
@@ -111,16 +108,10 @@ def identify(
     with stages() as progress:
         settings["progress"] = progress
         study = pb.identify(data, **settings)
-        found["parameters"] = (
-            pb.summary(study),
-            pb.verdict(study).sentences,
-        )
+        found["parameters"] = (pb.summary(study), pb.verdict(study).sentences)
         for name in profiled:
             curve = pb.profile(data, name, **settings)
-            found[f"profile of {name}"] = (
-                pb.summary(curve),
-                pb.verdict(curve).sentences,
-            )
+            found[f"profile of {name}"] = (pb.summary(curve), pb.verdict(curve).sentences)
         if count is not None:
             letters = {"D": pb.design.DOptimal, "A": pb.design.AOptimal}
             goal = (
@@ -129,10 +120,7 @@ def identify(
                 else pb.design.SingleParameter(criterion)
             )
             views = pb.next_views(data, count=count, criterion=goal, **settings)
-            found["next views"] = (
-                pb.summary(views),
-                pb.verdict(views).sentences,
-            )
+            found["next views"] = (pb.summary(views), pb.verdict(views).sentences)
     if as_json:
         rows: dict[str, Any] = {name: json_rows(table) for name, (table, _) in found.items()}
         for name, (_, sentences) in found.items():

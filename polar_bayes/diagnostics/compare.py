@@ -18,12 +18,7 @@ from polar_bayes.diagnostics.parameters import (
     posterior_scalars,
     scalars,
 )
-from polar_bayes.diagnostics.predictive import (
-    MAX_PARETO_K,
-    Loo,
-    predictive_checks,
-    usable_readings,
-)
+from polar_bayes.diagnostics.predictive import MAX_PARETO_K, Loo, predictive_checks, usable_readings
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import check_fit
@@ -252,15 +247,7 @@ def _stack(variable: xr.DataArray, reading: xr.DataArray, fitted: np.ndarray) ->
 
 # --- Intervals without a part of the instrument ---------------------------------------------------
 
-COLUMNS = (
-    "mean",
-    "q2.5",
-    "q97.5",
-    "mean_without",
-    "q2.5_without",
-    "q97.5_without",
-    "width_ratio",
-)
+COLUMNS = ("mean", "q2.5", "q97.5", "mean_without", "q2.5_without", "q97.5_without", "width_ratio")
 
 WITHOUT = {"discrepancy": "the discrepancy term", "instrument": "any instrument term"}
 """Fits for comparison, in the groups `without_<key>` of a result: the terms that they omit."""
