@@ -209,7 +209,7 @@ def accuracy_page(result: xr.DataTree) -> page.Page:
 
 def accuracy_picture(study: xr.Dataset) -> page.Picture:
     """Error against time."""
-    return page.make_picture(plot_accuracy(study), *text.figure_caption("accuracy.figure_front"))
+    return page.picture(plot_accuracy(study), "accuracy.figure_front")
 
 
 def study_table(study: xr.Dataset) -> Table:
@@ -241,7 +241,7 @@ def study_table(study: xr.Dataset) -> Table:
         "gradients": column("gradients", ",.0f"),
         "densities": column("densities", ",.0f"),
     }
-    caption = text.caption("accuracy.study")
+    caption = page.caption("accuracy.study")
     return page.make_table(
         "study", caption, cells, table, label="method", descriptions=marks, prose=["method"]
     )

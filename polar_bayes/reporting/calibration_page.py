@@ -63,7 +63,7 @@ def calibration_page(
     readings = calibration_readings(calibration) if holds_readings(calibration) else None
     headline, passed = text.calibration_headline(table, readings)
     first, *problems = text.verdict_after_headline(calibration)
-    introduction = text.caption("calibration.introduction")
+    introduction = page.caption("calibration.introduction")
     comparison: list[page.Block] = []
     if others:
         compared = compare_calibrations({method: calibration, **others})
@@ -151,16 +151,15 @@ def _pictures(
 
 
 def _paged(
-    ranks: Sequence[Ranks], draw: Callable[[Sequence[Ranks]], Figure], name: str, **values: object
+    ranks: Sequence[Ranks], draw: Callable[[Sequence[Ranks]], Figure], name: str, **values: Any
 ) -> Iterator[page.Picture]:
     """A few panels at a time; the first caption says how to read them all."""
     for at in range(0, len(ranks), MAX_PANELS):
         some = ranks[at : at + MAX_PANELS]
         labels = text.join([each.label for each in some])
         key = f"calibration.figure_{name}"
-        alternative, caption = text.figure_caption(key, labels=labels, **values)
-        caption = f"The same of {labels}." if at else caption
-        yield page.make_picture(draw(some), alternative, caption)
+        instead = f"The same of {labels}." if at else ""
+        yield page.picture(draw(some), key, instead=instead, labels=labels, **values)
 
 
 # --- Tables of parameters -------------------------------------------------------------------------
@@ -199,7 +198,7 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
         "failed": lambda row: f"{int(row['failed']):,} of {simulations:,}",
         **_score_cells(),
     }
-    caption = text.caption("calibration.parameter", level=level)
+    caption = page.caption("calibration.parameter", level=level)
     titles = {label: each.title for label, each in ranks.items()}
     data, prose = table.loc[list(ranks)], [RANKS_COLUMN]
     return page.make_table("parameter", caption, cells, data, descriptions=titles, prose=prose)
@@ -221,7 +220,7 @@ def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table
         f"score against {first}": _score_change,
         **_score_cells(),
     }
-    caption = text.caption("calibration.comparison", first=first)
+    caption = page.caption("calibration.comparison", first=first)
     prose = [RANKS_COLUMN]
     return page.make_table("comparison", caption, cells, compared, descriptions=titles, prose=prose)
 
@@ -260,7 +259,7 @@ def _readings(
         "spread": column("rank_spread", ".3f"),
         "untrusted": column("untrusted", ",.0f"),
     }
-    caption = text.caption("calibration.reading", level=level, largest_trusted=MAX_PARETO_K)
+    caption = page.caption("calibration.reading", level=level, largest_trusted=MAX_PARETO_K)
     table = page.make_table(
         "reading",
         caption,
@@ -278,7 +277,7 @@ def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterato
     """Numbers of fits by status and by approach."""
     fits = calibration["fits"].to_dataset()
     answered = np.all([np.isfinite(each.pit) for each in ranks.values()], axis=0)
-    status = text.caption("calibration.status")
+    status = page.caption("calibration.status")
     tables: dict[str, tuple[type[enum.IntEnum], Mapping[str, str], str]] = {
         "status": (Status, STATUSES, status),
         "approach": (MethodUsed, text.APPROACHES, "How the numbers of each fit were found."),

@@ -85,9 +85,8 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     left_out = [f"{name}: {why}." if name else why for name, why in comparison.left_out.items()]
     predictions: list[page.Block] = [] if comparison.loo.empty else [loo_table(comparison)]
     more = comparison.parameters.index.get_level_values("parameter").nunique() - MAX_PANELS
-    alternative, caption = text.figure_caption("comparison.figure_parameters")
-    caption += f" {more} more parameters are in the table only." if more > 0 else ""
-    figure = page.make_picture(plot_comparison(comparison), alternative, caption)
+    note = f" {more} more parameters are in the table only." if more > 0 else ""
+    figure = page.picture(plot_comparison(comparison), "comparison.figure_parameters", more=note)
     prior = [sensitivity] if sensitivity else []
     sections = [
         page.Section("predictions", "Predictions", [*predictions, *page.make_bullets(left_out)]),
@@ -126,7 +125,7 @@ def loo_table(comparison: FitComparison) -> Table:
         "weight": lambda row: f"{row['weight']:.2f}",
         "k > 0.7": lambda row: f"{int(row['unreliable'])}",
     }
-    caption = text.caption("comparison.loo", clear=CLEAR)
+    caption = page.caption("comparison.loo", clear=CLEAR)
     return page.make_table("loo", caption, cells, comparison.loo, label="fit")
 
 
@@ -162,7 +161,7 @@ def sensitivity_table(comparison: FitComparison) -> Table | None:
         "by the data": lambda row: str(row["verdict"]),
         **text.SENSITIVITY_CELLS,
     }
-    caption = text.caption("comparison.sensitivity", sensitive=SENSITIVE)
+    caption = page.caption("comparison.sensitivity", sensitive=SENSITIVE)
     prose = ["fit", "remark"]
     return page.make_table("sensitivity", caption, cells, known, prose=prose)
 

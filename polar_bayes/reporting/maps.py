@@ -220,7 +220,7 @@ def map_page(
     if truth is not None:
         conclusions, coverage = _coverage(maps, titles, truth, uncorrected)
         sentences += conclusions
-    regions = text.caption("map.regions")
+    regions = page.caption("map.regions")
     tables: list[page.Block] = [parameter_table(maps, titles), regions]
     sections = [
         page.Section("maps", "Maps", list(_pictures(maps, list(titles)))),
@@ -237,7 +237,7 @@ def map_page(
         headline=headline,
         passed=passed,
         sentences=sentences,
-        cautions=[] if is_weighted else [text.caption("map.unchecked")],
+        cautions=[] if is_weighted else [page.caption("map.unchecked")],
         sections=sections,
         footer="Computed from the maps of every pixel, which stay where they are.",
     )
@@ -301,11 +301,10 @@ def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Pict
             variables = [f"{name}{ending}" for name in shown for ending in ("", "_quantile")]
             place = "" if wavelength is None else f" at {wavelength:g} nm"
             drawn = f"{text.join(shown)}{place}"
-            alternative, caption = text.figure_caption("map.figure_maps", names=drawn)
-            is_first = at + turn == 0
-            caption = caption + thinned if is_first else f"The same of {drawn.replace('_', ' ')}."
+            caption = f"The same of {drawn.replace('_', ' ')}." if at + turn else ""
+            more = "" if caption else thinned
             figure = plot_maps(maps[[*variables, *TRUST]], wavelength=wavelength)
-            yield page.make_picture(figure, alternative, caption)
+            yield page.picture(figure, "map.figure_maps", instead=caption, more=more, names=drawn)
 
 
 def _wavelengths(maps: xr.Dataset) -> list[float]:
@@ -363,7 +362,7 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
         return lambda row: number(row[column], row["typical sd"])
 
     cells = {column: cell(column) for column in columns}
-    caption = text.caption("map.parameter")
+    caption = page.caption("map.parameter")
     frame = pd.DataFrame.from_dict(data, orient="index", columns=columns)
     by_label = {scalar.label: title for scalar, title in titles.items()}
     groups = {scalar.label: _group(scalar) for scalar in titles}
@@ -425,7 +424,7 @@ def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame])
                 cells += _coverage_cells(table, scalar.label, claimed)
             description = title if claimed == min(INTERVALS) else scalar.label
             rows.append(Row(scalar.label, tuple(cells), description, _group(scalar)))
-    caption = text.caption("map.coverage", slight=100 * SLIGHT)
+    caption = page.caption("map.coverage", slight=100 * SLIGHT)
     data = tables[0]
     for other in tables[1:]:
         data = data.join(other.add_suffix("_uncorrected"))

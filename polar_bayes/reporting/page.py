@@ -8,7 +8,9 @@ import base64
 import csv
 import dataclasses
 import functools
+import importlib.resources
 import io
+import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -109,14 +111,17 @@ class Details:
 type Block = str | Table | Picture | Facts | Heading | Bullets | Details
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Section:
     """A part of a page, which the menu calls `link`; one without blocks is left out."""
 
     id: str
     title: str
-    blocks: Sequence[Block]
+    blocks: Iterable[Block]
     link: str = ""
+
+    def __post_init__(self) -> None:
+        self.blocks = list(self.blocks)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,15 +158,31 @@ def _template() -> Template:
     return environment.get_template("page.html.j2")
 
 
-def make_picture(figure: Figure, alternative: str, caption: str) -> Picture:
-    """A figure as a block of a page."""
+@functools.cache
+def _captions() -> dict[str, dict[str, Any]]:
+    file = importlib.resources.files("polar_bayes.reporting") / "templates" / "captions.toml"
+    return tomllib.loads(file.read_text(encoding="utf-8"))
+
+
+def caption(key: str, **values: object) -> str:
+    """A caption from `templates/captions.toml`, such as `fit.parameter`, with its values."""
+    kind, name = key.split(".")
+    return str(_captions()[kind][name]).format(**values)
+
+
+def picture(
+    figure: Figure, key: str, *, instead: str = "", more: str = "", **values: Any
+) -> Picture:
+    """A figure as a block of a page, with its alternative text and its caption."""
+    kind, name = key.split(".")
+    alternative, caption = (each.format(**values) for each in _captions()[kind][name])
     buffer = io.BytesIO()
     with matplotlib.rc_context(FIXED_STYLE):
         # No date and a fixed salt: the same result gives the same page, byte for byte.
         figure.savefig(buffer, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
     encoded = base64.b64encode(buffer.getvalue()).decode("ascii")
     source = f"data:image/svg+xml;base64,{encoded}"
-    return Picture(source, alternative, caption, wide=figure.get_figwidth() > 7.0)
+    return Picture(source, alternative, (instead or caption) + more, figure.get_figwidth() > 7.0)
 
 
 def make_facts(
