@@ -18,7 +18,7 @@ from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batch_result import MIN_VIEWS, Status
 from polar_bayes.inference.batching import IMAGE, cut
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.maps.lazy import checked_status, ensure_loaded
+from polar_bayes.maps.lazy import COPY, checked_status, ensure_loaded
 from polar_bayes.physics.part import notation
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts
@@ -100,11 +100,9 @@ def _at_wavelength(maps: xr.Dataset, wavelength: float | None) -> tuple[xr.Datas
     known = maps["wavelength"].to_numpy()
     wavelength = float(known[0]) if wavelength is None else wavelength
     if wavelength not in known:
-        raise FitError(
-            f"there is no wavelength {wavelength:g} nm",
-            where="plot_maps",
-            hint=f"give one of {', '.join(f'{each:g}' for each in known)}",
-        )
+        what = f"there is no wavelength {wavelength:g} nm"
+        hint = f"give one of {', '.join(f'{each:g}' for each in known)}"
+        raise FitError(what, where="plot_maps", hint=hint)
     return maps.isel(wavelength=int(np.flatnonzero(known == wavelength)[0])), f"{wavelength:g} nm"
 
 
@@ -153,7 +151,8 @@ def _set_frame(axes: Axes, title: str) -> None:
 
 def flag_meanings(flags: xr.DataArray) -> dict[int, str]:
     """The meaning of each flag as the map itself states it, which holds for older maps as well."""
-    meanings = [each.replace("_", " ") for each in str(flags.attrs["flag_meanings"]).split()]
+    words = str(flags.attrs["flag_meanings"]).lower().split()
+    meanings = [each.replace("_", " ") for each in words]
     values = np.asarray(flags.attrs.get("flag_values", range(len(meanings))))
     known = dict(zip(map(int, values), meanings, strict=True))
     if flags.name == "status":  # a map may lose chunks, whether or not it states that flag
@@ -168,11 +167,8 @@ def flag_indices(flags: xr.DataArray, meanings: Mapping[int, str]) -> np.ndarray
     for index, value in enumerate(meanings):
         found[values == value] = index
     if (found < 0).any():
-        raise FitError(
-            f"{values[np.argmin(found)]} has no meaning there",
-            where=f"maps: {flags.name}",
-            hint="copy the store again, or make the map again",
-        )
+        what, hint = f"{values[np.argmin(found)]} has no meaning there", COPY
+        raise FitError(what, where=f"maps: {flags.name}", hint=hint)
     return found
 
 
@@ -208,7 +204,8 @@ def map_page(
     titles = parameter_titles(map_scalars(maps))
     if any(name not in maps for name in TRUST):
         raise FitError("it holds no maps", where="report", hint="give what fit_pixels returns")
-    _check_uncorrected(maps, truth, uncorrected)
+    if uncorrected is not None:
+        _check_uncorrected(maps, truth, uncorrected)
     maps, provenance = ensure_loaded(maps), provenance_of(maps)
     counts = count_cases(maps)
     headline, passed = text.map_headline(counts)
@@ -224,7 +221,7 @@ def map_page(
     tables: list[page.Block] = [parameter_table(maps, titles), regions]
     sections = [
         page.Section("maps", "Maps", list(_pictures(maps, list(titles)))),
-        page.Section("pixels", "Pixels", [status_table(counts), approach_table(counts)]),
+        page.Section("pixels", "Pixels", _pixel_tables(counts)),
         page.Section("parameters", "Parameters", tables),
         page.Section("coverage", "Coverage", coverage),
         page.Section("provenance", "Provenance", provenance_facts(provenance)),
@@ -243,25 +240,17 @@ def map_page(
     )
 
 
-def _check_uncorrected(
-    maps: xr.Dataset, truth: xr.Dataset | None, uncorrected: xr.Dataset | None
-) -> None:
-    if uncorrected is None:
-        return
+def _check_uncorrected(maps: xr.Dataset, truth: xr.Dataset | None, uncorrected: xr.Dataset) -> None:
     where = "report: uncorrected"
     if truth is None:
-        raise FitError(
-            "it is compared with the truth only", where=where, hint="give truth=capture as well"
-        )
+        hint = "give truth=capture as well"
+        raise FitError("it is compared with the truth only", where=where, hint=hint)
     map_scalars(uncorrected)
     if any(uncorrected.sizes[dim] != maps.sizes[dim] for dim in IMAGE):
         raise FitError("it is of another image", where=where, hint="map the same capture")
     if _is_weighted(provenance_of(uncorrected), default=False):
-        raise FitError(
-            "it was corrected as well",
-            where=where,
-            hint="make it with PixelLaplace(weighted=False)",
-        )
+        hint = "make it with PixelLaplace(weighted=False)"
+        raise FitError("it was corrected as well", where=where, hint=hint)
 
 
 def _is_weighted(provenance: Mapping[str, Any], *, default: bool) -> bool:
@@ -316,18 +305,14 @@ def _wavelengths(maps: xr.Dataset) -> list[float]:
 # --- Tables ---------------------------------------------------------------------------------------
 
 
-def status_table(counts: pd.DataFrame) -> Table:
-    """Pixels by status."""
+def _pixel_tables(counts: pd.DataFrame) -> Iterator[Table]:
+    """Pixels by status; and by approach, with how many of them are good."""
     caption = "The status of each pixel. Only good ones count in the other tables."
-    return count_table("status", caption, counts.sum(axis=1).to_frame("pixels"), STATUSES)
-
-
-def approach_table(counts: pd.DataFrame) -> Table:
-    """Pixels by approach, and how many of them are good."""
+    yield count_table("status", caption, counts.sum(axis=1).to_frame("pixels"), STATUSES)
     caption = "How the numbers of each pixel were found, from the cheapest approach to the dearest."
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
     data = pd.DataFrame({"pixels": counts.sum(), "good": good})
-    return count_table("approach", caption, data, APPROACHES)
+    yield count_table("approach", caption, data, APPROACHES)
 
 
 def count_table(name: str, caption: str, data: pd.DataFrame, meanings: Mapping[str, str]) -> Table:
@@ -361,12 +346,14 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
     def cell(column: str) -> Callable[[pd.Series], str]:
         return lambda row: number(row[column], row["typical sd"])
 
-    cells = {column: cell(column) for column in columns}
-    caption = page.caption("map.parameter")
-    frame = pd.DataFrame.from_dict(data, orient="index", columns=columns)
-    by_label = {scalar.label: title for scalar, title in titles.items()}
-    groups = {scalar.label: _group(scalar) for scalar in titles}
-    return page.make_table("parameter", caption, cells, frame, descriptions=by_label, groups=groups)
+    return page.make_table(
+        "parameter",
+        page.caption("map.parameter"),
+        {column: cell(column) for column in columns},
+        pd.DataFrame.from_dict(data, orient="index", columns=columns),
+        descriptions={scalar.label: title for scalar, title in titles.items()},
+        groups={scalar.label: _group(scalar) for scalar in titles},
+    )
 
 
 def _group(scalar: Scalar) -> str:
