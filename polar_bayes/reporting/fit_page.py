@@ -41,6 +41,9 @@ from polar_bayes.results import summary, verdict
 
 SHARED_GROUP = "Populations and spectra"
 INSTRUMENT_GROUP = "Instrument and noise"
+TRUTH = "true value"
+"""A column that is left out where no true value is known."""
+
 METHODS = {
     "nuts": "NUTS",
     "laplace": "Laplace approximation",
@@ -82,12 +85,7 @@ class Fit(NamedTuple):
     verdict: Verdict
 
     def table(
-        self,
-        name: str,
-        caption: str,
-        cells: page.Cells,
-        data: pd.DataFrame,
-        prose: Sequence[str] = (),
+        self, name: str, caption: str, cells: page.Cells, data: pd.DataFrame, prose: str = ""
     ) -> Table:
         """A table with a row for each parameter that the numbers have, in groups."""
         names = set(map(str, self.posterior.data_vars))
@@ -99,16 +97,15 @@ class Fit(NamedTuple):
                 if is_hyperparameter(scalar.name, names):
                     groups[scalar.label] = SHARED_GROUP
         data = data.loc[list(titles)]
+        if TRUTH in cells:
+            truths = pd.Series({each.label: truth_of(self.result, each) for each in self.scalars})
+            if np.isfinite(truths[data.index]).any():
+                data = data.assign(true_value=truths)
+            else:
+                cells = {title: cell for title, cell in cells.items() if title != TRUTH}
         return page.make_table(
-            name, caption, cells, data, descriptions=titles, groups=groups, prose=prose
+            name, caption, cells, data, descriptions=titles, groups=groups, prose=[prose]
         )
-
-    def with_truth(self, data: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
-        """Numbers with a column of true values, where any is known."""
-        truths = {scalar.label: truth_of(self.result, scalar) for scalar in self.scalars}
-        if not any(math.isfinite(truths[str(label)]) for label in data.index):
-            return data, False
-        return data.assign(true_value=pd.Series(truths)), True
 
     def determined(self) -> list[str]:
         """Which parameters the data determine; nothing of a fit that failed."""
@@ -202,18 +199,17 @@ def parameter_table(fit: Fit) -> Table:
     """Every parameter with its interval, the truth where known, and what the data determine."""
     if fit.method == "point":
         return _estimate_table(fit)
-    data, has_truth = fit.with_truth(fit.summary.join(fit.prior[["prior_inside", "verdict"]]))
-    cells: dict[str, Callable[[pd.Series], str]] = {
+    cells: page.Cells = {
         "mean": lambda row: number(row["mean"], row["sd"]),
         "sd": lambda row: number(row["sd"], row["sd"]),
         "2.5%": lambda row: number(row["q2.5"], row["sd"]),
         "97.5%": lambda row: number(row["q97.5"], row["sd"]),
+        TRUTH: _truth_cell,
+        "prior inside": lambda row: percent(row["prior_inside"]),
+        "by the data": lambda row: str(row["verdict"]),
     }
-    if has_truth:
-        cells["true value"] = _truth_cell
-    cells["prior inside"] = lambda row: percent(row["prior_inside"])
-    cells["by the data"] = lambda row: str(row["verdict"])
     caption = page.caption("fit.parameter", determined=DETERMINED, partly=PARTLY)
+    data = fit.summary.join(fit.prior[["prior_inside", "verdict"]])
     return fit.table("parameter", caption, cells, data)
 
 
@@ -224,19 +220,17 @@ def _truth_cell(row: pd.Series) -> str:
 
 
 def _estimate_table(fit: Fit) -> Table:
-    data = fit.summary[["mean", "sd"]].set_axis(["estimate", "standard_error"], axis="columns")
-    data, has_truth = fit.with_truth(data)
-    cells: dict[str, Callable[[pd.Series], str]] = {
+    def error(row: pd.Series) -> str:
+        size = row["standard_error"]
+        return number(size, size) if math.isfinite(size) else "not determined"
+
+    cells: page.Cells = {
         "estimate": lambda row: number(row["estimate"], row["standard_error"]),
-        "standard error": lambda row: (
-            number(row["standard_error"], row["standard_error"])
-            if math.isfinite(row["standard_error"])
-            else "not determined"
-        ),
+        "standard error": error,
+        TRUTH: lambda row: number(row["true_value"], row["standard_error"]),
     }
-    if has_truth:
-        cells["true value"] = lambda row: number(row["true_value"], row["standard_error"])
     caption = "Least squares; standard errors from the curvature and the residuals."
+    data = fit.summary[["mean", "sd"]].set_axis(["estimate", "standard_error"], axis="columns")
     return fit.table("parameter", caption, cells, data)
 
 
@@ -249,7 +243,7 @@ def sensitivity_table(fit: Fit) -> Table:
         **text.SENSITIVITY_CELLS,
     }
     caption = page.caption("fit.sensitivity", sensitive=SENSITIVE)
-    return fit.table("sensitivity", caption, cells, fit.prior, prose=["remark"])
+    return fit.table("sensitivity", caption, cells, fit.prior, prose="remark")
 
 
 def _prior(fit: Fit, has_draws: bool) -> Iterator[page.Block]:
@@ -357,22 +351,19 @@ def _without(fit: Fit) -> Iterator[page.Block]:
 
 def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) -> Table:
     """The fit of the report next to the same fit without a part of the instrument."""
-    data, has_truth = fit.with_truth(compared)
 
     def scale(row: pd.Series) -> float:
         return min(row["q97.5"] - row["q2.5"], row["q97.5_without"] - row["q2.5_without"]) / 4.0
 
-    cells: dict[str, Callable[[pd.Series], str]] = {
+    cells: page.Cells = {
         "mean": lambda row: number(row["mean"], scale(row)),
         "95% interval": lambda row: interval(row["q2.5"], row["q97.5"], scale(row)),
         "mean without": lambda row: number(row["mean_without"], scale(row)),
         "95% without": lambda row: interval(row["q2.5_without"], row["q97.5_without"], scale(row)),
         "width": lambda row: percent(row["width_ratio"]),
+        TRUTH: lambda row: number(row["true_value"], scale(row)),
     }
-    if has_truth:
-        cells["true value"] = lambda row: number(row["true_value"], scale(row))
-    caption = page.caption("fit.without", part=part)
-    return fit.table(name, caption, cells, data)
+    return fit.table(name, page.caption("fit.without", part=part), cells, compared)
 
 
 # --- Readings and checks --------------------------------------------------------------------------
