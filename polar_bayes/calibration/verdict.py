@@ -1,4 +1,4 @@
-"""Tables of a calibration, and the sentences that state what they mean."""
+"""What a calibration holds in a file, its tables, and the sentences that state what they mean."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -9,7 +9,6 @@ import scipy.special
 import scipy.stats
 import xarray as xr
 
-from polar_bayes.calibration.files import check_calibration
 from polar_bayes.calibration.scores import (
     FALSE_ALARMS,
     is_calibrated,
@@ -20,8 +19,89 @@ from polar_bayes.diagnostics.coverage import INTERVALS, coverage_columns
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_result import Status
-from polar_bayes.inference.psis import MAX_PARETO_K
+from polar_bayes.inference.files import (
+    ANY,
+    COMMON_PROVENANCE,
+    EACH,
+    FLAGS,
+    TEXT,
+    Group,
+    Like,
+    Schema,
+)
+from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
+
+# --- Schema ---------------------------------------------------------------------------------------
+
+_SIMULATION = ("simulation",)
+_RANKS = Group(_SIMULATION, extra_dims=False)
+
+CALIBRATION = Schema(
+    kind="calibration",
+    made_by="polar_bayes.calibrate or load",
+    command="`polar-bayes calibrate`",
+    groups={
+        "prior_sbc": Group(_SIMULATION, required=True),
+        "truth": Group(_SIMULATION, required=True, like=Like("prior_sbc", {"": ()}, required=True)),
+        "marginals": Group(
+            _SIMULATION,
+            required=True,
+            variables={"quantile": ("quantile",)},
+            like=Like(
+                "prior_sbc",
+                {"": (), "_sd": (), "_crps": (), "_quantile": ("quantile",)},
+                required=True,
+            ),
+        ),
+        "fits": Group(
+            required=True,
+            variables={"status": _SIMULATION},
+            kinds={"status": FLAGS, "approach": FLAGS},
+            names=("status", "approach", "effective_draws", "pareto_k"),
+            dims=_SIMULATION,
+            extra_dims=False,
+            variable_attributes={"flag_meanings?": TEXT},
+        ),
+        "predictive_pit": _RANKS,
+        "loo_pit": Group(
+            _SIMULATION, extra_dims=False, like=Like("predictive_pit", {"": ()}, required=True)
+        ),
+        "readings": Group(
+            _SIMULATION,
+            extra_dims=False,
+            like=Like("predictive_pit", {"_pareto_k": ()}, required=True),
+        ),
+    },
+    provenance={**COMMON_PROVENANCE, "truth?": {EACH: ANY}, "readings_told?": TEXT},
+)
+
+
+def is_calibration(tree: object) -> bool:
+    """Whether a tree is what `polar_bayes.calibrate` returns."""
+    return CALIBRATION.describes(tree)
+
+
+def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
+    """Refuse what is no calibration, or does not hold together."""
+    CALIBRATION.check(tree, source)
+    levels = tree["marginals"].to_dataset()["quantile"].to_numpy().tolist()
+    if missing := [level for level in LEVELS if levels.count(level) != 1]:
+        raise FitError(
+            f"the level {missing[0]} is not there once",
+            where=f"{source}: marginals/quantile",
+            hint=f"give the tree as {CALIBRATION.made_by} returned it",
+        )
+    groups = {"predictive_pit", "loo_pit", "readings"}
+    if (there := groups & set(tree.children)) and there != groups:
+        raise FitError(
+            f"it has no group {min(groups - there)}",
+            where=source,
+            hint=f"give the tree as {CALIBRATION.made_by} returned it, or drop {min(there)}",
+        )
+
+
+# --- Tables ---------------------------------------------------------------------------------------
 
 MOST_UNTRUSTED = 0.5
 """Share of fits that are not trusted above which their ranks do not judge the model."""

@@ -32,9 +32,6 @@ FINISHED = "capture_sha256"
 
 COPY = "copy the store again, or make the map again"
 
-LEDGER = ".progress"
-"""Ending of the name of the ledger, which lies next to an unfinished map."""
-
 
 def open_capture(path: str | os.PathLike[str]) -> xr.Dataset:
     """A capture from a file, its values read when they are needed where it is a Zarr store.

@@ -48,7 +48,7 @@ from polar_bayes.maps.fit_map import (
     provenance_json,
     with_pixel_numbers,
 )
-from polar_bayes.maps.lazy import FINISHED, LEDGER, REQUEST, check_whole, open_image, open_map
+from polar_bayes.maps.lazy import FINISHED, REQUEST, check_whole, open_image, open_map
 from polar_bayes.paths import as_path, is_same_file, replace_file, sync, temporary_folder
 from polar_bayes.progress import Counter, no_progress, with_counter
 
@@ -60,6 +60,9 @@ PARTS, LEAST = 4, 1024
 
 READ = frozenset((*(row.name for row in CONTRACT), WAVELENGTH.name, *LABELS))
 """Variables of a capture that a fit reads; known truths and other variables are not among them."""
+
+LEDGER = ".progress"
+"""Ending of the name of the ledger, which lies next to an unfinished map."""
 
 METADATA = "zarr.json"
 
