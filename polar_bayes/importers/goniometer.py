@@ -35,8 +35,8 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
 from polar_bayes.capture.schema import POSITIVE, ZENITH, Interval, validate
-from polar_bayes.capture.table_reader import Table, read_table
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers.table import Table, read_table
 
 Readings = str | os.PathLike[str] | tuple[ArrayLike, ArrayLike]
 

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from polar_bayes.capture.schema import Interval
-from polar_bayes.capture.table_reader import read_table
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.detector import os_name, read_array
+from polar_bayes.importers.table import read_table
 
 FEWEST_RIM_POINTS = 4
 CENTER = Interval(-1e6, 1e6)
