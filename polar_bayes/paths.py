@@ -72,11 +72,8 @@ def check_output(
         if not file.parent.is_dir():
             raise OutputError("its folder is not there", where=where, hint="make the folder first")
         if file.exists() and file.stat().st_size and not replaces(file):
-            raise OutputError(
-                "the file there holds something else",
-                where=where,
-                hint="give another path, or remove it first",
-            )
+            hint = "give another path, or remove it first"
+            raise OutputError("the file there holds something else", where=where, hint=hint)
         with tempfile.TemporaryFile(dir=file.parent):
             pass
     except (OSError, RuntimeError) as error:  # RuntimeError: a cycle of links
@@ -89,11 +86,8 @@ def refuse_inputs(path: Path, inputs: Iterable[PathLike]) -> None:
     for each in map(Path, inputs):
         inside = each.is_dir() and any(is_same_file(up, each) for up in path.resolve().parents)
         if inside or is_same_file(path, each):
-            raise OutputError(
-                f"it {'lies inside' if inside else 'is'} one of the inputs",
-                where=str(path),
-                hint="give another path to write",
-            )
+            what = f"it {'lies inside' if inside else 'is'} one of the inputs"
+            raise OutputError(what, where=str(path), hint="give another path to write")
 
 
 def is_same_file(one: Path, other: Path) -> bool:

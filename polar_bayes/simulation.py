@@ -27,12 +27,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import RANGES
 from polar_bayes.setups import SETUPS, Setup, find_setup
 
-__all__ = [
-    "PRESETS",
-    "Material",
-    "Protocol",
-    "simulate",
-]
+__all__ = ["PRESETS", "Material", "Protocol", "simulate"]
 
 REFERENCE_WAVELENGTHS = (450.0, 550.0, 650.0)
 
@@ -186,21 +181,17 @@ def checked_parameters(
     """A value for every parameter of the scene."""
     unknown = set(overrides) - set(scene.parameters)
     if unknown:
-        raise SceneError(
-            f"the scene has no parameter {', '.join(sorted(unknown))}",
-            where="simulate: parameters",
-            hint=f"give any of {', '.join(scene.parameters)}",
-        )
+        what = f"the scene has no parameter {', '.join(sorted(unknown))}"
+        hint = f"give any of {', '.join(scene.parameters)}"
+        raise SceneError(what, where="simulate: parameters", hint=hint)
     known = material.at(wavelengths if wavelengths.size else np.asarray(550.0))
     given = {name: _numbers(f"parameters[{name!r}]", value) for name, value in overrides.items()}
     available = {**NEUTRAL, **known, **given}
     missing = [name for name in scene.parameters if name not in available]
     if missing:
-        raise SceneError(
-            f"no value for {', '.join(missing)}",
-            where="simulate: parameters",
-            hint=f"give parameters={{{missing[0]!r}: <a number>}}",
-        )
+        what = f"no value for {', '.join(missing)}"
+        hint = f"give parameters={{{missing[0]!r}: <a number>}}"
+        raise SceneError(what, where="simulate: parameters", hint=hint)
     truth = {name: available[name] for name in scene.parameters}
     spectrum = f", or one per wavelength ({wavelengths.size})" if wavelengths.size else ""
     for name, value in truth.items():
@@ -221,21 +212,15 @@ def checked_noise(
     parameters = noise_parameters(links)
     unknown = set(overrides) - set(parameters)
     if unknown:
-        raise FitError(
-            f"no link reads {', '.join(sorted(unknown))}",
-            where="simulate: noise",
-            hint=f"give any of {', '.join(parameters)}",
-        )
+        what = f"no link reads {', '.join(sorted(unknown))}"
+        raise FitError(what, where="simulate: noise", hint=f"give any of {', '.join(parameters)}")
     given: dict[str, Value | None] = {"exposure": None, **defaults, **overrides}
     levels: dict[str, np.ndarray | None] = {}
     for name in parameters:
         where = f"noise[{name!r}]"
         if name not in given:
-            raise FitError(
-                "it has no value",
-                where=f"simulate: {where}",
-                hint=f"give noise={{{name!r}: <number>}}",
-            )
+            hint = f"give noise={{{name!r}: <number>}}"
+            raise FitError("it has no value", where=f"simulate: {where}", hint=hint)
         value = given[name]
         levels[name] = level = None if value is None else _numbers(where, value)
         if level is not None:
@@ -254,11 +239,9 @@ def image_shape(
     for name, shape in images[1:]:
         first, expected = images[0]
         if shape != expected:
-            raise CaptureError(
-                f"its shape is {shape} and that of {first} is {expected}",
-                where=f"simulate: {name}",
-                hint="give images (y, x) of one shape",
-            )
+            what = f"its shape is {shape} and that of {first} is {expected}"
+            hint = "give images (y, x) of one shape"
+            raise CaptureError(what, where=f"simulate: {name}", hint=hint)
     return images[0][1] if images else ()
 
 
@@ -271,11 +254,9 @@ def _numbers(where: str, value: Value) -> np.ndarray:
     try:
         return np.asarray(value, float)
     except (TypeError, ValueError):
-        raise CaptureError(
-            "it is no array of numbers",
-            where=f"simulate: {where}",
-            hint="give a number, or rows of numbers that are equally long",
-        ) from None
+        what = "it is no array of numbers"
+        hint = "give a number, or rows of numbers that are equally long"
+        raise CaptureError(what, where=f"simulate: {where}", hint=hint) from None
 
 
 def _is_number_or_image(value: np.ndarray) -> bool:
@@ -283,13 +264,7 @@ def _is_number_or_image(value: np.ndarray) -> bool:
 
 
 def _check_value(
-    where: str,
-    name: str,
-    value: np.ndarray,
-    has_shape: bool,
-    hint: str,
-    *,
-    is_open: bool = False,
+    where: str, name: str, value: np.ndarray, has_shape: bool, hint: str, *, is_open: bool = False
 ) -> None:
     """Refuse values outside the physical range (which may be open below), or of a wrong shape."""
     low, high = RANGES.get(name, (-np.inf, np.inf))
@@ -404,18 +379,13 @@ def simulate(
 
 def _checked_links(links: Mapping[str, AbstractLink]) -> dict[str, AbstractLink]:
     if not isinstance(links, Mapping) or not links:
-        raise FitError(
-            "that is no set of links",
-            where="simulate: links",
-            hint="give a mapping such as {'dop': BetaLink()}",
-        )
+        hint = "give a mapping such as {'dop': BetaLink()}"
+        raise FitError("that is no set of links", where="simulate: links", hint=hint)
     for name, link in links.items():
         if not isinstance(link, AbstractLink) or name not in link.observables:
-            raise FitError(
-                f"{link!r} does not describe {name}",
-                where=f"simulate: links[{name!r}]",
-                hint="give a link that names it in `observables`, such as {'dop': BetaLink()}",
-            )
+            what = f"{link!r} does not describe {name}"
+            hint = "give a link that names it in `observables`, such as {'dop': BetaLink()}"
+            raise FitError(what, where=f"simulate: links[{name!r}]", hint=hint)
     return dict(links)
 
 

@@ -125,19 +125,13 @@ def calibrate(
             "there is no store to go on with", where="calibrate: resume", hint="give store="
         )
     if simulations < MIN_SIMULATIONS:
-        raise FitError(
-            f"simulations is {simulations}",
-            where="calibrate",
-            hint=f"give {MIN_SIMULATIONS} or more",
-        )
+        hint = f"give {MIN_SIMULATIONS} or more"
+        raise FitError(f"simulations is {simulations}", where="calibrate", hint=hint)
     arguments = {"model": model, "scene": scene, "priors": priors, "links": links}
     unknown = set(truth or {}) - set(arguments)
     if unknown:
-        raise FitError(
-            f"{', '.join(sorted(unknown))} cannot differ",
-            where="calibrate: truth",
-            hint=f"give some of {', '.join(arguments)}",
-        )
+        what = f"{', '.join(sorted(unknown))} cannot differ"
+        raise FitError(what, where="calibrate: truth", hint=f"give some of {', '.join(arguments)}")
 
     def resolved(differing: Mapping[str, Any]) -> Request:
         model, scene, priors, links = {**arguments, **differing}.values()
@@ -149,11 +143,9 @@ def calibrate(
     start = time.perf_counter()
     plan = make_plan(request, resolved(truth) if truth else None, settings, readings)
     if not plan.compiled.shared:
-        raise FitError(
-            "the data-generating model and the fitted model share no parameter",
-            where="calibrate: truth",
-            hint="give models whose parameters have the same names and shapes",
-        )
+        what = "the data-generating model and the fitted model share no parameter"
+        hint = "give models whose parameters have the same names and shapes"
+        raise FitError(what, where="calibrate: truth", hint=hint)
     folder = None if store is None else as_path(store, "store")
     with (
         contextlib.nullcontext()
@@ -183,11 +175,9 @@ def calibrate(
 
 def _settings(method: str | Method | None, request: Request) -> Method:
     if isinstance(method, Point) or method == "point":
-        raise FitError(
-            "least squares make no draws whose intervals could be checked",
-            where="method='point'",
-            hint="give a method with draws, such as pb.methods.Laplace()",
-        )
+        what = "least squares make no draws whose intervals could be checked"
+        hint = "give a method with draws, such as pb.methods.Laplace()"
+        raise FitError(what, where="method='point'", hint=hint)
     if isinstance(method, Method):
         return method
     if _needs_mcmc(request) and method in (None, "nuts"):
@@ -195,11 +185,8 @@ def _settings(method: str | Method | None, request: Request) -> Method:
     if method is None:
         return METHODS["tempered"]
     if method not in METHODS:
-        raise FitError(
-            "no such method",
-            where=f"method={method!r}",
-            hint=f"give one of {', '.join(METHODS)}, or settings such as PixelNuts(draws=1000)",
-        )
+        hint = f"give one of {', '.join(METHODS)}, or settings such as PixelNuts(draws=1000)"
+        raise FitError("no such method", where=f"method={method!r}", hint=hint)
     return METHODS[method]
 
 

@@ -87,18 +87,13 @@ def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
     CALIBRATION.check(tree, source)
     levels = tree["marginals"].to_dataset()["quantile"].to_numpy().tolist()
     if missing := [level for level in LEVELS if levels.count(level) != 1]:
-        raise FitError(
-            f"the level {missing[0]} is not there once",
-            where=f"{source}: marginals/quantile",
-            hint=f"give the tree as {CALIBRATION.made_by} returned it",
-        )
+        what = f"the level {missing[0]} is not there once"
+        hint = f"give the tree as {CALIBRATION.made_by} returned it"
+        raise FitError(what, where=f"{source}: marginals/quantile", hint=hint)
     groups = {"predictive_pit", "loo_pit", "readings"}
     if (there := groups & set(tree.children)) and there != groups:
-        raise FitError(
-            f"it has no group {min(groups - there)}",
-            where=source,
-            hint=f"give the tree as {CALIBRATION.made_by} returned it, or drop {min(there)}",
-        )
+        hint = f"give the tree as {CALIBRATION.made_by} returned it, or drop {min(there)}"
+        raise FitError(f"it has no group {min(groups - there)}", where=source, hint=hint)
 
 
 # --- Tables ---------------------------------------------------------------------------------------
@@ -135,11 +130,9 @@ def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
     truths = {each.label: each.draws[0] for each in calibration_scalars(calibration, "truth")}
     marginals = calibration["marginals"].to_dataset()
     if any(each.label not in truths for each in found):
-        raise FitError(
-            "its labels are not those of prior_sbc",
-            where="calibration: truth",
-            hint="give what polar_bayes.calibrate returned",
-        )
+        what = "its labels are not those of prior_sbc"
+        hint = "give what polar_bayes.calibrate returned"
+        raise FitError(what, where="calibration: truth", hint=hint)
     rows = {each.label: _parameter_row(each, truths[each.label], marginals) for each in found}
     return pd.DataFrame.from_dict(rows, orient="index")
 
@@ -206,11 +199,8 @@ def calibration_readings(calibration: xr.DataTree) -> pd.DataFrame:
     """
     check_calibration(calibration)
     if not holds_readings(calibration):
-        raise FitError(
-            "it holds no ranks of readings",
-            where="calibration",
-            hint="give what polar_bayes.calibrate returns with readings=True",
-        )
+        hint = "give what polar_bayes.calibrate returns with readings=True"
+        raise FitError("it holds no ranks of readings", where="calibration", hint=hint)
     rows = {}
     for name in map(str, calibration["predictive_pit"].data_vars):
         pareto_k = calibration["readings"][f"{name}_pareto_k"].to_numpy()
@@ -386,11 +376,9 @@ def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFram
     (first, expected), *others = tables.items()
     for name, table in others:
         if set(table.index) != set(expected.index):
-            raise FitError(
-                f"it has other parameters than {first}",
-                where=f"compare_calibrations: {name}",
-                hint="calibrate the same model on the same layout",
-            )
+            what = f"it has other parameters than {first}"
+            hint = "calibrate the same model on the same layout"
+            raise FitError(what, where=f"compare_calibrations: {name}", hint=hint)
     level = significance_level(expected)
     rows = {}
     for scalar in calibration_scalars(calibrations[first], "truth"):

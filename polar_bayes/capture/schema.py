@@ -169,11 +169,9 @@ def clean_attributes(attributes: Mapping[Any, Any], where: str) -> dict[str, str
     # become text.
     for name in attributes:
         if not isinstance(name, str) or not NAME.fullmatch(name) or name in RESERVED:
-            raise CaptureError(
-                f"the attribute name {name!r} cannot be stored",
-                where=where,
-                hint="rename it: a letter, then letters, digits or any of _ . + -",
-            )
+            what = f"the attribute name {name!r} cannot be stored"
+            hint = "rename it: a letter, then letters, digits or any of _ . + -"
+            raise CaptureError(what, where=where, hint=hint)
     return {
         name: _clean_value(value, f"{where}: attribute {name}")
         for name, value in attributes.items()
@@ -188,11 +186,8 @@ def _clean_value(value: object, where: str) -> str | int | float:
     if isinstance(value, int) and not isinstance(value, bool):
         return int(value) if -(2**63) <= value < 2**63 else str(value)
     if array.dtype.kind not in "biufSU":
-        raise CaptureError(
-            f"the value is a {type(value).__name__}, neither a number nor text",
-            where=where,
-            hint="give a number or text, for instance JSON",
-        )
+        what = f"the value is a {type(value).__name__}, neither a number nor text"
+        raise CaptureError(what, where=where, hint="give a number or text, for instance JSON")
     item = value if isinstance(value, str | bytes) else array.tolist()
     if isinstance(item, bytes):
         item = item.decode("utf-8", "backslashreplace")
@@ -269,11 +264,9 @@ def _check_names(dataset: xr.Dataset, source: str) -> None:
     known = [*(row.name for row in CONTRACT), WAVELENGTH.name, *LABELS]
     for name in dataset.variables:
         if near := nearest_name(name, known):
-            raise CaptureError(
-                "a capture has no such variable",
-                where=f"{source}: {name}",
-                hint=f"rename it (nearest known name: {near}), call it true_<name> or drop it",
-            )
+            what = "a capture has no such variable"
+            hint = f"rename it (nearest known name: {near}), call it true_<name> or drop it"
+            raise CaptureError(what, where=f"{source}: {name}", hint=hint)
     for row in CONTRACT:
         if row.kind == "geometry" and row.name not in dataset:
             hint = f"add {row.name} in degree, with dim view"
@@ -292,11 +285,8 @@ def _layout(dataset: xr.Dataset, source: str) -> Layout:
     rest = [dim for dim in dims if dim not in ("view", "wavelength")]
     leading = next((option for option in LEADING if _same_dims(rest, option)), None)
     if leading is None or "view" not in dims or len(set(dims)) != len(dims):
-        raise CaptureError(
-            f"its dims are {_dims_text(dims)}",
-            where=f"{source}: {name}",
-            hint="use view[, wavelength], alone or behind material, patch, or y and x together",
-        )
+        hint = "use view[, wavelength], alone or behind material, patch, or y and x together"
+        raise CaptureError(f"its dims are {_dims_text(dims)}", where=f"{source}: {name}", hint=hint)
     for dim in dims:
         if dataset.sizes[dim] == 0:
             hint = f"give at least one {dim}"
@@ -313,11 +303,9 @@ def _ordered(variable: xr.Variable, row: Variable, layout: Layout, source: str) 
     for dims in options:
         if _same_dims(variable.dims, dims):
             return variable.transpose(*dims)
-    raise CaptureError(
-        f"its dims are {_dims_text(variable.dims)}",
-        where=f"{source}: {row.name}",
-        hint=f"give it {' or '.join(_dims_text(dims) for dims in options)}",
-    )
+    what = f"its dims are {_dims_text(variable.dims)}"
+    hint = f"give it {' or '.join(_dims_text(dims) for dims in options)}"
+    raise CaptureError(what, where=f"{source}: {row.name}", hint=hint)
 
 
 def _same_dims(dims: Sequence[Hashable], wanted: Sequence[str]) -> bool:
@@ -367,11 +355,8 @@ def _check_values(
     if allowed.all():
         return
     index = np.unravel_index(np.argmin(allowed), allowed.shape)
-    raise CaptureError(
-        f"{values[index]:g} is outside {row.range}",
-        where=f"{source}: {_entry(row.name, dims, index)}",
-        hint=row.hint,
-    )
+    what = f"{values[index]:g} is outside {row.range}"
+    raise CaptureError(what, where=f"{source}: {_entry(row.name, dims, index)}", hint=row.hint)
 
 
 def _check_polarization(
@@ -488,11 +473,9 @@ def _check_intensity_units(numbers: dict[str, xr.Variable], source: str) -> None
     if error["units"] == "arbitrary":
         error["units"] = intensity["units"]
     if error["units"] != intensity["units"]:
-        raise CaptureError(
-            f"its units are {error['units']!r}, those of intensity {intensity['units']!r}",
-            where=f"{source}: intensity_error",
-            hint="give both in the same units",
-        )
+        what = f"its units are {error['units']!r}, those of intensity {intensity['units']!r}"
+        hint = "give both in the same units"
+        raise CaptureError(what, where=f"{source}: intensity_error", hint=hint)
 
 
 def _entry(name: str, dims: Sequence[Hashable], index: Sequence[int | np.intp]) -> str:

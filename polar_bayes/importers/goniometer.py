@@ -253,11 +253,9 @@ def _channel(name: str, readings: Any) -> Channel:
     if isinstance(readings, str | os.PathLike):
         table = read_table(readings)
         if len(table.names) != 2:
-            raise CaptureError(
-                f"it has {len(table.names)} columns, not two",
-                where=table.source,
-                hint="give angle and reading, or use table= and name the columns angle=, s= and p=",
-            )
+            what = f"it has {len(table.names)} columns, not two"
+            hint = "give angle and reading, or use table= and name the columns angle=, s= and p="
+            raise CaptureError(what, where=table.source, hint=hint)
         return _channel_of_table(name, table, *table.names)
     try:
         angle, reading = (np.asarray(part) for part in readings)

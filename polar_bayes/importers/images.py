@@ -48,14 +48,7 @@ from polar_bayes.importers.camera_geometry import (
     local_geometry,
     mirror_direction,
 )
-from polar_bayes.importers.detector import (
-    Detector,
-    Frame,
-    Signal,
-    os_name,
-    read_frame,
-    signal_of,
-)
+from polar_bayes.importers.detector import Detector, Frame, Signal, os_name, read_frame, signal_of
 from polar_bayes.importers.normals import AbstractShape, Sphere, as_shape
 from polar_bayes.importers.stokes import StokesImage, check_angles, fit_stokes, unbiased_dop
 
@@ -196,11 +189,9 @@ def _capture(
     valid = ~np.logical_or.reduce(list(reasons.values()))
     if not valid.any():
         counts = ", ".join(f"{int(w.sum())} {r}" for r, w in reasons.items() if w.any())
-        raise CaptureError(
-            f"no reading is left ({counts})".replace("_", " "),
-            where=attributes["name"],
-            hint="check shape, light and exposure, or average more pixels (bin)",
-        )
+        what = f"no reading is left ({counts})".replace("_", " ")
+        hint = "check shape, light and exposure, or average more pixels (bin)"
+        raise CaptureError(what, where=attributes["name"], hint=hint)
     readings = {
         "dop": np.clip(dop, 0.0, 1.0),  # noise alone may carry it past one; such bins are counted
         "q": stokes.q,
@@ -460,8 +451,6 @@ def _polanalyser() -> ModuleType:
     try:
         return importlib.import_module("polanalyser")
     except ImportError as error:
-        raise CaptureError(
-            f"the library for mosaics of polarizers is not installed ({error.name})",
-            where="mosaic",
-            hint="pip install 'polar_bayes[camera]'",
-        ) from error
+        what = f"the library for mosaics of polarizers is not installed ({error.name})"
+        hint = "pip install 'polar_bayes[camera]'"
+        raise CaptureError(what, where="mosaic", hint=hint) from error

@@ -115,18 +115,13 @@ def check_angles(angles: Any) -> np.ndarray:
     different = np.unique(np.round(degrees % 180.0, 6) % 180.0)
     listed = ", ".join(f"{angle:g}" for angle in degrees)
     if different.size < FEWEST_ANGLES:
-        raise CaptureError(
-            f"the polarizer stood at {different.size} different angles ({listed})",
-            where="angles",
-            hint="give three or more; 0 and 180 are the same",
-        )
+        what = f"the polarizer stood at {different.size} different angles ({listed})"
+        raise CaptureError(what, where="angles", hint="give three or more; 0 and 180 are the same")
     condition = float(np.linalg.cond(_design(degrees)))
     if condition > LARGEST_CONDITION:
-        raise CaptureError(
-            f"{listed} are so close that noise grows {condition:.0f}-fold",
-            where="angles",
-            hint="spread them over 180 degrees, such as 0, 60 and 120",
-        )
+        what = f"{listed} are so close that noise grows {condition:.0f}-fold"
+        hint = "spread them over 180 degrees, such as 0, 60 and 120"
+        raise CaptureError(what, where="angles", hint=hint)
     return degrees
 
 

@@ -141,11 +141,8 @@ def _check_constants(
 
 def _check_name(variable: str, where: str) -> None:
     if near := nearest_name(variable, [*KNOWN, *DIMS]):
-        raise CaptureError(
-            f"a capture has no variable {variable!r}",
-            where=where,
-            hint=f"say what it is (nearest: {near}), call it true_<name> or ignore it",
-        )
+        hint = f"say what it is (nearest: {near}), call it true_<name> or ignore it"
+        raise CaptureError(f"a capture has no variable {variable!r}", where=where, hint=hint)
 
 
 def _check_values(
@@ -159,11 +156,8 @@ def _check_values(
         if wrong.any():
             first = int(np.argmax(wrong))
             column = f", column {columns[variable]}" if variable in columns else ""
-            raise CaptureError(
-                f"{variable} is {numbers[first]:g}, which is outside {row.range}",
-                where=f"{source}: line {lines[first]}{column}",
-                hint=row.hint,
-            )
+            what = f"{variable} is {numbers[first]:g}, which is outside {row.range}"
+            raise CaptureError(what, where=f"{source}: line {lines[first]}{column}", hint=row.hint)
 
 
 # --- Lines of one material ------------------------------------------------------------------------
@@ -362,8 +356,5 @@ def _number(cell: str, where: str) -> tuple[float, float]:
         step = float(f"1e{Decimal(digits).as_tuple().exponent}")
         if math.isfinite(value) and 0.0 < step < math.inf:
             return value, step
-    raise CaptureError(
-        f"{cell!r} is not a finite number",
-        where=where,
-        hint="correct it, or take the line out (a # before it makes it a comment)",
-    )
+    hint = "correct it, or take the line out (a # before it makes it a comment)"
+    raise CaptureError(f"{cell!r} is not a finite number", where=where, hint=hint)

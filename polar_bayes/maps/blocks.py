@@ -330,8 +330,6 @@ def written(store: Path, kind: type[PolarBayesError] = OutputError) -> Iterator[
         raise
     except Exception as error:  # Zarr raises nearly every type for a store that is not as it was
         reason = (getattr(error, "strerror", None) or "").lower() or str(error)
-        raise kind(
-            f"it could not be written ({reason or type(error).__name__})",
-            where=str(store),
-            hint="make room or give another --out; --resume goes on where it stopped",
-        ) from error
+        what = f"it could not be written ({reason or type(error).__name__})"
+        hint = "make room or give another --out; --resume goes on where it stopped"
+        raise kind(what, where=str(store), hint=hint) from error

@@ -16,13 +16,7 @@ from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.batch_engine import BatchEngine, engine_key, make_engine
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_method import AbstractPixelMethod
-from polar_bayes.inference.batch_result import (
-    MIN_VIEWS,
-    MethodUsed,
-    Outcome,
-    Status,
-    empty_outcome,
-)
+from polar_bayes.inference.batch_result import MIN_VIEWS, MethodUsed, Outcome, Status, empty_outcome
 from polar_bayes.inference.batching import IMAGE, batch_pixels
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.inference.request import Request, resolve
@@ -209,18 +203,13 @@ def plan_map(
     """Check the request of a map on one of its pixels."""
     settings = PixelLaplace() if method is None else method
     if not isinstance(settings, AbstractPixelMethod):
-        raise FitError(
-            f"{method!r} is no method for pixels",
-            where="fit_pixels: method",
-            hint="give settings such as PixelLaplace(draws=512) or PixelSMC()",
-        )
+        hint = "give settings such as PixelLaplace(draws=512) or PixelSMC()"
+        raise FitError(f"{method!r} is no method for pixels", where="fit_pixels: method", hint=hint)
     missing = [dim for dim in IMAGE if dim not in capture.dims]
     if missing:
-        raise CaptureError(
-            f"it has no axis {' or '.join(missing)}",
-            where=str(capture.attrs.get("name", "capture")),
-            hint="give an image with dims y and x, or use polar_bayes.fit",
-        )
+        what = f"it has no axis {' or '.join(missing)}"
+        hint = "give an image with dims y and x, or use polar_bayes.fit"
+        raise CaptureError(what, where=str(capture.attrs.get("name", "capture")), hint=hint)
     pixel, limit = _fullest_pixel(capture), largest_view_zenith
     request = resolve(pixel, model, scene, priors, links, limit, seed, precision)
     own = frozenset(
@@ -246,11 +235,9 @@ def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
         if most == capture.sizes["view"]:
             break
     if best is None or most < MIN_VIEWS:
-        raise CaptureError(
-            f"no pixel has {MIN_VIEWS} valid views",
-            where=str(capture.attrs.get("name", "capture")),
-            hint="check `valid` and the readings: NaN counts as missing",
-        )
+        what = f"no pixel has {MIN_VIEWS} valid views"
+        hint = "check `valid` and the readings: NaN counts as missing"
+        raise CaptureError(what, where=str(capture.attrs.get("name", "capture")), hint=hint)
     return best
 
 

@@ -57,11 +57,8 @@ def open_image(path: Path) -> xr.Dataset:
     image = _open_store(path, CaptureError, "write it again with to_zarr", decode_times=False)
     for name, variable in image.variables.items():
         if variable.dtype.kind not in "biufUOT":
-            raise CaptureError(
-                f"it holds {variable.dtype.name}, neither numbers nor flags",
-                where=f"{path}: {name}",
-                hint="write it again with to_zarr",
-            )
+            what = f"it holds {variable.dtype.name}, neither numbers nor flags"
+            raise CaptureError(what, where=f"{path}: {name}", hint="write it again with to_zarr")
     image.attrs.setdefault("name", path.stem)
     return image
 
@@ -73,11 +70,9 @@ def check_whole(path: Path) -> None:
             continue
         missing, chunks = _missing(path / name, CaptureError)
         if missing:
-            raise CaptureError(
-                f"{missing} of {chunks} chunks are missing",
-                where=f"{path}: {name}",
-                hint="copy the store again, or write it again with to_zarr",
-            )
+            what = f"{missing} of {chunks} chunks are missing"
+            hint = "copy the store again, or write it again with to_zarr"
+            raise CaptureError(what, where=f"{path}: {name}", hint=hint)
 
 
 def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -152,11 +147,9 @@ def _missing(array: Path, error: type[PolarBayesError]) -> tuple[int, int]:
         opened = zarr.open_array(array, mode="r")
         return opened.nchunks - opened.nchunks_initialized, opened.nchunks
     except Exception as cause:  # the libraries below raise nearly every type for a broken store
-        raise error(
-            "it cannot be read as Zarr",
-            where=f"{array.parent}: {array.name}",
-            hint="copy the store again, or write it again",
-        ) from cause
+        what = "it cannot be read as Zarr"
+        hint = "copy the store again, or write it again"
+        raise error(what, where=f"{array.parent}: {array.name}", hint=hint) from cause
 
 
 def _open_store(path: Path, error: type[PolarBayesError], hint: str, **options: Any) -> xr.Dataset:
@@ -222,9 +215,7 @@ def ensure_loaded(maps: xr.Dataset) -> xr.Dataset:
     if not any(variable.chunks for variable in maps.variables.values()):
         return maps
     if maps.nbytes > MOST_BYTES:
-        raise FitError(
-            f"these maps are in chunks and take {maps.nbytes / 2**30:.0f} GB",
-            where="maps",
-            hint="write them with to_zarr, if they are not yet, and open them with open_map",
-        )
+        what = f"these maps are in chunks and take {maps.nbytes / 2**30:.0f} GB"
+        hint = "write them with to_zarr, if they are not yet, and open them with open_map"
+        raise FitError(what, where="maps", hint=hint)
     return maps.compute()
