@@ -11,7 +11,7 @@ import xarray as xr
 
 from polar_bayes.calibration.scores import significance_level
 from polar_bayes.diagnostics.coverage import INTERVALS, coverage_columns
-from polar_bayes.diagnostics.parameters import Scalar, posterior_scalars, truth_of
+from polar_bayes.diagnostics.parameters import posterior_scalars, truth_of
 from polar_bayes.errors import FitError
 
 MAX_DRAWS = 4000
@@ -101,7 +101,10 @@ def proxy_scores(
     rows = []
     for at, (result, values) in enumerate(zip(results, given, strict=True)):
         for scalar in posterior_scalars(result):
-            proxy = truth_of(result, scalar) if values is None else _proxy(values, scalar)
+            if values is None:
+                proxy = truth_of(result, scalar)
+            else:
+                proxy = float(values.get(scalar.label, values.get(scalar.name, math.nan)))
             if math.isfinite(proxy):
                 row = {"fit": at, "parameter": scalar.label, "proxy": proxy}
                 rows.append(row | _position(proxy, scalar.draws.ravel()))
@@ -191,10 +194,6 @@ def _conclusion(row: pd.Series, level: float) -> str:
             "of the intervals is what all repeats share"
         )
     return "repeats scatter about as much as the intervals say"
-
-
-def _proxy(values: Mapping[str, float], scalar: Scalar) -> float:
-    return float(values.get(scalar.label, values.get(scalar.name, math.nan)))
 
 
 def _position(proxy: float, draws: np.ndarray) -> dict[str, float]:

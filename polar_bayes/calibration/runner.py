@@ -116,26 +116,18 @@ class CompiledPlan:
             return observe(request.capture, largest_view_zenith=request.largest_view_zenith)
 
     @functools.cached_property
-    def model(self) -> CompiledModel:
-        """The programs that fit one capture after another."""
-        with jax.enable_x64(True):
-            return compile_model(self.plan.request, self.data)
-
-    @functools.cached_property
-    def batch_engine(self) -> BatchEngine:
-        """The programs that fit many captures side by side."""
+    def engine(self) -> CompiledModel | BatchEngine:
+        """The programs that fit one capture after another, or many side by side."""
         plan = self.plan
-        return make_engine(plan.recipe_key, plan.request, lambda: self.data)
+        if not plan.is_sequential:
+            return make_engine(plan.recipe_key, plan.request, lambda: self.data)
+        with jax.enable_x64(True):
+            return compile_model(plan.request, self.data)
 
     @property
     def program(self) -> Program:
         """The model that is fitted."""
-        return self.model.program if self.plan.is_sequential else self.batch_engine.program
-
-    @property
-    def single(self) -> Program:
-        """The same in single precision."""
-        return self.model.single if self.plan.is_sequential else self.batch_engine.single_program
+        return self.engine.program
 
     @functools.cached_property
     def generative_program(self) -> Program:
@@ -169,22 +161,23 @@ _COMPILED: LRUCache[CompiledPlan] = LRUCache(4)
 def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
     """Simulate some captures and fit each; this is what a worker is sent."""
     # What becomes of a simulation depends on its number alone, not on the others of its block.
-    compiled, seed = plan.compiled, plan.request.seed
+    compiled, seed, count = plan.compiled, plan.request.seed, len(numbers)
     program, data, shared = compiled.generative_program, compiled.data, compiled.shared
     filled = np.resize(numbers, plan.block)  # so that all blocks run the same program
-    wanted = np.arange(len(numbers))
     is_ranked = plan.readings and not compiled.unranked_reason
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), 1)
         drawn = draw_captures(program, data, filled, key)
         fresh = redraw_readings(program, data, drawn, filled, key) if is_ranked else {}
-    truth = {name: np.asarray(drawn.truth[name])[wanted] for name in shared}
-    captures = drawn.captures.subset(wanted)
-    marginals, scores = Marginals(len(numbers), shared), PitCrps(truth, numbers, seed)
+    engine: Any = compiled.engine
+    truth: Arrays = {name: np.asarray(drawn.truth[name])[:count] for name in shared}
+    captures = drawn.captures.subset(np.arange(count))
+    marginals, scores = Marginals(count, shared), PitCrps(truth, numbers, seed)
     ranked = None
     if is_ranked:
-        again = {name: np.asarray(values)[wanted] for name, values in fresh.items()}
-        ranked = PredictivePit(compiled.single, captures, again, numbers, seed)
+        again = {name: np.asarray(values)[:count] for name, values in fresh.items()}
+        single = engine.single if plan.is_sequential else engine.single_program
+        ranked = PredictivePit(single, captures, again, numbers, seed)
     step = plan.settings.thinning(RANKED)
 
     def describe(at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
@@ -194,7 +187,6 @@ def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
             if statistic is not None:
                 statistic.describe(at, thinned, share)
 
-    engine: Any = compiled.model if plan.is_sequential else compiled.batch_engine
     outcome = plan.settings.run_batch(engine, captures, numbers, seed, describe)
     return Block(
         numbers=np.asarray(numbers),

@@ -110,22 +110,12 @@ READING_TESTS = {"predictive_pit": "fresh", "loo_pit": "left out"}
 
 
 def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
-    """One row for each parameter of a calibration.
-
-    Args:
-        calibration: What `polar_bayes.calibrate` returns.
-
-    Returns:
-        Columns `answered` and `failed` (fits); `p_value` of uniform ranks; `rank_mean` (a half
-        where the posterior is neither too high nor too low) and `rank_spread` (one where it is
-        neither too narrow, above, nor too wide); for 50, 80 and 95%, as `held_50`, the share of all
-        fits whose interval holds the truth, failed ones counted as misses, with its 95% interval
-        `_low` and `_high` (Wilson's); `width_95`, mean width of the 95% interval; `crps`, mean
-        continuous ranked probability score.
-
-    Raises:
-        FitError: It is no calibration.
-    """
+    """One row for each parameter of a calibration."""
+    # Columns: `answered` and `failed` fits; `p_value` of uniform ranks; `rank_mean` (a half where
+    # the posterior is neither too high nor too low) and `rank_spread` (above one: too narrow); for
+    # 50, 80 and 95%, as `held_50`, the share of all fits whose interval holds the truth, failed
+    # ones counted as misses, with Wilson's 95% interval; `width_95`, mean width of the 95%
+    # interval; `crps`, mean continuous ranked probability score.
     found = calibration_scalars(calibration, "prior_sbc")
     truths = {each.label: each.draws[0] for each in calibration_scalars(calibration, "truth")}
     marginals = calibration["marginals"].to_dataset()
@@ -234,19 +224,7 @@ def reading_ranks(calibration: xr.DataTree) -> dict[str, np.ndarray]:
 
 
 def calibration_verdict(calibration: xr.DataTree) -> list[str]:
-    """The result of a calibration, in sentences.
-
-    Args:
-        calibration: What `polar_bayes.calibrate` returns.
-
-    Returns:
-        First whether the ranks pass, then each parameter that does not pass and how it deviates,
-        then the fits that failed (and advice where most are not trusted), then the result for
-        readings, which are tested separately.
-
-    Raises:
-        FitError: It is no calibration.
-    """
+    """The result of a calibration, in sentences; readings, which are tested separately, last."""
     table = calibration_table(calibration)
     passed = is_calibrated(table)
     count = int(table["answered"].max() + table["failed"].min())

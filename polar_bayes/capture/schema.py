@@ -124,6 +124,14 @@ CONTRACT = (
 WAVELENGTH = Variable("wavelength", "label", "nm", POSITIVE, "wavelength", NANOMETERS)
 
 
+def as_numbers(values: Any) -> np.ndarray:
+    """An array of float64; a single NaN in place of what is no array of numbers."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.asarray(np.nan)
+
+
 def nearest_name(name: object, known: Sequence[str]) -> str | None:
     """The known name most similar to this one; None where it is known, or names a truth."""
     if name in known or (isinstance(name, str) and TRUTH.fullmatch(name)):

@@ -36,7 +36,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.ndimage import binary_dilation
 
-from polar_bayes.capture.schema import EXCESS_POLARIZATION, POSITIVE, validate
+from polar_bayes.capture.schema import EXCESS_POLARIZATION, POSITIVE, as_numbers, validate
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.camera_geometry import (
     AbstractLocation,
@@ -437,10 +437,7 @@ def _variance(variance: np.ndarray, binning: Binning) -> np.ndarray:
 
 
 def _angles(layout: ArrayLike) -> np.ndarray:
-    try:
-        four = np.asarray(layout, dtype=np.float64)
-    except (TypeError, ValueError):
-        four = np.full(0, np.nan)
+    four = as_numbers(layout)
     if four.shape != (2, 2):
         hint = "give two rows of two angles, such as ((90, 45), (135, 0))"
         raise CaptureError(f"it is {layout!r}", where="layout", hint=hint)

@@ -14,7 +14,7 @@ from typing import Any, override
 import numpy as np
 from scipy.optimize import least_squares
 
-from polar_bayes.capture.schema import Interval
+from polar_bayes.capture.schema import Interval, as_numbers
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.detector import os_name, read_array
 from polar_bayes.importers.table import read_table
@@ -241,10 +241,7 @@ def as_shape(shape: Any) -> AbstractShape:
 
 
 def _points(rim: Any) -> np.ndarray:
-    try:
-        points = np.asarray(rim, dtype=np.float64)
-    except (TypeError, ValueError):
-        points = np.full((0,), np.nan)
+    points = as_numbers(rim)
     if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
         hint = "give an array of shape (point, 2): row and column"
         raise CaptureError("it is no list of points", where="rim", hint=hint)

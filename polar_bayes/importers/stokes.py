@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from polar_bayes.capture.schema import as_numbers
 from polar_bayes.errors import CaptureError
 
 FEWEST_ANGLES = 3
@@ -105,10 +106,7 @@ def unbiased_dop(image: StokesImage) -> tuple[np.ndarray, np.ndarray]:
 
 def check_angles(angles: Any) -> np.ndarray:
     """Angles of a polarizer, refused unless they determine all three Stokes parameters."""
-    try:
-        degrees = np.asarray(angles, dtype=np.float64)
-    except (TypeError, ValueError):
-        degrees = np.full(1, np.nan)
+    degrees = as_numbers(angles)
     if degrees.ndim != 1 or not (np.abs(degrees) <= 360.0).all():
         hint = "give one number from -360 to 360 for each frame"
         raise CaptureError(f"{angles!r} are no angles", where="angles", hint=hint)

@@ -192,7 +192,9 @@ class _MapStore:
     def __init__(self, store: Path, image: xr.Dataset, plan: MapPlan) -> None:
         self._store, self._image, self._plan = store, image, plan
         self._maps = blank(image, plan)
-        self._regions = list(cut(image, _block(image)))
+        # The size of blocks depends on the image alone, so resumed maps have the same blocks.
+        size = min(BLOCK, max(LEAST, image.sizes["y"] * image.sizes["x"] // PARTS))
+        self._regions = list(cut(image, size))
         self._chunks = {dim: part.stop for dim, part in self._regions[0].items()}
         request, sizes = plan.request, dict(image.sizes)
         asked = provenance_json(plan), request.model, request.priors, _digest(request.capture)
@@ -242,7 +244,10 @@ class _MapStore:
             files = sorted(path.relative_to(empty) for path in empty.rglob("*") if path.is_file())
             if self._store.exists():
                 for file in files:
-                    self._check_same(empty, file)
+                    found, expected = self._store / file, (empty / file).read_bytes()
+                    if not found.is_file() or found.read_bytes() != expected:
+                        what, where = "it is missing, or not as it was written", self._store
+                        raise OutputError(what, where=f"{where}: {file}", hint=OTHER_OUT)
                 ledger.begin()
                 return
             for path in (*empty.rglob("*"), empty):
@@ -265,13 +270,6 @@ class _MapStore:
             zarr_format=3,
             write_empty_chunks=True,
         )
-
-    def _check_same(self, empty: Path, file: Path) -> None:
-        """Refuse a store whose metadata or axes are not those that were written."""
-        found = self._store / file
-        if not found.is_file() or found.read_bytes() != (empty / file).read_bytes():
-            what, where = "it is missing, or not as it was written", f"{self._store}: {file}"
-            raise OutputError(what, where=where, hint=OTHER_OUT)
 
     def run(self, ledger: Ledger, source: Path, scheduler: str | None, progress: Counter) -> None:
         """Fit and write every block that the ledger does not hold or whose files have changed."""
@@ -339,8 +337,3 @@ def _label(region: Region) -> str:
 
 def _size(region: Region) -> int:
     return math.prod(part.stop - part.start for part in region.values())
-
-
-def _block(image: xr.Dataset) -> int:
-    """Most pixels of a block; it depends on the image alone, so resumed maps have the same."""
-    return min(BLOCK, max(LEAST, image.sizes["y"] * image.sizes["x"] // PARTS))
