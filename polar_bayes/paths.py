@@ -1,7 +1,7 @@
 """Checks of paths, and atomic writes.
 
 Every file that the package writes goes through `check_output`: it never replaces an input, a
-device, a folder or a file of another kind. It is written to a temporary folder beside the output,
+device, a folder or a file of another kind. It is written to a temporary folder next to the output,
 synced to the disk, renamed, and the folder is synced: a process that dies at any moment leaves the
 older file or the new one, never a part.
 """
@@ -136,9 +136,9 @@ def write_errors(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def temporary_folder(beside: Path) -> Iterator[Path]:
+def temporary_folder(parent: Path) -> Iterator[Path]:
     """A temporary folder, removed at the end and by an interrupt."""
-    with tempfile.TemporaryDirectory(dir=beside, prefix=TEMPORARY_PREFIX) as made:
+    with tempfile.TemporaryDirectory(dir=parent, prefix=TEMPORARY_PREFIX) as made:
         folder = Path(made)
 
         def remove() -> None:

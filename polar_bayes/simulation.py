@@ -350,7 +350,7 @@ def simulate(
         recorded = _record(setup.scene, links, _layout(protocol, links, image), truth, levels, seed)
     name = preset if isinstance(preset, str) else "simulated"
     attributes: dict[str, str | int] = {"name": name, "seed": seed}
-    if isinstance(scene, str):  # a fit then takes the same set-up unless told otherwise
+    if isinstance(scene, str):  # a fit then takes the same set-up by default
         attributes["setup"] = scene
     return _label(recorded, protocol, IMAGE if image else (), truth, attributes)
 

@@ -119,6 +119,7 @@ def calibrate(
         CaptureError: The capture does not hold what a fit needs.
         FitError: An argument cannot be used, the store exists already (or, to resume, belongs to
             another request), or it cannot be written.
+        OutputError: Another process is writing the store, or its ledger is damaged.
     """
     if resume and store is None:
         raise FitError(

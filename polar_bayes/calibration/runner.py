@@ -147,7 +147,7 @@ class CompiledPlan:
 
     @functools.cached_property
     def unranked_reason(self) -> str:
-        """Why readings cannot be ranked; empty where they can, or nobody asks."""
+        """Why readings cannot be ranked; empty where they can, or where none are to be."""
         if not self.plan.readings:
             return ""
         program, given = self.program, _shapes(self.program, self.data)
@@ -160,7 +160,7 @@ _COMPILED: LRUCache[CompiledPlan] = LRUCache(4)
 
 def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
     """Simulate some captures and fit each; this is what a worker is sent."""
-    # What becomes of a simulation depends on its number alone, not on the others of its block.
+    # The result of a simulation depends on its number alone, not on the others of its block.
     compiled, seed, count = plan.compiled, plan.request.seed, len(numbers)
     program, data, shared = compiled.generative_program, compiled.data, compiled.shared
     filled = np.resize(numbers, plan.block)  # so that all blocks run the same program
@@ -328,7 +328,7 @@ def _batch(data: Observations, recorded: tuple) -> ObservationBatch:
 
 # --- Blocks on the disk ---------------------------------------------------------------------------
 
-LEDGER = "ledger"
+LEDGER, BLOCK_FILE = "ledger", "[0-9]*-[0-9]*.npz"
 LIBRARIES = ("polar_bayes", "jax", "jaxlib", "numpyro", "numpy", "scipy")
 
 
@@ -340,8 +340,9 @@ def open_store(folder: Path, plan: CalibrationPlan, *, resume: bool) -> Iterator
         raise FitError("it is there already", where=where, hint=f"{OTHER_OUT}, or --resume")
     with written(folder, FitError):
         folder.mkdir(exist_ok=resume)
-        names = {path.name for path in folder.iterdir()}
-    if LEDGER not in names and any(not name.startswith(TEMPORARY_PREFIX) for name in names):
+        others = [path for path in folder.iterdir() if not path.match(BLOCK_FILE)]
+    names = [path.name for path in others if not path.name.startswith(TEMPORARY_PREFIX)]
+    if names and LEDGER not in names:
         raise FitError("it holds no calibration", where=where, hint=OTHER_OUT)
     ledger_of_plan = folder / LEDGER, folder, "calibration", fingerprint_of(plan)
     with (

@@ -216,7 +216,7 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
 
     Canonical: float64 numbers, boolean flags, dims in the order (leading..., view[, wavelength]),
     `units` and `long_name` of the contract, attributes of text and numbers only. No number is
-    changed and none is dropped. Readings in entries marked `valid=False` are not looked at: they
+    changed and none is dropped. Readings in entries marked `valid=False` are not checked: they
     may be NaN. A second call changes nothing.
 
     Args:
@@ -224,7 +224,7 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
         source: Its name in errors, for instance the file.
 
     Returns:
-        A new dataset; the given one is left alone.
+        A new dataset; the given one is not changed.
 
     Raises:
         CaptureError: The first departure from the contract, with its variable and index.
@@ -327,7 +327,7 @@ def _dims_text(dims: Sequence[Hashable]) -> str:
 def _flag(dataset: xr.Dataset, row: Variable, layout: Layout, source: str) -> xr.Variable:
     variable = _ordered(dataset[row.name].variable, row, layout, source)
     values = variable.values
-    if values.dtype.kind != "b":  # netCDF has no truth values, so 0 and 1 stand for them
+    if values.dtype.kind != "b":  # netCDF has no truth values, only 0 and 1
         values = _floats(values, f"{source}: {row.name}")
         _check_values(values, row, variable.dims, source, np.isin(values, (0.0, 1.0)))
     return xr.Variable(variable.dims, values.astype(bool), _attributes(variable, row, source))

@@ -11,7 +11,7 @@ electron), and N pixels averaged. Averaging does not reduce $\epsilon$: unequal 
 of the analyzers, light that flickers, a flat field that has changed.
 
 PNG and TIFF files go through Pillow, which every plotting library brings along; .npy files hold
-what a script saved. A frame in color is refused: its channels would have to be told apart first.
+what a script saved. A frame in color is refused: its channels would have to be separated first.
 """
 
 import dataclasses
@@ -230,5 +230,5 @@ def _source(frame: Frame | float | None) -> str | float:
 
 
 def os_name(path: Any) -> str:
-    """The last part of a path, which says what was read without saying on whose machine."""
+    """The last part of a path: what was read, without the folders of this machine."""
     return str(path).replace("\\", "/").rstrip("/").split("/")[-1]

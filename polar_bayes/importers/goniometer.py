@@ -64,7 +64,7 @@ def from_goniometer(
     relative_error: float = 0.01,
     name: str | None = None,
 ) -> xr.Dataset:
-    """A capture from goniometer readings of s and p light; the module tells how.
+    """A capture from goniometer readings of s and p light; see the module.
 
     Args:
         s: A two-column table (angle in degrees, reading) or a pair (angles, readings); with

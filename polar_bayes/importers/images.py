@@ -294,8 +294,8 @@ def from_polarizer(
             the camera sees it, degree. Three different ones or more, shape (frame,).
         shape: Where the surface points: a `Sphere`, several, or unit normals of shape
             (row, column, 3), NaN where there is no surface, also in a .npy file.
-        light: Where the light stands: `Direction`, `Position`, `Highlight`, or `Surroundings`.
-        view: Where the camera stands: `Direction`, or `Position(0, 0, f)` for a focal length of f
+        light: Location of the light: `Direction`, `Position`, `Highlight`, or `Surroundings`.
+        view: Location of the camera: `Direction`, or `Position(0, 0, f)` for a focal length of f
             pixels.
         detector: How counts become light, and their noise.
         bin: Width of the squares of pixels that are averaged into one reading.
@@ -373,8 +373,8 @@ def from_mosaic(
         frame: A PNG, TIFF or .npy file, or an array of shape (row, column): raw counts, with an
             even number of rows and columns.
         shape: See `polar_bayes.from_polarizer`; the arguments that are not explained here too.
-        light: Where the light stands.
-        view: Where the camera stands.
+        light: Location of the light.
+        view: Location of the camera.
         layout: Angle of the polarizer of each of the four pixels, two rows of two, in degrees from
             x counterclockwise as the camera sees it.
         detector: How counts become light, and their noise.

@@ -48,7 +48,7 @@ def from_table(
     saturation_level: float | None = None,
     name: str | None = None,
 ) -> xr.Dataset:
-    """A capture from a table with a line for each reading; the module tells how.
+    """A capture from a table with a line for each reading; see the module.
 
     Args:
         table: A text table of numbers whose first line names the columns. Columns that are named
@@ -210,7 +210,7 @@ def _views(values: dict[str, np.ndarray], column: np.ndarray) -> np.ndarray:
 
 LARGEST_FILE = 50_000_000  # bytes
 BLANKS = re.compile(r"[ \t]+")
-# A decimal comma stands between digits, so that in "10, 5" it separates.
+# A decimal comma is between digits, so the comma of "10, 5" separates.
 NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*|,[0-9]+)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?")
 LONGEST_NUMBER = 64  # characters
 MISSING = frozenset({"nan", "inf", "infinity", "na", "n/a", "none", "null"})

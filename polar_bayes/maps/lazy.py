@@ -153,7 +153,7 @@ def _missing(array: Path, error: type[PolarBayesError]) -> tuple[int, int]:
 
 
 def _open_store(path: Path, error: type[PolarBayesError], hint: str, **options: Any) -> xr.Dataset:
-    """A Zarr store, lazily; each of its variables knows how to say that it is broken."""
+    """A Zarr store, lazily; reading a broken chunk of a variable is an error with its place."""
     where = str(path)
     try:
         opened = xr.open_dataset(path, engine="zarr", consolidated=False, cache=False, **options)

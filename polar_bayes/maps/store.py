@@ -67,7 +67,7 @@ LEDGER = ".progress"
 METADATA = "zarr.json"
 
 TOPIC = "capture or other settings"
-"""The one topic of the fingerprint of a map: what differs is not told apart."""
+"""The one topic of the fingerprint of a map, so errors do not name the setting that differs."""
 
 Region = dict[str, slice]
 

@@ -23,7 +23,7 @@ from polar_bayes.models.per_material import per_material
 import polar_bayes as pb
 from polar_bayes import interrupts
 from polar_bayes.calibration import runner as module
-from polar_bayes.maps.blocks import digest
+from polar_bayes.maps.blocks import digest, locked_ledger
 
 ASKED = {
     "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
@@ -173,6 +173,28 @@ def test_what_cannot_be_gone_on_with_is_refused(capture, begun, tmp_path) -> Non
         pb.calibrate(capture, store=tmp_path / "nowhere" / "fits", **ASKED)
     with pytest.raises(pb.FitError, match="no scheduler answers there"):
         pb.calibrate(capture, simulations=20, scheduler="tcp://127.0.0.1:9", **ASKED)
+
+
+@pytest.mark.thorough
+def test_a_second_process_is_refused(capture, begun, tmp_path) -> None:
+    store = copied(begun, tmp_path)
+    with (
+        locked_ledger(store / "ledger", store, "calibration", {}, resume=True),
+        pytest.raises(pb.OutputError, match="fits: another process is writing it; wait until"),
+    ):
+        pb.calibrate(capture, simulations=COUNT, store=store, resume=True, **ASKED)
+
+
+@pytest.mark.thorough
+def test_a_damaged_ledger_is_refused_and_can_be_removed(capture, whole, begun, tmp_path) -> None:
+    store = copied(begun, tmp_path)
+    content = (store / "ledger").read_bytes()
+    (store / "ledger").write_bytes(content.replace(b"-000000", b"-000001", 1))
+    with pytest.raises(pb.OutputError, match="ledger: line 2 is damaged; remove that file to fit"):
+        pb.calibrate(capture, simulations=COUNT, store=store, resume=True, **ASKED)
+    (store / "ledger").unlink()
+    found = pb.calibrate(capture, simulations=COUNT, store=store, resume=True, **ASKED)
+    assert_same_bits(found, whole)
 
 
 @pytest.mark.thorough
