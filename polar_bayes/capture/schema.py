@@ -235,10 +235,17 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
     _check_names(dataset, source)
     layout = _layout(dataset, source)
     present = [row for row in CONTRACT if row.name in dataset]
-    flags = {row.name: _flag(dataset, row, layout, source) for row in present if row.kind == "flag"}
-    valid = _valid_entries(dataset, flags, layout, source)
+    flags = {
+        row.name: _entries(dataset, row, layout, source) for row in present if row.kind == "flag"
+    }
+    valid = np.ones([dataset.sizes[dim] for dim in layout.readings], dtype=bool)
+    if "valid" in flags:
+        valid = flags["valid"].values
+    if not valid.any():
+        hint = "mark what was measured valid=True"
+        raise CaptureError("every view is masked", where=f"{source}: valid", hint=hint)
     numbers = {
-        row.name: _numbers(dataset, row, layout, valid, source)
+        row.name: _entries(dataset, row, layout, source, valid)
         for row in present
         if row.kind != "flag"
     }
@@ -324,47 +331,28 @@ def _dims_text(dims: Sequence[Hashable]) -> str:
     return f"({', '.join(map(str, dims))})"
 
 
-def _flag(dataset: xr.Dataset, row: Variable, layout: Layout, source: str) -> xr.Variable:
-    variable = _ordered(dataset[row.name].variable, row, layout, source)
-    values = variable.values
-    if values.dtype.kind != "b":  # netCDF has no truth values, only 0 and 1
-        values = _floats(values, f"{source}: {row.name}")
-        _check_values(values, row, variable.dims, source, np.isin(values, (0.0, 1.0)))
-    return xr.Variable(variable.dims, values.astype(bool), _attributes(variable, row, source))
-
-
-def _valid_entries(
-    dataset: xr.Dataset, flags: Mapping[str, xr.Variable], layout: Layout, source: str
-) -> np.ndarray:
-    """The `valid` flag, or all True; shaped like the readings."""
-    if "valid" not in flags:
-        return np.ones([dataset.sizes[dim] for dim in layout.readings], dtype=bool)
-    valid = flags["valid"].values
-    if not valid.any():
-        hint = "mark what was measured valid=True"
-        raise CaptureError("every view is masked", where=f"{source}: valid", hint=hint)
-    return valid
-
-
-def _numbers(
-    dataset: xr.Dataset, row: Variable, layout: Layout, valid: np.ndarray, source: str
+def _entries(
+    dataset: xr.Dataset,
+    row: Variable,
+    layout: Layout,
+    source: str,
+    valid: np.ndarray | bool = True,
 ) -> xr.Variable:
+    """A variable of the contract in canonical form; readings that are not valid are not checked."""
     variable = _ordered(dataset[row.name].variable, row, layout, source)
-    values = _floats(variable.values, f"{source}: {row.name}")
-    inside = row.range.contains(values)
-    allowed = inside | ~valid if row.kind == "reading" else inside
-    _check_values(values, row, variable.dims, source, allowed)
+    values, is_flag = variable.values, row.kind == "flag"
+    if not is_flag or values.dtype.kind != "b":  # netCDF has no truth values, only 0 and 1
+        values = _floats(values, f"{source}: {row.name}")
+        allowed = np.isin(values, (0.0, 1.0)) if is_flag else row.range.contains(values)
+        if row.kind == "reading":
+            allowed = allowed | np.logical_not(valid)
+        if not allowed.all():
+            index = np.unravel_index(np.argmin(allowed), allowed.shape)
+            where = f"{source}: {_entry(row.name, variable.dims, index)}"
+            what = f"{values[index]:g} is outside {row.range}"
+            raise CaptureError(what, where=where, hint=row.hint)
+    values = values.astype(bool) if is_flag else values
     return xr.Variable(variable.dims, values, _attributes(variable, row, source))
-
-
-def _check_values(
-    values: np.ndarray, row: Variable, dims: Sequence[Hashable], source: str, allowed: np.ndarray
-) -> None:
-    if allowed.all():
-        return
-    index = np.unravel_index(np.argmin(allowed), allowed.shape)
-    what = f"{values[index]:g} is outside {row.range}"
-    raise CaptureError(what, where=f"{source}: {_entry(row.name, dims, index)}", hint=row.hint)
 
 
 def _check_polarization(
@@ -418,20 +406,13 @@ def _floats(values: np.ndarray, where: str) -> np.ndarray:
 def _labels(dataset: xr.Dataset, layout: Layout, source: str) -> dict[str, xr.Variable]:
     """Coordinates named after a dim, along it or as the one label that selection leaves."""
     labels = {}
-    for name in (*LABELS, WAVELENGTH.name):
-        if name not in dataset.variables:
-            continue
-        row = (
-            WAVELENGTH if name == WAVELENGTH.name else Variable(name, "label", None, UNIT, name, "")
-        )
+    for name in (name for name in LABELS if name in dataset.variables):
+        row = Variable(name, "label", None, UNIT, name, "")
         variable = _ordered(dataset[name].variable, row, layout, source)
-        where = f"{source}: {name}"
-        if row is WAVELENGTH:
-            values = _floats(variable.values, where)
-            _check_values(values, row, variable.dims, source, row.range.contains(values))
-        else:
-            values = _label_values(variable.values, where)
+        values = _label_values(variable.values, f"{source}: {name}")
         labels[name] = xr.Variable(variable.dims, values, _attributes(variable, row, source))
+    if WAVELENGTH.name in dataset.variables:
+        labels[WAVELENGTH.name] = _entries(dataset, WAVELENGTH, layout, source)
     return labels
 
 
