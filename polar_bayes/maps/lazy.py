@@ -1,6 +1,5 @@
 """Images and maps in files, opened lazily; a damaged part of one is an error of one line."""
 
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from polar_bayes.capture.files import load_capture
 from polar_bayes.errors import CaptureError, FitError, PolarBayesError
 from polar_bayes.inference.batching import IMAGE
 from polar_bayes.inference.psis import LEVELS
-from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.observation.data import READINGS
 from polar_bayes.paths import as_path
 
@@ -45,11 +44,7 @@ def open_capture(path: str | os.PathLike[str]) -> xr.Dataset:
     Raises:
         CaptureError: It cannot be read; with a Zarr store also later, when values are read.
     """
-    return open_image(as_path(path, "capture"))
-
-
-def open_image(path: Path) -> xr.Dataset:
-    """A capture from a file; of a Zarr store it is validated block by block, later."""
+    path = as_path(path, "capture")
     if path.suffix != ".zarr":
         return load_capture(path)
     if not path.is_dir():
@@ -105,8 +100,10 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
 
 def _check_maps(maps: xr.Dataset, store: Path) -> None:
     """Refuse metadata that no map has."""
-    if not _has_provenance(maps):
-        raise FitError("its provenance cannot be read", where=str(store), hint=COPY)
+    try:
+        provenance_of(maps)
+    except FitError as error:
+        raise FitError("its provenance cannot be read", where=str(store), hint=COPY) from error
     if "quantile" in maps.dims and not np.array_equal(maps["quantile"], LEVELS):
         raise FitError("its levels are not those of a map", where=f"{store}: quantile", hint=COPY)
     for name, variable in maps.variables.items():
@@ -123,13 +120,6 @@ def _check_maps(maps: xr.Dataset, store: Path) -> None:
         is_ours = REQUEST in maps.attrs  # to_zarr of a user leaves out chunks of zeros
         if is_ours and name in maps.coords and _missing(store / str(name), FitError)[0]:
             raise FitError("its values are missing", where=where, hint=COPY)
-
-
-def _has_provenance(maps: xr.Dataset) -> bool:
-    try:
-        return isinstance(json.loads(maps.attrs[PROVENANCE]), dict)
-    except (TypeError, ValueError):
-        return False
 
 
 def _has_meanings(flags: xr.Variable) -> bool:

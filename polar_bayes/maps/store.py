@@ -48,7 +48,7 @@ from polar_bayes.maps.fit_map import (
     provenance_json,
     with_pixel_numbers,
 )
-from polar_bayes.maps.lazy import FINISHED, REQUEST, check_whole, open_image, open_map
+from polar_bayes.maps.lazy import FINISHED, REQUEST, check_whole, open_capture, open_map
 from polar_bayes.paths import as_path, is_same_file, replace_file, sync, temporary_folder
 from polar_bayes.progress import Counter, no_progress, with_counter
 
@@ -164,7 +164,7 @@ def fit_file_block(
 
 def _open(source: Path) -> xr.Dataset:
     """A capture from a file, with the variables that a fit reads."""
-    image = open_image(source)
+    image = open_capture(source)
     return image[[name for name in image.data_vars if name in READ]]
 
 
