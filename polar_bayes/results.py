@@ -11,9 +11,13 @@ import pandas as pd
 import xarray as xr
 
 from polar_bayes.benchmark.advice import STUDY, accuracy_dataset, accuracy_sentences, accuracy_table
-from polar_bayes.calibration.files import CALIBRATION, check_calibration
 from polar_bayes.calibration.scores import is_calibrated
-from polar_bayes.calibration.verdict import calibration_table, calibration_verdict
+from polar_bayes.calibration.verdict import (
+    CALIBRATION,
+    calibration_table,
+    calibration_verdict,
+    check_calibration,
+)
 from polar_bayes.capture.files import is_result, read_netcdf, write_netcdf
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.convergence import Verdict

@@ -68,6 +68,10 @@ class PixelNuts(AbstractPixelMethod):
                 self._refuse(what, f"give a number between {low:g} and {high:g}")
 
     @override
+    def thinning(self, count: int) -> int:
+        return max(1, self.chains * self.draws // count)
+
+    @override
     def fit(
         self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
     ) -> None:

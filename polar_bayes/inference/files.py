@@ -3,7 +3,7 @@
 A schema lists the groups, variables, attributes and provenance that this package reads, with the
 type of each. Everything else in a tree is ignored, so trees that ArviZ made, or that a user has
 edited, pass wherever their parts fit together. Functions trust a tree that has passed its schema.
-The schemas of calibrations and accuracy studies are in `polar_bayes.calibration.files` and
+The schemas of calibrations and accuracy studies are in `polar_bayes.calibration.verdict` and
 `polar_bayes.benchmark.accuracy`.
 """
 

@@ -127,6 +127,18 @@ class AbstractBatchMethod[Engine](HTMLRepr, abc.ABC):
             an error.
         """
 
+    def thinning(self, count: int) -> int:
+        """Every how many of the draws that it describes are nearly independent.
+
+        Args:
+            count: Draws that are wanted, about.
+
+        Returns:
+            1 where all are, as resampled draws and those that `run_batch` thins itself.
+        """
+        del count
+        return 1
+
 
 @dataclasses.dataclass(frozen=True)
 class AbstractMethod(AbstractBatchMethod[CompiledModel]):

@@ -10,7 +10,6 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
-from polar_bayes.calibration.files import is_calibration
 from polar_bayes.calibration.scores import significance_level
 from polar_bayes.calibration.verdict import (
     calibration_readings,
@@ -18,6 +17,7 @@ from polar_bayes.calibration.verdict import (
     compare_calibrations,
     comparison_sentences,
     holds_readings,
+    is_calibration,
     parameter_deviation,
     reading_deviation,
     reading_ranks,

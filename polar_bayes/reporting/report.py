@@ -9,8 +9,7 @@ from typing import Any, NamedTuple, cast
 import xarray as xr
 
 from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences, is_accuracy
-from polar_bayes.calibration.files import is_calibration
-from polar_bayes.calibration.verdict import calibration_table, calibration_verdict
+from polar_bayes.calibration.verdict import calibration_table, calibration_verdict, is_calibration
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import provenance_of
