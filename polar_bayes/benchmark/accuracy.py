@@ -27,9 +27,9 @@ from polar_bayes.benchmark.run import (
 )
 from polar_bayes.design.setup import request_provenance
 from polar_bayes.errors import FitError, PolarBayesError
+from polar_bayes.inference.auto import STUDY_METHODS
 from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, Schema
 from polar_bayes.inference.method import AbstractMethod
-from polar_bayes.inference.methods import STUDY_METHODS
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE

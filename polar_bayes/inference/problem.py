@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polar_bayes.inference import laplace
 from polar_bayes.inference.compile import (
     TRACING_LOCK,
     JitOnce,
@@ -85,11 +84,6 @@ class CompiledModel:
             return compile_program(self.bind(), self.layout.in_single_precision())
 
     @functools.cached_property
-    def least_squares(self) -> Callable[[Array, Observations], laplace.Estimate]:
-        """Least squares from several starts, compiled."""
-        return JitOnce(lambda starts, data: laplace.estimate(self.program, data, starts))
-
-    @functools.cached_property
     def log_densities(self) -> Callable[[Array, Observations], Array]:
         """Log posterior density of a block of unconstrained vectors, compiled."""
 
@@ -98,8 +92,7 @@ class CompiledModel:
                 lambda z: -self.program.potential_jit(z, data), z, batch_size=SIDE_BY_SIDE
             )
 
-        with TRACING_LOCK:
-            return JitOnce(compute)
+        return JitOnce(compute)
 
 
 _COMPILED: LRUCache[CompiledModel] = LRUCache(MAX_LAYOUTS)
