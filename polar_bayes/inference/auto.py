@@ -91,7 +91,7 @@ class Auto(AbstractMethod):
         Returns:
             Methods by name.
         """
-        needed = draws_needed(self.tolerance, problem.num_parameters)
+        needed = draws_needed(self.tolerance, int(problem.describe()["size"].sum()))
         chains = Nuts(effective_draws=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
         if not problem.is_one_spectrum_point:
             return {"nuts": chains}

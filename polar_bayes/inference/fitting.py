@@ -25,7 +25,7 @@ from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_unti
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.problem import BLOCK, THREADS, Problem, make_problem
-from polar_bayes.inference.request import MODELS, Request, resolve
+from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.instrument import Discrepancy
@@ -265,11 +265,11 @@ def _model_source(model: Callable) -> str:
     """The source of a model of the user's own, so that a result shows what was fitted."""
     while isinstance(model, Messenger):
         model = model.fn
-    ours = [known if isinstance(known, FunctionType) else type(known) for known in MODELS.values()]
-    if model in ours or type(model) in ours:
+    code = model if isinstance(model, FunctionType) else type(model)
+    if code.__module__.startswith("polar_bayes."):
         return ""
     try:
-        return inspect.getsource(model if isinstance(model, FunctionType) else type(model))
+        return inspect.getsource(code)
     except (OSError, TypeError):
         return ""
 

@@ -52,6 +52,7 @@ class Program:
     plates: Mapping[str, int]
     events: Mapping[str, tuple[int, ...]]
     supports: Mapping[str, dist.constraints.Constraint]
+    families: Mapping[str, str]
     auxiliary: tuple[str, ...]
     derived: tuple[str, ...]
     observed: tuple[str, ...]
@@ -206,6 +207,7 @@ def compile_program(model: Model, data: Observations) -> Program:
         events={name: tuple(site["fn"].event_shape) for name, site in sampled.items()}
         | {name: _event_shape(site) for name, site in derived.items()},
         supports=supports,
+        families={name: family_of(site["fn"]) for name, site in latent.items()},
         auxiliary=tuple(name for name, site in latent.items() if is_auxiliary(site)),
         derived=tuple(derived),
         observed=observed,
@@ -341,20 +343,3 @@ def _check_readings(sampled: Mapping[str, dict], data: Observations) -> None:
             where="model",
             hint=f"end it with declare_readings(...), or observe {' or '.join(data.readings)}",
         )
-
-
-PIECE = 500
-
-
-def parameters_of(program: Program, z: np.ndarray, data: Observations) -> dict[str, np.ndarray]:
-    """Parameters of draws (chain, draw, size) by name, in blocks of one compiled length."""
-    count = z.shape[1]
-    pieces = []
-    for begin in range(0, count, PIECE):
-        index = np.minimum(np.arange(begin, begin + PIECE), count - 1)
-        found = program.parameters_of_chains(jnp.asarray(z[:, index]), data)
-        pieces.append({name: np.asarray(value) for name, value in found.items()})
-    return {
-        name: np.concatenate([piece[name] for piece in pieces], axis=1)[:, :count]
-        for name in pieces[0]
-    }

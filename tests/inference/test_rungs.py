@@ -45,6 +45,15 @@ def problem(model, seed: int = 0):
     return make_problem(request, jax.random.split(jax.random.key(seed))[0])
 
 
+def test_a_problem_tells_what_is_estimated_and_from_what():
+    table = problem(line).describe()
+    assert list(table.index) == ["level", "slope"]
+    assert (table["size"] == 1).all()
+    assert (table["prior"] == "Normal").all()
+    assert (table["low"] == -np.inf).all()
+    assert table.attrs == {"used": {"q": 6}, "measured": {"q": 6}}
+
+
 def run(method, problem, seed: int = 0):
     return method.run(problem, jax.random.split(jax.random.key(seed))[1], no_progress)
 
