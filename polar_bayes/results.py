@@ -23,7 +23,7 @@ from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.effects.choose import ledger_sentences, ledger_table
 from polar_bayes.errors import FitError, OutputError
-from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.batching import Status
 from polar_bayes.inference.files import FIT, check_fit
 from polar_bayes.maps.fit_map import count_pixels
 from polar_bayes.maps.lazy import open_map

@@ -26,7 +26,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import engine_key
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.least_squares import Point
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.program import Values

@@ -19,8 +19,7 @@ from polar_bayes.calibration.simulations import draw_captures, redraw_readings
 from polar_bayes.inference.batch_engine import BatchEngine, make_engine
 from polar_bayes.inference.batch_method import AbstractPixelMethod
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import Describe, Outcome
-from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.inference.batching import Describe, ObservationBatch, Outcome
 from polar_bayes.inference.compile import TRACING_LOCK, LRUCache
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.problem import CompiledModel, compile_model

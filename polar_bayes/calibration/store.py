@@ -21,7 +21,7 @@ from numpyro.primitives import Messenger
 
 from polar_bayes.calibration.runner import Block, Plan
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_result import Outcome
+from polar_bayes.inference.batching import Outcome
 from polar_bayes.inference.request import Request
 from polar_bayes.interrupts import resume_hint
 from polar_bayes.paths import TEMPORARY_PREFIX, replace_file, temporary_folder

@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 from numpyro import infer
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_result import Describe, Outcome
-from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.inference.batching import Describe, ObservationBatch, Outcome
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.initialization import Target
 from polar_bayes.inference.mcse import measure

@@ -36,8 +36,7 @@ from scipy.special import ndtr
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
-from polar_bayes.inference.batch_result import MethodUsed, Status
-from polar_bayes.inference.batching import ObservationBatch, batched, take_rows
+from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status, batched, take_rows
 from polar_bayes.inference.levenberg_marquardt import NormalApproximation
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import CompiledModel, Problem

@@ -17,13 +17,14 @@ from polar_bayes.capture.schema import validate
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine, make_engine
 from polar_bayes.inference.batch_method import AbstractPixelMethod
-from polar_bayes.inference.batch_result import (
+from polar_bayes.inference.batching import (
+    IMAGE,
     MethodUsed,
     Outcome,
     Status,
+    batch_pixels,
     empty_outcome,
 )
-from polar_bayes.inference.batching import IMAGE, batch_pixels
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.inference.request import Request
 from polar_bayes.observation.data import READINGS, Observations, observe

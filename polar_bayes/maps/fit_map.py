@@ -12,8 +12,7 @@ from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.batch_engine import engine_key
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_method import AbstractPixelMethod
-from polar_bayes.inference.batch_result import MIN_VIEWS, Status, empty_outcome
-from polar_bayes.inference.batching import IMAGE
+from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, empty_outcome
 from polar_bayes.inference.psis import Marginals
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import PROVENANCE

@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from polar_bayes.diagnostics.coverage import BLOCK, INTERVALS, map_coverage, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
-from polar_bayes.inference.batch_result import MIN_VIEWS, Status
-from polar_bayes.inference.batching import IMAGE
+from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.fit_map import checked_status, cut
 from polar_bayes.maps.lazy import ensure_loaded

@@ -17,7 +17,7 @@ from polar_bayes.calibration.calibrate import METHODS, _settings
 from polar_bayes.calibration.runner import Method
 from polar_bayes.errors import FitError
 from polar_bayes.inference import hierarchical_reparam, problem
-from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.method import thin_draws
 from polar_bayes.inference.problem import compile_model
 from polar_bayes.inference.request import resolve
