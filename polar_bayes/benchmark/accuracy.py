@@ -1,7 +1,6 @@
 """Accuracy study: errors of methods and settings for one capture, and what they cost."""
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
 from typing import Any
@@ -25,14 +24,13 @@ from polar_bayes.benchmark.run import (
     run_fresh,
     run_trial,
 )
-from polar_bayes.design.setup import request_provenance
+from polar_bayes.design.setup import provenance_attrs
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.auto import STUDY_METHODS
 from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, Schema
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
-from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
@@ -130,15 +128,15 @@ def accuracy(
         show("trials", number / len(trials))
         rows.append(_row(trial, reference_run, fresh=fresh))
     show("trials", 1.0)
-    provenance = {
-        **request_provenance(request),
-        "accuracy": len(rows),
-        "fresh_processes": fresh,
-        "versions": {name: version(name) for name in ("polar_bayes", "jax", "numpyro")},
-    }
-    dataset = _dataset(list(trials), rows, reference_run)
-    tree = xr.DataTree(children={"accuracy": xr.DataTree(dataset)})
-    tree.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
+    tree = xr.DataTree(
+        children={"accuracy": xr.DataTree(_dataset(list(trials), rows, reference_run))}
+    )
+    tree.attrs |= provenance_attrs(
+        request,
+        accuracy=len(rows),
+        fresh_processes=fresh,
+        versions={name: version(name) for name in ("polar_bayes", "jax", "numpyro")},
+    )
     return tree
 
 
