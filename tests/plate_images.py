@@ -11,9 +11,9 @@ from textbook import plate_q
 import polar_bayes as pb
 from polar_bayes.capture.schema import validate
 from polar_bayes.inference.batch_laplace import PixelLaplace
-from polar_bayes.inference.batching import ObservationBatch, batch_pixels
+from polar_bayes.inference.batching import ObservationBatch, batch_pixels, cut
 from polar_bayes.maps.blocks import Plan, fit_block, mask_missing
-from polar_bayes.maps.fit_map import blank, cut, plan_map, with_pixel_numbers
+from polar_bayes.maps.fit_map import blank, plan_map, with_pixel_numbers
 
 NOISE = 0.02
 # Away from Brewster's angle q stays so far from -1 that ordinary noise is never clipped.

@@ -1,6 +1,5 @@
 """Accuracy study: errors of methods and settings for one capture, and what they cost."""
 
-import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
 from typing import Any
@@ -10,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
 
+from polar_bayes.benchmark.advice import AS_GIVEN
 from polar_bayes.benchmark.reference import (
     Distances,
     Reference,
@@ -27,7 +27,6 @@ from polar_bayes.benchmark.run import (
 from polar_bayes.design.setup import provenance_attrs
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.auto import STUDY_METHODS
-from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, Schema
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
@@ -35,7 +34,6 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
 
-AS_GIVEN = "as given"
 REFERENCE_FOLD = 7
 """Folded into the key of the reference, which shares no random number with a trial."""
 
@@ -242,17 +240,3 @@ def _dataset(
 
 
 # --- Accuracy studies in netCDF files -------------------------------------------------------------
-
-
-STUDY = Schema(
-    kind="accuracy study",
-    made_by="polar_bayes.accuracy or load",
-    command="`polar-bayes accuracy`",
-    groups={"accuracy": dataclasses.replace(ACCURACY, required=True)},
-    provenance=COMMON_PROVENANCE,
-)
-
-
-def is_accuracy(tree: object) -> bool:
-    """Whether a tree is what `polar_bayes.accuracy` returns, and no fit."""
-    return STUDY.describes(tree)

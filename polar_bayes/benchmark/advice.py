@@ -1,12 +1,22 @@
 """Table, Pareto front and sentences of an accuracy study."""
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from polar_bayes.benchmark.accuracy import AS_GIVEN, STUDY
 from polar_bayes.errors import FitError
-from polar_bayes.inference.files import FIT
+from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, FIT, Schema
+
+AS_GIVEN = "as given"
+STUDY = Schema(
+    kind="accuracy study",
+    made_by="polar_bayes.accuracy or load",
+    command="`polar-bayes accuracy`",
+    groups={"accuracy": dataclasses.replace(ACCURACY, required=True)},
+    provenance=COMMON_PROVENANCE,
+)
 
 RESOLVED = 2.0
 """Standard errors of the reference from which an error counts as different from 0."""
@@ -24,6 +34,11 @@ NUMBERS = (
     *(*TIMES, "peak_memory"),
 )
 TEXTS = ("method", "override", "problems")
+
+
+def is_accuracy(tree: object) -> bool:
+    """Whether a tree is what `polar_bayes.accuracy` returns, and no fit."""
+    return STUDY.describes(tree)
 
 
 def accuracy_dataset(result: xr.DataTree | xr.Dataset) -> xr.Dataset:

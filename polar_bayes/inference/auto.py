@@ -8,12 +8,10 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, override
 
 import numpy as np
-import xarray as xr
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import OutOfTimeError, run_until
-from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.laplace import Importance, Laplace
 from polar_bayes.inference.least_squares import Point
 from polar_bayes.inference.mcse import LARGEST_R_HAT, draws_needed, largest_error
@@ -21,7 +19,6 @@ from polar_bayes.inference.method import AbstractMethod, PosteriorDraws, flatten
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.psis import MAX_PARETO_K, max_effective_size
-from polar_bayes.inference.result import provenance_of
 from polar_bayes.inference.smc import PixelSMC, Tempered
 from polar_bayes.inference.variational import FlowGuide, NormalGuide
 from polar_bayes.progress import Progress
@@ -261,40 +258,3 @@ STUDY_METHODS: Mapping[str, AbstractMethod] = MappingProxyType(
 )
 """Methods that `polar_bayes.accuracy` compares, from cheap to exact. One more is one more value:
 `{**STUDY_METHODS, "mine": Mine()}`."""
-
-
-def auto_sentences(result: xr.DataTree) -> list[str]:
-    """What `method="auto"` tried, what it took, and why.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-
-    Returns:
-        A sentence for each method that was tried, in order; none for a fit by a method of one's
-        own choice.
-
-    Raises:
-        FitError: It is no fit, or does not hold together.
-    """
-    check_fit(result)
-    summary = provenance_of(result).get("auto")
-    if not summary:
-        return []
-    sentences = []
-    for step in summary["steps"]:
-        name = f"{step['name']} ({step['seconds']:.1f} s)"
-        if step["taken"]:
-            error = step.get("monte_carlo")
-            within = "an unknown number of" if error is None else f"{error:.2g}"
-            sentences.append(
-                f"{name} was taken: its means and standard deviations are expected within "
-                f"{within} posterior sd, and {summary['tolerance']:g} were asked for."
-            )
-        else:
-            sentences.append(f"{name} was not taken: {step['why']}.")
-    if not summary["met"]:
-        sentences.append(
-            f"Nothing was good enough; these are the numbers of {summary['chosen']}, which came "
-            "nearest. Give more seconds or a larger tolerance, or doubt them."
-        )
-    return sentences

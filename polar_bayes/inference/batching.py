@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from jaxtyping import Array
 
 from polar_bayes.inference.compile import JitOnce
@@ -101,6 +102,16 @@ def batch_pixels(
     valid = np.broadcast_to(np.asarray(image.valid), image.shape)
     views = np.any(valid, axis=tuple(range(2, valid.ndim - 1))).sum(axis=-1).ravel()
     return ObservationBatch(part(True), part(False), views)
+
+
+def cut(image: xr.Dataset, pixels: int) -> Iterator[dict[str, slice]]:
+    """Places of blocks that cover an image, row by row."""
+    rows, columns = (image.sizes[dim] for dim in IMAGE)
+    wide = min(columns, pixels)
+    high = max(1, pixels // wide)
+    for y in range(0, rows, high):
+        for x in range(0, columns, wide):
+            yield {"y": slice(y, min(y + high, rows)), "x": slice(x, min(x + wide, columns))}
 
 
 def take_rows[T](values: T, which: np.ndarray) -> T:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import xarray as xr
@@ -12,7 +12,7 @@ from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.batch_engine import engine_key
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_method import AbstractPixelMethod
-from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, empty_outcome
+from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, cut, empty_outcome
 from polar_bayes.inference.psis import Marginals
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import PROVENANCE
@@ -33,9 +33,6 @@ from polar_bayes.progress import Counter, with_counter
 
 BLOCK = 4096
 """Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
-
-CHUNK = 65536
-"""Pixels of a chunk of a store, which are read together."""
 
 
 @with_counter("pixels")
@@ -94,50 +91,6 @@ def fit_pixels(
         maps = _at_once(capture, plan, progress)
     maps["status"].encoding["fill_value"] = int(Status.NOT_FITTED)  # of chunks in a Zarr store
     return maps
-
-
-def count_pixels(maps: xr.Dataset) -> dict[str, int]:
-    """The number of pixels of each status.
-
-    Args:
-        maps: Of `fit_pixels`, or opened from a store.
-
-    Returns:
-        How many are good, masked, with too few views, not converged, not trusted and not fitted:
-        those whose chunk is lost, or whose numbers are not finite though they are called good.
-
-    Raises:
-        FitError: It holds no `status`.
-    """
-    if "status" not in maps:
-        raise FitError(
-            "it holds no maps", where="count_pixels", hint="give what fit_pixels returns"
-        )
-    counts = dict.fromkeys(Status, 0)
-    for region in cut(maps, CHUNK):
-        found = checked_status(maps.isel(region)).to_numpy()
-        for each in Status:
-            counts[each] += int(np.sum(found == each))
-    return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
-
-
-def checked_status(maps: xr.Dataset) -> xr.DataArray:
-    """Statuses of maps, in memory; a pixel that is called good without numbers is not fitted."""
-    # A chunk that was lost from a store reads as not a number.
-    answers = [
-        f"{name}{ending}"
-        for name in maps.data_vars
-        if f"{name}_quantile" in maps
-        for ending in ("", "_sd", "_quantile")
-        if f"{name}{ending}" in maps
-    ]
-    here = maps[["status", *answers]].load()
-    is_known = xr.ones_like(here["status"], dtype=bool)
-    for name in answers:
-        is_finite = abs(here[name]) < np.inf
-        is_known &= is_finite.all([dim for dim in is_finite.dims if dim not in IMAGE])
-    is_hole = (here["status"] == Status.GOOD) & ~is_known
-    return here["status"].where(~is_hole, Status.NOT_FITTED).astype(here["status"].dtype)
 
 
 def plan_map(
@@ -207,22 +160,12 @@ def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
     return whole.chunk(chunks) if chunks else whole
 
 
-def cut(capture: xr.Dataset, pixels: int = BLOCK) -> Iterator[dict[str, slice]]:
-    """Places of blocks that cover an image, row by row."""
-    rows, columns = (capture.sizes[dim] for dim in IMAGE)
-    wide = min(columns, pixels)
-    high = max(1, pixels // wide)
-    for y in range(0, rows, high):
-        for x in range(0, columns, wide):
-            yield {"y": slice(y, min(y + high, rows)), "x": slice(x, min(x + wide, columns))}
-
-
 def _at_once(capture: xr.Dataset, plan: Plan, progress: Counter | None) -> xr.Dataset:
     """Blocks on threads, put together in memory."""
     maps = blank(capture, plan).copy(deep=True)
     every, done = capture.sizes["y"] * capture.sizes["x"], 0
     with workers(None) as (pool, count):
-        tasks = ((region,) for region in cut(capture))
+        tasks = ((region,) for region in cut(capture, BLOCK))
 
         def fit(region: dict[str, slice]) -> xr.Dataset:
             block = with_pixel_numbers(capture.isel(region), region, capture.sizes["x"])

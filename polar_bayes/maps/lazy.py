@@ -13,7 +13,7 @@ from xarray.core import indexing
 
 from polar_bayes.capture.files import load_capture
 from polar_bayes.errors import CaptureError, FitError, PolarBayesError
-from polar_bayes.inference.batching import IMAGE
+from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.inference.psis import LEVELS
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.data import READINGS
@@ -231,3 +231,53 @@ def ensure_loaded(maps: xr.Dataset) -> xr.Dataset:
             hint="write them with to_zarr, if they are not yet, and open them with open_map",
         )
     return maps.compute()
+
+
+# --- Pixels ---------------------------------------------------------------------------------------
+
+CHUNK = 65536
+"""Pixels of a chunk of a store, which are read together."""
+
+
+def count_pixels(maps: xr.Dataset) -> dict[str, int]:
+    """The number of pixels of each status.
+
+    Args:
+        maps: Of `fit_pixels`, or opened from a store.
+
+    Returns:
+        How many are good, masked, with too few views, not converged, not trusted and not fitted:
+        those whose chunk is lost, or whose numbers are not finite though they are called good.
+
+    Raises:
+        FitError: It holds no `status`.
+    """
+    if "status" not in maps:
+        raise FitError(
+            "it holds no maps", where="count_pixels", hint="give what fit_pixels returns"
+        )
+    counts = dict.fromkeys(Status, 0)
+    for region in cut(maps, CHUNK):
+        found = checked_status(maps.isel(region)).to_numpy()
+        for each in Status:
+            counts[each] += int(np.sum(found == each))
+    return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
+
+
+def checked_status(maps: xr.Dataset) -> xr.DataArray:
+    """Statuses of maps, in memory; a pixel that is called good without numbers is not fitted."""
+    # A chunk that was lost from a store reads as not a number.
+    answers = [
+        f"{name}{ending}"
+        for name in maps.data_vars
+        if f"{name}_quantile" in maps
+        for ending in ("", "_sd", "_quantile")
+        if f"{name}{ending}" in maps
+    ]
+    here = maps[["status", *answers]].load()
+    is_known = xr.ones_like(here["status"], dtype=bool)
+    for name in answers:
+        is_finite = abs(here[name]) < np.inf
+        is_known &= is_finite.all([dim for dim in is_finite.dims if dim not in IMAGE])
+    is_hole = (here["status"] == Status.GOOD) & ~is_known
+    return here["status"].where(~is_hole, Status.NOT_FITTED).astype(here["status"].dtype)

@@ -23,12 +23,11 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from polar_bayes.capture.schema import CONTRACT, LABELS, WAVELENGTH
 from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError
-from polar_bayes.inference.batching import IMAGE, Status
+from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.interrupts import on_interrupt, resume_hint
 from polar_bayes.maps.blocks import Plan, as_completed, fit_block, workers
 from polar_bayes.maps.fit_map import (
     blank,
-    cut,
     fit_pixels,
     plan_map,
     provenance_json,

@@ -38,7 +38,7 @@ from polar_bayes.physics.surface import (
     RoughSurface,
     SmoothSurface,
 )
-from polar_bayes.repr_html import DisplayTable, HTMLRepr
+from polar_bayes.repr_html import HTMLRepr, Row, Table
 
 # Parameters of a material, in the order in which they are listed; every other one that a scene
 # reads belongs to the whole capture.
@@ -140,9 +140,10 @@ class Scene(HTMLRepr):
         return tuple(name for name in self.parameters if name not in instrument)
 
     @override
-    def extra_tables(self) -> tuple[DisplayTable, ...]:
-        rows = [(name, *notation(name)) for name in self.parameters]
-        return (DisplayTable(("parameter", "symbol", "meaning", "unit"), tuple(rows)),)
+    def extra_tables(self) -> tuple[Table, ...]:
+        rows = tuple(Row(name, notation(name)) for name in self.parameters)
+        columns = ("parameter", "symbol", "meaning", "unit")
+        return (Table(columns, rows, prose=columns),)
 
     def light(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> Light:
         """Light that reaches the viewer, before any instrument.

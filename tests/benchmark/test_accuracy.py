@@ -14,7 +14,7 @@ from toy_models import capture, line, of_line, squared
 
 import polar_bayes as pb
 from polar_bayes.benchmark import run
-from polar_bayes.benchmark.accuracy import AS_GIVEN
+from polar_bayes.benchmark.advice import AS_GIVEN
 from polar_bayes.benchmark.reference import ReferenceRun, best_reference, run_reference
 from polar_bayes.benchmark.run import AbstractOverride, Trial, run_fresh
 from polar_bayes.effects.variants import parts_of
