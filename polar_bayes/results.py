@@ -23,7 +23,7 @@ from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.errors import FitError, OutputError
-from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.batching import Status
 from polar_bayes.inference.files import FIT, check_fit
 from polar_bayes.maps.lazy import count_pixels, open_map
 from polar_bayes.paths import as_path, atomic_write, existing_file

@@ -26,8 +26,8 @@ from polar_bayes.benchmark.run import (
 )
 from polar_bayes.design.setup import provenance_attrs
 from polar_bayes.errors import FitError, PolarBayesError
+from polar_bayes.inference.auto import STUDY_METHODS
 from polar_bayes.inference.method import AbstractMethod
-from polar_bayes.inference.methods import STUDY_METHODS
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.observation.links import AbstractLink

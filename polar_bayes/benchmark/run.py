@@ -30,8 +30,8 @@ from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.compile import LRUCache, cache_key
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import Problem, make_problem
+from polar_bayes.inference.psis import CHAINS, numpy_generator
 from polar_bayes.inference.request import Request
-from polar_bayes.inference.resampling import CHAINS, numpy_generator
 from polar_bayes.inference.result import posterior_of
 from polar_bayes.interrupts import on_interrupt
 from polar_bayes.paths import temporary_folder

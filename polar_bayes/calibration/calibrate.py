@@ -26,8 +26,9 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import engine_key
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import MethodUsed, Status
-from polar_bayes.inference.mode_methods import Nuts, Point
+from polar_bayes.inference.batching import MethodUsed, Status
+from polar_bayes.inference.least_squares import Point
+from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
 from polar_bayes.inference.request import Request, resolve

@@ -23,8 +23,7 @@ from polar_bayes.calibration.scores import PitCrps
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine, make_engine
 from polar_bayes.inference.batch_method import AbstractPixelMethod
-from polar_bayes.inference.batch_result import Outcome
-from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.inference.batching import ObservationBatch, Outcome
 from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.problem import CompiledModel, compile_model

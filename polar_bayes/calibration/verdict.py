@@ -18,7 +18,7 @@ from polar_bayes.calibration.scores import (
 from polar_bayes.diagnostics.coverage import INTERVALS, coverage_columns
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.batching import Status
 from polar_bayes.inference.files import (
     ANY,
     COMMON_PROVENANCE,

@@ -18,8 +18,14 @@ from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.initialization import STARTS, CompiledPotential
-from polar_bayes.inference.optimize import Modes, ValueAndGradient, find_modes, from_prior
+from polar_bayes.inference.initialization import STARTS
+from polar_bayes.inference.optimize import (
+    Modes,
+    NumpyPotential,
+    ValueAndGradient,
+    find_modes,
+    from_prior,
+)
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import PROVENANCE, posterior_of, shape_of
@@ -64,7 +70,9 @@ def posterior_modes(
     problem: DesignProblem, progress: Progress | None, potential: ValueAndGradient | None = None
 ) -> Modes:
     """The modes of the posterior, heaviest first."""
-    potential = potential or CompiledPotential(problem.program, problem.data)
+    potential = potential or NumpyPotential(
+        problem.program.value_and_gradient, problem.data, problem.data.brightness.dtype
+    )
     return find_modes(potential, problem.prior[:STARTS], progress or no_progress)
 
 

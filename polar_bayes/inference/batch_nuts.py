@@ -18,10 +18,11 @@ from numpyro.diagnostics import effective_sample_size
 
 from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
-from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.inference.batching import (
     AnyArray,
+    MethodUsed,
     ObservationBatch,
+    Status,
     batched,
     take_rows,
 )

@@ -11,8 +11,14 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_result import Describe, MethodUsed, Outcome, Status, empty_outcome
-from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.inference.batching import (
+    Describe,
+    MethodUsed,
+    ObservationBatch,
+    Outcome,
+    Status,
+    empty_outcome,
+)
 from polar_bayes.inference.compile import TRACING_LOCK
 from polar_bayes.inference.mcse import (
     LARGEST_R_HAT,

@@ -16,8 +16,16 @@ from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.batch_engine import BatchEngine, engine_key, make_engine
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_method import AbstractPixelMethod
-from polar_bayes.inference.batch_result import MIN_VIEWS, MethodUsed, Outcome, Status, empty_outcome
-from polar_bayes.inference.batching import IMAGE, batch_pixels, cut
+from polar_bayes.inference.batching import (
+    IMAGE,
+    MIN_VIEWS,
+    MethodUsed,
+    Outcome,
+    Status,
+    batch_pixels,
+    cut,
+    empty_outcome,
+)
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE

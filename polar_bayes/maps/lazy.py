@@ -12,8 +12,7 @@ from xarray.core import indexing
 
 from polar_bayes.capture.files import load_capture
 from polar_bayes.errors import CaptureError, FitError, PolarBayesError
-from polar_bayes.inference.batch_result import Status
-from polar_bayes.inference.batching import IMAGE, cut
+from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.inference.psis import LEVELS
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.observation.data import READINGS

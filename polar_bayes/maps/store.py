@@ -21,8 +21,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from polar_bayes.capture.schema import CONTRACT, LABELS, WAVELENGTH
 from polar_bayes.errors import CaptureError, FitError, OutputError
-from polar_bayes.inference.batch_result import Status
-from polar_bayes.inference.batching import IMAGE, cut
+from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.interrupts import on_interrupt, resume_hint
 from polar_bayes.maps.blocks import (
     OTHER_OUT,

@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from polar_bayes.diagnostics.coverage import BLOCK, INTERVALS, map_coverage, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
-from polar_bayes.inference.batch_result import MIN_VIEWS, Status
-from polar_bayes.inference.batching import IMAGE, cut
+from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, cut
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.lazy import COPY, checked_status, ensure_loaded
 from polar_bayes.physics.part import notation

@@ -21,7 +21,7 @@ from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.population import Population
 from polar_bayes.diagnostics.predictive import PitBand, PredictiveCheck, pit_band
 from polar_bayes.errors import one_line
-from polar_bayes.inference.batch_result import MIN_VIEWS
+from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.reporting.style import QUANTITIES, coordinate_labels, short_title
 

@@ -21,8 +21,8 @@ from polar_bayes.effects.variants import parts_of
 from polar_bayes.inference.mcse import standard_errors
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import make_problem
+from polar_bayes.inference.psis import systematic_resample
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.resampling import systematic_resample
 
 LINKS = {"q": pb.links.StokesLink()}
 ROUGHLY = pb.benchmark.Reference(error=0.05, longer=0)

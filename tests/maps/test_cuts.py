@@ -11,7 +11,7 @@ from plate_images import ASKED, NAMES, mapped, planned, plate_image
 
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.maps import fit_map as verb
 from polar_bayes.maps.fit_map import MapPlan, fit_block, fit_pixels, with_pixel_numbers
 

@@ -19,8 +19,7 @@ from scipy import optimize, stats
 import polar_bayes as pb
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import MethodUsed, Status
-from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status
 from polar_bayes.inference.levenberg_marquardt import find_modes
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.result import PROVENANCE
