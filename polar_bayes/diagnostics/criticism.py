@@ -1,4 +1,4 @@
-r"""Model criticism of one fit: priors, bounds, noise, residuals, and influential or repeated readings.
+r"""Model criticism of one fit: priors, bounds, noise, residuals, influence and repeated readings.
 
 The residuals of the readings are compared with residuals of replicated readings. A replicate is
 drawn from the posterior predictive distribution, and refitted in the linear-Gaussian approximation:
@@ -290,7 +290,7 @@ def _positions(
         else np.zeros(variable.observed.size)
     )
     others = [d for d in reading.dims if d not in ("view", "wavelength")]
-    index = [along(xr.DataArray(np.arange(reading.sizes[d]), dims=d)) for d in others]
+    index = [along(xr.DataArray(np.arange(reading.sizes[d]), dims=str(d))) for d in others]
     group = [
         " ".join([variable.name, *(str(each[i]) for each in index)])
         for i in range(variable.observed.size)
@@ -416,8 +416,8 @@ def _leave_one_out(checks: Mapping[str, PredictiveCheck]) -> Finding:
     worst = min(p_values, key=lambda name: p_values[name])
     p_value = min(1.0, p_values[worst] * len(p_values))
     sentence = (
-        f"The leave-one-out PIT values of {worst} are not uniform (p = {p_value:.2g}): the readings "
-        "do not scatter about their predictions as the link says; try another link, or "
+        f"The leave-one-out PIT values of {worst} are not uniform (p = {p_value:.2g}): the "
+        "readings do not scatter about their predictions as the link says; try another link, or "
         "polar_bayes.compare_scenes."
     )
     return _finding(p_value, math.nan, sentence)
