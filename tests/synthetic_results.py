@@ -101,7 +101,9 @@ def make_result(
             for parameter in PRIOR
         }
     provenance["prior_probability"] = {
-        parameter: stats.norm.cdf(np.median(values, axis=(0, 1)), *PRIOR[parameter]).ravel().tolist()
+        parameter: np.ravel(
+            stats.norm.cdf(np.median(values, axis=(0, 1)), *PRIOR[parameter])
+        ).tolist()
         for parameter, (_, values) in _label(theta, names, lead, grid).items()
     }
     tree.attrs["polar_bayes"] = json.dumps(provenance)

@@ -84,7 +84,7 @@ def test_a_parameter_far_out_in_its_prior_is_a_problem() -> None:
 
 def test_several_parameters_somewhat_out_are_a_problem_together() -> None:
     names = ("roughness", "subsurface_fraction", "absorption", "refractive_index", "exposure")
-    out = dict.fromkeys(names, [float(stats.norm.cdf(2.3))])
+    out = {name: [float(stats.norm.cdf(2.3))] for name in names}
     row = criticize(edit_provenance(make_result(**SMALL), prior_probability=out)).loc["priors"]
     assert row["level"] == "problem"
 
