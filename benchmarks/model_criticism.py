@@ -3,8 +3,8 @@
     python benchmarks/model_criticism.py right --fits 1000   share of right models flagged
     python benchmarks/model_criticism.py wrong --fits 5      wrong worlds at 16, 40, 120 readings
 
-A fit is flagged where its verdict has a caution or a problem. It is silent and wrong where it is not
-flagged although the 95% interval of a material parameter misses its true value by more than 2 sds.
+A fit is flagged where its verdict has a caution or a problem. It is silent and wrong where it is
+not flagged although the 95% interval of a material parameter misses the truth by more than 2 sds.
 `right` draws the truth from the priors. Results are appended to a file of JSON lines, so that
 a run that was stopped goes on where it was.
 """
