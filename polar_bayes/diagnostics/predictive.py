@@ -11,7 +11,7 @@ Vehtari (2022), Stat. Comput. 32, 32 (bands of PIT values).
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 
 import numpy as np
@@ -49,6 +49,8 @@ class Loo:
     pareto_k: np.ndarray
     pit: np.ndarray
     pointwise: np.ndarray
+    weights: np.ndarray
+    """Of each draw (axis 0) where one reading (axis 1) is left out; they sum to one."""
 
     @property
     def unreliable(self) -> int:
@@ -88,9 +90,7 @@ def predictive_checks(result: xr.DataTree) -> dict[str, PredictiveCheck]:
     """Compare every recorded variable with its prediction."""
     check_fit(result)
     relative_ess, correction = _relative_ess(result), _correction(result)
-    names = result["observed_data"].data_vars if "observed_data" in result.children else ()
-    checks = (_check(result, str(name), relative_ess, correction) for name in names)
-    return {check.name: check for check in checks if check is not None}
+    return {v.name: _check(v, relative_ess, correction) for v in flat_variables(result)}
 
 
 def pit_band(pit: np.ndarray) -> PitBand | None:
@@ -127,58 +127,76 @@ def usable_readings(
     return usable
 
 
-def _check(
-    result: xr.DataTree, name: str, relative_ess: float, correction: np.ndarray | None
-) -> PredictiveCheck | None:
-    """The check of one variable; None where it has no prediction or no usable reading."""
-    readings, usable = result["observed_data"].to_dataset()[name], usable_readings(result, name)
-    observed = readings.to_numpy()[usable]
+@dataclasses.dataclass(frozen=True, eq=False)
+class FlatVariable:
+    """One variable with its readings flattened into one axis."""
+
+    name: str
+    usable: np.ndarray  # bool, in the shape of the readings
+    observed: np.ndarray  # (reading,)
+    predicted: np.ndarray  # (draw, reading)
+    noise_free: np.ndarray  # (draw, reading)
+    log_likelihood: np.ndarray | None  # (draw, reading)
+    full_scale: float
+
+
+def _select(result: xr.DataTree, name: str) -> FlatVariable | None:
+    observed = result["observed_data"].to_dataset()[name]
+    usable = usable_readings(result, name)
 
     def flat(group: str) -> np.ndarray | None:
-        """Draws of the usable readings: (draw, reading)."""
         if group not in result.children or name not in result[group].data_vars:
             return None
-        draws = result[group][name].transpose(*SAMPLE_DIMS, *readings.dims).to_numpy()
-        return draws.reshape(-1, *readings.shape)[:, usable]
+        draws = result[group][name].transpose(*SAMPLE_DIMS, *observed.dims).to_numpy()
+        return draws.reshape(-1, *observed.shape)[:, usable]
 
     predicted, noise_free = flat("posterior_predictive"), flat("noise_free")
-    if predicted is None or noise_free is None or not observed.size:
+    if predicted is None or noise_free is None:
         return None
+    full_scale = float(observed.attrs.get("saturation_level", math.inf))
+    readings, log_likelihood = observed.to_numpy()[usable], flat("log_likelihood")
+    return FlatVariable(name, usable, readings, predicted, noise_free, log_likelihood, full_scale)
+
+
+def flat_variables(result: xr.DataTree) -> list[FlatVariable]:
+    """The recorded variables that a fit predicts and that have readings."""
+    names = result["observed_data"].data_vars if "observed_data" in result.children else ()
+    found = (_select(result, str(name)) for name in names)
+    return [variable for variable in found if variable is not None and variable.observed.size]
+
+
+def _check(
+    variable: FlatVariable, relative_ess: float, correction: np.ndarray | None
+) -> PredictiveCheck:
+    name, observed, predicted = variable.name, variable.observed, variable.predicted
     with np.errstate(all="ignore"):  # the square of huge numbers overflows
-        rms = float(np.sqrt(np.mean((observed - noise_free.mean(axis=0)) ** 2)))
+        residual = observed - variable.noise_free.mean(axis=0)
+        rms = float(np.sqrt(np.mean(residual**2)))
     if len(predicted) < MIN_DRAWS or not np.isfinite(predicted).all():
         return PredictiveCheck(name, observed.size, rms, np.empty(0), {}, None)
-    full_scale = float(readings.attrs.get("saturation_level", math.inf))
-    pit_of = functools.partial(_pit, observed, predicted, full_scale)
-    pit = pit_of(np.full(predicted.shape, 1.0 / len(predicted)))
+    pit = _pit(variable, np.full(predicted.shape, 1.0 / len(predicted)))
     coverage = {p: float(np.mean(np.abs(2.0 * pit - 1.0) <= p)) for p in PROBABILITIES}
-    loo = _loo(flat("log_likelihood"), relative_ess, correction, pit_of)
+    loo = _loo(variable, relative_ess, correction)
     return PredictiveCheck(name, observed.size, rms, pit, coverage, loo)
 
 
-def _pit(
-    observed: np.ndarray, predicted: np.ndarray, full_scale: float, weights: np.ndarray
-) -> np.ndarray:
+def _pit(variable: FlatVariable, weights: np.ndarray) -> np.ndarray:
     """Weighted share of the predicted readings below each reading, ties broken at random."""
-    weights = np.where(predicted < full_scale, weights, 0.0)
-    below = np.sum(weights * (predicted < observed), axis=0)
-    tied = np.sum(weights * (predicted == observed), axis=0)
+    weights = np.where(variable.predicted < variable.full_scale, weights, 0.0)
+    below = np.sum(weights * (variable.predicted < variable.observed), axis=0)
+    tied = np.sum(weights * (variable.predicted == variable.observed), axis=0)
     total = np.sum(weights, axis=0)
-    uniform = np.random.default_rng(214).uniform(size=observed.size)
+    uniform = np.random.default_rng(214).uniform(size=variable.observed.size)
     return (below + uniform * tied) / np.where(total > 0.0, total, 1.0)
 
 
-def _loo(
-    log_likelihood: np.ndarray | None,
-    relative_ess: float,
-    correction: np.ndarray | None,
-    pit_of: Callable[[np.ndarray], np.ndarray],
-) -> Loo | None:
+def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | None) -> Loo | None:
+    log_likelihood = variable.log_likelihood
     if log_likelihood is None or not np.isfinite(log_likelihood).all():
         return None
     base = np.zeros((len(log_likelihood), 1)) if correction is None else correction[:, None]
     ratios = base - log_likelihood
-    count = log_likelihood.shape[1]
+    count = variable.observed.size
     log_weights, pareto_k = np.zeros_like(ratios), np.full(count, -np.inf)
     with np.errstate(all="ignore"):  # an extreme tail overflows: what is not known is NaN
         for i in np.flatnonzero(np.ptp(ratios, axis=0) > 1e-12):
@@ -192,8 +210,9 @@ def _loo(
         standard_error=float(error),
         p_loo=float(np.sum(p_loo)),
         pareto_k=pareto_k,
-        pit=pit_of(np.exp(log_weights)),
+        pit=_pit(variable, np.exp(log_weights)),
         pointwise=elpd,
+        weights=np.exp(log_weights),
     )
 
 

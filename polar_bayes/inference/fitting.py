@@ -139,6 +139,7 @@ def _fit(
     stated = {name: getattr(draws, name) for name in DIAGNOSTICS}
     provenance = {
         **_provenance(request, method, problem),
+        "prior_probability": _prior_probability(request, posterior.parameters),
         "timings": {stage: round(seconds, 3) for stage, seconds in timings.seconds.items()},
         "problems": draws.problems,
         "method": draws.method,
@@ -277,6 +278,19 @@ def _model_source(model: Callable) -> str:
 def _finite_bounds(prior: dist.Distribution) -> list[float | None]:
     """Where the support of a prior ends; None, which JSON can hold, where it does not."""
     return [bound if math.isfinite(bound) else None for bound in support_bounds(prior)]
+
+
+def _prior_probability(request: Request, posterior: Mapping[str, Any]) -> dict[str, list[float]]:
+    """Prior probability below each posterior median, where a prior has such a function."""
+    found = {}
+    for name, prior in request.priors.items():
+        if name in posterior and name not in request.fixed:
+            median = np.median(np.asarray(posterior[name]), axis=(0, 1))
+            try:
+                found[name] = np.asarray(prior.cdf(median), float).ravel().tolist()
+            except NotImplementedError:  # NumPyro asks few distributions for one
+                continue
+    return found
 
 
 def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> dict[str, Any]:
