@@ -1,3 +1,4 @@
 from .combine import combine as combine
 from .files import load_capture as load_capture, save_capture as save_capture
+from .plausibility import cautions as cautions, inferred as inferred, stated as stated
 from .schema import count as count, validate as validate

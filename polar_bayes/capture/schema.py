@@ -32,6 +32,13 @@ SPELLINGS = {
     "nm": ("nm", "nanometer", "nanometers"),
 }
 
+SMALLEST_WAVELENGTH = 10.0
+"""Shorter light, in nm, is X-rays, whose polarization no set-up here measures."""
+LIKELY_PERCENT = 1.5
+"""Polarization beyond it is percent rather than noise or an instrument error of a few percent."""
+SMALLEST_SCAN, LARGEST_SCAN_END = 0.1, 0.2
+"""Span and largest zenith below which a scan in radians would be one of a few degrees."""
+
 # q and u are measured one by one, so their noise may carry q^2 + u^2 a little past one.
 EXCESS_POLARIZATION = 0.05
 
@@ -93,7 +100,12 @@ FRACTION = f"give a fraction, not percent; {MASK}"
 TRUST = "give 1 where the normal is sure; what is not to be trusted at all is valid=False"
 SIGMA = f"give a standard deviation above zero; {MASK}"
 ZERO_ONE = "give True or False, or 1 or 0"
-NANOMETERS = "give nanometers above zero"
+WAVELENGTH_RANGE = dataclasses.replace(POSITIVE, low=SMALLEST_WAVELENGTH, open_low=False)
+NANOMETERS = (
+    "give nanometers: a number around 0.5 is micrometers, to be multiplied by 1000, and one below "
+    "1e-5 is meters"
+)
+NOT_LIGHT = f"no light has it: check dark level, background and channel gains; {MASK}"
 
 CONTRACT = (
     Variable("view_zenith", "geometry", "degree", ZENITH, "view zenith angle", FROM_NORMAL),
@@ -121,7 +133,7 @@ CONTRACT = (
     Variable("valid", "flag", "1", UNIT, "measured, not missing", ZERO_ONE),
     Variable("interpolated", "flag", "1", UNIT, "filled in between readings", ZERO_ONE),
 )
-WAVELENGTH = Variable("wavelength", "label", "nm", POSITIVE, "wavelength", NANOMETERS)
+WAVELENGTH = Variable("wavelength", "label", "nm", WAVELENGTH_RANGE, "wavelength", NANOMETERS)
 
 
 def as_numbers(values: Any) -> np.ndarray:
@@ -249,6 +261,7 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
         for row in present
         if row.kind != "flag"
     }
+    _check_degrees(numbers, source)
     _check_polarization(numbers, layout, valid, source)
     _check_intensity_units(numbers, source)
     return xr.Dataset(
@@ -350,9 +363,34 @@ def _entries(
             index = np.unravel_index(np.argmin(allowed), allowed.shape)
             where = f"{source}: {_entry(row.name, variable.dims, index)}"
             what = f"{values[index]:g} is outside {row.range}"
-            raise CaptureError(what, where=where, hint=row.hint)
+            raise CaptureError(what, where=where, hint=hint_for(row, values[~allowed]))
     values = values.astype(bool) if is_flag else values
     return xr.Variable(variable.dims, values, _attributes(variable, row, source))
+
+
+def hint_for(row: Variable, wrong: np.ndarray) -> str:
+    """What to do about numbers outside their range, by their likely cause."""
+    is_polarization = row.kind == "reading" and row.hint == FRACTION
+    if is_polarization and np.all(np.abs(wrong) <= LIKELY_PERCENT):  # False where one is NaN
+        return NOT_LIGHT
+    return row.hint
+
+
+def _check_degrees(numbers: Mapping[str, xr.Variable], source: str) -> None:
+    """Refuse zeniths that look like radians: a scan of views, and no angle above pi/2."""
+    zeniths = {name: numbers[name] for name in ("view_zenith", "light_zenith")}
+    if any(zenith.values.max() > np.pi / 2.0 for zenith in zeniths.values()):
+        return
+    for name, zenith in zeniths.items():
+        values = np.unique(zenith.values)
+        is_scan = zenith.sizes["view"] > 2 and len(values) > 2
+        if is_scan and values[-1] > LARGEST_SCAN_END and np.ptp(values) > SMALLEST_SCAN:
+            what = f"{values[0]:g} to {values[-1]:g} looks like radians, and no zenith is larger"
+            hint = (
+                "convert the angles to degrees; where the views really are within 1.6 degrees of "
+                "the normal, say so by one view at 10 degrees or more that is marked valid=False"
+            )
+            raise CaptureError(what, where=f"{source}: {name}", hint=hint)
 
 
 def _check_polarization(

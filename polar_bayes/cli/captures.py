@@ -27,10 +27,19 @@ wavelength_option = option("--wavelength", type=float, help="Nanometers.")
 
 
 def _save(capture: Any, out: Path) -> None:
-    """Write a capture and print its counts."""
+    """Write a capture, and print its counts."""
     pb.save_capture(capture, out)
     counts = ", ".join(f"{number} {what}" for what, number in pb.capture.count(capture).items())
     click.echo(f"{out}: {counts}")
+
+
+def _save_import(capture: Any, out: Path) -> None:
+    """Write a capture; print its counts, what was inferred and what is unlikely."""
+    _save(capture, out)
+    for sentence in pb.capture.inferred(capture) + pb.capture.stated(capture):
+        click.echo(sentence)
+    for sentence in pb.capture.cautions(capture):
+        click.echo(f"caution: {sentence}", err=True)
 
 
 @command()
@@ -97,7 +106,7 @@ def import_() -> None:
 @out_capture
 def goniometer(out: Path, **settings: Any) -> None:
     """Import s and p readings against the angle of incidence, from one table or two."""
-    _save(pb.from_goniometer(**settings), out)
+    _save_import(pb.from_goniometer(**settings), out)
 
 
 @import_.command(cls=Command)
@@ -119,7 +128,7 @@ def table(table: Path, out: Path, columns: Any, constants: Any, **settings: Any)
     """Import a table with a line for each reading and its directions."""
     settings["columns"] = _mapping(columns, "--column")
     settings["constants"] = _mapping(constants, "--constant")
-    _save(pb.from_table(table, **settings), out)
+    _save_import(pb.from_table(table, **settings), out)
 
 
 def _mapping(pairs: tuple[tuple[str, Any], ...], flag: str) -> dict[str, Any]:
@@ -204,7 +213,7 @@ def mosaic(frame: Path, layout: tuple[float, ...], out: Path, **options: Any) ->
 
 def _save_image(capture: Any, out: Path) -> None:
     """Write a capture, and print how many readings are masked for which reason."""
-    _save(capture, out)
+    _save_import(capture, out)
     masked = ", ".join(
         f"{number} {str(name).removeprefix('masked_').replace('_', ' ')}"
         for name, number in capture.attrs.items()

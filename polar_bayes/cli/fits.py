@@ -111,7 +111,8 @@ def fit(
         settings |= {"tolerance": tolerance} if is_auto else {}
         result = pb.fit(data, scene=scene, progress=progress, **settings)
     pb.save(result, out)
-    for sentence in pb.inference.auto_sentences(result):
+    chosen = pb.inference.choice_sentences(result) + pb.inference.auto_sentences(result)
+    for sentence in (*pb.capture.inferred(data), *chosen):
         click.echo(sentence, err=True)
     if not as_json:
         return print_fit(result)

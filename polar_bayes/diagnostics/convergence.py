@@ -102,6 +102,7 @@ def verdict(result: xr.DataTree, table: pd.DataFrame | None = None) -> Verdict:
         *_mode_cautions(provenance),
         *_estimate_cautions(result, table, method),
         *_reading_cautions(provenance.get("counts", {})),
+        *_capture_cautions(provenance),
         *against.get("caution", []),
         *dict.fromkeys(against.get("not computed", [])),
     )
@@ -361,6 +362,17 @@ def _reading_cautions(counts: Mapping[str, Any]) -> Iterator[str]:
                 f"{count} readings of {name} lie at the edge of their range and were moved to "
                 "the link's margin: their noise is not what the link describes."
             )
+
+
+def _capture_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
+    """A set-up that nobody stated, and what is unlikely in the capture."""
+    if not provenance.get("setup_stated", True):
+        yield (
+            f"No set-up was stated, so {provenance.get('scene', 'paper')!r} was used, a point "
+            "source and an unsigned degree of polarization: state it by setup= at import or "
+            "scene=, or let scene='auto' choose."
+        )
+    yield from provenance.get("capture_cautions", ())
 
 
 def _list(items: Iterable[str]) -> str:

@@ -44,6 +44,8 @@ ANGLE_DECIMALS = 6  # angles that agree to this many decimals are one angle
 MOST_ERRORS_BELOW_DARK = 3.0  # a reading so far below the dark level is still no light
 LARGEST_REFLECTANCE = 1.2  # noise may carry a reflectance past one, not this far
 SMALLEST_ERROR = 1e-30
+SMALLEST_COMPARED_ZENITH = 10.0  # s and p differ too little nearer to the normal
+SWAPPED_ERRORS, SWAPPED_VIEWS, SWAPPED_SHARE = 2.0, 3, 0.9
 LARGEST_READING = 1e30
 LEVEL = Interval(-LARGEST_READING, LARGEST_READING, open_low=True, open_high=True)
 ERROR = Interval(SMALLEST_ERROR, LARGEST_READING, open_high=True)
@@ -117,7 +119,22 @@ def from_goniometer(
     )
     if wavelength is not None:
         capture = capture.assign_coords(wavelength=POSITIVE.check(wavelength, "wavelength"))
+    _refuse_swapped(capture)
     return validate(capture, source=capture.attrs["name"])
+
+
+def _refuse_swapped(capture: xr.Dataset) -> None:
+    """Refuse s and p where s lies below p at nearly every angle, Brewster's included."""
+    q, limit = capture["q"], SWAPPED_ERRORS * capture["q_error"]
+    compared = capture["valid"] & (capture["view_zenith"] >= SMALLEST_COMPARED_ZENITH)
+    below, total = int((compared & (q < -limit)).sum()), int(compared.sum())
+    if total >= SWAPPED_VIEWS and below >= SWAPPED_SHARE * total:
+        what = f"s lies below p at {below} of {total} angles, which no reflecting surface does"
+        hint = (
+            "swap s and p, or give s_incident and p_incident where the channels differ in gain; a "
+            "coating that reflects more p light is imported by from_table, as q"
+        )
+        raise CaptureError(what, where=capture.attrs["name"], hint=hint)
 
 
 def _channels(

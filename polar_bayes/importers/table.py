@@ -28,7 +28,14 @@ import numpy as np
 import xarray as xr
 
 from polar_bayes.capture.combine import DIMS, combine
-from polar_bayes.capture.schema import CONTRACT, WAVELENGTH, Interval, nearest_name, validate
+from polar_bayes.capture.schema import (
+    CONTRACT,
+    WAVELENGTH,
+    Interval,
+    hint_for,
+    nearest_name,
+    validate,
+)
 from polar_bayes.errors import CaptureError
 from polar_bayes.paths import existing_file, system_error
 
@@ -157,7 +164,8 @@ def _check_values(
             first = int(np.argmax(wrong))
             column = f", column {columns[variable]}" if variable in columns else ""
             what = f"{variable} is {numbers[first]:g}, which is outside {row.range}"
-            raise CaptureError(what, where=f"{source}: line {lines[first]}{column}", hint=row.hint)
+            where = f"{source}: line {lines[first]}{column}"
+            raise CaptureError(what, where=where, hint=hint_for(row, numbers[wrong]))
 
 
 # --- Lines of one material ------------------------------------------------------------------------

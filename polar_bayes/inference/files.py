@@ -32,6 +32,13 @@ class Leaf(NamedTuple):
     holds: Callable[[Any], bool]
 
 
+CHOSEN_BY = {
+    "capture": ", which the capture names",
+    "caller": ", which the caller gave",
+    "default": ", by default, since neither the capture nor the caller named one",
+}
+
+
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
@@ -294,6 +301,9 @@ _FIT_PROVENANCE: Mapping[str, Spec] = {
     "bounds?": {EACH: BOUNDS},
     "declared?": {EACH: ANY},
     "fixed?": {EACH: ANY},
+    "scene_chosen_by?": TEXT,
+    "setup_stated?": FLAG,
+    "capture_cautions?": [TEXT],
     "swapped?": [TEXT],
     "largest_view_zenith?": FINITE,
     "machine?": {EACH: ANY},
@@ -401,6 +411,37 @@ FIT = Schema(
 def check_fit(result: xr.DataTree, source: str = "result") -> None:
     """Raise a `FitError` where a tree is no fit, or its parts do not fit together."""
     FIT.check(result, source)
+
+
+def choice_sentences(result: xr.DataTree) -> list[str]:
+    """What a fit used and who chose it.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+
+    Returns:
+        Sentences on the set-up, the links, the readings set aside, and the prior of the ratio of
+        the channels' gains where the capture has no incident levels.
+
+    Raises:
+        FitError: It is no fit, or does not hold together.
+    """
+    check_fit(result)
+    provenance = provenance_of(result)
+    by = CHOSEN_BY.get(provenance.get("scene_chosen_by", ""), "")
+    links = (f"{name} by {link}" for name, link in provenance.get("links", {}).items())
+    counts, limit = provenance.get("counts", {}), provenance.get("largest_view_zenith", 90.0)
+    views, masked, used = (counts.get(name) or 0 for name in ("views", "masked", "used"))
+    sentences = [
+        f"Set-up: {provenance.get('scene')}{by}.",
+        f"Links: {'; '.join(links)}.",
+        f"Readings: {used} of {views} are used; {masked} are masked, and "
+        f"{views - masked - used} are set aside beyond {limit:g} degrees.",
+    ]
+    gain = provenance.get("priors", {}).get("channel_gain_ratio")
+    if gain and (provenance.get("capture") or {}).get("incident_levels") == "not given":
+        sentences.append(f"Incident levels: not given; the prior of channel_gain_ratio is {gain}.")
+    return sentences
 
 
 def auto_sentences(result: xr.DataTree) -> list[str]:

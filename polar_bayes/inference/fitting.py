@@ -18,6 +18,7 @@ from jaxtyping import Array
 from numpyro import distributions as dist
 from numpyro.primitives import Messenger
 
+from polar_bayes.capture.plausibility import cautions
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference import methods
@@ -309,6 +310,9 @@ def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> d
         "model_settings": _model_settings(request.model),
         "model_source": _model_source(request.model),
         "scene": request.scene_name,
+        "scene_chosen_by": request.scene_chosen_by,
+        "setup_stated": request.scene_chosen_by != "default",
+        "capture_cautions": list(cautions(request.capture)),
         "scene_parts": repr(request.scene),
         "priors": {name: describe_prior(prior) for name, prior in request.priors.items()},
         "bounds": {name: _finite_bounds(prior) for name, prior in request.priors.items()},

@@ -42,6 +42,7 @@ class Request:
     model_name: str
     scene: Scene
     scene_name: str
+    scene_chosen_by: str
     priors: dict[str, dist.Distribution]
     declared: dict[str, str]
     fixed: dict[str, Any]
@@ -85,7 +86,9 @@ def resolve(
             where=f"{capture.attrs.get('name', 'capture')}: dims y, x",
             hint="average a region into one capture first, for example capture.mean(('y', 'x'))",
         )
+    chosen_by = "caller"
     if scene is None:
+        chosen_by = "capture" if "setup" in capture.attrs else "default"
         scene = str(capture.attrs.get("setup", "paper"))
     setup = find_setup(scene) if isinstance(scene, str) else _setup_around(scene, capture)
     chosen = _choose_links(capture, setup, links)
@@ -116,6 +119,7 @@ def resolve(
         model_name=_name_of(model) if callable(model) else model,
         scene=setup.scene,
         scene_name=scene if isinstance(scene, str) else "custom",
+        scene_chosen_by=chosen_by,
         priors=resolve_priors(found.priors, priors),
         declared=found.declared,
         fixed=found.fixed,

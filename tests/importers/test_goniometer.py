@@ -51,7 +51,32 @@ def test_q_is_positive_for_s_light_and_intensity_is_the_mean():
     np.testing.assert_array_equal(capture["dop"], np.abs(capture["q"]))
     np.testing.assert_allclose(capture["intensity"], 500.0 * (S + P), atol=0.01)
     assert capture["q"].min() > 0.0
-    assert from_goniometer(p, s)["q"].max() < 0.0
+
+
+def swapped(tmp_path, form):
+    """Import s as p and p as s, in one of the forms of an import."""
+    s, p = readings(full=90.0)
+    if form == "arrays":
+        return from_goniometer(p, s, name="plate")
+    table = tmp_path / "plate.csv"
+    rows = (f"{a},{x},{y}" for a, x, y in zip(ANGLES, s[1], p[1], strict=True))
+    table.write_text("\n".join(["angle,I_s,I_p", *rows]))
+    return from_goniometer(table=table, angle="angle", s="I_p", p="I_s")
+
+
+@each("form", ["arrays", "table"])
+def test_swapped_s_and_p_are_refused(tmp_path, form):
+    with pytest.raises(CaptureError, match="plate: s lies below p at 13 of 13 angles") as caught:
+        swapped(tmp_path, form)
+    assert "swap s and p, or give s_incident and p_incident" in str(caught.value)
+
+
+@each("ratio", [0.5, 1.0, 2.0])
+def test_channels_of_unequal_gain_are_not_swapped(ratio):
+    """Near Brewster's angle s exceeds p whatever the gains."""
+    s, (angles, p) = readings()
+    capture = from_goniometer(s, (angles, ratio * p))
+    assert capture["q"].max() > 0.9
 
 
 @pytest.mark.thorough
