@@ -178,7 +178,7 @@ def test_it_says_whether_intervals_can_be_trusted(small) -> None:
     assert "Nothing here speaks against" not in scattered
     assert "The fit converged, but the readings speak against the model" in scattered
     assert "problem (fails)" in scattered
-    repeated = edit_provenance(make_result(**SMALL), prior_probability={"roughness": [0.999]})
+    repeated = edit_provenance(make_result(**SMALL), prior_probability={"roughness": [0.997]})
     assert "Trust the intervals with care" in Page(render(repeated)).text
 
 
