@@ -49,6 +49,8 @@ class Loo:
     pareto_k: np.ndarray
     pit: np.ndarray
     pointwise: np.ndarray
+    weights: np.ndarray
+    """Of each draw (axis 0) where one reading (axis 1) is left out; they sum to one."""
 
     @property
     def unreliable(self) -> int:
@@ -88,12 +90,7 @@ def predictive_checks(result: xr.DataTree) -> dict[str, PredictiveCheck]:
     """Compare every recorded variable with its prediction."""
     check_fit(result)
     relative_ess, correction = _relative_ess(result), _correction(result)
-    checks = {}
-    for name in result["observed_data"].data_vars if "observed_data" in result.children else ():
-        variable = _select(result, str(name))
-        if variable is not None and variable.observed.size:
-            checks[str(name)] = _check(variable, relative_ess, correction)
-    return checks
+    return {v.name: _check(v, relative_ess, correction) for v in flat_variables(result)}
 
 
 def pit_band(pit: np.ndarray) -> PitBand | None:
@@ -131,10 +128,11 @@ def usable_readings(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Variable:
+class FlatVariable:
     """One variable with its readings flattened into one axis."""
 
     name: str
+    usable: np.ndarray  # bool, in the shape of the readings
     observed: np.ndarray  # (reading,)
     predicted: np.ndarray  # (draw, reading)
     noise_free: np.ndarray  # (draw, reading)
@@ -142,7 +140,7 @@ class _Variable:
     full_scale: float
 
 
-def _select(result: xr.DataTree, name: str) -> _Variable | None:
+def _select(result: xr.DataTree, name: str) -> FlatVariable | None:
     observed = result["observed_data"].to_dataset()[name]
     usable = usable_readings(result, name)
 
@@ -157,11 +155,18 @@ def _select(result: xr.DataTree, name: str) -> _Variable | None:
         return None
     full_scale = float(observed.attrs.get("saturation_level", math.inf))
     readings, log_likelihood = observed.to_numpy()[usable], flat("log_likelihood")
-    return _Variable(name, readings, predicted, noise_free, log_likelihood, full_scale)
+    return FlatVariable(name, usable, readings, predicted, noise_free, log_likelihood, full_scale)
+
+
+def flat_variables(result: xr.DataTree) -> list[FlatVariable]:
+    """The recorded variables that a fit predicts and that have readings."""
+    names = result["observed_data"].data_vars if "observed_data" in result.children else ()
+    found = (_select(result, str(name)) for name in names)
+    return [variable for variable in found if variable is not None and variable.observed.size]
 
 
 def _check(
-    variable: _Variable, relative_ess: float, correction: np.ndarray | None
+    variable: FlatVariable, relative_ess: float, correction: np.ndarray | None
 ) -> PredictiveCheck:
     name, observed, predicted = variable.name, variable.observed, variable.predicted
     with np.errstate(all="ignore"):  # the square of huge numbers overflows
@@ -175,7 +180,7 @@ def _check(
     return PredictiveCheck(name, observed.size, rms, pit, coverage, loo)
 
 
-def _pit(variable: _Variable, weights: np.ndarray) -> np.ndarray:
+def _pit(variable: FlatVariable, weights: np.ndarray) -> np.ndarray:
     """Weighted share of the predicted readings below each reading, ties broken at random."""
     weights = np.where(variable.predicted < variable.full_scale, weights, 0.0)
     below = np.sum(weights * (variable.predicted < variable.observed), axis=0)
@@ -185,7 +190,7 @@ def _pit(variable: _Variable, weights: np.ndarray) -> np.ndarray:
     return (below + uniform * tied) / np.where(total > 0.0, total, 1.0)
 
 
-def _loo(variable: _Variable, relative_ess: float, correction: np.ndarray | None) -> Loo | None:
+def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | None) -> Loo | None:
     log_likelihood = variable.log_likelihood
     if log_likelihood is None or not np.isfinite(log_likelihood).all():
         return None
@@ -207,6 +212,7 @@ def _loo(variable: _Variable, relative_ess: float, correction: np.ndarray | None
         pareto_k=pareto_k,
         pit=_pit(variable, np.exp(log_weights)),
         pointwise=elpd,
+        weights=np.exp(log_weights),
     )
 
 

@@ -20,12 +20,12 @@ from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
+from polar_bayes.inference import methods
 from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_until
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
-from polar_bayes.inference.methods import find_method
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.problem import BLOCK, THREADS, Problem, make_problem
-from polar_bayes.inference.request import MODELS, Request, resolve
+from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.instrument import Discrepancy
@@ -37,6 +37,17 @@ PRIOR_DRAWS = 500
 
 DIAGNOSTICS = ("r_hat", "k_hat", "effective_draws")
 """What a method states of its own draws, stored with the result; None where it states nothing."""
+
+
+METHODS: Mapping[str, Callable[[], AbstractMethod]] = {
+    "nuts": lambda: methods.Nuts(),
+    "laplace": lambda: methods.Laplace(),
+    "point": lambda: methods.Point(),
+    "importance": lambda: methods.Importance(),
+    "tempered": lambda: methods.Tempered(),
+    "auto": lambda: methods.Auto(),
+}
+"""Methods that `fit` knows by name; a function makes each, because it loads what it needs."""
 
 
 @with_progress
@@ -92,7 +103,7 @@ def fit(
         FitError: A model, method, prior or link cannot be used, or the memory is too small.
     """
     start_time = time.perf_counter()
-    chosen = find_method(method, tolerance, seconds)
+    chosen = _find_method(method, tolerance, seconds)
     request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, precision)
     with jax.enable_x64(precision == "double"):
         return _fit(request, chosen, progress or no_progress, start_time)
@@ -128,6 +139,7 @@ def _fit(
     stated = {name: getattr(draws, name) for name in DIAGNOSTICS}
     provenance = {
         **_provenance(request, method, problem),
+        "prior_probability": _prior_probability(request, posterior.parameters),
         "timings": {stage: round(seconds, 3) for stage, seconds in timings.seconds.items()},
         "problems": draws.problems,
         "method": draws.method,
@@ -145,6 +157,31 @@ def _fit(
         comparisons,
         provenance,
     )
+
+
+def _find_method(
+    method: str | AbstractMethod, tolerance: float | None, seconds: float | None
+) -> AbstractMethod:
+    """The settings that a caller asks for, by name or as they are."""
+    limits = {"tolerance": tolerance, "seconds": seconds}
+    given = {name: value for name, value in limits.items() if value is not None}
+    if given and method != "auto":
+        raise FitError(
+            f"{' and '.join(given)} needs method='auto'",
+            where=f"fit: method={method!r}",
+            hint="leave it out, or give method='auto'",
+        )
+    if given:
+        return methods.Auto(**given)
+    if isinstance(method, AbstractMethod):
+        return method
+    if not isinstance(method, str) or method not in METHODS:
+        raise FitError(
+            "no such method",
+            where=f"method={method!r}",
+            hint=f"give one of {', '.join(METHODS)}, or settings such as Nuts(draws=2000)",
+        )
+    return METHODS[method]()
 
 
 class _Timings:
@@ -229,11 +266,11 @@ def _model_source(model: Callable) -> str:
     """The source of a model of the user's own, so that a result shows what was fitted."""
     while isinstance(model, Messenger):
         model = model.fn
-    ours = [known if isinstance(known, FunctionType) else type(known) for known in MODELS.values()]
-    if model in ours or type(model) in ours:
+    code = model if isinstance(model, FunctionType) else type(model)
+    if code.__module__.startswith("polar_bayes."):
         return ""
     try:
-        return inspect.getsource(model if isinstance(model, FunctionType) else type(model))
+        return inspect.getsource(code)
     except (OSError, TypeError):
         return ""
 
@@ -241,6 +278,19 @@ def _model_source(model: Callable) -> str:
 def _finite_bounds(prior: dist.Distribution) -> list[float | None]:
     """Where the support of a prior ends; None, which JSON can hold, where it does not."""
     return [bound if math.isfinite(bound) else None for bound in support_bounds(prior)]
+
+
+def _prior_probability(request: Request, posterior: Mapping[str, Any]) -> dict[str, list[float]]:
+    """Prior probability below each posterior median, where a prior has such a function."""
+    found = {}
+    for name, prior in request.priors.items():
+        if name in posterior and name not in request.fixed:
+            median = np.median(np.asarray(posterior[name]), axis=(0, 1))
+            try:
+                found[name] = np.asarray(prior.cdf(median), float).ravel().tolist()
+            except NotImplementedError:  # NumPyro asks few distributions for one
+                continue
+    return found
 
 
 def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> dict[str, Any]:

@@ -4,11 +4,8 @@ Every conclusion that a report states is written here, by the kind of result: fi
 fits, maps, calibrations and accuracy studies. Tables and captions belong to their pages.
 """
 
-import functools
-import importlib.resources
 import itertools
 import math
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -24,7 +21,7 @@ from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.population import Population
 from polar_bayes.diagnostics.predictive import PitBand, PredictiveCheck, pit_band
 from polar_bayes.errors import one_line
-from polar_bayes.inference.batch_result import MIN_VIEWS
+from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.reporting.style import QUANTITIES, coordinate_labels, short_title
 
@@ -112,25 +109,6 @@ def capture_name(provenance: Mapping[str, Any], default: str = "capture") -> str
     capture = provenance.get("capture")
     name = capture.get("name") if isinstance(capture, Mapping) else capture
     return one_line(str(name or default))
-
-
-@functools.cache
-def _captions() -> dict[str, dict[str, Any]]:
-    file = importlib.resources.files("polar_bayes.reporting") / "templates" / "captions.toml"
-    return tomllib.loads(file.read_text(encoding="utf-8"))
-
-
-def caption(key: str, **values: object) -> str:
-    """A caption from `templates/captions.toml`, such as `fit.parameter`, with its values."""
-    kind, name = key.split(".")
-    return str(_captions()[kind][name]).format(**values)
-
-
-def figure_caption(key: str, **values: object) -> tuple[str, str]:
-    """The alternative text and the caption of a figure, such as `fit.figure_pairs`."""
-    kind, name = key.split(".")
-    alternative, caption = _captions()[kind][name]
-    return alternative.format(**values), caption.format(**values)
 
 
 # --- Fits -----------------------------------------------------------------------------------------
