@@ -420,8 +420,8 @@ def choice_sentences(result: xr.DataTree) -> list[str]:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
 
     Returns:
-        Sentences on the set-up, the links, the readings set aside, and the prior of the ratio of
-        the channels' gains where the capture has no incident levels.
+        Sentences on the set-up, the links, the readings set aside, and the priors that follow from
+        what the capture states of its incident levels and angles.
 
     Raises:
         FitError: It is no fit, or does not hold together.
@@ -438,9 +438,15 @@ def choice_sentences(result: xr.DataTree) -> list[str]:
         f"Readings: {used} of {views} are used; {masked} are masked, and "
         f"{views - masked - used} are set aside beyond {limit:g} degrees.",
     ]
-    gain = provenance.get("priors", {}).get("channel_gain_ratio")
-    if gain and (provenance.get("capture") or {}).get("incident_levels") == "not given":
-        sentences.append(f"Incident levels: not given; the prior of channel_gain_ratio is {gain}.")
+    priors, capture = provenance.get("priors", {}), provenance.get("capture") or {}
+    follows = (
+        ("channel_gain_ratio", "incident_levels", "Incident levels"),
+        ("angle_zero", "angle_set_by", "Angles set by"),
+    )
+    for name, attribute, words in follows:
+        if name in priors and attribute in capture:
+            said = f"{words}: {capture[attribute]}; the prior of {name} is {priors[name]}."
+            sentences.append(said)
     return sentences
 
 
