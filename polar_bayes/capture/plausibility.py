@@ -29,7 +29,8 @@ PI_TOLERANCE = 0.01
 BREWSTER_ZENITHS = (20.0, 85.0)
 BREWSTER_GAP = 10.0
 """Largest step, in degrees, between mirror views from which Brewster's angle is read by eye."""
-BREWSTER_PEAK = 0.5
+BREWSTER_PEAK, PURE_PEAK = 0.5, 0.9
+"""Polarization from which a peak is one, and from which the surface alone makes it."""
 MAX_LISTED = 4
 
 
@@ -274,11 +275,16 @@ def _sign_sentences(name: str, capture: xr.Dataset) -> Iterator[str]:
 def _brewster_sentences(name: str, capture: xr.Dataset) -> Iterator[str]:
     peak = _brewster(capture)
     if peak is not None:
-        low, center, high = peak
+        low, center, high, top = peak
+        moved = (
+            f"; the peak is {top:.2f}, so light of the body has likely moved it to larger "
+            "angles, and the index is smaller"
+        )
+        moved = "" if top >= PURE_PEAK else moved
         yield (
             f"Brewster's angle by eye{name}: the polarization is largest near {center:.0f} "
             f"degrees, which would mean an index near {_index(center)} "
-            f"({_index(low)} to {_index(high)})."
+            f"({_index(low)} to {_index(high)}){moved}."
         )
 
 
@@ -286,8 +292,8 @@ def _index(angle: float) -> str:
     return f"{np.tan(np.deg2rad(angle)):.2f}"
 
 
-def _brewster(capture: xr.Dataset) -> tuple[float, float, float] | None:
-    """Smallest, middle and largest angle at which mirror views are polarized most, if they tell."""
+def _brewster(capture: xr.Dataset) -> tuple[float, float, float, float] | None:
+    """Least, middle and largest angle at which mirror views are polarized most, and how much."""
     signal = next((each for each in ("q", "dop") if each in capture), None)
     if signal is None or {"y", "x"} & set(capture.dims):
         return None
@@ -314,4 +320,4 @@ def _brewster(capture: xr.Dataset) -> tuple[float, float, float] | None:
     if max(np.ptp(below), np.ptp(above), *np.diff(angles[first : last + 1]), 0.0) > BREWSTER_GAP:
         return None
     center = float(np.mean(angles[near]))
-    return float(np.mean(below)), center, float(np.mean(above))
+    return float(np.mean(below)), center, float(np.mean(above)), top

@@ -193,6 +193,13 @@ def test_brewsters_angle_by_eye_holds_the_index(index):
     assert low < index < high
 
 
+def test_a_peak_that_the_body_lowers_is_told_as_one():
+    s, p = fresnel(ZENITHS, 1.34)
+    q = (s - p) / (s + p + 0.02)
+    sentence = inferred(validate(plate(q=q, dop=q)))[-1]
+    assert "light of the body has likely moved it to larger angles" in sentence
+
+
 @each("zeniths", [ZENITHS[::6], ZENITHS[:6], ZENITHS[15:]], ids=["sparse", "below it", "beyond it"])
 def test_no_brewster_angle_where_the_views_do_not_show_it(zeniths):
     assert not any("Brewster" in sentence for sentence in inferred(validate(plate(zeniths))))

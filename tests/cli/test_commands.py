@@ -1,5 +1,6 @@
 """The commands as a user types them: output, files, exit status, and one line for a mistake."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -58,8 +59,34 @@ def test_a_table_of_readings_becomes_a_capture(
     assert main([*words, "--constant", "light_zenith", "30"]) == 1
     assert "--constant names light_zenith twice" in capsys.readouterr().err
     assert main(words) == 0
-    assert capsys.readouterr().out == f"{out}: 2 views, 0 masked, 0 saturated\n"
+    counts, readings, setup = capsys.readouterr().out.splitlines()
+    assert counts == f"{out}: 2 views, 0 masked, 0 saturated"
+    assert readings.startswith("Readings: dop (no errors stated); 2 views from 10 to 20 degrees")
+    assert setup == "Set-up: camera, which its fits take by default."
     assert pb.load_capture(out).attrs["setup"] == "camera"
+
+
+def test_a_fit_says_what_it_chose_and_what_is_unlikely(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On the error stream; a capture whose q has the wrong sign is cautioned at every door."""
+    table, capture, out = tmp_path / "t.csv", tmp_path / "t.nc", str(tmp_path / "fit.nc")
+    rows = [f"{angle},{-q},.01" for angle, q in ((30, 0.3), (40, 0.5), (50, 0.9), (60, 0.95))]
+    table.write_text("\n".join(["angle,q,q_error", *rows, "80,-.5,.01"]))
+    words = ["import", "table", str(table), "--column", "view_zenith", "angle"]
+    words += ["--column", "light_zenith", "angle", "--constant", "view_azimuth", "180"]
+    assert main([*words, "--constant", "light_azimuth", "0", "--out", str(capture)]) == 0
+    told = capsys.readouterr()
+    assert "Set-up: not stated, so a fit takes 'paper'" in told.out
+    assert "caution: q is negative at 4 of 5 mirror angles" in told.err
+    words = ["fit", str(capture), "--scene", "picture", "--largest-view-zenith", "70"]
+    main([*words, "--method", "point", "--json", "--out", out])
+    told = capsys.readouterr()
+    assert "q is negative" in " ".join(json.loads(told.out)["cautions"])
+    assert "Set-up: picture, which the caller gave." in told.err
+    assert "Links: q by StokesLink(" in told.err
+    assert "Readings: 4 of 5 are used; 0 are masked, and 1 are set aside beyond 70" in told.err
+    assert pb.inference.choice_sentences(pb.load(out))[0] in told.err
 
 
 def test_combine_puts_captures_side_by_side(

@@ -76,6 +76,14 @@ def test_a_good_fit_converges_without_a_word() -> None:
     assert judged.problems == judged.cautions == ()
 
 
+def test_a_set_up_that_nobody_stated_and_an_unlikely_capture_are_cautions() -> None:
+    tree = edit_provenance(make_result(), setup_stated=False, capture_cautions=["Swapped."])
+    judged = verdict(tree)
+    assert judged.passed
+    assert judged.cautions[0].startswith("No set-up was stated, so 'paper' was used")
+    assert judged.cautions[1:] == ("Swapped.",)
+
+
 def test_a_stuck_chain_is_named() -> None:
     tree = make_result()
     draws = posterior_of(tree, "roughness")
