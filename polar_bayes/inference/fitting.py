@@ -95,12 +95,18 @@ def fit(
     chosen = find_method(method, tolerance, seconds)
     request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, precision)
     with jax.enable_x64(precision == "double"):
-        return _fit(request, chosen, progress or no_progress, start_time)
+        return fit_request(request, chosen, progress or no_progress, start_time)
 
 
-def _fit(
-    request: Request, method: AbstractMethod, progress: Progress, start_time: float
+def fit_request(
+    request: Request,
+    method: AbstractMethod,
+    progress: Progress,
+    start_time: float,
+    *,
+    with_comparisons: bool = True,
 ) -> xr.DataTree:
+    """The fit of a request, in the precision that is switched on."""
     key, key_comparisons, key_posterior, key_prior = jax.random.split(
         jax.random.key(request.seed), 4
     )
@@ -120,7 +126,11 @@ def _fit(
     prior = problem.predict(key_prior, prior_z[None])
     timings.record("prediction")
 
-    comparisons, failed = _fit_comparisons(request, method, draws, key_comparisons, progress)
+    comparisons, failed = (
+        _fit_comparisons(request, method, draws, key_comparisons, progress)
+        if with_comparisons
+        else ({}, {})
+    )
     if isinstance(request.scene.ledger, xr.Dataset):
         comparisons["effects"] = request.scene.ledger  # how the scene was chosen
     timings.record("comparisons")
