@@ -8,6 +8,7 @@ import json
 
 import numpy as np
 import xarray as xr
+from scipy import stats
 
 PRIOR = {
     "roughness": (0.2, 0.05),
@@ -99,6 +100,12 @@ def make_result(
             ]
             for parameter in PRIOR
         }
+    provenance["prior_probability"] = {
+        parameter: np.ravel(
+            stats.norm.cdf(np.median(values, axis=(0, 1)), *PRIOR[parameter])
+        ).tolist()
+        for parameter, (_, values) in _label(theta, names, lead, grid).items()
+    }
     tree.attrs["polar_bayes"] = json.dumps(provenance)
     return tree
 

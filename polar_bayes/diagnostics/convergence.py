@@ -14,6 +14,7 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
+from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
     CENTRAL_95,
@@ -30,6 +31,9 @@ TAILS = (0.05, 0.95)
 LARGEST_R_HAT = 1.01
 SMALLEST_ESS = 400
 LARGEST_K_HAT = 0.7
+LARGE_CORRECTION = 0.1
+"""Error of an approximate mean in sds, or of an sd in its log, that is told."""
+WEIGHTED = ("importance", "tempered")
 MAX_SECOND_MODE = 0.01
 MAX_MASKED = 0.25
 MAX_DEEP_TREES = 0.01
@@ -56,12 +60,15 @@ class Verdict:
         problems: Why it did not pass.
         cautions: What a reader should know of a result that passed.
         findings: What the result says.
+        converged: False where the method itself failed; where it is True and `passed` is False,
+            the draws are of the posterior, but the readings speak against the model.
     """
 
     passed: bool
     problems: tuple[str, ...]
     cautions: tuple[str, ...]
     findings: tuple[str, ...] = ()
+    converged: bool = True
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -87,13 +94,19 @@ def verdict(result: xr.DataTree, table: pd.DataFrame | None = None) -> Verdict:
     problems += _draw_problems(found, method, provenance)
     if method == "nuts":
         problems += _chain_problems(result, table)
+    problems += _weight_problems(provenance, method)
+    criticism = criticize(result)
+    against = criticism["sentence"].groupby(criticism["level"], sort=False).agg(list)
     cautions = (
-        *_approximation_cautions(result, method),
+        *_approximation_cautions(result, found, method),
         *_mode_cautions(provenance),
         *_estimate_cautions(result, table, method),
         *_reading_cautions(provenance.get("counts", {})),
+        *against.get("caution", []),
+        *dict.fromkeys(against.get("not computed", [])),
     )
-    return Verdict(not problems, tuple(problems), cautions)
+    faults = tuple(against.get("problem", []))
+    return Verdict(not problems and not faults, (*problems, *faults), cautions, (), not problems)
 
 
 def json_summary(result: xr.DataTree) -> dict[str, Any]:
@@ -104,7 +117,7 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
 
     Returns:
         Keys parameters (label to mean, sd, q2.5, q97.5, r_hat, ess_bulk, ess_tail), converged,
-        problems, cautions, method, model, scene, seed, counts and timings.
+        passed, problems, cautions, method, model, scene, seed, counts and timings.
 
     Raises:
         FitError: The tree holds no posterior.
@@ -118,7 +131,8 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
             str(label): {column: _number(row[column]) for column in shown}
             for label, row in table.iterrows()
         },
-        "converged": found.passed,
+        "converged": found.converged,
+        "passed": found.passed,
         "problems": list(found.problems),
         "cautions": list(found.cautions),
         "method": method_of(result),
@@ -255,10 +269,25 @@ def _chain_problems(result: xr.DataTree, table: pd.DataFrame) -> Iterator[str]:
         )
 
 
-def _approximation_cautions(result: xr.DataTree, method: str) -> Iterator[str]:
+def _weight_problems(provenance: Mapping[str, Any], method: str) -> Iterator[str]:
+    """Weighted draws that are worth fewer independent ones than chains must have."""
+    effective = provenance.get("effective_draws")
+    if method in WEIGHTED and effective is not None and effective < SMALLEST_ESS:
+        yield (
+            f"The effective sample size of the weighted draws is {effective:.0f} (at least "
+            f"{SMALLEST_ESS}): the interval is not known well enough, so draw more, as in "
+            "Importance(draws=16384), or use method='nuts'."
+        )
+
+
+def _approximation_cautions(
+    result: xr.DataTree, found: Sequence[Scalar], method: str
+) -> Iterator[str]:
     if method not in APPROXIMATIONS or "log_weight" not in stats_of(result):
         return
     k_hat = laplace_k_hat(result)
+    if k_hat <= LARGEST_K_HAT:
+        yield from _corrections(result, found)
     if not k_hat <= LARGEST_K_HAT:
         draws, shape = ("the guide's draws", "the guide")
         if method == "laplace":
@@ -266,6 +295,30 @@ def _approximation_cautions(result: xr.DataTree, method: str) -> Iterator[str]:
         yield (
             f"Pareto k-hat of {draws} is {k_hat:.2f} (at most {LARGEST_K_HAT}): the posterior is "
             f"not close to {shape}; use method='nuts' for intervals."
+        )
+
+
+def _corrections(result: xr.DataTree, found: Sequence[Scalar]) -> Iterator[str]:
+    """Means and sds of an approximation that its own smoothed weights change."""
+    ratios = stats_of(result)["log_weight"].to_numpy().astype(float).ravel()
+    weights = np.exp(array_stats.psislw(-(ratios - ratios.max()))[0])
+    weights /= weights.sum()
+    changes = []
+    for scalar in found:
+        draws = scalar.draws.ravel()
+        if not np.isfinite(draws).all() or not np.ptp(draws) > 0.0:
+            continue
+        mean = weights @ draws
+        sd = math.sqrt(weights @ (draws - mean) ** 2)
+        shift, ratio = abs(mean - draws.mean()) / sd, draws.std() / sd
+        if shift > LARGE_CORRECTION or abs(math.log(ratio)) > LARGE_CORRECTION:
+            text = f"{scalar.label} (mean by {shift:.1f} sd, sd {ratio - 1.0:+.0%})"
+            changes.append((shift + abs(math.log(ratio)), text))
+    if changes:
+        names = _list(text for _, text in sorted(changes, reverse=True))
+        yield (
+            f"By its own weighted draws the approximation is off: {names}; use "
+            "method='importance' or 'nuts' where that matters."
         )
 
 

@@ -1,4 +1,4 @@
-r"""Model criticism of one fit: priors, bounds, noise, residuals, and influential or repeated readings.
+r"""Model criticism of one fit: priors, bounds, noise, residuals, influence and repeated readings.
 
 The residuals of the readings are compared with residuals of replicated readings. A replicate is
 drawn from the posterior predictive distribution, and refitted in the linear-Gaussian approximation:
@@ -47,6 +47,8 @@ PROBLEM = 0.004
 REPLICATES = 1000
 MAX_READINGS = 600
 """Readings that the residual checks use; of more, evenly spaced ones."""
+MAX_SATURATED = 0.01
+"""Share of the replicates at full scale beyond which the residual checks leave a reading out."""
 ANGLE_SCALES = (4.0, 15.0)
 """Length scales of structure over directions, unit degree."""
 NEAR_BOUND = 0.05
@@ -243,14 +245,15 @@ def _residuals(result: xr.DataTree) -> _Residuals | None:
         np.isfinite(v.predicted).all() and np.isfinite(v.noise_free).all() for v in variables
     ):
         return None
-    # A reading at full scale says only "at least": replicates beyond it are left out by the sd.
     noise_free = np.concatenate([v.noise_free for v in variables], axis=1)
     noise = np.concatenate([v.predicted for v in variables], axis=1) - noise_free
     observed = np.concatenate([v.observed for v in variables])
     where = [_positions(result, v) for v in variables]
-    keep = np.arange(0, observed.size, -(-observed.size // MAX_READINGS))
     sd = noise.std(axis=0)
-    keep = keep[sd[keep] > 0.0]
+    # Replicates of a reading near full scale are cut off there, and have no residuals of their own.
+    cut = np.concatenate([(v.predicted >= v.full_scale).mean(axis=0) for v in variables])
+    keep = np.flatnonzero((sd > 0.0) & (cut < MAX_SATURATED))
+    keep = keep[:: max(1, -(-keep.size // MAX_READINGS))]
     if keep.size < 4 or len(noise) < 100:
         return None
     noise, noise_free, sd = noise[:, keep] / sd[keep], noise_free[:, keep] / sd[keep], sd[keep]
@@ -290,7 +293,7 @@ def _positions(
         else np.zeros(variable.observed.size)
     )
     others = [d for d in reading.dims if d not in ("view", "wavelength")]
-    index = [along(xr.DataArray(np.arange(reading.sizes[d]), dims=d)) for d in others]
+    index = [along(xr.DataArray(np.arange(reading.sizes[d]), dims=str(d))) for d in others]
     group = [
         " ".join([variable.name, *(str(each[i]) for each in index)])
         for i in range(variable.observed.size)
@@ -416,8 +419,8 @@ def _leave_one_out(checks: Mapping[str, PredictiveCheck]) -> Finding:
     worst = min(p_values, key=lambda name: p_values[name])
     p_value = min(1.0, p_values[worst] * len(p_values))
     sentence = (
-        f"The leave-one-out PIT values of {worst} are not uniform (p = {p_value:.2g}): the readings "
-        "do not scatter about their predictions as the link says; try another link, or "
+        f"The leave-one-out PIT values of {worst} are not uniform (p = {p_value:.2g}): the "
+        "readings do not scatter about their predictions as the link says; try another link, or "
         "polar_bayes.compare_scenes."
     )
     return _finding(p_value, math.nan, sentence)

@@ -255,7 +255,7 @@ def _finite_bounds(prior: dist.Distribution) -> list[float | None]:
 
 
 def _prior_probability(request: Request, posterior: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Prior probability below the posterior medians, of every prior with a distribution function."""
+    """Prior probability below each posterior median, where a prior has such a function."""
     found = {}
     for name, prior in request.priors.items():
         if name in posterior and name not in request.fixed:

@@ -1,0 +1,365 @@
+"""False alarms and power of the verdict: right models, and worlds that the fitted scene lacks.
+
+    python benchmarks/model_criticism.py right --fits 1000   share of right models flagged
+    python benchmarks/model_criticism.py wrong --fits 5      wrong worlds at 16, 40, 120 readings
+
+A fit is flagged where its verdict has a caution or a problem. It is silent and wrong where it is
+not flagged although the 95% interval of a material parameter misses the truth by more than 2 sds.
+`right` draws the truth from the priors. Results are appended to a file of JSON lines, so that
+a run that was stopped goes on where it was.
+"""
+
+import argparse
+import dataclasses
+import json
+import platform
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+import xarray as xr
+from scipy import stats
+
+import polar_bayes as pb
+from polar_bayes.diagnostics.criticism import criticize
+from polar_bayes.observation.links import noise_parameters
+from polar_bayes.setups import SETUPS
+from polar_bayes.simulation import Protocol
+
+READINGS = (16, 40, 120)
+MISS = 2.0
+MATERIAL = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
+PAPER, CAMERA, GONIOMETER = (SETUPS[name].scene for name in ("paper", "camera", "goniometer"))
+Change = Callable[[xr.Dataset, np.random.Generator], xr.Dataset]
+
+
+def unchanged(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+    """The capture as it was simulated."""
+    del random
+    return capture
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """What is simulated, what happens to the readings, and the set-up that is fitted."""
+
+    setup: str
+    preset: str = "plastic"
+    truth: pb.Scene | None = None
+    parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    noise: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    change: Change = unchanged
+    method: str = "nuts"
+    largest_view_zenith: float = 85.0
+    azimuths: tuple[float, ...] = (180.0, 150.0, 120.0, 60.0)
+
+    def capture(self, readings: int, seed: int) -> xr.Dataset:
+        """A capture of this world, with as many views as there are readings of each variable."""
+        made = pb.simulate(
+            self.preset,
+            scene=self.truth or SETUPS[self.setup].scene,
+            links=SETUPS[self.setup].links,
+            protocol=Protocol(
+                views=readings,
+                wavelengths=(),
+                largest_view_zenith=self.largest_view_zenith,
+                azimuths=self.azimuths,
+            ),
+            parameters=dict(self.parameters),
+            noise=dict(self.noise),
+            seed=seed,
+        )
+        return self.change(made, np.random.default_rng(seed))
+
+
+# --- What happens to readings ---------------------------------------------------------------------
+
+
+def scaled(**factors: float) -> Change:
+    """Variables times factors."""
+
+    def change(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+        del random
+        return capture.assign({name: capture[name] * factors[name] for name in factors})
+
+    return change
+
+
+def repeated(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+    """A quarter of the views, each entered four times."""
+    del random
+    views = np.repeat(np.arange(2, capture.sizes["view"], 4), 4)
+    return capture.isel(view=views)
+
+
+def turned(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+    """View zeniths read 3 degrees too low."""
+    del random
+    return capture.assign(view_zenith=np.maximum(capture["view_zenith"] - 3.0, 0.0))
+
+
+def drifting(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+    """A smooth error of 6% over the angle."""
+    phase = random.uniform(0.0, 2.0 * np.pi)
+    wave = 1.0 + 0.06 * np.sin(np.radians(capture["view_zenith"]) * 5.0 + phase)
+    name = "dop" if "dop" in capture else "q"
+    return capture.assign({name: np.clip(capture[name] * wave, -0.999, 0.999)})
+
+
+def spoiled(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+    """One reading in ten is 0.15 off."""
+    name = "dop" if "dop" in capture else "q"
+    hit = random.random(capture[name].shape) < 0.1
+    return capture.assign({name: np.clip(capture[name] + 0.15 * hit, -0.999, 0.999)})
+
+
+def rounded(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+    """Readings noted to one decimal."""
+    del random
+    name = "dop" if "dop" in capture else "q"
+    return capture.assign({name: capture[name].round(1)})
+
+
+def stray(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+    """Unpolarized stray light that is a quarter of the brightest view's."""
+    del random
+    light = 0.25 * float(capture["intensity"].max())
+    share = capture["intensity"] / (capture["intensity"] + light)
+    return capture.assign(dop=capture["dop"] * share)
+
+
+def clipped(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+    """A sensor that saturates at 60% of the largest degree of polarization, unmarked."""
+    del random
+    name = "dop" if "dop" in capture else "q"
+    return capture.assign({name: np.minimum(capture[name], 0.6 * float(capture[name].max()))})
+
+
+def _part(scene: pb.Scene, **changes: Any) -> pb.Scene:
+    """A scene with fields of its surface, or of itself, replaced."""
+    own = {field.name for field in dataclasses.fields(scene)}
+    outer = {name: part for name, part in changes.items() if name in own}
+    inner = {name: part for name, part in changes.items() if name not in own}
+    surface = dataclasses.replace(scene.surface, **inner) if inner else scene.surface
+    return dataclasses.replace(scene, surface=surface, **outer)
+
+
+P, T = pb.physics, pb.instrument
+WRONG: dict[str, World] = {
+    # The surface.
+    "GGX fitted as Beckmann": World("paper", truth=_part(PAPER, distribution=P.GGX())),
+    "GGX fitted as Beckmann, camera": World("camera", truth=_part(CAMERA, distribution=P.GGX())),
+    "grooves fitted as isotropic": World(
+        "paper",
+        truth=_part(PAPER, slopes=P.AnisotropicSlopes()),
+        parameters={"roughness": 0.05, "roughness_across": 0.3},
+    ),
+    "no shadowing": World("paper", "leaf", truth=_part(PAPER, shadowing=P.NoShadowing())),
+    "a coat": World(
+        "paper",
+        truth=_part(PAPER, coat=P.ClearCoat()),
+        parameters={"coat_refractive_index": 1.6, "coat_absorbance": 0.3},
+    ),
+    "polarized light": World(
+        "paper",
+        truth=_part(
+            PAPER, illumination=P.PointSource(P.LinearPolarization(degree=0.3, angle=30.0))
+        ),
+    ),
+    "a sample that leans by 5 degrees": World(
+        "paper",
+        truth=_part(PAPER, normal=T.TiltedNormal()),
+        parameters={"normal_tilt_x": 5.0},
+    ),
+    "a near mirror that no view sees": World(
+        "paper", "glass", parameters={"roughness": 0.01}, azimuths=(120.0, 60.0)
+    ),
+    "the same by laplace": World(
+        "paper", "glass", parameters={"roughness": 0.01}, azimuths=(120.0, 60.0), method="laplace"
+    ),
+    # The body.
+    "turbid body fitted as depolarizer": World(
+        "paper", "leaf", truth=_part(PAPER, subsurface=P.TurbidMedium())
+    ),
+    "unpolarized body fitted as Lambertian": World(
+        "camera", "leaf", truth=_part(CAMERA, subsurface=P.Unpolarized())
+    ),
+    "depolarizer fitted as Lambertian": World(
+        "camera", "leaf", truth=_part(CAMERA, subsurface=P.Depolarizer())
+    ),
+    "index above the prior": World("paper", parameters={"refractive_index": 2.3}),
+    "index below the prior": World("paper", parameters={"refractive_index": 1.15}),
+    "a plate of index 2.3": World(
+        "goniometer", "glass", parameters={"refractive_index": 2.3, "subsurface_fraction": 0.02}
+    ),
+    # The light.
+    "light from the whole sky": World(
+        "camera", "water", truth=_part(CAMERA, illumination=P.UniformSky())
+    ),
+    "light 12 degrees wide": World(
+        "paper", truth=_part(PAPER, illumination=P.Disc(half_width=12.0))
+    ),
+    "stray light": World("paper", change=stray),
+    # The instrument.
+    "angles 3 degrees off": World("paper", change=turned),
+    "angles 3 degrees off, goniometer": World(
+        "goniometer", "glass", parameters={"subsurface_fraction": 0.02}, change=turned
+    ),
+    "DoLP reads 20% low": World("paper", change=scaled(dop=0.8)),
+    "s and p swapped": World(
+        "goniometer", "glass", parameters={"subsurface_fraction": 0.02}, change=scaled(q=-1.0)
+    ),
+    "a smooth error of 6%": World("paper", change=drifting),
+    "a smooth error of 6%, camera": World("camera", change=drifting),
+    "a channel that saturates": World("camera", change=clipped),
+    # The noise.
+    "noise 30 times the stated": World(
+        "goniometer",
+        "glass",
+        parameters={"subsurface_fraction": 0.02},
+        noise={"stokes_error_factor": 30.0},
+    ),
+    "one reading in ten spoiled": World("paper", change=spoiled),
+    "one reading in ten spoiled, camera": World("camera", change=spoiled),
+    "noted to one decimal": World("paper", change=rounded),
+    "a quarter of the views entered four times": World("paper", change=repeated),
+}
+
+
+# --- One fit --------------------------------------------------------------------------------------
+
+
+def judge(capture: xr.Dataset, truth: Mapping[str, float], **settings: Any) -> dict[str, Any]:
+    """One fit: what its verdict says, and by how many sds it misses."""
+    result = pb.fit(capture, **settings)
+    table, found = criticize(result), pb.verdict(result)
+    summary = pb.summary(result)
+    rows = {name: summary.loc[name] for name in truth if name in summary.index}
+    misses = {
+        name: max(row["q2.5"] - truth[name], truth[name] - row["q97.5"]) / row["sd"]
+        for name, row in rows.items()
+    }
+    return {
+        "levels": table["level"].to_dict(),
+        "p_values": {name: p for name, p in table["p_value"].items() if np.isfinite(p)},
+        "cautions": len(found.cautions),
+        "problems": len(found.problems),
+        "miss": float(max(0.0, *misses.values())),
+    }
+
+
+def wrong(fits: int) -> Any:
+    """Every wrong world at every number of readings."""
+    for readings in READINGS:
+        for name, world in WRONG.items():
+            for seed in range(fits):
+                key = f"{name}|{readings}|{seed}"
+                yield key, lambda w=world, r=readings, s=seed: _wrong(w, r, s)
+
+
+def _wrong(world: World, readings: int, seed: int) -> dict[str, Any]:
+    capture = world.capture(readings, seed)
+    truth = {n: float(capture[f"true_{n}"]) for n in MATERIAL if f"true_{n}" in capture}
+    return judge(capture, truth, scene=world.setup, method=world.method, seed=seed)
+
+
+def right(fits: int) -> Any:
+    """Right models: truth from the priors, three layouts."""
+    for setup, readings in (("paper", 40), ("camera", 16), ("goniometer", 40)):
+        for seed in range(fits):
+            yield (
+                f"{setup}, {readings} readings|{seed}",
+                lambda s=setup, r=readings, k=seed: _right(s, r, k),
+            )
+
+
+def _right(setup: str, readings: int, seed: int) -> dict[str, Any]:
+    scene, links = SETUPS[setup].scene, SETUPS[setup].links
+    keys = iter(jax.random.split(jax.random.key(seed), 64))
+
+    def drawn(names: Any) -> dict[str, Any]:
+        return {name: np.asarray(pb.PRIORS[name].sample(next(keys)), float) for name in names}
+
+    noise = {n: float(v) for n, v in drawn(noise_parameters(links)).items() if n != "exposure"}
+    parameters = drawn(scene.parameters)
+    capture = pb.simulate(
+        "plastic",
+        scene=scene,
+        links=links,
+        protocol=Protocol(views=readings, wavelengths=(), largest_view_zenith=80.0),
+        parameters=parameters,
+        noise=noise,
+        seed=seed,
+    )
+    truth = {name: float(parameters[name]) for name in MATERIAL if name in parameters}
+    return judge(capture, truth, scene=setup, seed=seed)
+
+
+# --- Tables ---------------------------------------------------------------------------------------
+
+
+def table(lines: list[dict[str, Any]]) -> pd.DataFrame:
+    """Share flagged, by world and number of readings."""
+    rows = pd.DataFrame(lines)
+    rows[["world", "seed"]] = rows["key"].str.rsplit("|", n=1, expand=True)
+    rows["flagged"] = (rows["cautions"] + rows["problems"]) > 0
+    rows["failed"] = rows["problems"] > 0
+    rows["silent and wrong"] = ~rows["flagged"] & (rows["miss"] > MISS)
+    return rows.groupby("world", sort=False).agg(
+        fits=("miss", "size"),
+        flagged=("flagged", "mean"),
+        problem=("failed", "mean"),
+        median_miss=("miss", "median"),
+        silent_and_wrong=("silent and wrong", "mean"),
+    )
+
+
+def wilson(hits: int, count: int) -> str:
+    """A share with its 95% Wilson interval, in percent."""
+    interval = stats.binomtest(hits, count).proportion_ci(method="wilson")
+    return f"{hits / count:.1%} [{interval.low:.1%}, {interval.high:.1%}]"
+
+
+def main() -> None:
+    """Run what is asked for, and print the table of all that is kept."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("part", choices=("right", "wrong"))
+    parser.add_argument("--fits", type=int, default=5)
+    parser.add_argument("--only", default="", help="worlds whose name holds this text")
+    parser.add_argument("--keep", type=Path, required=True, help="file of JSON lines")
+    asked = parser.parse_args()
+    lines = (
+        [json.loads(text) for text in asked.keep.read_text().splitlines()]
+        if asked.keep.exists()
+        else []
+    )
+    done = {line["key"] for line in lines}
+    for key, run in {"right": right, "wrong": wrong}[asked.part](asked.fits):
+        if key in done or asked.only not in key:
+            continue
+        try:
+            found = run()
+        except pb.PolarBayesError as error:  # refused at the door: nothing is silent
+            found = {"levels": {}, "p_values": {}, "cautions": 0, "problems": 1, "miss": 0.0}
+            found["refused"] = str(error)
+        lines.append({"key": key, **found})
+        with asked.keep.open("a") as file:
+            file.write(json.dumps(lines[-1]) + "\n")
+    found = table(lines)
+    print(found.to_string(float_format="{:.2f}".format))
+    levels = pd.DataFrame([line["levels"] for line in lines])
+    print(levels.apply(lambda column: column.value_counts(normalize=True)).T.to_string())
+    failed = sum(line["problems"] > 0 for line in lines)
+    silent = round(float((found["silent_and_wrong"] * found["fits"]).sum()))
+    print("with a problem:", wilson(failed, len(lines)))
+    print("silent and wrong:", wilson(silent, len(lines)))
+    print("machine:", platform.machine(), "python", platform.python_version())
+
+
+if __name__ == "__main__":
+    main()
