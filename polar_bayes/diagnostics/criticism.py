@@ -271,7 +271,7 @@ def _residuals(result: xr.DataTree) -> _Residuals | None:
         directions=np.array(directions)[keep],
         wavelength=np.array(wavelength)[keep],
         group=np.array([groups[name] for name in group])[keep],
-        labels=tuple(labels[i] for i in keep),
+        labels=tuple(str(labels[i]) for i in keep),
     )
 
 

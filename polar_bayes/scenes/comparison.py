@@ -8,7 +8,7 @@ the alternatives to the present scene are fitted, so that what cannot be told ap
 Source:
     Vehtari, Gelman & Gabry (2017), Stat. Comput. 27, 1413 (PSIS-LOO and the error of differences);
     Sivula, Magnusson, Matamoros & Vehtari (2020), arXiv:2008.10296 (differences below 4 are small);
-    Yao, Vehtari, Simpson & Gelman (2018), Bayesian Analysis 13, 917 (stacking weights).
+    Yao, Vehtari, Simpson & Gelman (2018), Bayesian Analysis 13, 917 (stacking; Bayesian bootstrap).
 """
 
 import dataclasses
@@ -56,6 +56,9 @@ ERRORS_APART = 2.0
 
 LEAST_WEIGHT = 0.05
 """Stacking weight below which a scene does not remain."""
+
+BOOTSTRAPS, EM_STEPS = 400, 300
+"""Of stacking weights: replicates of the Bayesian bootstrap, and steps of each optimization."""
 
 RESIDUAL_CHECKS = ("priors", "noise", "angle", "wavelength", "leave-one-out")
 """Checks of `criticize` by which a scene has left something unexplained."""
@@ -338,7 +341,10 @@ def _comparison(fits: _Fits) -> SceneComparison:
         )
     table = _predictions({name: fit.tree for name, fit in fits.done.items()})
     remaining = _remaining(fits.done, table)
-    weights = _predictions({name: fits.done[name].tree for name in remaining})["weight"]
+    weights = pd.Series(
+        stacking_weights(np.stack([fits.done[name].pointwise for name in remaining], axis=1)),
+        index=remaining,
+    )
     weights = weights[weights >= LEAST_WEIGHT]
     table["weight"] = (weights / weights.sum()).reindex(table.index).fillna(0.0)
     ordered = {name: fits.done[name] for name in table.index}
@@ -381,6 +387,18 @@ def _remaining(fits: Mapping[str, _Fit], table: pd.DataFrame) -> list[str]:
     near = [str(name) for name in table.index[~apart]]
     allowed = [name for name in near if not fits[name].is_contradicted]
     return allowed or near
+
+
+def stacking_weights(pointwise: np.ndarray) -> np.ndarray:
+    """Stacking weights (scene,) of elpd (reading, scene), averaged over the Bayesian bootstrap."""
+    # The optimum alone is often a corner: of two scenes that predict alike it takes one.
+    readings, scenes = pointwise.shape
+    density = np.exp(pointwise - pointwise.max(axis=1, keepdims=True))
+    shares = np.random.default_rng(0).dirichlet(np.ones(readings), BOOTSTRAPS)
+    weights = np.full((BOOTSTRAPS, scenes), 1.0 / scenes)
+    for _ in range(EM_STEPS):  # the weights of a mixture whose components are known
+        weights = weights * ((shares / (weights @ density.T)) @ density)
+    return weights.mean(axis=0)
 
 
 def _intervals(trees: Mapping[str, xr.DataTree]) -> pd.DataFrame:

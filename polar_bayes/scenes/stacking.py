@@ -19,8 +19,15 @@ from polar_bayes.diagnostics.parameters import SAMPLE_DIMS
 from polar_bayes.inference.fitting import fit_request
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.result import PROVENANCE, provenance_of
+from polar_bayes.inference.weighted import Importance
 from polar_bayes.progress import Progress
-from polar_bayes.scenes.comparison import SceneComparison, Setting, compare_candidates
+from polar_bayes.scenes.comparison import (
+    ERRORS_APART,
+    SMALL_DIFFERENCE,
+    SceneComparison,
+    Setting,
+    compare_candidates,
+)
 
 OF_DRAWS = (
     *("posterior", "sample_stats", "log_prior", "log_likelihood"),
@@ -48,7 +55,9 @@ def fit_best_scenes(setting: Setting, method: AbstractMethod, progress: Progress
     alone = len(weights) == 1
     with jax.enable_x64(setting.precision == "double"):
         fits = {
-            name: fit_request(
+            name: comparison.fits[name]
+            if isinstance(method, Importance)  # the comparison has more rounds of the same
+            else fit_request(
                 comparison.requests[name],
                 method,
                 progress,
@@ -75,8 +84,12 @@ def stack_fits(fits: Mapping[str, xr.DataTree], weights: Mapping[str, float]) ->
     for group in (name for name in OF_DRAWS if all(name in t.children for t in trees.values())):
         datasets = [tree[group].to_dataset() for tree in trees.values()]
         names = [name for name in _shared(datasets) if name not in NOT_STACKED]
+        if not names:
+            continue
         parts = [
-            each[names].isel(chain=slice(chains), draw=index[name]).drop_vars("draw", "ignore")
+            each[names]
+            .isel(chain=slice(chains), draw=index[name])
+            .drop_vars("draw", errors="ignore")
             for name, each in zip(trees, datasets, strict=True)
         ]
         groups[group] = _shuffled(xr.concat(parts, "draw", combine_attrs="override"))
@@ -133,10 +146,11 @@ def _provenance(
     found["scene_parts"] = "; ".join(
         f"{weights[name]:.2f} x {own.get('scene_parts', '')}" for name, own in each.items()
     )
+    verdicts = {name: verdict(tree) for name, tree in trees.items()}
     found["problems"] = [
         f"{name}: {problem.rstrip('.')}"
-        for name, tree in trees.items()
-        for problem in verdict(tree).problems
+        for name, own in verdicts.items()
+        for problem in (() if own.converged else own.problems)
     ]
     return json.dumps(found, sort_keys=True)
 
@@ -236,11 +250,13 @@ def scene_sentences(result: xr.DataTree | SceneComparison) -> list[str]:
 def _why_not(scene: xr.Dataset) -> str:
     """Why a scene does not remain."""
     name, difference = str(scene["scene"].item()), abs(float(scene["elpd_diff"]))
-    if difference == 0.0:
-        return f"{name} predicts best but does not remain: its parameters contradict their priors."
+    error = float(scene["dse"])
+    if difference > max(SMALL_DIFFERENCE, ERRORS_APART * error):
+        return f"Not {name}: it predicts worse, by {difference:.1f} +- {error:.1f} nat in all."
+    if "priors" in str(scene["criticism"].item()):
+        return f"Not {name}: its parameters are where their priors hardly allow them."
     return (
-        f"{name} does not remain: it predicts worse by {difference:.1f} +- "
-        f"{float(scene['dse']):.1f} nat in all."
+        f"Not {name}: it adds nothing to the others ({difference:.1f} +- {error:.1f} nat behind)."
     )
 
 
