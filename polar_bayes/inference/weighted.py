@@ -83,7 +83,7 @@ class Importance(AbstractMethod):
         sample = _Rounds(problem, self)
         proposal = laplace_mixture(initialization.modes, problem.dtype)
         sample.add(proposal, key_draw)
-        while not sample.is_enough and len(sample.proposals) < self.rounds:
+        while sample.calls_for_more and len(sample.proposals) < self.rounds:
             progress("weighting draws", len(sample.proposals) / self.rounds)
             key_draw, key_fit = jax.random.split(key_draw)
             sample.add(sample.fit(key_fit), key_draw)
@@ -156,10 +156,11 @@ class _Rounds:
         self.effective = float(effective_draws(weights)[0])
 
     @property
-    def is_enough(self) -> bool:
-        """Whether no further round is needed."""
+    def calls_for_more(self) -> bool:
+        """Whether a further round is needed, and there are draws to which it can be fitted."""
         enough = self.effective >= ENOUGH_SHARE * self._settings.draws
-        return enough and self.k_hat <= MAX_PARETO_K
+        reaches = self.k_hat <= MAX_PARETO_K
+        return bool(np.isfinite(self.weights).all()) and not (enough and reaches)
 
     def fit(self, key: Array) -> Mixture:
         """A mixture for the next round."""

@@ -140,13 +140,15 @@ def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None)
 
     Args:
         capture: A validated Dataset of the capture schema.
-        variables: Recorded variables that are fitted; by default all that it holds.
+        variables: Recorded variables that are fitted; by default those that the links of its set-up
+            describe, or all that it holds where it names none.
 
     Returns:
         The options, with the body, mixing and instrument of the set-up that the capture names.
     """
     setup = named_setup(capture)
-    fitted = {str(name) for name in capture.data_vars} if variables is None else set(variables)
+    described = capture.data_vars if setup is None else setup.links
+    fitted = {str(n) for n in (described if variables is None else variables)} & set(capture)
     mirrored = is_mirrored(capture)
     surfaces = [
         *(["mirror"] if mirrored else []),

@@ -16,8 +16,10 @@ import xarray as xr
 
 from polar_bayes.diagnostics.convergence import verdict
 from polar_bayes.diagnostics.parameters import SAMPLE_DIMS
+from polar_bayes.errors import FitError
 from polar_bayes.inference.fitting import fit_request
 from polar_bayes.inference.method import AbstractMethod
+from polar_bayes.inference.mode_methods import Point
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.inference.weighted import Importance
 from polar_bayes.progress import Progress
@@ -50,6 +52,12 @@ MUCH_BETWEEN = 0.1
 
 def fit_best_scenes(setting: Setting, method: AbstractMethod, progress: Progress) -> xr.DataTree:
     """Compare scenes, and fit those that remain by a method; their posteriors are stacked."""
+    if isinstance(method, Point):
+        raise FitError(
+            "a point estimate has no width to compare scenes by",
+            where="fit: scene='auto', method='point'",
+            hint="use method='laplace', or compare_scenes and then a scene of your choice",
+        )
     comparison = compare_candidates(setting, progress)
     weights = comparison.weights
     alone = len(weights) == 1
@@ -190,7 +198,8 @@ def scene_table(result: xr.DataTree | SceneComparison) -> pd.DataFrame:
 
     Returns:
         Columns elpd, se, elpd_diff and dse (nat), weight, a text `mean [q2.5, q97.5]` for each
-        material parameter, criticism and seconds; empty for a fit of one's own scene.
+        material parameter, unreliable (readings whose Pareto k is above 0.7), criticism and
+        seconds; empty for a fit of one's own scene.
     """
     found = _dataset(result)
     if found is None:
@@ -203,7 +212,7 @@ def scene_table(result: xr.DataTree | SceneComparison) -> pd.DataFrame:
             f"{mean:.3f} [{low:.3f}, {high:.3f}]" if np.isfinite(mean) else ""
             for mean, low, high in ends
         ]
-    for name in ("criticism", "seconds"):
+    for name in ("unreliable", "criticism", "seconds"):
         table[name] = found[name].to_numpy()
     return table
 

@@ -100,3 +100,5 @@ def test_what_is_no_scene_is_refused(capture: xr.Dataset) -> None:
         pb.compare_scenes(capture, {"a": "goniometer"})  # type: ignore[dict-item]
     with pytest.raises(pb.FitError, match="no such method"):
         pb.fit(capture, scene="auto", method="none")
+    with pytest.raises(pb.FitError, match="no width to compare"):
+        pb.fit(capture, scene="auto", method="point")
