@@ -232,7 +232,9 @@ def scene_sentences(result: xr.DataTree | SceneComparison) -> list[str]:
     weight = found["weight"].to_series().sort_values(ascending=False, kind="stable")
     remaining = weight[weight > 0.0]
     chosen = str(remaining.index[0])
-    sentences = [f"{found.sizes['scene']} scenes were compared, from simple to complex."]
+    count = found.sizes["scene"]
+    were = "scene was" if count == 1 else "scenes were"
+    sentences = [f"{count} {were} fitted, from simple to complex."]
     if len(remaining) == 1:
         sentences.append(f"One remains: {chosen}.")
     else:

@@ -89,7 +89,7 @@ def test_weights_favor_the_better_and_share_between_equals() -> None:
 def test_sentences_name_the_scenes_and_why_others_went(comparison: SceneComparison) -> None:
     said = " ".join(pb.scenes.scene_sentences(comparison))
     assert "with body" in said
-    assert "2 scenes were compared" in said
+    assert "2 scenes were fitted" in said
     assert list(pb.scenes.scene_table(comparison)["weight"]) == list(comparison.table["weight"])
 
 
