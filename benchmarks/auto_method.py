@@ -21,7 +21,7 @@ from jaxtyping import Array
 import polar_bayes as pb
 from polar_bayes.benchmark.reference import distances, run_reference
 from polar_bayes.benchmark.run import labeled
-from polar_bayes.calibration.simulations import draw_captures
+from polar_bayes.calibration.runner import draw_captures
 from polar_bayes.inference.problem import CompiledModel, Problem, make_problem
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations

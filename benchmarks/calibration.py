@@ -33,7 +33,7 @@ from numpyro.infer import MCMC, NUTS
 from one_material import SCENE, layout
 
 import polar_bayes as pb
-from polar_bayes.calibration.simulations import draw_captures
+from polar_bayes.calibration.runner import draw_captures
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe

@@ -37,7 +37,7 @@ from plates import GONIOMETER, GONIOMETER_VIEWS, LINKS, PLATE, plate_capture, pl
 from spectral_plates import spectral_plate
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.batching import Status
 
 VIEWS, COLORS, ERROR = 16, (450.0, 550.0, 650.0, 750.0), 0.02
 FEW = np.linspace(35.0, 75.0, 6)

@@ -21,7 +21,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from polar_bayes.physics import fresnel
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.illumination import Disc, UniformSky
@@ -81,18 +80,17 @@ def plain(distribution: AbstractMicrofacet, nodes: tuple[int, int], integral: st
         cos_incidence = jnp.maximum(tilt * (cosine + sine * x), 1e-6)
         facets = shares * jnp.maximum(cosine + sine * x, 0.0)
         in_plane, out_of_plane = (tilt * (sine - x * cosine)) ** 2, (tilt * y) ** 2
-        mean, contrast = fresnel.reflection(cos_incidence, in_plane + out_of_plane, n)
-        if half_width is None:
-            mean, contrast = fresnel.transmission(cos_incidence, n), -contrast
-        else:
+        law = Stack.transmission if half_width is None else Stack.reflection
+        power = law(Stack(n), cos_incidence, in_plane + out_of_plane)
+        if half_width is not None:
             cos_light = 2.0 * cos_incidence * tilt - cosine
             sin_light = 2.0 * cos_incidence * x * tilt - sine
             inside = cosine * cos_light - sine * sin_light > math.cos(math.radians(half_width))
             lit = (cos_light > 1e-6) & (inside | (half_width == 90.0))
             slope = jnp.where(lit, 1.0 / jnp.maximum(cos_light, 1e-6) ** 2 - 1.0, 0.0)
             facets = jnp.where(lit, facets * distribution.shadowing(slope, alpha), 0.0)
-        polarized = jnp.sum(facets * contrast * (in_plane - out_of_plane), axis=-1)
-        return polarized / jnp.sum(facets * mean, axis=-1)
+        polarized = jnp.sum(facets * power.contrast * (in_plane - out_of_plane), axis=-1)
+        return polarized / jnp.sum(facets * power.mean, axis=-1)
 
     return polarization
 

@@ -18,13 +18,13 @@ from one_material import SCENE, layout
 
 import polar_bayes as pb
 from polar_bayes.calibration.calibrate import make_plan
-from polar_bayes.calibration.runner import Plan, fit_block
+from polar_bayes.calibration.runner import CalibrationPlan, fit_block
 from polar_bayes.inference.request import resolve
 
 LARGE = pb.methods.PixelSMC(num_chains=4096, draws=16384)
 
 
-def large(seed: int) -> Plan:
+def large(seed: int) -> CalibrationPlan:
     """The same simulations, fitted by the larger crowd."""
     request = resolve(layout(), "per_material", SCENE, None, None, None, seed, "double")
     return make_plan(request, None, LARGE, readings=False)

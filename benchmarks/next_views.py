@@ -25,7 +25,7 @@ import xarray as xr
 from one_material import SCENE
 
 import polar_bayes as pb
-from polar_bayes.calibration.simulations import draw_captures
+from polar_bayes.calibration.runner import draw_captures
 from polar_bayes.design.fisher import (
     information_by_view,
     positive_definite,

@@ -51,8 +51,7 @@ from polar_bayes.inference.levenberg_marquardt import (
     find_modes,
     scoring_derivatives,
 )
-from polar_bayes.maps.blocks import mask_missing
-from polar_bayes.maps.fit_map import plan_map
+from polar_bayes.maps.fit_map import mask_missing, plan_map
 from polar_bayes.observation.data import Observations
 
 NOISE, VIEWS, STEPS = 0.01, 40, 25

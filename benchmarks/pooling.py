@@ -24,11 +24,11 @@ from patches import patch_capture
 from plates import LINKS, PLATE, plates
 
 import polar_bayes as pb
-from polar_bayes.inference.group_model import find_groups
 from polar_bayes.inference.hierarchical_reparam import (
     ExpansionPoint,
     HierarchicalReparam,
     ReparamInputs,
+    find_groups,
 )
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve

@@ -9,11 +9,10 @@ median in the parameter's own unit (before truncation), its `spread` the standar
 scale.
 """
 
-import abc
 import dataclasses
 import math
-from collections.abc import Mapping
-from typing import override
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,90 +37,36 @@ from polar_bayes.priors import RANGES, support_bounds
 from polar_bayes.repr_html import HTMLRepr
 
 
-@dataclasses.dataclass(frozen=True)
-class AbstractScale(abc.ABC):
+class Scale(NamedTuple):
     """The scale on which a population is normal."""
 
-    @abc.abstractmethod
-    def population(self, location: Array, spread: Array) -> dist.Distribution:
-        """Distribution of a member's coordinate on this scale."""
-
-    @abc.abstractmethod
-    def value(self, coordinate: Array) -> Array:
-        """The parameter of a member, in its own unit, from its coordinate."""
+    population: Callable[[Array, Array], dist.Distribution]
+    """From location and spread to the distribution of a member's coordinate on this scale."""
+    value: Callable[[Array], Array]
+    """From the coordinate of a member to the parameter in its own unit."""
 
 
-@dataclasses.dataclass(frozen=True)
-class LogScale(AbstractScale):
-    """For positive parameters: roughness, absorption."""
-
-    @override
-    def population(self, location: Array, spread: Array) -> dist.Distribution:
-        return dist.Normal(jnp.log(location), spread)
-
-    @override
-    def value(self, coordinate: Array) -> Array:
-        return jnp.exp(coordinate)
-
-
-@dataclasses.dataclass(frozen=True)
-class LogitScale(AbstractScale):
-    """For shares: the subsurface fraction."""
-
-    @override
-    def population(self, location: Array, spread: Array) -> dist.Distribution:
-        return dist.Normal(jnp.log(location) - jnp.log1p(-location), spread)
-
-    @override
-    def value(self, coordinate: Array) -> Array:
-        return jax.nn.sigmoid(coordinate)
-
-
-@dataclasses.dataclass(frozen=True)
-class IdentityScale(AbstractScale):
-    """The parameter itself, which may take any value."""
-
-    @override
-    def population(self, location: Array, spread: Array) -> dist.Distribution:
-        return dist.Normal(location, spread)
-
-    @override
-    def value(self, coordinate: Array) -> Array:
-        return coordinate
-
-
-@dataclasses.dataclass(frozen=True)
-class TruncatedScale(AbstractScale):
-    """The parameter itself, its population truncated at bounds: the refractive index.
-
-    Args:
-        low: Lower bound, finite.
-        high: Upper bound, or inf.
-    """
-
-    low: float
-    high: float
-
-    @override
-    def population(self, location: Array, spread: Array) -> dist.Distribution:
-        high = None if math.isinf(self.high) else self.high
-        cut = dist.TruncatedNormal(location, spread, low=self.low, high=high)
-        return dist.TransformedDistribution(cut, SoftClip(self.low, self.high).inv)
-
-    @override
-    def value(self, coordinate: Array) -> Array:
-        return SoftClip(self.low, self.high)(coordinate)
-
-
-def natural_scale(name: str, location: dist.Distribution) -> AbstractScale:
-    """The scale of a parameter, by its physical range."""
+def natural_scale(name: str, location: dist.Distribution) -> Scale:
+    """The scale of a parameter by its physical range: log, log odds, or the parameter itself."""
     limits = RANGES.get(name, (-math.inf, math.inf))
     if limits == (0.0, math.inf):
-        return LogScale()
+        return Scale(lambda center, spread: dist.Normal(jnp.log(center), spread), jnp.exp)
     if limits == (0.0, 1.0):
-        return LogitScale()
+        return Scale(
+            lambda center, spread: dist.Normal(jnp.log(center) - jnp.log1p(-center), spread),
+            jax.nn.sigmoid,
+        )
     low, high = support_bounds(location)
-    return IdentityScale() if math.isinf(low) else TruncatedScale(low, high)
+    if math.isinf(low):
+        return Scale(dist.Normal, lambda coordinate: coordinate)
+    clip = SoftClip(low, high)
+
+    def truncated(center: Array, spread: Array) -> dist.Distribution:
+        most = None if math.isinf(high) else high
+        cut = dist.TruncatedNormal(center, spread, low=low, high=most)
+        return dist.TransformedDistribution(cut, clip.inv)
+
+    return Scale(truncated, clip)
 
 
 def draw_pooled(

@@ -90,10 +90,6 @@ class SpectralProcess(HTMLRepr):
         """False where the kernel is an object, which has a length of its own."""
         return not isinstance(self.kernel, kernels.Kernel)
 
-    def size(self, wavelengths: int) -> int:
-        """How many weights a process over so many wavelengths has."""
-        return min(wavelengths, self.knots)
-
     def knot_wavelengths(self, wavelength: Float[Array, " wavelength"]) -> Float[Array, " knots"]:
         """The knots of these measured wavelengths in ascending order, nm."""
         if wavelength.size <= self.knots:
@@ -118,7 +114,7 @@ class SpectralProcess(HTMLRepr):
         Args:
             weights: w, standard normal. (..., knots), 1.
             length: Length of the kernel, or None where it is an object. nm, > 0.
-            places: The knots, from `places`. nm.
+            knot_wavelengths: The knots, from `knot_wavelengths`. nm.
             wavelength: Where to evaluate. nm.
 
         Returns:
@@ -136,7 +132,7 @@ class SpectralProcess(HTMLRepr):
 
         Args:
             length: Length of the kernel, or None where it is an object. nm, > 0.
-            places: The knots, from `places`. nm.
+            knot_wavelengths: The knots, from `knot_wavelengths`. nm.
             wavelength: New wavelengths. nm.
 
         Returns:

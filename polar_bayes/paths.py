@@ -1,7 +1,7 @@
 """Checks of paths, and atomic writes.
 
 Every file that the package writes goes through `check_output`: it never replaces an input, a
-device, a folder or a file of another kind. It is written to a temporary folder beside the output,
+device, a folder or a file of another kind. It is written to a temporary folder next to the output,
 synced to the disk, renamed, and the folder is synced: a process that dies at any moment leaves the
 older file or the new one, never a part.
 """
@@ -72,11 +72,8 @@ def check_output(
         if not file.parent.is_dir():
             raise OutputError("its folder is not there", where=where, hint="make the folder first")
         if file.exists() and file.stat().st_size and not replaces(file):
-            raise OutputError(
-                "the file there holds something else",
-                where=where,
-                hint="give another path, or remove it first",
-            )
+            hint = "give another path, or remove it first"
+            raise OutputError("the file there holds something else", where=where, hint=hint)
         with tempfile.TemporaryFile(dir=file.parent):
             pass
     except (OSError, RuntimeError) as error:  # RuntimeError: a cycle of links
@@ -89,11 +86,8 @@ def refuse_inputs(path: Path, inputs: Iterable[PathLike]) -> None:
     for each in map(Path, inputs):
         inside = each.is_dir() and any(is_same_file(up, each) for up in path.resolve().parents)
         if inside or is_same_file(path, each):
-            raise OutputError(
-                f"it {'lies inside' if inside else 'is'} one of the inputs",
-                where=str(path),
-                hint="give another path to write",
-            )
+            what = f"it {'lies inside' if inside else 'is'} one of the inputs"
+            raise OutputError(what, where=str(path), hint="give another path to write")
 
 
 def is_same_file(one: Path, other: Path) -> bool:
@@ -142,9 +136,9 @@ def write_errors(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def temporary_folder(beside: Path) -> Iterator[Path]:
+def temporary_folder(parent: Path) -> Iterator[Path]:
     """A temporary folder, removed at the end and by an interrupt."""
-    with tempfile.TemporaryDirectory(dir=beside, prefix=TEMPORARY_PREFIX) as made:
+    with tempfile.TemporaryDirectory(dir=parent, prefix=TEMPORARY_PREFIX) as made:
         folder = Path(made)
 
         def remove() -> None:

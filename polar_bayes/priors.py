@@ -29,7 +29,7 @@ from numpyro.distributions import constraints, transforms
 
 from polar_bayes.errors import FitError
 from polar_bayes.physics.part import notation
-from polar_bayes.repr_html import DisplaySummary, DisplayTable
+from polar_bayes.repr_html import DisplaySummary, Row, Table
 
 
 def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
@@ -257,10 +257,9 @@ class Priors(dict[str, dist.Distribution]):
     """A dictionary of priors that a notebook shows with their numbers."""
 
     def _repr_html_(self) -> str:
-        rows = tuple((n, notation(n).meaning, describe_prior(x)) for n, x in self.items())
-        return DisplaySummary(
-            "Priors", (), (DisplayTable(("parameter", "meaning", "prior"), rows),)
-        )._repr_html_()
+        columns = ("parameter", "meaning", "prior")
+        rows = tuple(Row(n, (notation(n).meaning, describe_prior(x))) for n, x in self.items())
+        return DisplaySummary("Priors", (), (Table(columns, rows, prose=columns),))._repr_html_()
 
 
 _ROWS: dict[str, dist.Distribution] = {

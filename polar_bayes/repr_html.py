@@ -8,8 +8,13 @@ log and a saved result show the expression that makes the value.
 import dataclasses
 import html
 import inspect
-from collections.abc import Mapping
-from typing import override
+import io
+import re
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Self, TextIO, override
+
+import rich.table
+from rich.console import Console
 
 from polar_bayes.errors import one_line
 
@@ -21,13 +26,16 @@ STYLE = """<style>
 .pb-card small { opacity: .72; }
 .pb-card table { border-collapse: collapse; margin: .3em 0; font: inherit;
   font-variant-numeric: tabular-nums; }
-.pb-card table :is(td, th) { text-align: left; vertical-align: top; padding: .1em 1.1em .1em 0;
+.pb-card table :is(td, th) { text-align: right; vertical-align: top; padding: .1em 1.1em .1em 0;
   background: none; border: 0; border-top: 1px solid rgba(128, 128, 128, .22);
-  white-space: normal; max-width: none; }
+  white-space: nowrap; max-width: none; }
+.pb-card table :is(.prose, th:first-child) { text-align: left; }
+.pb-card table td.prose { white-space: normal; }
 .pb-card thead th { border-top: 0; }
-.pb-card tbody th { font-weight: 500; white-space: nowrap; }
-.pb-card table.numbers td { text-align: right; white-space: nowrap; }
-.pb-card table.numbers thead th + th { text-align: right; }
+.pb-card tbody th { font-weight: 500; }
+.pb-card th small { display: block; font-weight: 400; }
+.pb-card th[scope="rowgroup"] { font-style: italic; }
+.pb-card td.warning { color: #d55e00; font-weight: 600; }
 .pb-card details { display: inline-block; vertical-align: top; }
 .pb-card summary { cursor: pointer; }
 .pb-card.good { border-left: 5px solid #009e73; }
@@ -36,38 +44,89 @@ STYLE = """<style>
 """Repeated in each representation, since a notebook may show any of them alone."""
 
 
+WARNING = re.compile(r"not determined|.*\((outside|too few|fails)\)")
+"""Cells that a page shows in red."""
+
+
 @dataclasses.dataclass(frozen=True)
-class DisplayTable:
-    """A table of texts with column heads; the first cell of a row is its label."""
+class Row:
+    """One row of a table as text: its label, what the label means, and the other cells."""
 
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    numeric: bool = False
+    label: str
+    cells: tuple[str, ...]
+    description: str = ""
+    group: str = ""
 
-    @property
-    def html(self) -> str:
-        """As an HTML table."""
-        head = "".join(f'<th scope="col">{_escaped(text)}</th>' for text in self.heads)
-        rows = "".join(
-            f'<tr><th scope="row">{_escaped(first)}</th>'
-            f"{''.join(f'<td>{_escaped(cell)}</td>' for cell in cells)}</tr>"
-            for first, *cells in self.rows
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Table:
+    """Rows of text under columns, which are numbers, or prose where `prose` names them.
+
+    A page also has a caption, and `data`, the numbers with every digit, as a file.
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[Row, ...]
+    prose: Collection[str] = ()
+    name: str = ""
+    caption: str = ""
+    data: Any = None  # pandas.DataFrame
+
+    def first(self, count: int) -> Self:
+        """The same table with its first rows only."""
+        return dataclasses.replace(self, rows=self.rows[:count])
+
+    def __html__(self) -> str:
+        """As HTML; Jinja calls this name."""
+        styles = [' class="prose"' if column in self.prose else "" for column in self.columns]
+        head = "".join(
+            f'<th scope="col"{style}>{_escaped(column)}</th>'
+            for column, style in zip(self.columns, styles, strict=True)
         )
-        kind = ' class="numbers"' if self.numeric else ""
-        return f"<table{kind}><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+        groups: dict[str, list[Row]] = {}
+        for row in self.rows:
+            groups.setdefault(row.group, []).append(row)
+        bodies = "".join(self._body(group, rows, styles) for group, rows in groups.items())
+        identifier = f' id="{_escaped(self.name)}-table"' if self.name else ""
+        return f"<table{identifier}><thead><tr>{head}</tr></thead>{bodies}</table>"
 
-    @property
-    def text(self) -> str:
-        """As aligned columns for a terminal, numbers to the right."""
-        lines = [self.heads, *self.rows]
-        widths = [max(len(line[at]) for line in lines) for at in range(len(self.heads))]
-        return "\n".join(
-            "  ".join(
-                cell.rjust(width) if self.numeric and at else cell.ljust(width)
-                for at, (cell, width) in enumerate(zip(line, widths, strict=True))
-            ).rstrip()
-            for line in lines
-        )
+    def _body(self, group: str, rows: Sequence[Row], styles: Sequence[str]) -> str:
+        """The rows of a group; those of the first group, which has no title, count most."""
+        lines = []
+        if group:
+            head = f'<th scope="rowgroup" colspan="{len(self.columns)}">{_escaped(group)}</th>'
+            lines.append(f"<tr>{head}</tr>")
+        for row in rows:
+            meaning = ""
+            if row.description and _letters(row.description) != _letters(row.label):
+                meaning = f"<small>{_escaped(row.description)}</small>"
+            cells = f'<th scope="row"{styles[0]}><code>{_escaped(row.label)}</code>{meaning}</th>'
+            for cell, style in zip(row.cells, styles[1:], strict=True):
+                warns = not style and not group and WARNING.fullmatch(cell)
+                cells += f"<td{' class="warning"' if warns else style}>{_escaped(cell)}</td>"
+            lines.append(f"<tr>{cells}</tr>")
+        titled = f' data-group="{_escaped(group)}"' if group else ""
+        return f"<tbody{titled}>{''.join(lines)}</tbody>"
+
+    def _columns(self) -> rich.table.Table:
+        """Numbers to the right, labels and prose to the left."""
+        grid = rich.table.Table(box=None, pad_edge=False)
+        for at, column in enumerate(self.columns):
+            grid.add_column(column, justify="right" if at and column not in self.prose else "left")
+        for row in self.rows:
+            grid.add_row(one_line(row.label), *map(one_line, row.cells))
+        return grid
+
+    def to_text(self, stream: TextIO | None = None) -> str:
+        """As aligned columns, which fit the width of the stream if that is a terminal."""
+        width = None if stream is not None and stream.isatty() else 1000
+        console = Console(
+            file=stream or io.StringIO(), width=width, markup=False, highlight=False, emoji=False,
+            force_jupyter=False,
+        )  # fmt: skip
+        with console.capture() as printed:
+            console.print(self._columns())
+        return "\n".join(line.rstrip() for line in printed.get().splitlines())
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -76,18 +135,18 @@ class DisplaySummary:
 
     title: str
     sentences: tuple[str, ...] = ()
-    tables: tuple[DisplayTable, ...] = ()
+    tables: tuple[Table, ...] = ()
     good: bool | None = None
 
     @override
     def __repr__(self) -> str:
         text = "\n".join([one_line(self.title), *self.sentences])
-        return "\n\n".join([text, *(table.text for table in self.tables)])
+        return "\n\n".join([text, *(table.to_text() for table in self.tables)])
 
     def _repr_html_(self) -> str:
         parts = [f"<h4>{_escaped(self.title)}</h4>"]
         parts += [f"<p>{_escaped(sentence)}</p>" for sentence in self.sentences]
-        parts += [table.html for table in self.tables]
+        parts += [table.__html__() for table in self.tables]
         return _card("".join(parts), self.good)
 
 
@@ -98,9 +157,9 @@ class HTMLRepr:
         title = f"<h4>{_escaped(type(self).__name__)}</h4><p><small>{_summary(self)}</small></p>"
         tables = self.extra_tables()
         fields = _fields(self, with_parameters=not tables)
-        return _card(title + fields + "".join(table.html for table in tables))
+        return _card(title + fields + "".join(table.__html__() for table in tables))
 
-    def extra_tables(self) -> tuple[DisplayTable, ...]:
+    def extra_tables(self) -> tuple[Table, ...]:
         """Tables below the fields."""
         return ()
 
@@ -113,6 +172,10 @@ def _card(inside: str, good: bool | None = None) -> str:
 def _escaped(text: object) -> str:
     """Any text as HTML that runs nothing, on one line."""
     return html.escape(one_line(str(text)))
+
+
+def _letters(text: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", text.lower())
 
 
 def _summary(value: object) -> str:
@@ -131,7 +194,7 @@ def _fields(value: object, *, with_parameters: bool = True) -> str:
     if parameters:
         rows["reads"] = ", ".join(f"<code>{_escaped(name)}</code>" for name in parameters)
     cells = "".join(
-        f'<tr><th scope="row">{_escaped(name)}</th><td>{cell}</td></tr>'
+        f'<tr><th scope="row">{_escaped(name)}</th><td class="prose">{cell}</td></tr>'
         for name, cell in rows.items()
     )
     return f"<table><tbody>{cells}</tbody></table>" if rows else ""

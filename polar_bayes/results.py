@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import pkgutil
 from collections.abc import Callable
 from typing import Any
 
@@ -9,24 +10,22 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from polar_bayes.benchmark.accuracy import STUDY
-from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences, accuracy_table
-from polar_bayes.calibration.files import CALIBRATION, check_calibration
+from polar_bayes.benchmark.advice import STUDY, accuracy_dataset, accuracy_sentences, accuracy_table
 from polar_bayes.calibration.scores import is_calibrated
-from polar_bayes.calibration.verdict import calibration_table, calibration_verdict
+from polar_bayes.calibration.verdict import (
+    CALIBRATION,
+    calibration_table,
+    calibration_verdict,
+    check_calibration,
+)
 from polar_bayes.capture.files import is_result, read_netcdf, write_netcdf
-from polar_bayes.design.identify import identifiability_sentences, identifiability_table
-from polar_bayes.design.next_views import next_views_sentences, next_views_table
-from polar_bayes.design.profile import profile_sentences, profile_table
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.coverage import map_scalars
-from polar_bayes.effects.choose import ledger_sentences, ledger_table
 from polar_bayes.errors import FitError, OutputError
-from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.batching import Status
 from polar_bayes.inference.files import FIT, check_fit
-from polar_bayes.maps.fit_map import count_pixels
-from polar_bayes.maps.lazy import open_map
+from polar_bayes.maps.lazy import count_pixels, open_map
 from polar_bayes.paths import as_path, atomic_write, existing_file
 
 MIN_GOOD_SHARE = 0.95
@@ -44,13 +43,19 @@ class Kind:
     check: Callable[[Any, str], None] = lambda result, source: None
 
 
-def _has(variable: str) -> Callable[[Any], bool]:
-    return lambda result: isinstance(result, xr.Dataset) and variable in result
+def _describing(name: str, variable: str, table: str, sentences: str) -> Kind:
+    """A kind that describes and cannot fail, read by functions of the file that makes it."""
 
+    # That file computes with JAX, and is loaded for a result of this kind only.
+    def call(function: str, result: object) -> Any:
+        return pkgutil.resolve_name(f"polar_bayes.{function}")(result)
 
-def _findings(sentences: Callable[[Any], list[str]]) -> Callable[[Any], Verdict]:
-    """The verdict of a result that describes and cannot fail."""
-    return lambda result: Verdict(True, (), (), tuple(sentences(result)))
+    return Kind(
+        name,
+        applies=lambda result: isinstance(result, xr.Dataset) and variable in result,
+        summary=lambda result: call(table, result),
+        verdict=lambda result: Verdict(True, (), (), tuple(call(sentences, result))),
+    )
 
 
 def _calibration_verdict(calibration: xr.DataTree) -> Verdict:
@@ -104,16 +109,33 @@ KINDS = (
         _calibration_verdict,
         check_calibration,
     ),
-    Kind("map", _has("status"), _map_summary, _map_verdict),
-    Kind("profile", _has("prior_beyond"), profile_table, _findings(profile_sentences)),
     Kind(
-        "identification",
-        _has("prior_share"),
-        identifiability_table,
-        _findings(identifiability_sentences),
+        "map",
+        lambda result: isinstance(result, xr.Dataset) and "status" in result,
+        _map_summary,
+        _map_verdict,
     ),
-    Kind("next views", _has("interval_width"), next_views_table, _findings(next_views_sentences)),
-    Kind("effects", _has("kept"), ledger_table, _findings(ledger_sentences)),
+    _describing(
+        "profile",
+        "prior_beyond",
+        "design.profile:profile_table",
+        "design.profile:profile_sentences",
+    ),
+    _describing(
+        "identification",
+        "prior_share",
+        "design.identify:identifiability_table",
+        "design.identify:identifiability_sentences",
+    ),
+    _describing(
+        "next views",
+        "interval_width",
+        "design.next_views:next_views_table",
+        "design.next_views:next_views_sentences",
+    ),
+    _describing(
+        "effects", "kept", "effects.choose:ledger_table", "effects.choose:ledger_sentences"
+    ),
     Kind("fit", FIT.describes, convergence.summary, convergence.verdict, check_fit),
 )
 """The kinds of results in the order in which they are tried."""

@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 
-from polar_bayes.capture.schema import validate
+from polar_bayes.capture.schema import Interval, validate
 from polar_bayes.errors import CaptureError, FitError, SceneError
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
@@ -27,12 +27,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import RANGES
 from polar_bayes.setups import SETUPS, Setup, find_setup
 
-__all__ = [
-    "PRESETS",
-    "Material",
-    "Protocol",
-    "simulate",
-]
+__all__ = ["PRESETS", "Material", "Protocol", "simulate"]
 
 REFERENCE_WAVELENGTHS = (450.0, 550.0, 650.0)
 
@@ -120,26 +115,17 @@ class Protocol:
     wavelengths: tuple[float, ...] = (450.0, 550.0, 650.0)
 
     def __post_init__(self) -> None:
-        checks = {
-            "views": (
-                isinstance(self.views, int) and 2 <= self.views <= 100_000,
-                "give a whole number from 2 to 100000",
-            ),
-            "largest_view_zenith": (
-                0.0 < self.largest_view_zenith < 90.0,
-                "give degrees above 0 and below 90",
-            ),
-            "light_zenith": (0.0 <= self.light_zenith < 90.0, "give degrees from 0 to below 90"),
-            "azimuths": (
-                len(self.azimuths) > 0 and all(abs(a) <= 360.0 for a in self.azimuths),
-                "give at least one, each from -360 to 360 degrees",
-            ),
-            "wavelengths": (
-                all(0.0 < w < 1e6 for w in self.wavelengths),
-                "give nanometers above zero",
-            ),
-        }
-        for name, (holds, hint) in checks.items():
+        are_angles = len(self.azimuths) > 0 and all(abs(a) <= 360.0 for a in self.azimuths)
+        are_positive = all(0.0 < w < 1e6 for w in self.wavelengths)
+        is_count = isinstance(self.views, int) and 2 <= self.views <= 100_000
+        is_below_90 = 0.0 < self.largest_view_zenith < 90.0
+        for holds, name, hint in (
+            (is_count, "views", "give a whole number from 2 to 100000"),
+            (is_below_90, "largest_view_zenith", "give degrees above 0 and below 90"),
+            (0.0 <= self.light_zenith < 90.0, "light_zenith", "give degrees from 0 to below 90"),
+            (are_angles, "azimuths", "give at least one, each from -360 to 360 degrees"),
+            (are_positive, "wavelengths", "give nanometers above zero"),
+        ):
             if not holds:
                 raise CaptureError(f"{name} is {getattr(self, name)}", where="Protocol", hint=hint)
 
@@ -163,17 +149,13 @@ class Protocol:
 
 # --- Validation of parameters and noise -----------------------------------------------------------
 
+_ZEROS = ("leakage", "dark_level", "angle_zero", "normal_tilt_x", "normal_tilt_y")
+
 NEUTRAL: Mapping[str, np.ndarray] = {
-    "dolp_gain": np.asarray(1.0),
-    "channel_gain_ratio": np.asarray(1.0),
-    "leakage": np.asarray(0.0),
-    "dark_level": np.asarray(0.0),
-    "angle_zero": np.asarray(0.0),
-    "beam_overlap_zenith": np.asarray(90.0),
-    "discrepancy_amplitude": np.asarray(0.0),
+    **dict.fromkeys((*_ZEROS, "discrepancy_amplitude"), np.asarray(0.0)),
+    **dict.fromkeys(("dolp_gain", "channel_gain_ratio"), np.asarray(1.0)),
     "discrepancy_weights": np.zeros(4),
-    "normal_tilt_x": np.asarray(0.0),
-    "normal_tilt_y": np.asarray(0.0),
+    "beam_overlap_zenith": np.asarray(90.0),
 }
 """A perfect instrument and a level sample, by the names of the terms' parameters."""
 
@@ -186,31 +168,28 @@ def checked_parameters(
     """A value for every parameter of the scene."""
     unknown = set(overrides) - set(scene.parameters)
     if unknown:
-        raise SceneError(
-            f"the scene has no parameter {', '.join(sorted(unknown))}",
-            where="simulate: parameters",
-            hint=f"give any of {', '.join(scene.parameters)}",
-        )
+        what = f"the scene has no parameter {', '.join(sorted(unknown))}"
+        hint = f"give any of {', '.join(scene.parameters)}"
+        raise SceneError(what, where="simulate: parameters", hint=hint)
     known = material.at(wavelengths if wavelengths.size else np.asarray(550.0))
-    given = {name: _numbers(f"parameters[{name!r}]", value) for name, value in overrides.items()}
-    available = {**NEUTRAL, **known, **given}
+    available = {**NEUTRAL, **known, **overrides}
     missing = [name for name in scene.parameters if name not in available]
     if missing:
-        raise SceneError(
-            f"no value for {', '.join(missing)}",
-            where="simulate: parameters",
-            hint=f"give parameters={{{missing[0]!r}: <a number>}}",
-        )
-    truth = {name: available[name] for name in scene.parameters}
+        what = f"no value for {', '.join(missing)}"
+        hint = f"give parameters={{{missing[0]!r}: <a number>}}"
+        raise SceneError(what, where="simulate: parameters", hint=hint)
+    truth = {}
     spectrum = f", or one per wavelength ({wavelengths.size})" if wavelengths.size else ""
-    for name, value in truth.items():
-        has_shape = value.ndim <= 1
-        hint = "give one number for each function"
+    for name in scene.parameters:
+        where = f"simulate: parameters[{name!r}]"
+        truth[name] = value = _checked_numbers(name, available[name], where)
+        has_shape, hint = value.ndim <= 1, "give one number for each function"
         if not is_vector(name):
             is_spectrum = wavelengths.size > 0 and value.shape == wavelengths.shape
             has_shape = is_spectrum or _is_number_or_image(value)
             hint = f"give one number{spectrum}, or an image (y, x)"
-        _check_value(f"parameters[{name!r}]", name, value, has_shape, hint)
+        if not has_shape:
+            raise CaptureError(f"its shape is {value.shape}", where=where, hint=hint)
     return truth
 
 
@@ -221,26 +200,21 @@ def checked_noise(
     parameters = noise_parameters(links)
     unknown = set(overrides) - set(parameters)
     if unknown:
-        raise FitError(
-            f"no link reads {', '.join(sorted(unknown))}",
-            where="simulate: noise",
-            hint=f"give any of {', '.join(parameters)}",
-        )
+        what = f"no link reads {', '.join(sorted(unknown))}"
+        raise FitError(what, where="simulate: noise", hint=f"give any of {', '.join(parameters)}")
     given: dict[str, Value | None] = {"exposure": None, **defaults, **overrides}
     levels: dict[str, np.ndarray | None] = {}
     for name in parameters:
-        where = f"noise[{name!r}]"
+        where = f"simulate: noise[{name!r}]"
         if name not in given:
-            raise FitError(
-                "it has no value",
-                where=f"simulate: {where}",
-                hint=f"give noise={{{name!r}: <number>}}",
-            )
-        value = given[name]
-        levels[name] = level = None if value is None else _numbers(where, value)
-        if level is not None:
-            has_shape, hint = _is_number_or_image(level), "give one number, or an image (y, x)"
-            _check_value(where, name, level, has_shape, hint, is_open=True)
+            hint = f"give noise={{{name!r}: <number>}}"
+            raise FitError("it has no value", where=where, hint=hint)
+        levels[name] = None
+        if (value := given[name]) is not None:
+            levels[name] = level = _checked_numbers(name, value, where, open_low=True)
+            if not _is_number_or_image(level):
+                hint = "give one number, or an image (y, x)"
+                raise CaptureError(f"its shape is {level.shape}", where=where, hint=hint)
     return levels
 
 
@@ -254,11 +228,9 @@ def image_shape(
     for name, shape in images[1:]:
         first, expected = images[0]
         if shape != expected:
-            raise CaptureError(
-                f"its shape is {shape} and that of {first} is {expected}",
-                where=f"simulate: {name}",
-                hint="give images (y, x) of one shape",
-            )
+            what = f"its shape is {shape} and that of {first} is {expected}"
+            hint = "give images (y, x) of one shape"
+            raise CaptureError(what, where=f"simulate: {name}", hint=hint)
     return images[0][1] if images else ()
 
 
@@ -267,42 +239,23 @@ def is_vector(name: str) -> bool:
     return np.ndim(NEUTRAL.get(name, 0.0)) > 0
 
 
-def _numbers(where: str, value: Value) -> np.ndarray:
+def _checked_numbers(name: str, value: Value, where: str, *, open_low: bool = False) -> np.ndarray:
+    """Numbers in the physical range, which may be open below."""
     try:
-        return np.asarray(value, float)
+        numbers = np.asarray(value, float)
     except (TypeError, ValueError):
-        raise CaptureError(
-            "it is no array of numbers",
-            where=f"simulate: {where}",
-            hint="give a number, or rows of numbers that are equally long",
-        ) from None
+        hint = "give a number, or rows of numbers that are equally long"
+        raise CaptureError("it is no array of numbers", where=where, hint=hint) from None
+    allowed = Interval(*RANGES.get(name, (-np.inf, np.inf)), open_low=open_low)
+    valid = np.isfinite(numbers) & allowed.contains(numbers)
+    if not valid.all():
+        what = f"{numbers[~valid].flat[0]:g} is outside {allowed}"
+        raise CaptureError(what, where=where, hint="give a finite number in that range")
+    return numbers
 
 
 def _is_number_or_image(value: np.ndarray) -> bool:
     return value.ndim == 0 or (value.ndim == 2 and value.size > 0)
-
-
-def _check_value(
-    where: str,
-    name: str,
-    value: np.ndarray,
-    has_shape: bool,
-    hint: str,
-    *,
-    is_open: bool = False,
-) -> None:
-    """Refuse values outside the physical range (which may be open below), or of a wrong shape."""
-    low, high = RANGES.get(name, (-np.inf, np.inf))
-    valid = np.isfinite(value) & ((value > low) if is_open else (value >= low)) & (value <= high)
-    if not valid.all():
-        sign = "<" if is_open else "<="
-        raise CaptureError(
-            f"{value[~valid].flat[0]:g} is outside {low:g} {sign} value <= {high:g}",
-            where=f"simulate: {where}",
-            hint="give a finite number in that range",
-        )
-    if not has_shape:
-        raise CaptureError(f"its shape is {value.shape}", where=f"simulate: {where}", hint=hint)
 
 
 # --- Captures of known truth ----------------------------------------------------------------------
@@ -397,25 +350,20 @@ def simulate(
         recorded = _record(setup.scene, links, _layout(protocol, links, image), truth, levels, seed)
     name = preset if isinstance(preset, str) else "simulated"
     attributes: dict[str, str | int] = {"name": name, "seed": seed}
-    if isinstance(scene, str):  # a fit then takes the same set-up unless told otherwise
+    if isinstance(scene, str):  # a fit then takes the same set-up by default
         attributes["setup"] = scene
     return _label(recorded, protocol, IMAGE if image else (), truth, attributes)
 
 
 def _checked_links(links: Mapping[str, AbstractLink]) -> dict[str, AbstractLink]:
     if not isinstance(links, Mapping) or not links:
-        raise FitError(
-            "that is no set of links",
-            where="simulate: links",
-            hint="give a mapping such as {'dop': BetaLink()}",
-        )
+        hint = "give a mapping such as {'dop': BetaLink()}"
+        raise FitError("that is no set of links", where="simulate: links", hint=hint)
     for name, link in links.items():
         if not isinstance(link, AbstractLink) or name not in link.observables:
-            raise FitError(
-                f"{link!r} does not describe {name}",
-                where=f"simulate: links[{name!r}]",
-                hint="give a link that names it in `observables`, such as {'dop': BetaLink()}",
-            )
+            what = f"{link!r} does not describe {name}"
+            hint = "give a link that names it in `observables`, such as {'dop': BetaLink()}"
+            raise FitError(what, where=f"simulate: links[{name!r}]", hint=hint)
     return dict(links)
 
 

@@ -11,9 +11,15 @@ from textbook import plate_q
 import polar_bayes as pb
 from polar_bayes.capture.schema import validate
 from polar_bayes.inference.batch_laplace import PixelLaplace
-from polar_bayes.inference.batching import ObservationBatch, batch_pixels
-from polar_bayes.maps.blocks import Plan, fit_block, mask_missing
-from polar_bayes.maps.fit_map import blank, cut, plan_map, with_pixel_numbers
+from polar_bayes.inference.batching import ObservationBatch, batch_pixels, cut
+from polar_bayes.maps.fit_map import (
+    MapPlan,
+    blank,
+    fit_block,
+    mask_missing,
+    plan_map,
+    with_pixel_numbers,
+)
 
 NOISE = 0.02
 # Away from Brewster's angle q stays so far from -1 that ordinary noise is never clipped.
@@ -84,7 +90,7 @@ def planned(
     seed: int = 0,
     precision: str = "double",
     **asked,
-) -> Plan:
+) -> MapPlan:
     """The plan of a map; with one plan, the same programs serve many tests."""
     given = {**ASKED, **asked}
     return plan_map(
@@ -92,12 +98,12 @@ def planned(
     )
 
 
-def stacked(capture: xr.Dataset, plan: Plan) -> ObservationBatch:
+def stacked(capture: xr.Dataset, plan: MapPlan) -> ObservationBatch:
     """The pixels of an image in a row."""
     return batch_pixels(plan.observe(validate(mask_missing(capture))))
 
 
-def mapped(capture: xr.Dataset, plan: Plan, block: int = 4096) -> xr.Dataset:
+def mapped(capture: xr.Dataset, plan: MapPlan, block: int = 4096) -> xr.Dataset:
     """Maps made block by block."""
     numbered = with_pixel_numbers(capture)
     maps = blank(numbered, plan).copy(deep=True)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import xarray as xr
 
-from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.psis import LEVELS
 
 LEVELS_HERE = np.array(LEVELS)

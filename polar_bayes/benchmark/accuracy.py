@@ -1,7 +1,5 @@
 """Accuracy study: errors of methods and settings for one capture, and what they cost."""
 
-import dataclasses
-import json
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
 from typing import Any
@@ -11,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
 
+from polar_bayes.benchmark.advice import AS_GIVEN
 from polar_bayes.benchmark.reference import (
     Distances,
     Reference,
@@ -25,19 +24,16 @@ from polar_bayes.benchmark.run import (
     run_fresh,
     run_trial,
 )
-from polar_bayes.design.setup import request_provenance
+from polar_bayes.design.setup import provenance_attrs
 from polar_bayes.errors import FitError, PolarBayesError
-from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, Schema
+from polar_bayes.inference.auto import STUDY_METHODS
 from polar_bayes.inference.method import AbstractMethod
-from polar_bayes.inference.methods import STUDY_METHODS
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
-from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
 
-AS_GIVEN = "as given"
 REFERENCE_FOLD = 7
 """Folded into the key of the reference, which shares no random number with a trial."""
 
@@ -130,15 +126,15 @@ def accuracy(
         show("trials", number / len(trials))
         rows.append(_row(trial, reference_run, fresh=fresh))
     show("trials", 1.0)
-    provenance = {
-        **request_provenance(request),
-        "accuracy": len(rows),
-        "fresh_processes": fresh,
-        "versions": {name: version(name) for name in ("polar_bayes", "jax", "numpyro")},
-    }
-    dataset = _dataset(list(trials), rows, reference_run)
-    tree = xr.DataTree(children={"accuracy": xr.DataTree(dataset)})
-    tree.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
+    tree = xr.DataTree(
+        children={"accuracy": xr.DataTree(_dataset(list(trials), rows, reference_run))}
+    )
+    tree.attrs |= provenance_attrs(
+        request,
+        accuracy=len(rows),
+        fresh_processes=fresh,
+        versions={name: version(name) for name in ("polar_bayes", "jax", "numpyro")},
+    )
     return tree
 
 
@@ -244,17 +240,3 @@ def _dataset(
 
 
 # --- Accuracy studies in netCDF files -------------------------------------------------------------
-
-
-STUDY = Schema(
-    kind="accuracy study",
-    made_by="polar_bayes.accuracy or load",
-    command="`polar-bayes accuracy`",
-    groups={"accuracy": dataclasses.replace(ACCURACY, required=True)},
-    provenance=COMMON_PROVENANCE,
-)
-
-
-def is_accuracy(tree: object) -> bool:
-    """Whether a tree is what `polar_bayes.accuracy` returns, and no fit."""
-    return STUDY.describes(tree)

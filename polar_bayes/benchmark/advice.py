@@ -1,12 +1,22 @@
 """Table, Pareto front and sentences of an accuracy study."""
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from polar_bayes.benchmark.accuracy import AS_GIVEN, STUDY
 from polar_bayes.errors import FitError
-from polar_bayes.inference.files import FIT
+from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, FIT, Schema
+
+AS_GIVEN = "as given"
+STUDY = Schema(
+    kind="accuracy study",
+    made_by="polar_bayes.accuracy or load",
+    command="`polar-bayes accuracy`",
+    groups={"accuracy": dataclasses.replace(ACCURACY, required=True)},
+    provenance=COMMON_PROVENANCE,
+)
 
 RESOLVED = 2.0
 """Standard errors of the reference from which an error counts as different from 0."""
@@ -24,6 +34,11 @@ NUMBERS = (
     *(*TIMES, "peak_memory"),
 )
 TEXTS = ("method", "override", "problems")
+
+
+def is_accuracy(tree: object) -> bool:
+    """Whether a tree is what `polar_bayes.accuracy` returns, and no fit."""
+    return STUDY.describes(tree)
 
 
 def accuracy_dataset(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
@@ -47,19 +62,9 @@ def accuracy_dataset(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
 def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
     """One row for each method and override, the errors of the worst parameter.
 
-    Args:
-        result: What `polar_bayes.accuracy` returns, or one read back from a file.
-
-    Returns:
-        Indexed by the name of the row: `error` (the largest of mean and sd, in reference sds),
-        `worst` (the parameter that has it), `resolved` (whether it is more than twice the
-        reference's own standard error), `interval` (the largest of both ends), `wasserstein`,
-        `r_hat`, `k_hat`, `effective_draws`, `gradients`, `densities`, `seconds_first` and
-        `seconds_again` [s], `peak_memory` [MiB], `on_front` (nothing is both faster and better),
-        `method`, `override` and `problems`.
-
-    Raises:
-        FitError: It holds no accuracy study.
+    `error` is the largest of mean and sd in reference sds, `worst` the parameter that has it;
+    `resolved`: it is more than twice the reference's own standard error; `interval` is the largest
+    of both ends; `on_front`: nothing is both faster and better. Seconds [s], memory [MiB].
     """
     found = accuracy_dataset(result)
     errors = parameter_errors(found)
@@ -108,14 +113,6 @@ def pareto_front(seconds: np.ndarray, error: np.ndarray) -> np.ndarray:
 def time_column(table: pd.DataFrame) -> str:
     """The column of times that is filled in: of the first fit, where it was measured."""
     return TIMES[0] if table[TIMES[0]].notna().any() else TIMES[1]
-
-
-def best_method(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> str | None:
-    """The fastest method as given that is good for every parameter."""
-    table = accuracy_table(result)
-    seconds = table[time_column(table)]
-    good = (table["override"] == AS_GIVEN) & (table["error"] <= tolerance) & seconds.notna()
-    return str(seconds[good].idxmin()) if good.any() else None
 
 
 def accuracy_sentences(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> list[str]:

@@ -12,12 +12,10 @@ from jaxtyping import Array, Float
 from polar_bayes.benchmark.run import labeled
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT
 from polar_bayes.errors import FitError
-from polar_bayes.inference.auto import missed_mode_weight
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
-from polar_bayes.inference.mode_methods import Nuts
+from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.problem import Problem
-from polar_bayes.inference.smc import PixelSMC
-from polar_bayes.inference.weighted import Tempered
+from polar_bayes.inference.smc import PixelSMC, Tempered
 from polar_bayes.progress import no_progress
 
 # --- Distances from the reference -----------------------------------------------------------------
@@ -166,7 +164,9 @@ def _run(
     biases = found.doubts
     if found.r_hat > LARGEST_R_HAT:
         biases.append(f"its R-hat is {found.r_hat:.3f}")
-    if found.method == "nuts" and (weight := missed_mode_weight(found.z, problem)) > 0.0:
+    if found.method == "nuts" and (
+        (weight := problem.initialize().missed_mode_weight(found.z)) > 0.0
+    ):
         biases.append(f"a mode of weight {weight:.2g} was not visited by every chain")
     run = ReferenceRun(
         labels, draws, name, mean_error, sd_error, distances(first, second), found, tuple(biases)

@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 from subprocess import PIPE
-from typing import override
+from typing import ClassVar, override
 
 import cloudpickle
 import jax
@@ -30,8 +30,8 @@ from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.compile import LRUCache, cache_key
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import Problem, make_problem
+from polar_bayes.inference.psis import CHAINS, numpy_generator
 from polar_bayes.inference.request import Request
-from polar_bayes.inference.resampling import CHAINS, numpy_generator
 from polar_bayes.inference.result import posterior_of
 from polar_bayes.interrupts import on_interrupt
 from polar_bayes.paths import temporary_folder
@@ -128,32 +128,32 @@ def _memory() -> float:
 # --- A trial in a process of its own: nothing is compiled yet, nothing else takes memory ----------
 
 
-LAST_WORDS = 300
-"""Characters of what a process that broke down has said."""
+STDERR_TAIL = 300
+"""Characters of the standard error of a process that failed, for its message."""
 
 
 def run_fresh(trial: Trial) -> Measured:
-    """Run a trial in a new process, with compiled programs of earlier ones out of reach."""
+    """Run a trial in a new process, without the compiled programs of earlier ones."""
     with temporary_folder(Path(tempfile.gettempdir())) as folder:
-        given, made = folder / "trial", folder / "measured"
-        given.write_bytes(cloudpickle.dumps(trial))
-        words = [sys.executable, "-m", "polar_bayes.benchmark.run", str(given), str(made)]
+        source, target = folder / "trial", folder / "measured"
+        source.write_bytes(cloudpickle.dumps(trial))
+        command = [sys.executable, "-m", "polar_bayes.benchmark.run", str(source), str(target)]
         with subprocess.Popen(
-            words, env=_environment(), stdout=PIPE, stderr=PIPE, text=True
+            command, env=_environment(), stdout=PIPE, stderr=PIPE, text=True
         ) as process:
             with on_interrupt(process.kill):
                 try:
-                    _, said = process.communicate()
+                    _, stderr = process.communicate()
                 finally:
                     process.kill()  # an exception must not wait for it
-        if not made.exists():
+        if not target.exists():
             raise FitError(
-                f"its process ended with {process.returncode}: {said[-LAST_WORDS:].strip()}",
+                f"its process ended with {process.returncode}: {stderr[-STDERR_TAIL:].strip()}",
                 where="accuracy",
                 hint="try the same method with polar_bayes.fit, or a smaller capture",
             )
         # Written by the process that this one has just started.
-        found = pickle.loads(made.read_bytes())
+        found = pickle.loads(target.read_bytes())
     if isinstance(found, PolarBayesError):
         raise found
     return found
@@ -166,13 +166,13 @@ def _environment() -> dict[str, str]:
     return kept | {"PYTHONPATH": path, "JAX_ENABLE_COMPILATION_CACHE": "false"}
 
 
-def _work(given: Path, made: Path) -> None:
-    trial = pickle.loads(given.read_bytes())
+def _run_file(source: Path, target: Path) -> None:
+    """What the new process does."""
     try:
-        found: Measured | PolarBayesError = run_trial(trial)
+        found: Measured | PolarBayesError = run_trial(pickle.loads(source.read_bytes()))
     except PolarBayesError as error:
         found = error
-    made.write_bytes(cloudpickle.dumps(found))
+    target.write_bytes(cloudpickle.dumps(found))
 
 
 # --- Overrides of the request or method: facets, effects, precision, number of draws --------------
@@ -210,7 +210,43 @@ class AbstractOverride(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True)
-class DrawsOverride(AbstractOverride):
+class _Factor(AbstractOverride):
+    """So many times of something that `what` names."""
+
+    factor: float
+    what: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        if not self.factor > 0.0:
+            raise FitError(
+                f"factor is {self.factor}", where=type(self).__name__, hint="give a number above 0"
+            )
+
+    @property
+    @override
+    def name(self) -> str:
+        if self.factor >= 1.0:
+            return f"{self.what} x {self.factor:g}"
+        return f"{self.what} / {1.0 / self.factor:g}"
+
+
+class _SceneOverride(AbstractOverride):
+    """Another scene."""
+
+    @abc.abstractmethod
+    def scene(self, request: Request) -> Scene:
+        """The scene that is fitted in place of the request's."""
+
+    @override
+    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
+        scene = self.scene(request)
+        if scene == request.scene:
+            return None
+        return dataclasses.replace(request, scene=scene), method
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawsOverride(_Factor):
     """So many times the draws; left out where a method cannot have about as many.
 
     Args:
@@ -220,18 +256,7 @@ class DrawsOverride(AbstractOverride):
         FitError: The factor is not above 0.
     """
 
-    factor: float
-
-    def __post_init__(self) -> None:
-        if not self.factor > 0.0:
-            raise FitError(
-                f"factor is {self.factor}", where="DrawsOverride", hint="give a number above 0"
-            )
-
-    @property
-    @override
-    def name(self) -> str:
-        return _times("draws", self.factor)
+    what: ClassVar[str] = "draws"
 
     @override
     def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
@@ -264,7 +289,7 @@ class PrecisionOverride(AbstractOverride):
 
 
 @dataclasses.dataclass(frozen=True)
-class FacetsOverride(AbstractOverride):
+class FacetsOverride(_Factor, _SceneOverride):
     """So many times the facets in each direction.
 
     Args:
@@ -274,28 +299,16 @@ class FacetsOverride(AbstractOverride):
         FitError: The factor is not above 0.
     """
 
-    factor: float
-
-    def __post_init__(self) -> None:
-        if not self.factor > 0.0:
-            raise FitError(
-                f"factor is {self.factor}", where="FacetsOverride", hint="give a number above 0"
-            )
-
-    @property
-    @override
-    def name(self) -> str:
-        return _times("facets", self.factor)
+    what: ClassVar[str] = "facets"
 
     @override
-    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
+    def scene(self, request: Request) -> Scene:
         changed = [
             Effect("", key_path, part, self._of(part))
             for key_path, part in parts_of(request.scene)
             if isinstance(part, FacetQuadrature)
         ]
-        scene = simplify(request.scene, changed)
-        return None if scene == request.scene else (_with_scene(request, scene), method)
+        return simplify(request.scene, changed)
 
     def _of(self, rule: FacetQuadrature) -> FacetQuadrature:
         along, across = (
@@ -305,7 +318,7 @@ class FacetsOverride(AbstractOverride):
 
 
 @dataclasses.dataclass(frozen=True)
-class EffectsOverride(AbstractOverride):
+class EffectsOverride(_SceneOverride):
     """Only the effects that `polar_bayes.choose_effects` keeps.
 
     Args:
@@ -320,11 +333,11 @@ class EffectsOverride(AbstractOverride):
         return "chosen effects"
 
     @override
-    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
+    def scene(self, request: Request) -> Scene:
         scene = _choose(request, self.tolerance)
         if isinstance(scene, PolarBayesError):
             raise scene
-        return None if scene == request.scene else (_with_scene(request, scene), method)
+        return scene
 
 
 OVERRIDES: tuple[AbstractOverride, ...] = (
@@ -371,13 +384,5 @@ def _choose(request: Request, tolerance: float) -> Scene | PolarBayesError:
     return _CHOSEN.of(key, choose)
 
 
-def _with_scene(request: Request, scene: Scene) -> Request:
-    return dataclasses.replace(request, scene=scene)
-
-
-def _times(what: str, factor: float) -> str:
-    return f"{what} x {factor:g}" if factor >= 1.0 else f"{what} / {1.0 / factor:g}"
-
-
 if __name__ == "__main__":
-    _work(*map(Path, sys.argv[1:]))
+    _run_file(*map(Path, sys.argv[1:]))

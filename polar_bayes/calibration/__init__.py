@@ -1,4 +1,4 @@
-"""Do the intervals hold? Simulate from the prior, fit, and see where the truth stands."""
+"""Simulation-based calibration: do intervals have their nominal coverage?"""
 
 from polar_bayes.namespace import attach
 

@@ -14,33 +14,34 @@ from numpyro import distributions as dist
 
 from polar_bayes.calibration.runner import (
     Block,
+    BlockStore,
+    CalibrationPlan,
     Method,
-    Plan,
     cut,
     fit_block,
     join,
-    needs_mcmc,
+    open_store,
 )
-from polar_bayes.calibration.store import BlockStore, fingerprint_of
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import engine_key
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import MethodUsed, Status
-from polar_bayes.inference.mode_methods import Nuts, Point
+from polar_bayes.inference.batching import MethodUsed, Status
+from polar_bayes.inference.least_squares import Point
+from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE, dims_of, shape_of
 from polar_bayes.inference.smc import PixelSMC
-from polar_bayes.interrupts import on_interrupt
 from polar_bayes.maps.blocks import as_completed, workers
-from polar_bayes.observation.data import Observations
+from polar_bayes.maps.fit_map import describe_request
+from polar_bayes.observation.data import READINGS, Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.paths import as_path
+from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import describe_prior
 from polar_bayes.progress import Counter, no_progress, with_counter
 
 METHODS: dict[str, Method] = {
@@ -119,25 +120,20 @@ def calibrate(
         CaptureError: The capture does not hold what a fit needs.
         FitError: An argument cannot be used, the store exists already (or, to resume, belongs to
             another request), or it cannot be written.
+        OutputError: Another process is writing the store, or its ledger is damaged.
     """
     if resume and store is None:
         raise FitError(
             "there is no store to go on with", where="calibrate: resume", hint="give store="
         )
     if simulations < MIN_SIMULATIONS:
-        raise FitError(
-            f"simulations is {simulations}",
-            where="calibrate",
-            hint=f"give {MIN_SIMULATIONS} or more",
-        )
+        hint = f"give {MIN_SIMULATIONS} or more"
+        raise FitError(f"simulations is {simulations}", where="calibrate", hint=hint)
     arguments = {"model": model, "scene": scene, "priors": priors, "links": links}
     unknown = set(truth or {}) - set(arguments)
     if unknown:
-        raise FitError(
-            f"{', '.join(sorted(unknown))} cannot differ",
-            where="calibrate: truth",
-            hint=f"give some of {', '.join(arguments)}",
-        )
+        what = f"{', '.join(sorted(unknown))} cannot differ"
+        raise FitError(what, where="calibrate: truth", hint=f"give some of {', '.join(arguments)}")
 
     def resolved(differing: Mapping[str, Any]) -> Request:
         model, scene, priors, links = {**arguments, **differing}.values()
@@ -148,62 +144,74 @@ def calibrate(
     settings = _settings(method, request)
     start = time.perf_counter()
     plan = make_plan(request, resolved(truth) if truth else None, settings, readings)
-    if not plan.shared:
-        raise FitError(
-            "the data-generating model and the fitted model share no parameter",
-            where="calibrate: truth",
-            hint="give models whose parameters have the same names and shapes",
-        )
-    blocks = None if store is None else BlockStore(as_path(store, "store"), fingerprint_of(plan))
-    done = blocks.begin(resume=resume) if blocks is not None else []
-    stored = np.concatenate([*(block.numbers for block in done), []])
-    missing = np.setdiff1d(np.arange(simulations), stored).astype(int)
-    with on_interrupt(blocks.resume_hint) if blocks is not None else contextlib.nullcontext():
+    if not plan.compiled.shared:
+        what = "the data-generating model and the fitted model share no parameter"
+        hint = "give models whose parameters have the same names and shapes"
+        raise FitError(what, where="calibrate: truth", hint=hint)
+    folder = None if store is None else as_path(store, "store")
+    with (
+        contextlib.nullcontext()
+        if folder is None
+        else open_store(folder, plan, resume=resume) as blocks
+    ):
+        done = [] if blocks is None else blocks.blocks()
+        stored = np.concatenate([*(block.numbers for block in done), []])
+        missing = np.setdiff1d(np.arange(simulations), stored).astype(int)
         done += _fit_all(plan, missing, simulations, blocks, scheduler, progress or no_progress)
-    provenance = _provenance(request, settings, truth, simulations)
-    provenance["seconds"] = round(time.perf_counter() - start, 3)
+    names = (name for name, each in METHODS.items() if each == settings)
+    provenance = {
+        **describe_request(request),
+        "calibration": simulations,
+        "method": next(names, type(settings).__name__),
+        "settings": repr(settings),
+        "truth": {name: repr(value) for name, value in (truth or {}).items()},
+        "capture": str(request.capture.attrs.get("name", "capture")),
+        "seconds": round(time.perf_counter() - start, 3),
+    }
     if missing.size < simulations:
         provenance["fits found in the store"] = simulations - missing.size
     if readings:
-        provenance["readings_told"] = plan.unranked_reason or "ranked"
-    return _assemble(plan, join(done, simulations), request, provenance)
+        provenance["readings_told"] = plan.compiled.unranked_reason or "ranked"
+    return _assemble(plan, join(done, simulations), provenance)
 
 
 def _settings(method: str | Method | None, request: Request) -> Method:
     if isinstance(method, Point) or method == "point":
-        raise FitError(
-            "least squares make no draws whose intervals could be checked",
-            where="method='point'",
-            hint="give a method with draws, such as pb.methods.Laplace()",
-        )
+        what = "least squares make no draws whose intervals could be checked"
+        hint = "give a method with draws, such as pb.methods.Laplace()"
+        raise FitError(what, where="method='point'", hint=hint)
     if isinstance(method, Method):
         return method
-    if needs_mcmc(request) and method in (None, "nuts"):
+    if _needs_mcmc(request) and method in (None, "nuts"):
         return Nuts()
     if method is None:
         return METHODS["tempered"]
     if method not in METHODS:
-        raise FitError(
-            "no such method",
-            where=f"method={method!r}",
-            hint=f"give one of {', '.join(METHODS)}, or settings such as PixelNuts(draws=1000)",
-        )
+        hint = f"give one of {', '.join(METHODS)}, or settings such as PixelNuts(draws=1000)"
+        raise FitError("no such method", where=f"method={method!r}", hint=hint)
     return METHODS[method]
+
+
+def _needs_mcmc(request: Request) -> bool:
+    """Whether the posteriors of a capture are out of reach of weighted draws."""
+    read = [request.capture[name].sizes for name in READINGS if name in request.capture]
+    several = any(dim != "view" and length > 1 for sizes in read for dim, length in sizes.items())
+    return several or request.scene.has(Discrepancy)
 
 
 def make_plan(
     request: Request, generative_request: Request | None, settings: Method, readings: bool
-) -> Plan:
+) -> CalibrationPlan:
     """What is done to every block; without a generative request, the fitted model simulates."""
     spec_key = engine_key(request, request.largest_view_zenith)
     generative_key = "" if generative_request is None else engine_key(generative_request)
     capture_key = tokenize(request.capture)
     key = tokenize(spec_key, generative_key, repr(settings), readings, capture_key)
-    return Plan(request, generative_request, settings, readings, spec_key, key)
+    return CalibrationPlan(request, generative_request, settings, readings, spec_key, key)
 
 
 def _fit_all(
-    plan: Plan,
+    plan: CalibrationPlan,
     missing: np.ndarray,
     total: int,
     store: BlockStore | None,
@@ -226,37 +234,15 @@ def _fit_all(
     return found
 
 
-def _provenance(
-    request: Request,
-    settings: Method,
-    truth: Mapping[str, Any] | None,
-    simulations: int,
-) -> dict[str, Any]:
-    names = (name for name, each in METHODS.items() if each == settings)
-    return {
-        "calibration": simulations,
-        "model": request.model_name,
-        "method": next(names, type(settings).__name__),
-        "settings": repr(settings),
-        "scene": request.scene_name,
-        "scene_parts": repr(request.scene),
-        "priors": {name: describe_prior(prior) for name, prior in request.priors.items()},
-        "links": {name: repr(link) for name, link in request.links.items()},
-        "truth": {name: repr(value) for name, value in (truth or {}).items()},
-        "seed": request.seed,
-        "capture": str(request.capture.attrs.get("name", "capture")),
-    }
-
-
 # --- The finished calibration as a tree -----------------------------------------------------------
 
 
 def _assemble(
-    plan: Plan, simulated: Block, request: Request, provenance: Mapping[str, Any]
+    plan: CalibrationPlan, simulated: Block, provenance: Mapping[str, Any]
 ) -> xr.DataTree:
     """Put labels on the arrays of all simulations."""
-    program, data, captured = plan.program, plan.data, request.capture
-    dims, lengths = dims_of(program), dict(plan.data.dims)
+    program, data, captured = plan.compiled.program, plan.compiled.data, plan.request.capture
+    dims, lengths = dims_of(program), dict(data.dims)
     axes = {
         dim: captured[dim].to_numpy() if dim in captured.coords else np.arange(lengths[dim])
         for name in simulated.truth

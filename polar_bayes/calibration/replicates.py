@@ -11,7 +11,7 @@ import xarray as xr
 
 from polar_bayes.calibration.scores import significance_level
 from polar_bayes.diagnostics.coverage import INTERVALS, coverage_columns
-from polar_bayes.diagnostics.parameters import Scalar, posterior_scalars, truth_of
+from polar_bayes.diagnostics.parameters import posterior_scalars, truth_of
 from polar_bayes.errors import FitError
 
 MAX_DRAWS = 4000
@@ -65,11 +65,8 @@ def retest(results: Sequence[xr.DataTree]) -> pd.DataFrame:
     found = [{each.label: each for each in posterior_scalars(result)} for result in results]
     common = [label for label in found[0] if all(label in each for each in found[1:])]
     if not common:
-        raise FitError(
-            "these fits share no parameter",
-            where="retest",
-            hint="give fits of the same model to captures of the same layout",
-        )
+        hint = "give fits of the same model to captures of the same layout"
+        raise FitError("these fits share no parameter", where="retest", hint=hint)
     rows = {label: _compare([each[label].draws.ravel() for each in found]) for label in common}
     table = pd.DataFrame.from_dict(rows, orient="index").reindex(columns=list(COLUMNS))
     level = significance_level(table)
@@ -99,24 +96,21 @@ def proxy_scores(
     """
     given = list(proxies) if isinstance(proxies, Sequence) else [proxies] * len(results)
     if len(given) != len(results):
-        raise FitError(
-            f"{len(given)} mappings do not go with {len(results)} fits",
-            where="proxies",
-            hint="give one mapping for all fits, or one for each",
-        )
+        what = f"{len(given)} mappings do not go with {len(results)} fits"
+        raise FitError(what, where="proxies", hint="give one mapping for all fits, or one for each")
     rows = []
     for at, (result, values) in enumerate(zip(results, given, strict=True)):
         for scalar in posterior_scalars(result):
-            proxy = truth_of(result, scalar) if values is None else _proxy(values, scalar)
+            if values is None:
+                proxy = truth_of(result, scalar)
+            else:
+                proxy = float(values.get(scalar.label, values.get(scalar.name, math.nan)))
             if math.isfinite(proxy):
                 row = {"fit": at, "parameter": scalar.label, "proxy": proxy}
                 rows.append(row | _position(proxy, scalar.draws.ravel()))
     if not rows:
-        raise FitError(
-            "no proxy is known of any parameter",
-            where="proxies",
-            hint="give values by parameter, or captures with `true_<parameter>`",
-        )
+        hint = "give values by parameter, or captures with `true_<parameter>`"
+        raise FitError("no proxy is known of any parameter", where="proxies", hint=hint)
     return pd.DataFrame(rows)
 
 
@@ -200,10 +194,6 @@ def _conclusion(row: pd.Series, level: float) -> str:
             "of the intervals is what all repeats share"
         )
     return "repeats scatter about as much as the intervals say"
-
-
-def _proxy(values: Mapping[str, float], scalar: Scalar) -> float:
-    return float(values.get(scalar.label, values.get(scalar.name, math.nan)))
 
 
 def _position(proxy: float, draws: np.ndarray) -> dict[str, float]:

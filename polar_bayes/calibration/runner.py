@@ -1,34 +1,50 @@
-"""Blocks of simulations of a calibration: simulated, fitted and ranked, in any process.
+"""Blocks of simulations of a calibration: simulated, fitted and ranked, in any process, and stored.
 
 Source:
     Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788.
 """
 
+import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from polar_bayes.calibration.predictive import Arrays, PredictivePit, unranked_reason
 from polar_bayes.calibration.scores import PitCrps
-from polar_bayes.calibration.simulations import draw_captures, redraw_readings
+from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine, make_engine
 from polar_bayes.inference.batch_method import AbstractPixelMethod
-from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import Describe, Outcome
-from polar_bayes.inference.batching import ObservationBatch
-from polar_bayes.inference.compile import TRACING_LOCK, LRUCache
+from polar_bayes.inference.batching import ObservationBatch, Outcome
+from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.problem import CompiledModel, compile_model
 from polar_bayes.inference.program import Program, Values, compile_program
 from polar_bayes.inference.psis import Marginals
 from polar_bayes.inference.request import Request
-from polar_bayes.observation.data import READINGS, Observations, observe
-from polar_bayes.physics.instrument import Discrepancy
+from polar_bayes.interrupts import on_interrupt, resume_hint
+from polar_bayes.maps.blocks import (
+    ADDRESS,
+    OTHER_OUT,
+    VERSIONS,
+    Entry,
+    Ledger,
+    digest,
+    digest_files,
+    locked_ledger,
+    written,
+)
+from polar_bayes.observation.data import Observations, observe
+from polar_bayes.paths import TEMPORARY_PREFIX, replace_file, temporary_folder
+from polar_bayes.priors import describe_prior
 
 Method = AbstractPixelMethod | AbstractMethod
 CHAINS_BLOCK = 4
@@ -51,15 +67,15 @@ class Block(NamedTuple):
     mean: Arrays
     sd: Arrays
     quantiles: Arrays
+    outcome: Outcome
     fresh: Arrays
     left_out: Arrays
     left_out_k: Arrays
     entry: Arrays
-    outcome: Outcome
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Plan:
+class CalibrationPlan:
     """What is done to every block of one calibration; it can be sent to another process."""
 
     request: Request
@@ -84,32 +100,12 @@ class Plan:
         """Whether one capture is fitted after another."""
         return isinstance(self.settings, AbstractMethod)
 
-    @property
-    def data(self) -> Observations:
-        """The capture whose layout all simulations have."""
-        return self.compiled.data
-
-    @property
-    def program(self) -> Program:
-        """The model that is fitted."""
-        return self.compiled.program
-
-    @property
-    def shared(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the parameters that are both simulated and fitted, by name."""
-        return self.compiled.shared
-
-    @property
-    def unranked_reason(self) -> str:
-        """Why readings cannot be ranked; empty where they can, or nobody asks."""
-        return self.compiled.unranked_reason if self.readings else ""
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CompiledPlan:
     """The programs of a plan, each made at its first use."""
 
-    plan: Plan
+    plan: CalibrationPlan
 
     @functools.cached_property
     def data(self) -> Observations:
@@ -119,26 +115,18 @@ class CompiledPlan:
             return observe(request.capture, largest_view_zenith=request.largest_view_zenith)
 
     @functools.cached_property
-    def model(self) -> CompiledModel:
-        """The programs that fit one capture after another."""
-        with jax.enable_x64(True):
-            return compile_model(self.plan.request, self.data)
-
-    @functools.cached_property
-    def batch_engine(self) -> BatchEngine:
-        """The programs that fit many captures side by side."""
+    def engine(self) -> CompiledModel | BatchEngine:
+        """The programs that fit one capture after another, or many side by side."""
         plan = self.plan
-        return make_engine(plan.recipe_key, plan.request, lambda: self.data)
+        if not plan.is_sequential:
+            return make_engine(plan.recipe_key, plan.request, lambda: self.data)
+        with jax.enable_x64(True):
+            return compile_model(plan.request, self.data)
 
     @property
     def program(self) -> Program:
         """The model that is fitted."""
-        return self.model.program if self.plan.is_sequential else self.batch_engine.program
-
-    @property
-    def single(self) -> Program:
-        """The same in single precision."""
-        return self.model.single if self.plan.is_sequential else self.batch_engine.single_program
+        return self.engine.program
 
     @functools.cached_property
     def generative_program(self) -> Program:
@@ -158,7 +146,9 @@ class CompiledPlan:
 
     @functools.cached_property
     def unranked_reason(self) -> str:
-        """Why readings cannot be ranked; empty where they can."""
+        """Why readings cannot be ranked; empty where they can, or where none are to be."""
+        if not self.plan.readings:
+            return ""
         program, given = self.program, _shapes(self.program, self.data)
         with jax.enable_x64(True), TRACING_LOCK:
             return unranked_reason(program, self.generative_program, self.data, given)
@@ -167,32 +157,27 @@ class CompiledPlan:
 _COMPILED: LRUCache[CompiledPlan] = LRUCache(4)
 
 
-def needs_mcmc(request: Request) -> bool:
-    """Whether the posteriors of a capture are out of reach of weighted draws."""
-    read = [request.capture[name].sizes for name in READINGS if name in request.capture]
-    several = any(dim != "view" and length > 1 for sizes in read for dim, length in sizes.items())
-    return several or request.scene.has(Discrepancy)
-
-
-def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
+def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
     """Simulate some captures and fit each; this is what a worker is sent."""
-    # What becomes of a simulation depends on its number alone, not on the others of its block.
-    seed, shared, program = plan.request.seed, plan.shared, plan.compiled.generative_program
+    # The result of a simulation depends on its number alone, not on the others of its block.
+    compiled, seed, count = plan.compiled, plan.request.seed, len(numbers)
+    program, data, shared = compiled.generative_program, compiled.data, compiled.shared
     filled = np.resize(numbers, plan.block)  # so that all blocks run the same program
-    wanted = np.arange(len(numbers))
-    is_ranked = plan.readings and not plan.unranked_reason
+    is_ranked = plan.readings and not compiled.unranked_reason
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), 1)
-        drawn = draw_captures(program, plan.data, filled, key)
-        fresh = redraw_readings(program, plan.data, drawn, filled, key) if is_ranked else {}
-    truth = {name: np.asarray(drawn.truth[name])[wanted] for name in shared}
-    captures = drawn.captures.subset(wanted)
-    marginals, scores = Marginals(len(numbers), shared), PitCrps(truth, numbers, seed)
+        drawn = draw_captures(program, data, filled, key)
+        fresh = redraw_readings(program, data, drawn, filled, key) if is_ranked else {}
+    engine: Any = compiled.engine
+    truth: Arrays = {name: np.asarray(drawn.truth[name])[:count] for name in shared}
+    captures = drawn.captures.subset(np.arange(count))
+    marginals, scores = Marginals(count, shared), PitCrps(truth, numbers, seed)
     ranked = None
     if is_ranked:
-        again = {name: np.asarray(values)[wanted] for name, values in fresh.items()}
-        ranked = PredictivePit(plan.compiled.single, captures, again, numbers, seed)
-    step = _thinning(plan.settings)
+        again = {name: np.asarray(values)[:count] for name, values in fresh.items()}
+        single = engine.single if plan.is_sequential else engine.single_program
+        ranked = PredictivePit(single, captures, again, numbers, seed)
+    step = plan.settings.thinning(RANKED)
 
     def describe(at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
         thinned = {name: np.asarray(x)[:, ::step] for name, x in parameters.items()}
@@ -201,7 +186,7 @@ def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
             if statistic is not None:
                 statistic.describe(at, thinned, share)
 
-    outcome = _fit(plan, captures, numbers, describe)
+    outcome = plan.settings.run_batch(engine, captures, numbers, seed, describe)
     return Block(
         numbers=np.asarray(numbers),
         truth=truth,
@@ -210,11 +195,11 @@ def fit_block(plan: Plan, numbers: np.ndarray) -> Block:
         mean=marginals.mean,
         sd=marginals.sd,
         quantiles={name: np.moveaxis(x, 0, 1) for name, x in marginals.quantiles.items()},
+        outcome=outcome,
         fresh=ranked.fresh if ranked else {},
         left_out=ranked.left_out if ranked else {},
         left_out_k=ranked.left_out_k if ranked else {},
         entry=ranked.entry if ranked else {},
-        outcome=outcome,
     )
 
 
@@ -231,23 +216,207 @@ def cut(numbers: np.ndarray, size: int) -> list[np.ndarray]:
     return [part for part in np.split(numbers, ends) if part.size]
 
 
-def _fit(
-    plan: Plan, captures: ObservationBatch, numbers: np.ndarray, describe: Describe
-) -> Outcome:
-    """Fits of captures by what the settings say."""
-    engine: Any = plan.compiled.model if plan.is_sequential else plan.compiled.batch_engine
-    return plan.settings.run_batch(engine, captures, numbers, plan.request.seed, describe)
-
-
-def _thinning(settings: Method) -> int:
-    """Every how many draws of a chain one is ranked."""
-    if isinstance(settings, PixelNuts):
-        return max(1, settings.chains * settings.draws // RANKED)
-    return 1
-
-
 def _shapes(program: Program, data: Observations) -> dict[str, tuple[int, ...]]:
     """Of the parameters of a model, in the order of their names."""
     with jax.enable_x64(True), TRACING_LOCK:
         found = jax.eval_shape(program.parameters, jnp.zeros(program.size), data)
     return {name: found[name].shape for name in sorted(found)}
+
+
+# --- Captures drawn from a model: parameters from the prior, readings from the links --------------
+
+_SIMULATORS: LRUCache[Callable] = LRUCache(4)
+_READERS: LRUCache[Callable] = LRUCache(4)
+
+
+class Simulations(NamedTuple):
+    """True parameters, and the captures simulated from them."""
+
+    truth: Values
+    captures: ObservationBatch
+
+
+def draw_captures(
+    program: Program, data: Observations, numbers: np.ndarray, key: Array
+) -> Simulations:
+    """Simulate captures by their numbers, with the layout, stated errors and masks of `data`."""
+    # Where intensity is recorded, each capture's own brightness sets its noise, and readings at
+    # full scale are saturated.
+    simulate = _SIMULATORS.of(program, lambda: _simulator(program))
+    found = simulate(jnp.asarray(numbers, np.uint32), key, data)
+    truth, recorded = jax.tree.map(np.asarray, found)
+    return Simulations(truth, _batch(data, recorded))
+
+
+def redraw_readings(
+    program: Program, data: Observations, drawn: Simulations, numbers: np.ndarray, key: Array
+) -> Values:
+    """Draw the readings of the same true parameters once more."""
+    read = _READERS.of(program, lambda: _reader(program))
+    captures = drawn.captures
+    found = read(np.asarray(numbers, np.uint32), key, data, captures.batched, captures.static)
+    return jax.tree.map(np.asarray, found)
+
+
+def _simulator(program: Program) -> Callable[[Array, Array, Observations], tuple[Values, tuple]]:
+    """Compiled: parameters and readings of many captures."""
+
+    def simulate(number: Array, key: Array, data: Observations) -> tuple[Values, tuple]:
+        key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
+        z = program.from_prior(key_truth, data)
+        draw = program.describe(key_noise, z, data)
+        recorded = _recorded(data, draw.predictive)
+        if "intensity" in program.observed:  # the noise of the other readings may follow it
+            others = program.describe(key_noise, z, recorded).predictive
+            recorded = _recorded(data, {**others, "intensity": draw.predictive["intensity"]})
+        return draw.parameters, (recorded.readings, recorded.brightness, recorded.saturated)
+
+    return JitOnce(
+        lambda numbers, key, data: jax.lax.map(lambda number: simulate(number, key, data), numbers)
+    )
+
+
+def _reader(program: Program) -> Callable[..., Values]:
+    """Compiled: further readings of the true parameters of many captures."""
+
+    def read_all(
+        numbers: Array, key: Array, data: Observations, own: Observations, shared: Observations
+    ) -> Values:
+        def read(at: tuple[Array, Observations]) -> Values:
+            number, capture = at
+            key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
+            z = program.from_prior(key_truth, data)
+            key_noise = jax.random.fold_in(key_noise, 1)
+            return program.describe(key_noise, z, eqx.combine(capture, shared)).predictive
+
+        return jax.lax.map(read, (numbers, own))
+
+    return JitOnce(read_all)
+
+
+def _recorded(data: Observations, readings: Mapping[str, Any]) -> Observations:
+    """A capture with other readings; where a view is not valid, those of `data` remain."""
+    valid = {n: jnp.where(data.valid, x, data.readings[n]) for n, x in readings.items()}
+    capture = dataclasses.replace(data, readings={**data.readings, **valid})
+    if "intensity" not in valid:
+        return capture
+    return dataclasses.replace(
+        capture,
+        brightness=jnp.clip(valid["intensity"], 0.0, 1.0),
+        saturated=data.valid & (valid["intensity"] >= data.full_scale),
+    )
+
+
+def _batch(data: Observations, recorded: tuple) -> ObservationBatch:
+    """Captures as a batch: what was drawn and the masks differ, all else is the same."""
+
+    def drawn(capture: Observations) -> tuple:
+        return capture.readings, capture.brightness, capture.saturated, capture.valid
+
+    shape = (len(recorded[1]), *data.shape)
+    recorded = jax.tree.map(lambda x: np.broadcast_to(x, shape), recorded)
+    valid = np.broadcast_to(np.asarray(data.valid), shape)
+    plain = jax.tree.map(np.asarray, data)
+    is_drawn = eqx.tree_at(
+        drawn, jax.tree.map(lambda _: False, plain), jax.tree.map(lambda _: True, drawn(plain))
+    )
+    own, shared = eqx.partition(eqx.tree_at(drawn, plain, (*recorded, valid)), is_drawn)
+    views = valid.reshape(shape[0], -1, shape[-1]).any(axis=1).sum(axis=-1)
+    return ObservationBatch(own, shared, views)
+
+
+# --- Blocks on the disk ---------------------------------------------------------------------------
+
+LEDGER, BLOCK_FILE = "ledger", "[0-9]*-[0-9]*.npz"
+LIBRARIES = ("polar_bayes", "jax", "jaxlib", "numpyro", "numpy", "scipy")
+
+
+@contextlib.contextmanager
+def open_store(folder: Path, plan: CalibrationPlan, *, resume: bool) -> Iterator["BlockStore"]:
+    """The blocks of a calibration in a folder, which is made, or read where it is resumed."""
+    where = str(folder)
+    if not resume and folder.exists():
+        raise FitError("it is there already", where=where, hint=f"{OTHER_OUT}, or --resume")
+    with written(folder, FitError):
+        folder.mkdir(exist_ok=resume)
+        others = [path for path in folder.iterdir() if not path.match(BLOCK_FILE)]
+    names = [path.name for path in others if not path.name.startswith(TEMPORARY_PREFIX)]
+    if names and LEDGER not in names:
+        raise FitError("it holds no calibration", where=where, hint=OTHER_OUT)
+    ledger_of_plan = folder / LEDGER, folder, "calibration", fingerprint_of(plan)
+    with (
+        locked_ledger(*ledger_of_plan, resume=True) as ledger,
+        on_interrupt(lambda: resume_hint(folder)),
+    ):
+        with written(folder, FitError):
+            ledger.read()
+            ledger.begin()
+        yield BlockStore(folder, ledger)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BlockStore:
+    """A folder of blocks, each in a file that is there whole or not at all."""
+
+    folder: Path
+    ledger: Ledger
+
+    def blocks(self) -> list[Block]:
+        """The finished blocks; those whose files are lost or damaged are fitted again."""
+        paths = {label: self.folder / f"{label}.npz" for label in sorted(self.ledger.entries)}
+        return [_read(path) for label, path in paths.items() if self.ledger.holds(label, [path])]
+
+    def add(self, block: Block) -> None:
+        """Write a block; arrays are named by their path, such as `pit/roughness`."""
+        label = f"{block.numbers.min():08d}-{block.numbers.max():08d}"
+        path = self.folder / f"{label}.npz"
+        arrays = {
+            jax.tree_util.keystr(at, simple=True, separator="/"): np.asarray(x)
+            for at, x in jax.tree_util.tree_leaves_with_path(block)
+        }
+        with written(self.folder, FitError), temporary_folder(self.folder) as unfinished:
+            np.savez(unfinished / path.name, allow_pickle=False, **arrays)
+            replace_file(unfinished / path.name, path)
+            self.ledger.add(label, Entry(digest(block.numbers), digest_files([path])))
+
+
+def _read(path: Path) -> Block:
+    parts: dict[str, Any] = {name: {} for name in Block._fields}
+    with np.load(path, allow_pickle=False) as file:
+        for key, values in file.items():
+            name, _, entry = key.partition("/")
+            if entry:
+                parts[name][entry] = values
+            else:
+                parts[name] = values
+    return Block(**{**parts, "outcome": Outcome(**parts["outcome"])})
+
+
+def fingerprint_of(plan: CalibrationPlan) -> dict[str, str]:
+    """One text per topic that determines the fits; their number may differ between runs."""
+    truth = _topics(plan.generative_request) if plan.generative_request is not None else {}
+    data = plan.compiled.data
+    return {
+        "capture": digest(jax.tree.leaves(data), data.dims, tuple(data.readings)),
+        **_topics(plan.request),
+        "truth": " ".join(f"{topic}: {text}" for topic, text in truth.items()),
+        "method": repr(plan.settings),
+        "seed": str(plan.request.seed),
+        "readings": str(plan.readings),
+        VERSIONS: " ".join(f"{name} {version(name)}" for name in LIBRARIES),
+    }
+
+
+def _topics(request: Request) -> dict[str, str]:
+    priors = (
+        f"{name}={describe_prior(prior)} {digest(prior)}"
+        for name, prior in sorted(request.priors.items())
+    )
+    links = (f"{name}={link!r}" for name, link in sorted(request.links.items()))
+    return {
+        "model": f"{request.model_name} {digest(request.model, request.fixed)}",
+        "scene": ADDRESS.sub("", repr(request.scene)),
+        "priors": ", ".join(priors),
+        "links": ADDRESS.sub("", ", ".join(links)),
+        "largest_view_zenith": repr(request.largest_view_zenith),
+    }

@@ -1,4 +1,4 @@
-"""Tables of a calibration, and the sentences that state what they mean."""
+"""What a calibration holds in a file, its tables, and the sentences that state what they mean."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -9,7 +9,6 @@ import scipy.special
 import scipy.stats
 import xarray as xr
 
-from polar_bayes.calibration.files import check_calibration
 from polar_bayes.calibration.scores import (
     FALSE_ALARMS,
     is_calibrated,
@@ -19,9 +18,85 @@ from polar_bayes.calibration.scores import (
 from polar_bayes.diagnostics.coverage import INTERVALS, coverage_columns
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_result import Status
-from polar_bayes.inference.psis import MAX_PARETO_K
+from polar_bayes.inference.batching import Status
+from polar_bayes.inference.files import (
+    ANY,
+    COMMON_PROVENANCE,
+    EACH,
+    FLAGS,
+    TEXT,
+    Group,
+    Like,
+    Schema,
+)
+from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
+
+# --- Schema ---------------------------------------------------------------------------------------
+
+_SIMULATION = ("simulation",)
+_RANKS = Group(_SIMULATION, extra_dims=False)
+
+CALIBRATION = Schema(
+    kind="calibration",
+    made_by="polar_bayes.calibrate or load",
+    command="`polar-bayes calibrate`",
+    groups={
+        "prior_sbc": Group(_SIMULATION, required=True),
+        "truth": Group(_SIMULATION, required=True, like=Like("prior_sbc", {"": ()}, required=True)),
+        "marginals": Group(
+            _SIMULATION,
+            required=True,
+            variables={"quantile": ("quantile",)},
+            like=Like(
+                "prior_sbc",
+                {"": (), "_sd": (), "_crps": (), "_quantile": ("quantile",)},
+                required=True,
+            ),
+        ),
+        "fits": Group(
+            required=True,
+            variables={"status": _SIMULATION},
+            kinds={"status": FLAGS, "approach": FLAGS},
+            names=("status", "approach", "effective_draws", "pareto_k"),
+            dims=_SIMULATION,
+            extra_dims=False,
+            variable_attributes={"flag_meanings?": TEXT},
+        ),
+        "predictive_pit": _RANKS,
+        "loo_pit": Group(
+            _SIMULATION, extra_dims=False, like=Like("predictive_pit", {"": ()}, required=True)
+        ),
+        "readings": Group(
+            _SIMULATION,
+            extra_dims=False,
+            like=Like("predictive_pit", {"_pareto_k": ()}, required=True),
+        ),
+    },
+    provenance={**COMMON_PROVENANCE, "truth?": {EACH: ANY}, "readings_told?": TEXT},
+)
+
+
+def is_calibration(tree: object) -> bool:
+    """Whether a tree is what `polar_bayes.calibrate` returns."""
+    return CALIBRATION.describes(tree)
+
+
+def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
+    """Refuse what is no calibration, or does not hold together."""
+    CALIBRATION.check(tree, source)
+    levels = tree["marginals"].to_dataset()["quantile"].to_numpy().tolist()
+    if missing := [level for level in LEVELS if levels.count(level) != 1]:
+        what = f"the level {missing[0]} is not there once"
+        hint = f"give the tree as {CALIBRATION.made_by} returned it"
+        raise FitError(what, where=f"{source}: marginals/quantile", hint=hint)
+    groups = {"predictive_pit", "loo_pit", "readings"}
+    if (there := groups & set(tree.children)) and there != groups:
+        hint = f"give the tree as {CALIBRATION.made_by} returned it, or drop {min(there)}"
+        raise FitError(f"it has no group {min(groups - there)}", where=source, hint=hint)
+
+
+# --- Tables ---------------------------------------------------------------------------------------
 
 MOST_UNTRUSTED = 0.5
 """Share of fits that are not trusted above which their ranks do not judge the model."""
@@ -35,31 +110,19 @@ READING_TESTS = {"predictive_pit": "fresh", "loo_pit": "left out"}
 
 
 def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
-    """One row for each parameter of a calibration.
-
-    Args:
-        calibration: What `polar_bayes.calibrate` returns.
-
-    Returns:
-        Columns `answered` and `failed` (fits); `p_value` of uniform ranks; `rank_mean` (a half
-        where the posterior is neither too high nor too low) and `rank_spread` (one where it is
-        neither too narrow, above, nor too wide); for 50, 80 and 95%, as `held_50`, the share of all
-        fits whose interval holds the truth, failed ones counted as misses, with its 95% interval
-        `_low` and `_high` (Wilson's); `width_95`, mean width of the 95% interval; `crps`, mean
-        continuous ranked probability score.
-
-    Raises:
-        FitError: It is no calibration.
-    """
+    """One row for each parameter of a calibration."""
+    # Columns: `answered` and `failed` fits; `p_value` of uniform ranks; `rank_mean` (a half where
+    # the posterior is neither too high nor too low) and `rank_spread` (above one: too narrow); for
+    # 50, 80 and 95%, as `held_50`, the share of all fits whose interval holds the truth, failed
+    # ones counted as misses, with Wilson's 95% interval; `width_95`, mean width of the 95%
+    # interval; `crps`, mean continuous ranked probability score.
     found = calibration_scalars(calibration, "prior_sbc")
     truths = {each.label: each.draws[0] for each in calibration_scalars(calibration, "truth")}
     marginals = calibration["marginals"].to_dataset()
     if any(each.label not in truths for each in found):
-        raise FitError(
-            "its labels are not those of prior_sbc",
-            where="calibration: truth",
-            hint="give what polar_bayes.calibrate returned",
-        )
+        what = "its labels are not those of prior_sbc"
+        hint = "give what polar_bayes.calibrate returned"
+        raise FitError(what, where="calibration: truth", hint=hint)
     rows = {each.label: _parameter_row(each, truths[each.label], marginals) for each in found}
     return pd.DataFrame.from_dict(rows, orient="index")
 
@@ -126,11 +189,8 @@ def calibration_readings(calibration: xr.DataTree) -> pd.DataFrame:
     """
     check_calibration(calibration)
     if not holds_readings(calibration):
-        raise FitError(
-            "it holds no ranks of readings",
-            where="calibration",
-            hint="give what polar_bayes.calibrate returns with readings=True",
-        )
+        hint = "give what polar_bayes.calibrate returns with readings=True"
+        raise FitError("it holds no ranks of readings", where="calibration", hint=hint)
     rows = {}
     for name in map(str, calibration["predictive_pit"].data_vars):
         pareto_k = calibration["readings"][f"{name}_pareto_k"].to_numpy()
@@ -164,19 +224,7 @@ def reading_ranks(calibration: xr.DataTree) -> dict[str, np.ndarray]:
 
 
 def calibration_verdict(calibration: xr.DataTree) -> list[str]:
-    """The result of a calibration, in sentences.
-
-    Args:
-        calibration: What `polar_bayes.calibrate` returns.
-
-    Returns:
-        First whether the ranks pass, then each parameter that does not pass and how it deviates,
-        then the fits that failed (and advice where most are not trusted), then the result for
-        readings, which are tested separately.
-
-    Raises:
-        FitError: It is no calibration.
-    """
+    """The result of a calibration, in sentences; readings, which are tested separately, last."""
     table = calibration_table(calibration)
     passed = is_calibrated(table)
     count = int(table["answered"].max() + table["failed"].min())
@@ -306,11 +354,9 @@ def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFram
     (first, expected), *others = tables.items()
     for name, table in others:
         if set(table.index) != set(expected.index):
-            raise FitError(
-                f"it has other parameters than {first}",
-                where=f"compare_calibrations: {name}",
-                hint="calibrate the same model on the same layout",
-            )
+            what = f"it has other parameters than {first}"
+            hint = "calibrate the same model on the same layout"
+            raise FitError(what, where=f"compare_calibrations: {name}", hint=hint)
     level = significance_level(expected)
     rows = {}
     for scalar in calibration_scalars(calibrations[first], "truth"):

@@ -104,11 +104,8 @@ def _check_variables(label: str, capture: xr.Dataset, first: str, pattern: xr.Da
         for attribute in ("units", "saturation_level"):
             own, other = (each[name].attrs.get(attribute) for each in (capture, pattern))
             if own != other:
-                raise CaptureError(
-                    f"{attribute} of {name} is {_text(own)}, that of {first} {_text(other)}",
-                    where=where,
-                    hint=f"bring both to one, or {drop}",
-                )
+                what = f"{attribute} of {name} is {_text(own)}, that of {first} {_text(other)}"
+                raise CaptureError(what, where=where, hint=f"bring both to one, or {drop}")
 
 
 def _check_labels(label: str, capture: xr.Dataset, first: str, pattern: xr.Dataset) -> None:
@@ -119,11 +116,8 @@ def _check_labels(label: str, capture: xr.Dataset, first: str, pattern: xr.Datas
             hint = f"drop the label with drop_vars({name!r})"
             if name == WAVELENGTH.name:
                 hint = "give captures of the same wavelengths, or select those that all have"
-            raise CaptureError(
-                f"{name} is {_text(own)}, that of {first} {_text(other)}",
-                where=f"combine: {label}",
-                hint=hint,
-            )
+            what = f"{name} is {_text(own)}, that of {first} {_text(other)}"
+            raise CaptureError(what, where=f"combine: {label}", hint=hint)
 
 
 def _text(value: Any) -> str:

@@ -35,11 +35,8 @@ def read_netcdf[Data: (xr.Dataset, xr.DataTree)](
     except OSError as error:
         raise system_error(error, file) from error
     if not is_whole:
-        raise type(broken)(
-            "its checksum is wrong: the file was damaged after it was written",
-            where=str(file),
-            hint="restore it from a copy, or make it again",
-        )
+        what = "its checksum is wrong: the file was damaged after it was written"
+        raise type(broken)(what, where=str(file), hint="restore it from a copy, or make it again")
     try:
         with open_netcdf(kind, file) as opened:
             return opened.load()

@@ -124,6 +124,14 @@ CONTRACT = (
 WAVELENGTH = Variable("wavelength", "label", "nm", POSITIVE, "wavelength", NANOMETERS)
 
 
+def as_numbers(values: Any) -> np.ndarray:
+    """An array of float64; a single NaN in place of what is no array of numbers."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.asarray(np.nan)
+
+
 def nearest_name(name: object, known: Sequence[str]) -> str | None:
     """The known name most similar to this one; None where it is known, or names a truth."""
     if name in known or (isinstance(name, str) and TRUTH.fullmatch(name)):
@@ -169,11 +177,9 @@ def clean_attributes(attributes: Mapping[Any, Any], where: str) -> dict[str, str
     # become text.
     for name in attributes:
         if not isinstance(name, str) or not NAME.fullmatch(name) or name in RESERVED:
-            raise CaptureError(
-                f"the attribute name {name!r} cannot be stored",
-                where=where,
-                hint="rename it: a letter, then letters, digits or any of _ . + -",
-            )
+            what = f"the attribute name {name!r} cannot be stored"
+            hint = "rename it: a letter, then letters, digits or any of _ . + -"
+            raise CaptureError(what, where=where, hint=hint)
     return {
         name: _clean_value(value, f"{where}: attribute {name}")
         for name, value in attributes.items()
@@ -188,11 +194,8 @@ def _clean_value(value: object, where: str) -> str | int | float:
     if isinstance(value, int) and not isinstance(value, bool):
         return int(value) if -(2**63) <= value < 2**63 else str(value)
     if array.dtype.kind not in "biufSU":
-        raise CaptureError(
-            f"the value is a {type(value).__name__}, neither a number nor text",
-            where=where,
-            hint="give a number or text, for instance JSON",
-        )
+        what = f"the value is a {type(value).__name__}, neither a number nor text"
+        raise CaptureError(what, where=where, hint="give a number or text, for instance JSON")
     item = value if isinstance(value, str | bytes) else array.tolist()
     if isinstance(item, bytes):
         item = item.decode("utf-8", "backslashreplace")
@@ -213,7 +216,7 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
 
     Canonical: float64 numbers, boolean flags, dims in the order (leading..., view[, wavelength]),
     `units` and `long_name` of the contract, attributes of text and numbers only. No number is
-    changed and none is dropped. Readings in entries marked `valid=False` are not looked at: they
+    changed and none is dropped. Readings in entries marked `valid=False` are not checked: they
     may be NaN. A second call changes nothing.
 
     Args:
@@ -221,7 +224,7 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
         source: Its name in errors, for instance the file.
 
     Returns:
-        A new dataset; the given one is left alone.
+        A new dataset; the given one is not changed.
 
     Raises:
         CaptureError: The first departure from the contract, with its variable and index.
@@ -232,10 +235,17 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
     _check_names(dataset, source)
     layout = _layout(dataset, source)
     present = [row for row in CONTRACT if row.name in dataset]
-    flags = {row.name: _flag(dataset, row, layout, source) for row in present if row.kind == "flag"}
-    valid = _valid_entries(dataset, flags, layout, source)
+    flags = {
+        row.name: _entries(dataset, row, layout, source) for row in present if row.kind == "flag"
+    }
+    valid = np.ones([dataset.sizes[dim] for dim in layout.readings], dtype=bool)
+    if "valid" in flags:
+        valid = flags["valid"].values
+    if not valid.any():
+        hint = "mark what was measured valid=True"
+        raise CaptureError("every view is masked", where=f"{source}: valid", hint=hint)
     numbers = {
-        row.name: _numbers(dataset, row, layout, valid, source)
+        row.name: _entries(dataset, row, layout, source, valid)
         for row in present
         if row.kind != "flag"
     }
@@ -269,11 +279,9 @@ def _check_names(dataset: xr.Dataset, source: str) -> None:
     known = [*(row.name for row in CONTRACT), WAVELENGTH.name, *LABELS]
     for name in dataset.variables:
         if near := nearest_name(name, known):
-            raise CaptureError(
-                "a capture has no such variable",
-                where=f"{source}: {name}",
-                hint=f"rename it (nearest known name: {near}), call it true_<name> or drop it",
-            )
+            what = "a capture has no such variable"
+            hint = f"rename it (nearest known name: {near}), call it true_<name> or drop it"
+            raise CaptureError(what, where=f"{source}: {name}", hint=hint)
     for row in CONTRACT:
         if row.kind == "geometry" and row.name not in dataset:
             hint = f"add {row.name} in degree, with dim view"
@@ -292,11 +300,8 @@ def _layout(dataset: xr.Dataset, source: str) -> Layout:
     rest = [dim for dim in dims if dim not in ("view", "wavelength")]
     leading = next((option for option in LEADING if _same_dims(rest, option)), None)
     if leading is None or "view" not in dims or len(set(dims)) != len(dims):
-        raise CaptureError(
-            f"its dims are {_dims_text(dims)}",
-            where=f"{source}: {name}",
-            hint="use view[, wavelength], alone or behind material, patch, or y and x together",
-        )
+        hint = "use view[, wavelength], alone or behind material, patch, or y and x together"
+        raise CaptureError(f"its dims are {_dims_text(dims)}", where=f"{source}: {name}", hint=hint)
     for dim in dims:
         if dataset.sizes[dim] == 0:
             hint = f"give at least one {dim}"
@@ -313,11 +318,9 @@ def _ordered(variable: xr.Variable, row: Variable, layout: Layout, source: str) 
     for dims in options:
         if _same_dims(variable.dims, dims):
             return variable.transpose(*dims)
-    raise CaptureError(
-        f"its dims are {_dims_text(variable.dims)}",
-        where=f"{source}: {row.name}",
-        hint=f"give it {' or '.join(_dims_text(dims) for dims in options)}",
-    )
+    what = f"its dims are {_dims_text(variable.dims)}"
+    hint = f"give it {' or '.join(_dims_text(dims) for dims in options)}"
+    raise CaptureError(what, where=f"{source}: {row.name}", hint=hint)
 
 
 def _same_dims(dims: Sequence[Hashable], wanted: Sequence[str]) -> bool:
@@ -328,50 +331,28 @@ def _dims_text(dims: Sequence[Hashable]) -> str:
     return f"({', '.join(map(str, dims))})"
 
 
-def _flag(dataset: xr.Dataset, row: Variable, layout: Layout, source: str) -> xr.Variable:
-    variable = _ordered(dataset[row.name].variable, row, layout, source)
-    values = variable.values
-    if values.dtype.kind != "b":  # netCDF has no truth values, so 0 and 1 stand for them
-        values = _floats(values, f"{source}: {row.name}")
-        _check_values(values, row, variable.dims, source, np.isin(values, (0.0, 1.0)))
-    return xr.Variable(variable.dims, values.astype(bool), _attributes(variable, row, source))
-
-
-def _valid_entries(
-    dataset: xr.Dataset, flags: Mapping[str, xr.Variable], layout: Layout, source: str
-) -> np.ndarray:
-    """The `valid` flag, or all True; shaped like the readings."""
-    if "valid" not in flags:
-        return np.ones([dataset.sizes[dim] for dim in layout.readings], dtype=bool)
-    valid = flags["valid"].values
-    if not valid.any():
-        hint = "mark what was measured valid=True"
-        raise CaptureError("every view is masked", where=f"{source}: valid", hint=hint)
-    return valid
-
-
-def _numbers(
-    dataset: xr.Dataset, row: Variable, layout: Layout, valid: np.ndarray, source: str
+def _entries(
+    dataset: xr.Dataset,
+    row: Variable,
+    layout: Layout,
+    source: str,
+    valid: np.ndarray | bool = True,
 ) -> xr.Variable:
+    """A variable of the contract in canonical form; readings that are not valid are not checked."""
     variable = _ordered(dataset[row.name].variable, row, layout, source)
-    values = _floats(variable.values, f"{source}: {row.name}")
-    inside = row.range.contains(values)
-    allowed = inside | ~valid if row.kind == "reading" else inside
-    _check_values(values, row, variable.dims, source, allowed)
+    values, is_flag = variable.values, row.kind == "flag"
+    if not is_flag or values.dtype.kind != "b":  # netCDF has no truth values, only 0 and 1
+        values = _floats(values, f"{source}: {row.name}")
+        allowed = np.isin(values, (0.0, 1.0)) if is_flag else row.range.contains(values)
+        if row.kind == "reading":
+            allowed = allowed | np.logical_not(valid)
+        if not allowed.all():
+            index = np.unravel_index(np.argmin(allowed), allowed.shape)
+            where = f"{source}: {_entry(row.name, variable.dims, index)}"
+            what = f"{values[index]:g} is outside {row.range}"
+            raise CaptureError(what, where=where, hint=row.hint)
+    values = values.astype(bool) if is_flag else values
     return xr.Variable(variable.dims, values, _attributes(variable, row, source))
-
-
-def _check_values(
-    values: np.ndarray, row: Variable, dims: Sequence[Hashable], source: str, allowed: np.ndarray
-) -> None:
-    if allowed.all():
-        return
-    index = np.unravel_index(np.argmin(allowed), allowed.shape)
-    raise CaptureError(
-        f"{values[index]:g} is outside {row.range}",
-        where=f"{source}: {_entry(row.name, dims, index)}",
-        hint=row.hint,
-    )
 
 
 def _check_polarization(
@@ -425,20 +406,13 @@ def _floats(values: np.ndarray, where: str) -> np.ndarray:
 def _labels(dataset: xr.Dataset, layout: Layout, source: str) -> dict[str, xr.Variable]:
     """Coordinates named after a dim, along it or as the one label that selection leaves."""
     labels = {}
-    for name in (*LABELS, WAVELENGTH.name):
-        if name not in dataset.variables:
-            continue
-        row = (
-            WAVELENGTH if name == WAVELENGTH.name else Variable(name, "label", None, UNIT, name, "")
-        )
+    for name in (name for name in LABELS if name in dataset.variables):
+        row = Variable(name, "label", None, UNIT, name, "")
         variable = _ordered(dataset[name].variable, row, layout, source)
-        where = f"{source}: {name}"
-        if row is WAVELENGTH:
-            values = _floats(variable.values, where)
-            _check_values(values, row, variable.dims, source, row.range.contains(values))
-        else:
-            values = _label_values(variable.values, where)
+        values = _label_values(variable.values, f"{source}: {name}")
         labels[name] = xr.Variable(variable.dims, values, _attributes(variable, row, source))
+    if WAVELENGTH.name in dataset.variables:
+        labels[WAVELENGTH.name] = _entries(dataset, WAVELENGTH, layout, source)
     return labels
 
 
@@ -488,11 +462,9 @@ def _check_intensity_units(numbers: dict[str, xr.Variable], source: str) -> None
     if error["units"] == "arbitrary":
         error["units"] = intensity["units"]
     if error["units"] != intensity["units"]:
-        raise CaptureError(
-            f"its units are {error['units']!r}, those of intensity {intensity['units']!r}",
-            where=f"{source}: intensity_error",
-            hint="give both in the same units",
-        )
+        what = f"its units are {error['units']!r}, those of intensity {intensity['units']!r}"
+        hint = "give both in the same units"
+        raise CaptureError(what, where=f"{source}: intensity_error", hint=hint)
 
 
 def _entry(name: str, dims: Sequence[Hashable], index: Sequence[int | np.intp]) -> str:

@@ -185,7 +185,7 @@ def image_options(function: Callable) -> Callable:
 def polarizer(frames: tuple[tuple[float, Path], ...], out: Path, **options: Any) -> None:
     """Import frames behind a polarizer at three or more angles."""
     angles, files = [angle for angle, _ in frames], [file for _, file in frames]
-    _save_image(pb.from_polarizer(files, angles, **_image_arguments(**options)), out)
+    _save_image(pb.from_polarizer(files, angles, **_image_arguments(options)), out)
 
 
 @import_.command(cls=Command)
@@ -199,7 +199,7 @@ def polarizer(frames: tuple[tuple[float, Path], ...], out: Path, **options: Any)
 def mosaic(frame: Path, layout: tuple[float, ...], out: Path, **options: Any) -> None:
     """Import one raw frame of a polarization camera."""
     rows = layout[:2], layout[2:]
-    _save_image(pb.from_mosaic(frame, layout=rows, **_image_arguments(**options)), out)
+    _save_image(pb.from_mosaic(frame, layout=rows, **_image_arguments(options)), out)
 
 
 def _save_image(capture: Any, out: Path) -> None:
@@ -214,44 +214,30 @@ def _save_image(capture: Any, out: Path) -> None:
         click.echo(f"masked: {masked}")
 
 
-def _image_arguments(
-    *,
-    spheres: tuple[tuple[float, ...], ...],
-    rims: tuple[Path, ...],
-    normals: Path | None,
-    light: tuple[float, ...] | None,
-    light_position: tuple[float, ...] | None,
-    highlight: tuple[float, ...] | None,
-    surroundings: bool,
-    view_position: tuple[float, ...] | None,
-    dark: Path | None,
-    dark_level: float | None,
-    **options: Any,
-) -> dict[str, Any]:
+def _image_arguments(options: dict[str, Any]) -> dict[str, Any]:
     """Arguments of an import from the options of a command."""
+    pop = options.pop
+    dark, dark_level = pop("dark"), pop("dark_level")
     if dark is not None and dark_level is not None:
         raise click.UsageError("--dark and --dark-level exclude each other")
-    outlines = (
-        *(pb.importers.Sphere(*each) for each in spheres),
-        *map(pb.importers.fit_sphere, rims),
-    )
     detector = {
-        field.name: options.pop(field.name)
+        field.name: pop(field.name)
         for field in dataclasses.fields(pb.importers.Detector)
         if field.name != "dark"
     }
-    if view_position:
-        options["view"] = pb.importers.Position(*view_position)
+    spheres = [pb.importers.Sphere(*each) for each in pop("spheres")]
+    outlines = (*spheres, *map(pb.importers.fit_sphere, pop("rims")))
+    lights = {
+        "--light": (light := pop("light")) and pb.importers.Direction(*light),
+        "--light-position": (at := pop("light_position")) and pb.importers.Position(*at),
+        "--highlight": (pixel := pop("highlight")) and pb.importers.Highlight(*pixel),
+        "--surroundings": pb.importers.Surroundings() if pop("surroundings") else None,
+    }
+    if camera := pop("view_position"):
+        options["view"] = pb.importers.Position(*camera)
     return {
-        "shape": _only_one({"--sphere or --rim": outlines, "--normals": normals}),
-        "light": _only_one(
-            {
-                "--light": light and pb.importers.Direction(*light),
-                "--light-position": light_position and pb.importers.Position(*light_position),
-                "--highlight": highlight and pb.importers.Highlight(*highlight),
-                "--surroundings": pb.importers.Surroundings() if surroundings else None,
-            }
-        ),
+        "shape": _only_one({"--sphere or --rim": outlines, "--normals": pop("normals")}),
+        "light": _only_one(lights),
         "detector": pb.importers.Detector(dark=dark or dark_level or 0.0, **detector),
         **options,
     }

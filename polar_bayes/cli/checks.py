@@ -59,24 +59,21 @@ def calibrate(
         data, readings=not no_readings, store=store, resume=resume, **settings
     )
     pb.save(calibration, out)
-    table, verdict = (
-        pb.summary(calibration),
-        pb.verdict(calibration).sentences,
-    )
+    table, verdict = pb.summary(calibration), pb.verdict(calibration)
     tables = {"parameters": table}
     if "predictive_pit" in calibration.children:
         tables["readings"] = pb.calibration.calibration_readings(calibration)
     if as_json:
         rows = {name: json_rows(each) for name, each in tables.items()}
-        print_json({**rows, "verdict": verdict})
+        print_json({**rows, "verdict": verdict.sentences})
     else:
         columns = ["answered", "failed", "p_value", "held_50", "held_80", "held_95", "crps"]
         print_frame(table[columns])
         if "readings" in tables:
             click.echo()
             print_frame(tables["readings"].drop(columns=["reading", "test"]))
-        click.echo("\n".join(["", *verdict]))
-    return 0 if pb.calibration.is_calibrated(table) else NOT_CONVERGED
+        click.echo("\n".join(["", *verdict.sentences]))
+    return 0 if verdict.passed else NOT_CONVERGED
 
 
 @command()
@@ -107,32 +104,16 @@ def identify(
 ) -> None:
     """Which parameters a capture determines, which trade off, and where to look next."""
     data = pb.load_capture(capture)
-    found = {}
     with stages() as progress:
         settings["progress"] = progress
-        study = pb.identify(data, **settings)
-        found["parameters"] = (
-            pb.summary(study),
-            pb.verdict(study).sentences,
-        )
+        results = {"parameters": pb.identify(data, **settings)}
         for name in profiled:
-            curve = pb.profile(data, name, **settings)
-            found[f"profile of {name}"] = (
-                pb.summary(curve),
-                pb.verdict(curve).sentences,
-            )
+            results[f"profile of {name}"] = pb.profile(data, name, **settings)
         if count is not None:
-            letters = {"D": pb.design.DOptimal, "A": pb.design.AOptimal}
-            goal = (
-                letters[criterion]()
-                if criterion in letters
-                else pb.design.SingleParameter(criterion)
-            )
-            views = pb.next_views(data, count=count, criterion=goal, **settings)
-            found["next views"] = (
-                pb.summary(views),
-                pb.verdict(views).sentences,
-            )
+            goals = {"D": pb.design.DOptimal(), "A": pb.design.AOptimal()}
+            goal = goals.get(criterion) or pb.design.SingleParameter(criterion)
+            results["next views"] = pb.next_views(data, count=count, criterion=goal, **settings)
+    found = {name: (pb.summary(each), pb.verdict(each).sentences) for name, each in results.items()}
     if as_json:
         rows: dict[str, Any] = {name: json_rows(table) for name, (table, _) in found.items()}
         for name, (_, sentences) in found.items():

@@ -188,11 +188,15 @@ def _with_setup(capture: Any, setup: str | None) -> Any:
 @option("--truth", type=INPUT, help="Of a map: its simulated capture.")
 @option("--uncorrected", type=INPUT, help="With --truth: the same map without weights, to compare.")
 @option(
-    "--beside", type=INPUT, multiple=True,
+    "--compare", "comparisons", type=INPUT, multiple=True,
     help="Of a calibration: another of the same layout; give it once for each.",
 )  # fmt: skip
 def report(
-    fit: Path, out: Path, truth: Path | None, uncorrected: Path | None, beside: tuple[Path, ...]
+    fit: Path,
+    out: Path,
+    truth: Path | None,
+    uncorrected: Path | None,
+    comparisons: tuple[Path, ...],
 ) -> None:
     """Write the standardized report of a fit, calibration, accuracy study, or map (.zarr)."""
     page = pb.report(
@@ -200,7 +204,7 @@ def report(
         out,
         truth=None if truth is None else pb.maps.open_capture(truth),
         uncorrected=None if uncorrected is None else pb.maps.open_map(uncorrected),
-        beside=_load_all(beside, "calibration") or None,
+        comparisons=_load_all(comparisons, "calibration") or None,
     )
     click.echo(f"report: {page}")
 

@@ -6,17 +6,16 @@ Option types refuse wrong values before anything is computed and before JAX is l
 import functools
 import json
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, override
 
 import click
-from rich.console import Console
-from rich.table import Table
 
 import polar_bayes as pb
 from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
 from polar_bayes.paths import as_path, check_output, refuse_inputs
+from polar_bayes.repr_html import Row, Table
 
 NOT_CONVERGED = 2
 """Exit status of a fit whose diagnostics fail."""
@@ -171,24 +170,10 @@ def json_rows(table: Any) -> dict[str, Any]:
     return json.loads(table.to_json(orient="index"))
 
 
-def print_frame(table: Any) -> None:
-    """Print a data frame."""
-    print_table(["", *table.columns], table.itertuples())
-
-
-def print_table(titles: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print rows whose first cell is their label; numbers with four digits, missing ones as -."""
-    grid = Table(box=None, pad_edge=False)
-    for number, title in enumerate(titles):
-        grid.add_column(title, justify="right" if number else "left")
-    for label, *cells in rows:
-        grid.add_row(str(label), *map(_text, cells))
-    # Rich would cut the table to 80 columns where the output is no terminal.
-    width = None if sys.stdout.isatty() else 1000
-    console = Console(width=width, markup=False, highlight=False, emoji=False)
-    with console.capture() as printed:
-        console.print(grid)
-    click.echo(printed.get(), nl=False)
+def print_frame(frame: Any) -> None:
+    """Print a data frame; numbers with four digits, missing ones as -."""
+    rows = (Row(str(label), tuple(map(_text, cells))) for label, *cells in frame.itertuples())
+    click.echo(Table(("", *frame.columns), tuple(rows)).to_text(sys.stdout))
 
 
 def _text(cell: Any) -> str:
@@ -202,11 +187,8 @@ def _text(cell: Any) -> str:
 def print_fit(result: Any) -> int:
     """Print a row per parameter, and the problems on the error stream; returns the exit status."""
     columns = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
-    rows = pb.diagnostics.json_summary(result)["parameters"]
-    print_table(
-        ["", "mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"],
-        [[name, *(row[column] for column in columns)] for name, row in rows.items()],
-    )
+    titles = ["mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"]
+    print_frame(pb.summary(result)[[*columns]].set_axis(titles, axis="columns"))
     return print_verdict(result)
 
 

@@ -28,7 +28,6 @@ import scipy.stats
 from jax.scipy.special import polygamma
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
-from numpyro import handlers
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Program
@@ -164,7 +163,9 @@ def reading_information(
     # The Jacobian and what is only evaluated come from one pass, so the optics run once.
     def with_aux(z: Array) -> tuple[dict[str, Array], dict[str, tuple]]:
         parameters, aux = {}, {}
-        for name, distribution in observation_distributions(program, z, data).items():
+        trace = program.trace(z, data)
+        for name in program.observed:
+            distribution = trace[name]["fn"]
             found = information(distribution)
             is_beta = isinstance(_unwrapped(distribution), MeanConcentrationBeta)
             parameters[name] = jnp.stack(found.parameters, axis=-1)
@@ -226,15 +227,6 @@ def paper_information(
         weighted_sum([jnp.asarray(each.concentration) for each in of_beta]),
         weighted_sum([each.information[..., 0, 0] for each in of_beta]),
     )
-
-
-def observation_distributions(
-    program: Program, z: Float[Array, " size"], data: Observations
-) -> dict[str, dist.Distribution]:
-    """The distribution of the readings of every observed variable at a point."""
-    fixed = handlers.substitute(program.model, data=program.constrain(z))
-    trace = handlers.trace(handlers.seed(fixed, jax.random.key(0))).get_trace(data)
-    return {name: trace[name]["fn"] for name in program.observed}
 
 
 # --- The precision of the prior -------------------------------------------------------------------

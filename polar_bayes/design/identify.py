@@ -1,6 +1,5 @@
 """Identifiability: which parameters, and which combinations of them, a capture determines."""
 
-import json
 from collections.abc import Callable, Mapping
 
 import jax
@@ -20,15 +19,14 @@ from polar_bayes.design.fisher import (
 )
 from polar_bayes.design.setup import (
     DesignProblem,
-    check_result,
     label_parameters,
     make_design_problem,
     parameter_vector,
     posterior_modes,
-    request_provenance,
+    provenance_attrs,
 )
 from polar_bayes.inference.compile import compiled
-from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.part import notation
@@ -84,10 +82,9 @@ def identify(
         Lehmann & Casella (1998), Theory of Point Estimation, section 2.6; the paper's sum:
         `polar_bayes.design.fisher`.
     """
+    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
     with jax.enable_x64(True):
-        problem = make_design_problem(
-            capture, model, scene, priors, links, largest_view_zenith, seed
-        )
+        problem = make_design_problem(request)
         return _identify_at(problem, posterior_modes(problem, progress).z[0])
 
 
@@ -153,8 +150,7 @@ def _identify_at(problem: DesignProblem, mode: np.ndarray) -> xr.Dataset:
     )
     for scalar in labels.scalars:
         dataset.attrs[f"meaning_of_{scalar.name}"] = notation(scalar.name).meaning
-    dataset.attrs[PROVENANCE] = json.dumps(request_provenance(problem.request), sort_keys=True)
-    return dataset
+    return dataset.assign_attrs(provenance_attrs(problem.request))
 
 
 # --- Table and sentences --------------------------------------------------------------------------
@@ -176,37 +172,16 @@ COLUMNS = ["value", "prior_sd", "expected_sd", "prior_share", "sensitivity", "pa
 
 
 def identifiability_table(found: xr.Dataset) -> pd.DataFrame:
-    """One row for each parameter.
-
-    Args:
-        found: What `polar_bayes.identify` returns.
-
-    Returns:
-        Columns value, prior_sd, expected_sd, prior_share, sensitivity and paper_sd.
-
-    Raises:
-        FitError: It is something else.
-    """
-    check_result(found, "prior_share", "identify")
+    """What `identify` found, one row for each parameter."""
     return found[COLUMNS].drop_vars("name").to_dataframe()
 
 
 def identifiability_sentences(found: xr.Dataset) -> list[str]:
-    """Which parameters are not determined, and which trade off.
+    """Which parameters of the material are not determined, and which trade off.
 
-    Args:
-        found: What `polar_bayes.identify` returns.
-
-    Returns:
-        Parameters of the material that the data determine little; the weakest direction, where it
-        is one of the material, several parameters are part of it, and the prior determines more of
-        it than the data do; then pairs that trade off, the strongest correlation first; or one
-        sentence that says that the data determine every parameter.
-
-    Raises:
-        FitError: It is something else.
+    The weakest direction is stated where it is one of the material, several parameters are part of
+    it, and the prior determines more of it than the data do.
     """
-    check_result(found, "prior_share", "identify")
     is_material = np.isin(found["name"].to_numpy(), MATERIAL_PARAMETERS)
     sentences = []
     for at in np.flatnonzero(is_material & (found["prior_share"].to_numpy() >= PARTLY)):

@@ -5,7 +5,6 @@ the posterior (Chaloner & Verdinelli 1995).
 """
 
 import dataclasses
-import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -27,7 +26,6 @@ from polar_bayes.design.candidates import (
 )
 from polar_bayes.design.fisher import (
     information_by_view,
-    observation_distributions,
     positive_definite,
     prior_precision,
     reading_information,
@@ -41,7 +39,6 @@ from polar_bayes.design.optimal_design import (
 from polar_bayes.design.setup import (
     PRIOR_DRAWS,
     DesignProblem,
-    check_result,
     coordinate_indices,
     fit_draws,
     label_parameters,
@@ -49,14 +46,13 @@ from polar_bayes.design.setup import (
     make_design_problem,
     parameter_vector,
     posterior_modes,
-    request_provenance,
+    provenance_attrs,
 )
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.observation.data import ANGLES, Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
@@ -178,11 +174,9 @@ def next_views(
             hint=f"give some of {', '.join(APART)}",
         )
     criterion, constraints = criterion or DOptimal(), constraints or Constraints()
+    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
     with jax.enable_x64(True):
-        problem = make_design_problem(
-            capture, model, scene, priors, links, largest_view_zenith, seed
-        )
-        request = problem.request
+        problem = make_design_problem(request)
         new = candidate_links(problem, readings)
         if candidates is None:
             candidates = default_candidates(request.capture, request.largest_view_zenith)
@@ -212,13 +206,13 @@ def next_views(
         loss, design.base, design.each, allowed[design.view] & useful, conflicts, count
     )
     found = _assemble(request.capture, views, design, selection, names)
-    settings = {"criterion": repr(criterion), "constraints": repr(constraints)}
-    provenance = {
-        **request_provenance(extended.request),
-        **settings,
-        "exchanges": selection.exchanges,
-    }
-    return found.assign_attrs({PROVENANCE: json.dumps(provenance, sort_keys=True)})
+    provenance = provenance_attrs(
+        extended.request,
+        criterion=repr(criterion),
+        constraints=repr(constraints),
+        exchanges=selection.exchanges,
+    )
+    return found.assign_attrs(provenance)
 
 
 def _extended(
@@ -309,7 +303,7 @@ def _with_predicted_brightness(
     extended: DesignProblem, z: Array, data: Observations, measured: int
 ) -> Observations:
     """The data with candidates as bright as the model predicts, which sets their noise."""
-    sensor = observation_distributions(extended.program, z, data)["intensity"]
+    sensor = extended.program.trace(z, data)["intensity"]["fn"]
     predicted = jnp.clip(jnp.broadcast_to(sensor.mean, data.shape), 0.0, 1.0)
     brightness = jnp.where(jnp.arange(data.shape[-1]) < measured, data.brightness, predicted)
     return dataclasses.replace(data, brightness=jax.lax.stop_gradient(brightness))
@@ -354,37 +348,14 @@ SMALL_GAIN = 0.9
 
 
 def next_views_table(found: xr.Dataset) -> pd.DataFrame:
-    """Width of the expected 95% interval of every parameter, before and after each view.
-
-    Args:
-        found: What `polar_bayes.next_views` returns.
-
-    Returns:
-        One row for each parameter, in its unit; columns "now", "after 1", "after 2" and so on.
-
-    Raises:
-        FitError: It is something else.
-    """
-    check_result(found, "interval_width", "next_views")
+    """Width of the expected 95% interval of every parameter, before and after each view."""
     table = found["interval_width"].transpose("parameter", "step").to_pandas()
     table.columns = ["now", *(f"after {step}" for step in table.columns[1:])]
     return table
 
 
 def next_views_sentences(found: xr.Dataset) -> list[str]:
-    """Which views to take next, and by how much the intervals narrow.
-
-    Args:
-        found: What `polar_bayes.next_views` returns.
-
-    Returns:
-        The views in their order; each parameter's interval before and after; then the parameters
-        that they hardly help, where there are any.
-
-    Raises:
-        FitError: It is something else.
-    """
-    check_result(found, "interval_width", "next_views")
+    """Which views to take next, by how much the intervals narrow, and which hardly do."""
     widths = found["interval_width"].transpose("step", "parameter")
     before, after = widths.isel(step=0).to_numpy(), widths.isel(step=-1).to_numpy()
     names = found["parameter"].to_numpy()

@@ -10,7 +10,6 @@ coordinates that the data do not determine from diverging. The priors of the ins
 belong to $L$ in both: a calibration determines them, and without it they trade for one another.
 """
 
-import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -23,24 +22,23 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
-from numpyro.infer.util import log_density
 
 from polar_bayes.design.setup import (
     Coordinate,
     DesignProblem,
-    check_result,
     label_coordinates,
     label_parameters,
+    log_density_of_sites,
     make_design_problem,
     parameter_vector,
     posterior_modes,
-    request_provenance,
+    provenance_attrs,
 )
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.optimize import Modes
 from polar_bayes.inference.program import Program
-from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -111,14 +109,13 @@ def profile(
     """
     if points < 5:
         raise FitError(f"points is {points}", where="profile", hint="give 5 or more")
+    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
     with jax.enable_x64(True):
-        problem = make_design_problem(
-            capture, model, scene, priors, links, largest_view_zenith, seed
-        )
+        problem = make_design_problem(request)
         coordinate = _find_coordinate(problem, parameter)
         index = coordinate.index
         given = None if values is None else _unconstrained(problem, coordinate, values)
-        instrument = problem.request.scene.instrument
+        instrument = request.scene.instrument
         known = set() if instrument is None else {*instrument.parameters} - {coordinate.site}
         parts = partial(log_density_parts, problem.program, known)
         potential = compile_potential(parts, problem.data)
@@ -216,7 +213,7 @@ def _assemble(problem: DesignProblem, coordinate: Coordinate, curve: "ProfileCur
         },
         attrs={
             "parameter": coordinate.label,
-            PROVENANCE: json.dumps(request_provenance(problem.request), sort_keys=True),
+            **provenance_attrs(problem.request),
         },
     )
 
@@ -239,15 +236,8 @@ def log_density_parts(
     program: Program, known: Collection[str], z: Float[Array, " size"], data: Observations
 ) -> LogDensityParts:
     """The log posterior density of the unconstrained coordinates in its two parts."""
-    free = program.unravel(z)
-    bijections = {name: dist.biject_to(program.supports[name]) for name in free}
-    latent = {name: biject(free[name]) for name, biject in bijections.items()}
-    joint, trace = log_density(program.model, (data,), {}, latent)
-    jacobians = {
-        n: jnp.sum(biject.log_abs_det_jacobian(free[n], latent[n]))
-        for n, biject in bijections.items()
-    }
-    of_likelihood = [name for name in free if name in known]
+    joint, jacobians, trace = log_density_of_sites(program, z, data)
+    of_likelihood = [name for name in jacobians if name in known]
     terms = [
         jnp.sum(trace[n]["fn"].log_prob(trace[n]["value"]))
         for n in (*program.observed, *of_likelihood)
@@ -476,38 +466,14 @@ SMALL_SHARE = 0.02
 
 
 def profile_table(found: xr.Dataset) -> pd.DataFrame:
-    """One row for each value of the grid.
-
-    Args:
-        found: What `polar_bayes.profile` returns.
-
-    Returns:
-        Columns posterior and likelihood: logarithms, 0 at the best value; NaN where no fit
-        converged. The index is the parameter's value.
-
-    Raises:
-        FitError: It is something else.
-    """
-    check_result(found, "prior_beyond", "profile")
+    """Both profiles by value of the parameter: logarithms, 0 at the best, NaN where none ended."""
     table = found["profile"].transpose("value", "kind").to_pandas()
     table.index.name, table.columns.name = str(found.attrs["parameter"]), None
     return table
 
 
 def profile_sentences(found: xr.Dataset) -> list[str]:
-    """What the data exclude, where the profile is flat, and where no fit converged.
-
-    Args:
-        found: What `polar_bayes.profile` returns.
-
-    Returns:
-        One sentence on the 95% interval of the likelihood ratio, and one on values at which no
-        fit converged, where there are any.
-
-    Raises:
-        FitError: It is something else.
-    """
-    check_result(found, "prior_beyond", "profile")
+    """What the data exclude, where the profile is flat, and where no fit converged."""
     sentences = [_interval_sentence(str(found.attrs["parameter"]), found.sel(kind="likelihood"))]
     failed = int(np.sum(~found["converged"]))
     if failed:

@@ -1,7 +1,8 @@
 """Set-up of a design problem: model, capture, posterior modes, and the labels of coordinates."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -11,19 +12,24 @@ import xarray as xr
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 from numpyro import distributions as dist
+from numpyro.infer.util import log_density
 
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.initialization import STARTS, CompiledPotential
-from polar_bayes.inference.optimize import Modes, ValueAndGradient, find_modes, from_prior
+from polar_bayes.inference.initialization import STARTS
+from polar_bayes.inference.optimize import (
+    Modes,
+    NumpyPotential,
+    ValueAndGradient,
+    find_modes,
+    from_prior,
+)
 from polar_bayes.inference.program import Program, compile_program
-from polar_bayes.inference.request import Request, resolve
-from polar_bayes.inference.result import posterior_of, shape_of
+from polar_bayes.inference.request import Request
+from polar_bayes.inference.result import PROVENANCE, posterior_of, shape_of
 from polar_bayes.observation.data import Observations, observe
-from polar_bayes.observation.links import AbstractLink
-from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress
 
 PRIOR_DRAWS = 500
@@ -38,32 +44,25 @@ class DesignProblem(NamedTuple):
     prior: np.ndarray
 
 
-def request_provenance(request: Request) -> dict[str, Any]:
-    """Capture, model and settings, as far as JSON can hold them."""
-    return {
+def provenance_attrs(request: Request, **more: Any) -> dict[str, str]:
+    """The attribute of a result that holds its capture, model and settings, as JSON."""
+    found = {
         "model": request.model_name,
         "scene": request.scene_name,
         "scene_parts": repr(request.scene),
         "links": {name: repr(link) for name, link in request.links.items()},
         "seed": request.seed,
         "capture": str(request.capture.attrs.get("name", "capture")),
+        **more,
     }
+    return {PROVENANCE: json.dumps(found, sort_keys=True)}
 
 
-def make_design_problem(
-    capture: xr.Dataset,
-    model: str | Callable,
-    scene: str | Scene | None,
-    priors: Mapping[str, dist.Distribution] | None,
-    links: AbstractLink | Mapping[str, AbstractLink] | None,
-    largest_view_zenith: float | None,
-    seed: int,
-) -> DesignProblem:
-    """Check the arguments of a public function and compile the model; call it with x64 enabled."""
-    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
+def make_design_problem(request: Request) -> DesignProblem:
+    """Compile the model of a request; call it with x64 enabled."""
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     program = compile_program(request.bind(request.scene), data)
-    prior = from_prior(program, jax.random.key(seed), PRIOR_DRAWS, data)
+    prior = from_prior(program, jax.random.key(request.seed), PRIOR_DRAWS, data)
     return DesignProblem(request, data, program, prior)
 
 
@@ -71,18 +70,25 @@ def posterior_modes(
     problem: DesignProblem, progress: Progress | None, potential: ValueAndGradient | None = None
 ) -> Modes:
     """The modes of the posterior, heaviest first."""
-    potential = potential or CompiledPotential(problem.program, problem.data)
+    potential = potential or NumpyPotential(
+        problem.program.value_and_gradient, problem.data, problem.data.brightness.dtype
+    )
     return find_modes(potential, problem.prior[:STARTS], progress or no_progress)
 
 
-def check_result(found: object, variable: str, function: str) -> None:
-    """Refuse what a function of this package did not return."""
-    if not isinstance(found, xr.Dataset) or variable not in found:
-        raise FitError(
-            f"it has no variable {variable}",
-            where=function,
-            hint=f"give what polar_bayes.{function} returns",
-        )
+def log_density_of_sites(
+    program: Program, z: Float[Array, " size"], data: Observations
+) -> tuple[Array, dict[str, Array], dict[str, dict]]:
+    """Log joint density, log Jacobian of every latent site, and the trace, from one pass."""
+    free = program.unravel(z)
+    bijections = {name: dist.biject_to(program.supports[name]) for name in free}
+    latent = {name: biject(free[name]) for name, biject in bijections.items()}
+    log_joint, trace = log_density(program.model, (data,), {}, latent)
+    log_jacobian = {
+        name: jnp.sum(biject.log_abs_det_jacobian(free[name], latent[name]))
+        for name, biject in bijections.items()
+    }
+    return log_joint, log_jacobian, trace
 
 
 # --- Names of parameters and coordinates ----------------------------------------------------------

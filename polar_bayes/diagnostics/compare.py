@@ -18,12 +18,7 @@ from polar_bayes.diagnostics.parameters import (
     posterior_scalars,
     scalars,
 )
-from polar_bayes.diagnostics.predictive import (
-    MAX_PARETO_K,
-    Loo,
-    predictive_checks,
-    usable_readings,
-)
+from polar_bayes.diagnostics.predictive import MAX_PARETO_K, Loo, predictive_checks, usable_readings
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import check_fit
@@ -31,11 +26,7 @@ from polar_bayes.inference.files import check_fit
 GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
 SUMMARY_COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
 SENSITIVITY_COLUMNS = (
-    "prior_inside",
-    "verdict",
-    "prior_sensitivity",
-    "likelihood_sensitivity",
-    "remark",
+    *("prior_inside", "verdict", "prior_sensitivity", "likelihood_sensitivity", "remark"),
 )
 
 
@@ -101,26 +92,14 @@ def compare_fits(fits: Mapping[str, xr.DataTree]) -> FitComparison:
 def _parameters(
     fits: Mapping[str, xr.DataTree], tables: Mapping[str, pd.DataFrame]
 ) -> pd.DataFrame:
-    priors = {name: sensitivity(fit) for name, fit in fits.items()}
-    labels = dict.fromkeys(s.label for fit in fits.values() for s in posterior_scalars(fit))
-    rows = {
-        (label, name): {
-            **table.loc[label, list(SUMMARY_COLUMNS)],
-            **(
-                priors[name].loc[label, list(SENSITIVITY_COLUMNS)]
-                if label in priors[name].index
-                else {}
-            ),
-        }
-        for label in labels
+    """The columns of both tables of each fit, parameter by parameter."""
+    found = {
+        name: table[[*SUMMARY_COLUMNS]].join(sensitivity(fits[name])[[*SENSITIVITY_COLUMNS]])
         for name, table in tables.items()
-        if label in table.index
     }
-    found = pd.DataFrame.from_dict(rows, orient="index").reindex(
-        columns=[*SUMMARY_COLUMNS, *SENSITIVITY_COLUMNS]
-    )
-    found.index = pd.MultiIndex.from_tuples(rows, names=["parameter", "fit"])
-    return found
+    labels = dict.fromkeys(label for table in tables.values() for label in table.index)
+    rows = [(label, name) for label in labels for name in fits if label in tables[name].index]
+    return pd.concat(found, names=["fit", "parameter"]).swaplevel().loc[rows]
 
 
 def _check_same_capture(one: xr.DataTree, other: xr.DataTree, first: str, name: str) -> None:
@@ -194,11 +173,7 @@ def _combined(parts: list[Loo]) -> ELPDDataLOO:
 # --- The fitted readings on a single axis ---------------------------------------------------------
 
 READING_GROUPS = (
-    "observed_data",
-    "log_likelihood",
-    "posterior_predictive",
-    "noise_free",
-    "prior_predictive",
+    *("observed_data", "log_likelihood", "posterior_predictive", "noise_free", "prior_predictive"),
 )
 FITTED = MappingProxyType({"valid": True})
 """Flags of readings that were fitted."""
@@ -252,15 +227,7 @@ def _stack(variable: xr.DataArray, reading: xr.DataArray, fitted: np.ndarray) ->
 
 # --- Intervals without a part of the instrument ---------------------------------------------------
 
-COLUMNS = (
-    "mean",
-    "q2.5",
-    "q97.5",
-    "mean_without",
-    "q2.5_without",
-    "q97.5_without",
-    "width_ratio",
-)
+COLUMNS = ("mean", "q2.5", "q97.5", "mean_without", "q2.5_without", "q97.5_without", "width_ratio")
 
 WITHOUT = {"discrepancy": "the discrepancy term", "instrument": "any instrument term"}
 """Fits for comparison, in the groups `without_<key>` of a result: the terms that they omit."""
@@ -278,13 +245,8 @@ def compare_without(result: xr.DataTree, part: str) -> pd.DataFrame:
             continue
         if not (np.isfinite(draws).all() and np.isfinite(other).all()):
             continue
-        low, high = np.quantile(draws, CENTRAL_95)
-        other_low, other_high = np.quantile(other, CENTRAL_95)
-        ratio = (other_high - other_low) / (high - low) if high > low else np.nan
-        rows[scalar.label] = (
-            *(draws.mean(), low, high),
-            *(other.mean(), other_low, other_high),
-            ratio,
-        )
+        own, its = ([each.mean(), *np.quantile(each, CENTRAL_95)] for each in (draws, other))
+        width = own[2] - own[1]
+        rows[scalar.label] = (*own, *its, (its[2] - its[1]) / width if width > 0.0 else np.nan)
     index = pd.Index(list(rows), dtype=str)
     return pd.DataFrame(list(rows.values()), columns=list(COLUMNS), index=index)

@@ -10,9 +10,7 @@ import xarray as xr
 
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.batch_result import Status
-from polar_bayes.inference.batching import IMAGE
-from polar_bayes.maps.fit_map import cut
+from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.maps.lazy import ensure_loaded
 
 INTERVALS = {50: (0.25, 0.75), 80: (0.1, 0.9), 95: (0.025, 0.975)}

@@ -24,30 +24,11 @@ from polar_bayes.priors import RANGES
 NEW_MEMBERS = 20_000
 SUMMARY_COLUMNS = (
     "members",
-    "location",
-    "location_sd",
-    "location_q2.5",
-    "location_q97.5",
-    "spread",
-    "spread_sd",
-    "spread_q2.5",
-    "spread_q97.5",
-    "new_q2.5",
-    "new_q97.5",
-    "between",
-    "between_q2.5",
-    "between_q97.5",
-    "meaning",
-    "pooling",
+    *(f"{part}{end}" for part in ("location", "spread") for end in ("", "_sd", "_q2.5", "_q97.5")),
+    *("new_q2.5", "new_q97.5", "between", "between_q2.5", "between_q97.5", "meaning", "pooling"),
 )
 MEMBER_COLUMNS = (
-    "mean",
-    "q2.5",
-    "q97.5",
-    "unpooled",
-    "unpooled_q2.5",
-    "unpooled_q97.5",
-    "shrinkage",
+    *("mean", "q2.5", "q97.5", "unpooled", "unpooled_q2.5", "unpooled_q97.5", "shrinkage"),
 )
 
 
@@ -184,29 +165,21 @@ def _is_finite(population: Population) -> bool:
     return all(bool(np.isfinite(draws).all()) for draws in (population.spread.draws, *on_scale))
 
 
-def _described(draws: np.ndarray) -> list[float]:
-    if not np.isfinite(draws).all():
-        return [math.nan] * 4
-    return [float(draws.mean()), float(draws.std(ddof=1)), *np.quantile(draws, CENTRAL_95)]
-
-
 def _summary_row(population: Population) -> list[Any]:
-    row = [
-        len(population.members),
-        *_described(population.location.draws),
-        *_described(population.spread.draws),
-    ]
+    row: list[Any] = [len(population.members)]
+    for draws in (population.location.draws, population.spread.draws):
+        described = draws.mean(), draws.std(ddof=1), *np.quantile(draws, CENTRAL_95)
+        row += described if np.isfinite(draws).all() else [math.nan] * 4
     if not _is_finite(population):
         return [*row, *[math.nan] * 5, "", math.nan]
     differences = population.differences()
     median = float(np.median(differences))
+    by = f"a factor of about {median:.3g}" if population.scale == "log" else f"about {median:.2g}"
     return [
         *row,
         *np.quantile(population.new_members(), CENTRAL_95),
         *(median, *np.quantile(differences, CENTRAL_95)),
-        f"members differ by a factor of about {median:.3g}"
-        if population.scale == "log"
-        else f"members differ by about {median:.2g}",
+        f"members differ by {by}",
         _pooling_factor(population),
     ]
 
@@ -241,23 +214,18 @@ def shrinkage(result: xr.DataTree) -> pd.DataFrame:
     rows = {}
     for population in [] if method_of(result) == "point" else populations(result):
         location = population.to_scale(population.location.draws.ravel())
-        is_finite = _is_finite(population)
+        spread, is_finite = population.spread.draws.ravel(), _is_finite(population)
         for scalar in population.members:
-            rows[scalar.label] = [math.nan] * len(MEMBER_COLUMNS)
+            draws = scalar.draws.ravel()
+            row = [math.nan] * len(MEMBER_COLUMNS)
             if is_finite:
-                draws = scalar.draws.ravel()
-                spread = population.spread.draws.ravel()
                 unpooled = unpooled_estimate(population.to_scale(draws), location, spread)
                 ends = unpooled.mean + np.array([0.0, -1.96, 1.96]) * unpooled.sd
-                rows[scalar.label] = [
-                    draws.mean(),
-                    *np.quantile(draws, CENTRAL_95),
-                    *population.from_scale(ends),
-                    unpooled.shrinkage,
-                ]
+                row = [draws.mean(), *np.quantile(draws, CENTRAL_95)]
+                row += [*population.from_scale(ends), unpooled.shrinkage]
+            rows[scalar.label] = row
     index = pd.Index(list(rows), dtype=object)
-    values = list(rows.values())
-    return pd.DataFrame(values, columns=list(MEMBER_COLUMNS), index=index, dtype=float)
+    return pd.DataFrame(list(rows.values()), index, list(MEMBER_COLUMNS), dtype=float)
 
 
 class UnpooledEstimate(NamedTuple):

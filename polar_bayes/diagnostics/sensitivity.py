@@ -34,17 +34,8 @@ SENSITIVE = 0.05
 POWERS = (0.99, 1.01)
 MIN_DRAWS = 100
 COLUMNS = (
-    "prior_q2.5",
-    "prior_q97.5",
-    "q2.5",
-    "q97.5",
-    "prior_inside",
-    "width_left",
-    "contraction",
-    "verdict",
-    "prior_sensitivity",
-    "likelihood_sensitivity",
-    "remark",
+    *("prior_q2.5", "prior_q97.5", "q2.5", "q97.5", "prior_inside", "width_left", "contraction"),
+    *("verdict", "prior_sensitivity", "likelihood_sensitivity", "remark"),
 )
 
 

@@ -272,14 +272,8 @@ def _texts(texts: Iterable[str]) -> np.ndarray:
 def ledger_table(ledger: xr.Dataset) -> pd.DataFrame:
     """One row for each effect, as text.
 
-    Args:
-        ledger: Of a scene that `polar_bayes.choose_effects` returned, or read back from a file.
-
-    Returns:
-        By effect: `data`, the largest move of a reading [noise sd]; `shift` [posterior sd] and
-        `sd`, the largest shift and the largest change of the sd of a judged parameter; the effect's
-        share of the full scene's `operations` and `time`; and the `result`: kept or dropped, and
-        why.
+    `data` is the largest move of a reading [noise sd]; `shift` [posterior sd] and `sd` are the
+    largest changes of a judged parameter; `operations` and `time` are shares of the full scene's.
     """
     judged = ledger.isel(parameter=ledger["judged"].to_numpy().astype(bool))
     rows = {}
@@ -297,14 +291,7 @@ def ledger_table(ledger: xr.Dataset) -> pd.DataFrame:
 
 
 def ledger_sentences(ledger: xr.Dataset) -> list[str]:
-    """How many effects are kept, what leaving out the others changes, and what it saves.
-
-    Args:
-        ledger: A ledger.
-
-    Returns:
-        One sentence on each of these, as far as they apply.
-    """
+    """How many effects are kept, what leaving out the others changes, and what it saves."""
     kept, forced = (ledger[name].to_numpy().astype(bool) for name in ("kept", "forced"))
     if not kept.size:
         return ["The scene has no effect that could be left out."]

@@ -25,10 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from numpyro import distributions as dist
-from numpyro.infer.util import log_density
 
-from polar_bayes.design.fisher import observation_distributions
-from polar_bayes.design.setup import label_coordinates
+from polar_bayes.design.setup import label_coordinates, log_density_of_sites
 from polar_bayes.inference.optimize import (
     ModeStatus,
     ValueAndGradient,
@@ -130,8 +128,8 @@ class Density:
 
         def apply(function: Callable[[dist.Distribution], Array], names: Sequence[str]) -> Readings:
             def of_noise(z: Array, data: Observations) -> dict[str, Array]:
-                found = observation_distributions(self.program, z, data)
-                return {name: function(found[name]) for name in names}
+                trace = self.program.trace(z, data)
+                return {name: function(trace[name]["fn"]) for name in names}
 
             found = jax.jit(of_noise)(jnp.asarray(z), self.data)
             return {name: np.asarray(values) for name, values in found.items()}
@@ -160,16 +158,9 @@ def compile_density(request: Request, data: Observations) -> Density:
     program = compile_program(request.bind(request.scene), data)
 
     def evaluate(z: Array, data: Observations) -> tuple[Array, dict[str, Array]]:
-        free = program.unravel(z)
-        bijections = {name: dist.biject_to(program.supports[name]) for name in free}
-        latent = {name: biject(free[name]) for name, biject in bijections.items()}
-        log_joint, trace = log_density(program.model, (data,), {}, latent)
-        log_jacobian = sum(
-            jnp.sum(biject.log_abs_det_jacobian(free[name], latent[name]))
-            for name, biject in bijections.items()
-        )
+        log_joint, log_jacobian, trace = log_density_of_sites(program, z, data)
         predicted = {name: noise_free(trace, name) for name in program.observed}
-        return -(log_joint + log_jacobian), predicted
+        return -(log_joint + sum(log_jacobian.values())), predicted
 
     compiled = compile_and_count(evaluate, jnp.zeros(program.size), data)
     coordinates = label_coordinates(program, request.capture)

@@ -6,10 +6,7 @@ from .camera_geometry import (
 )
 from .detector import Detector as Detector
 from .goniometer import from_goniometer as from_goniometer
-from .images import (
-    from_mosaic as from_mosaic,
-    from_polarizer as from_polarizer,
-)
+from .images import from_mosaic as from_mosaic, from_polarizer as from_polarizer
 from .normals import (
     fit_sphere as fit_sphere,
     NormalMap as NormalMap,

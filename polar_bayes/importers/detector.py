@@ -11,7 +11,7 @@ electron), and N pixels averaged. Averaging does not reduce $\epsilon$: unequal 
 of the analyzers, light that flickers, a flat field that has changed.
 
 PNG and TIFF files go through Pillow, which every plotting library brings along; .npy files hold
-what a script saved. A frame in color is refused: its channels would have to be told apart first.
+what a script saved. A frame in color is refused: its channels would have to be separated first.
 """
 
 import dataclasses
@@ -44,19 +44,15 @@ def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
     values = _array(frame, where)
     where = str(frame) if isinstance(frame, str | os.PathLike) else where
     if values.dtype.kind not in "uif" or values.ndim != 2 or values.size == 0:
-        raise CaptureError(
-            f"it holds {values.dtype.name} of shape {values.shape}, not one frame of gray values",
-            where=where,
-            hint="give rows and columns of numbers; of a color frame, one channel",
-        )
+        what = f"it holds {values.dtype.name} of shape {values.shape}, not one frame of gray values"
+        hint = "give rows and columns of numbers; of a color frame, one channel"
+        raise CaptureError(what, where=where, hint=hint)
     counts = values.astype(np.float64)
     if not np.isfinite(counts).all() or np.abs(counts).max() > LARGEST_COUNT:
         row, column = np.argwhere(~(np.abs(counts) <= LARGEST_COUNT))[0]
-        raise CaptureError(
-            f"{counts[row, column]:g} is no reading",
-            where=f"{where}[row={row}, column={column}]",
-            hint=f"give finite counts up to {LARGEST_COUNT:g}",
-        )
+        what = f"{counts[row, column]:g} is no reading"
+        hint = f"give finite counts up to {LARGEST_COUNT:g}"
+        raise CaptureError(what, where=f"{where}[row={row}, column={column}]", hint=hint)
     return counts, 255.0 if values.dtype == np.uint8 else None
 
 
@@ -168,11 +164,9 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
     """Light and its variance from raw frames."""
     full = level if detector.saturation_level is None else detector.saturation_level
     if full is None:
-        raise CaptureError(
-            "the frames do not say at which count a pixel is full",
-            where="saturation_level",
-            hint="give it: 4095 for 12 bits, 65535 for 16 bits",
-        )
+        what = "the frames do not say at which count a pixel is full"
+        hint = "give it: 4095 for 12 bits, 65535 for 16 bits"
+        raise CaptureError(what, where="saturation_level", hint=hint)
     raw = np.stack(frames)
     shape = raw.shape[1:]
     if isinstance(detector.dark, Real):
@@ -211,11 +205,9 @@ def _flat(flat: Frame | None, shape: tuple[int, ...]) -> np.ndarray:
     mean = float(values.mean())
     if not mean > 0.0 or not (values > DARKEST_FLAT * mean).all():
         row, column = np.unravel_index(np.argmin(values), shape)
-        raise CaptureError(
-            f"{values[row, column]:g} is less than a twentieth of its mean {mean:g}",
-            where=f"flat[row={row}, column={column}]",
-            hint="subtract its dark frame, use even light, and correct dead pixels",
-        )
+        what = f"{values[row, column]:g} is less than a twentieth of its mean {mean:g}"
+        hint = "subtract its dark frame, use even light, and correct dead pixels"
+        raise CaptureError(what, where=f"flat[row={row}, column={column}]", hint=hint)
     return values / mean
 
 
@@ -238,5 +230,5 @@ def _source(frame: Frame | float | None) -> str | float:
 
 
 def os_name(path: Any) -> str:
-    """The last part of a path, which says what was read without saying on whose machine."""
+    """The last part of a path: what was read, without the folders of this machine."""
     return str(path).replace("\\", "/").rstrip("/").split("/")[-1]

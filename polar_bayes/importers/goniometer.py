@@ -35,8 +35,8 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
 from polar_bayes.capture.schema import POSITIVE, ZENITH, Interval, validate
-from polar_bayes.capture.table_reader import Table, read_table
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers.table import Table, read_table
 
 Readings = str | os.PathLike[str] | tuple[ArrayLike, ArrayLike]
 
@@ -64,7 +64,7 @@ def from_goniometer(
     relative_error: float = 0.01,
     name: str | None = None,
 ) -> xr.Dataset:
-    """A capture from goniometer readings of s and p light; the module tells how.
+    """A capture from goniometer readings of s and p light; see the module.
 
     Args:
         s: A two-column table (angle in degrees, reading) or a pair (angles, readings); with
@@ -253,11 +253,9 @@ def _channel(name: str, readings: Any) -> Channel:
     if isinstance(readings, str | os.PathLike):
         table = read_table(readings)
         if len(table.names) != 2:
-            raise CaptureError(
-                f"it has {len(table.names)} columns, not two",
-                where=table.source,
-                hint="give angle and reading, or use table= and name the columns angle=, s= and p=",
-            )
+            what = f"it has {len(table.names)} columns, not two"
+            hint = "give angle and reading, or use table= and name the columns angle=, s= and p="
+            raise CaptureError(what, where=table.source, hint=hint)
         return _channel_of_table(name, table, *table.names)
     try:
         angle, reading = (np.asarray(part) for part in readings)

@@ -36,7 +36,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.ndimage import binary_dilation
 
-from polar_bayes.capture.schema import EXCESS_POLARIZATION, POSITIVE, validate
+from polar_bayes.capture.schema import EXCESS_POLARIZATION, POSITIVE, as_numbers, validate
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.camera_geometry import (
     AbstractLocation,
@@ -48,14 +48,7 @@ from polar_bayes.importers.camera_geometry import (
     local_geometry,
     mirror_direction,
 )
-from polar_bayes.importers.detector import (
-    Detector,
-    Frame,
-    Signal,
-    os_name,
-    read_frame,
-    signal_of,
-)
+from polar_bayes.importers.detector import Detector, Frame, Signal, os_name, read_frame, signal_of
 from polar_bayes.importers.normals import AbstractShape, Sphere, as_shape
 from polar_bayes.importers.stokes import StokesImage, check_angles, fit_stokes, unbiased_dop
 
@@ -196,11 +189,9 @@ def _capture(
     valid = ~np.logical_or.reduce(list(reasons.values()))
     if not valid.any():
         counts = ", ".join(f"{int(w.sum())} {r}" for r, w in reasons.items() if w.any())
-        raise CaptureError(
-            f"no reading is left ({counts})".replace("_", " "),
-            where=attributes["name"],
-            hint="check shape, light and exposure, or average more pixels (bin)",
-        )
+        what = f"no reading is left ({counts})".replace("_", " ")
+        hint = "check shape, light and exposure, or average more pixels (bin)"
+        raise CaptureError(what, where=attributes["name"], hint=hint)
     readings = {
         "dop": np.clip(dop, 0.0, 1.0),  # noise alone may carry it past one; such bins are counted
         "q": stokes.q,
@@ -303,8 +294,8 @@ def from_polarizer(
             the camera sees it, degree. Three different ones or more, shape (frame,).
         shape: Where the surface points: a `Sphere`, several, or unit normals of shape
             (row, column, 3), NaN where there is no surface, also in a .npy file.
-        light: Where the light stands: `Direction`, `Position`, `Highlight`, or `Surroundings`.
-        view: Where the camera stands: `Direction`, or `Position(0, 0, f)` for a focal length of f
+        light: Location of the light: `Direction`, `Position`, `Highlight`, or `Surroundings`.
+        view: Location of the camera: `Direction`, or `Position(0, 0, f)` for a focal length of f
             pixels.
         detector: How counts become light, and their noise.
         bin: Width of the squares of pixels that are averaged into one reading.
@@ -382,8 +373,8 @@ def from_mosaic(
         frame: A PNG, TIFF or .npy file, or an array of shape (row, column): raw counts, with an
             even number of rows and columns.
         shape: See `polar_bayes.from_polarizer`; the arguments that are not explained here too.
-        light: Where the light stands.
-        view: Where the camera stands.
+        light: Location of the light.
+        view: Location of the camera.
         layout: Angle of the polarizer of each of the four pixels, two rows of two, in degrees from
             x counterclockwise as the camera sees it.
         detector: How counts become light, and their noise.
@@ -446,10 +437,7 @@ def _variance(variance: np.ndarray, binning: Binning) -> np.ndarray:
 
 
 def _angles(layout: ArrayLike) -> np.ndarray:
-    try:
-        four = np.asarray(layout, dtype=np.float64)
-    except (TypeError, ValueError):
-        four = np.full(0, np.nan)
+    four = as_numbers(layout)
     if four.shape != (2, 2):
         hint = "give two rows of two angles, such as ((90, 45), (135, 0))"
         raise CaptureError(f"it is {layout!r}", where="layout", hint=hint)
@@ -460,8 +448,6 @@ def _polanalyser() -> ModuleType:
     try:
         return importlib.import_module("polanalyser")
     except ImportError as error:
-        raise CaptureError(
-            f"the library for mosaics of polarizers is not installed ({error.name})",
-            where="mosaic",
-            hint="pip install 'polar_bayes[camera]'",
-        ) from error
+        what = f"the library for mosaics of polarizers is not installed ({error.name})"
+        hint = "pip install 'polar_bayes[camera]'"
+        raise CaptureError(what, where="mosaic", hint=hint) from error

@@ -14,10 +14,10 @@ from typing import Any, override
 import numpy as np
 from scipy.optimize import least_squares
 
-from polar_bayes.capture.schema import Interval
-from polar_bayes.capture.table_reader import read_table
+from polar_bayes.capture.schema import Interval, as_numbers
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.detector import os_name, read_array
+from polar_bayes.importers.table import read_table
 
 FEWEST_RIM_POINTS = 4
 CENTER = Interval(-1e6, 1e6)
@@ -117,11 +117,9 @@ class Spheres(AbstractShape):
                 and -sphere.radius < sphere.column < shape[1] + sphere.radius
             )
             if not inside:
-                raise CaptureError(
-                    f"it lies outside of frames of {shape[0]} rows and {shape[1]} columns",
-                    where=repr(sphere),
-                    hint="give row, column and radius in pixels of the frame, row first",
-                )
+                what = f"it lies outside of frames of {shape[0]} rows and {shape[1]} columns"
+                hint = "give row, column and radius in pixels of the frame, row first"
+                raise CaptureError(what, where=repr(sphere), hint=hint)
 
     @property
     @override
@@ -159,11 +157,9 @@ class NormalMap(AbstractShape):
         wrong = ~missing & (np.abs(length - 1.0) > UNIT_LENGTH)
         if wrong.any():
             row, column, _ = np.argwhere(wrong)[0]
-            raise CaptureError(
-                f"its length is {length[row, column, 0]:g}",
-                where=f"{where}[row={row}, column={column}]",
-                hint="give unit normals, from -1 to 1; colors c of 8 bits are 2 c/255 - 1",
-            )
+            what = f"its length is {length[row, column, 0]:g}"
+            hint = "give unit normals, from -1 to 1; colors c of 8 bits are 2 c/255 - 1"
+            raise CaptureError(what, where=f"{where}[row={row}, column={column}]", hint=hint)
         unit = np.where(missing, np.nan, values) / np.where(missing, 1.0, length)
         object.__setattr__(self, "_unit", unit)
 
@@ -181,11 +177,9 @@ class NormalMap(AbstractShape):
     @override
     def check(self, shape: tuple[int, ...]) -> None:
         if self._unit.shape[:2] != tuple(shape):
-            raise CaptureError(
-                f"they are {self._unit.shape[:2]}, the frames {tuple(shape)}",
-                where="normals",
-                hint="give a normal for each pixel of the frame, before any averaging",
-            )
+            what = f"they are {self._unit.shape[:2]}, the frames {tuple(shape)}"
+            hint = "give a normal for each pixel of the frame, before any averaging"
+            raise CaptureError(what, where="normals", hint=hint)
 
     @property
     @override
@@ -226,11 +220,9 @@ def fit_sphere(rim: Any) -> Sphere:
     found = least_squares(distance, [*center, radius]).x
     off = np.abs(distance(found)).max()
     if not found[2] > 1.0 or off > 0.1 * found[2]:
-        raise CaptureError(
-            f"a point is {off:.3g} pixels off the best circle, of radius {found[2]:.3g}",
-            where=where,
-            hint="check for a swapped row and column, or give normals of another shape",
-        )
+        what = f"a point is {off:.3g} pixels off the best circle, of radius {found[2]:.3g}"
+        hint = "check for a swapped row and column, or give normals of another shape"
+        raise CaptureError(what, where=where, hint=hint)
     return Sphere(*found.tolist())
 
 
@@ -249,10 +241,7 @@ def as_shape(shape: Any) -> AbstractShape:
 
 
 def _points(rim: Any) -> np.ndarray:
-    try:
-        points = np.asarray(rim, dtype=np.float64)
-    except (TypeError, ValueError):
-        points = np.full((0,), np.nan)
+    points = as_numbers(rim)
     if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
         hint = "give an array of shape (point, 2): row and column"
         raise CaptureError("it is no list of points", where="rim", hint=hint)

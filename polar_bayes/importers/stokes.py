@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from polar_bayes.capture.schema import as_numbers
 from polar_bayes.errors import CaptureError
 
 FEWEST_ANGLES = 3
@@ -105,28 +106,20 @@ def unbiased_dop(image: StokesImage) -> tuple[np.ndarray, np.ndarray]:
 
 def check_angles(angles: Any) -> np.ndarray:
     """Angles of a polarizer, refused unless they determine all three Stokes parameters."""
-    try:
-        degrees = np.asarray(angles, dtype=np.float64)
-    except (TypeError, ValueError):
-        degrees = np.full(1, np.nan)
+    degrees = as_numbers(angles)
     if degrees.ndim != 1 or not (np.abs(degrees) <= 360.0).all():
         hint = "give one number from -360 to 360 for each frame"
         raise CaptureError(f"{angles!r} are no angles", where="angles", hint=hint)
     different = np.unique(np.round(degrees % 180.0, 6) % 180.0)
     listed = ", ".join(f"{angle:g}" for angle in degrees)
     if different.size < FEWEST_ANGLES:
-        raise CaptureError(
-            f"the polarizer stood at {different.size} different angles ({listed})",
-            where="angles",
-            hint="give three or more; 0 and 180 are the same",
-        )
+        what = f"the polarizer stood at {different.size} different angles ({listed})"
+        raise CaptureError(what, where="angles", hint="give three or more; 0 and 180 are the same")
     condition = float(np.linalg.cond(_design(degrees)))
     if condition > LARGEST_CONDITION:
-        raise CaptureError(
-            f"{listed} are so close that noise grows {condition:.0f}-fold",
-            where="angles",
-            hint="spread them over 180 degrees, such as 0, 60 and 120",
-        )
+        what = f"{listed} are so close that noise grows {condition:.0f}-fold"
+        hint = "spread them over 180 degrees, such as 0, 60 and 120"
+        raise CaptureError(what, where="angles", hint=hint)
     return degrees
 
 

@@ -1,3 +1,3 @@
 from . import methods as methods
-from .auto import auto_sentences as auto_sentences
+from .files import auto_sentences as auto_sentences
 from .spectrum import predict_spectrum as predict_spectrum

@@ -3,29 +3,25 @@
 import dataclasses
 import math
 import time
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, override
 
 import numpy as np
-import xarray as xr
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import OutOfTimeError, run_until
-from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.initialization import JointInit
+from polar_bayes.inference.laplace import Importance, Laplace
+from polar_bayes.inference.least_squares import Point
 from polar_bayes.inference.mcse import LARGEST_R_HAT, draws_needed, largest_error
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws, flatten
-from polar_bayes.inference.mode_methods import Nuts
+from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.problem import Problem
-from polar_bayes.inference.psis import MAX_PARETO_K
-from polar_bayes.inference.resampling import max_effective_size
-from polar_bayes.inference.result import provenance_of
-from polar_bayes.inference.smc import PixelSMC
-from polar_bayes.inference.weighted import Importance, Tempered
+from polar_bayes.inference.psis import MAX_PARETO_K, max_effective_size
+from polar_bayes.inference.smc import PixelSMC, Tempered
+from polar_bayes.inference.variational import FlowGuide, NormalGuide
 from polar_bayes.progress import Progress
-
-HEAVY_MODE = 0.01
-"""Laplace weight of a mode that chains must have visited."""
 
 RESERVE = 8
 """Times as many weighted draws as normal posteriors need: long tails need more."""
@@ -35,25 +31,6 @@ MOST_DRAWS = 2**17
 
 MARGIN, MOST_TIMES = 1.5, 16.0
 """Draws of a second try: more than the first error asks for, but not above so many times."""
-
-
-def missed_mode_weight(z: np.ndarray, problem: Problem) -> float:
-    """Weight of the heaviest mode to which some chain never came nearest."""
-    # Where all chains began at one mode, R-hat cannot see the others.
-    initialization = problem.initialize()
-    if not isinstance(initialization, JointInit):
-        return 0.0
-    modes = initialization.modes
-    heavy = np.flatnonzero(modes.weight >= HEAVY_MODE)
-    if heavy.size < 2:
-        return 0.0
-    halves = np.linalg.cholesky(modes.covariance[heavy])
-    apart = z[None] - modes.z[heavy][:, None, None]
-    steps = np.einsum("mij,mcdj->mcdi", np.linalg.inv(halves), apart)
-    volume = np.log(np.diagonal(halves, axis1=1, axis2=2)).sum(axis=1)
-    nearest = np.argmin(0.5 * np.sum(steps**2, axis=-1) + volume[:, None, None], axis=0)
-    visited = np.array([(nearest == number).any(axis=1).all() for number in range(heavy.size)])
-    return float(np.max(modes.weight[heavy], where=~visited, initial=0.0))
 
 
 def expected_error(draws: PosteriorDraws, problem: Problem) -> float:
@@ -111,7 +88,7 @@ class Auto(AbstractMethod):
         Returns:
             Methods by name.
         """
-        needed = draws_needed(self.tolerance, problem.num_parameters)
+        needed = draws_needed(self.tolerance, int(problem.describe()["size"].sum()))
         chains = Nuts(effective_draws=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
         if not problem.is_one_spectrum_point:
             return {"nuts": chains}
@@ -254,7 +231,10 @@ def _bias_doubts(draws: PosteriorDraws, problem: Problem) -> list[str]:
         doubts.append(f"its Pareto k-hat is {draws.k_hat:.2f}")
     if draws.r_hat > LARGEST_R_HAT:
         doubts.append(f"its R-hat is {draws.r_hat:.3f}")
-    if draws.method == "nuts" and (weight := missed_mode_weight(draws.z, problem)) > 0.0:
+    # Where all chains began at one mode, R-hat cannot see the others.
+    if draws.method == "nuts" and (
+        (weight := problem.initialize().missed_mode_weight(draws.z)) > 0.0
+    ):
         doubts.append(f"a mode of weight {weight:.2g} was not visited by every chain")
     return doubts
 
@@ -263,38 +243,18 @@ def _rounded(value: float) -> float | None:
     return round(float(value), 4) if np.isfinite(value) else None
 
 
-def auto_sentences(result: xr.DataTree) -> list[str]:
-    """What `method="auto"` tried, what it took, and why.
-
-    Args:
-        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-
-    Returns:
-        A sentence for each method that was tried, in order; none for a fit by a method of one's
-        own choice.
-
-    Raises:
-        FitError: It is no fit, or does not hold together.
-    """
-    check_fit(result)
-    summary = provenance_of(result).get("auto")
-    if not summary:
-        return []
-    sentences = []
-    for step in summary["steps"]:
-        name = f"{step['name']} ({step['seconds']:.1f} s)"
-        if step["taken"]:
-            error = step.get("monte_carlo")
-            within = "an unknown number of" if error is None else f"{error:.2g}"
-            sentences.append(
-                f"{name} was taken: its means and standard deviations are expected within "
-                f"{within} posterior sd, and {summary['tolerance']:g} were asked for."
-            )
-        else:
-            sentences.append(f"{name} was not taken: {step['why']}.")
-    if not summary["met"]:
-        sentences.append(
-            f"Nothing was good enough; these are the numbers of {summary['chosen']}, which came "
-            "nearest. Give more seconds or a larger tolerance, or doubt them."
-        )
-    return sentences
+STUDY_METHODS: Mapping[str, AbstractMethod] = MappingProxyType(
+    {
+        "point": Point(),
+        "laplace": Laplace(),
+        "importance": Importance(),
+        "tempered": Tempered(),
+        "normal guide": NormalGuide(),
+        "flow guide": FlowGuide(),
+        "nuts short": Nuts(warmup=100, draws=100, most_draws=100),
+        "nuts": Nuts(),
+        "nuts long": Nuts(warmup=1000, draws=4000, most_draws=4000),
+    }
+)
+"""Methods that `polar_bayes.accuracy` compares, from cheap to exact. One more is one more value:
+`{**STUDY_METHODS, "mine": Mine()}`."""

@@ -18,8 +18,9 @@ from jaxtyping import Array
 from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.inference.batching import (
+    MethodUsed,
+    Status,
     batched,
     put_rows,
     take_rows,

@@ -9,15 +9,15 @@ import numpy as np
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine
-from polar_bayes.inference.batch_result import (
+from polar_bayes.inference.batching import (
     MIN_VIEWS,
     Describe,
     MethodUsed,
+    ObservationBatch,
     Outcome,
     Status,
     empty_outcome,
 )
-from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.levenberg_marquardt import ModeSearch, NormalApproximation
 from polar_bayes.inference.method import AbstractBatchMethod
 from polar_bayes.inference.program import Values

@@ -18,10 +18,11 @@ from numpyro.diagnostics import effective_sample_size
 
 from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
-from polar_bayes.inference.batch_result import MethodUsed, Status
 from polar_bayes.inference.batching import (
     AnyArray,
+    MethodUsed,
     ObservationBatch,
+    Status,
     batched,
     take_rows,
 )
@@ -66,6 +67,10 @@ class PixelNuts(AbstractPixelMethod):
             if not low < getattr(self, name) < high:
                 what = f"{name} is {getattr(self, name)}"
                 self._refuse(what, f"give a number between {low:g} and {high:g}")
+
+    @override
+    def thinning(self, count: int) -> int:
+        return max(1, self.chains * self.draws // count)
 
     @override
     def fit(

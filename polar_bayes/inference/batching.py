@@ -1,20 +1,24 @@
-"""Batches of pixels: arrays that differ between pixels, and arrays that all of them share.
+"""Batches of pixels: their readings, the outcome of their fits, and compiled functions of them.
 
-A batch has a fixed number of pixels, so every batch of every image runs the same compiled program,
-which computes only as many of its pixels as are wanted.
+Some arrays differ between pixels, others are shared by all. A batch has a fixed number of pixels,
+so every batch of every image runs the same compiled program, which computes only as many of its
+pixels as are wanted.
 """
 
 import dataclasses
+import enum
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from jaxtyping import Array
 
 from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.program import Values
 from polar_bayes.observation.data import Observations
 from polar_bayes.physics.geometry import Geometry
 
@@ -100,6 +104,16 @@ def batch_pixels(
     return ObservationBatch(part(True), part(False), views)
 
 
+def cut(image: xr.Dataset, pixels: int) -> Iterator[dict[str, slice]]:
+    """Places of blocks that cover an image, row by row."""
+    rows, columns = (image.sizes[dim] for dim in IMAGE)
+    wide = min(columns, pixels)
+    high = max(1, pixels // wide)
+    for y in range(0, rows, high):
+        for x in range(0, columns, wide):
+            yield {"y": slice(y, min(y + high, rows)), "x": slice(x, min(x + wide, columns))}
+
+
 def take_rows[T](values: T, which: np.ndarray) -> T:
     """Some pixels of arrays that all begin with the pixel axis."""
     return jax.tree.map(lambda x: np.asarray(x)[which], values)
@@ -109,6 +123,63 @@ def put_rows[T](values: T, which: np.ndarray, new: T) -> None:
     """Replace some pixels of arrays that all begin with the pixel axis."""
     for whole, part in zip(jax.tree.leaves(values), jax.tree.leaves(new), strict=True):
         whole[which] = part
+
+
+# --- The outcome of a batch: status, method used and diagnostics of each pixel --------------------
+
+
+MIN_VIEWS = 2
+"""Valid views without which a pixel is not fitted."""
+
+
+class Status(enum.IntEnum):
+    """Status of a pixel; the last is the value of chunks that are not written."""
+
+    GOOD = 0
+    MASKED = 1
+    TOO_FEW_VIEWS = 2
+    NOT_CONVERGED = 3
+    NOT_TRUSTED = 4
+    NOT_FITTED = -1
+
+
+class MethodUsed(enum.IntEnum):
+    """The method by which the numbers of a pixel were found."""
+
+    NONE = 0
+    LAPLACE = 1
+    IMPORTANCE = 2
+    ADAPTED = 3
+    NUTS = 4
+    TEMPERED = 5
+    VARIATIONAL = 6
+
+
+Describe = Callable[[np.ndarray, Values, np.ndarray], None]
+"""Receives indices of pixels with an answer, their draws by name and weights of (pixel, draw)."""
+
+
+class Outcome(NamedTuple):
+    """Diagnostics of a batch of pixels: NaN where there are none."""
+
+    pareto_k: np.ndarray
+    effective_draws: np.ndarray
+    condition: np.ndarray
+    steps: np.ndarray
+    approach: np.ndarray
+    status: np.ndarray
+
+
+def empty_outcome(count: int, status: Status = Status.NOT_CONVERGED) -> Outcome:
+    """Diagnostics of pixels that are not fitted yet."""
+    return Outcome(
+        pareto_k=np.full(count, np.nan),
+        effective_draws=np.full(count, np.nan),
+        condition=np.full(count, np.nan),
+        steps=np.zeros(count, np.int32),
+        approach=np.full(count, MethodUsed.NONE, np.int8),
+        status=np.full(count, status, np.int8),
+    )
 
 
 # --- A function of one pixel as a compiled program of a batch -------------------------------------

@@ -3,7 +3,7 @@
 A schema lists the groups, variables, attributes and provenance that this package reads, with the
 type of each. Everything else in a tree is ignored, so trees that ArviZ made, or that a user has
 edited, pass wherever their parts fit together. Functions trust a tree that has passed its schema.
-The schemas of calibrations and accuracy studies are in `polar_bayes.calibration.files` and
+The schemas of calibrations and accuracy studies are in `polar_bayes.calibration.verdict` and
 `polar_bayes.benchmark.accuracy`.
 """
 
@@ -417,3 +417,40 @@ FIT = Schema(
 def check_fit(result: xr.DataTree, source: str = "result") -> None:
     """Raise a `FitError` where a tree is no fit, or its parts do not fit together."""
     FIT.check(result, source)
+
+
+def auto_sentences(result: xr.DataTree) -> list[str]:
+    """What `method="auto"` tried, what it took, and why.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+
+    Returns:
+        A sentence for each method that was tried, in order; none for a fit by a method of one's
+        own choice.
+
+    Raises:
+        FitError: It is no fit, or does not hold together.
+    """
+    check_fit(result)
+    summary = provenance_of(result).get("auto")
+    if not summary:
+        return []
+    sentences = []
+    for step in summary["steps"]:
+        name = f"{step['name']} ({step['seconds']:.1f} s)"
+        if step["taken"]:
+            error = step.get("monte_carlo")
+            within = "an unknown number of" if error is None else f"{error:.2g}"
+            sentences.append(
+                f"{name} was taken: its means and standard deviations are expected within "
+                f"{within} posterior sd, and {summary['tolerance']:g} were asked for."
+            )
+        else:
+            sentences.append(f"{name} was not taken: {step['why']}.")
+    if not summary["met"]:
+        sentences.append(
+            f"Nothing was good enough; these are the numbers of {summary['chosen']}, which came "
+            "nearest. Give more seconds or a larger tolerance, or doubt them."
+        )
+    return sentences

@@ -20,12 +20,12 @@ from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
+from polar_bayes.inference import methods
 from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_until
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
-from polar_bayes.inference.methods import find_method
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.problem import BLOCK, THREADS, Problem, make_problem
-from polar_bayes.inference.request import MODELS, Request, resolve
+from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.instrument import Discrepancy
@@ -37,6 +37,17 @@ PRIOR_DRAWS = 500
 
 DIAGNOSTICS = ("r_hat", "k_hat", "effective_draws")
 """What a method states of its own draws, stored with the result; None where it states nothing."""
+
+
+METHODS: Mapping[str, Callable[[], AbstractMethod]] = {
+    "nuts": lambda: methods.Nuts(),
+    "laplace": lambda: methods.Laplace(),
+    "point": lambda: methods.Point(),
+    "importance": lambda: methods.Importance(),
+    "tempered": lambda: methods.Tempered(),
+    "auto": lambda: methods.Auto(),
+}
+"""Methods that `fit` knows by name; a function makes each, because it loads what it needs."""
 
 
 def fit(
@@ -122,6 +133,31 @@ def fit_request(
     )
 
 
+def find_method(
+    method: str | AbstractMethod, tolerance: float | None, seconds: float | None
+) -> AbstractMethod:
+    """The settings that a caller asks for, by name or as they are."""
+    limits = {"tolerance": tolerance, "seconds": seconds}
+    given = {name: value for name, value in limits.items() if value is not None}
+    if given and method != "auto":
+        raise FitError(
+            f"{' and '.join(given)} needs method='auto'",
+            where=f"fit: method={method!r}",
+            hint="leave it out, or give method='auto'",
+        )
+    if given:
+        return methods.Auto(**given)
+    if isinstance(method, AbstractMethod):
+        return method
+    if not isinstance(method, str) or method not in METHODS:
+        raise FitError(
+            "no such method",
+            where=f"method={method!r}",
+            hint=f"give one of {', '.join(METHODS)}, or settings such as Nuts(draws=2000)",
+        )
+    return METHODS[method]()
+
+
 class _Timings:
     """Seconds of each stage, compilation included."""
 
@@ -204,11 +240,11 @@ def _model_source(model: Callable) -> str:
     """The source of a model of the user's own, so that a result shows what was fitted."""
     while isinstance(model, Messenger):
         model = model.fn
-    ours = [known if isinstance(known, FunctionType) else type(known) for known in MODELS.values()]
-    if model in ours or type(model) in ours:
+    code = model if isinstance(model, FunctionType) else type(model)
+    if code.__module__.startswith("polar_bayes."):
         return ""
     try:
-        return inspect.getsource(model if isinstance(model, FunctionType) else type(model))
+        return inspect.getsource(code)
     except (OSError, TypeError):
         return ""
 

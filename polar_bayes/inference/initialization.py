@@ -10,28 +10,41 @@ An initializer holds what is compiled for one layout, and serves every capture o
 import abc
 import dataclasses
 import functools
-from typing import Any, override
+from collections.abc import Callable
+from typing import Any, NamedTuple, override
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from numpyro import handlers
+from numpyro.infer.autoguide import AutoLaplaceApproximation
 
-from polar_bayes.inference import hierarchical_reparam, laplace, nuts
-from polar_bayes.inference.group_model import GroupModel, find_group_model, find_groups
-from polar_bayes.inference.hierarchical_reparam import FittedReparam, HierarchicalReparam
+from polar_bayes.errors import FitError
+from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.hierarchical_reparam import (
+    FittedReparam,
+    GroupModel,
+    HierarchicalReparam,
+    find_group_model,
+    find_groups,
+    fit_reparam,
+)
 from polar_bayes.inference.optimize import (
     Modes,
+    NumpyPotential,
     ValueAndGradient,
     find_modes,
     from_prior,
-    numpy_potential,
 )
 from polar_bayes.inference.program import Model, Program
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress
 
 STARTS = 16
+
+HEAVY_MODE = 0.01
+"""Laplace weight of a mode that chains must have visited."""
 
 LARGEST_DENSE = 60
 """Most coordinates whose covariance a warm-up of some hundred draws can estimate. The posterior of
@@ -41,8 +54,23 @@ Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 """Unconstrained draws (chain, draw, size), and statistics, each (chain, draw)."""
 
 
+class Target(NamedTuple):
+    """A density for chains, with starting points and metric."""
+
+    density: Callable[[Array, Any], Array]
+    """Minus its log, from coordinates and `given`; one object for all captures of a layout."""
+    given: Any
+    potential: ValueAndGradient
+    starts: np.ndarray
+    metric: np.ndarray
+    transform: Callable[[np.ndarray], np.ndarray] = lambda z: z
+    """From draws in the coordinates of the sampler to those of the program, (chain, draw, size)."""
+    acceptance: float = 0.9
+    warmup: int = 300
+
+
 class AbstractInit(abc.ABC):
-    """Where draws start."""
+    """Where draws start: what every method may ask of the modes, however they were found."""
 
     metadata: dict[str, Any]
     """Number of starts, failures and weights, for the provenance."""
@@ -53,12 +81,20 @@ class AbstractInit(abc.ABC):
         return float(self.metadata["newton_decrement"])
 
     @abc.abstractmethod
-    def target(self, key: Array, chains: int) -> nuts.Target:
+    def target(self, key: Array, chains: int) -> Target:
         """The density for NUTS, with starting points and metric."""
 
     @abc.abstractmethod
-    def laplace(self, key: Array, settings: laplace.LaplaceSettings) -> Draws:
+    def laplace(self, key: Array, chains: int, draws: int) -> Draws:
         """Draws from the normal approximation at the mode of largest weight."""
+
+    @abc.abstractmethod
+    def joint_modes(self, where: str) -> Modes:
+        """The modes of all coordinates together; a `FitError` where groups have modes each."""
+
+    @abc.abstractmethod
+    def missed_mode_weight(self, z: np.ndarray) -> float:
+        """Weight of the heaviest mode to which some chain of draws never came nearest."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,35 +108,60 @@ class JointInit(AbstractInit):
     metadata: dict[str, Any]
 
     @override
-    def target(self, key: Array, chains: int) -> nuts.Target:
-        return nuts.Target(
-            samplers=self.initializer.samplers,
-            given=self.data,
-            potential=self.potential,
-            starts=nuts.draw_starts(self.potential, self.modes, key, chains),
-            metric=self.modes.covariance[0],
-        )
+    def target(self, key: Array, chains: int) -> Target:
+        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        modes, starts = self.modes, []
+        for mode in random.choice(len(modes.weight), size=chains, p=modes.weight):
+            start = random.multivariate_normal(modes.z[mode], modes.covariance[mode])
+            starts.append(start if np.isfinite(self.potential(start)[0]) else modes.z[mode])
+        density = self.initializer.program.potential_jit
+        return Target(density, self.data, self.potential, np.stack(starts), modes.covariance[0])
 
     @override
-    def laplace(self, key: Array, settings: laplace.LaplaceSettings) -> Draws:
-        program, guide = self.initializer.program, self.initializer.guide
-        return laplace.sample(program, guide, self.data, self.potential, self.modes, key, settings)
+    def laplace(self, key: Array, chains: int, draws: int) -> Draws:
+        modes = self.modes
+        location, factor, order = self.initializer.guide(
+            jnp.asarray(modes.z[0]), jnp.linalg.inv(jnp.asarray(modes.covariance[0])), self.data
+        )
+        # Where the Hessian is not positive definite, the guide silently has zero width, so that a
+        # failed fit would look certain: such draws are NaN.
+        factor = jnp.where(jnp.diagonal(factor) > 0.0, factor, jnp.nan)
+        noise = jax.random.normal(key, (chains, draws, len(location)))
+        z = np.asarray(location + noise @ factor.T)[..., np.argsort(np.asarray(order))]
+        return z, _weigh(self.potential, z, np.asarray(noise))
+
+    @override
+    def joint_modes(self, where: str) -> Modes:
+        return self.modes
+
+    @override
+    def missed_mode_weight(self, z: np.ndarray) -> float:
+        modes = self.modes
+        heavy = np.flatnonzero(modes.weight >= HEAVY_MODE)
+        if heavy.size < 2:
+            return 0.0
+        halves = np.linalg.cholesky(modes.covariance[heavy])
+        apart = z[None] - modes.z[heavy][:, None, None]
+        steps = np.einsum("mij,mcdj->mcdi", np.linalg.inv(halves), apart)
+        volume = np.log(np.diagonal(halves, axis1=1, axis2=2)).sum(axis=1)
+        nearest = np.argmin(0.5 * np.sum(steps**2, axis=-1) + volume[:, None, None], axis=0)
+        visited = np.array([(nearest == number).any(axis=1).all() for number in range(heavy.size)])
+        return float(np.max(modes.weight[heavy], where=~visited, initial=0.0))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class HierarchicalInit(AbstractInit):
     """Many groups: coordinates in which the posterior is close to standard normal."""
 
-    samplers: nuts.SamplerCache
     fitted: FittedReparam
     metadata: dict[str, Any]
 
     @override
-    def target(self, key: Array, chains: int) -> nuts.Target:
+    def target(self, key: Array, chains: int) -> Target:
         size, dtype = self.fitted.reparam.size, self.fitted.given.point.common.dtype
         few = size <= LARGEST_DENSE
-        return nuts.Target(
-            samplers=self.samplers,
+        return Target(
+            density=self.fitted.reparam.potential_jit,
             given=self.fitted.given,
             potential=self.fitted.potential,
             starts=self.fitted.draw_starts(key, chains),
@@ -111,25 +172,46 @@ class HierarchicalInit(AbstractInit):
         )
 
     @override
-    def laplace(self, key: Array, settings: laplace.LaplaceSettings) -> Draws:
-        shape = (settings.chains, settings.draws, self.fitted.reparam.size)
-        noise = np.asarray(jax.random.normal(key, shape))
-        return self._to_program(noise), laplace.weigh(self.fitted.potential, noise, noise)
+    def laplace(self, key: Array, chains: int, draws: int) -> Draws:
+        noise = np.asarray(jax.random.normal(key, (chains, draws, self.fitted.reparam.size)))
+        return self._to_program(noise), _weigh(self.fitted.potential, noise, noise)
+
+    @override
+    def joint_modes(self, where: str) -> Modes:
+        raise FitError(
+            "it approximates one material; weights of many patches together are useless",
+            where=where,
+            hint="use method='nuts'",
+        )
+
+    @override
+    def missed_mode_weight(self, z: np.ndarray) -> float:
+        return 0.0  # chains start from modes of each group that are drawn by weight
 
     def _to_program(self, w: np.ndarray) -> np.ndarray:
         return np.asarray(self.fitted.reparam.forward_chains(jnp.asarray(w), self.fitted.given))
 
 
+def _weigh(potential: ValueAndGradient, z: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
+    """Log density and log importance weight of draws that are affine in standard normal noise."""
+    lp = -np.array([potential(draw)[0] for draw in z.reshape(-1, z.shape[-1])])
+    lp = lp.reshape(z.shape[:2])
+    return {"lp": lp, "log_weight": lp + 0.5 * np.sum(noise**2, axis=-1)}
+
+
+# --- Initializers: what is compiled for a layout --------------------------------------------------
+
+
 class AbstractInitializer(abc.ABC):
     """The search for modes in all captures of one layout."""
-
-    def expect(self, data: Observations, method: nuts.NutsSettings) -> None:
-        """Begin to compile the sampler, in parallel with the search, where its shapes are known."""
-        del data, method
 
     @abc.abstractmethod
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
         """The modes of one capture; a `FitError` where no start reached one."""
+
+    @abc.abstractmethod
+    def expected_target(self, data: Observations) -> Target | None:
+        """A target of the shapes that the search will give; None where they are not known."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -137,28 +219,15 @@ class JointInitializer(AbstractInitializer):
     """For captures whose coordinates are optimized together."""
 
     program: Program
-    samplers: nuts.SamplerCache
 
     @functools.cached_property
-    def guide(self) -> laplace.Guide:
-        """The normal approximation."""
-        return laplace.compiled_guide(self.program)
-
-    @override
-    def expect(self, data: Observations, method: nuts.NutsSettings) -> None:
-        size = self.program.size
-        target = nuts.Target(
-            samplers=self.samplers,
-            given=data,
-            potential=lambda z: (0.0, z),
-            starts=np.zeros((1, size)),
-            metric=np.eye(size),
-        )
-        nuts.expect(target, method)
+    def guide(self) -> Callable[[Array, Array, Observations], tuple[Array, Array, Array]]:
+        """NumPyro's guide around a mode, compiled."""
+        return JitOnce(functools.partial(_guide, self.program))
 
     @override
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
-        potential = CompiledPotential(self.program, data)
+        potential = NumpyPotential(self.program.value_and_gradient, data, data.brightness.dtype)
         modes = find_modes(potential, from_prior(self.program, key, STARTS, data), progress)
         metadata = {
             "starts": modes.starts,
@@ -169,6 +238,12 @@ class JointInitializer(AbstractInitializer):
         }
         return JointInit(self, data, potential, modes, metadata)
 
+    @override
+    def expected_target(self, data: Observations) -> Target:
+        size = self.program.size
+        starts, metric = np.zeros((1, size)), np.eye(size)
+        return Target(self.program.potential_jit, data, lambda z: (0.0, z), starts, metric)
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class HierarchicalInitializer(AbstractInitializer):
@@ -176,13 +251,10 @@ class HierarchicalInitializer(AbstractInitializer):
 
     group_model: GroupModel
     reparam: HierarchicalReparam
-    samplers: nuts.SamplerCache
 
     @override
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
-        fitted = hierarchical_reparam.fit_reparam(
-            self.group_model, self.reparam, data, key, progress
-        )
+        fitted = fit_reparam(self.group_model, self.reparam, data, key, progress)
         modes = fitted.modes
         metadata = {
             "starts": modes.starts * self.reparam.groups.count,
@@ -190,7 +262,11 @@ class HierarchicalInitializer(AbstractInitializer):
             "patches_with_several": sum(len(each.weight) > 1 for each in modes.of_group),
             "newton_decrement": fitted.decrement,
         }
-        return HierarchicalInit(self.samplers, fitted, metadata)
+        return HierarchicalInit(fitted, metadata)
+
+    @override
+    def expected_target(self, data: Observations) -> None:
+        return None
 
 
 def make_initializer(model: Model, program: Program, data: Observations) -> AbstractInitializer:
@@ -198,19 +274,25 @@ def make_initializer(model: Model, program: Program, data: Observations) -> Abst
     groups = find_groups(program, data)
     group_model = None if groups is None else find_group_model(model, groups, data)
     if groups is None or group_model is None:
-        return JointInitializer(program, nuts.SamplerCache(program.potential_jit))
-    reparam = HierarchicalReparam(program, groups)
-    return HierarchicalInitializer(group_model, reparam, nuts.SamplerCache(reparam.potential_jit))
+        return JointInitializer(program)
+    return HierarchicalInitializer(group_model, HierarchicalReparam(program, groups))
 
 
-class CompiledPotential:
-    """Potential and gradient of a program as functions of NumPy arrays; counts its calls."""
-
-    def __init__(self, program: Program, data: Observations) -> None:
-        self._potential = numpy_potential(program.value_and_gradient, data, data.brightness.dtype)
-        self.calls = 0
-
-    def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
-        """At an unconstrained vector."""
-        self.calls += 1
-        return self._potential(z)
+def _guide(
+    program: Program, mode: Array, precision: Array, data: Observations
+) -> tuple[Array, Array, Array]:
+    """Location and Cholesky factor of NumPyro's guide, and the order of its coordinates."""
+    # The guide orders sites as the model declares them, the program by name. The guide's own search
+    # for a starting point is not needed, and compilation removes it.
+    order = jnp.zeros(program.size, int)
+    guide = AutoLaplaceApproximation(
+        program.model, hessian_fn=lambda _, location: precision[order][:, order]
+    )
+    handlers.seed(guide, jax.random.key(0))(data)
+    numbers = jnp.arange(program.size, dtype=mode.dtype)
+    unpacked = guide._unpack_latent(numbers)
+    for name, positions in program.unravel(numbers).items():
+        of_guide = unpacked[name].ravel().astype(int)
+        order = order.at[of_guide].set(positions.ravel().astype(int))
+    posterior = guide.get_posterior({"auto_loc": mode[order]})
+    return posterior.loc, posterior.scale_tril, order

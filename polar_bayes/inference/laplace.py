@@ -1,38 +1,57 @@
-"""The Laplace approximation, and robust nonlinear least squares.
+"""The Laplace approximation, and its correction by importance sampling.
 
-The approximation is a normal distribution at the mode of largest weight (Tierney and Kadane 1986,
-J. Am. Stat. Assoc. 81, 82-86). NumPyro's `AutoLaplaceApproximation` supplies the guide, so users
-have its methods; the mode comes from `optimize`. Where the Hessian is not positive definite, the
-guide silently has zero width, so that a failed fit would look certain: here such draws are NaN.
-
-Least squares fit the readings themselves, each variable in units of its own residual scatter, with
-the soft L1 loss, by which residuals beyond about two of these units count less. Most published fits
-do the same.
+Source:
+    Tierney and Kadane (1986), J. Am. Stat. Assoc. 81, 82-86: the approximation; Vehtari, Simpson,
+    Gelman, Yao & Gabry (2024), JMLR 25(72): Pareto-smoothed importance sampling; Cappe, Douc,
+    Guillin, Marin & Robert (2008), Stat. Comput. 18, 447-459: population Monte Carlo; Cornuet,
+    Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), 798-812: weights over all rounds.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
+import math
+from typing import override
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float
-from numpyro import handlers
-from numpyro.infer.autoguide import AutoLaplaceApproximation
+import scipy.optimize
+import scipy.special
+from jaxtyping import Array
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import JitOnce
-from polar_bayes.inference.optimize import Modes, ValueAndGradient
-from polar_bayes.inference.program import Program
-from polar_bayes.observation.data import Observations
+from polar_bayes.inference.initialization import STARTS
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
+from polar_bayes.inference.optimize import SETTLED, Modes
+from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.proposals import Mixture, draw_mixture, fit_mixture, log_density
+from polar_bayes.inference.psis import (
+    MAX_PARETO_K,
+    effective_draws,
+    numpy_generator,
+    smooth,
+    systematic_resample,
+)
+from polar_bayes.progress import Progress
+
+LEAST_WEIGHT = 1e-3
+"""Share of the Laplace evidence; modes of less get no draws."""
+
+SIDE_BY_SIDE = 1024
+"""Draws whose proposal density is computed together: that of all at once would fill the memory."""
 
 
 @dataclasses.dataclass(frozen=True)
-class LaplaceSettings:
-    """Number of draws, and groups of them; `Laplace` explains each."""
+class Laplace(AbstractMethod):
+    """The Laplace approximation: a normal distribution at the heaviest mode.
+
+    Args:
+        draws: Draws from the fitted normal distribution, in `chains` groups for ArviZ.
+        chains: Groups; the draws are independent, so they only serve diagnostics.
+
+    Raises:
+        FitError: Fewer than 50 draws or than 1 chain.
+    """
 
     draws: int = 500
     chains: int = 4
@@ -45,136 +64,200 @@ class LaplaceSettings:
                 hint="give at least 50 draws and 1 chain",
             )
 
+    @override
+    def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
+        initialization = problem.initialize(progress)
+        z, stats = initialization.laplace(key, self.chains, self.draws)
+        problems = []
+        if initialization.decrement > SETTLED:
+            problems.append(
+                f"the mode is not settled (Newton decrement {initialization.decrement:.2g} "
+                "posterior standard deviations): use method='nuts'"
+            )
+        count = z[..., 0].size
+        return PosteriorDraws(
+            method="laplace",
+            z=z,
+            stats=stats,
+            problems=problems,
+            k_hat=float(smooth(stats["log_weight"].reshape(1, -1)).pareto_k[0]),
+            effective_draws=float(count),
+            gradients=float(initialization.metadata.get("gradients", np.nan)) + count,
+            densities=0.0,
+            metadata={"modes": initialization.metadata},
+        )
 
-Guide = Callable[[Array, Array, Observations], tuple[Array, Array, Array]]
-"""From a mode, its precision and the data to location and Cholesky factor of the guide, and to the
-order of its coordinates."""
+
+@dataclasses.dataclass(frozen=True)
+class Importance(AbstractMethod):
+    """Laplace with importance correction.
+
+    Draws come from a mixture of Student t distributions with 8 degrees of freedom, one at each
+    mode that holds 0.1% of the Laplace evidence or more, as heavy as its evidence. Weighting them
+    by the posterior corrects what the normal approximation gets wrong, as far as the mixture
+    reaches; Pareto k-hat says how far. In further rounds a mixture that is fitted to the weighted
+    draws of all rounds before proposes as many draws again, until there are enough effective ones.
+
+    Args:
+        draws: Of the mixture of each round, at least 256.
+        rounds: At most, at least 1.
+
+    Raises:
+        FitError: Fewer draws or rounds.
+    """
+
+    draws: int = 4096
+    rounds: int = 1
+
+    def __post_init__(self) -> None:
+        if self.draws < 256:
+            raise FitError(f"draws is {self.draws}", where="Importance", hint="give at least 256")
+        if self.rounds < 1:
+            raise FitError(f"rounds is {self.rounds}", where="Importance", hint="give at least 1")
+
+    @override
+    def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
+        initialization = problem.initialize(progress)
+        key_draw, key_resample = jax.random.split(key)
+        sample = _Rounds(problem, self)
+        proposal = laplace_mixture(initialization.joint_modes("Importance"), problem.dtype)
+        sample.add(proposal, key_draw)
+        while sample.calls_for_more and len(sample.proposals) < self.rounds:
+            progress("weighting draws", len(sample.proposals) / self.rounds)
+            key_draw, key_fit = jax.random.split(key_draw)
+            sample.add(sample.fit(key_fit), key_draw)
+        z, weights, k_hat = sample.z, sample.weights, sample.k_hat
+        if not np.isfinite(weights).all():
+            raise FitError(
+                "the posterior density is zero at every draw",
+                where="Importance",
+                hint="use method='nuts'",
+            )
+        effective = sample.effective
+        index = systematic_resample(weights, effective, numpy_generator(key_resample))
+        problems = []
+        if not k_hat <= MAX_PARETO_K:
+            problems.append(
+                f"Pareto k-hat of the weights is {k_hat:.2f} (at most {MAX_PARETO_K}): they do "
+                "not reach all of the posterior, so use method='nuts'"
+            )
+        return PosteriorDraws(
+            method="importance",
+            z=z[index],
+            stats={"lp": sample.log_posterior[index]},
+            problems=problems,
+            weighted=(z, weights),
+            k_hat=float(k_hat),
+            effective_draws=effective,
+            gradients=float(initialization.metadata["gradients"]),
+            densities=float(len(z)),
+            metadata={"modes": initialization.metadata},
+        )
 
 
-def sample(
-    program: Program,
-    guide: Guide,
-    data: Observations,
-    potential: ValueAndGradient,
-    modes: Modes,
-    key: Array,
-    settings: LaplaceSettings,
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Draws (chain, draw, size) from NumPyro's guide at the heaviest mode, and statistics."""
-    location, factor, order = guide(
-        jnp.asarray(modes.z[0]), jnp.linalg.inv(jnp.asarray(modes.covariance[0])), data
+COMPONENTS = 8
+"""Of the mixtures of further rounds."""
+
+ENOUGH_SHARE = 0.2
+"""Effective sample size, as a share of the draws of one round, after which no round follows."""
+
+FITTED_PER_SIZE = 10
+"""Effective draws for each coordinate to which a mixture is fitted: weights that leave fewer are
+raised to a power below 1."""
+
+
+class _Rounds:
+    """Draws of all rounds, weighted over the mean density of their proposals."""
+
+    def __init__(self, problem: Problem, settings: Importance) -> None:
+        self._problem, self._settings = problem, settings
+        self.proposals: list[Mixture] = []
+        size = problem.program.size
+        self.z, self.log_posterior = np.empty((0, size), problem.dtype), np.empty(0)
+        self._log_proposals = np.empty((0, 0))  # (proposal, draw)
+
+    def add(self, proposal: Mixture, key: Array) -> None:
+        """Draw from one more proposal, and weigh all draws anew."""
+        count = self._settings.draws
+        z, log_proposal = (np.asarray(x) for x in _propose(proposal, count, key))
+        older = [np.asarray(_log_densities(each, z)) for each in self.proposals]
+        newer = [np.asarray(_log_densities(proposal, block)) for block in self._blocks()]
+        above = np.concatenate([self._log_proposals, np.reshape(older, (-1, count))], axis=1)
+        below = np.concatenate([*newer, log_proposal])
+        self._log_proposals = np.concatenate([above, below[None]])
+        self.proposals.append(proposal)
+        self.z = np.concatenate([self.z, z])
+        self.log_posterior = np.concatenate([self.log_posterior, self._problem.log_density(z)])
+        mean = scipy.special.logsumexp(self._log_proposals, axis=0) - math.log(len(self.proposals))
+        self.log_ratios = self.log_posterior - mean
+        weights, k_hat = smooth(self.log_ratios[None])
+        self.weights, self.k_hat = weights[0], float(k_hat[0])
+        self.effective = float(effective_draws(weights)[0])
+
+    @property
+    def calls_for_more(self) -> bool:
+        """Whether a further round is needed, and there are draws to which it can be fitted."""
+        enough = self.effective >= ENOUGH_SHARE * self._settings.draws
+        reaches = self.k_hat <= MAX_PARETO_K
+        return bool(np.isfinite(self.weights).all()) and not (enough and reaches)
+
+    def fit(self, key: Array) -> Mixture:
+        """A mixture for the next round."""
+        weights = _temper(self.log_ratios, FITTED_PER_SIZE * self.z.shape[1])
+        # One length compiles once: the draws of rounds to come have no weight.
+        missing = self._settings.rounds * self._settings.draws - len(self.z)
+        z = np.pad(self.z, ((0, missing), (0, 0)))
+        padded = np.pad(weights, (0, missing)).astype(z.dtype)
+        return _fit_mixture(jnp.asarray(z), jnp.asarray(padded), COMPONENTS, key)
+
+    def _blocks(self) -> list[np.ndarray]:
+        return np.split(self.z, len(self.proposals)) if self.proposals else []
+
+
+_fit_mixture = functools.partial(jax.jit, static_argnums=2)(fit_mixture)
+
+
+@jax.jit
+def _log_densities(proposal: Mixture, z: Array) -> Array:
+    return jax.lax.map(
+        lambda z: log_density(proposal, z[None])[0], z, batch_size=min(SIDE_BY_SIDE, len(z))
     )
-    # The guide reports a failure by a width of exactly zero.
-    factor = jnp.where(jnp.diagonal(factor) > 0.0, factor, jnp.nan)
-    noise = jax.random.normal(key, (settings.chains, settings.draws, program.size))
-    drawn = location + noise @ factor.T
-    z = np.asarray(drawn)[..., np.argsort(np.asarray(order))]
-    return z, weigh(potential, z, np.asarray(noise))
 
 
-def weigh(potential: ValueAndGradient, z: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
-    """Log density and log importance weight of draws that are affine in standard normal noise."""
-    lp = -np.array([potential(draw)[0] for draw in z.reshape(-1, z.shape[-1])])
-    lp = lp.reshape(z.shape[:2])
-    return {"lp": lp, "log_weight": lp + 0.5 * np.sum(noise**2, axis=-1)}
+def _temper(log_ratios: np.ndarray, least: float) -> np.ndarray:
+    """Weights, raised to the largest power up to 1 that leaves so large an effective sample."""
+    relative = log_ratios - np.max(log_ratios)
+
+    def weights(power: float) -> np.ndarray:
+        raised = np.exp(power * np.where(np.isfinite(relative), relative, -1e300))
+        return raised / raised.sum()
+
+    def excess(power: float) -> float:
+        return float(effective_draws(weights(power)[None])[0]) - least
+
+    if excess(1.0) >= 0.0 or excess(1e-6) <= 0.0:
+        return weights(1.0)
+    return weights(scipy.optimize.brentq(excess, 1e-6, 1.0, xtol=1e-3))
 
 
-def compiled_guide(program: Program) -> Guide:
-    """NumPyro's guide around a mode, compiled for captures of the program's layout."""
-    return JitOnce(functools.partial(_guide, program))
+@functools.partial(jax.jit, static_argnums=1)
+def _propose(proposal: Mixture, count: int, key: Array) -> tuple[Array, Array]:
+    z = draw_mixture(proposal, count, key)
+    return z, _log_densities(proposal, z)
 
 
-def _guide(
-    program: Program, mode: Array, precision: Array, data: Observations
-) -> tuple[Array, Array, Array]:
-    """Location and Cholesky factor of NumPyro's guide, and the order of its coordinates."""
-    # The guide orders sites as the model declares them, the program by name. The guide's own search
-    # for a starting point is not needed, and compilation removes it.
-    order = jnp.zeros(program.size, int)
-    guide = AutoLaplaceApproximation(
-        program.model, hessian_fn=lambda _, location: precision[order][:, order]
+def laplace_mixture(modes: Modes, dtype: np.dtype) -> Mixture:
+    """A component for each heavy mode; always as many, so that one program draws from all."""
+    # There are never more modes than starts; a mode has several components where there are fewer.
+    heavy = np.flatnonzero(modes.weight >= LEAST_WEIGHT)
+    which = np.resize(heavy, max(STARTS, heavy.size))
+    times = np.bincount(which, minlength=len(modes.weight))[which]
+    share = modes.weight[which] / times
+    size = modes.z.shape[1]
+    return Mixture(
+        center=jnp.zeros(size, dtype),
+        half=jnp.eye(size, dtype=dtype),
+        log_share=jnp.asarray(np.log(share / share.sum()), dtype),
+        mean=jnp.asarray(modes.z[which], dtype),
+        scale=jnp.asarray(np.linalg.cholesky(modes.covariance[which]), dtype),
     )
-    handlers.seed(guide, jax.random.key(0))(data)
-    numbers = jnp.arange(program.size, dtype=mode.dtype)
-    unpacked = guide._unpack_latent(numbers)
-    for name, positions in program.unravel(numbers).items():
-        of_guide = unpacked[name].ravel().astype(int)
-        order = order.at[of_guide].set(positions.ravel().astype(int))
-    posterior = guide.get_posterior({"auto_loc": mode[order]})
-    return posterior.loc, posterior.scale_tril, order
-
-
-# --- Robust least squares, without priors and without noise models --------------------------------
-
-
-class Estimate(NamedTuple):
-    """The best of several fits."""
-
-    z: Float[Array, " size"]
-    covariance: Float[Array, "size size"]
-    converged: Array
-    loss: Float[Array, ""]
-
-
-def estimate(program: Program, data: Observations, starts: Float[Array, "start size"]) -> Estimate:
-    """Levenberg-Marquardt from several starts; the scatter is re-estimated after the first pass."""
-
-    def residuals(z: Array, unit: Array) -> Array:
-        parts = program.residuals(z, data)
-        return jnp.concatenate([(parts[n] / unit[i]).ravel() for i, n in enumerate(parts)])
-
-    def scatter(z: Array) -> Array:
-        parts = program.residuals(z, data).values()
-        count = jnp.maximum(jnp.sum(data.valid), 1)
-        return jnp.stack([jnp.sqrt(jnp.sum(part**2) / count) + 1e-6 for part in parts])
-
-    def soften(z: Array, unit: Array) -> Array:
-        # (sqrt(1 + r^2) - 1) = soft L1; its signed square root keeps the derivative at 0.
-        r = residuals(z, unit)
-        return r * jnp.sqrt(2.0 / (1.0 + jnp.sqrt(1.0 + r**2)))
-
-    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-
-    def descend(start: Array) -> tuple[Array, Array, Array]:
-        unit = jnp.ones(len(program.observed)) * 0.05
-        rough = optx.least_squares(soften, solver, start, unit, max_steps=100, throw=False)
-        unit = scatter(rough.value)
-        fine = optx.least_squares(soften, solver, rough.value, unit, max_steps=200, throw=False)
-        loss = jnp.sum(jnp.stack([jnp.log(scatter(fine.value))]))
-        converged = fine.result == optx.RESULTS.successful
-        return fine.value, jnp.where(jnp.isfinite(loss), loss, jnp.inf), converged
-
-    ends, losses, converged = jax.lax.map(descend, starts)
-    best = jnp.argmin(jnp.where(converged, losses, losses + 1e6))
-    z = ends[best]
-    unit = scatter(z)
-    jacobian = jax.jacfwd(lambda x: soften(x, unit))(z)
-    values, vectors = jnp.linalg.eigh(jacobian.T @ jacobian)
-    freedom = jnp.maximum(jnp.sum(data.valid) * len(program.observed) - program.size, 1)
-    variance = jnp.sum(soften(z, unit) ** 2) / freedom
-    inverse = jnp.where(values > 1e-10 * values[-1], variance / values, jnp.inf)
-    unknown = jnp.isinf(inverse)
-    covariance = (vectors * jnp.where(unknown, 0.0, inverse)) @ vectors.T
-    undetermined = jnp.any((vectors**2 > 1e-6) & unknown, axis=1)
-    covariance = covariance + jnp.diag(jnp.where(undetermined, jnp.inf, 0.0))
-    return Estimate(z=z, covariance=covariance, converged=converged[best], loss=losses[best])
-
-
-def to_numpy(estimate: Estimate) -> Estimate:
-    """An estimate with NumPy arrays."""
-    return jax.tree.map(np.asarray, estimate)
-
-
-def standard_errors(program: Program, estimate: Estimate) -> dict[str, list[float | None]]:
-    """Standard errors of the parameters in their physical range, by the delta method."""
-    infinite = np.isinf(np.diagonal(estimate.covariance))
-    covariance = np.where(np.isinf(estimate.covariance), 0.0, estimate.covariance)
-    errors = {}
-    for name, slope in program.slopes(jnp.asarray(estimate.z)).items():
-        rows = np.asarray(slope).reshape(-1, program.size)
-        sd = np.sqrt(np.einsum("ki,ij,kj->k", rows, covariance, rows))
-        undetermined = (rows[:, infinite] != 0.0).any(axis=1)
-        errors[name] = [
-            None if unknown else float(x) for x, unknown in zip(sd, undetermined, strict=True)
-        ]
-    return errors

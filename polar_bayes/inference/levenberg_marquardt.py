@@ -26,8 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpyro import distributions as dist
-from numpyro import handlers
-from numpyro.infer.util import compute_log_probs, potential_energy
+from numpyro.infer.util import compute_log_probs
 
 from polar_bayes.inference.batch_engine import BATCH, BatchEngine
 from polar_bayes.inference.batching import (
@@ -172,8 +171,7 @@ class _Pixel:
 
     def _prior(self, *coordinates: Array) -> Array:
         """Minus the log prior density of the coordinates."""
-        prior = handlers.block(self._program.model, hide=list(self._program.observed))
-        return potential_energy(prior, (self._data,), {}, self._sites(coordinates))
+        return self._program.prior_potential_at(self._sites(coordinates), self._data)
 
     def _arguments(self, coordinates: Coordinates) -> list[list[Array]]:
         """For each observed site, the arguments of its distribution, a value for each reading."""

@@ -11,8 +11,14 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_result import Describe, MethodUsed, Outcome, Status, empty_outcome
-from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.inference.batching import (
+    Describe,
+    MethodUsed,
+    ObservationBatch,
+    Outcome,
+    Status,
+    empty_outcome,
+)
 from polar_bayes.inference.compile import TRACING_LOCK
 from polar_bayes.inference.mcse import (
     LARGEST_R_HAT,
@@ -126,6 +132,18 @@ class AbstractBatchMethod[Engine](HTMLRepr, abc.ABC):
             shape (capture,); NaN where there is nothing to say. A fit that fails is a status, not
             an error.
         """
+
+    def thinning(self, count: int) -> int:
+        """Every how many of the draws that it describes are nearly independent.
+
+        Args:
+            count: Draws that are wanted, about.
+
+        Returns:
+            1 where all are, as resampled draws and those that `run_batch` thins itself.
+        """
+        del count
+        return 1
 
 
 @dataclasses.dataclass(frozen=True)

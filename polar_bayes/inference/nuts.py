@@ -9,7 +9,7 @@ reached the goals, within the limits of the settings. The draws do not depend on
 import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self, override
 
 import jax
 import jax.numpy as jnp
@@ -18,22 +18,41 @@ from jaxtyping import Array, Float
 from numpyro import infer
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import JitOnce, LRUCache
+from polar_bayes.inference.batching import Describe, ObservationBatch, Outcome
+from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.initialization import Target
 from polar_bayes.inference.mcse import measure
-from polar_bayes.inference.optimize import Modes, ValueAndGradient
-
-Progress = Callable[[float], None]
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
+from polar_bayes.inference.problem import CompiledModel, Problem
+from polar_bayes.progress import Progress
 
 LARGEST_R_HAT = 1.008
 """A little below the 1.01 at which a fit is refused."""
 
-MAX_SAMPLERS = 4
-"""Samplers of one density, by their lengths and goals, that stay compiled."""
-
 
 @dataclasses.dataclass(frozen=True)
-class NutsSettings:
-    """Numbers of chains and draws, and goals; `Nuts` explains each."""
+class Nuts(AbstractMethod):
+    """The No-U-Turn sampler.
+
+    Args:
+        chains: Independent chains, at least 2.
+        warmup: Draws spent on step size and metric, per chain. None: 300; 150 for many patches,
+            whose metric is known before.
+        draws: Draws kept at least, per chain.
+        most_draws: Draws kept at most, per chain; set it to `draws` for a fixed length.
+        effective_draws: Goal for the bulk and tail effective sample size of every coordinate.
+        target_acceptance: Higher means smaller steps, range [0.5, 1). None: 0.9 for one material,
+            0.98 for a few patches, 0.7 for many, whose coordinates are close to normal.
+        max_tree_depth: A trajectory has at most 2 ** this steps.
+        threads: Chains that run at once.
+        block: Draws between two reports of progress, per chain.
+
+    Raises:
+        FitError: A setting is out of range.
+
+    Source:
+        Hoffman & Gelman (2014), JMLR 15, 1593-1623.
+    """
 
     chains: int = 4
     warmup: int | None = None
@@ -58,16 +77,91 @@ class NutsSettings:
         for name, least in limits.items():
             given = getattr(self, name)
             if given is not None and given < least:
-                raise FitError(
-                    f"{name} is {getattr(self, name)}", where="Nuts", hint=f"give at least {least}"
-                )
+                raise FitError(f"{name} is {given}", where="Nuts", hint=f"give at least {least}")
         wanted = self.target_acceptance
         if wanted is not None and not 0.5 <= wanted < 1.0:
             raise FitError(
-                f"target_acceptance is {self.target_acceptance}",
+                f"target_acceptance is {wanted}",
                 where="Nuts",
                 hint="give a number from 0.5 to below 1",
             )
+
+    @override
+    def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
+        initialization = problem.initialize(progress)
+        key_starts, key_chains = jax.random.split(key)
+        target = initialization.target(key_starts, self.chains)
+        z, stats, mixed = sample(
+            self._sampler(target, problem),
+            target,
+            key_chains,
+            self,
+            lambda done: progress("sampling", done),
+        )
+        bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))
+        warmup = np.sum(stats["warmup_steps"][:, 0])
+        search = float(initialization.metadata.get("gradients", np.nan))
+        return PosteriorDraws(
+            method="nuts",
+            z=z,
+            stats=stats,
+            r_hat=float(np.max(r_hat)),
+            effective_draws=float(min(np.min(bulk), np.min(tail))),
+            gradients=search + float(warmup + np.sum(stats["n_steps"])),
+            densities=0.0,
+            metadata={"modes": initialization.metadata, "goals_reached": mixed},
+        )
+
+    @override
+    def prepare(self, problem: Problem) -> None:
+        target = problem.compiled_model.initializer.expected_target(problem.data)
+        if target is None:
+            return
+        sampler = self._sampler(target, problem)
+        if not sampler.advance.is_begun:
+            state = sampler.init(target, jax.random.key(0), target.starts[0])
+            sampler.advance.begin(state, target.given)
+
+    def _sampler(self, target: Target, problem: Problem) -> "Sampler":
+        """The compiled sampler of these settings."""
+        static = self.static(target)
+        return problem.compiled_model.programs.of(
+            ("nuts", static), lambda: Sampler(target.density, static)
+        )
+
+    def static(self, target: Target) -> "Static":
+        """What a sampler is compiled for; the target supplies what the settings leave open."""
+        warmup, acceptance = self.warmup, self.target_acceptance
+        return Static(
+            warmup=target.warmup if warmup is None else warmup,
+            acceptance=target.acceptance if acceptance is None else acceptance,
+            max_tree_depth=self.max_tree_depth,
+            block=self.block,
+            adapts_metric=target.metric.ndim == 2,  # a diagonal one is exact already
+        )
+
+    @override
+    def scale_draws(self, factor: float) -> Self:
+        scaled = {
+            name: int(np.ceil(factor * getattr(self, name))) for name in ("draws", "most_draws")
+        }
+        return dataclasses.replace(self, effective_draws=factor * self.effective_draws, **scaled)
+
+    @override
+    def run_batch(
+        self,
+        engine: CompiledModel,
+        observations: ObservationBatch,
+        numbers: np.ndarray,
+        seed: int,
+        describe: Describe,
+    ) -> Outcome:
+        # Several batches run at once, each on a thread of its own.
+        on_one = dataclasses.replace(self, threads=1)
+        return AbstractMethod.run_batch(on_one, engine, observations, numbers, seed, describe)
+
+
+# --- Chains -------------------------------------------------------------------------------------
 
 
 class Step(NamedTuple):
@@ -81,41 +175,14 @@ class Step(NamedTuple):
     lp: Array
 
 
-class Target(NamedTuple):
-    """A density with starting points and metric."""
-
-    samplers: "SamplerCache"
-    given: Any
-    potential: ValueAndGradient
-    starts: np.ndarray
-    metric: np.ndarray
-    transform: Callable[[np.ndarray], np.ndarray] = lambda z: z
-    """From draws in the coordinates of the sampler to those of the program, (chain, draw, size)."""
-    acceptance: float = 0.9
-    warmup: int = 300
-
-    def sampler(self, settings: NutsSettings) -> "_Sampler":
-        """The compiled sampler; the target supplies what the settings leave open."""
-        warmup, acceptance = settings.warmup, settings.target_acceptance
-        return self.samplers.of(
-            _Static(
-                warmup=self.warmup if warmup is None else warmup,
-                acceptance=self.acceptance if acceptance is None else acceptance,
-                max_tree_depth=settings.max_tree_depth,
-                block=settings.block,
-                adapts_metric=self.metric.ndim == 2,  # a diagonal one is exact already
-            )
-        )
-
-
 def sample(
+    sampler: "Sampler",
     target: Target,
     key: Array,
-    settings: NutsSettings,
-    progress: Progress = lambda _: None,
+    settings: Nuts,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[np.ndarray, dict[str, np.ndarray], bool]:
     """Draws (chain, draw, size), statistics by name, and whether the chains reached the goals."""
-    sampler = target.sampler(settings)
     warmup = sampler.static.warmup
     keys = jax.random.split(key, settings.chains)
     states = [sampler.init(target, key, at) for key, at in zip(keys, target.starts, strict=True)]
@@ -156,15 +223,7 @@ def sample(
     return z, stats, converged
 
 
-def expect(target: Target, settings: NutsSettings) -> None:
-    """Begin to compile what `sample` will need, in parallel with whatever follows."""
-    sampler = target.sampler(settings)
-    if not sampler.advance.is_begun:
-        state = sampler.init(target, jax.random.key(0), target.starts[0])
-        sampler.advance.begin(state, target.given)
-
-
-def _converged(rounds: list[Step], settings: NutsSettings) -> bool:
+def _converged(rounds: list[Step], settings: Nuts) -> bool:
     """Whether every coordinate has reached the goals; both are invariant to monotone maps."""
     z = np.concatenate([steps.z for steps in rounds], axis=1)
     bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))
@@ -172,19 +231,7 @@ def _converged(rounds: list[Step], settings: NutsSettings) -> bool:
     return bool(smallest >= settings.effective_draws and r_hat.max() <= LARGEST_R_HAT)
 
 
-def draw_starts(
-    potential: ValueAndGradient, modes: Modes, key: Array, chains: int
-) -> Float[np.ndarray, "chains size"]:
-    """Laplace draws at modes chosen by weight; the mode itself where the draw is not finite."""
-    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    starts = []
-    for mode in random.choice(len(modes.weight), size=chains, p=modes.weight):
-        start = random.multivariate_normal(modes.z[mode], modes.covariance[mode])
-        starts.append(start if np.isfinite(potential(start)[0]) else modes.z[mode])
-    return np.stack(starts)
-
-
-class _Static(NamedTuple):
+class Static(NamedTuple):
     """What is fixed when a sampler is compiled."""
 
     warmup: int
@@ -194,22 +241,10 @@ class _Static(NamedTuple):
     adapts_metric: bool
 
 
-class SamplerCache:
-    """The compiled samplers of one density."""
-
-    def __init__(self, density: Callable[[Array, Any], Array]) -> None:
-        self._density = density
-        self._samplers: LRUCache[_Sampler] = LRUCache(MAX_SAMPLERS)
-
-    def of(self, static: _Static) -> "_Sampler":
-        """The sampler of such lengths and goals."""
-        return self._samplers.of(static, lambda: _Sampler(self._density, static))
-
-
-class _Sampler:
+class Sampler:
     """NumPyro's NUTS as two functions of arrays: start a chain, advance it by a block."""
 
-    def __init__(self, density: Callable[[Array, Any], Array], static: _Static) -> None:
+    def __init__(self, density: Callable[[Array, Any], Array], static: Static) -> None:
         self.static = static
         # From a state and the data to the state after a block and its steps.
         self.advance = JitOnce(self._advance)

@@ -80,16 +80,22 @@ class Modes:
 # --- The potential, its finite values, and its Hessian --------------------------------------------
 
 
-def numpy_potential(
-    value_and_gradient: Callable[[Array, Any], tuple[Array, Array]], given: Any, dtype: DTypeLike
-) -> ValueAndGradient:
+class NumpyPotential:
     """A compiled potential of an unconstrained vector as a function of NumPy arrays."""
 
-    def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = value_and_gradient(jnp.asarray(z, dtype), given)
-        return float(value), np.asarray(gradient, float)
+    def __init__(
+        self,
+        value_and_gradient: Callable[[Array, Any], tuple[Array, Array]],
+        given: Any,
+        dtype: DTypeLike,
+    ) -> None:
+        self._compiled, self._given, self._dtype = value_and_gradient, given, dtype
+        self.calls = 0
 
-    return potential
+    def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        self.calls += 1
+        value, gradient = self._compiled(jnp.asarray(z, self._dtype), self._given)
+        return float(value), np.asarray(gradient, float)
 
 
 def finite_potential(potential: ValueAndGradient) -> ValueAndGradient:

@@ -7,16 +7,17 @@ layout; `Problem` adds the readings and the posterior modes that were found for 
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 from jaxtyping import Array, Float
+from numpyro import distributions as dist
 
-from polar_bayes.inference import laplace
 from polar_bayes.inference.compile import (
     TRACING_LOCK,
     JitOnce,
@@ -31,10 +32,10 @@ from polar_bayes.inference.program import (
     Program,
     Values,
     compile_program,
-    parameters_of,
 )
 from polar_bayes.inference.request import Request, bind_model
 from polar_bayes.observation.data import Observations, observe
+from polar_bayes.priors import RANGES, describe_prior, support_bounds
 from polar_bayes.progress import Progress, no_progress
 
 MAX_LAYOUTS = 8
@@ -50,7 +51,7 @@ SIDE_BY_SIDE = 64
 """Of these, draws that are vectorized over."""
 
 BLOCK = 500
-"""Draws that one call predicts."""
+"""Draws that one call predicts or constrains."""
 
 KEYS = 1 << 15
 """Random keys are split in multiples of this number: one compiled program serves any number."""
@@ -67,6 +68,7 @@ class CompiledModel:
     program: Program
     layout: Observations
     precision: str
+    priors: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
     programs: LRUCache[Any] = dataclasses.field(default_factory=lambda: LRUCache(MAX_PROGRAMS))
     """Further compiled programs of the model, which methods keep here by keys of their own."""
 
@@ -85,11 +87,6 @@ class CompiledModel:
             return compile_program(self.bind(), self.layout.in_single_precision())
 
     @functools.cached_property
-    def least_squares(self) -> Callable[[Array, Observations], laplace.Estimate]:
-        """Least squares from several starts, compiled."""
-        return JitOnce(lambda starts, data: laplace.estimate(self.program, data, starts))
-
-    @functools.cached_property
     def log_densities(self) -> Callable[[Array, Observations], Array]:
         """Log posterior density of a block of unconstrained vectors, compiled."""
 
@@ -98,8 +95,7 @@ class CompiledModel:
                 lambda z: -self.program.potential_jit(z, data), z, batch_size=SIDE_BY_SIDE
             )
 
-        with TRACING_LOCK:
-            return JitOnce(compute)
+        return JitOnce(compute)
 
 
 _COMPILED: LRUCache[CompiledModel] = LRUCache(MAX_LAYOUTS)
@@ -113,7 +109,8 @@ def compile_model(request: Request, data: Observations) -> CompiledModel:
     def make() -> CompiledModel:
         bind = functools.partial(bind_model, *parts)
         model = bind()
-        return CompiledModel(bind, model, compile_program(model, data), data, request.precision)
+        program = compile_program(model, data)
+        return CompiledModel(bind, model, program, data, request.precision, request.priors)
 
     with TRACING_LOCK:
         return _COMPILED.of(key, make)
@@ -129,7 +126,10 @@ class _ModeSearch:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
-    """A posterior to draw from.
+    """A posterior to draw from: one shape for one material and for many patches.
+
+    `describe` tells what is estimated; `initialize` finds the modes; `log_density`, `constrain` and
+    `predict` are functions of unconstrained vectors.
 
     Args:
         compiled_model: Programs of the model for the layout of the capture.
@@ -165,14 +165,6 @@ class Problem:
         """Whether the capture is of one material in one color."""
         return all(name == "view" or length == 1 for name, length in self.data.dims)
 
-    @functools.cached_property
-    def num_parameters(self) -> int:
-        """How many numbers the model estimates, derived ones included."""
-        z = jax.ShapeDtypeStruct((self.program.size,), self.dtype)
-        with TRACING_LOCK:
-            found = jax.eval_shape(self.program.parameters, z, self.data)
-        return sum(int(np.prod(x.shape)) for x in jax.tree.leaves(found))
-
     def initialize(self, progress: Progress = no_progress) -> AbstractInit:
         """The posterior modes and what surrounds them, found once however many methods ask.
 
@@ -191,6 +183,34 @@ class Problem:
             self._search.seconds = time.perf_counter() - begun
             self._search.found = found
         return self._search.found
+
+    def describe(self) -> pd.DataFrame:
+        """What is estimated, and from which readings.
+
+        Returns:
+            A row for each parameter, derived ones included: its dims and their lengths, how many
+            numbers it is, its prior (as text; the family of a distribution that the model itself
+            declares; "derived"), and the bounds of the prior in the unit of the parameter. The
+            attributes `used` and `measured` count the readings of each variable.
+        """
+        program, priors = self.program, self.compiled_model.priors
+        z = jax.ShapeDtypeStruct((program.size,), self.dtype)
+        with TRACING_LOCK:
+            shapes = jax.eval_shape(program.parameters, z, self.data)
+        rows = {}
+        for name, value in shapes.items():
+            text = program.families.get(name, "derived")
+            low, high = RANGES.get(name, (-np.inf, np.inf))
+            if name in priors:
+                text, (low, high) = describe_prior(priors[name]), support_bounds(priors[name])
+            dims = {dim: program.plates[dim] for dim in program.dims[name]}
+            rows[name] = [dims, int(np.prod(value.shape)), text, low, high]
+        columns = ["dims", "size", "prior", "low", "high"]
+        table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+        valid = np.asarray(self.data.valid)
+        table.attrs["used"] = dict.fromkeys(program.observed, int(valid.sum()))
+        table.attrs["measured"] = dict.fromkeys(program.observed, valid.size)
+        return table
 
     def log_density(self, z: Float[np.ndarray, "draw size"]) -> Float[np.ndarray, " draw"]:
         """Log posterior density of unconstrained vectors, up to a constant.
@@ -218,7 +238,15 @@ class Problem:
         Returns:
             Arrays of shape (chain, draw, ...), by name.
         """
-        return parameters_of(self.program, z.astype(self.dtype), self.data)
+        z, count, pieces = z.astype(self.dtype), z.shape[1], []
+        for begin in range(0, count, BLOCK):
+            index = np.minimum(np.arange(begin, begin + BLOCK), count - 1)
+            found = self.program.parameters_of_chains(jnp.asarray(z[:, index]), self.data)
+            pieces.append({name: np.asarray(value) for name, value in found.items()})
+        return {
+            name: np.concatenate([piece[name] for piece in pieces], axis=1)[:, :count]
+            for name in pieces[0]
+        }
 
     def prepare_predictions(self) -> None:
         """Begin to compile what `predict` needs, in parallel with whatever follows."""

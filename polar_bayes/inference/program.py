@@ -52,6 +52,7 @@ class Program:
     plates: Mapping[str, int]
     events: Mapping[str, tuple[int, ...]]
     supports: Mapping[str, dist.constraints.Constraint]
+    families: Mapping[str, str]
     auxiliary: tuple[str, ...]
     derived: tuple[str, ...]
     observed: tuple[str, ...]
@@ -68,8 +69,12 @@ class Program:
 
     def prior_potential(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """The potential without the likelihood."""
+        return self.prior_potential_at(self.unravel(z), data)
+
+    def prior_potential_at(self, sites: dict[str, Array], data: Observations) -> Float[Array, ""]:
+        """The same of the unconstrained latent sites by name."""
         prior = handlers.block(self.model, hide=list(self.observed))
-        return potential_energy(prior, (data,), {}, self.unravel(z))
+        return potential_energy(prior, (data,), {}, sites)
 
     def constrain(self, z: Float[Array, " size"]) -> dict[str, Array]:
         """The latent sites in their supports."""
@@ -206,6 +211,7 @@ def compile_program(model: Model, data: Observations) -> Program:
         events={name: tuple(site["fn"].event_shape) for name, site in sampled.items()}
         | {name: _event_shape(site) for name, site in derived.items()},
         supports=supports,
+        families={name: family_of(site["fn"]) for name, site in latent.items()},
         auxiliary=tuple(name for name, site in latent.items() if is_auxiliary(site)),
         derived=tuple(derived),
         observed=observed,
@@ -341,20 +347,3 @@ def _check_readings(sampled: Mapping[str, dict], data: Observations) -> None:
             where="model",
             hint=f"end it with declare_readings(...), or observe {' or '.join(data.readings)}",
         )
-
-
-PIECE = 500
-
-
-def parameters_of(program: Program, z: np.ndarray, data: Observations) -> dict[str, np.ndarray]:
-    """Parameters of draws (chain, draw, size) by name, in blocks of one compiled length."""
-    count = z.shape[1]
-    pieces = []
-    for begin in range(0, count, PIECE):
-        index = np.minimum(np.arange(begin, begin + PIECE), count - 1)
-        found = program.parameters_of_chains(jnp.asarray(z[:, index]), data)
-        pieces.append({name: np.asarray(value) for name, value in found.items()})
-    return {
-        name: np.concatenate([piece[name] for piece in pieces], axis=1)[:, :count]
-        for name in pieces[0]
-    }

@@ -1,6 +1,7 @@
 """Pareto-smoothed importance sampling (Vehtari et al. 2024) of many pixels at once.
 
-Also the effective sample sizes and the marginals (means, sds, quantiles) of weighted draws.
+Also the effective sample sizes, systematic resampling, and the marginals (means, sds, quantiles) of
+weighted draws.
 
 Source:
     Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72): the weights and Pareto k; Zhang &
@@ -10,9 +11,10 @@ Source:
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import jax
 import numpy as np
 import scipy.special
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from polar_bayes.inference.program import Values
 
@@ -140,6 +142,39 @@ def effective_tails(
                 size = np.where(p < 1.0, p * (1.0 - p) / np.where(p < 1.0, variance, 1.0), 1.0)
                 least = np.fmin(least, size)
     return least
+
+
+# --- Systematic resampling (Kitagawa 1996) --------------------------------------------------------
+
+
+CHAINS = 4
+"""Groups of resampled draws, for diagnostics that ask for chains."""
+
+FEWEST, MOST = 50, 10_000
+"""Resampled draws of each group."""
+
+
+def systematic_resample(
+    weights: Float[np.ndarray, " draw"], effective: float, random: np.random.Generator
+) -> Float[np.ndarray, "chain draw"]:
+    """Indices of draws, each as often as it weighs, in random order."""
+    # As many are drawn as the effective sample size: more would look like more than is known.
+    # Source: Kitagawa (1996), J. Comput. Graph. Stat. 5(1), 1-25.
+    each = int(np.clip(effective / CHAINS, FEWEST, MOST))
+    levels = (np.arange(CHAINS * each) + random.random()) / (CHAINS * each)
+    index = np.clip(np.searchsorted(np.cumsum(weights), levels), 0, len(weights) - 1)
+    return random.permutation(index).reshape(CHAINS, each)
+
+
+def max_effective_size(count: int) -> float:
+    """Effective sample size after resampling so many draws of equal weight."""
+    resampled = min(count, CHAINS * MOST)
+    return count * resampled / (count + resampled) if count else 0.0
+
+
+def numpy_generator(key: Array) -> np.random.Generator:
+    """NumPy's random numbers from a key of JAX."""
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)))
 
 
 # --- Marginals of a batch of pixels: what maps show -----------------------------------------------

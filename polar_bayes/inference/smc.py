@@ -19,9 +19,12 @@ Source:
     Dau & Chopin (2022), J. R. Stat. Soc. B 84(1), 114-148.
 """
 
+import collections
 import dataclasses
+import functools
+import math
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, override
+from typing import Any, NamedTuple, Self, override
 
 import jax
 import jax.numpy as jnp
@@ -30,11 +33,13 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 from scipy.special import ndtr
 
+from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
-from polar_bayes.inference.batch_result import MethodUsed, Status
-from polar_bayes.inference.batching import batched, take_rows
+from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status, batched, take_rows
 from polar_bayes.inference.levenberg_marquardt import NormalApproximation
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
+from polar_bayes.inference.problem import CompiledModel, Problem
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.inference.proposals import (
     Proposed,
@@ -45,8 +50,9 @@ from polar_bayes.inference.proposals import (
     moments,
     resample,
 )
-from polar_bayes.inference.psis import MAX_PARETO_K
+from polar_bayes.inference.psis import MAX_PARETO_K, numpy_generator, systematic_resample
 from polar_bayes.observation.data import Observations
+from polar_bayes.progress import Progress
 
 # --- Coordinates in which each parameter's prior is standard normal -------------------------------
 
@@ -292,7 +298,7 @@ def _attempt(
         )
 
     count("particles")
-    smc: Tempered = run(_particles, FIRST_KEY - np.uint32(attempt), at)
+    smc: TemperedParticles = run(_particles, FIRST_KEY - np.uint32(attempt), at)
     batch.outcome.steps[at] += smc.stages
     left = np.flatnonzero((smc.temperature >= 1.0) & np.isfinite(smc.u).all(axis=(1, 2)))
     repeated = np.arange(settings.answer_draws) % settings.num_particles
@@ -323,6 +329,134 @@ def _attempt(
         u, weights = sample.z[goes_on], sample.weights[goes_on]
 
 
+# --- One capture ----------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Tempered(AbstractMethod):
+    """Adaptive tempered SMC of one material in one color, corrected by weights.
+
+    Particles start from the prior, so they reach every mode before any of them is narrow; no
+    gradient is computed.
+
+    Args:
+        settings: Of the particles, and of the mixtures that are fitted to them; one fit alone has
+            time for more draws than each of thousands.
+
+    Raises:
+        FitError: A setting is outside its range.
+    """
+
+    settings: PixelSMC = dataclasses.field(default_factory=functools.partial(PixelSMC, draws=4096))
+
+    @property
+    @override
+    def num_draws(self) -> int:
+        return self.settings.answer_draws
+
+    @override
+    def scale_draws(self, factor: float) -> Self:
+        settings = self.settings
+        wanted = factor * settings.answer_draws
+        if wanted < settings.num_particles:
+            raise FitError(
+                f"{wanted:g} draws are fewer than the {settings.num_particles} particles",
+                where="Tempered",
+                hint="give fewer particles, or more draws",
+            )
+        scaled = self.with_draws(wanted).settings
+        effective = settings.effective_draws * scaled.answer_draws / settings.answer_draws
+        return dataclasses.replace(
+            self, settings=dataclasses.replace(scaled, effective_draws=effective)
+        )
+
+    def with_draws(self, count: float) -> Self:
+        """The same method with at least so many weighted draws.
+
+        Args:
+            count: Above 0.
+
+        Returns:
+            Other settings.
+        """
+        half = math.ceil(0.5 * max(count, self.settings.num_particles))
+        effective = min(self.settings.effective_draws, float(half))
+        changed = dataclasses.replace(self.settings, draws=half, effective_draws=effective)
+        return dataclasses.replace(self, settings=changed)
+
+    @override
+    def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
+        if not problem.is_one_spectrum_point:
+            raise FitError(
+                "tempered draws are of one material in one color only",
+                where="Tempered",
+                hint="use method='nuts'",
+            )
+        # Maps and calibrations fit many captures side by side; this is a batch of one.
+        settings, counts = self.settings, collections.Counter[str]()
+
+        def count(what: str) -> None:
+            """Report progress; a fit that was abandoned ends here."""
+            progress("tempering", counts.total() / (settings.num_attempts * (settings.rounds + 1)))
+            counts[what] += 1
+
+        keys = np.asarray(jax.random.key_data(key))[None]
+        batch = BatchFit(_engine(problem.compiled_model), _batch_of_one(problem.data), keys)
+        answers = list(smc_draws(batch, settings, np.zeros(1, int), count))
+        progress("tempering", 1.0)
+        if not answers:
+            raise FitError(
+                "the particles did not arrive at the posterior", where="Tempered", hint="use 'nuts'"
+            )
+        found = answers[-1][1]
+        z, weights = found.z[0].astype(float), found.weights[0].astype(float)
+        weights = weights / weights.sum()
+        effective, k_hat = float(found.ess[0]), float(found.pareto_k[0])
+        index = systematic_resample(weights, effective, numpy_generator(key))
+        problems = []
+        if batch.outcome.status[0] != Status.GOOD:
+            problems.append(
+                f"the effective sample size of the weighted draws is {effective:.0f} (at least "
+                f"{settings.effective_draws:.0f}), with a Pareto k-hat of {k_hat:.2f} (at "
+                f"most {MAX_PARETO_K}): use method='nuts'"
+            )
+        stages, rounds = int(batch.outcome.steps[0]), counts["rounds"]
+        densities = (
+            counts["particles"] * settings.init_factor * settings.num_particles
+            + stages * settings.num_chains * (settings.chain_length - 1)
+            + rounds * settings.draws
+        )
+        return PosteriorDraws(
+            method="tempered",
+            z=z[index],
+            stats={"log_weight": np.log(np.maximum(weights, 1e-300))[index]},
+            problems=problems,
+            weighted=(z, weights),
+            k_hat=k_hat,
+            effective_draws=effective,
+            gradients=0.0,
+            densities=float(densities),
+            metadata={"stages": stages, "rounds": rounds},
+        )
+
+
+def _engine(model: CompiledModel) -> BatchEngine:
+    """The programs of a model for batches."""
+
+    def make() -> BatchEngine:
+        return BatchEngine(model.program, model.single, model.layout, model.precision)
+
+    return model.programs.of("tempered", make)
+
+
+def _batch_of_one(data: Observations) -> ObservationBatch:
+    """One capture as a batch that shares nothing."""
+    batched = jax.tree.map(lambda x: np.asarray(x)[None], data)
+    return ObservationBatch(
+        batched, jax.tree.map(lambda _: None, data), np.array([int(np.sum(data.valid))])
+    )
+
+
 # --- Compiled programs of one pixel ---------------------------------------------------------------
 
 
@@ -334,7 +468,7 @@ class Particles(NamedTuple):
     log_likelihood: Float[Array, " draw"]
 
 
-class Tempered(NamedTuple):
+class TemperedParticles(NamedTuple):
     """Weighted particles at the last temperature, which is 1 unless there were too many stages."""
 
     u: Float[Array, "draw size"]
@@ -347,7 +481,7 @@ class Tempered(NamedTuple):
 def _particles(engine: BatchEngine, settings: PixelSMC) -> Callable:
     """The program of tempered SMC in one pixel."""
 
-    def pixel(number: Array, data: Observations, key: Array) -> Tempered:
+    def pixel(number: Array, data: Observations, key: Array) -> TemperedParticles:
         return temper(engine.single_program, settings, data, jax.random.fold_in(key, number))
 
     return batched(pixel, given=1, lanes=1)
@@ -379,7 +513,9 @@ def _mixture_draws(engine: BatchEngine, settings: PixelSMC) -> Callable:
     return batched(pixel, given=1, lanes=1)
 
 
-def temper(program: Program, settings: PixelSMC, data: Observations, key: Array) -> Tempered:
+def temper(
+    program: Program, settings: PixelSMC, data: Observations, key: Array
+) -> TemperedParticles:
     """Tempered SMC from the prior to the posterior of one pixel."""
     num_chains, count, size = settings.num_chains, settings.num_particles, program.size
     key_init, key_first, key_stages = jax.random.split(key, 3)
@@ -444,7 +580,7 @@ def temper(program: Program, settings: PixelSMC, data: Observations, key: Array)
         jnp.int32(0),
     )
     temperature, weights, particles, *_, stages = jax.lax.while_loop(goes_on, stage, state)
-    return Tempered(particles.u, weights, transform, temperature, stages)
+    return TemperedParticles(particles.u, weights, transform, temperature, stages)
 
 
 def _largest_step(log_likelihood: Array, most: Array, target: float) -> Array:

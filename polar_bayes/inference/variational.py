@@ -19,13 +19,11 @@ from numpyro import handlers, infer, optim
 from numpyro.infer import autoguide
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import TRACING_LOCK, JitOnce
-from polar_bayes.inference.initialization import JointInit
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.program import Program
-from polar_bayes.inference.psis import smooth
-from polar_bayes.inference.resampling import CHAINS
+from polar_bayes.inference.psis import CHAINS, smooth
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress
 
@@ -69,13 +67,7 @@ class AbstractGuide(AbstractMethod):
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
         initialization = problem.initialize(progress)
-        if not isinstance(initialization, JointInit):
-            raise FitError(
-                "guides are fitted to one material only",
-                where=type(self).__name__,
-                hint="use method='nuts'",
-            )
-        modes = initialization.modes
+        modes = initialization.joint_modes(type(self).__name__)
         half = jnp.asarray(np.linalg.cholesky(modes.covariance[0]), problem.dtype)
         center = jnp.asarray(modes.z[0], problem.dtype)
         fitted = problem.compiled_model.programs.of(
@@ -169,5 +161,4 @@ def _compile_guide(program: Program, settings: AbstractGuide) -> Callable[..., A
         log_ratio = log_posterior.reshape(shape) - log_guide
         return z, jnp.where(jnp.isnan(log_ratio), -jnp.inf, log_ratio), losses[-1]
 
-    with TRACING_LOCK:
-        return JitOnce(run)
+    return JitOnce(run)

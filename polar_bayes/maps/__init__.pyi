@@ -1,8 +1,6 @@
-from .fit_map import (
-    count_pixels as count_pixels,
-    fit_pixels as fit_pixels,
-)
+from .fit_map import fit_pixels as fit_pixels
 from .lazy import (
+    count_pixels as count_pixels,
     open_capture as open_capture,
     open_map as open_map,
 )

@@ -1,42 +1,59 @@
 """Maps of an image: every pixel fitted by itself."""
 
 import dataclasses
+import enum
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
+import jax
 import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
 
+from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.batch_engine import engine_key
+from polar_bayes.inference.batch_engine import BatchEngine, engine_key, make_engine
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_method import AbstractPixelMethod
-from polar_bayes.inference.batch_result import MIN_VIEWS, Status, empty_outcome
-from polar_bayes.inference.batching import IMAGE
-from polar_bayes.inference.psis import Marginals
-from polar_bayes.inference.request import resolve
-from polar_bayes.inference.result import PROVENANCE
-from polar_bayes.maps.blocks import (
-    NUMBER,
-    Plan,
-    as_completed,
-    fit_block,
-    maps_of,
-    mask_missing,
-    workers,
+from polar_bayes.inference.batching import (
+    IMAGE,
+    MIN_VIEWS,
+    MethodUsed,
+    Outcome,
+    Status,
+    batch_pixels,
+    cut,
+    empty_outcome,
 )
-from polar_bayes.observation.data import ANGLES
+from polar_bayes.inference.psis import LEVELS, Marginals
+from polar_bayes.inference.request import Request, resolve
+from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.maps.blocks import as_completed, workers
+from polar_bayes.observation.data import ANGLES, READINGS, Observations, observe
 from polar_bayes.observation.links import AbstractLink
+from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior
-from polar_bayes.progress import Counter, with_counter
+from polar_bayes.progress import Counter, no_progress, with_counter
 
 BLOCK = 4096
 """Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
 
-CHUNK = 65536
-"""Pixels of a chunk of a store, which are read together."""
+
+DIAGNOSTICS = {
+    "pareto_k": "Pareto k of the importance weights",
+    "effective_draws": "effective sample size of the draws",
+    "condition": "condition number of the curvature at the mode",
+    "steps": "steps to the mode",
+    "approach": "method by which the numbers were found",
+    "status": "status of the pixel",
+}
+
+FLAGS: dict[str, type[enum.IntEnum]] = {"approach": MethodUsed, "status": Status}
+
+NUMBER = "pixel_number"
+"""Variable of a block: index of each pixel in the whole image, row by row."""
 
 
 @with_counter("pixels")
@@ -92,53 +109,43 @@ def fit_pixels(
         numbered = with_pixel_numbers(capture)
         maps = xr.map_blocks(fit_block, numbered, args=[plan], template=blank(capture, plan))
     else:
-        maps = _at_once(capture, plan, progress)
+        maps = _in_memory(capture, plan, progress or no_progress)
     maps["status"].encoding["fill_value"] = int(Status.NOT_FITTED)  # of chunks in a Zarr store
     return maps
 
 
-def count_pixels(maps: xr.Dataset) -> dict[str, int]:
-    """The number of pixels of each status.
+@dataclasses.dataclass(frozen=True)
+class MapPlan:
+    """A checked request of a map, which can be sent to another process."""
 
-    Args:
-        maps: Of `fit_pixels`, or opened from a store.
+    key: str  # that of the compiled programs; plans with the same key are equal
+    request: Request = dataclasses.field(compare=False)
+    settings: AbstractPixelMethod = dataclasses.field(compare=False)
+    intensity_unit: float | None = dataclasses.field(compare=False)
+    own_directions: frozenset[str] = dataclasses.field(compare=False)
 
-    Returns:
-        How many are good, masked, with too few views, not converged, not trusted and not fitted:
-        those whose chunk is lost, or whose numbers are not finite though they are called good.
-
-    Raises:
-        FitError: It holds no `status`.
-    """
-    if "status" not in maps:
-        raise FitError(
-            "it holds no maps", where="count_pixels", hint="give what fit_pixels returns"
+    def observe(self, capture: xr.Dataset) -> Observations:
+        """A block, or one pixel, as arrays."""
+        return observe(
+            capture,
+            largest_view_zenith=self.request.largest_view_zenith,
+            intensity_unit=self.intensity_unit,
         )
-    counts = dict.fromkeys(Status, 0)
-    for region in cut(maps, CHUNK):
-        found = checked_status(maps.isel(region)).to_numpy()
-        for each in Status:
-            counts[each] += int(np.sum(found == each))
-    return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
 
+    @property
+    def engine(self) -> BatchEngine:
+        """The compiled programs, made at first use in each process."""
 
-def checked_status(maps: xr.Dataset) -> xr.DataArray:
-    """Statuses of maps, in memory; a pixel that is called good without numbers is not fitted."""
-    # A chunk that was lost from a store reads as not a number.
-    answers = [
-        f"{name}{ending}"
-        for name in maps.data_vars
-        if f"{name}_quantile" in maps
-        for ending in ("", "_sd", "_quantile")
-        if f"{name}{ending}" in maps
-    ]
-    here = maps[["status", *answers]].load()
-    is_known = xr.ones_like(here["status"], dtype=bool)
-    for name in answers:
-        is_finite = abs(here[name]) < np.inf
-        is_known &= is_finite.all([dim for dim in is_finite.dims if dim not in IMAGE])
-    is_hole = (here["status"] == Status.GOOD) & ~is_known
-    return here["status"].where(~is_hole, Status.NOT_FITTED).astype(here["status"].dtype)
+        def pixel() -> Observations:
+            with jax.enable_x64(True):
+                return self.observe(self.request.capture)
+
+        return make_engine(self.key, self.request, pixel)
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, ...]]:
+        """Lengths of the axes of every parameter within a pixel."""
+        return {name: own for name, (_, own) in self.engine.parameter_axes.items()}
 
 
 def plan_map(
@@ -151,22 +158,17 @@ def plan_map(
     largest_view_zenith: float | None,
     seed: int,
     precision: str,
-) -> Plan:
+) -> MapPlan:
     """Check the request of a map on one of its pixels."""
     settings = PixelLaplace() if method is None else method
     if not isinstance(settings, AbstractPixelMethod):
-        raise FitError(
-            f"{method!r} is no method for pixels",
-            where="fit_pixels: method",
-            hint="give settings such as PixelLaplace(draws=512) or PixelSMC()",
-        )
+        hint = "give settings such as PixelLaplace(draws=512) or PixelSMC()"
+        raise FitError(f"{method!r} is no method for pixels", where="fit_pixels: method", hint=hint)
     missing = [dim for dim in IMAGE if dim not in capture.dims]
     if missing:
-        raise CaptureError(
-            f"it has no axis {' or '.join(missing)}",
-            where=str(capture.attrs.get("name", "capture")),
-            hint="give an image with dims y and x, or use polar_bayes.fit",
-        )
+        what = f"it has no axis {' or '.join(missing)}"
+        hint = "give an image with dims y and x, or use polar_bayes.fit"
+        raise CaptureError(what, where=str(capture.attrs.get("name", "capture")), hint=hint)
     pixel, limit = _fullest_pixel(capture), largest_view_zenith
     request = resolve(pixel, model, scene, priors, links, limit, seed, precision)
     own = frozenset(
@@ -175,75 +177,14 @@ def plan_map(
         if name in capture and set(IMAGE) & set(capture[name].dims)
     )
     unit = _intensity_unit(capture)
-    return Plan(
-        request, settings, unit, own, engine_key(request, settings, sorted(own), unit is None)
-    )
-
-
-def with_pixel_numbers(
-    block: xr.Dataset, region: Mapping[str, slice] | None = None, columns: int = 0
-) -> xr.Dataset:
-    """A block, by default a whole image, with the index of each pixel in the image, row by row."""
-    if region is None:
-        region, columns = {dim: slice(0, block.sizes[dim]) for dim in IMAGE}, block.sizes["x"]
-    y, x = (xr.Variable((d,), np.arange(region[d].start, region[d].stop)) for d in IMAGE)
-    if block.chunks:
-        y, x = y.chunk(y=block.chunks["y"]), x.chunk(x=block.chunks["x"])
-    return block.assign({NUMBER: y * columns + x})
-
-
-def blank(capture: xr.Dataset, plan: Plan) -> xr.Dataset:
-    """Maps of the image without values: names, axes, types and attributes."""
-    corner = capture.isel({dim: slice(1) for dim in IMAGE})
-    nothing = empty_outcome(1, Status.NOT_FITTED)
-    tiny = maps_of(Marginals(1, plan.sizes), nothing, corner, plan.engine.parameter_axes)
-    one = tiny.isel({dim: 0 for dim in IMAGE}, drop=True)
-    whole = one.expand_dims({dim: capture.sizes[dim] for dim in IMAGE})
-    whole = whole.assign_coords({dim: capture[dim] for dim in IMAGE if dim in capture.coords})
-    whole = xr.Dataset(
-        {n: v.transpose(*tiny[n].dims) for n, v in whole.items()},
-        attrs={PROVENANCE: provenance_json(plan)},
-    )
-    chunks = {dim: capture.chunks[dim] for dim in IMAGE if dim in capture.chunks}
-    return whole.chunk(chunks) if chunks else whole
-
-
-def cut(capture: xr.Dataset, pixels: int = BLOCK) -> Iterator[dict[str, slice]]:
-    """Places of blocks that cover an image, row by row."""
-    rows, columns = (capture.sizes[dim] for dim in IMAGE)
-    wide = min(columns, pixels)
-    high = max(1, pixels // wide)
-    for y in range(0, rows, high):
-        for x in range(0, columns, wide):
-            yield {"y": slice(y, min(y + high, rows)), "x": slice(x, min(x + wide, columns))}
-
-
-def _at_once(capture: xr.Dataset, plan: Plan, progress: Counter | None) -> xr.Dataset:
-    """Blocks on threads, put together in memory."""
-    maps = blank(capture, plan).copy(deep=True)
-    every, done = capture.sizes["y"] * capture.sizes["x"], 0
-    with workers(None) as (pool, count):
-        tasks = ((region,) for region in cut(capture))
-
-        def fit(region: dict[str, slice]) -> xr.Dataset:
-            block = with_pixel_numbers(capture.isel(region), region, capture.sizes["x"])
-            return fit_block(block, plan)
-
-        blocks = as_completed(pool, count, fit, tasks)
-        for (region,), block in blocks:
-            for name, values in block.items():
-                maps[name][region] = values
-            done += block.sizes["y"] * block.sizes["x"]
-            if progress is not None:
-                progress(done, every)
-    return maps
+    key = engine_key(request, settings, sorted(own), unit is None)
+    return MapPlan(key, request, settings, unit, own)
 
 
 def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
     """The first pixel that has as many valid views as any in its rows; read row by row."""
-    rows = capture.sizes["y"]
     best, most = None, 0
-    for y in range(rows):
+    for y in range(capture.sizes["y"]):
         row = mask_missing(capture.isel(y=y).load())
         views = row["valid"].any([d for d in row["valid"].dims if d not in ("x", "view")])
         counts = views.sum("view")
@@ -253,11 +194,9 @@ def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
         if most == capture.sizes["view"]:
             break
     if best is None or most < MIN_VIEWS:
-        raise CaptureError(
-            f"no pixel has {MIN_VIEWS} valid views",
-            where=str(capture.attrs.get("name", "capture")),
-            hint="check `valid` and the readings: NaN counts as missing",
-        )
+        what = f"no pixel has {MIN_VIEWS} valid views"
+        hint = "check `valid` and the readings: NaN counts as missing"
+        raise CaptureError(what, where=str(capture.attrs.get("name", "capture")), hint=hint)
     return best
 
 
@@ -270,23 +209,128 @@ def _intensity_unit(capture: xr.Dataset) -> float | None:
     return largest if largest > 0.0 else 1.0
 
 
-def provenance_json(plan: Plan) -> str:
+def provenance_json(plan: MapPlan) -> str:
     """Provenance of maps, as JSON."""
     request = plan.request
     provenance = {
+        **describe_request(request),
         "method": "pixels",
         "fitted_by": type(plan.settings).__name__,
         "settings": dataclasses.asdict(plan.settings),
-        "model": request.model_name,
-        "scene": request.scene_name,
-        "scene_parts": repr(request.scene),
-        "priors": {name: describe_prior(prior) for name, prior in request.priors.items()},
         "fixed": request.fixed,
-        "links": {name: repr(link) for name, link in request.links.items()},
         "swapped": list(request.swapped),
         "largest_view_zenith": request.largest_view_zenith,
-        "seed": request.seed,
         "precision": request.precision,
         "intensity_unit": plan.intensity_unit,
     }
     return json.dumps(provenance, sort_keys=True)
+
+
+def describe_request(request: Request) -> dict[str, Any]:
+    """What a request was, for the provenance of a map or a calibration."""
+    return {
+        "model": request.model_name,
+        "scene": request.scene_name,
+        "scene_parts": repr(request.scene),
+        "priors": {name: describe_prior(prior) for name, prior in request.priors.items()},
+        "links": {name: repr(link) for name, link in request.links.items()},
+        "seed": request.seed,
+    }
+
+
+# --- Blocks of an image ---------------------------------------------------------------------------
+
+
+def with_pixel_numbers(image: xr.Dataset, region: Mapping[str, slice] | None = None) -> xr.Dataset:
+    """A block, by default the whole image, with the index of each pixel, row by row."""
+    region = region or {dim: slice(None) for dim in IMAGE}
+    block = image.isel(region)
+    y, x = (xr.Variable((dim,), np.arange(image.sizes[dim])[region[dim]]) for dim in IMAGE)
+    if block.chunks:
+        y, x = y.chunk(y=block.chunks["y"]), x.chunk(x=block.chunks["x"])
+    return block.assign({NUMBER: y * image.sizes["x"] + x})
+
+
+def blank(capture: xr.Dataset, plan: MapPlan) -> xr.Dataset:
+    """Maps of the image without values: names, axes, types and attributes."""
+    corner = capture.isel({dim: slice(1) for dim in IMAGE})
+    nothing = empty_outcome(1, Status.NOT_FITTED)
+    tiny = maps_of(Marginals(1, plan.sizes), nothing, corner, plan)
+    one = tiny.isel({dim: 0 for dim in IMAGE}, drop=True)
+    whole = one.expand_dims({dim: capture.sizes[dim] for dim in IMAGE})
+    whole = whole.assign_coords({dim: capture[dim] for dim in IMAGE if dim in capture.coords})
+    whole = xr.Dataset(
+        {n: v.transpose(*tiny[n].dims) for n, v in whole.items()},
+        attrs={PROVENANCE: provenance_json(plan)},
+    )
+    chunks = {dim: capture.chunks[dim] for dim in IMAGE if dim in capture.chunks}
+    return whole.chunk(chunks) if chunks else whole
+
+
+def _in_memory(capture: xr.Dataset, plan: MapPlan, progress: Counter) -> xr.Dataset:
+    """Blocks on threads, put together in memory."""
+    maps = blank(capture, plan).copy(deep=True)
+    every, done = capture.sizes["y"] * capture.sizes["x"], 0
+    with workers(None) as (pool, count):
+        tasks = ((region,) for region in cut(capture, BLOCK))
+
+        def fit(region: dict[str, slice]) -> xr.Dataset:
+            return fit_block(with_pixel_numbers(capture, region), plan)
+
+        for (region,), block in as_completed(pool, count, fit, tasks):
+            for name, values in block.items():
+                maps[name][region] = values
+            done += block.sizes["y"] * block.sizes["x"]
+            progress(done, every)
+    return maps
+
+
+def fit_block(block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
+    """Fit every pixel of a block."""
+    numbers = block[NUMBER].transpose(*IMAGE).to_numpy().ravel()
+    found = Marginals(numbers.size, plan.sizes)
+    with jax.enable_x64(True):
+        readings = mask_missing(block.drop_vars(NUMBER))
+        if not readings["valid"].any():  # a corner of a picture; as a capture it would be refused
+            return maps_of(found, empty_outcome(numbers.size, Status.MASKED), block, plan)
+        pixels = batch_pixels(plan.observe(validate(readings)), plan.own_directions)
+    seed = plan.request.seed
+    outcome = plan.settings.run_batch(plan.engine, pixels, numbers, seed, found.describe)
+    return maps_of(found, outcome, block, plan)
+
+
+def mask_missing(capture: xr.Dataset) -> xr.Dataset:
+    """A capture whose missing readings are marked as such."""
+    valid = capture.get("valid", xr.DataArray(True)).astype(bool)
+    for name in READINGS:
+        if name in capture:
+            valid = valid & capture[name].notnull()
+    return capture.assign(valid=valid)
+
+
+def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
+    """The marginals of a block as labeled maps."""
+    shape = tuple(block.sizes[dim] for dim in IMAGE)
+    variables: dict[str, Any] = {}
+    for name, (own, sizes) in plan.engine.parameter_axes.items():
+        symbol, meaning, unit = notation(name)
+        for ending, statistic, values, first in (
+            ("", "mean of", found.mean[name], ()),
+            ("_sd", "standard deviation of", found.sd[name], ()),
+            ("_quantile", "quantiles of", found.quantiles[name], ("quantile",)),
+        ):
+            whole = values.reshape(*values.shape[: len(first)], *shape, *sizes)
+            labels = {"units": unit, "long_name": f"{statistic} {meaning}", "symbol": symbol}
+            variables[f"{name}{ending}"] = ((*first, *IMAGE, *own), np.float32(whole), labels)
+    for name, meaning in DIAGNOSTICS.items():
+        attrs: dict[str, Any] = {"units": "1", "long_name": meaning}
+        if name in FLAGS:
+            flags = list(FLAGS[name])
+            attrs = {
+                "long_name": meaning,
+                "flag_values": [int(each) for each in flags],
+                "flag_meanings": " ".join(each.name.lower() for each in flags),
+            }
+        variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), attrs)
+    coords = {dim: block.coords[dim] for dim in (*IMAGE, "wavelength") if dim in block.coords}
+    return xr.Dataset(variables, coords={**coords, "quantile": list(LEVELS)})

@@ -1,6 +1,5 @@
 """Images and maps in files, opened lazily; a damaged part of one is an error of one line."""
 
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,9 @@ from xarray.core import indexing
 
 from polar_bayes.capture.files import load_capture
 from polar_bayes.errors import CaptureError, FitError, PolarBayesError
-from polar_bayes.inference.batching import IMAGE
+from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.inference.psis import LEVELS
-from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.observation.data import READINGS
 from polar_bayes.paths import as_path
 
@@ -32,9 +31,6 @@ FINISHED = "capture_sha256"
 
 COPY = "copy the store again, or make the map again"
 
-LEDGER = ".progress"
-"""Ending of the name of the ledger, which lies next to an unfinished map."""
-
 
 def open_capture(path: str | os.PathLike[str]) -> xr.Dataset:
     """A capture from a file, its values read when they are needed where it is a Zarr store.
@@ -48,11 +44,7 @@ def open_capture(path: str | os.PathLike[str]) -> xr.Dataset:
     Raises:
         CaptureError: It cannot be read; with a Zarr store also later, when values are read.
     """
-    return open_image(as_path(path, "capture"))
-
-
-def open_image(path: Path) -> xr.Dataset:
-    """A capture from a file; of a Zarr store it is validated block by block, later."""
+    path = as_path(path, "capture")
     if path.suffix != ".zarr":
         return load_capture(path)
     if not path.is_dir():
@@ -60,11 +52,8 @@ def open_image(path: Path) -> xr.Dataset:
     image = _open_store(path, CaptureError, "write it again with to_zarr", decode_times=False)
     for name, variable in image.variables.items():
         if variable.dtype.kind not in "biufUOT":
-            raise CaptureError(
-                f"it holds {variable.dtype.name}, neither numbers nor flags",
-                where=f"{path}: {name}",
-                hint="write it again with to_zarr",
-            )
+            what = f"it holds {variable.dtype.name}, neither numbers nor flags"
+            raise CaptureError(what, where=f"{path}: {name}", hint="write it again with to_zarr")
     image.attrs.setdefault("name", path.stem)
     return image
 
@@ -76,11 +65,9 @@ def check_whole(path: Path) -> None:
             continue
         missing, chunks = _missing(path / name, CaptureError)
         if missing:
-            raise CaptureError(
-                f"{missing} of {chunks} chunks are missing",
-                where=f"{path}: {name}",
-                hint="copy the store again, or write it again with to_zarr",
-            )
+            what = f"{missing} of {chunks} chunks are missing"
+            hint = "copy the store again, or write it again with to_zarr"
+            raise CaptureError(what, where=f"{path}: {name}", hint=hint)
 
 
 def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -113,8 +100,10 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
 
 def _check_maps(maps: xr.Dataset, store: Path) -> None:
     """Refuse metadata that no map has."""
-    if not _has_provenance(maps):
-        raise FitError("its provenance cannot be read", where=str(store), hint=COPY)
+    try:
+        provenance_of(maps)
+    except FitError as error:
+        raise FitError("its provenance cannot be read", where=str(store), hint=COPY) from error
     if "quantile" in maps.dims and not np.array_equal(maps["quantile"], LEVELS):
         raise FitError("its levels are not those of a map", where=f"{store}: quantile", hint=COPY)
     for name, variable in maps.variables.items():
@@ -133,13 +122,6 @@ def _check_maps(maps: xr.Dataset, store: Path) -> None:
             raise FitError("its values are missing", where=where, hint=COPY)
 
 
-def _has_provenance(maps: xr.Dataset) -> bool:
-    try:
-        return isinstance(json.loads(maps.attrs[PROVENANCE]), dict)
-    except (TypeError, ValueError):
-        return False
-
-
 def _has_meanings(flags: xr.Variable) -> bool:
     """Whether every value of a flag has a meaning."""
     meanings = str(flags.attrs.get("flag_meanings", "")).split()
@@ -155,15 +137,13 @@ def _missing(array: Path, error: type[PolarBayesError]) -> tuple[int, int]:
         opened = zarr.open_array(array, mode="r")
         return opened.nchunks - opened.nchunks_initialized, opened.nchunks
     except Exception as cause:  # the libraries below raise nearly every type for a broken store
-        raise error(
-            "it cannot be read as Zarr",
-            where=f"{array.parent}: {array.name}",
-            hint="copy the store again, or write it again",
-        ) from cause
+        what = "it cannot be read as Zarr"
+        hint = "copy the store again, or write it again"
+        raise error(what, where=f"{array.parent}: {array.name}", hint=hint) from cause
 
 
 def _open_store(path: Path, error: type[PolarBayesError], hint: str, **options: Any) -> xr.Dataset:
-    """A Zarr store, lazily; each of its variables knows how to say that it is broken."""
+    """A Zarr store, lazily; reading a broken chunk of a variable is an error with its place."""
     where = str(path)
     try:
         opened = xr.open_dataset(path, engine="zarr", consolidated=False, cache=False, **options)
@@ -225,9 +205,57 @@ def ensure_loaded(maps: xr.Dataset) -> xr.Dataset:
     if not any(variable.chunks for variable in maps.variables.values()):
         return maps
     if maps.nbytes > MOST_BYTES:
-        raise FitError(
-            f"these maps are in chunks and take {maps.nbytes / 2**30:.0f} GB",
-            where="maps",
-            hint="write them with to_zarr, if they are not yet, and open them with open_map",
-        )
+        what = f"these maps are in chunks and take {maps.nbytes / 2**30:.0f} GB"
+        hint = "write them with to_zarr, if they are not yet, and open them with open_map"
+        raise FitError(what, where="maps", hint=hint)
     return maps.compute()
+
+
+# --- Pixels ---------------------------------------------------------------------------------------
+
+CHUNK = 65536
+"""Pixels of a chunk of a store, which are read together."""
+
+
+def count_pixels(maps: xr.Dataset) -> dict[str, int]:
+    """The number of pixels of each status.
+
+    Args:
+        maps: Of `fit_pixels`, or opened from a store.
+
+    Returns:
+        How many are good, masked, with too few views, not converged, not trusted and not fitted:
+        those whose chunk is lost, or whose numbers are not finite though they are called good.
+
+    Raises:
+        FitError: It holds no `status`.
+    """
+    if "status" not in maps:
+        raise FitError(
+            "it holds no maps", where="count_pixels", hint="give what fit_pixels returns"
+        )
+    counts = dict.fromkeys(Status, 0)
+    for region in cut(maps, CHUNK):
+        found = checked_status(maps.isel(region)).to_numpy()
+        for each in Status:
+            counts[each] += int(np.sum(found == each))
+    return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
+
+
+def checked_status(maps: xr.Dataset) -> xr.DataArray:
+    """Statuses of maps, in memory; a pixel that is called good without numbers is not fitted."""
+    # A chunk that was lost from a store reads as not a number.
+    answers = [
+        f"{name}{ending}"
+        for name in maps.data_vars
+        if f"{name}_quantile" in maps
+        for ending in ("", "_sd", "_quantile")
+        if f"{name}{ending}" in maps
+    ]
+    here = maps[["status", *answers]].load()
+    is_known = xr.ones_like(here["status"], dtype=bool)
+    for name in answers:
+        is_finite = abs(here[name]) < np.inf
+        is_known &= is_finite.all([dim for dim in is_finite.dims if dim not in IMAGE])
+    is_hole = (here["status"] == Status.GOOD) & ~is_known
+    return here["status"].where(~is_hole, Status.NOT_FITTED).astype(here["status"].dtype)

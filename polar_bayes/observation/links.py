@@ -77,16 +77,7 @@ class ConcentrationSchedule(HTMLRepr):
         brightness: Float[Array, "... view"],
         cos_view: Float[Array, "... view"],
     ) -> Float[Array, "... view"]:
-        """The concentration of each view.
-
-        Args:
-            scale: Concentration gained by a bright upright view, unit 1, range > 0.
-            brightness: Recorded intensity over the capture's largest, unit 1, range [0, 1].
-            cos_view: Cosine of the view zenith, unit 1, range (0, 1].
-
-        Returns:
-            The concentration, unit 1, at least `minimum`.
-        """
+        """The concentration of each view, at least `minimum`; brightness is the recorded one."""
         gain = brightness**self.brightness_exponent * cos_view**self.angle_exponent
         return self.minimum + scale * gain
 
@@ -128,16 +119,7 @@ class ScaleSchedule(HTMLRepr):
         brightness: Float[Array, "... view"],
         cos_view: Float[Array, "... view"],
     ) -> Float[Array, "... view"]:
-        """The scale of each view, in the unit of `base`.
-
-        Args:
-            base: Scale of a dark upright view, range > 0.
-            brightness: Predicted intensity over full scale, unit 1, range >= 0.
-            cos_view: Cosine of the view zenith, unit 1, range (0, 1].
-
-        Returns:
-            The scale, at least `base`.
-        """
+        """The scale of each view, at least `base`; brightness is the predicted one."""
         # A smooth bound: a corner here would put a corner, not a peak, on top of the posterior
         # whenever a view is predicted close to full scale.
         width = SMOOTHING * self.least_headroom
@@ -163,13 +145,13 @@ def scale_by_confidence(
     return scale if confidence is None else scale / jnp.sqrt(confidence)
 
 
-def _check_range(schedule: object, field: str, low: float, high: float) -> None:
-    value = getattr(schedule, field)
+def _check_range(owner: object, field: str, low: float, high: float, note: str = "") -> None:
+    value = getattr(owner, field)
     if not low <= value <= high:
         raise FitError(
             f"{field} is {value}",
-            where=type(schedule).__name__,
-            hint=f"give a number from {low:g} to {high:g}",
+            where=type(owner).__name__,
+            hint=f"give a number from {low:g} to {high:g}{note}",
         )
 
 
@@ -406,12 +388,7 @@ class StudentTLink(AbstractLink):
     schedule: ScaleSchedule = dataclasses.field(default_factory=ScaleSchedule)
 
     def __post_init__(self) -> None:
-        if not 3.0 <= self.degrees_of_freedom <= 7.0:
-            raise FitError(
-                f"degrees_of_freedom is {self.degrees_of_freedom}",
-                where="StudentTLink",
-                hint="give a number from 3 to 7, the paper's range of nu",
-            )
+        _check_range(self, "degrees_of_freedom", 3.0, 7.0, ", the paper's range of nu")
 
     @override
     def center(self, name: str, prediction: Prediction, noise: Noise) -> Float[Array, "... view"]:

@@ -1,4 +1,4 @@
-r"""Polarized light at one plane boundary between two media, bare or with thin films.
+r"""Fresnel's laws at one plane boundary between two lossless media, bare or with thin films.
 
 The light comes from air. `Diattenuation` holds the effect of one interface, or of many, in numbers
 that lose no digits. Power reflected (or passed) is s along e_s and p across it, and the field
@@ -15,7 +15,11 @@ rho = (n_2^2 - n_1^2)/(Q_1 + Q_2)^2, a bare boundary reflects
 
     r_s = -rho,    r_p = -rho (A-B)/(A+B)
 
-in the sign that makes both alike at normal incidence. For n_1 = 1 this is `fresnel.reflection`.
+in the sign that makes both alike at normal incidence. At Brewster's angle A = B. Everything is
+regular at n_1 = n_2 and accurate up to grazing, in both precisions.
+
+Source:
+    Born and Wolf, Principles of Optics, on the Fresnel formulae.
 """
 
 from typing import NamedTuple
@@ -89,24 +93,14 @@ class Diattenuation(NamedTuple):
 
 
 class Medium(NamedTuple):
-    """A medium on the path of light.
-
-    Args:
-        refractive_index: Refractive index. Broadcasts with (..., view[, facet]), 1, >= 1.
-        normal: Q, the index times the cosine inside. Same shape, 1.
-    """
+    """A medium on the path of light, with Q, the index times the cosine inside."""
 
     refractive_index: Array
     normal: Array
 
 
 class Film(NamedTuple):
-    """A layer thin enough for interference.
-
-    Args:
-        medium: What it is made of.
-        phase: exp(2 i delta), the phase of one round trip. Complex.
-    """
+    """A layer thin enough for interference, and the phase of one round trip, exp(2 i delta)."""
 
     medium: Medium
     phase: Array
@@ -152,22 +146,19 @@ def medium(refractive_index: Array, cos_squared: Array) -> Medium:
     return Medium(refractive_index, jnp.sqrt(jnp.maximum(normal_squared, least)))
 
 
-def step(above: Medium, below: Medium) -> Array:
-    """Factor (n_2^2 - n_1^2)^2 of every reflectance of a bare boundary. Any shape, 1, >= 0."""
-    return _square_difference(above, below) ** 2
+def reflection(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
+    """Power that a bare boundary reflects."""
+    return relative_reflection(above, below, sin_squared, _square_difference(above, below))
 
 
-def relative_reflection(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
-    """Power that a bare boundary reflects, without the factor `step`."""
+def relative_reflection(
+    above: Medium, below: Medium, sin_squared: Array, step: Array | float = 1.0
+) -> Diattenuation:
+    """The same without the factor (n_2^2 - n_1^2)^2, whose root `step` would put back."""
     a, b = above.normal * below.normal, sin_squared
     # Squared last: near grazing the derivatives of the whole would overflow single precision.
-    return _of_shape((1.0 / ((above.normal + below.normal) ** 2 * (a + b))) ** 2, a, b)
-
-
-def reflection(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
-    """Power that a bare boundary reflects; see `relative_reflection`."""
-    a, b = above.normal * below.normal, sin_squared
-    return _of_shape((_rho(above, below) / (a + b)) ** 2, a, b)
+    scale = (step / ((above.normal + below.normal) ** 2 * (a + b))) ** 2
+    return Diattenuation(scale * (a**2 + b**2), 2.0 * scale * a, 2.0 * scale, b)
 
 
 def transmission(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
@@ -220,11 +211,6 @@ def filmed(
 def _rho(above: Medium, below: Medium) -> Array:
     """Field reflected along s, without its sign."""
     return _square_difference(above, below) / (above.normal + below.normal) ** 2
-
-
-def _of_shape(scale: Array, a: Array, b: Array) -> Diattenuation:
-    """The reflectance of s and p that A and B give, times a common factor."""
-    return Diattenuation(scale * (a**2 + b**2), 2.0 * scale * a, 2.0 * scale, b)
 
 
 def _square_difference(above: Medium, below: Medium) -> Array:

@@ -6,21 +6,12 @@ A coat lies on every facet of a rough surface alike. One of your own says which 
 import abc
 import dataclasses
 import math
-from collections.abc import Mapping
-from typing import override
+from typing import Annotated, override
 
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.part import (
-    Part,
-    Setting,
-    check_part,
-    check_setting,
-    names_in,
-    parameters_of,
-    value_of,
-)
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, check_part, value_of
 from polar_bayes.physics.stack import Layer
 
 
@@ -29,9 +20,7 @@ class AbstractCoat(Part):
     """One or more layers on the body."""
 
     @abc.abstractmethod
-    def layers(
-        self, parameters: Mapping[str, Array], wavelength: Array | None
-    ) -> tuple[Layer, ...]:
+    def layers(self, parameters: Parameters, wavelength: Array | None) -> tuple[Layer, ...]:
         """Layers from the top down.
 
         Args:
@@ -70,22 +59,11 @@ class ClearCoat(AbstractCoat):
         SceneError: A setting is neither a number in its range nor a name.
     """
 
-    refractive_index: Setting = "coat_refractive_index"
-    absorbance: Setting = "coat_absorbance"
-
-    def __post_init__(self) -> None:
-        check_setting(self.refractive_index, "ClearCoat: refractive_index", 1.0, 3.0)
-        check_setting(self.absorbance, "ClearCoat: absorbance", 0.0, 100.0)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return names_in(self.refractive_index, self.absorbance)
+    refractive_index: Annotated[Setting, Range(1.0, 3.0)] = "coat_refractive_index"
+    absorbance: Annotated[Setting, Range(0.0, 100.0)] = "coat_absorbance"
 
     @override
-    def layers(
-        self, parameters: Mapping[str, Array], wavelength: Array | None
-    ) -> tuple[Layer, ...]:
+    def layers(self, parameters: Parameters, wavelength: Array | None) -> tuple[Layer, ...]:
         clear = self.absorbance == 0.0
         index = value_of(self.refractive_index, parameters)
         return (Layer(index, None if clear else value_of(self.absorbance, parameters)),)
@@ -103,22 +81,11 @@ class ThinFilm(AbstractCoat):
         SceneError: A setting is neither a number in its range nor a name.
     """
 
-    refractive_index: Setting = "film_refractive_index"
-    thickness_nm: Setting = "film_thickness"
-
-    def __post_init__(self) -> None:
-        check_setting(self.refractive_index, "ThinFilm: refractive_index", 1.0, 3.0)
-        check_setting(self.thickness_nm, "ThinFilm: thickness_nm", 0.0, 1e5)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return names_in(self.refractive_index, self.thickness_nm)
+    refractive_index: Annotated[Setting, Range(1.0, 3.0)] = "film_refractive_index"
+    thickness_nm: Annotated[Setting, Range(0.0, 1e5)] = "film_thickness"
 
     @override
-    def layers(
-        self, parameters: Mapping[str, Array], wavelength: Array | None
-    ) -> tuple[Layer, ...]:
+    def layers(self, parameters: Parameters, wavelength: Array | None) -> tuple[Layer, ...]:
         if wavelength is None:
             raise SceneError(
                 "fringes depend on the wavelength, and there is none",
@@ -156,18 +123,11 @@ class CoatStack(AbstractCoat):
                 hint="name the parameters apart: ClearCoat(absorbance='lacquer_absorbance')",
             )
 
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return parameters_of(*self.coats)
-
     @override
     def simpler(self) -> tuple[Part | None, ...]:
         others = [self.coats[:at] + self.coats[at + 1 :] for at in range(len(self.coats))]
         return tuple(CoatStack(coats) if coats else None for coats in others)
 
     @override
-    def layers(
-        self, parameters: Mapping[str, Array], wavelength: Array | None
-    ) -> tuple[Layer, ...]:
+    def layers(self, parameters: Parameters, wavelength: Array | None) -> tuple[Layer, ...]:
         return tuple(layer for coat in self.coats for layer in coat.layers(parameters, wavelength))

@@ -2,14 +2,13 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
-from typing import override
+from typing import Annotated, override
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
 
 # Wavelengths are in nm outside and in micrometers inside, as coefficients are tabulated.
 NANOMETERS = 1e-3
@@ -20,7 +19,7 @@ class AbstractDispersion(Part):
     """A law for the refractive index over wavelength."""
 
     @abc.abstractmethod
-    def index(self, parameters: Mapping[str, Array], wavelength: Array) -> Array:
+    def index(self, parameters: Parameters, wavelength: Array) -> Array:
         """Refractive index.
 
         Args:
@@ -49,22 +48,12 @@ class Cauchy(AbstractDispersion):
         SceneError: A setting is neither a number in its range nor a name.
     """
 
-    a: Setting = "cauchy_a"
-    b: Setting = "cauchy_b"
-    c: Setting = 0.0
-
-    def __post_init__(self) -> None:
-        check_setting(self.a, "Cauchy: a", 1.0, 3.0)
-        check_setting(self.b, "Cauchy: b", 0.0, 1.0)
-        check_setting(self.c, "Cauchy: c", -1.0, 1.0)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return names_in(self.a, self.b, self.c)
+    a: Annotated[Setting, Range(1.0, 3.0)] = "cauchy_a"
+    b: Annotated[Setting, Range(0.0, 1.0)] = "cauchy_b"
+    c: Annotated[Setting, Range(-1.0, 1.0)] = 0.0
 
     @override
-    def index(self, parameters: Mapping[str, Array], wavelength: Array) -> Array:
+    def index(self, parameters: Parameters, wavelength: Array) -> Array:
         a, b = value_of(self.a, parameters), value_of(self.b, parameters)
         inverse = 1.0 / (NANOMETERS * wavelength) ** 2
         if self.c == 0.0:
@@ -91,30 +80,23 @@ class Sellmeier(AbstractDispersion):
             range nor a name.
     """
 
-    strengths: tuple[Setting, ...] = ("sellmeier_strength",)
-    resonances: tuple[Setting, ...] = ("sellmeier_resonance",)
+    strengths: Annotated[tuple[Setting, ...], Range(0.0, 10.0)] = ("sellmeier_strength",)
+    resonances: Annotated[tuple[Setting, ...], Range(0.0, 1e4)] = ("sellmeier_resonance",)
 
+    @override
     def __post_init__(self) -> None:
         both = (self.strengths, self.resonances)
-        if not all(isinstance(each, tuple) and each for each in both) or len(both[0]) != len(
-            both[1]
-        ):
+        are_tuples = all(isinstance(each, tuple) and each for each in both)
+        if not are_tuples or len(self.strengths) != len(self.resonances):
             raise SceneError(
                 f"strengths={self.strengths!r} and resonances={self.resonances!r} do not pair",
                 where="Sellmeier",
                 hint="give two tuples of one length: Sellmeier((1.04, 0.23), (0.006, 0.02))",
             )
-        for strength, resonance in zip(*both, strict=True):
-            check_setting(strength, "Sellmeier: strengths", 0.0, 10.0)
-            check_setting(resonance, "Sellmeier: resonances", 0.0, 1e4)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return names_in(*self.strengths, *self.resonances)
+        super().__post_init__()
 
     @override
-    def index(self, parameters: Mapping[str, Array], wavelength: Array) -> Array:
+    def index(self, parameters: Parameters, wavelength: Array) -> Array:
         inverse = 1.0 / (NANOMETERS * wavelength) ** 2
         square = jnp.ones_like(inverse)
         for strength, resonance in zip(self.strengths, self.resonances, strict=True):

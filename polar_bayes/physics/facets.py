@@ -25,7 +25,13 @@ from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.boundary import Diattenuation
-from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_slopes, sin_degrees
+from polar_bayes.physics.geometry import (
+    Geometry,
+    cos_degrees,
+    mirror_slopes,
+    per_facet,
+    sin_degrees,
+)
 from polar_bayes.physics.microfacet import AbstractMicrofacet, AbstractShadowing, SlopeEllipse
 from polar_bayes.physics.part import Part
 from polar_bayes.physics.stokes import Light
@@ -98,15 +104,12 @@ class FacetQuadrature(Part):
 
 
 class Window(NamedTuple):
-    """Border of the facets that matter, in slope coordinates.
-
-    Args:
-        limit: Largest slope across the plane of the viewer. Shape (..., view), or () for all alike.
-        edges: Function from that slope to the smallest and largest slope in the plane.
-    """
+    """Border of the facets that matter, in slope coordinates."""
 
     limit: Array
+    """Largest slope across the plane of the viewer, (..., view), or () for all alike."""
     edges: Callable[[Array], tuple[Array, Array]]
+    """From that slope to the smallest and largest slope in the plane."""
 
 
 class Facets(NamedTuple):
@@ -177,72 +180,6 @@ def inside_disc(sin_view: Array, cos_view: Array, sin_half: float) -> Window:
     return Window(jnp.minimum(limit, sky.limit), edges)
 
 
-def sample_facets(
-    distribution: AbstractMicrofacet,
-    quadrature: FacetQuadrature,
-    ellipse: SlopeEllipse,
-    sin_view: Array,
-    cos_view: Array,
-    border: Callable[[Array, Array], Window],
-) -> Facets:
-    r"""Facets inside a border, weighted by the area that they show to the viewer.
-
-    $$ \sum_i w_i f_i \approx \int f \, \frac{v\cdot m}{\cos m} D \cos m \, dm, \qquad
-       \frac{v\cdot m}{\cos m} = c_v + s_v x $$
-    """
-    dtype = jnp.result_type(float, ellipse.across, cos_view)
-    # Axes (..., across, along, view): what one of the two does not touch is found once for all of
-    # it, and the views, the longest axis, are the innermost loop.
-    sides = 1 if ellipse.shear is None else 2
-    share_across, weight_across = (
-        jnp.asarray(np.tile(row, sides)[:, None, None], dtype) for row in quadrature.rule_across()
-    )
-    share_along, weight_along = (
-        jnp.asarray(row[:, None], dtype) for row in quadrature.rule_along()
-    )
-    sin_view, cos_view = sin_view[..., None, None, :], cos_view[..., None, None, :]
-    ellipse = ellipse.per_facet().per_facet()
-
-    window = border(sin_view, cos_view)
-    y, density_y = distribution.across(window.limit, ellipse.across, share_across)
-    lower, upper = window.edges(y)
-    if ellipse.shear is None:
-        x, density_x = distribution.along(lower, upper, y, ellipse.across, share_along)
-    else:
-        # Both sides of the plane, in slopes that are stretched and sheared to an isotropic pair.
-        side = jnp.asarray(np.repeat([1.0, -1.0], quadrature.across)[:, None, None], dtype)
-        density_y, y = 0.5 * density_y, side * y
-        stretch = ellipse.across / ellipse.along
-        shift = ellipse.shear / ellipse.across * y
-        x, density_x = distribution.along(
-            (lower - shift) * stretch, (upper - shift) * stretch, y, ellipse.across, share_along
-        )
-        x = x / stretch + shift
-    # Without a barrier XLA's CPU compiler fuses the slopes into each of their many readers and
-    # finds them anew for each: derivatives then take several times as long.
-    x, y, density_x, density_y = jax.lax.optimization_barrier((x, y, density_x, density_y))
-
-    shown = jnp.maximum(cos_view + sin_view * x, 0.0)
-    cos_tilt = 1.0 / jnp.sqrt(1.0 + x**2 + y**2)
-    cos_incidence = jnp.maximum(cos_tilt * shown, 1e-6)
-    in_plane = cos_tilt * (sin_view - x * cos_view)
-    out_of_plane = cos_tilt * y
-    facets = Facets(
-        weight=weight_across * density_y * weight_along * density_x * shown,
-        cos_incidence=cos_incidence,
-        sin_squared=in_plane**2 + out_of_plane**2,
-        along_s=in_plane**2 - out_of_plane**2,
-        across_s=None if ellipse.shear is None else 2.0 * in_plane * out_of_plane,
-        cos_light=2.0 * cos_incidence * cos_tilt - cos_view,
-        light_in_plane=2.0 * cos_incidence * cos_tilt * x - sin_view,
-        light_out_of_plane=2.0 * cos_incidence * cos_tilt * y,
-    )
-    shape = jnp.broadcast_shapes(*(jnp.shape(field) for field in (x, y, cos_view, share_along)))
-    return jax.tree.map(
-        lambda field: jnp.broadcast_to(field, shape).reshape(*shape[:-3], -1, shape[-1]), facets
-    )
-
-
 def _crowded_gauss_legendre(nodes: int, crowding: float) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Legendre nodes and weights on (-1, 1), moved outwards by an odd cubic."""
     node, weight = np.polynomial.legendre.leggauss(nodes)
@@ -250,24 +187,12 @@ def _crowded_gauss_legendre(nodes: int, crowding: float) -> tuple[np.ndarray, np
     return moved, weight * (1.0 + 0.5 * crowding * (1.0 - 3.0 * node**2))
 
 
-# --- Nodes and weights of integrals from 0 to 1 ---------------------------------------------------
-
-
-# --- The surface as a population of facets --------------------------------------------------------
-
-
 Border = Callable[[Array, Array], Window]
 
 
 @dataclasses.dataclass(frozen=True)
 class Microsurface:
-    """Facets of a surface.
-
-    Args:
-        distribution: How facets tilt.
-        shadowing: Which of them are seen.
-        quadrature: How many stand for all.
-    """
+    """The surface as a population of facets."""
 
     distribution: AbstractMicrofacet
     shadowing: AbstractShadowing
@@ -295,14 +220,61 @@ class Microsurface:
         return self.distribution.shadowing(steepness / peak, jnp.sqrt(peak))
 
     def sample(self, ellipse: SlopeEllipse, geometry: Geometry, border: Border) -> Facets:
-        """Facets inside a border, weighted by the area that they show to the viewer."""
-        return sample_facets(
-            self.distribution,
-            self.quadrature,
-            ellipse,
-            sin_degrees(geometry.view_zenith),
-            cos_degrees(geometry.view_zenith),
-            border,
+        r"""Facets inside a border, weighted by the area that they show to the viewer.
+
+        $$ \sum_i w_i f_i \approx \int f \, \frac{v\cdot m}{\cos m} D \cos m \, dm, \qquad
+           \frac{v\cdot m}{\cos m} = c_v + s_v x $$
+        """
+        sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
+        dtype = jnp.result_type(float, ellipse.across, cos_view)
+        # Axes (..., across, along, view): what one of the two does not touch is found once for all
+        # of it, and the views, the longest axis, are the innermost loop.
+        sides = 1 if ellipse.shear is None else 2
+        rule = self.quadrature
+        share_across, weight_across = (
+            jnp.asarray(np.tile(row, sides)[:, None, None], dtype) for row in rule.rule_across()
+        )
+        share_along, weight_along = (jnp.asarray(row[:, None], dtype) for row in rule.rule_along())
+        sin_view, cos_view = sin_view[..., None, None, :], cos_view[..., None, None, :]
+        ellipse = per_facet(per_facet(ellipse))
+
+        window = border(sin_view, cos_view)
+        y, density_y = self.distribution.across(window.limit, ellipse.across, share_across)
+        lower, upper = window.edges(y)
+        if ellipse.shear is None:
+            x, density_x = self.distribution.along(lower, upper, y, ellipse.across, share_along)
+        else:
+            # Both sides of the plane, in slopes stretched and sheared to an isotropic pair.
+            side = jnp.asarray(np.repeat([1.0, -1.0], rule.across)[:, None, None], dtype)
+            density_y, y = 0.5 * density_y, side * y
+            stretch = ellipse.across / ellipse.along
+            shift = ellipse.shear / ellipse.across * y
+            x, density_x = self.distribution.along(
+                (lower - shift) * stretch, (upper - shift) * stretch, y, ellipse.across, share_along
+            )
+            x = x / stretch + shift
+        # Without a barrier XLA's CPU compiler fuses the slopes into each of their many readers and
+        # finds them anew for each: derivatives then take several times as long.
+        x, y, density_x, density_y = jax.lax.optimization_barrier((x, y, density_x, density_y))
+
+        shown = jnp.maximum(cos_view + sin_view * x, 0.0)
+        cos_tilt = 1.0 / jnp.sqrt(1.0 + x**2 + y**2)
+        cos_incidence = jnp.maximum(cos_tilt * shown, 1e-6)
+        in_plane = cos_tilt * (sin_view - x * cos_view)
+        out_of_plane = cos_tilt * y
+        facets = Facets(
+            weight=weight_across * density_y * weight_along * density_x * shown,
+            cos_incidence=cos_incidence,
+            sin_squared=in_plane**2 + out_of_plane**2,
+            along_s=in_plane**2 - out_of_plane**2,
+            across_s=None if ellipse.shear is None else 2.0 * in_plane * out_of_plane,
+            cos_light=2.0 * cos_incidence * cos_tilt - cos_view,
+            light_in_plane=2.0 * cos_incidence * cos_tilt * x - sin_view,
+            light_out_of_plane=2.0 * cos_incidence * cos_tilt * y,
+        )
+        shape = jnp.broadcast_shapes(*(jnp.shape(field) for field in (x, y, cos_view, share_along)))
+        return jax.tree.map(
+            lambda field: jnp.broadcast_to(field, shape).reshape(*shape[:-3], -1, shape[-1]), facets
         )
 
 

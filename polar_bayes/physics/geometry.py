@@ -74,17 +74,8 @@ class Geometry(NamedTuple):
 
     def reversed(self) -> "Geometry":
         """Light and viewer in each other's place."""
-        return Geometry(
-            self.light_zenith,
-            self.light_azimuth,
-            self.view_zenith,
-            self.view_azimuth,
-            self.wavelength,
-        )
-
-    def per_ray(self) -> "Geometry":
-        """The same with a trailing axis, for many facets or rays of one view."""
-        return jax.tree.map(lambda array: array[..., None], self)
+        view, light = self[:2], self[2:4]
+        return Geometry(*light, *view, self.wavelength)
 
     @property
     def dtype(self) -> jnp.dtype:
@@ -118,6 +109,21 @@ def sin_degrees(angle: Array) -> Array:
 def cos_degrees(angle: Array) -> Array:
     """Cosine of an angle in degrees, accurate up to 90, where a plain cosine loses its digits."""
     return jnp.sin(jnp.deg2rad(90.0 - angle))
+
+
+def double_angle(cos: Array, sin: Array) -> tuple[Array, Array]:
+    """Cosine and sine of twice an angle; of a vector (cos, sin), times its squared length."""
+    return (cos - sin) * (cos + sin), 2.0 * sin * cos
+
+
+def per_ray[T](arrays: T) -> T:
+    """Arrays with a trailing axis, for many rays or quadrature nodes of each view."""
+    return jax.tree.map(lambda array: array[..., None] if array.ndim else array, arrays)
+
+
+def per_facet[T](arrays: T) -> T:
+    """Arrays with an axis before the views, for many facets of each."""
+    return jax.tree.map(lambda array: array[..., None, :] if array.ndim else array, arrays)
 
 
 def mirror_facet(geometry: Geometry) -> MirrorFacet:
@@ -182,8 +188,8 @@ def turn_between_frames(geometry: Geometry) -> tuple[Array, Array]:
     up = cos_degrees(half_difference) * cos_half
     down = cos_degrees(half_sum) * sin_half
     length = up**2 + down**2
-    cos, sin = (down - up) * (down + up) / length, 2.0 * up * down / length
-    return (cos - sin) * (cos + sin), 2.0 * sin * cos
+    cos, sin = double_angle(down, up)
+    return double_angle(cos / length, sin / length)
 
 
 def _half_azimuth(azimuth: Array) -> tuple[Array, Array]:

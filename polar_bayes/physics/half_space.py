@@ -35,8 +35,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.physics.geometry import cos_degrees, sin_degrees
+from polar_bayes.physics.boundary import medium
+from polar_bayes.physics.geometry import cos_degrees, double_angle, sin_degrees
 from polar_bayes.physics.part import squared_rule, unit_rule
+from polar_bayes.physics.stack import Stack
 
 # Scattered light changes with the square root of absorption, whose slope at zero is infinite: less
 # absorption than this counts as this.
@@ -79,14 +81,9 @@ _SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 
 class Ray(NamedTuple):
-    """A direction inside the body.
+    """A direction inside the body; a negative sine is on the other side of the normal."""
 
-    Args:
-        cosine: Cosine of the angle from the normal. Shape (..., view), 1, in [0, 1].
-        sine: Its sine; a negative one is on the other side of the normal. Same shape, 1.
-    """
-
-    cosine: Array
+    cosine: Array  # (..., view)
     sine: Array
 
 
@@ -117,9 +114,8 @@ class _Turned(NamedTuple):
 
 def refract(sine: Array, cosine: Array, refractive_index: Array) -> Ray:
     """Direction inside of light that meets a smooth interface."""
-    n = refractive_index
-    cosine = jnp.maximum(cosine, GRAZING)
-    return Ray(jnp.sqrt((n - 1.0) * (n + 1.0) + cosine**2) / n, sine / n)
+    inside = medium(refractive_index, jnp.maximum(cosine, GRAZING) ** 2)
+    return Ray(inside.normal / refractive_index, sine / refractive_index)
 
 
 def scatter(
@@ -159,7 +155,7 @@ def scatter(
 
     s_light, p_light = _unseen(cos_view, pair_0)
     cos_1, sin_1 = cos_degrees(azimuth), sin_degrees(azimuth)
-    cos_2, sin_2 = (cos_1 - sin_1) * (cos_1 + sin_1), 2.0 * sin_1 * cos_1
+    cos_2, sin_2 = double_angle(cos_1, sin_1)
     even, odd = cos_light * (intensity - q), u
     size = 1.5 * light.sine * view.sine * pair_1[0]
     even_1, odd_1 = size * (even * cos_1 - odd * sin_1), size * (even * sin_1 + odd * cos_1)
@@ -274,10 +270,15 @@ def _interface(n: Array) -> _Interface:
     one, kept = jnp.ones_like(cosine), (1.0 - tangent) / (1.0 + tangent)
     beyond = _Interface(cosine, critical * node * weight, one, one, kept)
     node, weight = (_column(x, n) for x in squared_rule(WITHIN))
-    root = jnp.sqrt(step + node**2)
-    s = step / (root + node) ** 2
-    p = step * (1.0 - (n**2 + 1.0) * node**2) / (root + n**2 * node) ** 2
-    within = _Interface(root / n, weight * node / n**2, s**2, p**2, s * p)
+    power = Stack(n).reflection(node, (1.0 - node) * (1.0 + node))
+    difference = power.contrast * power.sin_squared
+    within = _Interface(
+        refract(node, node, n).cosine,
+        weight * node / n**2,
+        power.mean + difference,
+        power.mean - difference,
+        -power.cross,
+    )
     return _Interface(*(jnp.concatenate(both) for both in zip(beyond, within, strict=True)))
 
 

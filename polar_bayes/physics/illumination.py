@@ -3,7 +3,6 @@
 import abc
 import dataclasses
 import math
-from collections.abc import Mapping
 from typing import override
 
 import jax.numpy as jnp
@@ -12,9 +11,16 @@ from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import Microsurface, Window, above_horizon, inside_disc, sum_facets
-from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
+from polar_bayes.physics.geometry import (
+    Geometry,
+    cos_degrees,
+    mirror_facet,
+    per_facet,
+    per_ray,
+    sin_degrees,
+)
 from polar_bayes.physics.microfacet import SlopeEllipse
-from polar_bayes.physics.part import Part, check_part, like, parameters_of, squared_rule, unit_rule
+from polar_bayes.physics.part import Parameters, Part, check_part, like, squared_rule, unit_rule
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import (
     Light,
@@ -44,7 +50,7 @@ class AbstractIllumination(Part):
         ellipse: SlopeEllipse,
         stack: Stack,
         geometry: Geometry,
-        parameters: Mapping[str, Array],
+        parameters: Parameters,
     ) -> Light:
         """Light that facets mirror to the viewer.
 
@@ -60,13 +66,8 @@ class AbstractIllumination(Part):
         """
 
     @abc.abstractmethod
-    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
-        """Irradiance that passes the interface into the body, in the frame of the light.
-
-        Args:
-            stack: What the surface is made of. Broadcasts with (..., view).
-            geometry: Directions. Shape (..., view), degree.
-            parameters: Material parameters by name, for those of the light itself.
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Light:
+        """Irradiance that passes the interface into the body; arguments as in `reflect`.
 
         Returns:
             Power per area, for unit irradiance (point) or unit radiance (disc, sky), with its
@@ -77,30 +78,24 @@ class AbstractIllumination(Part):
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
         """Beams that stand for the source, for a body that asks where its light comes from.
 
-        Args:
-            geometry: Directions. Shape (..., view), degree.
-
         Returns:
             `(geometry, irradiance)` with a ray axis: directions of shape (..., view, ray), and what
             each beam brings across itself. Broadcasts with them.
         """
 
-    def incident(
-        self, parameters: Mapping[str, Array], geometry: Geometry
-    ) -> tuple[Array, Array] | None:
+    def incident(self, parameters: Parameters, geometry: Geometry) -> tuple[Array, Array] | None:
         """Components q and u of the light in its own frame; None for unpolarized light."""
         del parameters, geometry
         return None
 
     def beams(
-        self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]
+        self, stack: Stack, geometry: Geometry, parameters: Parameters
     ) -> tuple[Geometry, Light]:
         """Light that passes into the body, ray by ray; see `rays` and `entering`."""
         rays, irradiance = self.rays(geometry)
         cos_light = cos_degrees(rays.light_zenith)
-        passing = stack.per_ray().transmission(cos_light, sin_degrees(rays.light_zenith) ** 2)
-        per_ray = {name: value[..., None] for name, value in parameters.items()}
-        light = transmit_inward(passing, cos_light, self.incident(per_ray, rays))
+        passing = per_ray(stack).transmission(cos_light, sin_degrees(rays.light_zenith) ** 2)
+        light = transmit_inward(passing, cos_light, self.incident(per_ray(dict(parameters)), rays))
         return rays, light._replace(intensity=irradiance * light.intensity)
 
 
@@ -127,11 +122,6 @@ class PointSource(AbstractIllumination):
             allowed = "LinearPolarization(degree=1.0, angle=0.0) or None"
             check_part(self.polarization, "PointSource: polarization", LinearPolarization, allowed)
 
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return parameters_of(self.polarization)
-
     @override
     def reflect(
         self,
@@ -139,7 +129,7 @@ class PointSource(AbstractIllumination):
         ellipse: SlopeEllipse,
         stack: Stack,
         geometry: Geometry,
-        parameters: Mapping[str, Array],
+        parameters: Parameters,
     ) -> Light:
         facet = mirror_facet(geometry)
         cos_view, cos_light = cos_degrees(geometry.view_zenith), cos_degrees(geometry.light_zenith)
@@ -157,20 +147,18 @@ class PointSource(AbstractIllumination):
         return mirrored._replace(intensity=density * seen / (4.0 * cos_view) * mirrored.intensity)
 
     @override
-    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Light:
         cos_light = cos_degrees(geometry.light_zenith)
         passing = stack.transmission(cos_light, sin_degrees(geometry.light_zenith) ** 2)
         return transmit_inward(passing, cos_light, self.incident(parameters, geometry))
 
     @override
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
-        rays = geometry.per_ray()
+        rays = per_ray(geometry)
         return rays, jnp.ones_like(rays.light_zenith)
 
     @override
-    def incident(
-        self, parameters: Mapping[str, Array], geometry: Geometry
-    ) -> tuple[Array, Array] | None:
+    def incident(self, parameters: Parameters, geometry: Geometry) -> tuple[Array, Array] | None:
         if self.polarization is None:
             return None
         q, u = self.polarization.stokes(parameters)
@@ -191,14 +179,11 @@ class AbstractExtendedSource(AbstractIllumination):
 
     @abc.abstractmethod
     def border(self, sin_view: Array, cos_view: Array) -> Window:
-        """Facets that mirror the viewer's ray into the source.
+        """Slopes of the facets that mirror the viewer's ray into the source.
 
         Args:
             sin_view: Sine of the view zenith. Shape (..., view), 1.
             cos_view: Its cosine. Same shape, 1, > 0.
-
-        Returns:
-            Window of slopes.
         """
 
     @override
@@ -208,17 +193,17 @@ class AbstractExtendedSource(AbstractIllumination):
         ellipse: SlopeEllipse,
         stack: Stack,
         geometry: Geometry,
-        parameters: Mapping[str, Array],
+        parameters: Parameters,
     ) -> Light:
         sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
         sample = facets.sample(ellipse, geometry, self.border)
-        power = stack.per_facet().relative_reflection(sample.cos_incidence, sample.sin_squared)
+        power = per_facet(stack).relative_reflection(sample.cos_incidence, sample.sin_squared)
         cos_light = jnp.clip(sample.cos_light, 1e-6, 1.0)
         to_viewer = sin_view / cos_view
         seen = facets.shadowing.both(
             facets.visible(ellipse, to_viewer, jnp.zeros_like(to_viewer))[..., None, :],
             facets.visible(
-                ellipse.per_facet(),
+                per_facet(ellipse),
                 sample.light_in_plane / cos_light,
                 sample.light_out_of_plane / cos_light,
             ),
@@ -238,7 +223,7 @@ class UniformSky(AbstractExtendedSource):
         return above_horizon(sin_view, cos_view)
 
     @override
-    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Light:
         passing = jnp.pi * stack.hemispherical_transmission() + jnp.zeros_like(geometry.view_zenith)
         return Light(passing, jnp.zeros_like(passing), jnp.zeros_like(passing))
 
@@ -248,7 +233,7 @@ class UniformSky(AbstractExtendedSource):
         # up once and twice around to nothing, which is all that scattering knows of azimuth.
         cosine, weight = squared_rule(SKY_NODES)
         solid_angle = 0.5 * np.pi * weight
-        rays = geometry.per_ray()
+        rays = per_ray(geometry)
         zenith, azimuth = np.degrees(np.arccos(cosine)), 90.0 * np.arange(4.0)
         around = like(np.tile(azimuth, SKY_NODES), rays.view_azimuth)
         return (
@@ -290,7 +275,7 @@ class Disc(AbstractExtendedSource):
         return (PointSource(),)
 
     @override
-    def entering(self, stack: Stack, geometry: Geometry, parameters: Mapping[str, Array]) -> Light:
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Light:
         cosine, sine_cosine, solid_angle = self._directions()
         sin_view = sin_degrees(geometry.view_zenith)[..., None]
         cos_view = cos_degrees(geometry.view_zenith)[..., None]
@@ -298,7 +283,7 @@ class Disc(AbstractExtendedSource):
         cos_light = cos_light + jnp.asarray(sine_cosine, cos_view.dtype) * sin_view
         cos_light = jnp.clip(cos_light, 1e-4, 1.0)
         sin_squared = (1.0 - cos_light) * (1.0 + cos_light)
-        through = stack.per_ray().transmission(cos_light, sin_squared)
+        through = per_ray(stack).transmission(cos_light, sin_squared)
         passing = jnp.sum(cos_light * through.mean * like(solid_angle, cos_view), axis=-1)
         # Around the light's own plane the disc is nearly symmetric: what polarization is left
         # after averaging belongs to its middle.
@@ -306,7 +291,7 @@ class Disc(AbstractExtendedSource):
 
     @override
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
-        rays = geometry.per_ray()
+        rays = per_ray(geometry)
         sin_view, cos_view = sin_degrees(rays.view_zenith), cos_degrees(rays.view_zenith)
         cosine, along, solid_angle = (like(x, cos_view) for x in self._directions())
         across = jnp.sqrt(jnp.maximum((1.0 - cosine) * (1.0 + cosine) - along**2, 0.0))

@@ -3,24 +3,31 @@
 Terms aim first (the angles a light path really has), then record in the order given. Parameters
 reach a term with a trailing view axis.
 
-Directions are stated in the frame of an assumed normal. The optics is told them in the frame of the
-true one, and the Stokes components that come out are turned back. Nothing is lost where the normal
-does not lean: the directions are then those that were stated, to the last bit or two.
+Directions are stated in the frame of an assumed normal. The optics receives them in the frame of
+the true one, and the Stokes components that come out are turned back. Nothing is lost where the
+normal is not tilted: the directions are then those that were stated, to the last bit or two.
 """
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, override
+from typing import Annotated, ClassVar, NamedTuple, override
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
-from polar_bayes.physics.stokes import Light, in_turned_frame
+from polar_bayes.physics.geometry import Geometry, cos_degrees, double_angle, sin_degrees
+from polar_bayes.physics.part import (
+    Parameters,
+    Part,
+    Range,
+    Setting,
+    check_setting,
+    parameters_of,
+    value_of,
+)
+from polar_bayes.physics.stokes import Light, diattenuate, in_turned_frame
 from polar_bayes.repr_html import HTMLRepr
 
 __all__ = [
@@ -49,7 +56,7 @@ class AbstractInstrumentTerm(Part):
     def simpler(self) -> tuple[Part | None, ...]:
         return (None,)
 
-    def aim(self, parameters: Mapping[str, Array], geometry: Geometry) -> Geometry:
+    def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
         """Directions the light really takes, from those that were read off.
 
         Args:
@@ -62,7 +69,7 @@ class AbstractInstrumentTerm(Part):
         del parameters
         return geometry
 
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         """Light as the instrument records it.
 
         Args:
@@ -110,15 +117,15 @@ class Instrument(HTMLRepr):
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of all parameters, in the order of the terms."""
-        return tuple(name for term in self.terms for name in term.parameters)
+        return parameters_of(*self.terms)
 
-    def aim(self, parameters: Mapping[str, Array], geometry: Geometry) -> Geometry:
+    def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
         """Directions the light really takes; see `AbstractInstrumentTerm.aim`."""
         for term in self.terms:
             geometry = term.aim(parameters, geometry)
         return geometry
 
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         """Light as recorded; see `AbstractInstrumentTerm.record`."""
         for term in self.terms:
             light = term.record(parameters, geometry, light)
@@ -132,7 +139,7 @@ class AngleZero(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("angle_zero",)
 
     @override
-    def aim(self, parameters: Mapping[str, Array], geometry: Geometry) -> Geometry:
+    def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
         shift = parameters["angle_zero"]
         return geometry._replace(
             view_zenith=jnp.minimum(geometry.view_zenith + shift, STEEPEST_ZENITH),
@@ -147,7 +154,7 @@ class DolpGain(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("dolp_gain",)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         gain = parameters["dolp_gain"]
         return Light(light.intensity, gain * light.q, gain * light.u)
 
@@ -159,7 +166,7 @@ class ChannelGain(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("channel_gain_ratio",)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         ratio = parameters["channel_gain_ratio"]
         return diattenuate(
             light, (ratio - 1.0) / (ratio + 1.0), 2.0 * jnp.sqrt(ratio) / (ratio + 1.0)
@@ -176,7 +183,7 @@ class Leakage(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("leakage",)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         leakage = parameters["leakage"]
         kept = (1.0 - leakage) / (1.0 + leakage)
         return Light(light.intensity, kept * light.q, kept * light.u)
@@ -189,7 +196,7 @@ class DarkLevel(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("dark_level",)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         intensity = light.intensity + parameters["dark_level"]
         # A trace below rounding: a view without any light keeps its polarization, and a dark
         # level below zero does not divide by it.
@@ -211,7 +218,7 @@ class BeamOverlap(AbstractInstrumentTerm):
     parameters: ClassVar[tuple[str, ...]] = ("beam_overlap_zenith",)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         fills = cos_degrees(parameters["beam_overlap_zenith"])
         # In the smaller of the two ratios, since the eighth power of the other may overflow.
         view = cos_degrees(geometry.view_zenith)
@@ -238,8 +245,7 @@ class Analyzer(AbstractInstrumentTerm):
 
     angle: float | tuple[float, ...] = 0.0
 
-    parameters: ClassVar[tuple[str, ...]] = ()
-
+    @override
     def __post_init__(self) -> None:
         angles = self.angle if isinstance(self.angle, tuple) else (self.angle,)
         for angle in angles:
@@ -252,7 +258,7 @@ class Analyzer(AbstractInstrumentTerm):
             check_setting(angle, "Analyzer: angle", -360.0, 360.0)
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         twice = 2.0 * jnp.asarray(self.angle, light.q.dtype)
         passed = 1.0 + light.q * cos_degrees(twice) + light.u * sin_degrees(twice)
         return light._replace(intensity=0.5 * passed * light.intensity)
@@ -273,8 +279,7 @@ class Saturation(AbstractInstrumentTerm):
 
     level: float
 
-    parameters: ClassVar[tuple[str, ...]] = ()
-
+    @override
     def __post_init__(self) -> None:
         if isinstance(self.level, str) or not self.level > 0.0:
             raise SceneError(
@@ -284,53 +289,41 @@ class Saturation(AbstractInstrumentTerm):
             )
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         return light._replace(intensity=jnp.minimum(light.intensity, self.level))
 
 
-def diattenuate(light: Light, contrast: Array, balance: Array) -> Light:
-    r"""Light seen by channels s and p of sensitivity 1 + t and 1 - t.
-
-    $$ I' = I (1 + q t), \quad q' = \frac{q+t}{1+qt}, \quad u' = \frac{u\sqrt{1-t^2}}{1+qt} $$
-    """
-    total = 1.0 + light.q * contrast
-    return Light(light.intensity * total, (light.q + contrast) / total, light.u * balance / total)
+# --- A tilted normal: what a patch sees if it is not level ----------------------------------------
 
 
-# --- A normal that leans away from the one that was stated: what a patch sees if it is not level
-
-
-# Largest lean along either axis, in degrees: a sampler may ask for more, and gets this.
+# Largest tilt along either axis, in degrees: a sampler may ask for more, and gets this.
 LARGEST_TILT = 80.0
 
 
 class Direction(NamedTuple):
-    """A direction in the frame of the true normal.
+    """A direction in the frame of the true normal, in degrees.
 
-    Args:
-        zenith: Angle from the true normal. Shape (..., view), degree.
-        azimuth: Around the true normal. Shape (..., view), degree.
-        turn: Cosine and sine of twice the angle from the s axis of the stated normal to that of
-            the true one. Each (..., view).
+    `turn` is the cosine and sine of twice the angle from the s axis of the stated normal to that
+    of the true one.
     """
 
-    zenith: Array
+    zenith: Array  # (..., view)
     azimuth: Array
     turn: tuple[Array, Array]
 
 
 @dataclasses.dataclass(frozen=True)
 class TiltedNormal(Part):
-    r"""The true normal leans by small angles towards azimuth 0 and towards azimuth 90.
+    r"""The true normal is tilted by small angles towards azimuth 0 and towards azimuth 90.
 
     $$ n \propto (\tan t_x, \tan t_y, 1) $$
 
-    in the frame in which the directions are stated: seen along azimuth 90 the normal leans by t_x,
+    in the frame in which the directions are stated: seen along azimuth 90 the tilt is t_x,
     seen along azimuth 0 by t_y. The axes of the true frame are those of the stated one, carried
     along by the rotation that takes the stated normal to the true one the shortest way; so are the
     grooves of an anisotropic surface, and a sky or disc that lights it.
 
-    A direction that the lean carries below the horizon counts as grazing, 89.999 degrees (or as
+    A direction that the tilt carries below the horizon counts as grazing, 89.999 degrees (or as
     stated, where that is nearer to 90): the light it has left is next to none, and its slope with
     the tilt is zero. Exactly on the true normal, where azimuth has no meaning, the azimuth as
     stated is kept, and slopes are those along the stated plane.
@@ -343,69 +336,41 @@ class TiltedNormal(Part):
         SceneError: A setting is neither a number in its range nor a name.
     """
 
-    tilt_x: Setting = "normal_tilt_x"
-    tilt_y: Setting = "normal_tilt_y"
-
-    def __post_init__(self) -> None:
-        check_setting(self.tilt_x, "TiltedNormal: tilt_x", -60.0, 60.0)
-        check_setting(self.tilt_y, "TiltedNormal: tilt_y", -60.0, 60.0)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return names_in(self.tilt_x, self.tilt_y)
+    tilt_x: Annotated[Setting, Range(-60.0, 60.0)] = "normal_tilt_x"
+    tilt_y: Annotated[Setting, Range(-60.0, 60.0)] = "normal_tilt_y"
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
         return (None,)
 
     def enter(
-        self, parameters: Mapping[str, Array], geometry: Geometry
+        self, parameters: Parameters, geometry: Geometry
     ) -> tuple[Geometry, tuple[Array, Array]]:
-        """Directions in the frame of the true normal.
-
-        Args:
-            parameters: Material parameters by name. Each broadcasts with (..., view).
-            geometry: Directions in the stated frame. Shape (..., view), degree.
-
-        Returns:
-            The directions, and the turn of the viewer's frame as in `Direction`. Broadcast shape.
-        """
-        slopes = self._slopes(parameters)
-        view = lean(geometry.view_zenith, geometry.view_azimuth, *slopes)
-        light = lean(geometry.light_zenith, geometry.light_azimuth, *slopes)
+        """Directions in the frame of the true normal, and the turn of the viewer's frame."""
+        tilts = (value_of(tilt, parameters) for tilt in (self.tilt_x, self.tilt_y))
+        bounded = (jnp.deg2rad(jnp.clip(tilt, -LARGEST_TILT, LARGEST_TILT)) for tilt in tilts)
+        slopes = [jnp.tan(tilt) for tilt in bounded]
+        view = tilted_direction(geometry.view_zenith, geometry.view_azimuth, *slopes)
+        light = tilted_direction(geometry.light_zenith, geometry.light_azimuth, *slopes)
         inside = Geometry(
             view.zenith, view.azimuth, light.zenith, light.azimuth, geometry.wavelength, light.turn
         )
         return inside, view.turn
 
     def leave(self, light: Light, turn: tuple[Array, Array]) -> Light:
-        """Light in the stated frame of the viewer.
-
-        Args:
-            light: Light in the true frame. Shape (..., view).
-            turn: As `enter` gave it.
-
-        Returns:
-            Light of the same shape.
-        """
+        """Light in the stated frame of the viewer, from that in the true one."""
         cos, sin = turn
         return Light(light.intensity, *in_turned_frame(light.q, light.u, (cos, -sin)))
 
-    def _slopes(self, parameters: Mapping[str, Array]) -> tuple[Array, Array]:
-        tilts = (value_of(setting, parameters) for setting in (self.tilt_x, self.tilt_y))
-        bounded = [jnp.deg2rad(jnp.clip(tilt, -LARGEST_TILT, LARGEST_TILT)) for tilt in tilts]
-        return jnp.tan(bounded[0]), jnp.tan(bounded[1])
 
-
-def lean(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direction:
+def tilted_direction(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direction:
     r"""A direction as the normal (slope_x, slope_y, 1)/N sees it.
 
     $$ \frac{s - p c}{N}, \quad \frac{-t}{N} $$
 
     along the stated s axis and the one at right angles to it: their length is the sine of the
     angle from the true normal, and their angle is that between both s axes. The zenith is given
-    as the stated one plus a difference, which is exactly zero without a lean.
+    as the stated one plus a difference, which is exactly zero without a tilt.
     """
     # With p and t the slopes along and across the plane of the direction, s and c its sine and
     # cosine, the true normal's cross product with the direction has the components
@@ -420,7 +385,7 @@ def lean(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direc
     lift = (cos + towards * sin / (1.0 + length)) / length
     x, y = sin - towards * lift, -across * lift
 
-    # On the true normal only the plane as stated tells where the direction came from.
+    # On the true normal only the plane as stated says where the direction came from.
     squared = along_s**2 + along_p**2
     overhead = squared <= jnp.finfo(squared.dtype).eps ** 1.5
     signed = along_s
@@ -429,12 +394,13 @@ def lean(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direc
     squared = along_s**2 + along_p**2
     sine = jnp.where(overhead, signed, jnp.sqrt(squared))
 
+    cos_turn, sin_turn = double_angle(along_s, along_p)
     steeper = jnp.rad2deg(jnp.arctan2(sine * cos - height * sin, height * cos + sine * sin))
     horizon = jnp.maximum(zenith, STEEPEST_ZENITH)
     return Direction(
         jnp.minimum(zenith + steeper, horizon),
         azimuth + jnp.rad2deg(jnp.arctan2(y, x)),
-        ((along_s - along_p) * (along_s + along_p) / squared, 2.0 * along_s * along_p / squared),
+        (cos_turn / squared, sin_turn / squared),
     )
 
 
@@ -474,6 +440,7 @@ class Discrepancy(AbstractInstrumentTerm):
 
     parameters: ClassVar[tuple[str, ...]] = ("discrepancy_amplitude", "discrepancy_weights")
 
+    @override
     def __post_init__(self) -> None:
         if not (isinstance(self.basis, int) and self.basis >= 1 and self.length > 0.0):
             raise SceneError(
@@ -483,7 +450,7 @@ class Discrepancy(AbstractInstrumentTerm):
             )
 
     @override
-    def record(self, parameters: Mapping[str, Array], geometry: Geometry, light: Light) -> Light:
+    def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         # Weights come as (..., basis, 1): the scene's view axis stands last, as in the functions.
         weights = parameters["discrepancy_weights"]
         smooth = jnp.sum(weights * self.functions(geometry.view_zenith), axis=-2)

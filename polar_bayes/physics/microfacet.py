@@ -7,8 +7,7 @@ slopes of a facet, one after the other) serve extended sources and the way out o
 
 import abc
 import dataclasses
-from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, override
+from typing import Annotated, ClassVar, NamedTuple, override
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
 
 # A roughness below this is taken as this: the width of a highlight is then 0.001 degree, which no
 # instrument resolves, and its peak brightness stays within single precision.
@@ -214,29 +213,18 @@ class SlopeEllipse(NamedTuple):
     along: Array
     shear: Array | None
 
-    def per_facet(self) -> "SlopeEllipse":
-        """The same with an axis before the views, for many facets of each."""
-        return SlopeEllipse(
-            self.across[..., None, :],
-            self.along[..., None, :],
-            None if self.shear is None else self.shear[..., None, :],
-        )
-
 
 @dataclasses.dataclass(frozen=True)
 class AbstractSlopes(Part):
     """The roughness of a surface, direction by direction."""
 
     @abc.abstractmethod
-    def ellipse(self, parameters: Mapping[str, Array], geometry: Geometry) -> SlopeEllipse:
+    def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
         """Slopes in the frame of each viewer.
 
         Args:
             parameters: Material parameters by name. Each broadcasts with (..., view).
             geometry: Directions. Shape (..., view), degree.
-
-        Returns:
-            SlopeEllipse.
         """
 
 
@@ -247,7 +235,7 @@ class IsotropicSlopes(AbstractSlopes):
     parameters: ClassVar[tuple[str, ...]] = ("roughness",)
 
     @override
-    def ellipse(self, parameters: Mapping[str, Array], geometry: Geometry) -> SlopeEllipse:
+    def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
         return SlopeEllipse(parameters["roughness"], parameters["roughness"], None)
 
 
@@ -268,22 +256,19 @@ class AnisotropicSlopes(AbstractSlopes):
         SceneError: The azimuth is neither a number in its range nor a name.
     """
 
-    azimuth: Setting = 0.0
-
-    def __post_init__(self) -> None:
-        check_setting(self.azimuth, "AnisotropicSlopes: azimuth", -360.0, 360.0)
+    azimuth: Annotated[Setting, Range(-360.0, 360.0)] = 0.0
 
     @property
     @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return ("roughness", "roughness_across", *names_in(self.azimuth))
+    def parameters(self) -> tuple[str, ...]:
+        return ("roughness", "roughness_across", *super().parameters)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
         return (IsotropicSlopes(),)
 
     @override
-    def ellipse(self, parameters: Mapping[str, Array], geometry: Geometry) -> SlopeEllipse:
+    def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
         first = jnp.maximum(parameters["roughness"], SMOOTHEST)
         second = jnp.maximum(parameters["roughness_across"], SMOOTHEST)
         turn = value_of(self.azimuth, parameters) - geometry.view_azimuth

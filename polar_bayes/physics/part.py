@@ -6,8 +6,8 @@ that is all the ledger of effects needs to weigh it (`polar_bayes.choose_effects
 
 import abc
 import dataclasses
-from collections.abc import Mapping
-from typing import ClassVar, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,12 +20,48 @@ Setting = float | str
 """A known number, or the name of a parameter that stands for it."""
 
 
+Parameters = Mapping[str, Array]
+"""Parameters by name, each of which broadcasts with (..., view)."""
+
+
+class Range(NamedTuple):
+    """Range of the numbers of a field: `absorbance: Annotated[Setting, Range(0.0, 100.0)]`."""
+
+    low: float
+    high: float
+
+
 @dataclasses.dataclass(frozen=True)
 class Part(HTMLRepr, abc.ABC):
     """One effect of a scene."""
 
-    parameters: ClassVar[tuple[str, ...]] = ()
-    """Names of the parameters that it reads, its own parts' included."""
+    def __post_init__(self) -> None:
+        for name, allowed, value in self._values():
+            if allowed is not None:
+                check_setting(value, f"{type(self).__name__}: {name}", *allowed)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that it reads: those of its settings and of its parts."""
+        names: list[str] = []
+        for _, allowed, value in self._values():
+            if isinstance(value, Part):
+                names += value.parameters
+            elif isinstance(value, str) and allowed is not None:
+                names.append(value)
+        return tuple(dict.fromkeys(names))
+
+    def _values(self) -> Iterator[tuple[str, Range | None, Any]]:
+        """Every field with its range and its value, or each value of its tuple."""
+        for field in dataclasses.fields(self):
+            notes = getattr(field.type, "__metadata__", ())
+            allowed = next((note for note in notes if isinstance(note, Range)), None)
+            value = getattr(self, field.name)
+            is_many = isinstance(value, tuple)
+            if allowed is not None:  # a tuple is no value of a field for one number
+                is_many = is_many and isinstance(field.default, tuple)
+            for one in value if is_many else (value,):
+                yield field.name, allowed, one
 
     def simpler(self) -> "tuple[Part | None, ...]":
         """What may stand in its place: a cheaper part, or None for leaving it out.
@@ -36,20 +72,15 @@ class Part(HTMLRepr, abc.ABC):
         return ()
 
 
-def value_of(setting: Setting, parameters: Mapping[str, Array]) -> Array:
+def value_of(setting: Setting, parameters: Parameters) -> Array:
     """The number of a setting in the parameters' precision, or the parameter that it names."""
     if isinstance(setting, str):
         return parameters[setting]
     return jnp.asarray(setting, jnp.result_type(float, *parameters.values()))
 
 
-def names_in(*settings: Setting) -> tuple[str, ...]:
-    """The parameters that settings name, each once."""
-    return tuple(dict.fromkeys(setting for setting in settings if isinstance(setting, str)))
-
-
-def parameters_of(*parts: Part | None) -> tuple[str, ...]:
-    """The parameters that several parts read, each once."""
+def parameters_of(*parts: Any) -> tuple[str, ...]:
+    """The parameters that several parts read, each once; a part may be None."""
     return tuple(
         dict.fromkeys(name for part in parts if part is not None for name in part.parameters)
     )

@@ -27,7 +27,7 @@ from polar_bayes.physics.instrument import (
 )
 from polar_bayes.physics.microfacet import Beckmann, HeightCorrelatedShadowing
 from polar_bayes.physics.mixing import AbstractMixing, DopMixing, StokesMixing
-from polar_bayes.physics.part import Part, check_part, notation, parameters_of
+from polar_bayes.physics.part import Parameters, check_part, notation, parameters_of
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization, to_stokes
 from polar_bayes.physics.subsurface import AbstractSubsurface, Depolarizer, Lambertian, Unpolarized
@@ -38,7 +38,7 @@ from polar_bayes.physics.surface import (
     RoughSurface,
     SmoothSurface,
 )
-from polar_bayes.repr_html import DisplayTable, HTMLRepr
+from polar_bayes.repr_html import HTMLRepr, Row, Table
 
 # Parameters of a material, in the order in which they are listed; every other one that a scene
 # reads belongs to the whole capture.
@@ -126,11 +126,10 @@ class Scene(HTMLRepr):
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters that the scene reads: the material's, then all others."""
-        index = self.dispersion or _FREE_INDEX
-        read = parameters_of(
-            self.surface, self.subsurface, self.mixing, index, self.coat, self.normal
-        )
-        read = (*read, *(() if self.instrument is None else self.instrument.parameters))
+        index = ("refractive_index",) if self.dispersion is None else self.dispersion.parameters
+        optics = parameters_of(self.surface, self.subsurface, self.mixing)
+        rest = parameters_of(self.coat, self.normal, self.instrument)
+        read = tuple(dict.fromkeys((*optics, *index, *rest)))
         material = tuple(name for name in MATERIAL_PARAMETERS if name in read)
         return (*material, *(name for name in read if name not in MATERIAL_PARAMETERS))
 
@@ -141,9 +140,10 @@ class Scene(HTMLRepr):
         return tuple(name for name in self.parameters if name not in instrument)
 
     @override
-    def extra_tables(self) -> tuple[DisplayTable, ...]:
-        rows = [(name, *notation(name)) for name in self.parameters]
-        return (DisplayTable(("parameter", "symbol", "meaning", "unit"), tuple(rows)),)
+    def extra_tables(self) -> tuple[Table, ...]:
+        rows = tuple(Row(name, notation(name)) for name in self.parameters)
+        columns = ("parameter", "symbol", "meaning", "unit")
+        return (Table(columns, rows, prose=columns),)
 
     def light(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> Light:
         """Light that reaches the viewer, before any instrument.
@@ -238,14 +238,14 @@ class Scene(HTMLRepr):
             )
         return dataclasses.replace(self, instrument=Instrument(rest) if rest else None)
 
-    def _optics(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
+    def _optics(self, parameters: Parameters, geometry: Geometry) -> Light:
         """Light in the stated frame of the viewer, for parameters that have a view axis."""
         if self.normal is None:
             return self._material(parameters, geometry)
         inside, turn = self.normal.enter(parameters, geometry)
         return self.normal.leave(self._material(parameters, inside), turn)
 
-    def _material(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
+    def _material(self, parameters: Parameters, geometry: Geometry) -> Light:
         """Surface, body and their mixture, in directions from the true normal."""
         if self.dispersion is not None:
             index = self.dispersion.index(parameters, self._wavelength(geometry))
@@ -286,16 +286,6 @@ class Scene(HTMLRepr):
         return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}
 
 
-@dataclasses.dataclass(frozen=True)
-class _FreeIndex(Part):
-    """The index itself is a parameter, one for each wavelength."""
-
-    parameters: ClassVar[tuple[str, ...]] = ("refractive_index",)
-
-
-_FREE_INDEX = _FreeIndex()
-
-
 # --- Scenes by name, as they are used and with every effect on that such a set-up may have --------
 
 
@@ -333,33 +323,29 @@ SCENES: dict[str, Scene] = {
     ),
 }
 
+_FULL_SURFACE = RoughSurface(
+    Beckmann(), PointSource(), MANY_FACETS, shadowing=HeightCorrelatedShadowing()
+)
+
 FULL_SCENES: dict[str, Scene] = {
-    "paper": Scene(
-        surface=RoughSurface(
-            Beckmann(), PointSource(), MANY_FACETS, shadowing=HeightCorrelatedShadowing()
-        ),
-        subsurface=Depolarizer(),
-        mixing=DopMixing(),
+    "paper": dataclasses.replace(
+        SCENES["paper"],
+        surface=_FULL_SURFACE,
         instrument=Instrument((AngleZero(), DarkLevel())),
     ),
-    "camera": Scene(
-        surface=RoughSurface(
-            Beckmann(), PointSource(), MANY_FACETS, shadowing=HeightCorrelatedShadowing()
-        ),
+    "camera": dataclasses.replace(
+        SCENES["camera"],
+        surface=_FULL_SURFACE,
         subsurface=Lambertian(internal_reflection=InternalReflection()),
-        mixing=StokesMixing(),
         instrument=Instrument((AngleZero(), DolpGain(), DarkLevel())),
     ),
-    "picture": Scene(
-        surface=SmoothSurface(),
+    "picture": dataclasses.replace(
+        SCENES["picture"],
         subsurface=Lambertian(internal_reflection=InternalReflection()),
-        mixing=StokesMixing(),
         instrument=Instrument((DolpGain(),)),
     ),
-    "goniometer": Scene(
-        surface=SmoothSurface(),
-        subsurface=Unpolarized(),
-        mixing=StokesMixing(),
+    "goniometer": dataclasses.replace(
+        SCENES["goniometer"],
         instrument=Instrument(
             (AngleZero(), BeamOverlap(), ChannelGain(), Leakage(), Discrepancy())
         ),

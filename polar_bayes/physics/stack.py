@@ -11,9 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.physics import boundary, fresnel
+from polar_bayes.physics import boundary
 from polar_bayes.physics.boundary import EVANESCENT, Diattenuation, Film, Medium
+from polar_bayes.physics.geometry import per_ray
 from polar_bayes.physics.part import like, squared_rule
+
+# Cosines and weights for integrals over the hemisphere: 24 Gauss-Legendre nodes in the square root
+# of the cosine, because near n = 1 all reflection gathers at grazing. The error of a bare body's
+# is 1e-15 from n = 1.1 on, 2e-14 at 1.01 and at most 3e-9 anywhere.
+HEMISPHERE_COSINES, HEMISPHERE_WEIGHTS = squared_rule(24)
 
 # Squared sines of inner angles that reach a coat but not the air, crowded towards grazing.
 _FROM_END, TRAPPED_WEIGHT = squared_rule(24)
@@ -21,10 +27,10 @@ TRAPPED_SHARE = 1.0 - _FROM_END
 
 
 class Layer(NamedTuple):
-    """One layer on the body.
+    """One layer on the body; its arrays broadcast with (..., view).
 
     Args:
-        refractive_index: Refractive index. Broadcasts with (..., view), 1, >= 1.
+        refractive_index: Refractive index, 1, >= 1.
         absorbance: Minus the log of what passes at normal incidence; None for a clear layer.
         wavenumber: 4 pi thickness/wavelength for a film thin enough for interference, so that
             the phase of a round trip is wavenumber times Q; None for a thick layer.
@@ -45,14 +51,6 @@ class Stack(NamedTuple):
 
     refractive_index: Array
     layers: tuple[Layer, ...] = ()
-
-    def per_facet(self) -> "Stack":
-        """The same with an axis before the views, for many facets of each."""
-        return jax.tree.map(lambda array: array[..., None, :] if array.ndim else array, self)
-
-    def per_ray(self) -> "Stack":
-        """The same with a trailing axis, for many rays or quadrature nodes of each view."""
-        return jax.tree.map(lambda array: array[..., None] if array.ndim else array, self)
 
     def reflection(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
         """Share of the light that comes back from the whole stack."""
@@ -75,7 +73,7 @@ class Stack(NamedTuple):
     def scale(self) -> Array:
         """Factor that `relative_reflection` leaves out, shape of the index."""
         if not self.layers:
-            return fresnel.index_step(self.refractive_index)
+            return ((self.refractive_index - 1.0) * (self.refractive_index + 1.0)) ** 2
         return jnp.ones_like(self.refractive_index)
 
     def transmission(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
@@ -86,11 +84,13 @@ class Stack(NamedTuple):
         return self._respond(cos_incidence, sin_squared)[1]
 
     def hemispherical_transmission(self) -> Array:
-        """Share of diffuse light from outside that reaches the body, shape of the index."""
-        if not self.layers:
-            return 1.0 - fresnel.hemispherical_reflection(self.refractive_index)
+        r"""Share of diffuse light from outside that reaches the body, shape of the index.
+
+        $$ 1 - F_e = \int_0^1 2\mu T_+(\mu)\, d\mu $$
+        """
         cosine, weight = self._hemisphere()
-        through = self.per_ray().transmission(cosine, (1.0 - cosine) * (1.0 + cosine))
+        through = per_ray(self).transmission(cosine, (1.0 - cosine) * (1.0 + cosine))
+        # A sum, since matrix products of accelerators drop digits in single precision.
         return jnp.sum(weight * through.mean, axis=-1)
 
     def escape(self) -> Array:
@@ -98,13 +98,13 @@ class Stack(NamedTuple):
 
         $$ 1 - F_i = \frac{1}{n^2}\int_0^{n^2} (1 - R'(B))\, dB $$
 
-        over the squared sine B in air: up to 1 light leaves, beyond it a coat may absorb it.
+        over the squared sine B in air: up to 1 light leaves, beyond it a coat may absorb it. A bare
+        interface is the same both ways: 1 - F_i = (1 - F_e)/n^2.
         """
         if not self.layers:
-            return fresnel.escape(self.refractive_index)
+            return self.hemispherical_transmission() / self.refractive_index**2
         cosine, weight = self._hemisphere()
-        left = self.per_ray()._not_returned(cosine**2, (1.0 - cosine) * (1.0 + cosine))
-        # Sums, since matrix products of accelerators drop digits in single precision.
+        left = per_ray(self)._not_returned(cosine**2, (1.0 - cosine) * (1.0 + cosine))
         lost = jnp.sum(weight * left, axis=-1)
         if any(layer.absorbance is not None for layer in self.layers):
             lost = lost + self._absorbed_under_total_reflection()
@@ -115,7 +115,7 @@ class Stack(NamedTuple):
         lowest = [layer for layer in self.layers if layer.wavenumber is None][-1]
         end = jnp.minimum(self.refractive_index, lowest.refractive_index) ** 2
         beyond = (end - 1.0)[..., None] * like(TRAPPED_SHARE, self.refractive_index)
-        absorbed = self.per_ray()._not_returned(-beyond, 1.0 + beyond, reaches_air=False)
+        absorbed = per_ray(self)._not_returned(-beyond, 1.0 + beyond, reaches_air=False)
         return (end - 1.0) * jnp.sum(
             like(TRAPPED_WEIGHT, self.refractive_index) * absorbed, axis=-1
         )
@@ -126,9 +126,8 @@ class Stack(NamedTuple):
 
     def _hemisphere(self) -> tuple[Array, Array]:
         """Cosines in air, and weights that average over diffuse light."""
-        cosine = fresnel.HEMISPHERE_COSINES
-        weight = 2.0 * cosine * fresnel.HEMISPHERE_WEIGHTS
-        return like(cosine, self.refractive_index), like(weight, self.refractive_index)
+        weight = 2.0 * HEMISPHERE_COSINES * HEMISPHERE_WEIGHTS
+        return like(HEMISPHERE_COSINES, self.refractive_index), like(weight, self.refractive_index)
 
     def _respond(
         self, cos_incidence: Array, sin_squared: Array

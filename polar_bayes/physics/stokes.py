@@ -15,8 +15,7 @@ thin film turns into circular light counts as unpolarized.
 """
 
 import dataclasses
-from collections.abc import Mapping
-from typing import NamedTuple, override
+from typing import Annotated, NamedTuple, override
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -30,7 +29,7 @@ from polar_bayes.physics.geometry import (
     sin_degrees,
     turn_between_frames,
 )
-from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
 from polar_bayes.physics.stack import Stack
 
 # Rounds the tip of the cone |(q, u)|: small against any reading, large enough that the Hessian at
@@ -88,6 +87,15 @@ def in_turned_frame(q: Array, u: Array, turn: tuple[Array, Array]) -> tuple[Arra
     return q * cos + u * sin, u * cos - q * sin
 
 
+def diattenuate(light: Light, contrast: Array, balance: Array) -> Light:
+    r"""Light behind a filter that passes 1 + t of s and 1 - t of p (Mueller's diattenuator).
+
+    $$ I' = I (1 + q t), \quad q' = \frac{q+t}{1+qt}, \quad u' = \frac{u\sqrt{1-t^2}}{1+qt} $$
+    """
+    total = 1.0 + light.q * contrast
+    return Light(light.intensity * total, (light.q + contrast) / total, light.u * balance / total)
+
+
 def angle_of_linear_polarization(q: Array, u: Array) -> Array:
     """Angle of polarization from the s axis, atan2(u, q)/2; 0 where there is none."""
     cos_double, sin_double = direction(q, u)
@@ -110,23 +118,14 @@ class LinearPolarization(Part):
         SceneError: A setting is neither a number in its range nor a name.
     """
 
-    degree: Setting = 1.0
-    angle: Setting = 0.0
-
-    def __post_init__(self) -> None:
-        check_setting(self.degree, "LinearPolarization: degree", 0.0, 1.0)
-        check_setting(self.angle, "LinearPolarization: angle", -180.0, 180.0)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return names_in(self.degree, self.angle)
+    degree: Annotated[Setting, Range(0.0, 1.0)] = 1.0
+    angle: Annotated[Setting, Range(-180.0, 180.0)] = 0.0
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
         return (None,)
 
-    def stokes(self, parameters: Mapping[str, Array]) -> tuple[Array, Array]:
+    def stokes(self, parameters: Parameters) -> tuple[Array, Array]:
         """The components q and u of the light, in its own frame."""
         degree = value_of(self.degree, parameters)
         angle = 2.0 * value_of(self.angle, parameters)
@@ -148,18 +147,18 @@ def mirror_light(
     (q, u), source = incident, mirror_facet(geometry.reversed())
     along = q * source.along_s - u * source.across_s
     across = q * source.across_s + u * source.along_s
-    cos, sin = turn_between_frames(geometry)
+    turned_q, turned_u = in_turned_frame(q, u, turn_between_frames(geometry))
     turned = 0.5 * (power.mean + power.cross)
     folded = 0.5 * power.shortfall
     total = power.mean + power.contrast * along
     first = (
         power.contrast * facet.along_s
-        + turned * (q * cos + u * sin)
+        + turned * turned_q
         + folded * (along * facet.along_s - across * facet.across_s)
     )
     second = (
         -power.contrast * facet.across_s
-        + turned * (u * cos - q * sin)
+        + turned * turned_u
         - folded * (along * facet.across_s + across * facet.along_s)
     )
     # Fully p-polarized light at Brewster's angle is not reflected at all: 0/0 is then kept finite.
@@ -171,12 +170,7 @@ def transmit_inward(
     passing: Diattenuation, cos_light: Array, incident: tuple[Array, Array] | None
 ) -> Light:
     """Light that passes the surface into the body, in the frame of the light."""
-    contrast = passing.contrast * passing.sin_squared
+    light, q = cos_light * passing.mean, passing.contrast * passing.sin_squared / passing.mean
     if incident is None:
-        q = contrast / passing.mean
-        return Light(cos_light * passing.mean, q, jnp.zeros_like(q))
-    q, u = incident
-    total = passing.mean + contrast * q
-    return Light(
-        cos_light * total, (contrast + passing.mean * q) / total, passing.cross * u / total
-    )
+        return Light(light, q, jnp.zeros_like(q))
+    return diattenuate(Light(light, *incident), q, passing.cross / passing.mean)

@@ -2,8 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
-from typing import ClassVar, override
+from typing import Annotated, ClassVar, override
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.half_space import CLEAREST, refract, scatter
-from polar_bayes.physics.part import Part, Setting, check_setting, names_in, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import Interface, InternalReflection
 
@@ -21,9 +20,7 @@ class AbstractSubsurface(Part):
     """A body that scatters. Parameters broadcast with (..., view)."""
 
     @abc.abstractmethod
-    def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
-    ) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         """Light from the body that reaches the viewer.
 
         Args:
@@ -53,26 +50,18 @@ class DiffuseBody(AbstractSubsurface):
         SceneError: The albedo is neither a number from 0 to 1 nor a name.
     """
 
-    albedo: Setting = 1.0
+    albedo: Annotated[Setting, Range(0.0, 1.0)] = 1.0
     internal_reflection: InternalReflection | None = None
 
-    def __post_init__(self) -> None:
-        check_setting(self.albedo, f"{type(self).__name__}: albedo", 0.0, 1.0)
-
-    @property
-    @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return names_in(self.albedo)
-
     def diffuse(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
+        self, parameters: Parameters, geometry: Geometry, interface: Interface
     ) -> tuple[Array, Light]:
         """Brightness inside, and what the way out does to it."""
         albedo = value_of(self.albedo, parameters)
         entering = interface.entering(parameters, geometry).intensity
         brightness = albedo / jnp.pi * entering
         if self.internal_reflection is not None:
-            escape = self.internal_reflection.escape(interface)
+            escape = interface.escape()
             # 1 - A Fi, as a sum of two positive terms.
             not_trapped = (1.0 - albedo) + albedo * escape
             brightness = brightness / (parameters["refractive_index"] ** 2 * not_trapped)
@@ -88,9 +77,7 @@ class Unpolarized(DiffuseBody):
     """
 
     @override
-    def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
-    ) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         brightness, leaving = self.diffuse(parameters, geometry, interface)
         brightness = brightness * leaving.intensity
         return Light(brightness, jnp.zeros_like(brightness), jnp.zeros_like(brightness))
@@ -113,9 +100,7 @@ class Lambertian(DiffuseBody):
         return (Unpolarized(self.albedo, self.internal_reflection),)
 
     @override
-    def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
-    ) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         brightness, leaving = self.diffuse(parameters, geometry, interface)
         return leaving._replace(intensity=brightness * leaving.intensity)
 
@@ -141,14 +126,12 @@ class Depolarizer(AbstractSubsurface):
     parameters: ClassVar[tuple[str, ...]] = ("absorption",)
 
     @override
-    def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
-    ) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         lost = half_space_loss(parameters["absorption"])
         if self.internal_reflection is None:
             not_trapped, kept = jnp.ones_like(lost), lost
         else:
-            escape = self.internal_reflection.escape(interface)
+            escape = interface.escape()
             # 1 - Fi Rd, as a sum of two positive terms.
             not_trapped = lost + (1.0 - lost) * escape
             kept = body_loss(parameters["absorption"], escape)
@@ -207,27 +190,22 @@ class TurbidMedium(AbstractSubsurface):
         SceneError: The fraction is neither a number from 0 to 1 nor a name.
     """
 
-    polarized_fraction: Setting = 0.5
+    polarized_fraction: Annotated[Setting, Range(0.0, 1.0)] = 0.5
     internal_reflection: InternalReflection | None = dataclasses.field(
         default_factory=InternalReflection
     )
 
-    def __post_init__(self) -> None:
-        check_setting(self.polarized_fraction, "TurbidMedium: polarized_fraction", 0.0, 1.0)
-
     @property
     @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return ("absorption", *names_in(self.polarized_fraction))
+    def parameters(self) -> tuple[str, ...]:
+        return ("absorption", *super().parameters)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
         return (Depolarizer(self.internal_reflection),)
 
     @override
-    def light(
-        self, parameters: Mapping[str, Array], geometry: Geometry, interface: Interface
-    ) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         n = parameters["refractive_index"]
         rays, entering = interface.beams(parameters, geometry)
         view = refract(sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith), n)

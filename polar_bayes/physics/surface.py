@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
 from typing import override
 
 import jax
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.physics.facets import FacetQuadrature, Facets, Microsurface, seen, sum_facets
-from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
+from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, per_facet, sin_degrees
 from polar_bayes.physics.illumination import AbstractIllumination, PointSource
 from polar_bayes.physics.microfacet import (
     AbstractMicrofacet,
@@ -21,7 +20,7 @@ from polar_bayes.physics.microfacet import (
     SeparableShadowing,
     SlopeEllipse,
 )
-from polar_bayes.physics.part import Part, check_part, parameters_of
+from polar_bayes.physics.part import Parameters, Part, check_part, parameters_of
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, mirror_light
 
@@ -78,7 +77,7 @@ class RoughExit(AbstractExit):
         sample = facets.sample(ellipse, geometry, seen)
         # A barrier keeps facets from being found anew for each of their readers; see `facets`.
         sample = Facets(*jax.lax.optimization_barrier(tuple(sample)))
-        passing = stack.per_facet().transmission(sample.cos_incidence, sample.sin_squared)
+        passing = per_facet(stack).transmission(sample.cos_incidence, sample.sin_squared)
         area = jnp.sum(sample.weight, axis=-2)
         light = sum_facets(sample, sample.weight, passing)
         light = light._replace(intensity=light.intensity / area)
@@ -98,32 +97,24 @@ def exit_through_plane(stack: Stack, geometry: Geometry) -> Light:
 
 @dataclasses.dataclass(frozen=True)
 class AbstractSurface(Part):
-    """An interface between air and the body. Parameters broadcast with (..., view).
+    """An interface between air and the body.
 
-    What a single facet is made of (the bare body, or layers on it) comes as a `Stack`.
+    Every method takes `parameters` (material parameters by name, each broadcasts with (..., view)),
+    `geometry` (directions of shape (..., view), in degrees) and `stack` (what a single facet is
+    made of: the bare body, or layers on it; broadcasts with (..., view)).
     """
 
     @abc.abstractmethod
-    def light(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         """Light that the interface reflects to the viewer.
-
-        Args:
-            parameters: Material parameters by name. Each broadcasts with (..., view).
-            geometry: Directions. Shape (..., view), degree.
-            stack: Layers and body. Broadcasts with (..., view).
 
         Returns:
             Light; q > 0 is polarized across the plane of the viewer. Shape (..., view).
         """
 
     @abc.abstractmethod
-    def entering(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def entering(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         """Light that passes into the body.
-
-        Args:
-            parameters: Material parameters by name. Each broadcasts with (..., view).
-            geometry: Directions. Shape (..., view), degree.
-            stack: Layers and body. Broadcasts with (..., view).
 
         Returns:
             Power per area for unit irradiance, or for unit radiance of a disc or sky, and its
@@ -132,27 +123,17 @@ class AbstractSurface(Part):
 
     @abc.abstractmethod
     def beams(
-        self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack
+        self, parameters: Parameters, geometry: Geometry, stack: Stack
     ) -> tuple[Geometry, Light]:
         """The same light ray by ray, for a body that asks where it comes from.
-
-        Args:
-            parameters: Material parameters by name. Each broadcasts with (..., view).
-            geometry: Directions. Shape (..., view), degree.
-            stack: Layers and body. Broadcasts with (..., view).
 
         Returns:
             `(rays, light)`: directions and light of shape (..., view, ray).
         """
 
     @abc.abstractmethod
-    def exit(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def exit(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         """What the interface does to unpolarized light on its way out to the viewer.
-
-        Args:
-            parameters: Material parameters by name. Each broadcasts with (..., view).
-            geometry: Directions. Shape (..., view), degree.
-            stack: Layers and body. Broadcasts with (..., view).
 
         Returns:
             Light whose intensity is the transmittance; q <= 0, along the plane of the viewer.
@@ -177,28 +158,23 @@ class SmoothSurface(AbstractSurface):
     def __post_init__(self) -> None:
         check_part(self.beam, "SmoothSurface: beam", PointSource, "PointSource()")
 
-    @property
     @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self.beam.parameters
-
-    @override
-    def light(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         incident = self.beam.incident(parameters, geometry)
         return mirror_light(stack, mirror_facet(geometry), geometry, incident)
 
     @override
-    def entering(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def entering(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         return self.beam.entering(stack, geometry, parameters)
 
     @override
     def beams(
-        self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack
+        self, parameters: Parameters, geometry: Geometry, stack: Stack
     ) -> tuple[Geometry, Light]:
         return self.beam.beams(stack, geometry, parameters)
 
     @override
-    def exit(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def exit(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         return exit_through_plane(stack, geometry)
 
 
@@ -238,7 +214,7 @@ class RoughSurface(AbstractSurface):
 
     @property
     @override
-    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
+    def parameters(self) -> tuple[str, ...]:
         return parameters_of(self.distribution, self.slopes, self.illumination)
 
     @property
@@ -247,47 +223,42 @@ class RoughSurface(AbstractSurface):
         return Microsurface(self.distribution, self.shadowing, self.quadrature)
 
     @override
-    def light(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def light(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         ellipse = self.slopes.ellipse(parameters, geometry)
         return self.illumination.reflect(self.facets, ellipse, stack, geometry, parameters)
 
     @override
-    def entering(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def entering(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         return self.illumination.entering(stack, geometry, parameters)
 
     @override
     def beams(
-        self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack
+        self, parameters: Parameters, geometry: Geometry, stack: Stack
     ) -> tuple[Geometry, Light]:
         return self.illumination.beams(stack, geometry, parameters)
 
     @override
-    def exit(self, parameters: Mapping[str, Array], geometry: Geometry, stack: Stack) -> Light:
+    def exit(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         ellipse = self.slopes.ellipse(parameters, geometry)
         return self.way_out.light(self.facets, ellipse, stack, geometry)
 
 
 @dataclasses.dataclass(frozen=True)
 class Interface:
-    """A surface with all it is made of, as a body under it needs it.
-
-    Args:
-        surface: The surface.
-        stack: Layers and body. Broadcasts with (..., view).
-    """
+    """A surface with all it is made of, as a body under it needs it."""
 
     surface: AbstractSurface
     stack: Stack
 
-    def entering(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
+    def entering(self, parameters: Parameters, geometry: Geometry) -> Light:
         """Light that passes into the body; see `AbstractSurface.entering`."""
         return self.surface.entering(parameters, geometry, self.stack)
 
-    def beams(self, parameters: Mapping[str, Array], geometry: Geometry) -> tuple[Geometry, Light]:
+    def beams(self, parameters: Parameters, geometry: Geometry) -> tuple[Geometry, Light]:
         """The same ray by ray; see `AbstractSurface.beams`."""
         return self.surface.beams(parameters, geometry, self.stack)
 
-    def exit(self, parameters: Mapping[str, Array], geometry: Geometry) -> Light:
+    def exit(self, parameters: Parameters, geometry: Geometry) -> Light:
         """What happens to light on its way out; see `AbstractSurface.exit`."""
         return self.surface.exit(parameters, geometry, self.stack)
 
@@ -311,7 +282,3 @@ class InternalReflection(Part):
     @override
     def simpler(self) -> tuple[Part | None, ...]:
         return (None,)
-
-    def escape(self, interface: Interface) -> Array:
-        """Share of diffuse light that leaves, 1 - F_i. Broadcasts with (..., view), in (0, 1]."""
-        return interface.escape()

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,8 +15,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 from matplotlib.transforms import Bbox
 
-from polar_bayes.benchmark.accuracy import AS_GIVEN
 from polar_bayes.benchmark.advice import (
+    AS_GIVEN,
     RESOLVED,
     accuracy_dataset,
     accuracy_sentences,
@@ -27,6 +28,7 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import DASH, column, or_dash
+from polar_bayes.repr_html import Table
 
 METHOD, VARIATION = "method", "override"
 """Names of the dimensions of a study: a method, and what was changed of it."""
@@ -86,21 +88,13 @@ def plot_accuracy(
             axes.set_ylabel("largest error of a mean or sd [posterior sd]")
     markers = _assign(table[VARIATION], MARKERS)
     if len(markers) > 1:
+        fills = [GRAY, *["none"] * (len(markers) - 1)]
         handles = [
-            Line2D(
-                [],
-                [],
-                ls="",
-                marker=marker,
-                mfc=GRAY if at == 0 else "none",
-                mec=GRAY,
-                label=variation,
-            )
-            for at, (variation, marker) in enumerate(markers.items())
+            Line2D([], [], ls="", marker=marker, mfc=fill, mec=GRAY, label=variation)
+            for fill, (variation, marker) in zip(fills, markers.items(), strict=True)
         ]
-        figure.legend(
-            handles=handles, loc="outside lower center", ncols=4 * len(shown), frameon=False
-        )
+        place: Any = {"loc": "outside lower center", "ncols": 4 * len(shown)}
+        figure.legend(handles=handles, frameon=False, **place)
     return figure
 
 
@@ -116,16 +110,10 @@ def front_panel(axes: Axes, study: xr.Dataset, time: str) -> None:
     axes.plot(front[time], front["error"], color=GRAY, lw=1.0, drawstyle="steps-post", zorder=1)
     for _, row in known.iterrows():
         given, color = row[VARIATION] == AS_GIVEN, colors[row[METHOD]]
-        axes.plot(
-            row[time],
-            row["error"],
-            ls="",
-            marker=markers[row[VARIATION]],
-            ms=6.5 if given else 4.5,
-            mfc=color if given else "none",
-            mec=color,
-            zorder=3 if given else 2,
-        )
+        look: Any = {"mfc": color, "ms": 6.5, "zorder": 3}
+        look = look if given else {"mfc": "none", "ms": 4.5, "zorder": 2}
+        marker = markers[row[VARIATION]]
+        axes.plot(row[time], row["error"], ls="", marker=marker, mec=color, **look)
     if not known.empty:  # with room for a name on the right
         error = known["error"].clip(lower=1e-6)
         axes.set_xlim(float(known[time].min()) / 1.6, float(known[time].max()) * 3.0)
@@ -165,15 +153,12 @@ def _name_methods(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, 
                 break
         taken.append(box)
         line = {"arrowstyle": "-", "color": colors[name], "lw": 0.6}
+        place: Any = {"xytext": (right, up), "textcoords": "offset points", "va": "center"}
         axes.annotate(
             style.label_text(name),
             (float(row[time]), float(row["error"])),
-            xytext=(right, up),
-            textcoords="offset points",
             ha="left" if right > 0 else "right",
-            va="center",
-            fontsize=8,
-            color=colors[name],
+            **{**place, "fontsize": 8, "color": colors[name]},
             arrowprops=line if abs(up) > NEAR else None,
             path_effects=[withStroke(linewidth=2.5, foreground=style.background())],
         )
@@ -208,10 +193,10 @@ def accuracy_page(result: xr.DataTree) -> page.Page:
 
 def accuracy_picture(study: xr.Dataset) -> page.Picture:
     """Error against time."""
-    return page.make_picture(plot_accuracy(study), *text.figure_caption("accuracy.figure_front"))
+    return page.picture(plot_accuracy(study), "accuracy.figure_front")
 
 
-def study_table(study: xr.Dataset) -> page.Table:
+def study_table(study: xr.Dataset) -> Table:
     """A row for each method and each variation of it."""
     noise = float(study.attrs["reference_error"])
     table = accuracy_table(study)
@@ -223,7 +208,6 @@ def study_table(study: xr.Dataset) -> page.Table:
 
     marks = {
         str(name): "; ".join(filter(None, ["*" if row["on_front"] else "", row["problems"]]))
-        or str(name)
         for name, row in table.iterrows()
     }
     cells: page.Cells = {
@@ -240,13 +224,13 @@ def study_table(study: xr.Dataset) -> page.Table:
         "gradients": column("gradients", ",.0f"),
         "densities": column("densities", ",.0f"),
     }
-    caption = text.caption("accuracy.study")
+    caption = page.caption("accuracy.study")
     return page.make_table(
         "study", caption, cells, table, label="method", descriptions=marks, prose=["method"]
     )
 
 
-def error_table(study: xr.Dataset) -> page.Table:
+def error_table(study: xr.Dataset) -> Table:
     """Errors of every parameter by the methods as given."""
     errors = parameter_errors(study)[study[VARIATION].to_numpy() == AS_GIVEN]
     cells: page.Cells = {str(name): column(name, ".2g") for name in errors.columns}

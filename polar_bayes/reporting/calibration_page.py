@@ -10,7 +10,6 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
-from polar_bayes.calibration.files import is_calibration
 from polar_bayes.calibration.scores import significance_level
 from polar_bayes.calibration.verdict import (
     calibration_readings,
@@ -18,21 +17,23 @@ from polar_bayes.calibration.verdict import (
     compare_calibrations,
     comparison_sentences,
     holds_readings,
+    is_calibration,
     parameter_deviation,
     reading_deviation,
     reading_ranks,
 )
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.errors import FitError, one_line
-from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, text
 from polar_bayes.reporting import plots_calibration as figures
-from polar_bayes.reporting.maps import count_table
+from polar_bayes.reporting.maps import count_table, flag_meanings
 from polar_bayes.reporting.plots_calibration import MAX_INTERVALS, Ranks
 from polar_bayes.reporting.style import QUANTITIES
 from polar_bayes.reporting.text import DASH, column, number
+from polar_bayes.repr_html import Table
 
 MAX_PANELS = 12
 """Parameters of one figure: more would be too small to read."""
@@ -49,10 +50,10 @@ RANKS_COLUMN = "the ranks"
 
 
 def calibration_page(
-    calibration: xr.DataTree, beside: Mapping[str, xr.DataTree] | None = None
+    calibration: xr.DataTree, comparisons: Mapping[str, xr.DataTree] | None = None
 ) -> page.Page:
     """The page of a calibration, compared with others of the same layout."""
-    others = {one_line(str(name)): each for name, each in (beside or {}).items()}
+    others = {one_line(str(name)): each for name, each in (comparisons or {}).items()}
     provenance = provenance_of(calibration)
     method = one_line(str(provenance.get("method", "this calibration")))
     _check_others(others, method)
@@ -62,28 +63,38 @@ def calibration_page(
     readings = calibration_readings(calibration) if holds_readings(calibration) else None
     headline, passed = text.calibration_headline(table, readings)
     first, *problems = text.verdict_after_headline(calibration)
-    introduction = text.caption("calibration.introduction")
+    introduction = page.caption("calibration.introduction")
     comparison: list[page.Block] = []
     if others:
         compared = compare_calibrations({method: calibration, **others})
         comparison = [*comparison_sentences(compared), comparison_table(compared, titles)]
-    pictures = _pictures(
-        list(ranks.values()),
-        {name: figures.parameter_ranks(each) for name, each in others.items()},
-        method,
-    )
+    shown = list(ranks.values())
+    other_ranks = {name: figures.parameter_ranks(each) for name, each in others.items()}
+    colors = f" Band and dots are those of {method}; the others are drawn over it."
+
+    def ecdf(some: Sequence[Ranks]) -> Figure:
+        return figures.ecdf_differences(some, other_ranks, method)
+
+    def coverage(some: Sequence[Ranks]) -> Figure:
+        return figures.interval_coverage(some, other_ranks, method)
+
+    rank_figures = [
+        *_paged(shown, ecdf, "ecdf", colors=colors if others else ""),
+        *_paged(shown, figures.rank_histograms, "histograms"),
+    ]
+    estimates = _paged(shown, figures.estimates, "estimates", max_intervals=MAX_INTERVALS)
     simulations = next(iter(ranks.values())).pit.size
     elsewhere = " What it is compared with stays where it is." if others else ""
     fits = [*_fit_tables(calibration, ranks), *page.make_facts(_fit_facts(calibration))]
     sections = [
         page.Section("parameters", "Parameters", [introduction, rank_table(table, ranks)]),
         page.Section("comparison", "Comparison with other methods", comparison),
-        page.Section("ranks", "Ranks of the truth", pictures["ranks"]),
-        page.Section("coverage", "Coverage of the intervals", pictures["coverage"]),
-        page.Section("estimates", "Estimates against the truth", pictures["estimates"]),
+        page.Section("ranks", "Ranks of the truth", rank_figures),
+        page.Section("coverage", "Coverage of the intervals", _paged(shown, coverage, "coverage")),
+        page.Section("estimates", "Estimates against the truth", estimates),
         page.Section("readings", "Readings", _readings(calibration, readings, method)),
         page.Section("fits", "Status of the fits", fits),
-        page.Section("provenance", "Provenance", list(_provenance_facts(provenance))),
+        page.Section("provenance", "Provenance", _provenance_facts(provenance)),
     ]
     return page.Page(
         kind="Calibration report",
@@ -104,62 +115,32 @@ def calibration_page(
 
 
 def _check_others(others: Mapping[str, xr.DataTree], method: str) -> None:
+    where = "report: comparisons"
     for name, each in others.items():
-        where = f"report: beside {name}"
         if not is_calibration(each):
-            raise FitError(
-                "it is no calibration", where=where, hint="give what polar_bayes.calibrate returns"
-            )
+            hint = "give what polar_bayes.calibrate returns"
+            raise FitError("it is no calibration", where=f"{where}, {name}", hint=hint)
         if name == method:
-            raise FitError(
-                "the calibration itself is called so", where=where, hint="give it another name"
-            )
+            what = "the calibration itself is called so"
+            raise FitError(what, where=f"{where}, {name}", hint="give it another name")
     if len(others) > MAX_OTHERS:
-        raise FitError(
-            f"{len(others)} calibrations are too many for one figure",
-            where="report: beside",
-            hint=f"give at most {MAX_OTHERS}",
-        )
+        what = f"{len(others)} calibrations are too many for one figure"
+        raise FitError(what, where=where, hint=f"give at most {MAX_OTHERS}")
 
 
 # --- Figures --------------------------------------------------------------------------------------
 
 
-def _pictures(
-    ranks: Sequence[Ranks], others: Mapping[str, Mapping[str, Ranks]], method: str
-) -> dict[str, list[page.Block]]:
-    """The figures of each section."""
-    colors = f" Band and dots are those of {method}; the others are drawn over it."
-
-    def ecdf(some: Sequence[Ranks]) -> Figure:
-        return figures.ecdf_differences(some, others, method)
-
-    def coverage(some: Sequence[Ranks]) -> Figure:
-        return figures.interval_coverage(some, others, method)
-
-    return {
-        "ranks": [
-            *_paged(ranks, ecdf, "ecdf", colors=colors if others else ""),
-            *_paged(ranks, figures.rank_histograms, "histograms"),
-        ],
-        "coverage": list(_paged(ranks, coverage, "coverage")),
-        "estimates": list(
-            _paged(ranks, figures.estimates, "estimates", max_intervals=MAX_INTERVALS)
-        ),
-    }
-
-
 def _paged(
-    ranks: Sequence[Ranks], draw: Callable[[Sequence[Ranks]], Figure], name: str, **values: object
+    ranks: Sequence[Ranks], draw: Callable[[Sequence[Ranks]], Figure], name: str, **values: Any
 ) -> Iterator[page.Picture]:
     """A few panels at a time; the first caption says how to read them all."""
     for at in range(0, len(ranks), MAX_PANELS):
         some = ranks[at : at + MAX_PANELS]
         labels = text.join([each.label for each in some])
         key = f"calibration.figure_{name}"
-        alternative, caption = text.figure_caption(key, labels=labels, **values)
-        caption = f"The same of {labels}." if at else caption
-        yield page.make_picture(draw(some), alternative, caption)
+        instead = f"The same of {labels}." if at else ""
+        yield page.picture(draw(some), key, instead=instead, labels=labels, **values)
 
 
 # --- Tables of parameters -------------------------------------------------------------------------
@@ -184,7 +165,7 @@ def _score_cells() -> page.Cells:
     }
 
 
-def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> page.Table:
+def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
     """Every parameter: uniform ranks, coverage, width and score."""
     level = significance_level(table)
     simulations = next(iter(ranks.values())).pit.size
@@ -198,13 +179,13 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> page.Table:
         "failed": lambda row: f"{int(row['failed']):,} of {simulations:,}",
         **_score_cells(),
     }
-    caption = text.caption("calibration.parameter", level=level)
+    caption = page.caption("calibration.parameter", level=level)
     titles = {label: each.title for label, each in ranks.items()}
     data, prose = table.loc[list(ranks)], [RANKS_COLUMN]
     return page.make_table("parameter", caption, cells, data, descriptions=titles, prose=prose)
 
 
-def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> page.Table:
+def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table:
     """Every parameter by every method."""
     first = one_line(str(compared.index.get_level_values("method")[0]))
 
@@ -220,7 +201,7 @@ def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> page.
         f"score against {first}": _score_change,
         **_score_cells(),
     }
-    caption = text.caption("calibration.comparison", first=first)
+    caption = page.caption("calibration.comparison", first=first)
     prose = [RANKS_COLUMN]
     return page.make_table("comparison", caption, cells, compared, descriptions=titles, prose=prose)
 
@@ -259,7 +240,7 @@ def _readings(
         "spread": column("rank_spread", ".3f"),
         "untrusted": column("untrusted", ",.0f"),
     }
-    caption = text.caption("calibration.reading", level=level, largest_trusted=MAX_PARETO_K)
+    caption = page.caption("calibration.reading", level=level, largest_trusted=MAX_PARETO_K)
     table = page.make_table(
         "reading",
         caption,
@@ -273,28 +254,25 @@ def _readings(
     return [note, table, *pictures]
 
 
-def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterator[page.Table]:
+def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterator[Table]:
     """Numbers of fits by status and by approach."""
     fits = calibration["fits"].to_dataset()
     answered = np.all([np.isfinite(each.pit) for each in ranks.values()], axis=0)
-    status = text.caption("calibration.status")
+    approach = "How the numbers of each fit were found."
     tables: dict[str, tuple[type[enum.IntEnum], Mapping[str, str], str]] = {
-        "status": (Status, STATUSES, status),
-        "approach": (MethodUsed, text.APPROACHES, "How the numbers of each fit were found."),
+        "status": (Status, STATUSES, page.caption("calibration.status")),
+        "approach": (MethodUsed, text.APPROACHES, approach),
     }
     for name, (known, meanings, caption) in tables.items():
         if name not in fits:
             continue
-        flags = fits[name]
-        # The tree states its own flags, whatever their order in this version.
-        names = str(flags.attrs.get("flag_meanings", " ".join(each.name for each in known)))
-        flag_names = [each.lower().replace("_", " ") for each in names.split()]
-        values = np.asarray(flags.attrs.get("flag_values", range(len(flag_names))))
+        names = " ".join(each.name.lower() for each in known)
+        flags = fits[name].assign_attrs({"flag_meanings": names} | fits[name].attrs)
         counts = {}
-        for value, flag in zip(values, flag_names, strict=True):
+        for value, meaning in flag_meanings(flags).items():
             chosen = flags.to_numpy() == value
             if chosen.any():
-                counts[flag] = [int(chosen.sum()), int(answered[chosen].sum())]
+                counts[meaning] = [int(chosen.sum()), int(answered[chosen].sum())]
         data = pd.DataFrame.from_dict(counts, orient="index", columns=["fits", "with ranks"])
         yield count_table(name, caption, data, meanings)
 
@@ -311,14 +289,10 @@ def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
             facts["effective draws: 5% of the fits have fewer than"] = f"{low:.0f}"
             facts["effective draws: median"] = f"{middle:.0f}"
     if "pareto_k" in fits:
-        k = fits["pareto_k"].to_numpy()
-        known = k[~np.isnan(k)]
-        if known.size:
-            above = int(np.sum(known > MAX_PARETO_K))
-            facts[f"Pareto k above {MAX_PARETO_K:g}"] = (
-                f"{above:,} of {known.size:,} fits that know it "
-                f"({text.count_percent(above, known.size)})"
-            )
+        k = fits["pareto_k"].dropna("simulation").to_numpy()
+        above = int(np.sum(k > MAX_PARETO_K))
+        share = f"{above:,} of {k.size:,} fits that know it ({text.count_percent(above, k.size)})"
+        facts |= {f"Pareto k above {MAX_PARETO_K:g}": share} if k.size else {}
     return facts
 
 
@@ -332,11 +306,7 @@ def _provenance_facts(provenance: Mapping[str, Any]) -> Iterator[page.Block]:
         "versions": "Versions",
         "timings": "Seconds, compilation included",
     }
-    groups = {
-        key: value
-        for key, value in provenance.items()
-        if key in titles and isinstance(value, Mapping)
-    }
+    groups = {key: provenance[key] for key in titles if isinstance(provenance.get(key), Mapping)}
     own = {
         "simulations" if key == "calibration" else key.replace("_", " "): value
         for key, value in provenance.items()

@@ -16,6 +16,7 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import CLEAR, DASH, column, interval, number, or_dash, percent
+from polar_bayes.repr_html import Row, Table
 
 COLORS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, GRAY)
 MAX_PANELS = 12
@@ -84,9 +85,8 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     left_out = [f"{name}: {why}." if name else why for name, why in comparison.left_out.items()]
     predictions: list[page.Block] = [] if comparison.loo.empty else [loo_table(comparison)]
     more = comparison.parameters.index.get_level_values("parameter").nunique() - MAX_PANELS
-    alternative, caption = text.figure_caption("comparison.figure_parameters")
-    caption += f" {more} more parameters are in the table only." if more > 0 else ""
-    figure = page.make_picture(plot_comparison(comparison), alternative, caption)
+    note = f" {more} more parameters are in the table only." if more > 0 else ""
+    figure = page.picture(plot_comparison(comparison), "comparison.figure_parameters", more=note)
     prior = [sensitivity] if sensitivity else []
     sections = [
         page.Section("predictions", "Predictions", [*predictions, *page.make_bullets(left_out)]),
@@ -109,7 +109,7 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     )
 
 
-def loo_table(comparison: FitComparison) -> page.Table:
+def loo_table(comparison: FitComparison) -> Table:
     """Expected log densities, best first."""
 
     def difference(row: pd.Series) -> str:
@@ -125,7 +125,7 @@ def loo_table(comparison: FitComparison) -> page.Table:
         "weight": lambda row: f"{row['weight']:.2f}",
         "k > 0.7": lambda row: f"{int(row['unreliable'])}",
     }
-    caption = text.caption("comparison.loo", clear=CLEAR)
+    caption = page.caption("comparison.loo", clear=CLEAR)
     return page.make_table("loo", caption, cells, comparison.loo, label="fit")
 
 
@@ -135,7 +135,7 @@ def _fit_name(row: pd.Series) -> str:
     return str(label[1])
 
 
-def parameter_table(comparison: FitComparison) -> page.Table:
+def parameter_table(comparison: FitComparison) -> Table:
     """Every parameter by every fit."""
     cells: page.Cells = {
         "fit": _fit_name,
@@ -150,7 +150,7 @@ def parameter_table(comparison: FitComparison) -> page.Table:
     return page.make_table("parameter", caption, cells, data, prose=["fit"])
 
 
-def sensitivity_table(comparison: FitComparison) -> page.Table | None:
+def sensitivity_table(comparison: FitComparison) -> Table | None:
     """What the priors did in each fit; None where no fit has draws."""
     known = comparison.parameters.dropna(subset=["prior_sensitivity"])
     if known.empty:
@@ -161,22 +161,23 @@ def sensitivity_table(comparison: FitComparison) -> page.Table | None:
         "by the data": lambda row: str(row["verdict"]),
         **text.SENSITIVITY_CELLS,
     }
-    caption = text.caption("comparison.sensitivity", sensitive=SENSITIVE)
+    caption = page.caption("comparison.sensitivity", sensitive=SENSITIVE)
     prose = ["fit", "remark"]
     return page.make_table("sensitivity", caption, cells, known, prose=prose)
 
 
-def settings_table(provenances: Mapping[str, Mapping[str, Any]]) -> page.Table:
+def settings_table(provenances: Mapping[str, Mapping[str, Any]]) -> Table:
     """What the fits were asked for, where it is not the same for all."""
     settings = [_settings(each) for each in provenances.values()]
     rows = []
     for key in dict.fromkeys(key for each in settings for key in each):
         cells = tuple(each.get(key, DASH) for each in settings)
         if len(set(cells)) > 1:
-            rows.append(page.Row(key, key, cells))
+            rows.append(Row(key, cells))
     caption = "Only what differs between the fits." if rows else "The fits were asked for the same."
     names: Sequence[str] = list(provenances)
-    return page.Table("settings", caption, ("asked for", *names), tuple(rows), prose=names)
+    data = pd.DataFrame([row.cells for row in rows], [row.label for row in rows], names)
+    return Table(("asked for", *names), tuple(rows), names, "settings", caption, data)
 
 
 def _settings(provenance: Mapping[str, Any]) -> dict[str, str]:

@@ -9,9 +9,10 @@ import pandas as pd
 import xarray as xr
 
 from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
+from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
-from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, Verdict, laplace_k_hat, verdict
-from polar_bayes.diagnostics.convergence import summary as summarize
+from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, Verdict
+from polar_bayes.diagnostics.criticism import CAUTION, PROBLEM, QUESTIONS, criticize
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
     Scalar,
@@ -29,17 +30,21 @@ from polar_bayes.diagnostics.population import (
 )
 from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck, predictive_checks
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, sensitivity
-from polar_bayes.effects.choose import ledger_sentences, ledger_table
 from polar_bayes.errors import one_line
-from polar_bayes.inference.auto import auto_sentences
+from polar_bayes.inference.files import auto_sentences
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table
 from polar_bayes.reporting.style import QUANTITIES, parameter_title
 from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
+from polar_bayes.repr_html import Row, Table
+from polar_bayes.results import summary, verdict
 
 SHARED_GROUP = "Populations and spectra"
 INSTRUMENT_GROUP = "Instrument and noise"
+TRUTH = "true value"
+"""A column that is left out where no true value is known."""
+
 METHODS = {
     "nuts": "NUTS",
     "laplace": "Laplace approximation",
@@ -54,7 +59,18 @@ SCALES = {
     "plain": "on its own scale",
 }
 MAX_POPULATIONS = 6
-SWAPPED = "swapped"
+PROVENANCE_GROUPS = {
+    "model_settings": "Settings of the model",
+    "counts": "Readings",
+    "capture": "Capture",
+    "priors": "Priors",
+    "declared": "Priors that stand in the model itself",
+    "fixed": "Held fixed, by the model or around it",
+    "links": "Likelihood links",
+    "timings": "Seconds, compilation included",
+    "versions": "Versions",
+}
+"""Entries of the provenance, each with the title of its group on the page."""
 
 
 class Fit(NamedTuple):
@@ -67,36 +83,31 @@ class Fit(NamedTuple):
     prior: pd.DataFrame
     method: str
     provenance: dict[str, Any]
+    criticism: pd.DataFrame
     verdict: Verdict
 
     def table(
-        self,
-        name: str,
-        caption: str,
-        cells: page.Cells,
-        data: pd.DataFrame,
-        prose: Sequence[str] = (),
-    ) -> page.Table:
+        self, name: str, caption: str, cells: page.Cells, data: pd.DataFrame, prose: str = ""
+    ) -> Table:
         """A table with a row for each parameter that the numbers have, in groups."""
         names = set(map(str, self.posterior.data_vars))
         titles, groups = {}, {}
         for scalar in self.scalars:
             if scalar.label in data.index:
                 titles[scalar.label] = parameter_title(scalar, self.posterior)
-                groups[scalar.label] = page.MAIN_GROUP if scalar.is_material else INSTRUMENT_GROUP
+                groups[scalar.label] = "" if scalar.is_material else INSTRUMENT_GROUP
                 if is_hyperparameter(scalar.name, names):
                     groups[scalar.label] = SHARED_GROUP
         data = data.loc[list(titles)]
+        if TRUTH in cells:
+            truths = pd.Series({each.label: truth_of(self.result, each) for each in self.scalars})
+            if np.isfinite(truths[data.index]).any():
+                data = data.assign(true_value=truths)
+            else:
+                cells = {title: cell for title, cell in cells.items() if title != TRUTH}
         return page.make_table(
-            name, caption, cells, data, descriptions=titles, groups=groups, prose=prose
+            name, caption, cells, data, descriptions=titles, groups=groups, prose=[prose]
         )
-
-    def with_truth(self, data: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
-        """Numbers with a column of true values, where any is known."""
-        truths = {scalar.label: truth_of(self.result, scalar) for scalar in self.scalars}
-        if not any(math.isfinite(truths[str(label)]) for label in data.index):
-            return data, False
-        return data.assign(true_value=pd.Series(truths)), True
 
     def determined(self) -> list[str]:
         """Which parameters the data determine; nothing of a fit that failed."""
@@ -106,12 +117,13 @@ class Fit(NamedTuple):
 
     def headline(self) -> str:
         """The verdict in one sentence."""
-        return text.fit_headline(self.method, self.verdict.passed, self.verdict.cautions)
+        return text.fit_headline(self.method, self.verdict)
 
 
 def read_fit(result: xr.DataTree) -> Fit:
     """Summaries of a result, which is checked first."""
-    scalars, table = posterior_scalars(result), summarize(result)
+    scalars, table = posterior_scalars(result), convergence.summary(result)
+    criticism = criticize(result)
     return Fit(
         result=result,
         posterior=result["posterior"].to_dataset(),
@@ -120,7 +132,8 @@ def read_fit(result: xr.DataTree) -> Fit:
         prior=sensitivity(result),
         method=method_of(result),
         provenance=provenance_of(result),
-        verdict=verdict(result, table),
+        criticism=criticism,
+        verdict=convergence.verdict(result, table, criticism),
     )
 
 
@@ -128,31 +141,50 @@ def fit_page(result: xr.DataTree) -> page.Page:
     """The page of a fit."""
     fit = read_fit(result)
     checks = predictive_checks(result)
-    is_point, converged = fit.method == "point", fit.verdict.passed
+    is_point, passed = fit.method == "point", fit.verdict.passed
     pooled = [] if is_point else populations(result)
-    summary = population_summary(result) if pooled else pd.DataFrame()
+    summary = population_summary(result)
     sentences = fit.determined()
-    if converged:
+    if passed:
         sentences += text.between_members(summary, pooled, fit.posterior)
         sentences += text.predictive_sentences(checks)
         sentences.append(text.trust(fit.method, fit.verdict.cautions, checks))
     has_draws = not is_point and bool(plots_fit.drawable(result))
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
-    without = [] if is_point else list(_without(fit))
-    prior = [] if is_point else [*_prior(result, has_draws), sensitivity_table(fit)]
+    code = str(fit.provenance.get("model_source") or "")
+    source = [page.Details("Source of the model", code=code)] if code else []
+    pairs = []
+    if has_draws and len(plots_fit.drawable(result, material=True)) > 1:
+        pairs = [page.picture(plots_fit.plot_pairs(result), "fit.figure_pairs")]
     sections = [
         page.Section("parameters", "Parameters", [parameter_table(fit)]),
         page.Section("population", "Population", _population(fit, summary, pooled)),
         page.Section("spectrum", "Spectrum", _spectrum(result) if has_draws else []),
-        page.Section("without", "What trusting the instrument would claim", without, "Instrument"),
-        page.Section("readings", "Readings and fit", list(_readings(result, has_draws))),
-        page.Section("pairs", "Material parameters together", _pairs(result, has_draws)),
-        page.Section("prior", "What the prior said, and what the data", prior, "Prior and data"),
+        page.Section(
+            "without",
+            "What trusting the instrument would claim",
+            [] if is_point else _without(fit),
+            "Instrument",
+        ),
+        page.Section("readings", "Readings and fit", _readings(result, has_draws)),
+        page.Section("pairs", "Material parameters together", pairs),
+        page.Section(
+            "prior",
+            "What the prior said, and what the data",
+            [] if is_point else _prior(fit, has_draws),
+            "Prior and data",
+        ),
         page.Section("convergence", approximation, _convergence(fit, has_draws), approximation),
+        page.Section(
+            "criticism",
+            "What the readings say against the model",
+            _criticism(fit),
+            "Model criticism",
+        ),
         page.Section("checks", "Predictive checks", _checks(result, checks)),
         page.Section("effects", "Effects", _effects(result)),
         page.Section("accuracy", "Accuracy against time", _accuracy(result)),
-        page.Section("provenance", "Provenance", _provenance(fit.provenance)),
+        page.Section("provenance", "Provenance", [*provenance_facts(fit.provenance), *source]),
     ]
     method = METHODS.get(fit.method, one_line(fit.method))
     swapped = text.swapped_sentence(fit.provenance)
@@ -161,7 +193,7 @@ def fit_page(result: xr.DataTree) -> page.Page:
         name=text.capture_name(fit.provenance),
         subtitles=[text.made_by(fit.provenance, method), *filter(None, [swapped])],
         headline=fit.headline(),
-        passed=converged,
+        passed=passed,
         problems=fit.verdict.problems,
         sentences=sentences,
         cautions=fit.verdict.cautions,
@@ -173,22 +205,21 @@ def fit_page(result: xr.DataTree) -> page.Page:
 # --- Parameters -----------------------------------------------------------------------------------
 
 
-def parameter_table(fit: Fit) -> page.Table:
+def parameter_table(fit: Fit) -> Table:
     """Every parameter with its interval, the truth where known, and what the data determine."""
     if fit.method == "point":
         return _estimate_table(fit)
-    data, has_truth = fit.with_truth(fit.summary.join(fit.prior[["prior_inside", "verdict"]]))
-    cells: dict[str, Callable[[pd.Series], str]] = {
+    cells: page.Cells = {
         "mean": lambda row: number(row["mean"], row["sd"]),
         "sd": lambda row: number(row["sd"], row["sd"]),
         "2.5%": lambda row: number(row["q2.5"], row["sd"]),
         "97.5%": lambda row: number(row["q97.5"], row["sd"]),
+        TRUTH: _truth_cell,
+        "prior inside": lambda row: percent(row["prior_inside"]),
+        "by the data": lambda row: str(row["verdict"]),
     }
-    if has_truth:
-        cells["true value"] = _truth_cell
-    cells["prior inside"] = lambda row: percent(row["prior_inside"])
-    cells["by the data"] = lambda row: str(row["verdict"])
-    caption = text.caption("fit.parameter", determined=DETERMINED, partly=PARTLY)
+    caption = page.caption("fit.parameter", determined=DETERMINED, partly=PARTLY)
+    data = fit.summary.join(fit.prior[["prior_inside", "verdict"]])
     return fit.table("parameter", caption, cells, data)
 
 
@@ -198,24 +229,22 @@ def _truth_cell(row: pd.Series) -> str:
     return f"{truth} (outside)" if is_outside else truth
 
 
-def _estimate_table(fit: Fit) -> page.Table:
-    data = fit.summary[["mean", "sd"]].set_axis(["estimate", "standard_error"], axis="columns")
-    data, has_truth = fit.with_truth(data)
-    cells: dict[str, Callable[[pd.Series], str]] = {
+def _estimate_table(fit: Fit) -> Table:
+    def error(row: pd.Series) -> str:
+        size = row["standard_error"]
+        return number(size, size) if math.isfinite(size) else "not determined"
+
+    cells: page.Cells = {
         "estimate": lambda row: number(row["estimate"], row["standard_error"]),
-        "standard error": lambda row: (
-            number(row["standard_error"], row["standard_error"])
-            if math.isfinite(row["standard_error"])
-            else "not determined"
-        ),
+        "standard error": error,
+        TRUTH: lambda row: number(row["true_value"], row["standard_error"]),
     }
-    if has_truth:
-        cells["true value"] = lambda row: number(row["true_value"], row["standard_error"])
     caption = "Least squares; standard errors from the curvature and the residuals."
+    data = fit.summary[["mean", "sd"]].set_axis(["estimate", "standard_error"], axis="columns")
     return fit.table("parameter", caption, cells, data)
 
 
-def sensitivity_table(fit: Fit) -> page.Table:
+def sensitivity_table(fit: Fit) -> Table:
     """Prior against posterior, and how far a changed prior would change the posterior."""
     cells: page.Cells = {
         "prior 95%": lambda row: interval(row["prior_q2.5"], row["prior_q97.5"]),
@@ -223,26 +252,31 @@ def sensitivity_table(fit: Fit) -> page.Table:
         "width left": lambda row: percent(row["width_left"]),
         **text.SENSITIVITY_CELLS,
     }
-    caption = text.caption("fit.sensitivity", sensitive=SENSITIVE)
-    return fit.table("sensitivity", caption, cells, fit.prior, prose=["remark"])
+    caption = page.caption("fit.sensitivity", sensitive=SENSITIVE)
+    return fit.table("sensitivity", caption, cells, fit.prior, prose="remark")
 
 
-def _prior(result: xr.DataTree, has_draws: bool) -> list[page.Block]:
-    if not has_draws or "prior" not in result.children:
-        return []
-    return [
-        page.make_picture(
-            plots_fit.plot_prior_posterior(result), *text.figure_caption("fit.figure_prior")
-        )
-    ]
+def _prior(fit: Fit, has_draws: bool) -> Iterator[page.Block]:
+    if has_draws and "prior" in fit.result.children:
+        yield page.picture(plots_fit.plot_prior_posterior(fit.result), "fit.figure_prior")
+    yield sensitivity_table(fit)
 
 
-def _pairs(result: xr.DataTree, has_draws: bool) -> list[page.Block]:
-    if not has_draws or len(plots_fit.drawable(result, material=True)) < 2:
-        return []
-    return [
-        page.make_picture(plots_fit.plot_pairs(result), *text.figure_caption("fit.figure_pairs"))
-    ]
+def _criticism(fit: Fit) -> Iterator[page.Block]:
+    """The checks of the model, unless there is nothing to check."""
+    if fit.method == "point":
+        return
+    cells: page.Cells = {
+        "outcome": lambda row: (
+            f"{row['level']} (fails)" if row["level"] == "problem" else row["level"]
+        ),
+        "p": column("p_value", ".2g"),
+        "what it says": lambda row: row["sentence"] or DASH,
+    }
+    caption = page.caption("fit.criticism", caution=CAUTION, problem=PROBLEM)
+    yield page.make_table(
+        "criticism", caption, cells, fit.criticism, descriptions=QUESTIONS, prose=["what it says"]
+    )
 
 
 # --- Populations and spectra ----------------------------------------------------------------------
@@ -256,10 +290,9 @@ def _population(fit: Fit, summary: pd.DataFrame, pooled: Sequence[Population]) -
     drawn = [each.label for each in pooled if math.isfinite(summary.loc[each.label, "pooling"])]
     pictures: list[page.Block] = []
     for label in drawn[:MAX_POPULATIONS]:
-        alternative, caption = text.figure_caption("fit.figure_shrinkage", label=label)
         figure = plots_fit.plot_shrinkage(fit.result, label, summary, members)
-        caption = "The same." if pictures else caption
-        pictures.append(page.make_picture(figure, alternative, caption))
+        instead = "The same." if pictures else ""
+        pictures.append(page.picture(figure, "fit.figure_shrinkage", instead=instead, label=label))
     more = len(drawn) - MAX_POPULATIONS
     return [
         *(text.pooling(summary, pooled, fit.posterior) if fit.verdict.passed else []),
@@ -270,7 +303,7 @@ def _population(fit: Fit, summary: pd.DataFrame, pooled: Sequence[Population]) -
     ]
 
 
-def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> page.Table:
+def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> Table:
     """Location, spread and the range of a new member, for every pooled parameter."""
 
     def with_interval(row: pd.Series, part: str) -> str:
@@ -291,13 +324,11 @@ def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> pag
         each.label: f"{summary.loc[each.label, 'members']} members, {SCALES[each.scale]}"
         for each in pooled
     }
-    caption = text.caption("fit.population")
+    caption = page.caption("fit.population")
     return page.make_table("population", caption, cells, summary, descriptions=members)
 
 
-def member_table(
-    result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Population]
-) -> page.Table:
+def member_table(result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Population]) -> Table:
     """Every member of every population, with and without it."""
     posterior = result["posterior"].to_dataset()
     titles = {
@@ -317,18 +348,15 @@ def member_table(
         "pooled share": lambda row: percent(row["shrinkage"]),
     }
     data = members.loc[list(titles)]
-    return page.make_table("member", text.caption("fit.member"), cells, data, descriptions=titles)
+    return page.make_table("member", page.caption("fit.member"), cells, data, descriptions=titles)
 
 
-def _spectrum(result: xr.DataTree) -> list[page.Block]:
+def _spectrum(result: xr.DataTree) -> Iterator[page.Block]:
     spectra = plots_curves.spectra(result)
-    pictures: list[page.Block] = []
     for name, members in spectra.items():
         key = f"fit.figure_spectrum_{'bands' if members[0].between.size else 'intervals'}"
-        captions = text.figure_caption(key, name=name.replace("_", " ").capitalize())
         figure = plots_curves.plot_spectrum(result, name, spectra)
-        pictures.append(page.make_picture(figure, *captions))
-    return pictures
+        yield page.picture(figure, key, name=name.replace("_", " ").capitalize())
 
 
 # --- The instrument -------------------------------------------------------------------------------
@@ -348,24 +376,21 @@ def _without(fit: Fit) -> Iterator[page.Block]:
         yield f"This comparison failed, so nothing is said of it: {one_line(reason)}."
 
 
-def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) -> page.Table:
+def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) -> Table:
     """The fit of the report next to the same fit without a part of the instrument."""
-    data, has_truth = fit.with_truth(compared)
 
     def scale(row: pd.Series) -> float:
         return min(row["q97.5"] - row["q2.5"], row["q97.5_without"] - row["q2.5_without"]) / 4.0
 
-    cells: dict[str, Callable[[pd.Series], str]] = {
+    cells: page.Cells = {
         "mean": lambda row: number(row["mean"], scale(row)),
         "95% interval": lambda row: interval(row["q2.5"], row["q97.5"], scale(row)),
         "mean without": lambda row: number(row["mean_without"], scale(row)),
         "95% without": lambda row: interval(row["q2.5_without"], row["q97.5_without"], scale(row)),
         "width": lambda row: percent(row["width_ratio"]),
+        TRUTH: lambda row: number(row["true_value"], scale(row)),
     }
-    if has_truth:
-        cells["true value"] = lambda row: number(row["true_value"], scale(row))
-    caption = text.caption("fit.without", part=part)
-    return fit.table(name, caption, cells, data)
+    return fit.table(name, page.caption("fit.without", part=part), cells, compared)
 
 
 # --- Readings and checks --------------------------------------------------------------------------
@@ -374,42 +399,36 @@ def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) ->
 def _readings(result: xr.DataTree, has_draws: bool) -> Iterator[page.Picture]:
     key = "fit.figure_readings" if has_draws else "fit.figure_point_readings"
     for name in plots_curves.variables(result):
-        captions = text.figure_caption(key, quantity=QUANTITIES[name])
-        yield page.make_picture(plots_curves.plot_readings(result, name), *captions)
+        quantity = QUANTITIES[name]
+        yield page.picture(plots_curves.plot_readings(result, name), key, quantity=quantity)
         if name != "intensity":
-            captions = text.figure_caption("fit.figure_residuals", quantity=QUANTITIES[name])
-            yield page.make_picture(plots_curves.plot_residuals(result, name), *captions)
+            figure = plots_curves.plot_residuals(result, name)
+            yield page.picture(figure, "fit.figure_residuals", quantity=quantity)
 
 
-def _checks(result: xr.DataTree, checks: Mapping[str, PredictiveCheck]) -> list[page.Block]:
-    if not checks:
-        return []
-    blocks: list[page.Block] = [check_table(checks)]
+def _checks(result: xr.DataTree, checks: dict[str, PredictiveCheck]) -> Iterator[page.Block]:
+    if checks:
+        yield check_table(checks)
     if any(check.pit.size > 1 for check in checks.values()):
-        blocks.append(
-            page.make_picture(
-                plots_fit.plot_pit(result, dict(checks)), *text.figure_caption("fit.figure_pit")
-            )
-        )
-    return blocks
+        yield page.picture(plots_fit.plot_pit(result, checks), "fit.figure_pit")
 
 
-def check_table(checks: Mapping[str, PredictiveCheck]) -> page.Table:
+def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
     """Residuals, coverage, and leave-one-out results of every variable."""
     has_draws = any(check.pit.size for check in checks.values())
     columns = ["variable", "readings", "residual RMS"]
     caption = "Residual: reading minus the noise-free prediction, in the unit of the reading."
     if has_draws:
         columns += [*(f"inside {p:.0%}" for p in PROBABILITIES), "elpd", "p", "k > 0.7"]
-        caption += text.caption("fit.predictive_check")
+        caption += page.caption("fit.predictive_check")
     rows, data = [], {}
     for check in checks.values():
         cells = [str(check.count), f"{check.residual_rms:.3g}"]
         cells += _predictive_cells(check) if has_draws else []
-        rows.append(page.Row(check.name, QUANTITIES.get(check.name, check.name), tuple(cells)))
+        rows.append(Row(check.name, tuple(cells), QUANTITIES.get(check.name, "")))
         data[check.name] = _check_numbers(check)
     frame = pd.DataFrame.from_dict(data, "index")
-    return page.Table("check", caption, tuple(columns), tuple(rows), frame)
+    return Table(tuple(columns), tuple(rows), (), "check", caption, frame)
 
 
 def _check_numbers(check: PredictiveCheck) -> dict[str, float]:
@@ -436,20 +455,16 @@ def _predictive_cells(check: PredictiveCheck) -> list[str]:
 # --- The method -----------------------------------------------------------------------------------
 
 
-def _convergence(fit: Fit, has_draws: bool) -> list[page.Block]:
-    blocks: list[page.Block] = [convergence_table(fit)] if fit.method == "nuts" else []
-    blocks += page.make_bullets(auto_sentences(fit.result))
-    blocks += page.make_facts(_sampler_facts(fit))
+def _convergence(fit: Fit, has_draws: bool) -> Iterator[page.Block]:
+    if fit.method == "nuts":
+        yield convergence_table(fit)
+    yield from page.make_bullets(auto_sentences(fit.result))
+    yield from page.make_facts(_sampler_facts(fit))
     if fit.method == "nuts" and has_draws:
-        blocks.append(
-            page.make_picture(
-                plots_fit.plot_ranks(fit.result), *text.figure_caption("fit.figure_ranks")
-            )
-        )
-    return blocks
+        yield page.picture(plots_fit.plot_ranks(fit.result), "fit.figure_ranks")
 
 
-def convergence_table(fit: Fit) -> page.Table:
+def convergence_table(fit: Fit) -> Table:
     """R-hat, effective sample sizes and Monte Carlo error of every parameter."""
     cells: page.Cells = {
         "R-hat": column("r_hat", ".4f"),
@@ -462,69 +477,69 @@ def convergence_table(fit: Fit) -> page.Table:
     return fit.table("convergence", caption, cells, data)
 
 
+SAMPLER_FACTS: Mapping[str, tuple[str, Callable[[xr.DataArray], object]]] = {
+    "diverging": ("divergences", lambda flags: int(flags.sum())),
+    "reached_max_treedepth": (
+        "draws at the largest tree depth",
+        lambda flags: f"{int(flags.sum())} of {flags.size}",
+    ),
+    "acceptance_rate": ("mean acceptance", lambda rates: f"{float(rates.mean()):.2f}"),
+    "step_size": (
+        "step size of each chain",
+        lambda sizes: [f"{size:.3g}" for size in sizes.isel(draw=-1).to_numpy()],
+    ),
+}
+
+
 def _sampler_facts(fit: Fit) -> dict[str, object]:
     """What the sampler or approximation reports of itself."""
-    stats = stats_of(fit.result)
-    modes = fit.provenance.get("modes") or {}
-    facts: dict[str, object] = {}
-    if "diverging" in stats:
-        facts["divergences"] = int(stats["diverging"].sum())
-    if "reached_max_treedepth" in stats:
-        deep = stats["reached_max_treedepth"]
-        facts["draws at the largest tree depth"] = f"{int(deep.sum())} of {deep.size}"
-    if "acceptance_rate" in stats:
-        facts["mean acceptance"] = f"{float(stats['acceptance_rate'].mean()):.2f}"
-    if "step_size" in stats:
-        sizes = stats["step_size"].isel(draw=-1).to_numpy()
-        facts["step size of each chain"] = [f"{size:.3g}" for size in sizes]
-    facts |= _weight_facts(fit, has_weights="log_weight" in stats)
+    stats, modes = stats_of(fit.result), fit.provenance.get("modes") or {}
+    facts = {
+        title: describe(stats[name])
+        for name, (title, describe) in SAMPLER_FACTS.items()
+        if name in stats
+    }
+    k_hat = fit.provenance.get("k_hat")
+    if fit.method in APPROXIMATIONS and "log_weight" in stats:
+        k_hat = convergence.laplace_k_hat(fit.result)
+    if k_hat is not None:
+        facts[f"Pareto k-hat (at most {LARGEST_K_HAT})"] = or_dash(k_hat, ".2f")
+    if (effective := fit.provenance.get("effective_draws")) is not None:
+        facts["effective sample size of the draws"] = f"{effective:.0f}"
     if modes.get("weights"):
         facts["weights of the modes found"] = [f"{weight:.3g}" for weight in modes["weights"]]
         facts["mode searches"] = f"{modes.get('starts')}, failed: {modes.get('failures')}"
     return facts
 
 
-def _weight_facts(fit: Fit, *, has_weights: bool) -> dict[str, object]:
-    """How far the draws of an approximation, or weighted ones, can be trusted."""
-    facts: dict[str, object] = {}
-    k_hat = fit.provenance.get("k_hat")
-    if fit.method in APPROXIMATIONS and has_weights:
-        k_hat = laplace_k_hat(fit.result)
-    if k_hat is not None:
-        facts[f"Pareto k-hat (at most {LARGEST_K_HAT})"] = or_dash(k_hat, ".2f")
-    if (effective := fit.provenance.get("effective_draws")) is not None:
-        facts["effective sample size of the draws"] = f"{effective:.0f}"
-    return facts
-
-
 # --- Effects, accuracy and provenance -------------------------------------------------------------
 
 
-def _effects(result: xr.DataTree) -> list[page.Block]:
+def _effects(result: xr.DataTree) -> Iterator[page.Block]:
     """How the scene was chosen, where it was."""
     if "effects" not in result.children:
-        return []
+        return
     ledger = result["effects"].to_dataset()
+    yield from verdict(ledger).findings
     paths = map(str, ledger["path"].to_numpy())
     rows = tuple(
-        page.Row(str(name), path, tuple(row))
-        for path, (name, row) in zip(paths, ledger_table(ledger).iterrows(), strict=True)
+        Row(str(name), tuple(row), path)
+        for path, (name, row) in zip(paths, summary(ledger).iterrows(), strict=True)
     )
     reason = "kept or dropped, and why"
     columns = ("effect", "data", "shift", "sd", "operations", "time", reason)
-    caption = text.caption("fit.effect", tolerance=ledger.attrs["tolerance"])
+    caption = page.caption("fit.effect", tolerance=ledger.attrs["tolerance"])
     single = [name for name in ledger.data_vars if ledger[name].dims == ("effect",)]
-    data = ledger[single].to_dataframe()
-    return [*ledger_sentences(ledger), page.Table("effect", caption, columns, rows, data, [reason])]
+    yield Table(columns, rows, [reason], "effect", caption, ledger[single].to_dataframe())
 
 
-def _accuracy(result: xr.DataTree) -> list[page.Block]:
+def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
     """An accuracy study of the same capture, where the result holds one."""
-    if "accuracy" not in result.children:
-        return []
-    study = accuracy_dataset(result)
-    sentences = f"{accuracy_sentences(study)} {text.reference_sentence(study)}"
-    return [sentences, accuracy_picture(study), study_table(study)]
+    if "accuracy" in result.children:
+        study = accuracy_dataset(result)
+        yield " ".join([*accuracy_sentences(study), text.reference_sentence(study)])
+        yield accuracy_picture(study)
+        yield study_table(study)
 
 
 def provenance_facts(provenance: Mapping[str, Any]) -> list[page.Block]:
@@ -534,40 +549,28 @@ def provenance_facts(provenance: Mapping[str, Any]) -> list[page.Block]:
     fit = {key.replace("_", " "): provenance[key] for key in keys if key in provenance}
     swapped = [str(name) for name in provenance.get("swapped") or ()]
     fit["swapped by the user"] = swapped or "nothing: all defaults"
-    links, timings = provenance.get("links") or {}, dict(provenance.get("timings") or {})
-    if timings:
-        timings["total"] = round(sum(timings.values()), 3)
-    versions = {**(provenance.get("versions") or {}), **(provenance.get("machine") or {})}
-    groups: dict[str, Mapping[str, Any]] = {
-        "Fit": fit,
-        "Settings of the model": provenance.get("model_settings") or {},
-        "Readings": _counts(provenance.get("counts") or {}),
-        "Capture": provenance.get("capture") or {},
-        "Priors": provenance.get("priors") or {},
-        "Priors that stand in the model itself": provenance.get("declared") or {},
-        "Held fixed, by the model or around it": provenance.get("fixed") or {},
-        "Likelihood links": links,
-        "Seconds, compilation included": timings,
-        "Versions": versions,
-    }
+    groups = {name: provenance.get(name) or {} for name in PROVENANCE_GROUPS}
+    if timings := groups["timings"]:
+        groups["timings"] = {**timings, "total": round(sum(timings.values()), 3)}
+    groups["versions"] = {**groups["versions"], **(provenance.get("machine") or {})}
+    groups["counts"] = _counts(groups["counts"])
     marked = {
-        "Fit": {"model", "scene"} & set(swapped),
-        "Priors": {
+        "fit": {"model", "scene"} & set(swapped),
+        "priors": {
             name.removeprefix(text.PRIOR) for name in swapped if name.startswith(text.PRIOR)
         },
-        "Likelihood links": set(links) if "links" in swapped else set(),
+        "links": set(groups["links"]) if "links" in swapped else set(),
     }
     return [
         block
-        for title, values in groups.items()
-        for block in page.make_facts(values, title, marked=marked.get(title, ()), mark=SWAPPED)
+        for name, values in {"fit": fit, **groups}.items()
+        for block in page.make_facts(
+            values,
+            PROVENANCE_GROUPS.get(name, "Fit"),
+            marked=marked.get(name, ()),
+            mark="swapped",
+        )
     ]
-
-
-def _provenance(provenance: Mapping[str, Any]) -> list[page.Block]:
-    source = str(provenance.get("model_source") or "")
-    details = [page.Details("Source of the model", code=source)] if source else []
-    return [*provenance_facts(provenance), *details]
 
 
 def _counts(counts: Mapping[str, Any]) -> dict[str, Any]:

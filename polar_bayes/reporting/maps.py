@@ -15,16 +15,15 @@ from matplotlib.figure import Figure
 from polar_bayes.diagnostics.coverage import BLOCK, INTERVALS, map_coverage, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
-from polar_bayes.inference.batch_result import MIN_VIEWS, Status
-from polar_bayes.inference.batching import IMAGE
+from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, cut
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.maps.fit_map import checked_status, cut
-from polar_bayes.maps.lazy import ensure_loaded
+from polar_bayes.maps.lazy import COPY, checked_status, ensure_loaded
 from polar_bayes.physics.part import notation
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts
 from polar_bayes.reporting.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import APPROACHES, DASH, SLIGHT, count_percent, number
+from polar_bayes.repr_html import Row, Table
 
 STATUSES = {
     "good": "an answer that the checks let pass",
@@ -100,11 +99,9 @@ def _at_wavelength(maps: xr.Dataset, wavelength: float | None) -> tuple[xr.Datas
     known = maps["wavelength"].to_numpy()
     wavelength = float(known[0]) if wavelength is None else wavelength
     if wavelength not in known:
-        raise FitError(
-            f"there is no wavelength {wavelength:g} nm",
-            where="plot_maps",
-            hint=f"give one of {', '.join(f'{each:g}' for each in known)}",
-        )
+        what = f"there is no wavelength {wavelength:g} nm"
+        hint = f"give one of {', '.join(f'{each:g}' for each in known)}"
+        raise FitError(what, where="plot_maps", hint=hint)
     return maps.isel(wavelength=int(np.flatnonzero(known == wavelength)[0])), f"{wavelength:g} nm"
 
 
@@ -153,7 +150,8 @@ def _set_frame(axes: Axes, title: str) -> None:
 
 def flag_meanings(flags: xr.DataArray) -> dict[int, str]:
     """The meaning of each flag as the map itself states it, which holds for older maps as well."""
-    meanings = [each.replace("_", " ") for each in str(flags.attrs["flag_meanings"]).split()]
+    words = str(flags.attrs["flag_meanings"]).lower().split()
+    meanings = [each.replace("_", " ") for each in words]
     values = np.asarray(flags.attrs.get("flag_values", range(len(meanings))))
     known = dict(zip(map(int, values), meanings, strict=True))
     if flags.name == "status":  # a map may lose chunks, whether or not it states that flag
@@ -168,11 +166,8 @@ def flag_indices(flags: xr.DataArray, meanings: Mapping[int, str]) -> np.ndarray
     for index, value in enumerate(meanings):
         found[values == value] = index
     if (found < 0).any():
-        raise FitError(
-            f"{values[np.argmin(found)]} has no meaning there",
-            where=f"maps: {flags.name}",
-            hint="copy the store again, or make the map again",
-        )
+        what, hint = f"{values[np.argmin(found)]} has no meaning there", COPY
+        raise FitError(what, where=f"maps: {flags.name}", hint=hint)
     return found
 
 
@@ -208,7 +203,8 @@ def map_page(
     titles = parameter_titles(map_scalars(maps))
     if any(name not in maps for name in TRUST):
         raise FitError("it holds no maps", where="report", hint="give what fit_pixels returns")
-    _check_uncorrected(maps, truth, uncorrected)
+    if uncorrected is not None:
+        _check_uncorrected(maps, truth, uncorrected)
     maps, provenance = ensure_loaded(maps), provenance_of(maps)
     counts = count_cases(maps)
     headline, passed = text.map_headline(counts)
@@ -220,11 +216,11 @@ def map_page(
     if truth is not None:
         conclusions, coverage = _coverage(maps, titles, truth, uncorrected)
         sentences += conclusions
-    regions = text.caption("map.regions")
+    regions = page.caption("map.regions")
     tables: list[page.Block] = [parameter_table(maps, titles), regions]
     sections = [
         page.Section("maps", "Maps", list(_pictures(maps, list(titles)))),
-        page.Section("pixels", "Pixels", [status_table(counts), approach_table(counts)]),
+        page.Section("pixels", "Pixels", _pixel_tables(counts)),
         page.Section("parameters", "Parameters", tables),
         page.Section("coverage", "Coverage", coverage),
         page.Section("provenance", "Provenance", provenance_facts(provenance)),
@@ -237,31 +233,23 @@ def map_page(
         headline=headline,
         passed=passed,
         sentences=sentences,
-        cautions=[] if is_weighted else [text.caption("map.unchecked")],
+        cautions=[] if is_weighted else [page.caption("map.unchecked")],
         sections=sections,
         footer="Computed from the maps of every pixel, which stay where they are.",
     )
 
 
-def _check_uncorrected(
-    maps: xr.Dataset, truth: xr.Dataset | None, uncorrected: xr.Dataset | None
-) -> None:
-    if uncorrected is None:
-        return
+def _check_uncorrected(maps: xr.Dataset, truth: xr.Dataset | None, uncorrected: xr.Dataset) -> None:
     where = "report: uncorrected"
     if truth is None:
-        raise FitError(
-            "it is compared with the truth only", where=where, hint="give truth=capture as well"
-        )
+        hint = "give truth=capture as well"
+        raise FitError("it is compared with the truth only", where=where, hint=hint)
     map_scalars(uncorrected)
     if any(uncorrected.sizes[dim] != maps.sizes[dim] for dim in IMAGE):
         raise FitError("it is of another image", where=where, hint="map the same capture")
     if _is_weighted(provenance_of(uncorrected), default=False):
-        raise FitError(
-            "it was corrected as well",
-            where=where,
-            hint="make it with PixelLaplace(weighted=False)",
-        )
+        hint = "make it with PixelLaplace(weighted=False)"
+        raise FitError("it was corrected as well", where=where, hint=hint)
 
 
 def _is_weighted(provenance: Mapping[str, Any], *, default: bool) -> bool:
@@ -301,11 +289,10 @@ def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Pict
             variables = [f"{name}{ending}" for name in shown for ending in ("", "_quantile")]
             place = "" if wavelength is None else f" at {wavelength:g} nm"
             drawn = f"{text.join(shown)}{place}"
-            alternative, caption = text.figure_caption("map.figure_maps", names=drawn)
-            is_first = at + turn == 0
-            caption = caption + thinned if is_first else f"The same of {drawn.replace('_', ' ')}."
+            caption = f"The same of {drawn.replace('_', ' ')}." if at + turn else ""
+            more = "" if caption else thinned
             figure = plot_maps(maps[[*variables, *TRUST]], wavelength=wavelength)
-            yield page.make_picture(figure, alternative, caption)
+            yield page.picture(figure, "map.figure_maps", instead=caption, more=more, names=drawn)
 
 
 def _wavelengths(maps: xr.Dataset) -> list[float]:
@@ -317,23 +304,17 @@ def _wavelengths(maps: xr.Dataset) -> list[float]:
 # --- Tables ---------------------------------------------------------------------------------------
 
 
-def status_table(counts: pd.DataFrame) -> page.Table:
-    """Pixels by status."""
+def _pixel_tables(counts: pd.DataFrame) -> Iterator[Table]:
+    """Pixels by status; and by approach, with how many of them are good."""
     caption = "The status of each pixel. Only good ones count in the other tables."
-    return count_table("status", caption, counts.sum(axis=1).to_frame("pixels"), STATUSES)
-
-
-def approach_table(counts: pd.DataFrame) -> page.Table:
-    """Pixels by approach, and how many of them are good."""
+    yield count_table("status", caption, counts.sum(axis=1).to_frame("pixels"), STATUSES)
     caption = "How the numbers of each pixel were found, from the cheapest approach to the dearest."
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
     data = pd.DataFrame({"pixels": counts.sum(), "good": good})
-    return count_table("approach", caption, data, APPROACHES)
+    yield count_table("approach", caption, data, APPROACHES)
 
 
-def count_table(
-    name: str, caption: str, data: pd.DataFrame, meanings: Mapping[str, str]
-) -> page.Table:
+def count_table(name: str, caption: str, data: pd.DataFrame, meanings: Mapping[str, str]) -> Table:
     """Counts by flag: how many there are, their share, and how many of them fulfil a condition."""
     what, *others = map(str, data.columns)
     total = int(data[what].sum())
@@ -349,7 +330,7 @@ def count_table(
     )
 
 
-def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> page.Table:
+def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
     """Every parameter over the good pixels: its value, its variation, its uncertainty."""
     data = {}
     for scalar in titles:
@@ -364,16 +345,18 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> page.Tabl
     def cell(column: str) -> Callable[[pd.Series], str]:
         return lambda row: number(row[column], row["typical sd"])
 
-    cells = {column: cell(column) for column in columns}
-    caption = text.caption("map.parameter")
-    frame = pd.DataFrame.from_dict(data, orient="index", columns=columns)
-    by_label = {scalar.label: title for scalar, title in titles.items()}
-    groups = {scalar.label: _group(scalar) for scalar in titles}
-    return page.make_table("parameter", caption, cells, frame, descriptions=by_label, groups=groups)
+    return page.make_table(
+        "parameter",
+        page.caption("map.parameter"),
+        {column: cell(column) for column in columns},
+        pd.DataFrame.from_dict(data, orient="index", columns=columns),
+        descriptions={scalar.label: title for scalar, title in titles.items()},
+        groups={scalar.label: _group(scalar) for scalar in titles},
+    )
 
 
 def _group(scalar: Scalar) -> str:
-    return page.MAIN_GROUP if scalar.is_material else INSTRUMENT_GROUP
+    return "" if scalar.is_material else INSTRUMENT_GROUP
 
 
 def _over_good(maps: xr.Dataset, scalar: Scalar, ending: str) -> np.ndarray:
@@ -415,7 +398,7 @@ def _coverage(
     return conclusions, [coverage_table(titles, list(tables.values())), *counted]
 
 
-def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame]) -> page.Table:
+def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame]) -> Table:
     """How often the intervals hold the truth, next to those of a map that was not corrected."""
     ways = ["holds the truth"] if len(tables) == 1 else ["corrected", "uncorrected"]
     columns = [column for way in ways for column in (way, "within", "of all read")]
@@ -426,12 +409,13 @@ def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame])
             for table in tables:
                 cells += _coverage_cells(table, scalar.label, claimed)
             description = title if claimed == min(INTERVALS) else scalar.label
-            rows.append(page.Row(scalar.label, description, tuple(cells), _group(scalar)))
-    caption = text.caption("map.coverage", slight=100 * SLIGHT)
+            rows.append(Row(scalar.label, tuple(cells), description, _group(scalar)))
+    caption = page.caption("map.coverage", slight=100 * SLIGHT)
     data = tables[0]
     for other in tables[1:]:
         data = data.join(other.add_suffix("_uncorrected"))
-    return page.Table("coverage", caption, ("parameter", "interval", *columns), tuple(rows), data)
+    columns = ["parameter", "interval", *columns]
+    return Table(tuple(columns), tuple(rows), (), "coverage", caption, data)
 
 
 def _coverage_cells(table: pd.DataFrame, label: str, claimed: int) -> list[str]:

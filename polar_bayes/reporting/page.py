@@ -8,8 +8,9 @@ import base64
 import csv
 import dataclasses
 import functools
+import importlib.resources
 import io
-import re
+import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,7 +22,7 @@ from matplotlib.figure import Figure
 
 from polar_bayes.paths import check_output, replace_file, temporary_folder, write_errors
 from polar_bayes.reporting.style import FIXED_STYLE
-from polar_bayes.repr_html import DisplayTable
+from polar_bayes.repr_html import Row, Table
 
 PAGE = "index.html"
 MARK, MARK_BYTES = b'<meta name="generator" content="polar_bayes">', 1024
@@ -30,62 +31,8 @@ MARK, MARK_BYTES = b'<meta name="generator" content="polar_bayes">', 1024
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """A spreadsheet runs a text that begins with one of these."""
 
-MAIN_GROUP = ""
 LONG_TABLE = 40
 """Tables with more rows scroll in a box of their own."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """One row of a table as text."""
-
-    name: str
-    description: str
-    cells: tuple[str, ...]
-    group: str = MAIN_GROUP
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Table:
-    """Rows of text under columns, with the numbers behind them; columns of prose are wrapped."""
-
-    name: str
-    caption: str
-    columns: tuple[str, ...]
-    rows: tuple[Row, ...]
-    data: pd.DataFrame | None = None
-    prose: Collection[str] = ()
-    kind: ClassVar[str] = "table"
-
-    @property
-    def csv(self) -> str:
-        """A link that holds the table, with every digit, as a CSV file."""
-        if self.data is not None:
-            return csv_link(self.data, self.columns[0])
-        texts = pd.DataFrame.from_records(
-            [row.cells for row in self.rows],
-            index=pd.Index([row.name for row in self.rows]),
-            columns=list(self.columns[1:]),
-        )
-        return csv_link(texts, self.columns[0])
-
-    @property
-    def groups(self) -> list[tuple[str, list[Row]]]:
-        """Rows by the title of their group, in order; the main group has none."""
-        groups: dict[str, list[Row]] = {}
-        for row in self.rows:
-            groups.setdefault(row.group, []).append(row)
-        return list(groups.items())
-
-    @property
-    def is_long(self) -> bool:
-        """True where a page would be mostly this table."""
-        return len(self.rows) > LONG_TABLE
-
-    def grid(self, max_rows: int) -> DisplayTable:
-        """The first rows, for a notebook or a terminal."""
-        rows = tuple((row.name, *row.cells) for row in self.rows[:max_rows])
-        return DisplayTable(self.columns, rows, numeric=True)
 
 
 type Cells = Mapping[str, Callable[[pd.Series], str]]
@@ -108,9 +55,11 @@ def make_table(
     for key, numbers in data.iterrows():
         name = str(key[0] if isinstance(key, tuple) else key)
         texts = tuple(cell(numbers) for cell in cells.values())
-        group = groups.get(name, MAIN_GROUP)
-        rows.append(Row(name, descriptions.get(name, name), texts, group))
-    return Table(table, caption, (label, *cells), tuple(rows), data, prose)
+        rows.append(Row(name, texts, descriptions.get(name, ""), groups.get(name, "")))
+    return Table((label, *cells), tuple(rows), prose, table, caption, data)
+
+
+# --- Blocks, each drawn by the macro of the template that `kind` names ----------------------------
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,14 +111,17 @@ class Details:
 type Block = str | Table | Picture | Facts | Heading | Bullets | Details
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Section:
     """A part of a page, which the menu calls `link`; one without blocks is left out."""
 
     id: str
     title: str
-    blocks: Sequence[Block]
+    blocks: Iterable[Block]
     link: str = ""
+
+    def __post_init__(self) -> None:
+        self.blocks = list(self.blocks)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,19 +154,35 @@ def _template() -> Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["only_letters"] = lambda text: re.sub(r"[^a-z0-9]", "", text.lower())
+    environment.globals |= {"csv_link": csv_link, "long_table": LONG_TABLE}
     return environment.get_template("page.html.j2")
 
 
-def make_picture(figure: Figure, alternative: str, caption: str) -> Picture:
-    """A figure as a block of a page."""
+@functools.cache
+def _captions() -> dict[str, dict[str, Any]]:
+    file = importlib.resources.files("polar_bayes.reporting") / "templates" / "captions.toml"
+    return tomllib.loads(file.read_text(encoding="utf-8"))
+
+
+def caption(key: str, **values: object) -> str:
+    """A caption from `templates/captions.toml`, such as `fit.parameter`, with its values."""
+    kind, name = key.split(".")
+    return str(_captions()[kind][name]).format(**values)
+
+
+def picture(
+    figure: Figure, key: str, *, instead: str = "", more: str = "", **values: Any
+) -> Picture:
+    """A figure as a block of a page, with its alternative text and its caption."""
+    kind, name = key.split(".")
+    alternative, caption = (each.format(**values) for each in _captions()[kind][name])
     buffer = io.BytesIO()
     with matplotlib.rc_context(FIXED_STYLE):
         # No date and a fixed salt: the same result gives the same page, byte for byte.
         figure.savefig(buffer, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
     encoded = base64.b64encode(buffer.getvalue()).decode("ascii")
     source = f"data:image/svg+xml;base64,{encoded}"
-    return Picture(source, alternative, caption, wide=figure.get_figwidth() > 7.0)
+    return Picture(source, alternative, (instead or caption) + more, figure.get_figwidth() > 7.0)
 
 
 def make_facts(

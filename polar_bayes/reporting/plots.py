@@ -5,8 +5,8 @@ from typing import Any
 import xarray as xr
 from matplotlib.figure import Figure
 
-from polar_bayes.benchmark.accuracy import is_accuracy
-from polar_bayes.calibration.files import is_calibration
+from polar_bayes.benchmark.advice import is_accuracy
+from polar_bayes.calibration.verdict import is_calibration
 from polar_bayes.diagnostics.compare import FitComparison
 from polar_bayes.diagnostics.parameters import method_of
 from polar_bayes.errors import FitError

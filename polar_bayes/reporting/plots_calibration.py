@@ -1,8 +1,8 @@
 """Figures of a calibration: ranks, coverage, and estimates against the truth."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -42,29 +42,20 @@ NO_HISTOGRAM_DECORATION = dict.fromkeys(
 )
 
 
-class Estimates(NamedTuple):
-    """Truth, posterior mean and 80% interval of one parameter in every simulation."""
-
-    truth: np.ndarray
-    mean: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-
-NO_ESTIMATES = Estimates(*(np.empty(0),) * 4)
-"""Of readings, of which there are ranks only."""
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ranks:
-    """Ranks of a parameter, or of a reading, that should be uniform; NaN where a fit failed."""
+    """Ranks of a parameter, or of a reading, that should be uniform; NaN where a fit failed.
+
+    The estimates, shape (4, simulation), are truth, posterior mean and ends of the 80% interval;
+    readings have ranks only.
+    """
 
     label: str
     title: str
     pit: np.ndarray
     row: pd.Series
     level: float
-    estimates: Estimates = NO_ESTIMATES
+    estimates: np.ndarray = dataclasses.field(default_factory=lambda: np.empty((4, 0)))
 
     @property
     def answered(self) -> np.ndarray:
@@ -88,7 +79,6 @@ def parameter_ranks(
     for scalar in calibration_scalars(calibration, "prior_sbc"):
         place = dict(scalar.index)
         ends = marginals[f"{scalar.name}_quantile"].isel(place).sel(quantile=list(INTERVALS[80]))
-        low, high = ends.transpose("quantile", "simulation").to_numpy()
         mean = marginals[scalar.name].isel(place).to_numpy()
         found[scalar.label] = Ranks(
             label=scalar.label,
@@ -96,7 +86,7 @@ def parameter_ranks(
             pit=scalar.draws[0],
             row=table.loc[scalar.label],
             level=significance_level(table),
-            estimates=Estimates(truths[scalar.label], mean, low, high),
+            estimates=np.stack([truths[scalar.label], mean, *ends.transpose("quantile", ...)]),
         )
     return found
 
@@ -188,11 +178,11 @@ def _too_few(axes: Axes) -> None:
     axes.set(xticks=[], yticks=[])
 
 
-def estimate_panel(axes: Axes, estimates: Estimates) -> None:
+def estimate_panel(axes: Axes, ranks: Ranks) -> None:
     """Posterior means and 80% intervals against the truth."""
-    count = estimates.truth.size
-    shown = np.unique(np.linspace(0, count - 1, MAX_INTERVALS).astype(int))
-    truth, mean, low, high = (each[shown] for each in estimates)
+    last = ranks.estimates.shape[1] - 1
+    shown = np.unique(np.linspace(0, last, MAX_INTERVALS).astype(int))
+    truth, mean, low, high = ranks.estimates[:, shown]
     answered = np.isfinite(mean) & np.isfinite(low + high)
     held = answered & (low <= truth) & (truth <= high)
     for which, color, order in ((held, BLUE, 2), (answered & ~held, ORANGE, 3)):
@@ -256,7 +246,7 @@ def plot_calibration(
         left, middle, right = panels[3 * row : 3 * row + 3]
         ecdf_panel(left, ranks[label])
         histogram_panel(middle, ranks[label])
-        estimate_panel(right, ranks[label].estimates)
+        estimate_panel(right, ranks[label])
         left.set_title(_title_with_p(ranks[label]), loc="left")
         left.set_ylabel(BELOW, fontsize=8)
         middle.set_ylabel("density", fontsize=8)
@@ -272,13 +262,14 @@ def ecdf_differences(
     ranks: Sequence[Ranks], others: Mapping[str, Mapping[str, Ranks]], method: str
 ) -> Figure:
     """Share of the ranks below each rank, minus the uniform share."""
-    figure, panels = _panels(len(ranks), panel_height=1.85, header=0.6 if others else 0.3)
     colors = _method_colors(others)
-    for axes, each in zip(panels, ranks, strict=True):
+
+    def panel(axes: Axes, each: Ranks) -> None:
         same = [(by_label[each.label], colors[name]) for name, by_label in others.items()]
         ecdf_panel(axes, each, same, several=bool(others))
         axes.set_title(_title_with_p(each), loc="left")
-    _set_labels(figure, panels, RANK, BELOW)
+
+    figure = _panels(ranks, panel, (RANK, BELOW), 1.85, header=0.6 if others else 0.3)
     _name_methods(figure, method, colors)
     return figure
 
@@ -286,12 +277,7 @@ def ecdf_differences(
 @style.styled
 def rank_histograms(ranks: Sequence[Ranks]) -> Figure:
     """Histograms of the ranks."""
-    figure, panels = _panels(len(ranks), panel_height=1.5, header=0.3)
-    for axes, each in zip(panels, ranks, strict=True):
-        histogram_panel(axes, each)
-        axes.set_title(style.wrap(each.title, 38), loc="left")
-    _set_labels(figure, panels, RANK, "density")
-    return figure
+    return _panels(ranks, histogram_panel, (RANK, "density"), 1.5)
 
 
 @style.styled
@@ -330,11 +316,7 @@ def interval_coverage(
 @style.styled
 def estimates(ranks: Sequence[Ranks]) -> Figure:
     """Posterior means with 80% intervals against the truth."""
-    figure, panels = _panels(len(ranks), panel_height=2.3, header=0.3)
-    for axes, each in zip(panels, ranks, strict=True):
-        estimate_panel(axes, each.estimates)
-        axes.set_title(style.wrap(each.title, 38), loc="left")
-    _set_labels(figure, panels, "truth", "mean and 80% interval")
+    figure = _panels(ranks, estimate_panel, ("truth", "mean and 80% interval"), 2.3)
     handles = [
         Line2D([], [], color=BLUE, marker="o", ms=3, label="holds the truth"),
         Line2D([], [], color=ORANGE, marker="o", ms=3, label="misses it"),
@@ -346,16 +328,23 @@ def estimates(ranks: Sequence[Ranks]) -> Figure:
     return figure
 
 
-def _panels(count: int, *, panel_height: float, header: float) -> tuple[Figure, list[Axes]]:
-    """Panels of one size, however few there are."""
-    width = {1: 4.4, 2: 6.3}.get(count, 8.2)
-    return style.grid(count, width=width, panel_height=panel_height, header=header)
-
-
-def _set_labels(figure: Figure, panels: Sequence[Axes], x: str, y: str) -> None:
+def _panels(
+    ranks: Sequence[Ranks],
+    draw: Callable[[Axes, Ranks], None],
+    labels: tuple[str, str],
+    height: float,
+    header: float = 0.3,
+) -> Figure:
+    """A panel for each parameter, all of one size, however few there are."""
+    width = {1: 4.4, 2: 6.3}.get(len(ranks), 8.2)
+    figure, panels = style.grid(len(ranks), width=width, panel_height=height, header=header)
+    for axes, each in zip(panels, ranks, strict=True):
+        axes.set_title(style.wrap(each.title, 38), loc="left")
+        draw(axes, each)
     style.set_tick_style(panels)
-    figure.supxlabel(x, fontsize=9)
-    figure.supylabel(y, fontsize=9)
+    figure.supxlabel(labels[0], fontsize=9)
+    figure.supylabel(labels[1], fontsize=9)
+    return figure
 
 
 def _title_with_p(ranks: Ranks) -> str:
@@ -371,12 +360,10 @@ def _method_colors(others: Mapping[str, object]) -> dict[str, str]:
 
 
 def _name_methods(figure: Figure, method: str, colors: Mapping[str, str]) -> None:
-    if colors:
-        named = {method: BLUE, **colors}
-        _add_legend(
-            figure,
-            [
-                Line2D([], [], color=color, label=style.label_text(name, 24))
-                for name, color in named.items()
-            ],
-        )
+    named = {method: BLUE, **colors} if colors else {}
+    handles = [
+        Line2D([], [], color=color, label=style.label_text(name, 24))
+        for name, color in named.items()
+    ]
+    if handles:
+        _add_legend(figure, handles)

@@ -57,11 +57,9 @@ def curves(result: xr.DataTree, name: str) -> list[xr.Dataset]:
     """One recorded variable and its prediction by view, for each material and wavelength."""
     if name not in variables(result):
         lacks = f", for it has no {_missing(result, name)}" if name in QUANTITIES else ""
-        raise FitError(
-            f"the result has no readings of {name} to draw{lacks}",
-            where="figure",
-            hint=f"choose one of {', '.join(variables(result)) or 'none'}",
-        )
+        hint = f"choose one of {', '.join(variables(result)) or 'none'}"
+        what = f"the result has no readings of {name} to draw{lacks}"
+        raise FitError(what, where="figure", hint=hint)
     observed = result["observed_data"].to_dataset()[name].astype(float)
     constants = result["constant_data"].to_dataset()
     predicted = result["posterior_predictive"][name].astype(float)
@@ -433,20 +431,15 @@ def plot_spectrum(
     """
     found = spectra(result) if found is None else found
     if name not in found:
-        raise FitError(
-            f"{name} was not fitted over wavelength",
-            where="plot_spectrum",
-            hint=f"choose one of {', '.join(found) or 'none'}",
-        )
+        hint = f"choose one of {', '.join(found) or 'none'}"
+        what = f"{name} was not fitted over wavelength"
+        raise FitError(what, where="plot_spectrum", hint=hint)
     shown = found[name]
     several = len(shown) > 1
-    figure, panels = style.grid(
-        len(shown),
-        columns=3 if len(shown) != 4 else 2,
-        width=8.2 if several else 6.6,
-        panel_height=1.9 if several else 2.9,
-        header=0.8,
-    )
+    width, height = (8.2, 1.9) if several else (6.6, 2.9)
+    columns = 3 if len(shown) != 4 else 2
+    size: dict[str, Any] = {"width": width, "panel_height": height, "header": 0.8}
+    figure, panels = style.grid(len(shown), columns=columns, **size)
     for axes, each in zip(panels, shown, strict=True):
         _draw_spectrum(axes, each)
         axes.set_title(style.wrap(each.title, 34) if several else "", loc="left")
@@ -488,20 +481,19 @@ def _draw_spectrum(axes: Axes, each: Spectrum) -> None:
 
 
 def _spectrum_handles(shown: Sequence[Spectrum]) -> list[Artist]:
-    handles: list[Artist]
+    dashes: dict[str, Any] = {"color": lighten(GRAY, 0.6), "lw": 0.9, "ls": (0, (2, 2))}
+    ring: dict[str, Any] = {"marker": "o", "mfc": style.background(), "ls": ""}
+    handles: list[Artist] = [
+        Line2D([], [], color=BLUE, label="posterior median", **ring),
+        Line2D([], [], color=BLUE, lw=3.6, label="50%"),
+        Line2D([], [], color=BLUE, lw=1.1, label="95%"),
+    ]
     if shown[0].between.size:
         handles = [
             Line2D([], [], color=BLUE, lw=1.4, label="posterior median"),
             Patch(color=lighten(BLUE, 0.45), label="50%"),
             Patch(color=lighten(BLUE, 0.75), label="95%"),
-            Line2D([], [], color=lighten(GRAY, 0.6), lw=0.9, ls=(0, (2, 2)), label="measured"),
-        ]
-    else:
-        ring = style.background()
-        handles = [
-            Line2D([], [], color=BLUE, marker="o", mfc=ring, ls="", label="posterior median"),
-            Line2D([], [], color=BLUE, lw=3.6, label="50%"),
-            Line2D([], [], color=BLUE, lw=1.1, label="95%"),
+            Line2D([], [], label="measured", **dashes),
         ]
     if any(np.isfinite(each.true).any() for each in shown):
         handles.append(style.true_value_handle())

@@ -93,7 +93,8 @@ def plot_pairs(result: xr.DataTree) -> Figure:
     figure, panels = _pair_panels(size, lines=max(label.count("\n") for label in labels) + 1)
     draws = np.stack([scalar.draws.ravel() for scalar in found])
     shown = np.linspace(0, draws.shape[1] - 1, min(MAX_POINTS, draws.shape[1])).astype(int)
-    diverging = _divergent_draws(result)
+    flags = stats_of(result).get("diverging", np.empty(0))
+    diverging = np.flatnonzero(np.asarray(flags))
     correlation = np.corrcoef(draws)
     limits = [style.padded_range(values, 0.04) for values in draws]
     truths = [truth_of(result, scalar) for scalar in found]
@@ -102,10 +103,17 @@ def plot_pairs(result: xr.DataTree) -> Figure:
             axes = panels[row, column]
             axes.set_xlim(limits[column])
             if row == column:
-                _histogram(axes, draws[row], limits[row], truths[row])
+                counts, edges = np.histogram(draws[row], 30, range=limits[row])
+                axes.stairs(counts, edges, fill=True, color=lighten(BLUE, 0.45))
+                axes.set_ylim(0, 1.08 * counts.max())
+                _draw_truth(axes, truths[row], np.nan)
             elif row > column:
                 axes.set_ylim(limits[row])
-                _draw_points(axes, draws[[column, row]], shown, diverging)
+                xy = draws[[column, row]]
+                axes.plot(*xy[:, shown], "o", color=BLUE, ms=1.6, mew=0, alpha=0.4, rasterized=True)
+                if diverging.size:
+                    cross: dict[str, Any] = {"color": VERMILLION, "ms": 4, "mew": 1.2}
+                    axes.plot(*xy[:, diverging], "x", rasterized=True, **cross)
                 _draw_truth(axes, truths[column], truths[row])
             else:
                 _write_correlation(axes, correlation[row, column])
@@ -274,23 +282,6 @@ def _pit_panel(axes: Axes, values: np.ndarray | None) -> None:
     axes.set_xlim(0, 1)
 
 
-def _divergent_draws(result: xr.DataTree) -> np.ndarray:
-    stats = stats_of(result)
-    if "diverging" not in stats:
-        return np.empty(0, int)
-    return np.flatnonzero(stats["diverging"].to_numpy().ravel())
-
-
-def _histogram(
-    axes: Axes, values: np.ndarray, limits: tuple[float, float], true: float = np.nan
-) -> None:
-    counts, edges = np.histogram(values, 30, range=limits)
-    axes.stairs(counts, edges, fill=True, color=lighten(BLUE, 0.45))
-    axes.set_ylim(0, 1.08 * counts.max())
-    if np.isfinite(true):
-        axes.axvline(true, color=ORANGE, lw=1.4, ls="--")
-
-
 def _scaled_histogram(
     axes: Axes, values: np.ndarray, limits: tuple[float, float], color: str, share: float
 ) -> None:
@@ -299,12 +290,6 @@ def _scaled_histogram(
     counts, edges = np.histogram(inside, 16 if inside.size < 1000 else 30)
     axes.stairs(counts / counts.max(), edges, fill=True, color=lighten(color, share))
     axes.stairs(counts / counts.max(), edges, color=color, lw=0.8)
-
-
-def _draw_points(axes: Axes, xy: np.ndarray, shown: np.ndarray, diverging: np.ndarray) -> None:
-    axes.plot(*xy[:, shown], "o", color=BLUE, ms=1.6, mew=0, alpha=0.4, rasterized=True)
-    if diverging.size:
-        axes.plot(*xy[:, diverging], "x", color=VERMILLION, ms=4, mew=1.2, rasterized=True)
 
 
 def _draw_truth(axes: Axes, x: float, y: float) -> None:
@@ -390,19 +375,14 @@ def plot_shrinkage(
     members = shrinkage(result) if members is None else members
     found = {each.label: each for each in populations(result)}
     if label not in found or label not in summary.index:
-        raise FitError(
-            f"{label!r} is no pooled parameter",
-            where="plot_shrinkage: label",
-            hint=f"choose one of {', '.join(summary.index) or 'none'}",
-        )
+        hint = f"choose one of {', '.join(summary.index) or 'none'}"
+        what = f"{label!r} is no pooled parameter"
+        raise FitError(what, where="plot_shrinkage: label", hint=hint)
     population, whole = found[label], summary.loc[label]
     rows = members.loc[[scalar.label for scalar in population.members]].reset_index(drop=True)
     if not np.isfinite(rows["mean"]).all():
-        raise FitError(
-            "its draws are not finite on the population's scale",
-            where=f"plot_shrinkage: {label}",
-            hint="see the verdict",
-        )
+        what = "its draws are not finite on the population's scale"
+        raise FitError(what, where=f"plot_shrinkage: {label}", hint="see the verdict")
     rows["true"] = [truth_of(result, scalar) for scalar in population.members]
     rows["name"] = [_member_name(scalar, population) for scalar in population.members]
     rows = rows.sort_values("mean", kind="stable", ignore_index=True)

@@ -1,18 +1,15 @@
 """The standard report of every kind of result, and its summary for a notebook or a terminal."""
 
-import dataclasses
 import functools
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import xarray as xr
 
-from polar_bayes.benchmark.accuracy import is_accuracy
-from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
-from polar_bayes.calibration.files import is_calibration
-from polar_bayes.calibration.verdict import calibration_table, calibration_verdict
+from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences, is_accuracy
+from polar_bayes.calibration.verdict import calibration_table, calibration_verdict, is_calibration
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import provenance_of
@@ -22,10 +19,10 @@ from polar_bayes.reporting.accuracy import accuracy_page, study_table
 from polar_bayes.reporting.calibration_page import calibration_page, rank_table
 from polar_bayes.reporting.comparison import comparison_page
 from polar_bayes.reporting.fit_page import fit_page, parameter_table, read_fit
-from polar_bayes.reporting.page import Page, Table, write_page
+from polar_bayes.reporting.page import Page, write_page
 from polar_bayes.reporting.plots_calibration import parameter_ranks
 from polar_bayes.reporting.style import in_default_style
-from polar_bayes.repr_html import DisplaySummary
+from polar_bayes.repr_html import DisplaySummary, Table
 from polar_bayes.results import save
 
 MAX_ROWS = 40
@@ -34,7 +31,7 @@ MAX_ROWS = 40
 HINTS = {
     "truth": "leave it out: a fit carries the truth of its capture",
     "uncorrected": "leave it out: a fit carries the truth of its capture",
-    "beside": "leave it out, or give what polar_bayes.calibrate returns",
+    "comparisons": "leave it out, or give what polar_bayes.calibrate returns",
 }
 
 
@@ -45,7 +42,7 @@ def report(
     *,
     truth: xr.Dataset | None = None,
     uncorrected: xr.Dataset | None = None,
-    beside: Mapping[str, xr.DataTree] | None = None,
+    comparisons: Mapping[str, xr.DataTree] | None = None,
 ) -> Path:
     """Write the standard report of any result, or of several fits side by side: one `index.html`.
 
@@ -64,7 +61,7 @@ def report(
             against.
         uncorrected: Of maps, with `truth`: those of the same image by
             `PixelLaplace(weighted=False)`, whose coverage is compared.
-        beside: Of a calibration: others of the same layout, by a name such as their method
+        comparisons: Of a calibration: others of the same layout, by a name such as their method
             ("laplace"), with which it is compared.
 
     Returns:
@@ -78,7 +75,7 @@ def report(
             of a report.
     """
     folder = as_path(directory, "report")
-    page = render(result, truth=truth, uncorrected=uncorrected, beside=beside)
+    page = render(result, truth=truth, uncorrected=uncorrected, comparisons=comparisons)
     files = {}
     if file := _kind_of(result).file:
         files[file] = functools.partial(save, cast(xr.DataTree, result))
@@ -91,8 +88,8 @@ def render(result: Any, **options: Any) -> str:
     given = {name: value for name, value in options.items() if value is not None}
     for name in given:
         if name not in kind.options:
-            owner = next(each.name for each in KINDS if name in each.options)
-            raise FitError(f"it goes with {owner} only", where=f"report: {name}", hint=HINTS[name])
+            owner = next(each.title for each in KINDS if name in each.options)
+            raise FitError(f"it goes with {owner}s only", where=f"report: {name}", hint=HINTS[name])
     return kind.page(result, **given).html
 
 
@@ -109,24 +106,22 @@ def show(result: xr.DataTree | xr.Dataset) -> DisplaySummary:
     Raises:
         FitError: It is no result.
     """
-    return _kind_of(result).card(result)
+    kind = _kind_of(result)
+    sentences, table, passed = kind.card(result)
+    total = len(table.rows)
+    more = f"The first {MAX_ROWS} of {total} rows." if total > MAX_ROWS else ""
+    title = f"{text.capture_name(provenance_of(result))}: {kind.title}"
+    lines = tuple(filter(None, [*sentences, more]))
+    return DisplaySummary(title, lines, (table.first(MAX_ROWS),), passed)
 
 
 # --- Cards ----------------------------------------------------------------------------------------
 
-
-def _make_card(
-    provenance: Mapping[str, Any], kind: str, sentences: list[str], table: Table, passed: bool
-) -> DisplaySummary:
-    """`leaf: fit`, sentences and the first rows of a table."""
-    total = len(table.rows)
-    more = [f"The first {MAX_ROWS} of {total} rows."] if total > MAX_ROWS else []
-    title = f"{text.capture_name(provenance)}: {kind}"
-    lines = tuple(filter(None, [*sentences, *more]))
-    return DisplaySummary(title, lines, (table.grid(MAX_ROWS),), passed)
+type Card = tuple[list[str], Table, bool]
+"""Sentences, a table, and whether the numbers may be used."""
 
 
-def _fit_card(result: xr.DataTree) -> DisplaySummary:
+def _fit_card(result: xr.DataTree) -> Card:
     fit = read_fit(result)
     sentences = [
         fit.headline(),
@@ -135,44 +130,39 @@ def _fit_card(result: xr.DataTree) -> DisplaySummary:
         *(f"Caution: {caution}" for caution in fit.verdict.cautions),
         text.swapped_sentence(fit.provenance),
     ]
-    converged = fit.verdict.passed
-    return _make_card(fit.provenance, "fit", sentences, parameter_table(fit), converged)
+    return sentences, parameter_table(fit), fit.verdict.passed
 
 
-def _map_card(result: xr.Dataset) -> DisplaySummary:
+def _map_card(result: xr.Dataset) -> Card:
     table = maps.parameter_table(result, maps.parameter_titles(map_scalars(result)))
     counts = maps.count_cases(result)
     headline, passed = text.map_headline(counts)
-    sentences = [headline, *text.pixel_sentences(counts)]
-    return _make_card(provenance_of(result), "map", sentences, table, passed)
+    return [headline, *text.pixel_sentences(counts)], table, passed
 
 
-def _calibration_card(calibration: xr.DataTree) -> DisplaySummary:
+def _calibration_card(calibration: xr.DataTree) -> Card:
     table = calibration_table(calibration)
-    ranks = rank_table(table, parameter_ranks(calibration, table))
     _, passed = text.calibration_headline(table, None)
-    sentences = calibration_verdict(calibration)
-    return _make_card(provenance_of(calibration), "calibration", sentences, ranks, passed)
+    ranks = parameter_ranks(calibration, table)
+    return calibration_verdict(calibration), rank_table(table, ranks), passed
 
 
-def _accuracy_card(result: xr.DataTree) -> DisplaySummary:
+def _accuracy_card(result: xr.DataTree) -> Card:
     study = accuracy_dataset(result)
     sentences = [*accuracy_sentences(study), text.reference_sentence(study)]
-    passed = not study.attrs["reference_doubts"]
-    return _make_card(provenance_of(result), "accuracy", sentences, study_table(study), passed)
+    return sentences, study_table(study), not study.attrs["reference_doubts"]
 
 
 # --- Kinds of results -----------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class Kind:
-    """A kind of result: how it is recognized, its page, card, options, and file in the folder."""
+class Kind(NamedTuple):
+    """What is reported of a kind of result: page, card, options, and file in the folder."""
 
-    name: str
+    title: str
     applies: Callable[[Any], bool]
     page: Callable[..., Page]
-    card: Callable[[Any], DisplaySummary] = _fit_card
+    card: Callable[[Any], Card] = _fit_card
     options: tuple[str, ...] = ()
     file: str = ""
 
@@ -181,25 +171,23 @@ def _is_several_fits(result: Any) -> bool:
     return isinstance(result, Mapping) and not isinstance(result, xr.Dataset | xr.DataTree)
 
 
+def _is_dataset(result: Any) -> bool:
+    return isinstance(result, xr.Dataset)
+
+
 KINDS = (
     Kind("several fits", _is_several_fits, comparison_page),
+    Kind("map", _is_dataset, maps.map_page, _map_card, ("truth", "uncorrected")),
+    Kind("accuracy", is_accuracy, accuracy_page, _accuracy_card, file="accuracy.nc"),
     Kind(
-        "maps",
-        lambda result: isinstance(result, xr.Dataset),
-        maps.map_page,
-        _map_card,
-        options=("truth", "uncorrected"),
-    ),
-    Kind("accuracy studies", is_accuracy, accuracy_page, _accuracy_card, file="accuracy.nc"),
-    Kind(
-        "calibrations",
+        "calibration",
         is_calibration,
         calibration_page,
         _calibration_card,
-        options=("beside",),
-        file="calibration.nc",
+        ("comparisons",),
+        "calibration.nc",
     ),
-    Kind("fits", lambda result: True, fit_page, _fit_card, file="result.nc"),
+    Kind("fit", lambda result: True, fit_page, file="result.nc"),
 )
 """In the order in which they are tried; everything else is taken as a fit, which refuses it."""
 

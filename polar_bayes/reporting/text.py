@@ -4,11 +4,8 @@ Every conclusion that a report states is written here, by the kind of result: fi
 fits, maps, calibrations and accuracy studies. Tables and captions belong to their pages.
 """
 
-import functools
-import importlib.resources
 import itertools
 import math
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -20,11 +17,12 @@ from polar_bayes.benchmark.advice import accuracy_dataset
 from polar_bayes.calibration.scores import is_calibrated, significance_level
 from polar_bayes.calibration.verdict import calibration_verdict
 from polar_bayes.diagnostics.compare import FitComparison
+from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.population import Population
 from polar_bayes.diagnostics.predictive import PitBand, PredictiveCheck, pit_band
 from polar_bayes.errors import one_line
-from polar_bayes.inference.batch_result import MIN_VIEWS
+from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.reporting.style import QUANTITIES, coordinate_labels, short_title
 
@@ -114,25 +112,6 @@ def capture_name(provenance: Mapping[str, Any], default: str = "capture") -> str
     return one_line(str(name or default))
 
 
-@functools.cache
-def _captions() -> dict[str, dict[str, Any]]:
-    file = importlib.resources.files("polar_bayes.reporting") / "templates" / "captions.toml"
-    return tomllib.loads(file.read_text(encoding="utf-8"))
-
-
-def caption(key: str, **values: object) -> str:
-    """A caption from `templates/captions.toml`, such as `fit.parameter`, with its values."""
-    kind, name = key.split(".")
-    return str(_captions()[kind][name]).format(**values)
-
-
-def figure_caption(key: str, **values: object) -> tuple[str, str]:
-    """The alternative text and the caption of a figure, such as `fit.figure_pairs`."""
-    kind, name = key.split(".")
-    alternative, caption = _captions()[kind][name]
-    return alternative.format(**values), caption.format(**values)
-
-
 # --- Fits -----------------------------------------------------------------------------------------
 
 # Two intervals whose widths differ by less than this are equally wide, as far as draws can tell.
@@ -153,14 +132,17 @@ METHODS = {
 HELD, PRIOR = " held fixed", "prior of "
 
 
-def fit_headline(method: str, converged: bool, cautions: Sequence[str]) -> str:
+def fit_headline(method: str, verdict: Verdict) -> str:
     """The verdict in one sentence."""
-    if not converged:
+    name = METHODS.get(method, "The method")
+    if not verdict.converged:
         failed = "did not converge" if method == "nuts" else "failed"
-        return f"{METHODS.get(method, 'The method')} {failed}: do not use these numbers."
+        return f"{name} {failed}: do not use these numbers."
     passed = {"nuts": "converged", "point": "met its tolerance"}.get(method, "raised no alarm")
-    headline = f"{METHODS.get(method, 'The method')} {passed}."
-    return f"{headline} Mind the cautions." if cautions else headline
+    if not verdict.passed:
+        against = "but the readings speak against the model: do not use these intervals."
+        return f"{name} {passed}, {against}"
+    return f"{name} {passed}." + (" Mind the cautions." if verdict.cautions else "")
 
 
 def made_by(provenance: Mapping[str, Any], method: str) -> str:

@@ -29,8 +29,8 @@ from polar_bayes.diagnostics.parameters import CENTRAL_95, scalars
 from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.errors import FitError, SceneError, one_line
 from polar_bayes.inference.fitting import fit_request
+from polar_bayes.inference.laplace import Importance
 from polar_bayes.inference.request import Request, resolve
-from polar_bayes.inference.weighted import Importance
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress

@@ -9,7 +9,6 @@ import polar_bayes.scenes  # its names load the comparison, and with it diagnost
 from polar_bayes.capture.schema import validate
 from polar_bayes.inference import fitting
 from polar_bayes.inference.method import AbstractMethod
-from polar_bayes.inference.methods import find_method
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
@@ -84,7 +83,7 @@ def fit(
             precision=precision,
             progress=progress,
         )
-    chosen = find_method(method, tolerance, seconds)
+    chosen = fitting.find_method(method, tolerance, seconds)
     capture = validate(capture)
     setting = polar_bayes.scenes.Setting(
         capture, model, priors, links, largest_view_zenith, seed, precision

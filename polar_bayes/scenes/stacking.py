@@ -18,10 +18,10 @@ from polar_bayes.diagnostics.convergence import verdict
 from polar_bayes.diagnostics.parameters import SAMPLE_DIMS
 from polar_bayes.errors import FitError
 from polar_bayes.inference.fitting import fit_request
+from polar_bayes.inference.laplace import Importance
+from polar_bayes.inference.least_squares import Point
 from polar_bayes.inference.method import AbstractMethod
-from polar_bayes.inference.mode_methods import Point
 from polar_bayes.inference.result import PROVENANCE, provenance_of
-from polar_bayes.inference.weighted import Importance
 from polar_bayes.progress import Progress
 from polar_bayes.scenes.comparison import (
     ERRORS_APART,

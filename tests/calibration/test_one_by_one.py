@@ -17,10 +17,9 @@ from polar_bayes.calibration.calibrate import METHODS, _settings
 from polar_bayes.calibration.runner import Method
 from polar_bayes.errors import FitError
 from polar_bayes.inference import hierarchical_reparam, problem
-from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.method import thin_draws
 from polar_bayes.inference.problem import compile_model
-from polar_bayes.inference.program import PIECE, parameters_of
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 from polar_bayes.progress import no_progress
@@ -190,9 +189,10 @@ def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
 def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None:
     request = resolve(capture, population, PLATE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
-    program = compile_model(request, data).program
-    z = np.random.default_rng(1).normal(size=(2, PIECE + 3, program.size))
-    found = parameters_of(program, z, data)
+    here = problem.Problem(compile_model(request, data), data, jax.random.key(1))
+    program = here.program
+    z = np.random.default_rng(1).normal(size=(2, problem.BLOCK + 3, program.size))
+    found = here.constrain(z)
     assert found["level"].shape[:2] == z.shape[:2]
     last = program.parameters(z[1, -1], data)["level"]
     np.testing.assert_array_equal(found["level"][1, -1], last)

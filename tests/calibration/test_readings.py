@@ -18,7 +18,7 @@ from polar_bayes.calibration.predictive import (
     _resample,
     unranked_reason,
 )
-from polar_bayes.calibration.simulations import draw_captures, redraw_readings
+from polar_bayes.calibration.runner import draw_captures, redraw_readings
 from polar_bayes.inference.program import compile_program
 from polar_bayes.observation.data import observe
 

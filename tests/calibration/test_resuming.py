@@ -22,7 +22,9 @@ from polar_bayes.models.per_material import per_material
 import polar_bayes as pb
 from polar_bayes import interrupts
 from polar_bayes.calibration import runner as module
-from polar_bayes.calibration.store import digest
+from polar_bayes.calibration.calibrate import METHODS, make_plan
+from polar_bayes.inference.request import resolve
+from polar_bayes.maps.blocks import digest, locked_ledger
 
 ASKED = {
     "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
@@ -175,17 +177,35 @@ def test_what_cannot_be_gone_on_with_is_refused(capture, begun, tmp_path) -> Non
 
 
 @pytest.mark.thorough
-def test_a_plan_that_was_sent_makes_the_same_block(capture, whole, monkeypatch) -> None:
+def test_a_second_process_is_refused(capture, begun, tmp_path) -> None:
+    store = copied(begun, tmp_path)
+    with (
+        locked_ledger(store / "ledger", store, "calibration", {}, resume=True),
+        pytest.raises(pb.OutputError, match="fits: another process is writing it; wait until"),
+    ):
+        pb.calibrate(capture, simulations=COUNT, store=store, resume=True, **ASKED)
+
+
+@pytest.mark.thorough
+def test_a_damaged_ledger_is_refused_and_can_be_removed(capture, whole, begun, tmp_path) -> None:
+    store = copied(begun, tmp_path)
+    content = (store / "ledger").read_bytes()
+    (store / "ledger").write_bytes(content.replace(b"-000000", b"-000001", 1))
+    with pytest.raises(pb.OutputError, match="ledger: line 2 is damaged; remove that file to fit"):
+        pb.calibrate(capture, simulations=COUNT, store=store, resume=True, **ASKED)
+    (store / "ledger").unlink()
+    found = pb.calibrate(capture, simulations=COUNT, store=store, resume=True, **ASKED)
+    assert_same_bits(found, whole)
+
+
+@pytest.mark.thorough
+def test_a_plan_that_was_sent_makes_the_same_block(capture, whole) -> None:
     """As a worker gets it."""
-    sent = []
-    monkeypatch.setattr(
-        "polar_bayes.calibration.calibrate.fit_block",
-        lambda plan, numbers: sent.append(plan) or module.fit_block(plan, numbers),
-    )
-    pb.calibrate(capture, simulations=20, **ASKED)
-    plan = cloudpickle.loads(cloudpickle.dumps(sent[0]))
-    assert plan.key == sent[0].key
-    found = module.fit_block(plan, np.array([17, 3]))
+    request = resolve(capture, ASKED["model"], PLATE, None, LINKS, None, 0, "double")
+    plan = make_plan(request, None, METHODS["tempered"], True)
+    sent = cloudpickle.loads(cloudpickle.dumps(plan))
+    assert sent.key == plan.key
+    found = module.fit_block(sent, np.array([17, 3]))
     for name, pit in found.pit.items():
         np.testing.assert_array_equal(pit, whole["prior_sbc"][name].to_numpy()[[17, 3]])
     for name, pit in found.left_out.items():
@@ -209,7 +229,7 @@ import numpy as np
 import numpyro.distributions as dist
 from plates import plate_capture
 from polar_bayes.calibration.calibrate import METHODS, make_plan
-from polar_bayes.calibration.store import fingerprint_of
+from polar_bayes.calibration.runner import fingerprint_of
 from polar_bayes.inference.request import resolve
 from test_resuming import ASKED
 capture = plate_capture(np.array([30.0, 42.0, 68.0, 80.0]), 0.03, seed=0)

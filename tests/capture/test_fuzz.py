@@ -21,10 +21,10 @@ from mutations import (
 
 from polar_bayes.capture.files import load_capture, save_capture
 from polar_bayes.capture.schema import LEADING, validate
-from polar_bayes.capture.table_reader import read_table
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.detector import read_array, read_frame
 from polar_bayes.importers.goniometer import from_goniometer
+from polar_bayes.importers.table import read_table
 
 
 def sample(count):

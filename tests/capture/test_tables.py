@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from cases import each
 
-from polar_bayes.capture import table_reader
-from polar_bayes.capture.table_reader import read_table
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers import table as module
+from polar_bayes.importers.table import read_table
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def test_an_unknown_column_is_answered_with_the_known_ones(write):
 
 
 def test_a_table_too_large_is_not_read(write, monkeypatch):
-    monkeypatch.setattr(table_reader, "LARGEST_FILE", 5)
+    monkeypatch.setattr(module, "LARGEST_FILE", 5)
     with pytest.raises(CaptureError, match="the file is too large; give a table of at most 50 MB"):
         read_table(write("1 2\n3 4\n"))
 

@@ -23,7 +23,7 @@ def test_a_calibration_has_a_page(files: Path, capsys: pytest.CaptureFixture[str
     page = files / "report" / "index.html"
     assert capsys.readouterr().out == f"report: {page}\n"
     assert "Calibration report: leaf" in page.read_text()
-    assert main([*words, "--beside", str(files / "laplace.nc")]) == 0
+    assert main([*words, "--compare", str(files / "laplace.nc")]) == 0
     assert "by laplace intervals are too narrow" in page.read_text()
 
 
@@ -33,10 +33,10 @@ def test_a_mistake_gets_one_line(
     monkeypatch.chdir(files)
     (files / "other").mkdir()
     pb.save(make_calibration(count=60), files / "other" / "laplace.nc")
-    twice = ["--beside", "laplace.nc", "--beside", "other/laplace.nc"]
+    twice = ["--compare", "laplace.nc", "--compare", "other/laplace.nc"]
     for options, says in (
         (["nowhere.nc"], "nowhere.nc: there is no such file"),
-        (["sbc.nc", "--beside", "nowhere.nc"], "nowhere.nc: there is no such file"),
+        (["sbc.nc", "--compare", "nowhere.nc"], "nowhere.nc: there is no such file"),
         (["sbc.nc", *twice], "two of the files have the same name"),
     ):
         assert main(["report", *options, "--out", "report"]) == 1

@@ -121,7 +121,7 @@ def test_a_demo_writes_in_no_folder_of_anothers(held, plate, tmp_path, capsys):
 
 def test_names_of_options_are_those_of_the_tables():
     from polar_bayes.calibration.calibrate import METHODS as CALIBRATION_METHODS
-    from polar_bayes.inference.methods import METHODS
+    from polar_bayes.inference.fitting import METHODS
     from polar_bayes.inference.request import MODELS
 
     known = {

@@ -58,7 +58,8 @@ def test_a_point_fit_finds_the_line_of_least_squares() -> None:
 def test_every_method_is_a_frozen_value_that_its_repr_makes_again(method: object) -> None:
     assert dataclasses.replace(method) == method  # type: ignore[type-var]
     assert hash(dataclasses.replace(method)) == hash(method)  # type: ignore[type-var]
-    assert eval(repr(method), vars(pb.methods)) == method
+    names = {name: getattr(pb.methods, name) for name in pb.methods.__all__}
+    assert eval(repr(method), names) == method
     with pytest.raises(dataclasses.FrozenInstanceError):
         method.no_such_setting = 1  # type: ignore[attr-defined]
 

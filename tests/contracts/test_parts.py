@@ -12,12 +12,12 @@ from cases import each
 import polar_bayes as pb
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat
+from polar_bayes.physics.dispersion import Sellmeier
 from polar_bayes.physics.part import (
     Part,
     check_part,
     check_setting,
     like,
-    names_in,
     parameters_of,
     value_of,
 )
@@ -88,7 +88,7 @@ def test_a_number_takes_the_precision_of_the_parameters(dtype: type) -> None:
 
 
 def test_names_come_once_and_in_order() -> None:
-    assert names_in("b", 1.0, "a", "b") == ("b", "a")
+    assert Sellmeier(("b", 1.0), ("a", "b")).parameters == ("b", "a")
     both = parameters_of(ClearCoat("a", "b"), None, ClearCoat("c", "a"))
     assert both == ("a", "b", "c")
 

@@ -12,9 +12,9 @@ from polar_bayes.design.profile import (
     PRIOR_WEIGHT,
     likelihood_interval,
     log_density_parts,
-    profile_sentences,
 )
 from polar_bayes.design.setup import make_design_problem
+from polar_bayes.inference.request import resolve
 
 ZENITHS = np.array([20.0, 40.0, 60.0, 70.0])
 
@@ -71,7 +71,8 @@ def test_a_grid_of_ones_own_keeps_its_values() -> None:
 
 @pytest.mark.thorough
 def test_what_is_known_beside_the_readings_is_of_the_likelihood() -> None:
-    problem = make_design_problem(line_capture(ZENITHS), line, ASKED["scene"], None, None, None, 0)
+    request = resolve(line_capture(ZENITHS), line, ASKED["scene"], None, None, None, 0, "double")
+    problem = make_design_problem(request)
     z = jnp.array([0.3, -0.2])
     bare = log_density_parts(problem.program, (), z, problem.data)
     told = log_density_parts(problem.program, ("level", "dark_level"), z, problem.data)
@@ -113,5 +114,3 @@ def test_what_cannot_be_profiled_is_told() -> None:
         pb.profile(capture, "slope", model=line, points=2, **ASKED)
     with pytest.raises(pb.FitError, match="values of slope: nan is not inside its prior"):
         pb.profile(capture, "slope", model=line, values=[np.nan], **ASKED)
-    with pytest.raises(pb.FitError, match="profile: it has no variable"):
-        profile_sentences(xr.Dataset())

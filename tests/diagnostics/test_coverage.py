@@ -11,7 +11,7 @@ from synthetic_maps import make_maps
 
 import polar_bayes as pb
 from polar_bayes.diagnostics import coverage
-from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.batching import Status
 from polar_bayes.maps import lazy as opening
 
 HALF = np.full((40, 50), 0.5)

@@ -11,7 +11,6 @@ from cases import each
 import polar_bayes as pb
 from polar_bayes.effects.compare_scenes import compile_and_count, run_seconds
 from polar_bayes.effects.variants import effects_of, simplify
-from polar_bayes.physics import fresnel
 from polar_bayes.physics.boundary import Medium, medium, relative_reflection, transmission
 from polar_bayes.physics.geometry import cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization
@@ -116,7 +115,7 @@ def by_hand(parameters, geometry):
     brightness = density * (seen[0] * seen[1]) / (4.0 * views[0])
     polarized = mirrored.contrast / mirrored.mean
     surface = Light(
-        brightness * (fresnel.index_step(index) * mirrored.mean),
+        brightness * ((index**2 - 1.0) ** 2 * mirrored.mean),
         polarized * facet.along_s,
         -polarized * facet.across_s,
     )

@@ -15,7 +15,6 @@ import numpy as np
 
 from polar_bayes.observation.distributions import MeanConcentrationBeta
 from polar_bayes.observation.links import ScaleSchedule
-from polar_bayes.physics import fresnel
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.microfacet import Beckmann
 from polar_bayes.physics.mixing import StokesMixing
@@ -114,6 +113,16 @@ def angles(zenith):
     return cos_degrees(zenith), sin_degrees(zenith) ** 2
 
 
+def our_reflected_dolp(zenith, n):
+    power = Stack(n).relative_reflection(*angles(zenith))
+    return power.contrast * power.sin_squared / power.mean
+
+
+def our_exit_dolp(zenith, n):
+    power = Stack(n).transmission(*angles(zenith))
+    return -power.contrast * power.sin_squared / power.mean
+
+
 def our_contrast(zenith, n):
     power = Stack(n).reflection(*angles(zenith))
     return power.contrast * power.sin_squared
@@ -177,7 +186,7 @@ CASES = (
         "DoLP of reflection",
         (89.99, 1.5),
         reflected_dolp,
-        lambda z, n: fresnel.reflection_polarization(*angles(z), n),
+        our_reflected_dolp,
         lambda z, n: reflected_dolp(z, n, mp),
     ),
     Case(
@@ -185,7 +194,7 @@ CASES = (
         "DoLP of reflection",
         (50.0, 1.000001),
         reflected_dolp,
-        lambda z, n: fresnel.reflection_polarization(*angles(z), n),
+        our_reflected_dolp,
         lambda z, n: reflected_dolp(z, n, mp),
     ),
     Case("n = 1", "DoLP under two facets", (1.0,), textbook_sky_dolp, sky_dolp, exact_sky_dolp),
@@ -194,7 +203,7 @@ CASES = (
         "DoLP of exit",
         (0.01, 1.5),
         exit_dolp,
-        lambda z, n: fresnel.exit_polarization(*angles(z), n),
+        our_exit_dolp,
         lambda z, n: exit_dolp(z, n, mp),
     ),
     Case(
@@ -202,7 +211,7 @@ CASES = (
         "transmittance",
         (89.9999, 1.5),
         transmitted,
-        lambda z, n: fresnel.transmission(cos_degrees(z), n),
+        lambda z, n: Stack(n).transmission(*angles(z)).mean,
         lambda z, n: transmitted(z, n, mp),
     ),
     Case(

@@ -10,13 +10,12 @@ from cases import each
 from hard_cases import multiprecision as twin
 from hard_cases.catalogue import MATERIALS, WAVELENGTH, Material, every_case
 
-from polar_bayes.physics import fresnel
 from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.facets import FacetQuadrature, Microsurface
 from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.illumination import PointSource
-from polar_bayes.physics.instrument import STEEPEST_ZENITH, BeamOverlap, lean
+from polar_bayes.physics.instrument import STEEPEST_ZENITH, BeamOverlap, tilted_direction
 from polar_bayes.physics.microfacet import (
     GGX,
     AnisotropicSlopes,
@@ -26,7 +25,7 @@ from polar_bayes.physics.microfacet import (
 )
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.scene import Scene
-from polar_bayes.physics.stack import Layer, Stack
+from polar_bayes.physics.stack import HEMISPHERE_COSINES, HEMISPHERE_WEIGHTS, Layer, Stack
 from polar_bayes.physics.stokes import Light, LinearPolarization
 from polar_bayes.physics.subsurface import Lambertian, body_loss, half_space_loss
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
@@ -82,18 +81,17 @@ def test_fresnel(dtype: type) -> None:
         twin.interface(twin.cosine(a), mp.mpf(float(n))) for a, n in zip(angle, index, strict=True)
     ]
     c, b = cos_degrees(angle), sin_degrees(angle) ** 2
-    mean, contrast = fresnel.reflection(c, b, index)
-    relative_mean, relative_contrast = fresnel.relative_reflection(c, b, index)
-    step = fresnel.index_step(index)
-    reflected = fresnel.reflection_polarization(c, b, index)
+    stack = Stack(jnp.asarray(index))
+    power, relative = stack.reflection(c, b), stack.relative_reflection(c, b)
+    passing = stack.transmission(c, b)
     for value, field in (
-        (mean, "mean"),
-        (contrast * b, "difference"),
-        (step * relative_mean, "mean"),
-        (step * relative_contrast * b, "difference"),
-        (fresnel.transmission(c, index), "transmitted"),
-        (reflected, "reflected_polarization"),
-        (fresnel.exit_polarization(c, b, index), "exit_polarization"),
+        (power.mean, "mean"),
+        (power.contrast * b, "difference"),
+        (stack.scale * relative.mean, "mean"),
+        (stack.scale * relative.contrast * b, "difference"),
+        (passing.mean, "transmitted"),
+        (relative.contrast * b / relative.mean, "reflected_polarization"),
+        (-passing.contrast * b / passing.mean, "exit_polarization"),
     ):
         assert_accurate(value, [getattr(one, field) for one in truth], dtype, names)
 
@@ -103,13 +101,13 @@ def test_hemisphere(dtype: type) -> None:
     """Rounding only: the twin takes the same nodes. Their own error is tested with Fresnel."""
     indices = np.array([1.0, 1.0 + 1e-6, 1.001, 1.2, 1.33, 1.5, 2.0, 2.42], dtype)
     names = [f"n = {n}" for n in indices]
-    nodes = [mp.mpf(float(x)) for x in fresnel.HEMISPHERE_COSINES]
-    weights = [mp.mpf(float(w)) for w in fresnel.HEMISPHERE_WEIGHTS]
-    truth = [twin.hemispherical_reflection(mp.mpf(float(n)), nodes, weights) for n in indices]
-    inside = [1 - (1 - fe) / mp.mpf(float(n)) ** 2 for fe, n in zip(truth, indices, strict=True)]
-    assert_accurate(fresnel.hemispherical_reflection(indices), truth, dtype, names)
-    assert_accurate(fresnel.internal_reflection(indices), inside, dtype, names)
-    assert_accurate(fresnel.escape(indices), [1 - one for one in inside], dtype, names)
+    nodes = [mp.mpf(float(x)) for x in HEMISPHERE_COSINES]
+    weights = [mp.mpf(float(w)) for w in HEMISPHERE_WEIGHTS]
+    truth = [1 - twin.hemispherical_reflection(mp.mpf(float(n)), nodes, weights) for n in indices]
+    leaving = [passed / mp.mpf(float(n)) ** 2 for passed, n in zip(truth, indices, strict=True)]
+    stack = Stack(jnp.asarray(indices))
+    assert_accurate(stack.hemispherical_transmission(), truth, dtype, names)
+    assert_accurate(stack.escape(), leaving, dtype, names)
 
 
 @PRECISIONS
@@ -147,7 +145,7 @@ def test_lean(dtype: type) -> None:
         normal = mp.matrix([*(mp.mpf(float(slope)) for slope in slopes), 1])
         normal /= mp.norm(normal)
         zenith, azimuth = directions[:, 1], directions[:, 2]
-        found = lean(zenith, azimuth, *slopes)
+        found = tilted_direction(zenith, azimuth, *slopes)
         assert found.zenith.dtype == dtype
         for i, (down, around) in enumerate(zip(zenith, azimuth, strict=True)):
             light, s = (
@@ -195,12 +193,16 @@ def test_body(dtype: type) -> None:
     index = np.full_like(absorption, 1.5)
     names = [f"a = {a}" for a in absorption]
     albedo = [twin.half_space_albedo(mp.mpf(float(a))) for a in absorption]
-    inside = mp.mpf(float(fresnel.internal_reflection(index)[0]))
+    escape = Stack(jnp.asarray(index)).escape()
+    inside = 1 - mp.mpf(float(escape[0]))
     behind = [(1 - inside) * rd / (1 - inside * rd) for rd in albedo]
     assert_accurate(half_space_loss(absorption), [1 - rd for rd in albedo], dtype, names)
     # The floor of absorption is rounded to the precision before its square root is taken.
     assert_accurate(
-        body_loss(absorption, fresnel.escape(index)), [1 - rb for rb in behind], dtype, names
+        body_loss(absorption, Stack(jnp.asarray(index)).escape()),
+        [1 - rb for rb in behind],
+        dtype,
+        names,
     )
 
 

@@ -17,7 +17,7 @@ from synthetic_results import edit_provenance, make_result, pool, replace
 from tree_mutations import ODD_ATTRIBUTES, mutate, pick
 
 import polar_bayes as pb
-from polar_bayes.calibration.files import check_calibration
+from polar_bayes.calibration.verdict import check_calibration
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.predictive import predictive_checks

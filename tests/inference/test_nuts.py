@@ -6,16 +6,17 @@ import numpy as np
 
 import polar_bayes as pb
 from polar_bayes.inference import nuts
+from polar_bayes.inference.initialization import Target
 
 
 def density(z: jax.Array, center: jax.Array) -> jax.Array:
     return 0.5 * jnp.sum((z - center) ** 2)
 
 
-def target(size: int, chains: int) -> nuts.Target:
+def target(size: int, chains: int) -> Target:
     starts = np.random.default_rng(0).standard_normal((chains, size))
-    return nuts.Target(
-        samplers=nuts.SamplerCache(density),
+    return Target(
+        density=density,
         given=jnp.zeros(size),
         potential=lambda z: (0.5 * float(z @ z), z),
         starts=starts,
@@ -29,7 +30,9 @@ def test_how_draws_are_cut_into_blocks_changes_nothing() -> None:
     with jax.enable_x64(True):
         for block in (60, 35):  # 60 divides the warm-up and the draws, 35 does neither
             settings = pb.methods.Nuts(chains=2, warmup=60, draws=120, most_draws=120, block=block)
-            told.append(nuts.sample(target(3, 2), jax.random.key(1), settings))
+            here = target(3, 2)
+            sampler = nuts.Sampler(density, settings.static(here))
+            told.append(nuts.sample(sampler, here, jax.random.key(1), settings))
     (z, stats, _), (again, others, _) = told
     assert z.shape == (2, 120, 3)
     assert np.array_equal(z, again)

@@ -11,12 +11,12 @@ from toy_models import capture, funnel, line, of_line, squared
 import polar_bayes as pb
 from polar_bayes.benchmark.run import labeled, sample_point
 from polar_bayes.errors import FitError
-from polar_bayes.inference.auto import expected_error, missed_mode_weight
+from polar_bayes.inference.auto import expected_error
+from polar_bayes.inference.laplace import laplace_mixture
 from polar_bayes.inference.mcse import draws_needed, quantile
 from polar_bayes.inference.optimize import Modes
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.weighted import laplace_mixture
 from polar_bayes.progress import no_progress
 
 SMALL = {
@@ -43,6 +43,15 @@ def problem(model, seed: int = 0):
         capture(), model, "paper", None, {"q": pb.links.StokesLink()}, 90.0, 0, "double"
     )
     return make_problem(request, jax.random.split(jax.random.key(seed))[0])
+
+
+def test_a_problem_tells_what_is_estimated_and_from_what():
+    table = problem(line).describe()
+    assert list(table.index) == ["level", "slope"]
+    assert (table["size"] == 1).all()
+    assert (table["prior"] == "Normal").all()
+    assert (table["low"] == -np.inf).all()
+    assert table.attrs == {"used": {"q": 6}, "measured": {"q": 6}}
 
 
 def run(method, problem, seed: int = 0):
@@ -127,16 +136,16 @@ def test_every_mode_of_weight_gets_draws():
 def test_chains_that_missed_a_mode_are_told():
     here = problem(squared)
     both = run(SMALL["importance"], here)
-    assert missed_mode_weight(both.z, here) == 0.0
+    assert here.initialize().missed_mode_weight(both.z) == 0.0
     at = here.program.unravel(np.arange(here.program.size))["root"]
     one = both.z.copy()
     one[..., int(at)] = np.abs(one[..., int(at)])
-    assert missed_mode_weight(one, here) == pytest.approx(0.5, abs=0.02)
+    assert here.initialize().missed_mode_weight(one) == pytest.approx(0.5, abs=0.02)
     # One chain that saw only one of them is enough.
     some = both.z.copy()
     some[0] = one[0]
-    assert missed_mode_weight(some, here) > 0.4
-    assert missed_mode_weight(both.z, problem(line)) == 0.0
+    assert here.initialize().missed_mode_weight(some) > 0.4
+    assert problem(line).initialize().missed_mode_weight(both.z) == 0.0
 
 
 @pytest.mark.thorough

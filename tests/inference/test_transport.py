@@ -11,11 +11,12 @@ from numpyro import distributions as dist
 from scipy import stats
 
 import polar_bayes as pb
-from polar_bayes.inference.group_model import find_groups, group_of
 from polar_bayes.inference.hierarchical_reparam import (
     ExpansionPoint,
     HierarchicalReparam,
     ReparamInputs,
+    find_groups,
+    group_of,
 )
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve

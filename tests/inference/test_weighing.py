@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from cases import each
 
-from polar_bayes.inference.resampling import (
+from polar_bayes.inference.psis import (
     CHAINS,
     FEWEST,
     MOST,

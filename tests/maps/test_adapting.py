@@ -7,7 +7,7 @@ from plate_images import NAMES, VIEWS, mapped, on_a_grid, planned, plate_image
 from scipy import stats
 
 from polar_bayes.inference.batch_laplace import PixelLaplace
-from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.proposals import PROPOSAL_DEGREES_OF_FREEDOM as DEGREES_OF_FREEDOM
 from polar_bayes.inference.proposals import Points, Proposal, fit_t, normal_points, student_t_points
 

@@ -11,10 +11,9 @@ from plate_images import ASKED, NAMES, mapped, planned, plate_image
 
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.maps import fit_map as verb
-from polar_bayes.maps.blocks import Plan, fit_block
-from polar_bayes.maps.fit_map import fit_pixels, with_pixel_numbers
+from polar_bayes.maps.fit_map import MapPlan, fit_block, fit_pixels, with_pixel_numbers
 
 # Chains too short to be believed are as good as any to compare bits.
 SHORT = PixelLaplace(
@@ -30,12 +29,12 @@ def image() -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
-def plan(image: xr.Dataset) -> Plan:
+def plan(image: xr.Dataset) -> MapPlan:
     return planned(image, SHORT)
 
 
 @pytest.fixture(scope="module")
-def whole(image: xr.Dataset, plan: Plan) -> xr.Dataset:
+def whole(image: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     maps = mapped(image, plan)
     for approach in (MethodUsed.IMPORTANCE, MethodUsed.ADAPTED, MethodUsed.NUTS):
         assert (maps["approach"] == approach).any(), approach
@@ -53,13 +52,13 @@ def assert_same_bits(one: xr.Dataset, other: xr.Dataset) -> None:
 @pytest.mark.thorough
 @each("block", [100, 43, 17])
 def test_blocks_of_any_size_give_the_same_bits(
-    image: xr.Dataset, plan: Plan, whole: xr.Dataset, block: int
+    image: xr.Dataset, plan: MapPlan, whole: xr.Dataset, block: int
 ) -> None:
     assert_same_bits(mapped(image, plan, block), whole)
 
 
 @pytest.mark.thorough
-def test_a_block_in_which_nothing_was_read_is_masked(image: xr.Dataset, plan: Plan) -> None:
+def test_a_block_in_which_nothing_was_read_is_masked(image: xr.Dataset, plan: MapPlan) -> None:
     """A corner of a picture, for example, beside what is shown."""
     nothing = with_pixel_numbers(image.assign(valid=xr.zeros_like(image["q"], bool))).isel(y=[1])
     maps = fit_block(nothing, plan)
@@ -69,7 +68,9 @@ def test_a_block_in_which_nothing_was_read_is_masked(image: xr.Dataset, plan: Pl
 
 
 @pytest.mark.thorough
-def test_a_pixel_alone_gets_the_same_bits(image: xr.Dataset, plan: Plan, whole: xr.Dataset) -> None:
+def test_a_pixel_alone_gets_the_same_bits(
+    image: xr.Dataset, plan: MapPlan, whole: xr.Dataset
+) -> None:
     sampled = np.argwhere((whole["approach"] == MethodUsed.NUTS).values)[-1]
     for y, x in ((0, 0), (2, 42), sampled):
         place = {"y": slice(y, y + 1), "x": slice(x, x + 1)}
@@ -79,7 +80,7 @@ def test_a_pixel_alone_gets_the_same_bits(image: xr.Dataset, plan: Plan, whole: 
 
 @pytest.mark.thorough
 def test_a_mirrored_image_has_mirrored_modes(
-    image: xr.Dataset, plan: Plan, whole: xr.Dataset
+    image: xr.Dataset, plan: MapPlan, whole: xr.Dataset
 ) -> None:
     mirrored = mapped(image.isel(x=slice(None, None, -1)), plan).isel(x=slice(None, None, -1))
     # Draws follow the number of a pixel, which has changed; where it climbs to does not.
@@ -97,10 +98,10 @@ def test_chunks_on_threads_give_the_same_bits(image: xr.Dataset, whole: xr.Datas
 
 
 @pytest.fixture
-def compiled_already(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+def compiled_already(plan: MapPlan, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of twenty pixels, fitted by the programs of the whole image."""
 
-    def plan_map(capture: xr.Dataset, *asked) -> Plan:
+    def plan_map(capture: xr.Dataset, *asked) -> MapPlan:
         own = verb_plan(capture, *asked)
         assert own.settings == plan.settings
         assert own.request.priors.keys() == plan.request.priors.keys()

@@ -3,30 +3,37 @@
 import signal
 import subprocess
 import sys
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 
 import polar_bayes as pb
-from polar_bayes.maps.store import Entry, locked_ledger
+from polar_bayes.maps.blocks import Entry, Ledger, locked_ledger
 
 REQUEST = "ab" * 32
 ENTRIES = {f"y={row}:{row + 2} x=0:20": Entry(f"{row:064x}", "cd" * 32) for row in range(0, 6, 2)}
 
 HOLDER = """
 import pathlib, sys, time
-from polar_bayes.maps.store import locked_ledger
-with locked_ledger(pathlib.Path(sys.argv[1]), "0", resume=True):
+from polar_bayes.maps.blocks import locked_ledger
+file = pathlib.Path(sys.argv[1])
+with locked_ledger(file, file.with_suffix(""), "map", {}, resume=True):
     print("locked", flush=True)
     time.sleep(600)
 """
+
+
+def locked(file: Path, request: str = REQUEST, *, resume: bool) -> AbstractContextManager[Ledger]:
+    fingerprint = {"capture or other settings": request}
+    return locked_ledger(file, file.with_suffix(""), "map", fingerprint, resume=resume)
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     """Of three blocks."""
     file = tmp_path / "map.zarr.progress"
-    with locked_ledger(file, REQUEST, resume=False) as ledger:
+    with locked(file, resume=False) as ledger:
         ledger.read()
         ledger.begin()
         for label, entry in ENTRIES.items():
@@ -35,7 +42,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def entries(file: Path, request: str = REQUEST) -> dict[str, Entry]:
-    with locked_ledger(file, request, resume=True) as ledger:
+    with locked(file, request, resume=True) as ledger:
         ledger.read()
         ledger.begin()
         return ledger.entries
@@ -81,7 +88,7 @@ def test_what_is_no_ledger_of_this_map_is_refused_and_left_alone(
         entries(file, "00" * 32)
     with (
         pytest.raises(pb.OutputError, match="it is there already"),
-        locked_ledger(file, REQUEST, resume=False),
+        locked(file, resume=False),
     ):
         pass
     assert file.read_bytes() == whole
@@ -99,11 +106,11 @@ def test_what_is_no_ledger_of_this_map_is_refused_and_left_alone(
 @pytest.mark.thorough
 def test_a_ledger_in_which_nothing_was_written_is_not_left_behind(tmp_path: Path) -> None:
     file = tmp_path / "map.zarr.progress"
-    with pytest.raises(ZeroDivisionError), locked_ledger(file, REQUEST, resume=True):
+    with pytest.raises(ZeroDivisionError), locked(file, resume=True):
         _ = 1 / 0
     assert not file.exists()
     file.touch()  # of somebody else
-    with pytest.raises(ZeroDivisionError), locked_ledger(file, REQUEST, resume=True):
+    with pytest.raises(ZeroDivisionError), locked(file, resume=True):
         _ = 1 / 0
     assert file.exists()
 
@@ -124,7 +131,7 @@ def test_a_second_process_is_refused_and_a_killed_one_leaves_no_lock(file: Path)
 
 @pytest.mark.thorough
 def test_a_ledger_that_was_taken_away_is_one_line(file: Path) -> None:
-    with locked_ledger(file, REQUEST, resume=True) as ledger:
+    with locked(file, resume=True) as ledger:
         file.rename(file.with_name("taken"))
         with pytest.raises(pb.OutputError, match="finished, moved or removed it; let one process"):
             ledger.add("y=0:2 x=0:20", Entry("", ""))

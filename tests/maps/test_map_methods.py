@@ -9,7 +9,7 @@ import xarray as xr
 from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, plate_image
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.reporting.text import APPROACHES
 

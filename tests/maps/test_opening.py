@@ -14,7 +14,7 @@ from synthetic_maps import make_maps
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_result import Status
+from polar_bayes.inference.batching import Status
 
 
 def test_what_was_written_is_read_when_it_is_needed(tmp_path: Path) -> None:

@@ -18,8 +18,7 @@ from plates import plate_capture
 import polar_bayes as pb
 from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_result import MethodUsed, Status
-from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.proposals import (
     DEGREES_OF_FREEDOM,

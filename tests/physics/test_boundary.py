@@ -1,4 +1,4 @@
-"""One boundary, bare or with films: against Fresnel, against 80 digits, against matrices."""
+"""One boundary, bare or with films: against 80 digits, against matrices."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polar_bayes.physics import boundary, fresnel
+from polar_bayes.physics import boundary
 from polar_bayes.physics.boundary import Diattenuation, Film, Medium
 from polar_bayes.physics.geometry import cos_degrees, sin_degrees
 
@@ -45,25 +45,6 @@ def filmed(degrees: float, layers: list, below: float) -> tuple[Diattenuation, D
     indexes = [jnp.asarray(n) for n in (1.0, *(layer[0] for layer in layers), below)]
     wavenumbers = [jnp.asarray(2.0 * layer[1]) for layer in layers]
     return respond(cos_degrees(degrees), sin_degrees(degrees) ** 2, indexes, wavenumbers)
-
-
-@given(theta=zenith, n=index)
-@RUN
-def test_under_air_it_is_fresnels_law(theta: float, n: float) -> None:
-    c, b = cos_degrees(theta), sin_degrees(theta) ** 2
-    air, body = media(theta, 1.0, n)
-    mean, contrast = fresnel.reflection(c, b, n)
-    found = boundary.reflection(air, body, b)
-    np.testing.assert_allclose(found.mean, mean, rtol=1e-13)
-    np.testing.assert_allclose(found.contrast, contrast, rtol=1e-13)
-    relative, _ = fresnel.relative_reflection(c, b, n)
-    found = boundary.relative_reflection(air, body, b)
-    np.testing.assert_allclose(found.mean, relative, rtol=1e-13)
-    passing = boundary.transmission(air, body, b)
-    np.testing.assert_allclose(passing.mean, fresnel.transmission(c, n), rtol=1e-13)
-    leaving = -fresnel.exit_polarization(c, b, n)
-    found_leaving = passing.contrast * b / passing.mean
-    np.testing.assert_allclose(found_leaving, leaving, rtol=1e-12, atol=1e-16)
 
 
 @given(theta=zenith, first=index, second=index)
@@ -130,7 +111,6 @@ def test_alike_media_have_no_boundary(n: float) -> None:
     above, below = media(50.0, n, n)
     np.testing.assert_array_equal(s_and_p(boundary.reflection(above, below, b)), 0.0)
     np.testing.assert_allclose(s_and_p(boundary.transmission(above, below, b)), 1.0, rtol=1e-15)
-    assert boundary.step(above, below) == 0.0
     assert boundary.relative_reflection(above, below, b).mean > 0.0
 
 

@@ -7,10 +7,10 @@ import pytest
 from cases import each
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.facets import FacetQuadrature, sample_facets, seen
-from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
+from polar_bayes.physics.facets import FacetQuadrature, Microsurface, seen
+from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import UniformSky
-from polar_bayes.physics.microfacet import GGX, Beckmann, SlopeEllipse
+from polar_bayes.physics.microfacet import GGX, Beckmann, SeparableShadowing, SlopeEllipse
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.surface import RoughSurface
 
@@ -52,14 +52,9 @@ def test_thirty_facets_are_enough(distribution: Beckmann | GGX) -> None:
 @each("zenith", [0.0, 30.0, 80.0])
 def test_no_facet_turns_its_back(zenith: float, side: float) -> None:
     view = jnp.array([side * zenith])
-    facets = sample_facets(
-        Beckmann(),
-        FacetQuadrature(),
-        SlopeEllipse(jnp.array([0.5]), jnp.array([0.5]), None),
-        sin_degrees(view),
-        cos_degrees(view),
-        seen,
-    )
+    surface = Microsurface(Beckmann(), SeparableShadowing(), FacetQuadrature())
+    ellipse = SlopeEllipse(jnp.array([0.5]), jnp.array([0.5]), None)
+    facets = surface.sample(ellipse, Geometry(view, view, view, view), seen)
     assert facets.weight.shape == (30, 1)
     assert np.all(facets.weight > 0.0)
     np.testing.assert_allclose(facets.cos_incidence**2 + facets.sin_squared, 1.0, rtol=1e-13)

@@ -13,6 +13,7 @@ from polar_bayes.physics.geometry import (
     cos_degrees,
     mirror_facet,
     mirror_slopes,
+    per_ray,
     sin_degrees,
     turn_between_frames,
 )
@@ -172,8 +173,8 @@ def test_the_wavelength_travels_with_the_directions() -> None:
     assert geometry.wavelength.shape == (2, 1)
     assert geometry.wavelength.dtype == jnp.float32
     assert geometry.dtype == jnp.float32
-    assert geometry.per_ray().wavelength.shape == (2, 1, 1)
-    assert geometry.per_ray().view_zenith.shape == (2, 1)
+    assert per_ray(geometry).wavelength.shape == (2, 1, 1)
+    assert per_ray(geometry).view_zenith.shape == (2, 1)
     np.testing.assert_array_equal(geometry.reversed().wavelength, colors)
 
 

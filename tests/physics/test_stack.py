@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from polar_bayes.physics import fresnel
 from polar_bayes.physics.boundary import Diattenuation
-from polar_bayes.physics.geometry import cos_degrees, sin_degrees
+from polar_bayes.physics.geometry import cos_degrees, per_ray, sin_degrees
 from polar_bayes.physics.stack import Layer, Stack
 
 RUN = settings(deadline=None, max_examples=60, derandomize=True)
@@ -41,21 +40,6 @@ def at(degrees: float) -> tuple:
 def one_by_one(power: Diattenuation) -> np.ndarray:
     difference = power.contrast * power.sin_squared
     return np.array([power.mean + difference, power.mean - difference, power.cross])
-
-
-@given(theta=zenith, n=index)
-@RUN
-def test_without_layers_it_is_fresnels_law(theta: float, n: float) -> None:
-    stack = Stack(jnp.asarray(n))
-    c, b = at(theta)
-    mean, contrast = fresnel.reflection(c, b, n)
-    found = reflect(stack, c, b)
-    np.testing.assert_allclose([found.mean, found.contrast], [mean, contrast], rtol=1e-13)
-    scaled = stack.relative_reflection(c, b).mean * stack.scale
-    np.testing.assert_allclose(scaled, mean, rtol=1e-12, atol=1e-300)
-    through = fresnel.transmission(c, n)
-    np.testing.assert_allclose(transmit(stack, c, b).mean, through, rtol=1e-13)
-    np.testing.assert_allclose(escape(stack), fresnel.escape(jnp.asarray(n)), rtol=1e-14)
 
 
 THICK = {
@@ -257,9 +241,8 @@ def test_absorption_in_a_coat_never_brings_light_back() -> None:
 
 @pytest.mark.thorough
 def test_shapes_broadcast_over_facets() -> None:
-    stack = Stack(
-        jnp.array([1.5, 1.6]), (Layer(jnp.array([1.3, 1.4]), jnp.asarray(0.1)),)
-    ).per_ray()
+    layers = (Layer(jnp.array([1.3, 1.4]), jnp.asarray(0.1)),)
+    stack = per_ray(Stack(jnp.array([1.5, 1.6]), layers))
     cosine = jnp.full((2, 5), 0.5)
     assert stack.reflection(cosine, 1.0 - cosine**2).mean.shape == (2, 5)
     assert stack.transmission(cosine, 1.0 - cosine**2).contrast.shape == (2, 5)

@@ -6,7 +6,6 @@ import pytest
 from cases import each
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics import fresnel
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.microfacet import Beckmann
 from polar_bayes.physics.stack import Stack
@@ -104,8 +103,9 @@ def test_half_space_agrees_with_the_closed_form_of_the_table(half_space: np.ndar
     n, anisotropy, albedo = half_space[:, :3].T
     reduced = albedo * (1.0 - anisotropy) / (1.0 - albedo * anisotropy)
     absorption = (1.0 - reduced) / reduced
-    outside = fresnel.hemispherical_reflection(n)
-    behind = outside + (1.0 - outside) * (1.0 - body_loss(absorption, fresnel.escape(n)))
+    stack = Stack(jnp.asarray(n))
+    entering = stack.hemispherical_transmission()
+    behind = 1.0 - entering * body_loss(absorption, stack.escape())
     np.testing.assert_allclose(behind, half_space[:, 6], rtol=1e-7)
 
 

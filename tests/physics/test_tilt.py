@@ -23,7 +23,7 @@ from polar_bayes.physics.instrument import (
     DolpGain,
     Instrument,
     TiltedNormal,
-    lean,
+    tilted_direction,
 )
 from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes, Beckmann
 from polar_bayes.physics.mixing import StokesMixing
@@ -150,8 +150,8 @@ def test_a_leaning_normal_is_light_and_viewer_rotated_the_other_way(
 def test_the_lean_is_the_one_that_its_names_say() -> None:
     """A normal that leans towards azimuth 0 brings a viewer there nearer to itself."""
     zenith, azimuth = jnp.array([30.0, 30.0]), jnp.array([0.0, 90.0])
-    towards_x = lean(zenith, azimuth, *(jnp.tan(jnp.deg2rad(x)) for x in (10.0, 0.0)))
-    towards_y = lean(zenith, azimuth, *(jnp.tan(jnp.deg2rad(x)) for x in (0.0, 10.0)))
+    towards_x = tilted_direction(zenith, azimuth, *(jnp.tan(jnp.deg2rad(x)) for x in (10.0, 0.0)))
+    towards_y = tilted_direction(zenith, azimuth, *(jnp.tan(jnp.deg2rad(x)) for x in (0.0, 10.0)))
     np.testing.assert_allclose(towards_x.zenith[0], 20.0, rtol=1e-14)
     np.testing.assert_allclose(towards_y.zenith[1], 20.0, rtol=1e-14)
     assert towards_x.zenith[1] > 30.0
@@ -227,7 +227,7 @@ def test_without_a_lean_nothing_changes(name: str) -> None:
 
 def test_no_lean_is_no_lean_to_the_last_bit() -> None:
     zenith = jnp.array([0.0, 1e-12, 1e-3, 45.0, 89.999, 89.9999999])
-    found = lean(zenith, jnp.full(6, 70.0), *jnp.zeros((2, 1)))
+    found = tilted_direction(zenith, jnp.full(6, 70.0), *jnp.zeros((2, 1)))
     np.testing.assert_array_equal(found.zenith, zenith)
     np.testing.assert_array_equal(found.azimuth, np.full(6, 70.0))
     np.testing.assert_array_equal(found.turn, [np.ones(6), np.zeros(6)])
@@ -252,7 +252,7 @@ def test_without_the_part_nothing_of_it_is_in_the_program() -> None:
 def test_below_the_horizon_counts_as_grazing() -> None:
     slopes = (jnp.tan(jnp.deg2rad(-20.0)), jnp.zeros(()))
     zenith = jnp.array([60.0, 69.99, 70.5, 80.0, 89.9, 89.9995])
-    found = np.asarray(lean(zenith, jnp.zeros(6), *slopes).zenith)
+    found = np.asarray(tilted_direction(zenith, jnp.zeros(6), *slopes).zenith)
     np.testing.assert_allclose(found, [80.0, 89.99, 89.999, 89.999, 89.999, 89.9995], rtol=1e-12)
 
 

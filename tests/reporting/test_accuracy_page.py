@@ -51,7 +51,7 @@ def test_the_report_lies_beside_its_file(tmp_path):
     again = pb.load(page.parent / "accuracy.nc")
     assert page.read_text() == render(again)
     with pytest.raises(pb.FitError, match="it goes with calibrations only"):
-        pb.report(make_accuracy(), tmp_path / "other", beside={})
+        pb.report(make_accuracy(), tmp_path / "other", comparisons={})
 
 
 def test_a_fit_that_holds_a_study_shows_it():

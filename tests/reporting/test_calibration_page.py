@@ -32,7 +32,7 @@ def broken() -> xr.DataTree:
 
 @pytest.fixture(scope="module")
 def page(good: xr.DataTree, broken: xr.DataTree) -> Page:
-    return Page(render(good, beside={"laplace": broken}))
+    return Page(render(good, comparisons={"laplace": broken}))
 
 
 def test_it_stands_alone_and_its_anchors_lead_somewhere(page: Page) -> None:
@@ -152,7 +152,7 @@ def evil_page() -> str:
     asked = {"names": names, "count": 40, "failed": (1,)}
     return render(
         make_calibration(**asked, **own, method=EVIL),
-        beside={EVIL + "2": make_calibration(**asked)},
+        comparisons={EVIL + "2": make_calibration(**asked)},
     )
 
 
@@ -188,13 +188,19 @@ def test_the_folder_holds_page_and_calibration(tmp_path: Path, broken: xr.DataTr
 def test_arguments_that_do_not_apply_are_refused(tmp_path: Path, good: xr.DataTree) -> None:
     fit = make_result(wavelengths=(), views=2, draws=10, variables=("dop",))
     for asked, says in (
-        ((fit, {"beside": {"laplace": good}}), "report: beside: it goes with calibrations only"),
-        ((good, {"truth": xr.Dataset()}), "report: truth: it goes with maps only"),
-        ((good, {"beside": {"laplace": fit}}), "report: beside laplace: it is no calibration"),
-        ((good, {"beside": {"importance": good}}), "give it another name"),
-        ((good, {"beside": {f"{at}": good for at in range(5)}}), "too many for one figure"),
         (
-            (good, {"beside": {"other": make_calibration(names=NAMES[:1])}}),
+            (fit, {"comparisons": {"laplace": good}}),
+            "comparisons: it goes with calibrations only",
+        ),
+        ((good, {"truth": xr.Dataset()}), "report: truth: it goes with maps only"),
+        (
+            (good, {"comparisons": {"laplace": fit}}),
+            "comparisons, laplace: it is no calibration",
+        ),
+        ((good, {"comparisons": {"importance": good}}), "give it another name"),
+        ((good, {"comparisons": {f"{at}": good for at in range(5)}}), "too many for one figure"),
+        (
+            (good, {"comparisons": {"other": make_calibration(names=NAMES[:1])}}),
             "it has other parameters than importance",
         ),
     ):

@@ -12,7 +12,7 @@ from synthetic_maps import make_maps
 from synthetic_results import make_result
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_result import MethodUsed, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.reporting.maps import count_cases
 from polar_bayes.reporting.report import render
 from polar_bayes.reporting.text import count_percent, map_headline
