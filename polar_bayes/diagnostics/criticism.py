@@ -45,6 +45,8 @@ CAUTION = 0.02
 """Probability, under a right model, that one check gives a caution or a problem."""
 PROBLEM = 0.004
 """Probability, under a right model, that one check gives a problem."""
+FAR = 0.01
+"""Prior probability beyond the posterior median, on both sides, of one parameter that is told."""
 REPLICATES = 1000
 MAX_READINGS = 600
 """Readings that the residual checks use; of more, evenly spaced ones."""
@@ -163,6 +165,7 @@ def _prior_conflict(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     farthest = min(1.0, two_sided.min() * len(labels))
     together = float(stats.chi2.sf(np.sum(score**2), len(labels)))
     p_value = min(1.0, 2.0 * min(farthest, together))
+    level = "caution" if _level(p_value) == "passed" and two_sided.min() < FAR else _level(p_value)
     worst = np.argsort(-score)
     names = [f"{labels[i]} {score[i]:.1f} sd" for i in worst if score[i] > 1.5]
     sentence = (
@@ -170,7 +173,7 @@ def _prior_conflict(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
         "the prior; a scene without what the readings show forces its parameters there, so try "
         "polar_bayes.compare_scenes, or state priors that hold for this object."
     )
-    return _finding(p_value, float(score.max()), sentence)
+    return Finding(level, p_value, float(score.max()), "" if level == "passed" else sentence)
 
 
 def _finding(p_value: float, statistic: float, sentence: str) -> Finding:
@@ -343,20 +346,27 @@ def _unit_vectors(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
 
 
 def _angle(residuals: _Residuals) -> Finding:
-    """Neighbors in direction with residuals of one sign, at the length scale that shows it most."""
+    """Neighbors with residuals of one sign, where a coordinate and a scale show it most."""
     view_zenith, view_azimuth, light_zenith, light_azimuth = residuals.directions.T
-    apart = sum(
-        np.sum((v[:, None] - v[None]) ** 2, axis=-1)
-        for v in (
-            _unit_vectors(view_zenith, view_azimuth),
-            _unit_vectors(light_zenith, light_azimuth),
-        )
+    view = _unit_vectors(view_zenith, view_azimuth)
+    light = _unit_vectors(light_zenith, light_azimuth)
+    half = (view + light) / np.maximum(np.linalg.norm(view + light, axis=1, keepdims=True), 1e-9)
+    # A wrong microfacet distribution errs by the tilt of the half vector, a wrong reflectance by
+    # the angle of incidence on the facet, a wrong body or instrument by the view zenith.
+    coordinates = (
+        np.hstack([view, light]),
+        np.arccos(np.clip(half[:, 2:], -1.0, 1.0)),
+        np.arccos(np.clip(np.sum(half * light, axis=1, keepdims=True), -1.0, 1.0)),
+        np.radians(view_zenith[:, None]),
     )
     same = residuals.group[:, None] == residuals.group[None]
-    kernels = [
-        np.where(same, np.exp(-0.5 * apart / math.radians(scale) ** 2), 0.0)
-        for scale in ANGLE_SCALES
-    ]
+    kernels = []
+    for x in coordinates:
+        apart = np.sum((x[:, None] - x[None]) ** 2, axis=-1)
+        kernels += [
+            np.where(same, np.exp(-0.5 * apart / math.radians(scale) ** 2), 0.0)
+            for scale in ANGLE_SCALES
+        ]
     p_value, statistic = _autocorrelation(residuals, kernels)
     sentence = (
         f"The residuals have structure over the angle ({_p_text(p_value)}): neighboring readings "
