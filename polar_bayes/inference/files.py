@@ -35,6 +35,7 @@ class Leaf(NamedTuple):
 CHOSEN_BY = {
     "capture": ", which the capture names",
     "caller": ", which the caller gave",
+    "comparison": ", chosen by a comparison of scenes",
     "default": ", by default, since neither the capture nor the caller named one",
 }
 
@@ -375,6 +376,21 @@ ACCURACY = Group(
 )
 """The group `accuracy`: a study of `polar_bayes.accuracy`."""
 
+_OF_SCENES = {
+    **dict.fromkeys(("elpd", "se", "elpd_diff", "dse", "weight", "unreliable"), ("scene",)),
+    **dict.fromkeys(("scene", "parts", "criticism", "seconds"), ("scene",)),
+    **dict.fromkeys(("mean", "sd", "low", "high"), ("scene", "parameter")),
+    **dict.fromkeys(("parameter", "between_share"), ("parameter",)),
+}
+SCENES = Group(
+    labeled=False,
+    names=tuple(_OF_SCENES),
+    variables=_OF_SCENES,
+    kinds=dict.fromkeys(("scene", "parameter", "parts", "criticism"), TEXTS),
+    attributes={"left_out": TEXT},
+)
+"""The group `scenes`: the comparison behind a fit with scene="auto"."""
+
 _FLAGS = ("valid", "saturated", "diverging", "reached_max_treedepth")
 _OF_READINGS = Group(DRAWS, tied=True, like=Like("observed_data", {"": DRAWS}))
 FIT = Schema(
@@ -402,6 +418,7 @@ FIT = Schema(
         "without_discrepancy": Group(DRAWS, labeled=False),
         "without_instrument": Group(DRAWS, labeled=False),
         "effects": LEDGER,
+        "scenes": SCENES,
         "accuracy": ACCURACY,
     },
     provenance=_FIT_PROVENANCE,
@@ -428,7 +445,8 @@ def choice_sentences(result: xr.DataTree) -> list[str]:
     """
     check_fit(result)
     provenance = provenance_of(result)
-    by = CHOSEN_BY.get(provenance.get("scene_chosen_by", ""), "")
+    chosen_by = "comparison" if "scenes" in result.children else provenance.get("scene_chosen_by")
+    by = CHOSEN_BY.get(str(chosen_by), "")
     links = (f"{name} by {link}" for name, link in provenance.get("links", {}).items())
     counts, limit = provenance.get("counts", {}), provenance.get("largest_view_zenith", 90.0)
     views, masked, used = (counts.get(name) or 0 for name in ("views", "masked", "used"))
