@@ -34,10 +34,10 @@ def test_the_table_has_a_row_per_parameter(
 def test_a_fit_whose_diagnostics_fail_is_written_and_exits_with_2(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:
-    from polar_bayes.inference import methods
+    from polar_bayes.inference import fitting
 
     short = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
-    monkeypatch.setitem(methods.METHODS, "nuts", short)
+    monkeypatch.setitem(fitting.METHODS, "nuts", short)
     out = tmp_path / "fit.nc"
     assert main(["fit", str(plate), "--scene", "picture", "--out", str(out)]) == 2
     assert "problem: " in capsys.readouterr().err
