@@ -37,7 +37,7 @@ def test_a_fit_whose_diagnostics_fail_is_written_and_exits_with_2(
     from polar_bayes.inference import fitting
 
     short = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
-    monkeypatch.setitem(fitting.METHODS, "nuts", short)
+    monkeypatch.setitem(fitting.METHODS, "nuts", lambda: short)
     out = tmp_path / "fit.nc"
     assert main(["fit", str(plate), "--scene", "picture", "--out", str(out)]) == 2
     assert "problem: " in capsys.readouterr().err
