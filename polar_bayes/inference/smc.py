@@ -221,11 +221,11 @@ class PixelSMC(AbstractPixelMethod):
     chain_length: int = 8
     init_factor: int = 2
     target_ess: float = 0.5
-    draws: int = 1024
+    draws: int = 2048
     components: int = 4
     rounds: int = 8
     num_attempts: int = 3
-    effective_draws: float = 200.0
+    effective_draws: float = 400.0
 
     def __post_init__(self) -> None:
         self._check_least(num_chains=16, chain_length=2, init_factor=1)

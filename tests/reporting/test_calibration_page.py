@@ -47,7 +47,10 @@ def test_it_stands_alone_and_its_anchors_lead_somewhere(page: Page) -> None:
 
 def test_the_verdict_comes_first(page: Page, broken: xr.DataTree) -> None:
     assert page.text.index("Calibrated.") < page.text.index("Parameters were drawn")
-    assert "The ranks of 3 parameters in 400 simulations pass a joint test" in page.text
+    assert (
+        "The ranks, coverage and spread of 3 parameters in 400 simulations pass a joint"
+        in page.text
+    )
     text = Page(render(broken)).text
     assert "Not calibrated." in text
     assert "roughness: intervals are too narrow (p = " in text
