@@ -48,7 +48,7 @@ study = pb.accuracy(
     capture,
     scene=plate,
     links=links,
-    rungs={name: pb.methods.STUDY_METHODS[name] for name in names},
+    methods={name: pb.methods.STUDY_METHODS[name] for name in names},
     overrides=(),
     fresh=False,
     reference=pb.benchmark.Reference(error=0.03),

@@ -17,6 +17,7 @@ the fit chooses the precision.
 import difflib
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from types import MappingProxyType
 from typing import override
 
 import jax
@@ -318,8 +319,8 @@ _ROWS: dict[str, dist.Distribution] = {
     "angle_zero": dist.Normal(0.0, 0.75),
     "beam_overlap_zenith": dist.TruncatedNormal(80.0, 5.0, low=45.0, high=89.0),
     # No set-up is free of smooth errors of some percent: a prior that allows none would let a
-    # few lucky readings claim an accuracy that no goniometer has.
-    "discrepancy_amplitude": dist.LogNormal(math.log(0.08), 0.5),
+    # few lucky readings claim an accuracy that no goniometer has. One in 400 is worse than 50%.
+    "discrepancy_amplitude": dist.LogNormal(math.log(0.08), 0.65),
     "discrepancy_weights": dist.Normal(0.0, 1.0).expand([4]).to_event(1),
     # The noise: scales that the data themselves determine. None may reach zero: where the scene
     # can match a few readings exactly, a scale of zero would have infinite posterior density.
@@ -334,6 +335,19 @@ _ROWS: dict[str, dist.Distribution] = {
 
 PRIORS = Priors(_ROWS)
 """Default prior of each parameter, by its name."""
+
+ANGLE_ZERO: Mapping[str, dist.Distribution] = MappingProxyType(
+    {
+        "stage": dist.Normal(0.0, 0.2),
+        "hand": PRIORS["angle_zero"],
+        "lens": dist.Normal(0.0, 3.0),
+    }
+)
+"""Prior of `angle_zero`, degree, by how the angles were set: by a rotary stage, by hand, or read
+from a picture through the geometry of its lens. What is not stated counts as by hand."""
+
+UNCHECKED_GAIN = dist.LogNormal(0.0, 0.3)
+"""Prior of `channel_gain_ratio` where the incident levels of both channels were not read."""
 
 _INDICES = (
     *("refractive_index", "refractive_index_location", "cauchy_a"),

@@ -10,13 +10,21 @@ from types import MappingProxyType
 import jax
 import numpy as np
 import pandas as pd
+import xarray as xr
 from numpyro import distributions as dist
 
 from polar_bayes.errors import SceneError
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import SCENES, Scene
-from polar_bayes.priors import PRIORS, describe_prior, resolve_priors
+from polar_bayes.priors import (
+    ANGLE_ZERO,
+    PRIORS,
+    UNCHECKED_GAIN,
+    Beta,
+    describe_prior,
+    resolve_priors,
+)
 from polar_bayes.repr_html import HTMLRepr
 
 __all__ = [
@@ -34,11 +42,13 @@ class Setup(HTMLRepr):
         scene: The optics.
         links: Likelihood link of each variable that such a capture may hold.
         largest_view_zenith: Views beyond it are set aside and counted. Unit degree.
+        priors: Distributions that replace those of `polar_bayes.PRIORS` in this set-up.
     """
 
     scene: Scene
     links: Mapping[str, AbstractLink]
     largest_view_zenith: float = 90.0
+    priors: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
 
 
 SETUPS: Mapping[str, Setup] = MappingProxyType(
@@ -60,6 +70,8 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             SCENES["goniometer"],
             {"q": StokesLink(degrees_of_freedom=4.0, stated_errors=True)},
             largest_view_zenith=78.0,
+            # A plate with an opaque back sends nothing from below: zero must not be an outlier.
+            priors={"subsurface_fraction": Beta(1.0, 3.0)},
         ),
     }
 )
@@ -74,6 +86,15 @@ def find_setup(name: str) -> Setup:
             hint=f"give one of {', '.join(SETUPS)}, or a polar_bayes.Scene",
         )
     return SETUPS[name]
+
+
+def default_priors(setup: Setup, capture: xr.Dataset) -> dict[str, dist.Distribution]:
+    """Priors of a set-up, and those that follow from how the capture says that it was made."""
+    attrs = capture.attrs
+    priors = {**setup.priors, "angle_zero": ANGLE_ZERO[attrs.get("angle_set_by", "hand")]}
+    if attrs.get("incident_levels") == "not given":
+        priors["channel_gain_ratio"] = UNCHECKED_GAIN
+    return {name: prior for name, prior in priors.items() if name in setup.scene.parameters}
 
 
 DRAWS = 10_000
@@ -99,7 +120,8 @@ def prior_table(
         FitError: A prior cannot be used, or belongs to no parameter of the scene.
     """
     rows = {}
-    for name, prior in resolve_priors(_names(scene, priors), priors).items():
+    own = find_setup(scene).priors if isinstance(scene, str) else {}
+    for name, prior in resolve_priors(_names(scene, priors), {**own, **(priors or {})}).items():
         draws = np.asarray(prior.sample(jax.random.key(0), (DRAWS,)))
         levels = np.quantile(draws, LEVELS).tolist()
         rows[name] = [*notation(name), describe_prior(prior), *levels]

@@ -14,28 +14,6 @@ GONIOMETER_VIEWS = np.arange(12.0, 79.0, 3.0)
 """How and where a plate on a goniometer is read, with all that is unknown of the instrument."""
 
 
-def plate_capture(zeniths: np.ndarray, error: float, seed: int) -> xr.Dataset:
-    """A plate of index 1.5 and fraction 0.02, with normal errors of q."""
-    zeniths = np.asarray(zeniths, float)
-    geometry = {
-        "view_zenith": zeniths,
-        "view_azimuth": np.full(zeniths.size, 180.0),
-        "light_zenith": zeniths,
-        "light_azimuth": np.zeros(zeniths.size),
-    }
-    truth = {"subsurface_fraction": 0.02, "refractive_index": 1.5}
-    q = np.asarray(PLATE.predict(truth, pb.Geometry.from_degrees(**geometry))["q"])
-    noise = np.random.default_rng(seed).normal(0.0, error, zeniths.size)
-    return xr.Dataset(
-        {name: ("view", angle) for name, angle in geometry.items()}
-        | {
-            "q": ("view", np.clip(q + noise, -1.0, 1.0)),
-            "q_error": ("view", np.full(zeniths.size, error)),
-        },
-        attrs={"name": "plate"},
-    )
-
-
 VIEWS = np.linspace(35.0, 75.0, 6)
 
 
@@ -56,3 +34,9 @@ def plates(index, error, views=VIEWS, fraction=0.02, seed=0) -> xr.Dataset:
         },
         attrs={"name": "plates"},
     )
+
+
+def plate_capture(zeniths: np.ndarray, error: float, seed: int) -> xr.Dataset:
+    """A plate of index 1.5 and fraction 0.02, with normal errors of q."""
+    plate = plates([1.5], error, np.asarray(zeniths, float), seed=seed).isel(patch=0)
+    return plate.drop_vars("true_refractive_index").assign_attrs(name="plate")

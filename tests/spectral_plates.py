@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from textbook import plate_q
 
 import polar_bayes as pb
 
@@ -51,8 +52,7 @@ def spectral_plate(
         "light_zenith": views,
         "light_azimuth": np.zeros(views.size),
     }
-    truth = {"subsurface_fraction": FRACTION, "refractive_index": values}
-    q = np.asarray(PLATE.predict(truth, pb.Geometry.from_degrees(**angles))["q"])
+    q = plate_q(values[:, None], FRACTION, np.radians(views))
     noise = np.random.default_rng(seed).normal(0.0, error, q.shape)
     return xr.Dataset(
         {name: ("view", angle) for name, angle in angles.items()}

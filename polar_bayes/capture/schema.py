@@ -211,6 +211,10 @@ def _clean_value(value: object, where: str) -> str | int | float:
 # --- Validation -----------------------------------------------------------------------------------
 
 
+ANGLE_SETTERS = ("stage", "hand", "lens")
+"""How the angles of a capture may have been set: by a rotary stage, by hand, through a lens."""
+
+
 def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
     """The capture, checked against the contract and written in one canonical form.
 
@@ -251,6 +255,9 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
     }
     _check_polarization(numbers, layout, valid, source)
     _check_intensity_units(numbers, source)
+    if dataset.attrs.get("angle_set_by", "hand") not in ANGLE_SETTERS:
+        what, hint = "no such way to set an angle", f"give one of {', '.join(ANGLE_SETTERS)}"
+        raise CaptureError(what, where=f"{source}: attribute angle_set_by", hint=hint)
     return xr.Dataset(
         {**numbers, **flags, **_truths(dataset, layout, source)},
         coords=_labels(dataset, layout, source),

@@ -73,6 +73,12 @@ def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Pa
     _save(pb.capture.combine(named, dim=dim, drop=drop), out)
 
 
+angle_option = option(
+    "--angle-set-by", default="hand",
+    help="How the angles were set (stage, hand or lens): how far their zero may be off.",
+)  # fmt: skip
+
+
 # --- Commands that import raw measurements --------------------------------------------------------
 
 
@@ -92,6 +98,7 @@ def import_() -> None:
 @option("--s-error", type=float, help="Absolute error of an s reading.")
 @option("--p-error", type=float, help="Absolute error of a p reading.")
 @option("--relative-error", type=float, default=0.01)
+@angle_option
 @wavelength_option
 @name_option
 @out_capture
@@ -112,6 +119,7 @@ def goniometer(out: Path, **settings: Any) -> None:
 )  # fmt: skip
 @option("--ignore", "ignored", multiple=True, metavar="COLUMN", help="Leave it out.")
 @option("--setup", help="Set-up that a fit takes by default.")
+@angle_option
 @option("--saturation-level", type=float, help="Intensity of a full pixel.")
 @name_option
 @out_capture

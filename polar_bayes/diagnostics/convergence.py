@@ -84,9 +84,12 @@ def summary(result: xr.DataTree) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index([s.label for s in found]))
 
 
-def verdict(result: xr.DataTree, table: pd.DataFrame | None = None) -> Verdict:
-    """Whether the numbers of a fit may be used; `table` is its summary, if computed already."""
+def verdict(
+    result: xr.DataTree, table: pd.DataFrame | None = None, criticism: pd.DataFrame | None = None
+) -> Verdict:
+    """Whether the numbers of a fit may be used; its summary and criticism, if computed already."""
     table = summary(result) if table is None else table
+    criticism = criticize(result) if criticism is None else criticism
     method, provenance = method_of(result), provenance_of(result)
     found = posterior_scalars(result)
     noted = (str(problem).rstrip(".") for problem in provenance.get("problems", ()))
@@ -95,7 +98,6 @@ def verdict(result: xr.DataTree, table: pd.DataFrame | None = None) -> Verdict:
     if method == "nuts":
         problems += _chain_problems(result, table)
     problems += _weight_problems(provenance, method)
-    criticism = criticize(result)
     against = criticism["sentence"].groupby(criticism["level"], sort=False).agg(list)
     cautions = (
         *_approximation_cautions(result, found, method),
@@ -117,13 +119,15 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
 
     Returns:
         Keys parameters (label to mean, sd, q2.5, q97.5, r_hat, ess_bulk, ess_tail), converged,
-        passed, problems, cautions, method, model, scene, seed, counts and timings.
+        passed, problems, cautions, criticism (check to level and p_value), method, model, scene,
+        seed, counts and timings.
 
     Raises:
         FitError: The tree holds no posterior.
     """
     table, provenance = summary(result), provenance_of(result)
-    found = verdict(result, table)
+    criticism = criticize(result)
+    found = verdict(result, table, criticism)
     shown = [column for column in COLUMNS if column != "mcse_mean"]
     about = {key: provenance.get(key) for key in ("model", "scene", "seed", "counts", "timings")}
     return {
@@ -135,6 +139,10 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
         "passed": found.passed,
         "problems": list(found.problems),
         "cautions": list(found.cautions),
+        "criticism": {
+            str(check): {"level": row["level"], "p_value": _number(row["p_value"])}
+            for check, row in criticism.iterrows()
+        },
         "method": method_of(result),
         **about,
     }

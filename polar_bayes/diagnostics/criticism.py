@@ -18,6 +18,7 @@ Evans & Moshonov (2006), Bayesian Analysis 1, 893 (prior-data conflict by tail p
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -44,6 +45,8 @@ CAUTION = 0.02
 """Probability, under a right model, that one check gives a caution or a problem."""
 PROBLEM = 0.004
 """Probability, under a right model, that one check gives a problem."""
+FAR = 0.01
+"""Prior probability beyond the posterior median, on both sides, of one parameter that is told."""
 REPLICATES = 1000
 MAX_READINGS = 600
 """Readings that the residual checks use; of more, evenly spaced ones."""
@@ -61,6 +64,19 @@ NOISE_FACTOR = "stokes_error_factor"
 LARGE_FACTOR = 3.0
 """Stated errors that are exceeded by this factor, with probability 97.5%, give a caution."""
 MAX_NAMED = 4
+QUESTIONS = {
+    "priors": "are posterior medians in the tails of their priors?",
+    "noise": "do the readings scatter more than their stated errors?",
+    "bounds": "does a parameter lie against a bound?",
+    "angle": "do neighboring directions err alike?",
+    "wavelength": "do the wavelengths of one view err alike?",
+    "outliers": "is a reading farther out than noise explains?",
+    "leave-one-out": "are leave-one-out PIT values uniform?",
+    "influence": "does a single reading decide the answer?",
+    "repeats": "was a view entered more than once?",
+}
+"""The checks in the order of the table, and what each asks."""
+CHECKS = tuple(QUESTIONS)
 COLUMNS = ("level", "p_value", "statistic", "sentence")
 
 
@@ -115,16 +131,13 @@ def criticize(result: xr.DataTree) -> pd.DataFrame:
     )
 
 
-CHECKS = (
-    *("priors", "noise", "bounds", "angle", "wavelength", "outliers"),
-    *("leave-one-out", "influence", "repeats"),
-)
-"""The checks in the order of the table."""
-
-
 def _table(findings: Mapping[str, Finding]) -> pd.DataFrame:
     rows = [dataclasses.astuple(findings[name]) for name in CHECKS]
     return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index(CHECKS, name="check"))
+
+
+def _p_text(p_value: float) -> str:
+    return "p < 1e-6" if p_value < 1e-6 else f"p = {p_value:.2g}"
 
 
 def _level(p_value: float) -> str:
@@ -152,14 +165,15 @@ def _prior_conflict(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     farthest = min(1.0, two_sided.min() * len(labels))
     together = float(stats.chi2.sf(np.sum(score**2), len(labels)))
     p_value = min(1.0, 2.0 * min(farthest, together))
+    level = "caution" if _level(p_value) == "passed" and two_sided.min() < FAR else _level(p_value)
     worst = np.argsort(-score)
     names = [f"{labels[i]} {score[i]:.1f} sd" for i in worst if score[i] > 1.5]
     sentence = (
-        f"Priors and data are in conflict (p = {p_value:.2g}): {_list(names)} from the center of "
+        f"Priors and data are in conflict ({_p_text(p_value)}): {_list(names)} from the center of "
         "the prior; a scene without what the readings show forces its parameters there, so try "
         "polar_bayes.compare_scenes, or state priors that hold for this object."
     )
-    return _finding(p_value, float(score.max()), sentence)
+    return Finding(level, p_value, float(score.max()), "" if level == "passed" else sentence)
 
 
 def _finding(p_value: float, statistic: float, sentence: str) -> Finding:
@@ -261,49 +275,53 @@ def _residuals(result: xr.DataTree) -> _Residuals | None:
     pick = random.permutation(len(noise))[:REPLICATES]
     centered = noise_free - noise_free.mean(axis=0)
     absorbed = (noise[pick] @ centered.T) @ centered / (len(centered) - 1)
-    directions, wavelength, group, labels = (
-        [entry for each in where for entry in each[part]] for part in range(4)
-    )
+    group = [name for each in where for name in each.group]
+    labels = [label for each in where for label in each.labels]
     groups = {name: number for number, name in enumerate(dict.fromkeys(group))}
     return _Residuals(
         observed=observed[keep] / sd - noise_free.mean(axis=0),
         replicated=noise[pick] - absorbed,
-        directions=np.array(directions)[keep],
-        wavelength=np.array(wavelength)[keep],
+        directions=np.concatenate([each.directions for each in where])[keep],
+        wavelength=np.concatenate([each.wavelength for each in where])[keep],
         group=np.array([groups[name] for name in group])[keep],
         labels=tuple(labels[i] for i in keep),
     )
 
 
-def _positions(
-    result: xr.DataTree, variable: FlatVariable
-) -> tuple[list[list[float]], list[float], list[str], list[str]]:
+class _Positions(NamedTuple):
+    """Where each reading of a variable was read."""
+
+    directions: np.ndarray  # (reading, 4), degree
+    wavelength: np.ndarray  # (reading,)
+    group: list[str]
+    labels: list[str]
+
+
+def _positions(result: xr.DataTree, variable: FlatVariable) -> _Positions:
     """Directions, wavelength, group and label of every reading of a variable."""
     reading = result["observed_data"].to_dataset()[variable.name]
     constants = result["constant_data"].to_dataset()
 
     def along(values: xr.DataArray) -> np.ndarray:
-        spread = values.broadcast_like(reading).transpose(*reading.dims)
-        return np.asarray(spread)[variable.usable]
+        whole = values.broadcast_like(reading).transpose(*reading.dims)
+        return np.asarray(whole)[variable.usable]
 
     angles = [along(constants[name]) for name in GEOMETRY]
-    wavelength = (
-        along(reading["wavelength"])
-        if "wavelength" in reading.coords and "wavelength" in reading.dims
-        else np.zeros(variable.observed.size)
-    )
-    others = [d for d in reading.dims if d not in ("view", "wavelength")]
-    index = [along(xr.DataArray(np.arange(reading.sizes[d]), dims=str(d))) for d in others]
+    wavelength = np.zeros(variable.observed.size)
+    if "wavelength" in reading.coords and "wavelength" in reading.dims:
+        wavelength = along(reading["wavelength"])
+    others = [str(dim) for dim in reading.dims if dim not in ("view", "wavelength")]
+    index = [along(xr.DataArray(np.arange(reading.sizes[dim]), dims=dim)) for dim in others]
     group = [
         " ".join([variable.name, *(str(each[i]) for each in index)])
         for i in range(variable.observed.size)
     ]
     colored = len(np.unique(wavelength)) > 1
     labels = [
-        f"{variable.name} at {zenith:g} degrees" + (f", {length:g} nm" if colored else "")
+        f"{variable.name} at {zenith:.3g} degrees" + (f", {length:g} nm" if colored else "")
         for zenith, length in zip(angles[0], wavelength, strict=True)
     ]
-    return np.stack(angles, axis=1).tolist(), wavelength.tolist(), group, labels
+    return _Positions(np.stack(angles, axis=1), wavelength, group, labels)
 
 
 GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
@@ -328,23 +346,30 @@ def _unit_vectors(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
 
 
 def _angle(residuals: _Residuals) -> Finding:
-    """Neighbors in direction with residuals of one sign, at the length scale that shows it most."""
+    """Neighbors with residuals of one sign, where a coordinate and a scale show it most."""
     view_zenith, view_azimuth, light_zenith, light_azimuth = residuals.directions.T
-    apart = sum(
-        np.sum((v[:, None] - v[None]) ** 2, axis=-1)
-        for v in (
-            _unit_vectors(view_zenith, view_azimuth),
-            _unit_vectors(light_zenith, light_azimuth),
-        )
+    view = _unit_vectors(view_zenith, view_azimuth)
+    light = _unit_vectors(light_zenith, light_azimuth)
+    half = (view + light) / np.maximum(np.linalg.norm(view + light, axis=1, keepdims=True), 1e-9)
+    # A wrong microfacet distribution errs by the tilt of the half vector, a wrong reflectance by
+    # the angle of incidence on the facet, a wrong body or instrument by the view zenith.
+    coordinates = (
+        np.hstack([view, light]),
+        np.arccos(np.clip(half[:, 2:], -1.0, 1.0)),
+        np.arccos(np.clip(np.sum(half * light, axis=1, keepdims=True), -1.0, 1.0)),
+        np.radians(view_zenith[:, None]),
     )
     same = residuals.group[:, None] == residuals.group[None]
-    kernels = [
-        np.where(same, np.exp(-0.5 * apart / math.radians(scale) ** 2), 0.0)
-        for scale in ANGLE_SCALES
-    ]
+    kernels = []
+    for x in coordinates:
+        apart = np.sum((x[:, None] - x[None]) ** 2, axis=-1)
+        kernels += [
+            np.where(same, np.exp(-0.5 * apart / math.radians(scale) ** 2), 0.0)
+            for scale in ANGLE_SCALES
+        ]
     p_value, statistic = _autocorrelation(residuals, kernels)
     sentence = (
-        f"The residuals have structure over the angle (p = {p_value:.2g}): neighboring readings "
+        f"The residuals have structure over the angle ({_p_text(p_value)}): neighboring readings "
         "err in the same direction, which noise does not, so the scene lacks what the readings "
         "show; look at the residuals in the report, and try polar_bayes.compare_scenes."
     )
@@ -360,7 +385,7 @@ def _wavelength(residuals: _Residuals) -> Finding:
     kernels = [np.where(same, sign, 0.0) for sign in (1.0, -1.0)]
     p_value, statistic = _autocorrelation(residuals, kernels)
     sentence = (
-        f"The residuals of one view depend on those at other wavelengths (p = {p_value:.2g}): the "
+        f"The residuals of one view depend on those at other wavelengths ({_p_text(p_value)}): the "
         "errors of the wavelengths are not independent, so intervals are too narrow; look at the "
         "residuals in the report."
     )
@@ -399,7 +424,7 @@ def _outliers(residuals: _Residuals) -> Finding:
     order = np.argsort(-np.abs(residuals.observed))
     names = [residuals.labels[i] for i in order[:1]]
     sentence = (
-        f"A reading is farther out than the noise explains (p = {p_value:.2g}): {names[0]}, "
+        f"A reading is farther out than the noise explains ({_p_text(p_value)}): {names[0]}, "
         f"{observed:.1f} times the rms residual; check it, or mark it valid=False."
     )
     return _finding(p_value, observed, sentence)
@@ -419,7 +444,7 @@ def _leave_one_out(checks: Mapping[str, PredictiveCheck]) -> Finding:
     worst = min(p_values, key=lambda name: p_values[name])
     p_value = min(1.0, p_values[worst] * len(p_values))
     sentence = (
-        f"The leave-one-out PIT values of {worst} are not uniform (p = {p_value:.2g}): the "
+        f"The leave-one-out PIT values of {worst} are not uniform ({_p_text(p_value)}): the "
         "readings do not scatter about their predictions as the link says; try another link, or "
         "polar_bayes.compare_scenes."
     )
@@ -446,7 +471,7 @@ def _influence(
         scores = (draws - draws.mean(axis=1, keepdims=True)) / draws.std(axis=1, keepdims=True)
         weights = check.loo.weights
         shift = np.abs(scores @ weights).max(axis=0)  # (reading,)
-        labels = _positions(result, variable)[3]
+        labels = _positions(result, variable).labels
         named += [(float(shift[i]), labels[i]) for i in np.flatnonzero(shift > LARGE_SHIFT)]
     if not named:
         return Finding("passed")

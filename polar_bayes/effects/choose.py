@@ -442,6 +442,8 @@ def choose_effects(
         "seed": request.seed,
         "links": json.dumps({name: repr(link) for name, link in request.links.items()}),
     }
+    own = {name: p for name, p in request.priors.items() if name in full.parameters}
+    priors = {**own, **(priors or {})}
     with jax.enable_x64(True):
         densities = SceneDensities(request, priors, progress or no_progress)
         # Unknown priors are refused before minutes are spent.

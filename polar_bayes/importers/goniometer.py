@@ -62,6 +62,7 @@ def from_goniometer(
     s_error: float | None = None,
     p_error: float | None = None,
     relative_error: float = 0.01,
+    angle_set_by: str = "hand",
     name: str | None = None,
 ) -> xr.Dataset:
     """A capture from goniometer readings of s and p light; see the module.
@@ -80,6 +81,8 @@ def from_goniometer(
         s_error: Standard deviation of s readings without light, > 0, in units of the readings.
         p_error: The same for p readings.
         relative_error: Standard deviation that grows with the reading, over the reading, in [0, 1).
+        angle_set_by: How the angles were set: "stage", "hand" or "lens"; a fit takes the prior of
+            `angle_zero` from it (`polar_bayes.priors.ANGLE_ZERO`).
         name: Name of the capture; default: that of the table.
 
     Returns:
@@ -112,6 +115,7 @@ def from_goniometer(
         incident_levels="not given" if s_incident is None else "given",
         dark_level=float(dark_level),
         relative_error=float(relative_error),
+        angle_set_by=angle_set_by,
         readings_at_zero=int(sum((c.light == 0.0).sum() for c in (s_channel, p_channel))),
         **given,
     )

@@ -45,6 +45,7 @@ def from_table(
     constants: Mapping[str, float] | None = None,
     ignored: Sequence[str] = (),
     setup: str | None = None,
+    angle_set_by: str = "hand",
     saturation_level: float | None = None,
     name: str | None = None,
 ) -> xr.Dataset:
@@ -58,6 +59,8 @@ def from_table(
         constants: Variables that are the same everywhere: `{"light_zenith": 45.0}`.
         ignored: Columns to leave out.
         setup: Which scene, links and limits a fit takes by default; None: the paper's.
+        angle_set_by: How the angles were set: "stage", "hand" or "lens"; a fit takes the prior of
+            `angle_zero` from it (`polar_bayes.priors.ANGLE_ZERO`).
         saturation_level: Intensity, > 0, at which the detector saturates.
         name: Name of the capture; default: that of the table.
 
@@ -91,7 +94,9 @@ def from_table(
         capture = combine(parts, dim=leading[0])
     else:
         capture = _capture(values, saturation_level)
-    capture = capture.assign_attrs(source=Path(source).name, name=name or Path(source).stem)
+    capture = capture.assign_attrs(
+        source=Path(source).name, name=name or Path(source).stem, angle_set_by=angle_set_by
+    )
     if setup is not None:
         capture.attrs["setup"] = setup
     return validate(capture, source=source)

@@ -22,7 +22,7 @@ from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import PriorTable, cast_prior, resolve_priors
-from polar_bayes.setups import SETUPS, Setup, find_setup
+from polar_bayes.setups import SETUPS, Setup, default_priors, find_setup
 
 MODELS: dict[str, Callable] = {
     "per_material": per_material,
@@ -100,9 +100,12 @@ def resolve(
     if not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed < 2**32:
         raise FitError(f"seed is {seed!r}", where="fit", hint="give an integer from 0 to 2**32 - 1")
     function = model if callable(model) else _find_model(model)
+    stated = {} if priors is None else priors
+    if isinstance(stated, Mapping):  # anything else is refused where the priors are read
+        stated = {**default_priors(setup, capture), **stated}
     with jax.enable_x64(precision == "double"):
         data = observe(capture, largest_view_zenith=limit)
-        found = _inspect(function, data, setup.scene, priors, chosen)
+        found = _inspect(function, data, setup.scene, stated, chosen)
     swapped = {
         "scene": not isinstance(scene, str),
         "model": callable(model),
@@ -116,7 +119,10 @@ def resolve(
         model_name=_name_of(model) if callable(model) else model,
         scene=setup.scene,
         scene_name=scene if isinstance(scene, str) else "custom",
-        priors=resolve_priors(found.priors, priors),
+        priors=resolve_priors(
+            found.priors,
+            {n: prior for n, prior in stated.items() if n in found.priors or n in (priors or {})},
+        ),
         declared=found.declared,
         fixed=found.fixed,
         links=chosen,

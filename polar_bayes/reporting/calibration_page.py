@@ -65,6 +65,10 @@ def calibration_page(
     headline, passed = text.calibration_headline(table, readings)
     first, *problems = text.verdict_after_headline(calibration)
     introduction = page.caption("calibration.introduction")
+    comparison: list[page.Block] = []
+    if others:
+        compared = compare_calibrations({method: calibration, **others})
+        comparison = [*comparison_sentences(compared), comparison_table(compared, titles)]
     shown = list(ranks.values())
     other_ranks = {name: figures.parameter_ranks(each) for name, each in others.items()}
     colors = f" Band and dots are those of {method}; the others are drawn over it."
@@ -82,10 +86,6 @@ def calibration_page(
     estimates = _paged(shown, figures.estimates, "estimates", max_intervals=MAX_INTERVALS)
     simulations = next(iter(ranks.values())).pit.size
     elsewhere = " What it is compared with stays where it is." if others else ""
-    comparison: list[page.Block] = []
-    if others:
-        compared = compare_calibrations({method: calibration, **others})
-        comparison = [*comparison_sentences(compared), comparison_table(compared, titles)]
     fits = [*_fit_tables(calibration, ranks), *page.make_facts(_fit_facts(calibration))]
     sections = [
         page.Section("parameters", "Parameters", [introduction, rank_table(table, ranks)]),

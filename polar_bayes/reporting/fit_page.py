@@ -12,6 +12,7 @@ from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
 from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, Verdict
+from polar_bayes.diagnostics.criticism import CAUTION, PROBLEM, QUESTIONS, criticize
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
     Scalar,
@@ -82,6 +83,7 @@ class Fit(NamedTuple):
     prior: pd.DataFrame
     method: str
     provenance: dict[str, Any]
+    criticism: pd.DataFrame
     verdict: Verdict
 
     def table(
@@ -115,12 +117,13 @@ class Fit(NamedTuple):
 
     def headline(self) -> str:
         """The verdict in one sentence."""
-        return text.fit_headline(self.method, self.verdict.passed, self.verdict.cautions)
+        return text.fit_headline(self.method, self.verdict)
 
 
 def read_fit(result: xr.DataTree) -> Fit:
     """Summaries of a result, which is checked first."""
     scalars, table = posterior_scalars(result), convergence.summary(result)
+    criticism = criticize(result)
     return Fit(
         result=result,
         posterior=result["posterior"].to_dataset(),
@@ -129,7 +132,8 @@ def read_fit(result: xr.DataTree) -> Fit:
         prior=sensitivity(result),
         method=method_of(result),
         provenance=provenance_of(result),
-        verdict=convergence.verdict(result, table),
+        criticism=criticism,
+        verdict=convergence.verdict(result, table, criticism),
     )
 
 
@@ -137,11 +141,11 @@ def fit_page(result: xr.DataTree) -> page.Page:
     """The page of a fit."""
     fit = read_fit(result)
     checks = predictive_checks(result)
-    is_point, converged = fit.method == "point", fit.verdict.passed
+    is_point, passed = fit.method == "point", fit.verdict.passed
     pooled = [] if is_point else populations(result)
     summary = population_summary(result)
     sentences = fit.determined()
-    if converged:
+    if passed:
         sentences += text.between_members(summary, pooled, fit.posterior)
         sentences += text.predictive_sentences(checks)
         sentences.append(text.trust(fit.method, fit.verdict.cautions, checks))
@@ -171,6 +175,12 @@ def fit_page(result: xr.DataTree) -> page.Page:
             "Prior and data",
         ),
         page.Section("convergence", approximation, _convergence(fit, has_draws), approximation),
+        page.Section(
+            "criticism",
+            "What the readings say against the model",
+            _criticism(fit),
+            "Model criticism",
+        ),
         page.Section("checks", "Predictive checks", _checks(result, checks)),
         page.Section("effects", "Effects", _effects(result)),
         page.Section("accuracy", "Accuracy against time", _accuracy(result)),
@@ -183,7 +193,7 @@ def fit_page(result: xr.DataTree) -> page.Page:
         name=text.capture_name(fit.provenance),
         subtitles=[text.made_by(fit.provenance, method), *filter(None, [swapped])],
         headline=fit.headline(),
-        passed=converged,
+        passed=passed,
         problems=fit.verdict.problems,
         sentences=sentences,
         cautions=fit.verdict.cautions,
@@ -250,6 +260,23 @@ def _prior(fit: Fit, has_draws: bool) -> Iterator[page.Block]:
     if has_draws and "prior" in fit.result.children:
         yield page.picture(plots_fit.plot_prior_posterior(fit.result), "fit.figure_prior")
     yield sensitivity_table(fit)
+
+
+def _criticism(fit: Fit) -> Iterator[page.Block]:
+    """The checks of the model, unless there is nothing to check."""
+    if fit.method == "point":
+        return
+    cells: page.Cells = {
+        "outcome": lambda row: (
+            f"{row['level']} (fails)" if row["level"] == "problem" else row["level"]
+        ),
+        "p": column("p_value", ".2g"),
+        "what it says": lambda row: row["sentence"] or DASH,
+    }
+    caption = page.caption("fit.criticism", caution=CAUTION, problem=PROBLEM)
+    yield page.make_table(
+        "criticism", caption, cells, fit.criticism, descriptions=QUESTIONS, prose=["what it says"]
+    )
 
 
 # --- Populations and spectra ----------------------------------------------------------------------

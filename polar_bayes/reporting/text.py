@@ -17,6 +17,7 @@ from polar_bayes.benchmark.advice import accuracy_dataset
 from polar_bayes.calibration.scores import is_calibrated, p_values, significance_level
 from polar_bayes.calibration.verdict import calibration_verdict
 from polar_bayes.diagnostics.compare import FitComparison
+from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.population import Population
 from polar_bayes.diagnostics.predictive import PitBand, PredictiveCheck, pit_band
@@ -131,14 +132,17 @@ METHODS = {
 HELD, PRIOR = " held fixed", "prior of "
 
 
-def fit_headline(method: str, converged: bool, cautions: Sequence[str]) -> str:
+def fit_headline(method: str, verdict: Verdict) -> str:
     """The verdict in one sentence."""
-    if not converged:
+    name = METHODS.get(method, "The method")
+    if not verdict.converged:
         failed = "did not converge" if method == "nuts" else "failed"
-        return f"{METHODS.get(method, 'The method')} {failed}: do not use these numbers."
+        return f"{name} {failed}: do not use these numbers."
     passed = {"nuts": "converged", "point": "met its tolerance"}.get(method, "raised no alarm")
-    headline = f"{METHODS.get(method, 'The method')} {passed}."
-    return f"{headline} Mind the cautions." if cautions else headline
+    if not verdict.passed:
+        against = "but the readings speak against the model: do not use these intervals."
+        return f"{name} {passed}, {against}"
+    return f"{name} {passed}." + (" Mind the cautions." if verdict.cautions else "")
 
 
 def made_by(provenance: Mapping[str, Any], method: str) -> str:

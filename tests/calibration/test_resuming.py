@@ -1,6 +1,5 @@
 """A calibration that was broken off goes on to the same bits; another question is refused."""
 
-import importlib
 import json
 import os
 import shutil
@@ -23,6 +22,8 @@ from polar_bayes.models.per_material import per_material
 import polar_bayes as pb
 from polar_bayes import interrupts
 from polar_bayes.calibration import runner as module
+from polar_bayes.calibration.calibrate import METHODS, make_plan
+from polar_bayes.inference.request import resolve
 from polar_bayes.maps.blocks import digest, locked_ledger
 
 ASKED = {
@@ -198,18 +199,13 @@ def test_a_damaged_ledger_is_refused_and_can_be_removed(capture, whole, begun, t
 
 
 @pytest.mark.thorough
-def test_a_plan_that_was_sent_makes_the_same_block(capture, whole, monkeypatch) -> None:
+def test_a_plan_that_was_sent_makes_the_same_block(capture, whole) -> None:
     """As a worker gets it."""
-    sent: list = []
-    monkeypatch.setattr(
-        importlib.import_module("polar_bayes.calibration.calibrate"),
-        "fit_block",
-        lambda plan, numbers: sent.append(plan) or module.fit_block(plan, numbers),
-    )
-    pb.calibrate(capture, simulations=20, **ASKED)
-    plan = cloudpickle.loads(cloudpickle.dumps(sent[0]))
-    assert plan.key == sent[0].key
-    found = module.fit_block(plan, np.array([17, 3]))
+    request = resolve(capture, ASKED["model"], PLATE, None, LINKS, None, 0, "double")
+    plan = make_plan(request, None, METHODS["tempered"], True)
+    sent = cloudpickle.loads(cloudpickle.dumps(plan))
+    assert sent.key == plan.key
+    found = module.fit_block(sent, np.array([17, 3]))
     for name, pit in found.pit.items():
         np.testing.assert_array_equal(pit, whole["prior_sbc"][name].to_numpy()[[17, 3]])
     for name, pit in found.left_out.items():

@@ -48,7 +48,7 @@ def test_calibrate_prints_a_table_and_writes_every_fit(
 def test_identify_says_what_is_told_and_where_to_look(
     plate: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["identify", str(plate), "--next-views", "2"]
+    words = ["identify", str(plate), "--next-views", "2", "--scene", "picture"]
     assert main([*words, "--criterion", "refractive_index", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert 0.0 < told["parameters"]["refractive_index"]["prior_share"] < 0.5

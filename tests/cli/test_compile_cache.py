@@ -100,7 +100,7 @@ def simulate(*_, **__):
     import jax  # which reads the environment now
     for shape in range(1, 4):
         jax.jit(lambda x: x + 1.0)(jax.numpy.ones(shape))
-    raise pb.CaptureError("it is broken", where="x.nc", mend="give another")
+    raise pb.CaptureError("it is broken", where="x.nc", hint="give another")
 
 pb.simulate = simulate
 sys.argv = ["polar-bayes", "simulate", "--out", "x.nc"]

@@ -115,7 +115,7 @@ NOISY = """
         warnings.warn("consolidated metadata is not part of the specification")
         for name in ("jit_a", "jit_b"):
             warnings.warn(f"Error reading persistent compilation cache entry for '{name}': x")
-        raise pb.CaptureError("it is broken", where="x.nc", mend="give another")
+        raise pb.CaptureError("it is broken", where="x.nc", hint="give another")
 
     pb.simulate = simulate
     sys.argv = ["polar-bayes", "simulate", "--out", "x.nc"]

@@ -158,7 +158,7 @@ DOUBLE = {
     "grooves under a disc, of their own color",
     "a plate under film and coat",
 }
-SINGLE = {"a plate under film and coat"}
+SINGLE = {"goniometer"}
 FIRST = [(n, dtype) for n, dtype in RUNS if n in (SINGLE if dtype == np.float32 else DOUBLE)]
 
 

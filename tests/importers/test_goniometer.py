@@ -75,6 +75,7 @@ def test_attributes_tell_how_it_was_measured(tmp_path):
         "source": "arrays",
         "setup": "goniometer",
         "incident_levels": "given",
+        "angle_set_by": "hand",
         "dark_level": 0.0,
         "readings_at_zero": 0,
     }

@@ -40,7 +40,8 @@ def test_each_line_is_a_view(write):
     assert set(capture["dop_error"].values) == {0.01}
     assert capture["wavelength"].item() == 550.0
     assert capture["intensity"].attrs["saturation_level"] == 1023.0
-    assert capture.attrs == {"source": "leaf.csv", "setup": "camera", "name": "leaf"}
+    stated = {"source": "leaf.csv", "setup": "camera", "name": "leaf"}
+    assert capture.attrs == {**stated, "angle_set_by": "hand"}
 
 
 def test_columns_of_other_names_are_said_and_the_rest_ignored(write):

@@ -222,13 +222,17 @@ def test_intervals_hold_the_truth_as_often_as_they_say(image: xr.Dataset, maps: 
 
 
 @pytest.mark.thorough
-def test_single_precision_finds_the_same_maps(image: xr.Dataset, maps: xr.Dataset) -> None:
+def test_single_precision_finds_the_same_maps(image: xr.Dataset) -> None:
     corner = image.isel(y=slice(10), x=slice(10))
-    single = mapped(corner, planned(corner, PixelLaplace(sampler=None), precision="single"))
-    double = maps.isel(y=slice(10), x=slice(10))
-    weighted = (double["approach"] == MethodUsed.IMPORTANCE).values
-    weighted &= (single["approach"] == MethodUsed.IMPORTANCE).values
+    single, double = (
+        mapped(corner, planned(corner, PixelLaplace(sampler=None), precision=precision))
+        for precision in ("single", "double")
+    )
+    assert (single["approach"] == double["approach"]).all()
+    weighted = double["approach"].isin([MethodUsed.IMPORTANCE, MethodUsed.ADAPTED])
     assert weighted.mean() > 0.75  # the others are for the sampler, which is not asked here
+    at_once = (double["approach"] == MethodUsed.IMPORTANCE).values
+    assert at_once.mean() > 0.5  # adapted proposals carry errors further than the bound below
     for name in NAMES:
         sd = double[f"{name}_sd"].values
         # A reading is predicted to some 30 units of the last digit, 4e-6: 2e-4 of its noise. Six
@@ -236,7 +240,7 @@ def test_single_precision_finds_the_same_maps(image: xr.Dataset, maps: xr.Datase
         # carry as much again, and the maps are kept to 1e-7 of values of order 1: together 2e-3.
         for ending in ("", "_sd", "_quantile"):
             apart = np.abs(double[f"{name}{ending}"].values - single[f"{name}{ending}"].values) / sd
-            assert apart[..., weighted].max() < 2e-3, (name, ending)
+            assert apart[..., at_once].max() < 2e-3, (name, ending)
 
 
 # --- what a map is and what is refused ------------------------------------------------------------

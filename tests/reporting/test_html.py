@@ -174,8 +174,12 @@ def test_a_comparison_that_failed_is_told() -> None:
 
 def test_it_says_whether_intervals_can_be_trusted(small) -> None:
     assert "Nothing here speaks against the intervals." in small[1].text
-    scattered = Page(render(make_result(**{**SMALL, "views": 60}, noise=4.0))).text
-    assert "Trust the intervals with care" in scattered
+    scattered = Page(render(make_result(**{**SMALL, "draws": 250}, noise=4.0))).text
+    assert "Nothing here speaks against" not in scattered
+    assert "The fit converged, but the readings speak against the model" in scattered
+    assert "problem (fails)" in scattered
+    repeated = edit_provenance(make_result(**SMALL), prior_probability={"roughness": [0.997]})
+    assert "Trust the intervals with care" in Page(render(repeated)).text
 
 
 @pytest.mark.thorough
