@@ -188,6 +188,9 @@ DRAW_BATCH = 64
 """Draws of one pixel that are evaluated together: more are shared among cores that then wait for
 each other."""
 
+ENGINE = "tempered"
+"""Key of the engine among the programs of a model."""
+
 FIRST_KEY = np.uint32(2**32 - 1)
 """Number of the random key of the first particles; those of rounds count up from 0."""
 
@@ -417,6 +420,21 @@ class Tempered(AbstractMethod):
         changed = dataclasses.replace(self.settings, draws=half, effective_draws=effective)
         return dataclasses.replace(self, settings=changed)
 
+    def is_compiled(self, problem: Problem) -> bool:
+        """Whether `run` finds all of its programs in the cache.
+
+        Args:
+            problem: The capture and its model.
+
+        Returns:
+            False where it must compile, which takes longer than many chains.
+        """
+        engine = problem.compiled_model.programs.get(ENGINE)
+        if engine is None:
+            return False
+        keys = ((make, self.settings) for make in (_particles, _mixture_draws))
+        return all(engine.programs.get(key) is not None for key in keys)
+
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
         if not problem.is_one_spectrum_point:
@@ -479,7 +497,7 @@ def _engine(model: CompiledModel) -> BatchEngine:
     def make() -> BatchEngine:
         return BatchEngine(model.program, model.single, model.layout, model.precision)
 
-    return model.programs.of("tempered", make)
+    return model.programs.of(ENGINE, make)
 
 
 def _batch_of_one(data: Observations) -> ObservationBatch:

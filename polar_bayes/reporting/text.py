@@ -455,6 +455,8 @@ APPROACHES = {
     "adapted": "a proposal fitted to its own draws and corrected by weights",
     "nuts": "sampling (NUTS)",
     "tempered": "tempered draws",
+    "variational": "a variational guide",
+    "other": "a method of the user's own",
 }
 
 
