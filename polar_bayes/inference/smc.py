@@ -322,7 +322,7 @@ def _attempt(
             return
         count("rounds")
         transform = take_rows(smc.transform, left)
-        this = Round(np.uint32(number), transform, np.float32(u), np.float32(weights))
+        this = Round(np.uint32(number), transform, u.astype("f4"), weights.astype("f4"))
         drawn = draw(this, np.arange(left.size), again=False)
         sample = combine_samples(drawn if last is None else last[1], drawn)
         possible = np.isfinite(sample.weights).all(axis=-1)
