@@ -12,6 +12,7 @@ from . import maps as maps
 from . import models as models  # type: ignore[attr-defined]
 from . import physics as physics
 from . import reporting as reporting
+from . import scenes as scenes
 from . import setups as setups
 from . import simulation as simulation
 from .benchmark.accuracy import accuracy as accuracy
@@ -38,7 +39,6 @@ from .importers.images import (
 )
 from .importers.table import from_table as from_table
 from .inference import methods as methods
-from .inference.fitting import fit as fit
 from .maps.fit_map import fit_pixels as fit_pixels
 from .observation import links as links
 from .physics import instrument as instrument
@@ -82,4 +82,6 @@ from .results import (
     summary as summary,
     verdict as verdict,
 )
+from .scenes.comparison import compare_scenes as compare_scenes
+from .scenes.fitting import fit as fit
 from .simulation import simulate as simulate

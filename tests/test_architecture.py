@@ -27,6 +27,7 @@ LAYERS = (
     ("polar_bayes.inference",),
     ("polar_bayes.maps",),
     ("polar_bayes.diagnostics",),
+    ("polar_bayes.scenes",),
     ("polar_bayes.calibration", "polar_bayes.design"),
     ("polar_bayes.effects",),
     ("polar_bayes.benchmark",),

@@ -8,6 +8,7 @@ import click
 import polar_bayes as pb
 from polar_bayes.cli.options import (
     FIT_METHOD,
+    FIT_SCENE,
     FOLDER,
     INPUT,
     NOT_CONVERGED,
@@ -79,7 +80,10 @@ def _make_folder(folder: Path) -> None:
     help="point, laplace, importance, tempered, nuts, or auto: the cheapest that is good enough.",
 )  # fmt: skip
 @option("--seconds", type=float, help="Of --method auto; 60 by default.")
-@scene_option
+@option(
+    "--scene", type=FIT_SCENE,
+    help="Named set-up; by default the one that the capture names. auto: what `scenes` finds.",
+)  # fmt: skip
 @view_limit_option
 @option("--choose-effects", "choose", is_flag=True, help="Fit what `effects` would keep.")
 @option("--tolerance", type=float, help="Of --choose-effects and --method auto; 0.1 sd.")
@@ -111,7 +115,7 @@ def fit(
         settings |= {"tolerance": tolerance} if is_auto else {}
         result = pb.fit(data, scene=scene, progress=progress, **settings)
     pb.save(result, out)
-    for sentence in pb.inference.auto_sentences(result):
+    for sentence in (*pb.inference.auto_sentences(result), *pb.scenes.scene_sentences(result)):
         click.echo(sentence, err=True)
     if not as_json:
         return print_fit(result)

@@ -42,6 +42,7 @@ class Name(click.ParamType):
 
 MODEL = Name("model", ("per_material", "hierarchical", "gp_spectral"), FitError)
 SCENE = Name("scene", ("paper", "camera", "picture", "goniometer"), SceneError)
+FIT_SCENE = Name("scene", (*SCENE.names, "auto"), SceneError)
 MATERIAL = Name("material", ("leaf", "fruit", "plastic", "coating", "glass", "water"), CaptureError)
 FIT_METHOD = Name(
     "method", ("nuts", "laplace", "point", "importance", "tempered", "auto"), FitError

@@ -5,4 +5,5 @@ from .compare import (
 )
 from .convergence import json_summary as json_summary
 from .coverage import map_coverage as map_coverage
+from .criticism import criticize as criticize
 from .population import population_summary as population_summary

@@ -80,7 +80,7 @@ def compare_fits(fits: Mapping[str, xr.DataTree]) -> FitComparison:
     (first, reference), *others = named.items()
     for name, fit in others:
         _check_same_capture(reference, fit, first, name)
-    loo, left_out = _loo(named)
+    loo, left_out = compare_predictions(named)
     return FitComparison(
         parameters=_parameters(named, tables),
         loo=loo,
@@ -126,8 +126,8 @@ def _agree(one: xr.DataArray, other: xr.DataArray | None) -> bool:
     return bool(np.allclose(first[both], second[both], rtol=1e-9, atol=1e-12))
 
 
-def _loo(fits: Mapping[str, xr.DataTree]) -> tuple[pd.DataFrame, dict[str, str]]:
-    """Expected log density of each reading given all others, by fit; and why there is none."""
+def compare_predictions(fits: Mapping[str, xr.DataTree]) -> tuple[pd.DataFrame, dict[str, str]]:
+    """Expected log density of each reading given all others, best fit first; why some have none."""
     left_out, found, used = {}, {}, {}
     for name, fit in fits.items():
         parts = {n: check.loo for n, check in sorted(predictive_checks(fit).items())}

@@ -284,7 +284,7 @@ def _residuals(result: xr.DataTree) -> _Residuals | None:
         directions=np.concatenate([each.directions for each in where])[keep],
         wavelength=np.concatenate([each.wavelength for each in where])[keep],
         group=np.array([groups[name] for name in group])[keep],
-        labels=tuple(labels[i] for i in keep),
+        labels=tuple(str(labels[i]) for i in keep),
     )
 
 

@@ -1,4 +1,3 @@
 from . import methods as methods
 from .files import auto_sentences as auto_sentences
-from .fitting import fit as fit
 from .spectrum import predict_spectrum as predict_spectrum

@@ -365,6 +365,21 @@ ACCURACY = Group(
 )
 """The group `accuracy`: a study of `polar_bayes.accuracy`."""
 
+_OF_SCENES = {
+    **dict.fromkeys(("elpd", "se", "elpd_diff", "dse", "weight", "unreliable"), ("scene",)),
+    **dict.fromkeys(("scene", "parts", "criticism", "seconds"), ("scene",)),
+    **dict.fromkeys(("mean", "sd", "low", "high"), ("scene", "parameter")),
+    **dict.fromkeys(("parameter", "between_share"), ("parameter",)),
+}
+SCENES = Group(
+    labeled=False,
+    names=tuple(_OF_SCENES),
+    variables=_OF_SCENES,
+    kinds=dict.fromkeys(("scene", "parameter", "parts", "criticism"), TEXTS),
+    attributes={"left_out": TEXT},
+)
+"""The group `scenes`: the comparison behind a fit with scene="auto"."""
+
 _FLAGS = ("valid", "saturated", "diverging", "reached_max_treedepth")
 _OF_READINGS = Group(DRAWS, tied=True, like=Like("observed_data", {"": DRAWS}))
 FIT = Schema(
@@ -392,6 +407,7 @@ FIT = Schema(
         "without_discrepancy": Group(DRAWS, labeled=False),
         "without_instrument": Group(DRAWS, labeled=False),
         "effects": LEDGER,
+        "scenes": SCENES,
         "accuracy": ACCURACY,
     },
     provenance=_FIT_PROVENANCE,

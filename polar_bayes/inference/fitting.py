@@ -1,4 +1,4 @@
-"""The public verb of one capture: a capture in, an ArviZ DataTree out."""
+"""One capture and one scene in, an ArviZ DataTree out."""
 
 import dataclasses
 import inspect
@@ -31,7 +31,7 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior, support_bounds
-from polar_bayes.progress import Progress, no_progress, with_progress
+from polar_bayes.progress import Progress, no_progress
 
 PRIOR_DRAWS = 500
 
@@ -50,7 +50,6 @@ METHODS: Mapping[str, Callable[[], AbstractMethod]] = {
 """Methods that `fit` knows by name; a function makes each, because it loads what it needs."""
 
 
-@with_progress
 def fit(
     capture: xr.Dataset,
     *,
@@ -66,52 +65,23 @@ def fit(
     precision: str = "double",
     progress: Progress | None = None,
 ) -> xr.DataTree:
-    """Fit one capture.
-
-    Args:
-        capture: A Dataset of the capture schema; validated here.
-        model: A name in `polar_bayes.inference.request.MODELS` or a callable
-            `model(data, scene, priors, links)`.
-        method: "nuts", "laplace", "point", "importance" (Laplace, its draws weighted by the
-            posterior), "tempered" (adaptive tempered SMC from the prior to the posterior; one
-            material in one color), "auto" (the cheapest of these that is good enough), or settings
-            such as `Nuts(draws=2000)`.
-        tolerance: Of "auto": largest error of a posterior mean or standard deviation, in posterior
-            standard deviations, above 0 and at most 1; by default 0.1.
-        seconds: Of "auto": wall time of the whole fit, by default 60. Only the first method always
-            ends; what is not done by then is abandoned, and the best answer so far is returned.
-        scene: A name in `SETUPS` or a `Scene`; by default the set-up that the capture names in
-            its attribute `setup`, else "paper".
-        priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
-        links: One link for the polarization, or a mapping from variable to link.
-        largest_view_zenith: Views beyond it are set aside and counted. Unit degree.
-        seed: The same seed gives the same result on the same machine, unless "auto" ran out of
-            time.
-        precision: "double" or "single".
-        progress: Called with the name of a stage and the fraction of it that is done.
-
-    Returns:
-        A DataTree with the groups posterior, sample_stats, log_likelihood, log_prior,
-        posterior_predictive, noise_free, prior, prior_predictive, observed_data and
-        constant_data, and effects for a scene of `polar_bayes.choose_effects`;
-        `polar_bayes.verdict` says whether it converged, and
-        `polar_bayes.inference.auto_sentences` what "auto" did and why.
-
-    Raises:
-        CaptureError: The capture does not hold what a fit needs.
-        SceneError: No such scene.
-        FitError: A model, method, prior or link cannot be used, or the memory is too small.
-    """
+    """Fit one capture by one scene; `polar_bayes.fit` describes the arguments."""
     start_time = time.perf_counter()
-    chosen = _find_method(method, tolerance, seconds)
+    chosen = find_method(method, tolerance, seconds)
     request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, precision)
     with jax.enable_x64(precision == "double"):
-        return _fit(request, chosen, progress or no_progress, start_time)
+        return fit_request(request, chosen, progress or no_progress, start_time)
 
 
-def _fit(
-    request: Request, method: AbstractMethod, progress: Progress, start_time: float
+def fit_request(
+    request: Request,
+    method: AbstractMethod,
+    progress: Progress,
+    start_time: float,
+    *,
+    with_comparisons: bool = True,
 ) -> xr.DataTree:
+    """The fit of a request, in the precision that is switched on."""
     key, key_comparisons, key_posterior, key_prior = jax.random.split(
         jax.random.key(request.seed), 4
     )
@@ -131,7 +101,11 @@ def _fit(
     prior = problem.predict(key_prior, prior_z[None])
     timings.record("prediction")
 
-    comparisons, failed = _fit_comparisons(request, method, draws, key_comparisons, progress)
+    comparisons, failed = (
+        _fit_comparisons(request, method, draws, key_comparisons, progress)
+        if with_comparisons
+        else ({}, {})
+    )
     if isinstance(request.scene.ledger, xr.Dataset):
         comparisons["effects"] = request.scene.ledger  # how the scene was chosen
     timings.record("comparisons")
@@ -159,7 +133,7 @@ def _fit(
     )
 
 
-def _find_method(
+def find_method(
     method: str | AbstractMethod, tolerance: float | None, seconds: float | None
 ) -> AbstractMethod:
     """The settings that a caller asks for, by name or as they are."""

@@ -2,16 +2,21 @@
 
 Source:
     Tierney and Kadane (1986), J. Am. Stat. Assoc. 81, 82-86: the approximation; Vehtari, Simpson,
-    Gelman, Yao & Gabry (2024), JMLR 25(72): Pareto-smoothed importance sampling.
+    Gelman, Yao & Gabry (2024), JMLR 25(72): Pareto-smoothed importance sampling; Cappe, Douc,
+    Guillin, Marin & Robert (2008), Stat. Comput. 18, 447-459: population Monte Carlo; Cornuet,
+    Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), 798-812: weights over all rounds.
 """
 
 import dataclasses
 import functools
+import math
 from typing import override
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.optimize
+import scipy.special
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
@@ -19,7 +24,7 @@ from polar_bayes.inference.initialization import STARTS
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import SETTLED, Modes
 from polar_bayes.inference.problem import Problem
-from polar_bayes.inference.proposals import Mixture, draw_mixture, log_density
+from polar_bayes.inference.proposals import Mixture, draw_mixture, fit_mixture, log_density
 from polar_bayes.inference.psis import (
     MAX_PARETO_K,
     effective_draws,
@@ -90,36 +95,45 @@ class Importance(AbstractMethod):
     Draws come from a mixture of Student t distributions with 8 degrees of freedom, one at each
     mode that holds 0.1% of the Laplace evidence or more, as heavy as its evidence. Weighting them
     by the posterior corrects what the normal approximation gets wrong, as far as the mixture
-    reaches; Pareto k-hat says how far.
+    reaches; Pareto k-hat says how far. In further rounds a mixture that is fitted to the weighted
+    draws of all rounds before proposes as many draws again, until there are enough effective ones.
 
     Args:
-        draws: Of the mixture, at least 256.
+        draws: Of the mixture of each round, at least 256.
+        rounds: At most, at least 1.
 
     Raises:
-        FitError: Fewer draws.
+        FitError: Fewer draws or rounds.
     """
 
     draws: int = 4096
+    rounds: int = 1
 
     def __post_init__(self) -> None:
         if self.draws < 256:
             raise FitError(f"draws is {self.draws}", where="Importance", hint="give at least 256")
+        if self.rounds < 1:
+            raise FitError(f"rounds is {self.rounds}", where="Importance", hint="give at least 1")
 
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
         initialization = problem.initialize(progress)
-        proposal = laplace_mixture(initialization.joint_modes("Importance"), problem.dtype)
         key_draw, key_resample = jax.random.split(key)
-        z, log_proposal = (np.asarray(x) for x in _propose(proposal, self.draws, key_draw))
-        log_ratios = problem.log_density(z) - log_proposal
-        weights, k_hat = (x[0] for x in smooth(log_ratios[None]))
+        sample = _Rounds(problem, self)
+        proposal = laplace_mixture(initialization.joint_modes("Importance"), problem.dtype)
+        sample.add(proposal, key_draw)
+        while sample.calls_for_more and len(sample.proposals) < self.rounds:
+            progress("weighting draws", len(sample.proposals) / self.rounds)
+            key_draw, key_fit = jax.random.split(key_draw)
+            sample.add(sample.fit(key_fit), key_draw)
+        z, weights, k_hat = sample.z, sample.weights, sample.k_hat
         if not np.isfinite(weights).all():
             raise FitError(
                 "the posterior density is zero at every draw",
                 where="Importance",
                 hint="use method='nuts'",
             )
-        effective = float(effective_draws(weights[None])[0])
+        effective = sample.effective
         index = systematic_resample(weights, effective, numpy_generator(key_resample))
         problems = []
         if not k_hat <= MAX_PARETO_K:
@@ -130,24 +144,106 @@ class Importance(AbstractMethod):
         return PosteriorDraws(
             method="importance",
             z=z[index],
-            stats={"lp": (log_ratios + log_proposal)[index]},
+            stats={"lp": sample.log_posterior[index]},
             problems=problems,
             weighted=(z, weights),
             k_hat=float(k_hat),
             effective_draws=effective,
             gradients=float(initialization.metadata["gradients"]),
-            densities=float(self.draws),
+            densities=float(len(z)),
             metadata={"modes": initialization.metadata},
         )
+
+
+COMPONENTS = 8
+"""Of the mixtures of further rounds."""
+
+ENOUGH_SHARE = 0.2
+"""Effective sample size, as a share of the draws of one round, after which no round follows."""
+
+FITTED_PER_SIZE = 10
+"""Effective draws for each coordinate to which a mixture is fitted: weights that leave fewer are
+raised to a power below 1."""
+
+
+class _Rounds:
+    """Draws of all rounds, weighted over the mean density of their proposals."""
+
+    def __init__(self, problem: Problem, settings: Importance) -> None:
+        self._problem, self._settings = problem, settings
+        self.proposals: list[Mixture] = []
+        size = problem.program.size
+        self.z, self.log_posterior = np.empty((0, size), problem.dtype), np.empty(0)
+        self._log_proposals = np.empty((0, 0))  # (proposal, draw)
+
+    def add(self, proposal: Mixture, key: Array) -> None:
+        """Draw from one more proposal, and weigh all draws anew."""
+        count = self._settings.draws
+        z, log_proposal = (np.asarray(x) for x in _propose(proposal, count, key))
+        older = [np.asarray(_log_densities(each, z)) for each in self.proposals]
+        newer = [np.asarray(_log_densities(proposal, block)) for block in self._blocks()]
+        above = np.concatenate([self._log_proposals, np.reshape(older, (-1, count))], axis=1)
+        below = np.concatenate([*newer, log_proposal])
+        self._log_proposals = np.concatenate([above, below[None]])
+        self.proposals.append(proposal)
+        self.z = np.concatenate([self.z, z])
+        self.log_posterior = np.concatenate([self.log_posterior, self._problem.log_density(z)])
+        mean = scipy.special.logsumexp(self._log_proposals, axis=0) - math.log(len(self.proposals))
+        self.log_ratios = self.log_posterior - mean
+        weights, k_hat = smooth(self.log_ratios[None])
+        self.weights, self.k_hat = weights[0], float(k_hat[0])
+        self.effective = float(effective_draws(weights)[0])
+
+    @property
+    def calls_for_more(self) -> bool:
+        """Whether a further round is needed, and there are draws to which it can be fitted."""
+        enough = self.effective >= ENOUGH_SHARE * self._settings.draws
+        reaches = self.k_hat <= MAX_PARETO_K
+        return bool(np.isfinite(self.weights).all()) and not (enough and reaches)
+
+    def fit(self, key: Array) -> Mixture:
+        """A mixture for the next round."""
+        weights = _temper(self.log_ratios, FITTED_PER_SIZE * self.z.shape[1])
+        # One length compiles once: the draws of rounds to come have no weight.
+        missing = self._settings.rounds * self._settings.draws - len(self.z)
+        z = np.pad(self.z, ((0, missing), (0, 0)))
+        padded = np.pad(weights, (0, missing)).astype(z.dtype)
+        return _fit_mixture(jnp.asarray(z), jnp.asarray(padded), COMPONENTS, key)
+
+    def _blocks(self) -> list[np.ndarray]:
+        return np.split(self.z, len(self.proposals)) if self.proposals else []
+
+
+_fit_mixture = functools.partial(jax.jit, static_argnums=2)(fit_mixture)
+
+
+@jax.jit
+def _log_densities(proposal: Mixture, z: Array) -> Array:
+    return jax.lax.map(
+        lambda z: log_density(proposal, z[None])[0], z, batch_size=min(SIDE_BY_SIDE, len(z))
+    )
+
+
+def _temper(log_ratios: np.ndarray, least: float) -> np.ndarray:
+    """Weights, raised to the largest power up to 1 that leaves so large an effective sample."""
+    relative = log_ratios - np.max(log_ratios)
+
+    def weights(power: float) -> np.ndarray:
+        raised = np.exp(power * np.where(np.isfinite(relative), relative, -1e300))
+        return raised / raised.sum()
+
+    def excess(power: float) -> float:
+        return float(effective_draws(weights(power)[None])[0]) - least
+
+    if excess(1.0) >= 0.0 or excess(1e-6) <= 0.0:
+        return weights(1.0)
+    return weights(scipy.optimize.brentq(excess, 1e-6, 1.0, xtol=1e-3))
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def _propose(proposal: Mixture, count: int, key: Array) -> tuple[Array, Array]:
     z = draw_mixture(proposal, count, key)
-    densities = jax.lax.map(
-        lambda z: log_density(proposal, z[None])[0], z, batch_size=min(SIDE_BY_SIDE, count)
-    )
-    return z, densities
+    return z, _log_densities(proposal, z)
 
 
 def laplace_mixture(modes: Modes, dtype: np.dtype) -> Mixture:

@@ -1,6 +1,7 @@
 """The report of a fit: what it says of the material, and every check of it."""
 
 import math
+import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -39,6 +40,7 @@ from polar_bayes.reporting.style import QUANTITIES, parameter_title
 from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
 from polar_bayes.repr_html import Row, Table
 from polar_bayes.results import summary, verdict
+from polar_bayes.scenes.stacking import scene_sentences, scene_table
 
 SHARED_GROUP = "Populations and spectra"
 INSTRUMENT_GROUP = "Instrument and noise"
@@ -158,6 +160,7 @@ def fit_page(result: xr.DataTree) -> page.Page:
         pairs = [page.picture(plots_fit.plot_pairs(result), "fit.figure_pairs")]
     sections = [
         page.Section("parameters", "Parameters", [parameter_table(fit)]),
+        page.Section("scenes", "Which scene", list(_scenes(result))),
         page.Section("population", "Population", _population(fit, summary, pooled)),
         page.Section("spectrum", "Spectrum", _spectrum(result) if has_draws else []),
         page.Section(
@@ -260,6 +263,25 @@ def _prior(fit: Fit, has_draws: bool) -> Iterator[page.Block]:
     if has_draws and "prior" in fit.result.children:
         yield page.picture(plots_fit.plot_prior_posterior(fit.result), "fit.figure_prior")
     yield sensitivity_table(fit)
+
+
+def _scenes(result: xr.DataTree) -> Iterator[page.Block]:
+    """The scenes that were compared, where the fit has chosen its scene."""
+    table = scene_table(result)
+    if table.empty:
+        return
+    yield " ".join(scene_sentences(result))
+    numbers = ["elpd", "se", "elpd_diff", "dse", "weight", "unreliable", "criticism", "seconds"]
+    texts = [name for name in table.columns if name not in numbers]
+    cells: page.Cells = {
+        "elpd": column("elpd", ".1f"),
+        "difference": lambda row: f"{row['elpd_diff']:.1f} +- {row['dse']:.1f}",
+        "weight": lambda row: percent(row["weight"]),
+        **{name: operator.itemgetter(name) for name in texts},
+        "criticism": lambda row: row["criticism"] or DASH,
+    }
+    caption = page.caption("fit.scene")
+    yield page.make_table("scene", caption, cells, table, prose=["criticism"])
 
 
 def _criticism(fit: Fit) -> Iterator[page.Block]:

@@ -155,6 +155,14 @@ def test_weights_that_do_not_reach_all_of_a_posterior_are_a_problem():
     assert any("Pareto k-hat" in problem for problem in found.problems)
 
 
+def test_further_rounds_follow_a_posterior_that_is_not_normal():
+    here = problem(funnel)
+    once = run(pb.methods.Importance(draws=1024), here)
+    found = run(pb.methods.Importance(draws=1024, rounds=6), here)
+    assert found.effective_draws > 2.0 * once.effective_draws
+    assert found.k_hat < once.k_hat
+
+
 def test_the_expected_error_is_the_one_that_is_seen():
     """Over 40 seeds the error of a mean stays within what is expected, and is not far below."""
     mean, covariance = of_line(capture()["q"].to_numpy())
@@ -219,6 +227,7 @@ def test_tempered_answers_have_as_many_draws_as_are_asked_for():
     ("make", "said"),
     [
         (lambda: pb.methods.Importance(draws=10), "draws is 10"),
+        (lambda: pb.methods.Importance(rounds=0), "rounds is 0"),
         (lambda: pb.methods.NormalGuide(steps=1), "steps is 1"),
         (lambda: pb.methods.FlowGuide(learning_rate=0.0), "learning_rate 0.0"),
     ],

@@ -1,0 +1,229 @@
+"""Candidate scenes: the parts that the variables and the geometry of a capture allow.
+
+A candidate takes one option of each slot: a surface with its source, a body or none, the systematic
+errors of the instrument or none, and so on. Systematic errors are one option together: an unknown
+angle zero without a discrepancy explains by a shifted angle what a smooth error has caused.
+"""
+
+import dataclasses
+from collections.abc import Collection, Iterator, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
+from polar_bayes.physics.coat import ThinFilm
+from polar_bayes.physics.illumination import PointSource, UniformSky
+from polar_bayes.physics.instrument import AngleZero, Discrepancy, Instrument, TiltedNormal
+from polar_bayes.physics.microfacet import Beckmann
+from polar_bayes.physics.mixing import AbstractMixing, StokesMixing
+from polar_bayes.physics.scene import WAY_OUT, Scene
+from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
+from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+from polar_bayes.setups import SETUPS, Setup
+
+MIRROR_TOLERANCE = 0.5
+"""Largest difference of a view from the mirror direction of the light, unit degree."""
+
+Choice = tuple[str, ...]
+"""The option of each slot, by name; "" where the slot stays empty."""
+
+SURFACES: Mapping[str, Any] = MappingProxyType(
+    {
+        "mirror": SmoothSurface(),
+        "rough surface": RoughSurface(Beckmann(), PointSource(), WAY_OUT),
+        "sky": RoughSurface(Beckmann(), UniformSky(), WAY_OUT),
+    }
+)
+BODIES: Mapping[str, Any] = MappingProxyType(
+    {
+        "unpolarized body": Unpolarized(),
+        "Lambertian body": Lambertian(),
+        "depolarizing body": Depolarizer(),
+    }
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneLibrary:
+    """The options of each slot for one capture, the simplest first.
+
+    Args:
+        surfaces: Surfaces with their sources, by name.
+        bodies: Bodies under the surface, by name; the first is the one that is added, the others
+            are compared with it.
+        mixing: How surface and body add up.
+        others: Parts by the field of the scene and by name, each of which may be there or not.
+    """
+
+    surfaces: Mapping[str, Any]
+    bodies: Mapping[str, Any]
+    mixing: AbstractMixing
+    others: Mapping[str, Mapping[str, Any]]
+
+    @property
+    def simplest(self) -> Choice:
+        """The first surface and nothing else."""
+        return (next(iter(self.surfaces)), "", *("" for _ in self.others))
+
+    def scene(self, choice: Choice) -> Scene:
+        """The scene of a choice.
+
+        Args:
+            choice: The option of each slot: surface, body, then those of `others`.
+
+        Returns:
+            The scene.
+        """
+        surface, body, *rest = choice
+        named = zip(self.others.items(), rest, strict=True)
+        return Scene(
+            surface=self.surfaces[surface],
+            subsurface=self.bodies[body] if body else None,
+            mixing=self.mixing if body else None,
+            **{field: options[name] for (field, options), name in named if name},
+        )
+
+    def single_parts(self) -> Iterator[Scene]:
+        """Scenes that together have every option.
+
+        Yields:
+            The simplest scene with each option in turn.
+        """
+        slots = (self.surfaces, self.bodies, *self.others.values())
+        for slot, options in enumerate(slots):
+            for name in options:
+                choice = list(self.simplest)
+                choice[slot] = name
+                yield self.scene(tuple(choice))
+
+    def extensions(self, choice: Choice) -> Iterator[Choice]:
+        """Choices with one part more, or with another surface.
+
+        Args:
+            choice: The option of each slot.
+
+        Yields:
+            Other choices.
+        """
+        for surface in self.surfaces:
+            if surface != choice[0]:
+                yield (surface, *choice[1:])
+        for slot, options in enumerate((self.bodies, *self.others.values()), start=1):
+            if not choice[slot]:
+                yield (*choice[:slot], next(iter(options)), *choice[slot + 1 :])
+
+    def alternatives(self, choice: Choice) -> Iterator[Choice]:
+        """Choices with another body, and those with one part less.
+
+        Args:
+            choice: The option of each slot.
+
+        Yields:
+            Other choices.
+        """
+        if choice[1]:
+            yield from ((choice[0], body, *choice[2:]) for body in self.bodies if body != choice[1])
+        for slot in range(1, len(choice)):
+            if choice[slot]:
+                yield (*choice[:slot], "", *choice[slot + 1 :])
+
+
+def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None) -> SceneLibrary:
+    """The parts that a capture allows.
+
+    A mirror needs views in the mirror direction of the light; a rough surface under a point source
+    in that direction sends the polarization of the mirror, so that it needs a fitted brightness. A
+    thin film needs several wavelengths, a leaning normal needs u.
+
+    Args:
+        capture: A validated Dataset of the capture schema.
+        variables: Recorded variables that are fitted; by default those that the links of its set-up
+            describe, or all that it holds where it names none.
+
+    Returns:
+        The options, with the body, mixing and instrument of the set-up that the capture names.
+    """
+    setup = named_setup(capture)
+    described = capture.data_vars if setup is None else setup.links
+    fitted = {str(n) for n in (described if variables is None else variables)} & set(capture)
+    mirrored = is_mirrored(capture)
+    surfaces = [
+        *(["mirror"] if mirrored else []),
+        *(["rough surface"] if "intensity" in fitted or not mirrored else []),
+        "sky",
+    ]
+    several_colors = capture.sizes.get("wavelength", 1) > 2
+    mixing = setup.scene.mixing if setup else None
+    return SceneLibrary(
+        surfaces={name: SURFACES[name] for name in surfaces},
+        bodies=_bodies(setup, bool({"intensity", "dop"} & fitted)),
+        mixing=StokesMixing() if mixing is None else mixing,
+        others={
+            "instrument": {"systematic errors": _systematic_errors(setup)},
+            **({"normal": {"leaning normal": TiltedNormal()}} if "u" in fitted else {}),
+            **({"coat": {"thin film": _FILM}} if several_colors else {}),
+        },
+    )
+
+
+_FILM = ThinFilm("film_refractive_index", "film_thickness")
+
+
+def named_setup(capture: xr.Dataset) -> Setup | None:
+    """The set-up that a capture names, where its links suit what the capture holds."""
+    setup = SETUPS.get(str(capture.attrs.get("setup")))
+    if setup is None:
+        return None
+    suited = [
+        name
+        for name, link in setup.links.items()
+        if name in ("dop", "q", "u")
+        and name in capture
+        and (not link.reads_errors or f"{name}_error" in capture)
+    ]
+    return setup if suited else None
+
+
+def default_links(capture: xr.Dataset) -> Mapping[str, AbstractLink] | None:
+    """Links of a capture that names no set-up that suits it; None where it names one."""
+    if named_setup(capture) is not None:
+        return None
+    links: dict[str, AbstractLink] = {
+        name: StokesLink(degrees_of_freedom=4.0, stated_errors=f"{name}_error" in capture)
+        for name in ("q", "u")
+        if name in capture
+    }
+    if not links and "dop" in capture:
+        links = {"dop": BetaLink()}
+    if links and "intensity" in capture:
+        links["intensity"] = StudentTLink()
+    return links or None
+
+
+def is_mirrored(capture: xr.Dataset) -> bool:
+    """Whether every view is in the mirror direction of the light."""
+    zenith = np.abs(capture["view_zenith"] - capture["light_zenith"])
+    around = np.abs((capture["view_azimuth"] - capture["light_azimuth"]) % 360.0 - 180.0)
+    sideways = around * np.sin(np.radians(capture["view_zenith"]))
+    return bool((zenith <= MIRROR_TOLERANCE).all() and (sideways <= MIRROR_TOLERANCE).all())
+
+
+def _bodies(setup: Setup | None, shows_absorption: bool) -> Mapping[str, Any]:
+    """The body of the set-up first; `Depolarizer` only where its absorption may show."""
+    first = setup.scene.subsurface if setup else Lambertian()
+    order = sorted(BODIES, key=lambda name: BODIES[name] != first)
+    return {
+        name: BODIES[name]
+        for name in order
+        if name != "depolarizing body" or shows_absorption or BODIES[name] == first
+    }
+
+
+def _systematic_errors(setup: Setup | None) -> Instrument:
+    """The instrument terms of the set-up, an unknown angle zero, and a discrepancy."""
+    given = setup.scene.instrument.terms if setup and setup.scene.instrument else ()
+    kinds = (AngleZero, Discrepancy)
+    return Instrument((AngleZero(), *(t for t in given if not isinstance(t, kinds)), Discrepancy()))

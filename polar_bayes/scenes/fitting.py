@@ -1,0 +1,91 @@
+"""The public verb of one capture: by one scene, or by those that remain of a comparison."""
+
+from collections.abc import Callable, Mapping
+
+import xarray as xr
+from numpyro import distributions as dist
+
+import polar_bayes.scenes  # its names load the comparison, and with it diagnostics, on first use
+from polar_bayes.capture.schema import validate
+from polar_bayes.inference import fitting
+from polar_bayes.inference.method import AbstractMethod
+from polar_bayes.observation.links import AbstractLink
+from polar_bayes.physics.scene import Scene
+from polar_bayes.progress import Progress, no_progress, with_progress
+
+
+@with_progress
+def fit(
+    capture: xr.Dataset,
+    *,
+    model: str | Callable = "per_material",
+    method: str | AbstractMethod = "nuts",
+    tolerance: float | None = None,
+    seconds: float | None = None,
+    scene: str | Scene | None = None,
+    priors: Mapping[str, dist.Distribution] | None = None,
+    links: AbstractLink | Mapping[str, AbstractLink] | None = None,
+    largest_view_zenith: float | None = None,
+    seed: int = 0,
+    precision: str = "double",
+    progress: Progress | None = None,
+) -> xr.DataTree:
+    """Fit one capture.
+
+    Args:
+        capture: A Dataset of the capture schema; validated here.
+        model: A name in `polar_bayes.inference.request.MODELS` or a callable
+            `model(data, scene, priors, links)`.
+        method: "nuts", "laplace", "point", "importance" (Laplace, its draws weighted by the
+            posterior), "tempered" (adaptive tempered SMC from the prior to the posterior; one
+            material in one color), "auto" (the cheapest of these that is good enough), or settings
+            such as `Nuts(draws=2000)`.
+        tolerance: Of "auto": largest error of a posterior mean or standard deviation, in posterior
+            standard deviations, above 0 and at most 1; by default 0.1.
+        seconds: Of "auto": wall time of the whole fit, by default 60. Only the first method always
+            ends; what is not done by then is abandoned, and the best answer so far is returned.
+        scene: A name in `SETUPS` or a `Scene`; by default the set-up that the capture names in
+            its attribute `setup`, else "paper". "auto" compares scenes, as
+            `polar_bayes.compare_scenes` does, and stacks the posteriors of those that remain.
+        priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
+        links: One link for the polarization, or a mapping from variable to link.
+        largest_view_zenith: Views beyond it are set aside and counted. Unit degree.
+        seed: The same seed gives the same result on the same machine, unless "auto" ran out of
+            time.
+        precision: "double" or "single".
+        progress: Called with the name of a stage and the fraction of it that is done.
+
+    Returns:
+        A DataTree with the groups posterior, sample_stats, log_likelihood, log_prior,
+        posterior_predictive, noise_free, prior, prior_predictive, observed_data and
+        constant_data, effects for a scene of `polar_bayes.choose_effects`, and scenes for "auto"
+        (`polar_bayes.scenes.scene_sentences` says what was chosen and why);
+        `polar_bayes.verdict` says whether it converged, and
+        `polar_bayes.inference.auto_sentences` what "auto" did and why.
+
+    Raises:
+        CaptureError: The capture does not hold what a fit needs.
+        SceneError: No such scene.
+        FitError: A model, method, prior or link cannot be used, or the memory is too small.
+    """
+    if not isinstance(scene, str) or scene != "auto":
+        return fitting.fit(
+            capture,
+            model=model,
+            method=method,
+            tolerance=tolerance,
+            seconds=seconds,
+            scene=scene,
+            priors=priors,
+            links=links,
+            largest_view_zenith=largest_view_zenith,
+            seed=seed,
+            precision=precision,
+            progress=progress,
+        )
+    chosen = fitting.find_method(method, tolerance, seconds)
+    capture = validate(capture)
+    setting = polar_bayes.scenes.Setting(
+        capture, model, priors, links, largest_view_zenith, seed, precision
+    )
+    return polar_bayes.scenes.fit_best_scenes(setting, chosen, progress or no_progress)

@@ -1,0 +1,31 @@
+"""The command that compares scenes: what it prints, and what it writes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import polar_bayes as pb
+from polar_bayes.cli import main
+from polar_bayes.scenes import comparison
+
+
+@pytest.fixture(autouse=True)
+def one_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The simplest scene alone: what the command does, not what it finds."""
+    monkeypatch.setattr(comparison, "MAX_FITS", 1)
+
+
+def test_scenes_are_compared_and_what_remains_is_written(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "fit.nc"
+    words = ["scenes", str(plate), "--method", "laplace", "--json", "--out", str(out)]
+    assert main(words) in (0, 2)
+    said = json.loads(capsys.readouterr().out)
+    assert said["scenes"]["mirror"]["weight"] == pytest.approx(1.0)
+    assert said["sentences"][0] == "1 scene was fitted, from simple to complex."
+    result = pb.load(out, "fit")
+    assert pb.scenes.scene_sentences(result) == said["sentences"]
+    assert main(["scenes", str(plate), "--method", "point", "--out", str(out)]) == 1
+    assert "no width to compare" in capsys.readouterr().err
