@@ -171,7 +171,7 @@ def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
     engine: Any = compiled.engine
     truth: Arrays = {name: np.asarray(drawn.truth[name])[:count] for name in shared}
     captures = drawn.captures.subset(np.arange(count))
-    marginals, scores = Marginals(count, shared), PitCrps(truth, numbers, seed)
+    marginals, scores = Marginals(count, shared, random=True), PitCrps(truth, numbers, seed)
     ranked = None
     if is_ranked:
         again = {name: np.asarray(values)[:count] for name, values in fresh.items()}

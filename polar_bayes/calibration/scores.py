@@ -1,4 +1,4 @@
-"""Simulation-based calibration: PIT and CRPS of the truth, and whether PIT values are uniform.
+"""Simulation-based calibration: PIT and CRPS of the truth; tests of ranks, coverage and spread.
 
 Source: Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788 (ranks); Gneiting &
 Raftery (2007), JASA 102, 359-378 (CRPS); Saeilynoja, Buerkner & Vehtari (2022), Stat. Comput. 32,
@@ -11,10 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy.special
 import scipy.stats
 from jaxtyping import Float
 
 from polar_bayes.inference.program import Values
+from polar_bayes.inference.psis import effective_draws
 
 
 class PitCrps:
@@ -48,9 +50,11 @@ def randomized_pit(
     uniform: Float[np.ndarray, " fit"],
 ) -> Float[np.ndarray, " fit"]:
     """Weighted share of draws below a value, uniform over ties and over the gap it falls into."""
+    # The gap is as wide as between as many draws of equal weight: where a value is one more draw of
+    # the same distribution, this has the variance of a uniform number, however few they are.
     below = np.sum(weights * (draws < value[:, None]), axis=-1)
     tied = np.sum(weights * (draws == value[:, None]), axis=-1)
-    count = draws.shape[-1]
+    count = effective_draws(weights)
     return (count * (below + uniform * tied) + uniform) / (count + 1)
 
 
@@ -155,25 +159,63 @@ def histogram_band(count: int, bins: int, level: float = 0.05) -> tuple[float, f
     return float(low) * bins / count, float(high) * bins / count
 
 
+# --- Coverage and spread --------------------------------------------------------------------------
+
+
+def coverage_p_value(held: int, count: int, share: float) -> float:
+    """Two-sided exact binomial test of how many intervals hold the truth; NaN without any."""
+    return float(scipy.stats.binomtest(held, count, share).pvalue) if count else math.nan
+
+
+class Spread(NamedTuple):
+    """Scatter of the truths in units of the posterior's width: the spread of a right one is 1."""
+
+    p_value: float
+    spread: float
+
+
+def spread_of_scores(pit: Float[np.ndarray, " size"]) -> Spread:
+    """Test the standard deviation of normal scores of PIT values, of which there are two or more.
+
+    A normal score is (truth - mean) / sd where the posterior is normal. Of any other posterior it
+    is standard normal all the same, so the test is exact, and no tail of a posterior upsets it.
+    """
+    scores = scipy.special.ndtri(np.clip(pit, 1e-12, 1.0 - 1e-12))
+    freedom = len(scores) - 1
+    chi_square = freedom * float(np.var(scores, ddof=1))
+    tails = scipy.stats.chi2.cdf(chi_square, freedom), scipy.stats.chi2.sf(chi_square, freedom)
+    return Spread(min(1.0, 2.0 * float(min(tails))), math.sqrt(chi_square / freedom))
+
+
 # --- Several p-values as one test -----------------------------------------------------------------
 
 FALSE_ALARMS = 0.05
 """Probability, at most, that a correct model, prior, link and method fail a joint test."""
 
 
+TESTS = ("p_value", "p_held_50", "p_held_80", "p_held_95", "p_spread")
+"""Columns of p-values: of uniform ranks, of the coverage of intervals, and of the spread."""
+
+
+def p_values(table: pd.DataFrame) -> pd.DataFrame:
+    """Every p-value of a table: of parameters by five tests, of readings by their ranks alone."""
+    return table[[test for test in TESTS if test in table]]
+
+
 def significance_level(table: pd.DataFrame) -> float:
-    """Level at which each row is tested: the false-alarm rate over the number of rows."""
-    return FALSE_ALARMS / len(table)
+    """Level of each test of each row: the false-alarm rate over the number of all tests."""
+    return FALSE_ALARMS / p_values(table).size
 
 
 def is_calibrated(table: pd.DataFrame) -> bool:
-    """Whether ranks pass the joint test, at a rate of false alarms of at most 5%.
+    """Whether ranks, coverage and spread pass the joint test, with at most 5% of false alarms.
 
     Args:
-        table: Of `calibration_table`, or of `calibration_readings`.
+        table: Of `calibration_table`, or of `calibration_readings`, which are judged by their ranks
+            alone.
 
     Returns:
-        False where the smallest p-value is below 5% over the number of rows (Bonferroni), or a row
+        False where the smallest p-value is below 5% over the number of tests (Bonferroni), or a row
         has none, with fewer than two fits that have an answer.
     """
-    return bool((table["p_value"] >= significance_level(table)).all())
+    return bool((p_values(table) >= significance_level(table)).all(axis=None))

@@ -1,7 +1,7 @@
 """What a calibration holds in a file, its tables, and the sentences that state what they mean."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
@@ -11,8 +11,10 @@ import xarray as xr
 
 from polar_bayes.calibration.scores import (
     FALSE_ALARMS,
+    coverage_p_value,
     is_calibrated,
     significance_level,
+    spread_of_scores,
     uniformity,
 )
 from polar_bayes.diagnostics.coverage import INTERVALS, coverage_columns
@@ -105,6 +107,8 @@ SHIFT_LIMIT = SPREAD_LIMIT = 2.5
 TAIL_LIMIT = 2.0
 """Standard errors from which a moment of the ranks is named as the deviation."""
 
+TOO_FEW = "fewer than two fits have an answer"
+
 READING_TESTS = {"predictive_pit": "fresh", "loo_pit": "left out"}
 """The groups of a calibration that hold PIT values of readings, and the names of their tests."""
 
@@ -114,8 +118,10 @@ def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
     # Columns: `answered` and `failed` fits; `p_value` of uniform ranks; `rank_mean` (a half where
     # the posterior is neither too high nor too low) and `rank_spread` (above one: too narrow); for
     # 50, 80 and 95%, as `held_50`, the share of all fits whose interval holds the truth, failed
-    # ones counted as misses, with Wilson's 95% interval; `width_95`, mean width of the 95%
-    # interval; `crps`, mean continuous ranked probability score.
+    # ones counted as misses, with Wilson's 95% interval, and as `p_held_50` the exact binomial test
+    # of the same among the fits that have an answer; `spread`, sd of the normal scores of the ranks
+    # (above one: truths scatter further than the posterior says), and its test, `p_spread`;
+    # `width_95`, mean width of the 95% interval; `crps`, mean continuous ranked probability score.
     found = calibration_scalars(calibration, "prior_sbc")
     truths = {each.label: each.draws[0] for each in calibration_scalars(calibration, "truth")}
     marginals = calibration["marginals"].to_dataset()
@@ -136,6 +142,7 @@ def calibration_scalars(calibration: xr.DataTree, group: str) -> list[Scalar]:
 
 def _parameter_row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> dict[str, float]:
     pit, index = scalar.draws[0], dict(scalar.index)
+    finite = pit[np.isfinite(pit)]
     bounds = marginals[f"{scalar.name}_quantile"].isel(index)
     held = {}
     for percent, levels in INTERVALS.items():
@@ -144,6 +151,11 @@ def _parameter_row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> 
     return {
         **_rank_columns(pit),
         **coverage_columns(held, pit.size),
+        **{
+            f"p_held_{percent}": coverage_p_value(hits, finite.size, percent / 100.0)
+            for percent, hits in held.items()
+        },
+        **dict(zip(("p_spread", "spread"), _spread(finite), strict=True)),
         "width_95": _finite_mean(high - low),
         "crps": _finite_mean(marginals[f"{scalar.name}_crps"].isel(index).to_numpy()),
     }
@@ -157,6 +169,10 @@ def _rank_columns(pit: np.ndarray) -> dict[str, float]:
         "failed": pit.size - finite.size,
         **dict(zip(("p_value", "rank_mean", "rank_spread"), moments, strict=True)),
     }
+
+
+def _spread(pit: np.ndarray) -> tuple[float, float]:
+    return spread_of_scores(pit) if pit.size > 1 else (math.nan, math.nan)
 
 
 def _finite_mean(values: np.ndarray) -> float:
@@ -229,10 +245,14 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
     passed = is_calibrated(table)
     count = int(table["answered"].max() + table["failed"].min())
     sentences = [
-        f"{'Calibrated' if passed else 'Not calibrated'}: the ranks of {len(table)} parameters in "
-        f"{count} simulations {'pass' if passed else 'fail'} a joint test that a right method "
-        f"fails {FALSE_ALARMS:.0%} of the time.",
-        *_deviations(table, parameter_deviation),
+        f"{'Calibrated' if passed else 'Not calibrated'}: the ranks, coverage and spread of "
+        f"{len(table)} parameters in {count} simulations {'pass' if passed else 'fail'} a joint "
+        f"test that a right method fails at most {FALSE_ALARMS:.0%} of the time.",
+        *(
+            f"{label}: {found}."
+            for label, row in table.iterrows()
+            if (found := parameter_deviation(row, significance_level(table)))
+        ),
     ]
     statuses = calibration["fits"]["status"].to_numpy()
     for status in Status:
@@ -259,7 +279,7 @@ def _reading_sentences(calibration: xr.DataTree) -> list[str]:
         f"Readings ({names}; fresh ones and ones left out) "
         f"{'pass' if is_calibrated(table) else 'fail'} a joint test of their own that a right "
         f"model fails {FALSE_ALARMS:.0%} of the time.",
-        *_deviations(table, reading_deviation),
+        *_reading_deviations(table),
     ]
     sentences += [
         f"{label}: in {int(row['untrusted'])} of {int(row['answered'])} fits the weights "
@@ -270,19 +290,38 @@ def _reading_sentences(calibration: xr.DataTree) -> list[str]:
     return sentences
 
 
-def _deviations(table: pd.DataFrame, deviation: Callable[[pd.Series], str]) -> list[str]:
+def _reading_deviations(table: pd.DataFrame) -> Iterator[str]:
     """A sentence for each row that fails its test."""
-    sentences = []
     for label, row in table.iterrows():
         if not row["p_value"] >= significance_level(table):  # a row without p-value fails too
             p_value = f" (p = {row['p_value']:.2g})" if row["answered"] > 1 else ""
-            sentences.append(f"{label}: {deviation(row)}{p_value}.")
-    return sentences
+            yield f"{label}: {reading_deviation(row)}{p_value}."
 
 
-def parameter_deviation(row: pd.Series) -> str:
-    """How the ranks of a parameter deviate from the uniform distribution."""
-    return _deviation(row, _spread_of_shifted(row["rank_mean"]), "the posterior is", "intervals")
+def parameter_deviation(row: pd.Series, level: float) -> str:
+    """Which tests a parameter fails at a level, by how much; empty where it passes all."""
+    count = row["answered"]
+    if count < 2:
+        return TOO_FEW
+    found = []
+    if not row["p_value"] >= level:
+        expected = _spread_of_shifted(row["rank_mean"])
+        shape = _deviation(row, expected, "the posterior is", "intervals")
+        found.append(f"{shape} (p = {row['p_value']:.2g})")
+    missed = [percent for percent in INTERVALS if not row[f"p_held_{percent}"] >= level]
+    if missed:
+        # Among the fits that have an answer, as the test.
+        answered = (count + row["failed"]) / count
+        shares = ", ".join(f"{answered * row[f'held_{percent}']:.1%}" for percent in missed)
+        least = min(row[f"p_held_{percent}"] for percent in missed)
+        named = ", ".join(f"{percent}%" for percent in missed)
+        found.append(f"{named} intervals hold {shares} of the truths (p = {least:.2g})")
+    if not row["p_spread"] >= level:
+        found.append(
+            f"the truths scatter {row['spread']:.2f} times as far as the posterior says "
+            f"(p = {row['p_spread']:.2g})"
+        )
+    return "; ".join(found)
 
 
 def reading_deviation(row: pd.Series) -> str:
@@ -293,7 +332,7 @@ def reading_deviation(row: pd.Series) -> str:
 def _deviation(row: pd.Series, expected_spread: float, location: str, width: str) -> str:
     count = row["answered"]
     if count < 2:
-        return "fewer than two fits have an answer"
+        return TOO_FEW
     shift = (row["rank_mean"] - 0.5) * math.sqrt(12.0 * count)
     # The standard error of the spread of n uniform ranks is 1 / sqrt(5 n).
     stretch = (row["rank_spread"] - expected_spread) * math.sqrt(5.0 * count)
@@ -323,7 +362,7 @@ def _spread_of_shifted(mean: float) -> float:
 
 # --- Calibrations of one layout by several methods ------------------------------------------------
 
-PASSES = "the ranks pass"
+PASSES = "all tests pass"
 
 
 def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFrame:
@@ -338,10 +377,11 @@ def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFram
 
     Returns:
         A row for each parameter and method: the columns of `calibration_table`, and `passes`
-        (whether its p-value is at least 5% over the number of parameters), `deviation` (how its
-        ranks deviate, in words), `score_change` (ranked score over that of the first method, minus
-        one: below zero is better) and `score_change_error` (its standard error). The change is NaN
-        where the simulations differ; a simulation counts where both methods have an answer.
+        (whether each of its p-values is at least 5% over the number of all tests), `deviation`
+        (which tests fail, and by how much), `score_change` (ranked score over that of the first
+        method, minus one: below zero is better) and `score_change_error` (its standard error). The
+        change is NaN where the simulations differ; a simulation counts where both methods have an
+        answer.
 
     Raises:
         FitError: There is none, or they are not all calibrations of the same parameters.
@@ -362,12 +402,12 @@ def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFram
     for scalar in calibration_scalars(calibrations[first], "truth"):
         for name, calibration in calibrations.items():
             row = tables[name].loc[scalar.label]
-            passes = bool(row["p_value"] >= level)
+            deviation = parameter_deviation(row, level)
             change, error = _score_change(calibration, calibrations[first], scalar)
             rows[scalar.label, name] = {
                 **row,
-                "passes": passes,
-                "deviation": PASSES if passes else parameter_deviation(row),
+                "passes": not deviation,
+                "deviation": deviation or PASSES,
                 "score_change": change,
                 "score_change_error": error,
             }
@@ -401,8 +441,7 @@ def comparison_sentences(compared: pd.DataFrame) -> list[str]:
 
 
 def _method_result(row: pd.Series) -> str:
-    p_value = "" if row["passes"] or row["answered"] < 2 else f"p = {row['p_value']:.2g}, "
-    return f"{row['deviation']} ({p_value}95% intervals hold {row['held_95']:.1%})"
+    return f"{row['deviation']} (95% intervals hold {row['held_95']:.1%})"
 
 
 def _score_change(

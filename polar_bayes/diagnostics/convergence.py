@@ -95,7 +95,7 @@ def verdict(
     noted = (str(problem).rstrip(".") for problem in provenance.get("problems", ()))
     problems = [f"{text[:1].upper()}{text[1:]}." for text in noted]
     problems += _draw_problems(found, method, provenance)
-    if method == "nuts":
+    if method not in (*WEIGHTED, *APPROXIMATIONS, "point"):  # chains, those of users included
         problems += _chain_problems(result, table)
     problems += _weight_problems(provenance, method)
     against = criticism["sentence"].groupby(criticism["level"], sort=False).agg(list)

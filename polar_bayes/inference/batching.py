@@ -144,7 +144,7 @@ class Status(enum.IntEnum):
 
 
 class MethodUsed(enum.IntEnum):
-    """The method by which the numbers of a pixel were found."""
+    """The method by which the numbers of a pixel were found; `OTHER` is one of the user's own."""
 
     NONE = 0
     LAPLACE = 1
@@ -153,6 +153,7 @@ class MethodUsed(enum.IntEnum):
     NUTS = 4
     TEMPERED = 5
     VARIATIONAL = 6
+    OTHER = 7
 
 
 Describe = Callable[[np.ndarray, Values, np.ndarray], None]

@@ -190,6 +190,11 @@ class LRUCache[T]:
         self._values: cachetools.LRUCache[Hashable, T] = cachetools.LRUCache(maxsize)
         self._lock = threading.RLock()
 
+    def get(self, key: Hashable) -> T | None:
+        """The value of a key, None if it is not in the cache."""
+        with self._lock:
+            return self._values.get(key)
+
     def of(self, key: Hashable, make: Callable[[], T]) -> T:
         """The value of a key, made now if it is not in the cache."""
         with self._lock:

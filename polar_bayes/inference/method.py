@@ -245,15 +245,16 @@ def assess_draws(draws: PosteriorDraws, parameters: Values) -> dict[str, float]:
     """Status and effective sample size of one fit, by the names of `Outcome`."""
     finite = finite_draws(parameters)
     good, effective = not draws.doubts and bool(finite.all()), float(finite.sum())
-    if "diverging" in draws.stats:
+    approach = MethodUsed.__members__.get(draws.method.upper(), MethodUsed.OTHER)
+    if "diverging" in draws.stats or approach == MethodUsed.OTHER:  # a user's draws may be chains
         bulk, tail, r_hat = measure(flatten(parameters))
         mixed = min(bulk.min(), tail.min()) >= SMALLEST_ESS and r_hat.max() <= LARGEST_R_HAT
-        good = good and bool(mixed and draws.metadata["goals_reached"])
+        good = good and bool(mixed and draws.metadata.get("goals_reached", True))
         effective = float(np.nan_to_num(bulk.min(), nan=1.0))
     return {
         "effective_draws": effective,
         "pareto_k": draws.k_hat,
-        "approach": MethodUsed[draws.method.upper()],
+        "approach": approach,
         "status": Status.GOOD if good else Status.NOT_TRUSTED,
     }
 

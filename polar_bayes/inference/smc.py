@@ -13,7 +13,11 @@ prior (the log of a roughness that may be zero), in which steps and mixtures wit
 coordinate reach either the middle or the tail. Normal scores have neither tail nor skew.
 
 The particles are then the first sample to which rounds of adaptive importance sampling fit
-mixtures of Student t distributions (`proposals.py`).
+mixtures of Student t distributions (`proposals.py`). The draws to which a mixture was fitted are
+never part of an answer: the mixture is dense where they lie, which lowers exactly the weights that
+are high, so tails come out too short and the effective sample size too large. Nor are the draws by
+which the rounds were ended. When the draws of two rounds have the effective sample size, new draws
+of the same two mixtures are the answer, if they have it too.
 
 Source:
     Dau & Chopin (2022), J. R. Stat. Soc. B 84(1), 114-148.
@@ -184,6 +188,9 @@ DRAW_BATCH = 64
 """Draws of one pixel that are evaluated together: more are shared among cores that then wait for
 each other."""
 
+ENGINE = "tempered"
+"""Key of the engine among the programs of a model."""
+
 FIRST_KEY = np.uint32(2**32 - 1)
 """Number of the random key of the first particles; those of rounds count up from 0."""
 
@@ -201,7 +208,7 @@ class PixelSMC(AbstractPixelMethod):
         target_ess: Effective sample size of the incremental weights at each stage, as a share of
             the number of particles, between 0.1 and 0.95.
         draws: Of a mixture in every round, at least half the number of particles. An answer has
-            the draws of two rounds.
+            as many new draws of the mixtures of two rounds.
         components: Of the mixtures, >= 1.
         rounds: In which a mixture is fitted to the weighted draws, at most, >= 2.
         num_attempts: Pixels without an answer after these rounds start again from new particles,
@@ -217,11 +224,11 @@ class PixelSMC(AbstractPixelMethod):
     chain_length: int = 8
     init_factor: int = 2
     target_ess: float = 0.5
-    draws: int = 1024
+    draws: int = 2048
     components: int = 4
     rounds: int = 8
     num_attempts: int = 3
-    effective_draws: float = 200.0
+    effective_draws: float = 400.0
 
     def __post_init__(self) -> None:
         self._check_least(num_chains=16, chain_length=2, init_factor=1)
@@ -285,48 +292,77 @@ def _attempt(
 ) -> Iterator[tuple[np.ndarray, WeightedSample, np.ndarray]]:
     """Particles from the prior, then mixtures until their draws have the effective sample size."""
 
-    def run(make: Callable, number: np.uint32, which: np.ndarray, *states: Any) -> Any:
+    def run(make: Callable, given: tuple, which: np.ndarray, *states: Any) -> Any:
         return batch.engine.run(
             make,
             settings,
             batch.pixels.subset(which),
             *states,
             batch.keys[which],
-            given=(number,),
+            given=given,
             batch=SMALL_BATCH,
             single=True,
         )
 
+    def draw(round_: Round, which: np.ndarray, again: bool) -> Proposed:
+        """Draws of the mixtures of a round in some of its pixels, those of the fit or new ones."""
+        number, *states = round_.of(which)
+        return run(_mixture_draws, (number, np.uint32(again)), at[left[which]], *states)
+
     count("particles")
-    smc: TemperedParticles = run(_particles, FIRST_KEY - np.uint32(attempt), at)
+    smc: TemperedParticles = run(_particles, (FIRST_KEY - np.uint32(attempt),), at)
     batch.outcome.steps[at] += smc.stages
     left = np.flatnonzero((smc.temperature >= 1.0) & np.isfinite(smc.u).all(axis=(1, 2)))
     repeated = np.arange(settings.answer_draws) % settings.num_particles
     u = np.asarray(smc.u)[left][:, repeated]
     weights = np.asarray(smc.weights)[left][:, repeated] / np.bincount(repeated)[repeated]
-    previous: Proposed | None = None
+    last: tuple[Round, Proposed] | None = None
     for number in range(attempt * settings.rounds, (attempt + 1) * settings.rounds):
         if not left.size:
             return
         count("rounds")
         transform = take_rows(smc.transform, left)
-        states = transform, np.float32(u), np.float32(weights)
-        drawn: Proposed = run(_mixture_draws, np.uint32(number), at[left], *states)
-        sample = combine_samples(drawn if previous is None else previous, drawn)
+        this = Round(np.uint32(number), transform, u.astype("f4"), weights.astype("f4"))
+        drawn = draw(this, np.arange(left.size), again=False)
+        sample = combine_samples(drawn if last is None else last[1], drawn)
         possible = np.isfinite(sample.weights).all(axis=-1)
         enough = np.zeros(left.size, bool)
-        if previous is not None:  # its own weights do not show that one mixture is too narrow
-            enough = sample.ess >= settings.effective_draws
-            enough &= sample.pareto_k <= MAX_PARETO_K
-        is_last = number + 1 == (attempt + 1) * settings.rounds
-        answered = np.flatnonzero(enough | (is_last & possible))
-        if answered.size:
-            answer = take_rows(sample, answered)
-            z = inverse_of_pixels(take_rows(transform, answered), answer.z)
-            yield at[left[answered]], answer._replace(z=z), enough[answered]
+        if last is not None:  # its own weights do not show that one mixture is too narrow
+            is_last = number + 1 == (attempt + 1) * settings.rounds
+            tested = np.flatnonzero(_is_enough(sample, settings) | (is_last & possible))
+            if tested.size:
+                count("answers")
+                answer = combine_samples(
+                    *(draw(each, tested, again=True) for each in (last[0], this))
+                )
+                good = _is_enough(answer, settings)
+                enough[tested] = good | (is_last & np.isfinite(answer.weights).all(axis=-1))
+                ended = np.flatnonzero(enough[tested])
+                found, some = take_rows(answer, ended), tested[ended]
+                z = inverse_of_pixels(take_rows(transform, some), found.z)
+                yield at[left[some]], found._replace(z=z), good[ended]
         goes_on = ~enough & possible
-        left, previous = left[goes_on], take_rows(drawn, goes_on)
+        left, last = left[goes_on], (this.of(goes_on), take_rows(drawn, goes_on))
         u, weights = sample.z[goes_on], sample.weights[goes_on]
+
+
+class Round(NamedTuple):
+    """What the mixtures of one round are fitted to, in every pixel."""
+
+    number: np.uint32
+    transform: NormalScoreTransform
+    u: np.ndarray
+    weights: np.ndarray
+
+    def of(self, which: np.ndarray) -> Self:
+        """The same of some pixels."""
+        rows = take_rows((self.transform, self.u, self.weights), which)
+        return type(self)(self.number, *rows)
+
+
+def _is_enough(sample: WeightedSample, settings: PixelSMC) -> np.ndarray:
+    """Which pixels have the effective sample size that was asked for."""
+    return (sample.ess >= settings.effective_draws) & (sample.pareto_k <= MAX_PARETO_K)
 
 
 # --- One capture ----------------------------------------------------------------------------------
@@ -384,6 +420,21 @@ class Tempered(AbstractMethod):
         changed = dataclasses.replace(self.settings, draws=half, effective_draws=effective)
         return dataclasses.replace(self, settings=changed)
 
+    def is_compiled(self, problem: Problem) -> bool:
+        """Whether `run` finds all of its programs in the cache.
+
+        Args:
+            problem: The capture and its model.
+
+        Returns:
+            False where it must compile, which takes longer than many chains.
+        """
+        engine = problem.compiled_model.programs.get(ENGINE)
+        if engine is None:
+            return False
+        keys = ((make, self.settings) for make in (_particles, _mixture_draws))
+        return all(engine.programs.get(key) is not None for key in keys)
+
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
         if not problem.is_one_spectrum_point:
@@ -397,7 +448,7 @@ class Tempered(AbstractMethod):
 
         def count(what: str) -> None:
             """Report progress; a fit that was abandoned ends here."""
-            progress("tempering", counts.total() / (settings.num_attempts * (settings.rounds + 1)))
+            progress("tempering", counts.total() / (settings.num_attempts * 2 * settings.rounds))
             counts[what] += 1
 
         keys = np.asarray(jax.random.key_data(key))[None]
@@ -424,7 +475,7 @@ class Tempered(AbstractMethod):
         densities = (
             counts["particles"] * settings.init_factor * settings.num_particles
             + stages * settings.num_chains * (settings.chain_length - 1)
-            + rounds * settings.draws
+            + (rounds + 2 * counts["answers"]) * settings.draws
         )
         return PosteriorDraws(
             method="tempered",
@@ -446,7 +497,7 @@ def _engine(model: CompiledModel) -> BatchEngine:
     def make() -> BatchEngine:
         return BatchEngine(model.program, model.single, model.layout, model.precision)
 
-    return model.programs.of("tempered", make)
+    return model.programs.of(ENGINE, make)
 
 
 def _batch_of_one(data: Observations) -> ObservationBatch:
@@ -488,10 +539,11 @@ def _particles(engine: BatchEngine, settings: PixelSMC) -> Callable:
 
 
 def _mixture_draws(engine: BatchEngine, settings: PixelSMC) -> Callable:
-    """The program of one round: fit a mixture to weighted draws, and draw from it."""
+    """The program of one round: fit a mixture to weighted draws, and draw from it (or again)."""
 
     def pixel(
         number: Array,
+        again: Array,
         data: Observations,
         transform: NormalScoreTransform,
         u: Array,
@@ -499,6 +551,7 @@ def _mixture_draws(engine: BatchEngine, settings: PixelSMC) -> Callable:
         key: Array,
     ) -> Proposed:
         key_fit, key_draw = jax.random.split(jax.random.fold_in(key, number))
+        key_draw = jnp.where(again, jax.random.fold_in(key_draw, again), key_draw)
         mixture = fit_mixture(u, weights, settings.components, key_fit)
         drawn = draw_mixture(mixture, settings.draws, key_draw)
         scored = ScoredProgram(engine.single_program, transform)
@@ -510,7 +563,7 @@ def _mixture_draws(engine: BatchEngine, settings: PixelSMC) -> Callable:
         log_posterior = jnp.where(jnp.isnan(values), -jnp.inf, -values)
         return Proposed(mixture, drawn, parameters, log_posterior)
 
-    return batched(pixel, given=1, lanes=1)
+    return batched(pixel, given=2, lanes=1)
 
 
 def temper(

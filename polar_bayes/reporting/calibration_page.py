@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from polar_bayes.calibration.scores import significance_level
 from polar_bayes.calibration.verdict import (
+    PASSES,
     calibration_readings,
     calibration_table,
     compare_calibrations,
@@ -46,7 +47,7 @@ STATUSES = {
     "not converged": "no mode was reached",
     "not trusted": "no check confirms its numbers",
 }
-RANKS_COLUMN = "the ranks"
+RANKS_COLUMN, JUDGED_COLUMN = "the ranks", "the tests"
 
 
 def calibration_page(
@@ -159,7 +160,7 @@ def _score_cells() -> page.Cells:
     return {
         **{f"{level}% hold": held(level) for level in INTERVALS},
         "mean rank": column("rank_mean", ".3f"),
-        "spread": column("rank_spread", ".3f"),
+        "spread": column("spread", ".3f"),
         "width": column("width_95", ".3g"),
         "score": column("crps", ".3g"),
     }
@@ -170,24 +171,23 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
     level = significance_level(table)
     simulations = next(iter(ranks.values())).pit.size
 
-    def passes(row: pd.Series) -> bool:
-        return bool(row["p_value"] >= level)
-
     cells: page.Cells = {
-        "p": lambda row: text.p_value(row["p_value"], passes=passes(row)),
-        RANKS_COLUMN: lambda row: "uniform" if passes(row) else parameter_deviation(row),
+        "p": lambda row: text.p_value(row["p_value"], passes=bool(row["p_value"] >= level)),
+        JUDGED_COLUMN: lambda row: parameter_deviation(row, level) or PASSES,
         "failed": lambda row: f"{int(row['failed']):,} of {simulations:,}",
         **_score_cells(),
     }
     caption = page.caption("calibration.parameter", level=level)
     titles = {label: each.title for label, each in ranks.items()}
-    data, prose = table.loc[list(ranks)], [RANKS_COLUMN]
+    data, prose = table.loc[list(ranks)], [JUDGED_COLUMN]
     return page.make_table("parameter", caption, cells, data, descriptions=titles, prose=prose)
 
 
 def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table:
     """Every parameter by every method."""
-    first = one_line(str(compared.index.get_level_values("method")[0]))
+    method_of_scores = compared.index.get_level_values("method")[0]
+    first = one_line(str(method_of_scores))
+    level = significance_level(compared.xs(method_of_scores, level="method"))
 
     def method(row: pd.Series) -> str:
         label: Any = row.name
@@ -195,14 +195,14 @@ def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table
 
     cells: page.Cells = {
         "method": method,
-        "p": lambda row: text.p_value(row["p_value"], passes=bool(row["passes"])),
-        RANKS_COLUMN: lambda row: row["deviation"],
+        "p": lambda row: text.p_value(row["p_value"], passes=bool(row["p_value"] >= level)),
+        JUDGED_COLUMN: lambda row: row["deviation"],
         "failed": lambda row: f"{int(row['failed']):,}",
         f"score against {first}": _score_change,
         **_score_cells(),
     }
     caption = page.caption("calibration.comparison", first=first)
-    prose = [RANKS_COLUMN]
+    prose = [JUDGED_COLUMN]
     return page.make_table("comparison", caption, cells, compared, descriptions=titles, prose=prose)
 
 

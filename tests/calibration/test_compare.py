@@ -29,8 +29,12 @@ def test_each_parameter_by_each_method(compared) -> None:
         (label, method): method == "importance" or label == "subsurface_fraction"
         for label, method in compared.index
     }
-    assert compared.loc[("roughness", "laplace"), "deviation"] == "intervals are too narrow"
-    assert compared.loc[("refractive_index", "laplace"), "deviation"] == "the posterior is too high"
+    said = compared["deviation"].xs("laplace", level="method")
+    assert said["roughness"].startswith(
+        "intervals are too narrow (p = 0.0001); 50%, 80%, 95% inter"
+    )
+    assert "; the truths scatter 1.6" in said["roughness"]
+    assert said["refractive_index"].startswith("the posterior is too high (p = 0.0001)")
     assert (compared.xs("laplace", level="method")["failed"] == 2).all()
 
 
@@ -50,8 +54,8 @@ def test_scores_are_compared_fit_by_fit(compared) -> None:
 def test_sentences_name_what_fails_and_what_mends_it(compared) -> None:
     said = pb.calibration.comparison_sentences(compared)
     assert said[0] == "Of 3 parameters 2 fail by laplace, none fails by importance."
-    assert said[1].startswith("roughness: by laplace intervals are too narrow (p = 0.0001, 95%")
-    assert "; by importance the ranks pass (95% intervals hold 9" in said[1]
+    assert said[1].startswith("roughness: by laplace intervals are too narrow (p = 0.0001); 50%")
+    assert "; by importance all tests pass (95% intervals hold 9" in said[1]
     assert len(said) == 3
 
 
@@ -60,7 +64,9 @@ def test_a_shift_alone_is_not_called_a_width() -> None:
     for shift in (-1.0, -0.4, 0.4, 1.0):
         tree = make_calibration(shifted={"roughness": shift}, count=4000)
         way = pb.calibration.compare_calibrations({"a": tree})["deviation"].iloc[0]
-        assert way == f"the posterior is too {'high' if shift > 0.0 else 'low'}"
+        shape, *others = way.split("; ")
+        assert shape == f"the posterior is too {'high' if shift > 0.0 else 'low'} (p = 0.0001)"
+        assert not any("scatter" in each for each in others)
 
 
 def test_what_cannot_be_compared_is_refused() -> None:

@@ -1,7 +1,8 @@
 """Calibration by the fits of `polar_bayes.fit`, of models with more axes than a pixel has."""
 
+import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, override
 
 import jax
 import numpy as np
@@ -11,6 +12,7 @@ import xarray as xr
 from numpyro import distributions as dist
 from plates import LINKS, PLATE, plate_capture, plates
 from spectral_plates import spectral_plate
+from toy_models import line
 
 import polar_bayes as pb
 from polar_bayes.calibration.calibrate import METHODS, _settings
@@ -18,8 +20,8 @@ from polar_bayes.calibration.runner import Method
 from polar_bayes.errors import FitError
 from polar_bayes.inference import hierarchical_reparam, problem
 from polar_bayes.inference.batching import MethodUsed, Status
-from polar_bayes.inference.method import thin_draws
-from polar_bayes.inference.problem import compile_model
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws, thin_draws
+from polar_bayes.inference.problem import Problem, compile_model
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 from polar_bayes.progress import no_progress
@@ -205,3 +207,26 @@ def test_draws_are_thinned_by_what_they_are_worth() -> None:
     assert few["x"].tolist() == [x for x in range(0, 200, 10) if x != 40]
     assert few["y"].shape == (19, 3)
     assert len(thin_draws(draws, effective=500.0)["x"]) == 199
+
+
+@dataclasses.dataclass(frozen=True)
+class Mine(AbstractMethod):
+    """Draws of a user's own, of which each stands for ten: from the normal approximation."""
+
+    draws: int = 1000
+
+    @override
+    def run(self, problem: Problem, key: Any, progress: Any) -> PosteriorDraws:
+        z, stats = problem.initialize(progress).laplace(key, 4, self.draws)
+        return PosteriorDraws("my own", np.repeat(z, 10, axis=1), stats)
+
+
+def test_a_method_of_a_user_is_calibrated_and_judged_by_its_own_draws() -> None:
+    one = plate_capture(np.linspace(35.0, 75.0, VIEWS), 0.03, 0)
+    given: dict[str, Any] = {"model": line, "method": Mine(), "links": LINKS, "readings": False}
+    fits = pb.calibrate(one, simulations=20, **given)["fits"].to_dataset()
+    assert (fits["approach"] == MethodUsed.OTHER).all()
+    assert (fits["status"] == Status.GOOD).all()
+    assert (fits["effective_draws"] < 6000.0).all()
+    short = pb.calibrate(one, simulations=20, **given | {"method": Mine(50)})["fits"].to_dataset()
+    assert (short["status"] == Status.NOT_TRUSTED).all()

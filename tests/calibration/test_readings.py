@@ -116,7 +116,11 @@ def test_readings_are_judged_by_themselves() -> None:
         assert list(table.index) == [
             "dop, fresh", "dop, left out", "intensity, fresh", "intensity, left out"
         ]  # fmt: skip
-        assert pb.verdict(tree).sentences[0].startswith("Calibrated: the ranks of 3 parameters")
+        assert (
+            pb.verdict(tree)
+            .sentences[0]
+            .startswith("Calibrated: the ranks, coverage and spread of 3")
+        )
         assert pb.calibration.is_calibrated(pb.summary(tree))
     said = pb.verdict(good).sentences
     assert "Readings (dop, intensity; fresh ones and ones left out) pass a joint test" in said[1]

@@ -5,6 +5,7 @@ import pytest
 from scipy import stats
 
 from polar_bayes.calibration.scores import PitCrps, crps, randomized_pit
+from polar_bayes.inference.psis import summarize
 
 
 def even(fits: int, draws: int) -> np.ndarray:
@@ -28,11 +29,28 @@ def test_ties_are_shared_evenly() -> None:
     assert stats.kstest(pit, "uniform").pvalue > 1e-3
 
 
+@pytest.mark.thorough
+def test_few_effective_draws_do_not_look_like_a_narrow_posterior() -> None:
+    """Weighted draws of a normal distribution, from one that is wider: some 40 effective ones."""
+    random = np.random.default_rng(2)
+    values = random.normal(size=4000)
+    draws = 2.5 * random.standard_t(4, size=(4000, 120))
+    weights = stats.norm.pdf(draws) / stats.t(4).pdf(draws / 2.5)
+    weights /= weights.sum(axis=-1, keepdims=True)
+    pit = randomized_pit(draws, weights, values, random.random(4000))
+    low, high = summarize(draws, weights, (0.025, 0.975), random=True)[2]
+    held = np.mean((low <= values) & (values <= high))
+    # Four standard errors each.
+    assert abs(np.sqrt(12.0) * pit.std() - 1.0) < 4.0 / np.sqrt(5.0 * 4000)
+    assert abs(held - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 4000)
+
+
 def test_weights_count_as_repeated_draws() -> None:
     draws, weights = np.array([[0.0, 1.0, 2.0]]), np.array([[0.5, 0.25, 0.25]])
     repeated = np.array([[0.0, 0.0, 1.0, 2.0]])
     truth, chance = np.array([1.5]), np.array([0.0])
-    told = randomized_pit(draws, weights, truth, chance) * 4 / 3
+    effective = 1.0 / np.sum(weights**2)
+    told = randomized_pit(draws, weights, truth, chance) * (effective + 1.0) / effective
     assert told == pytest.approx(randomized_pit(repeated, even(1, 4), truth, chance) * 5 / 4)
     assert crps(draws, weights, truth) == pytest.approx(crps(repeated, even(1, 4), truth))
 

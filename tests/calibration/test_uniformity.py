@@ -1,11 +1,13 @@
-"""The test of uniform ranks: its false alarms, and what it finds."""
+"""The tests of ranks, coverage and spread: their false alarms, and what they find."""
 
 import numpy as np
 import pytest
 from cases import each
 from scipy import stats
+from synthetic_calibrations import NAMES, make_calibration
 
-from polar_bayes.calibration.scores import uniformity
+from polar_bayes.calibration.scores import is_calibrated, spread_of_scores, uniformity
+from polar_bayes.calibration.verdict import calibration_table, calibration_verdict
 
 
 @each("count", [50, 300, 1000])
@@ -47,3 +49,64 @@ def test_numbers_at_both_ends_are_counted() -> None:
     assert uniformity(np.zeros(50)).p_value == pytest.approx(1e-4)
     assert uniformity(np.ones(50)).p_value == pytest.approx(1e-4)
     assert uniformity((np.arange(50) + 0.5) / 50).p_value > 0.9
+
+
+def test_a_right_posterior_is_called_wrong_in_one_of_twenty_calibrations_at_most() -> None:
+    alarms = sum(
+        not is_calibrated(calibration_table(make_calibration(count=100, seed=seed)))
+        for seed in range(60)
+    )
+    # Tests of one parameter overlap and counts are whole numbers, so alarms are fewer than 5%. Of
+    # 60 calibrations at 5%, more than 9 are called wrong by chance in one of 1000 runs.
+    assert alarms <= 9
+
+
+@pytest.mark.thorough
+def test_the_rate_of_false_alarms_is_that_which_is_stated() -> None:
+    alarms = sum(
+        not is_calibrated(calibration_table(make_calibration(count=200, seed=seed)))
+        for seed in range(1000, 1600)
+    )
+    assert stats.binom.ppf(0.001, 600, 0.01) <= alarms <= stats.binom.ppf(0.999, 600, 0.05)
+
+
+def test_the_spread_of_skewed_and_heavy_tailed_posteriors_is_one() -> None:
+    """Scores of ranks are normal, whatever the posterior: its tails cause no false alarm."""
+    random = np.random.default_rng(3)
+    p_values = []
+    for _ in range(400):
+        truths = stats.t(3).rvs(200, random_state=random)
+        p_values.append(spread_of_scores(stats.t(3).cdf(truths)).p_value)
+    assert stats.kstest(p_values, "uniform").pvalue > 1e-3
+
+
+def test_intervals_that_are_a_little_short_are_named_with_their_coverage() -> None:
+    """Ranks alone, at half the level, do not see what shows in the tails."""
+    tree = make_calibration(count=4000, narrow={NAMES[0]: 0.93})
+    first, second = calibration_verdict(tree)[:2]
+    assert first.startswith(
+        "Not calibrated: the ranks, coverage and spread of 3 parameters in 4000"
+    )
+    assert second.startswith(f"{NAMES[0]}: ")
+    assert "50%, 80%, 95% intervals hold 47.0%, 76.4%, 93.1% of the truths (p = 3e-08)" in second
+    assert "; the truths scatter 1.0" in second
+
+
+def test_tails_that_are_cut_are_found_by_coverage() -> None:
+    """1000 ranks of which 74 lie outside of the 95% interval, the middle even: p = .001."""
+    tree = make_calibration(count=1000)
+    tails, middle = np.linspace(0.0005, 0.0245, 37), np.linspace(0.0255, 0.9745, 926)
+    pit = np.random.default_rng(4).permutation(np.concatenate([tails, middle, 1.0 - tails]))
+    prior = tree["prior_sbc"].to_dataset()
+    marginals, truth = tree["marginals"].to_dataset(), tree["truth"].to_dataset()
+    z = stats.norm.ppf(pit)
+    name = NAMES[0]
+    truth[name] = marginals[name] + z * marginals[f"{name}_sd"]
+    prior[name] = ("simulation", pit)
+    for group, values in (("truth", truth), ("prior_sbc", prior)):
+        tree[group] = type(tree)(values)
+    row = calibration_table(tree).loc[name]
+    assert row["held_95"] == 0.926
+    assert row["p_held_95"] < 0.05 / 15
+    assert not is_calibrated(calibration_table(tree))
+    assert "95% intervals hold 92.6% of the truths (p = 0.001)" in calibration_verdict(tree)[1]

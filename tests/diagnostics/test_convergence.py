@@ -297,3 +297,33 @@ def test_a_file_gives_the_same_table(tmp_path) -> None:
 def test_what_is_no_result_is_refused(wrong: object) -> None:
     with pytest.raises(FitError, match="result: it holds no fit; give the tree"):
         summary(wrong)
+
+
+@each("method", ["importance", "tempered"])
+def test_weighted_draws_have_the_floor_of_chains(method: str) -> None:
+    for effective, is_enough in ((399.0, False), (401.0, True)):
+        judged = verdict(edit_provenance(make_result(method=method), effective_draws=effective))
+        told = "The effective sample size of the weighted draws is 399 (at least 400)"
+        assert any(problem.startswith(told) for problem in judged.problems) != is_enough
+        assert judged.passed == is_enough
+
+
+def test_a_laplace_fit_says_how_far_it_is_off_from_its_own_weighted_draws() -> None:
+    """The posterior is wider by a fifth than the approximation, and half a sd higher."""
+    tree = make_result(method="laplace", draws=1000)
+    draws = posterior_of(tree, "roughness")
+    z = (draws - draws.mean()) / draws.std()
+    log_weight = stats.norm.logpdf(z, 0.5, 1.2) - stats.norm.logpdf(z)
+    judged = verdict(replace(tree, "sample_stats", "log_weight", log_weight))
+    (told,) = [text for text in judged.cautions if text.startswith("By its own weighted draws")]
+    shift, change = re.search(r"roughness \(mean by (.*?) sd, sd (.*?)%\)", told).groups()
+    assert 0.3 < float(shift) < 0.5
+    assert -25.0 < float(change) < -8.0
+    assert "use method='importance' or 'nuts'" in told
+
+
+def test_chains_of_a_method_of_a_user_are_judged_as_those_of_nuts() -> None:
+    tree = edit_provenance(make_result(draws=60), method="independence sampler")
+    judged = verdict(tree)
+    assert not judged.passed
+    assert any("Bulk ESS below 400" in problem for problem in judged.problems)

@@ -18,6 +18,7 @@ from toy_models import capture, funnel, line, of_line
 
 import polar_bayes as pb
 from polar_bayes.inference import fitting
+from polar_bayes.inference.auto import _compiled_first
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.request import resolve
@@ -131,7 +132,7 @@ def test_the_first_rung_that_is_good_enough_is_taken():
     assert said["auto"]["chosen"] == "rung 0"
     assert said["auto"]["met"]
     assert said["method"] == "importance"
-    assert pb.verdict(result).passed
+    assert pb.verdict(result).converged
     (sentence,) = pb.inference.auto_sentences(result)
     assert "was taken: its means and standard deviations are expected within" in sentence
 
@@ -158,7 +159,7 @@ def test_a_rung_that_fails_its_own_diagnostics_is_climbed_over(rung, why):
     assert said["auto"]["chosen"] == "rung 1"
     assert why in said["auto"]["steps"][0]["why"]
     assert why in pb.inference.auto_sentences(result)[0]
-    assert pb.verdict(result).passed
+    assert pb.verdict(result).converged
 
 
 def test_too_few_draws_are_mended_by_more_of_the_same():
@@ -345,3 +346,22 @@ def test_a_funnel_is_left_to_higher_rungs():
 def test_what_cannot_be_asked_is_refused(asked, said):
     with pytest.raises(pb.FitError, match=said):
         pb.fit(capture(), model=line, links=LINKS, **asked)
+
+
+def test_chains_come_before_tempered_draws_that_must_still_compile() -> None:
+    """And after them once they are compiled, as by an earlier fit of this layout."""
+    here = problem(line)
+    tempered = pb.methods.Tempered(pb.methods.PixelSMC(draws=1024, effective_draws=100.0))
+    rungs = {"importance": Made(), "tempered": tempered, "nuts": Made()}
+    assert [name for name, _ in _compiled_first(list(rungs.items()), here)] == [
+        "importance", "nuts", "tempered"
+    ]  # fmt: skip
+    tempered.run(here, KEY, no_progress)
+    assert list(_compiled_first(list(rungs.items()), here)) == list(rungs.items())
+    other = dataclasses.replace(tempered, settings=pb.methods.PixelSMC())
+    assert not other.is_compiled(here)
+
+
+def test_each_of_several_methods_is_tried_once_more_with_more_draws() -> None:
+    _, said = fitted(Made(draws=200, r_hat=1.2), Made(draws=200), Made(fails="must not be tried"))
+    assert [step["name"] for step in said["auto"]["steps"]] == ["rung 0", "rung 1", "rung 1"]

@@ -199,10 +199,10 @@ def test_draws_are_scaled_and_settings_kept():
     assert (chains.draws, chains.most_draws, chains.effective_draws) == (1000, 16000, 900.0)
     assert chains.warmup == 77
     tempered = pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)).scale_draws(4.0).settings
-    assert (tempered.draws, tempered.effective_draws) == (16384, 800.0)
+    assert (tempered.draws, tempered.effective_draws) == (16384, 1600.0)
     assert pb.methods.Tempered(tempered).num_draws == tempered.answer_draws == 32768
     fewer = pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)).scale_draws(0.25).settings
-    assert (fewer.draws, fewer.effective_draws) == (1024, 50.0)
+    assert (fewer.draws, fewer.effective_draws) == (1024, 100.0)
     with pytest.raises(FitError, match="512 draws are fewer than the 2048 particles"):
         pb.methods.Tempered(pb.methods.PixelSMC(draws=1024)).scale_draws(0.25)
     assert pb.methods.Point().scale_draws(2.0) is None

@@ -215,7 +215,7 @@ def test_skewed_pixels_have_the_posteriors_of_a_grid(chains: bool) -> None:
         ({"init_factor": 0}, "init_factor is 0; give 1 or more"),
         ({"target_ess": 0.99}, "target_ess is 0.99; give a number from 0.1 to 0.95"),
         ({"draws": 800}, "draws is 800, of 2048 particles; give at least half of num_chains"),
-        ({"effective_draws": 5000.0}, "effective_draws is 5000.0, of 2048 draws"),
+        ({"effective_draws": 5000.0}, "effective_draws is 5000.0, of 4096 draws"),
     ],
 )
 def test_mistakes_are_told(settings: dict, said: str) -> None:
