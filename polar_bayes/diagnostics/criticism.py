@@ -113,9 +113,12 @@ def criticize(result: xr.DataTree) -> pd.DataFrame:
         Analysis 1, 893.
     """
     found = posterior_scalars(result)
-    if method_of(result) == "point":
-        missing = Finding("not computed", sentence="A point fit has no draws to criticize.")
-        return _table(dict.fromkeys(CHECKS, missing))
+    missing = [name for name in GROUPS if name not in result.children]
+    if method_of(result) == "point" or missing:
+        why = f"The result has no group {', '.join(missing)}, so the model was not checked."
+        if method_of(result) == "point":
+            why = "A point fit has no draws to criticize."
+        return _table(dict.fromkeys(CHECKS, Finding("not computed", sentence=why)))
     residuals = _residuals(result)
     checks = predictive_checks(result)
     return _table(
@@ -324,6 +327,8 @@ def _positions(result: xr.DataTree, variable: FlatVariable) -> _Positions:
     return _Positions(np.stack(angles, axis=1), wavelength, group, labels)
 
 
+GROUPS = ("prior", "observed_data", "constant_data")
+"""Groups of a result without which nothing can be checked."""
 GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
 
 
@@ -485,8 +490,6 @@ def _influence(
 
 def _repeats(result: xr.DataTree) -> Finding:
     """Views that repeat another in its directions and in every digit of its readings."""
-    if "observed_data" not in result.children or "constant_data" not in result.children:
-        return Finding("not computed", sentence="The fit holds no readings.")
     observed = result["observed_data"].to_dataset()
     constants = result["constant_data"].to_dataset()
     columns = [
