@@ -40,7 +40,7 @@ from polar_bayes.reporting.style import QUANTITIES, parameter_title
 from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
 from polar_bayes.repr_html import Row, Table
 from polar_bayes.results import summary, verdict
-from polar_bayes.scenes.stacking import scene_sentences, scene_table
+from polar_bayes.scenes.sentences import scene_sentences, scene_table
 
 SHARED_GROUP = "Populations and spectra"
 INSTRUMENT_GROUP = "Instrument and noise"

@@ -8,8 +8,8 @@ from .comparison import (
     Setting as Setting,
 )
 from .fitting import fit as fit
-from .stacking import (
-    fit_best_scenes as fit_best_scenes,
+from .sentences import (
     scene_sentences as scene_sentences,
     scene_table as scene_table,
 )
+from .stacking import fit_best_scenes as fit_best_scenes

@@ -12,6 +12,7 @@ Source:
 """
 
 import dataclasses
+import json
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -41,6 +42,7 @@ from polar_bayes.scenes.candidates import (
     named_setup,
     scene_library,
 )
+from polar_bayes.scenes.sentences import ERRORS_APART, SMALL_DIFFERENCE
 
 METHOD = Importance(draws=2048, rounds=6)
 """Of the fits that are compared."""
@@ -48,11 +50,6 @@ METHOD = Importance(draws=2048, rounds=6)
 MAX_FITS = 12
 """Candidates that are fitted at most."""
 
-SMALL_DIFFERENCE = 4.0
-"""Difference in elpd, unit nat, below which two scenes are not told apart, whatever its error."""
-
-ERRORS_APART = 2.0
-"""Standard errors of the difference beyond which a scene is told apart from the best."""
 
 LEAST_WEIGHT = 0.05
 """Stacking weight below which a scene does not remain."""
@@ -95,6 +92,29 @@ class SceneComparison:
         """Stacking weights of the scenes that remain, largest first."""
         remaining = self.table["weight"][self.table["weight"] > 0.0]
         return {str(k): float(v) for k, v in remaining.sort_values(ascending=False).items()}
+
+    def to_dataset(self) -> xr.Dataset:
+        """The tables as a dataset with the dims scene and parameter, as a fit holds them."""
+        table = self.table.rename_axis("scene")
+        intervals = self.intervals.rename(columns={"q2.5": "low", "q97.5": "high"})
+        labels = list(dict.fromkeys(intervals.index.get_level_values(0)))
+        wide = {
+            name: intervals[name].unstack(0).reindex(index=table.index, columns=labels).to_numpy()
+            for name in ("mean", "sd", "low", "high")
+        }
+        parts = [repr(self.scenes[name]) for name in table.index]
+        texts = {"parts": parts, "criticism": list(table["criticism"])}
+        numbers = ("elpd", "se", "elpd_diff", "dse", "weight", "unreliable", "seconds")
+        return xr.Dataset(
+            {
+                **{name: ("scene", table[name].to_numpy(float)) for name in numbers},
+                **{name: ("scene", np.array(text, dtype=str)) for name, text in texts.items()},
+                **{name: (("scene", "parameter"), values) for name, values in wide.items()},
+                "between_share": ("parameter", self.between.reindex(labels).to_numpy(float)),
+            },
+            {"scene": table.index.to_numpy(str), "parameter": np.array(labels, dtype=str)},
+            {"left_out": json.dumps(dict(self.left_out))},
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
