@@ -243,7 +243,7 @@ def main(count: int) -> None:
     }.items():
         ratios = (speed / peer for peer in (scipy_rate, newton_rate, guide_rate))
         print(f"{name:<8} {speed:11.0f}" + "".join(f"{ratio:11.1f}" for ratio in ratios))
-    sd = np.sqrt(np.sum(np.asarray(settled.mode.widths) ** 2, axis=1))
+    sd = np.sqrt(np.sum(np.asarray(settled.mode.root) ** 2, axis=1))
     apart = np.max(np.abs(np.asarray(newton) - settled.mode.z[:1024]) / sd[:1024], axis=1)
     higher = heights(engine, pixels, np.asarray(newton)) - heights(
         engine, pixels, settled.mode.z[:1024]

@@ -99,7 +99,8 @@ class PredictivePit:
                 (self.fresh, randomized_pit(predicted[name], equal, observed[:, 0], uniform[:, 0])),
                 (
                     self.left_out,
-                    randomized_pit(predicted[name], without, observed[:, 1], uniform[:, 1]),
+                    # Weights without a reading select predictions, which are as many as before.
+                    randomized_pit(predicted[name], without, observed[:, 1], uniform[:, 1], DRAWS),
                 ),
                 (self.left_out_k, pareto_k),
             )

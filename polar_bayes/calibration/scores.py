@@ -48,14 +48,16 @@ def randomized_pit(
     weights: Float[np.ndarray, "fit draw"],
     value: Float[np.ndarray, " fit"],
     uniform: Float[np.ndarray, " fit"],
+    count: int | None = None,
 ) -> Float[np.ndarray, " fit"]:
     """Weighted share of draws below a value, uniform over ties and over the gap it falls into."""
-    # The gap is as wide as between as many draws of equal weight: where a value is one more draw of
-    # the same distribution, this has the variance of a uniform number, however few they are.
+    # The gap is as wide as between `count` draws of equal weight, by default as many as the weights
+    # are worth: where a value is one more draw of the same distribution, this has the variance of a
+    # uniform number, however few they are.
     below = np.sum(weights * (draws < value[:, None]), axis=-1)
     tied = np.sum(weights * (draws == value[:, None]), axis=-1)
-    count = effective_draws(weights)
-    return (count * (below + uniform * tied) + uniform) / (count + 1)
+    number = effective_draws(weights) if count is None else count
+    return (number * (below + uniform * tied) + uniform) / (number + 1)
 
 
 def crps(
