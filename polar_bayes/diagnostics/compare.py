@@ -22,8 +22,8 @@ from polar_bayes.diagnostics.predictive import MAX_PARETO_K, Loo, predictive_che
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import check_fit
+from polar_bayes.observation.data import ANGLES
 
-GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
 SUMMARY_COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
 SENSITIVITY_COLUMNS = (
     *("prior_inside", "verdict", "prior_sensitivity", "likelihood_sensitivity", "remark"),
@@ -104,7 +104,7 @@ def _parameters(
 
 def _check_same_capture(one: xr.DataTree, other: xr.DataTree, first: str, name: str) -> None:
     """Directions and readings must be the same; the readings that each fit uses may differ."""
-    for group, names in (("constant_data", GEOMETRY), ("observed_data", None)):
+    for group, names in (("constant_data", ANGLES), ("observed_data", None)):
         values, expected = (
             tree[group].to_dataset() if group in tree.children else xr.Dataset()
             for tree in (other, one)

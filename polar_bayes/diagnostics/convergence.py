@@ -14,7 +14,7 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
-from polar_bayes.diagnostics.criticism import criticize
+from polar_bayes.diagnostics.criticism import criticize, listed
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
     CENTRAL_95,
@@ -37,7 +37,6 @@ WEIGHTED = ("importance", "tempered")
 MAX_SECOND_MODE = 0.01
 MAX_MASKED = 0.25
 MAX_DEEP_TREES = 0.01
-MAX_LISTED = 4
 ROUNDING = 1e-6
 """Tolerance of draws in single precision at the ends of their prior."""
 ONLY_HEAVIEST = ", and only the heaviest is described here; use method='nuts', or "
@@ -227,8 +226,8 @@ def _draw_problems(
     equal = [s.label for s in free if s.draws.min() == s.draws.max()]
     if equal and method != "point":
         yield (
-            f"All draws are equal: {_list(equal)}; nothing is known of the width of the posterior, "
-            "so fit again with more draws, or hold the parameter fixed."
+            f"All draws are equal: {listed(equal)}; nothing is known of the width of the "
+            "posterior, so fit again with more draws, or hold the parameter fixed."
         )
 
 
@@ -245,7 +244,7 @@ def _out_of_range(scalar: Scalar, provenance: Mapping[str, Any]) -> tuple[str, n
 
 def _percentages(flags: Iterable[tuple[str, np.ndarray]]) -> str:
     """`roughness 3% of its draws` of each parameter that has flagged draws; empty without any."""
-    return _list(f"{label} {bad.mean():.0%} of its draws" for label, bad in flags if bad.any())
+    return listed(f"{label} {bad.mean():.0%} of its draws" for label, bad in flags if bad.any())
 
 
 def _chain_problems(result: xr.DataTree, table: pd.DataFrame) -> Iterator[str]:
@@ -254,7 +253,7 @@ def _chain_problems(result: xr.DataTree, table: pd.DataFrame) -> Iterator[str]:
     high = r_hat[~(r_hat <= LARGEST_R_HAT)].sort_values(ascending=False)
     if len(high):
         yield (
-            f"R-hat above {LARGEST_R_HAT}: {_list(f'{n} {x:.4g}' for n, x in high.items())}; the "
+            f"R-hat above {LARGEST_R_HAT}: {listed(f'{n} {x:.4g}' for n, x in high.items())}; the "
             "chains have not found one distribution, so sample longer, as in Nuts(warmup=1000, "
             "most_draws=20000), and look at the pair plot for several modes."
         )
@@ -264,7 +263,7 @@ def _chain_problems(result: xr.DataTree, table: pd.DataFrame) -> Iterator[str]:
     ):
         low = table[column][~(table[column] >= SMALLEST_ESS)].sort_values()
         if len(low):
-            numbers = _list(f"{label} {np.floor(x):.0f}" for label, x in low.items())
+            numbers = listed(f"{label} {np.floor(x):.0f}" for label, x in low.items())
             yield (
                 f"{part} ESS below {SMALLEST_ESS}: {numbers}; the {estimate} is not known well "
                 "enough, so sample longer, as in Nuts(most_draws=20000)."
@@ -324,7 +323,7 @@ def _corrections(result: xr.DataTree, found: Sequence[Scalar]) -> Iterator[str]:
             text = f"{scalar.label} (mean by {shift:.1f} sd, sd {ratio - 1.0:+.0%})"
             changes.append((shift + abs(math.log(ratio)), text))
     if changes:
-        names = _list(text for _, text in sorted(changes, reverse=True))
+        names = listed(text for _, text in sorted(changes, reverse=True))
         yield (
             f"By its own weighted draws the approximation is off: {names}; use "
             "method='importance' or 'nuts' where that matters."
@@ -352,7 +351,7 @@ def _estimate_cautions(result: xr.DataTree, table: pd.DataFrame, method: str) ->
     undetermined = table.index[table["sd"].isna()]
     if method == "point" and len(undetermined):
         yield (
-            f"No standard error: {_list(dict.fromkeys(undetermined))}; least squares does not "
+            f"No standard error: {listed(dict.fromkeys(undetermined))}; least squares does not "
             "determine such values, so they say nothing."
         )
 
@@ -381,13 +380,6 @@ def _capture_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
             "scene=, or let scene='auto' choose."
         )
     yield from provenance.get("capture_cautions", ())
-
-
-def _list(items: Iterable[str]) -> str:
-    """`roughness 1.08, absorption[450] 1.03 and 2 more`."""
-    items = list(items)
-    more = len(items) - MAX_LISTED
-    return ", ".join(items[:MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _number(value: float) -> float | None:

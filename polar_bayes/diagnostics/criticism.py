@@ -17,7 +17,7 @@ Evans & Moshonov (2006), Bayesian Analysis 1, 893 (prior-data conflict by tail p
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +40,7 @@ from polar_bayes.diagnostics.predictive import (
     predictive_checks,
 )
 from polar_bayes.inference.result import bounds_of, provenance_of
+from polar_bayes.observation.data import ANGLES
 
 CAUTION = 0.02
 """Probability, under a right model, that one check gives a caution or a problem."""
@@ -63,7 +64,7 @@ LARGE_SHIFT = 1.0
 NOISE_FACTOR = "stokes_error_factor"
 LARGE_FACTOR = 3.0
 """Stated errors that are exceeded by this factor, with probability 97.5%, give a caution."""
-MAX_NAMED = 4
+MAX_LISTED = 4
 QUESTIONS = {
     "priors": "are posterior medians in the tails of their priors?",
     "noise": "do the readings scatter more than their stated errors?",
@@ -149,9 +150,11 @@ def _level(p_value: float) -> str:
     return "problem" if p_value < PROBLEM else "caution" if p_value < CAUTION else "passed"
 
 
-def _list(items: Sequence[str]) -> str:
-    more = len(items) - MAX_NAMED
-    return ", ".join(items[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
+def listed(items: Iterable[str]) -> str:
+    """The first items, and how many more there are: `roughness 1.08, exposure 1.03 and 2 more`."""
+    items = list(items)
+    more = len(items) - MAX_LISTED
+    return ", ".join(items[:MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 # --- Priors, noise and bounds ---------------------------------------------------------------------
@@ -172,7 +175,7 @@ def _prior_conflict(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     worst = np.argsort(-score)
     names = [f"{labels[i]} {score[i]:.1f} sd" for i in worst if score[i] > 1.5]
     sentence = (
-        f"Priors and data are in conflict ({_p_text(p_value)}): {_list(names)} from the center of "
+        f"Priors and data are in conflict ({_p_text(p_value)}): {listed(names)} from the center of "
         "the prior; a scene without what the readings show forces its parameters there, so try "
         "polar_bayes.compare_scenes, or state priors that hold for this object."
     )
@@ -227,7 +230,7 @@ def _bounds(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
         return Finding("passed")
     hits.sort(reverse=True)
     sentence = (
-        f"The posterior lies against a bound: {_list([text for _, text in hits])}; what is beyond "
+        f"The posterior lies against a bound: {listed([text for _, text in hits])}; what is beyond "
         "is excluded by the prior or by physics, not by the readings, so the interval is too "
         "narrow or the scene is wrong."
     )
@@ -257,7 +260,7 @@ class _Residuals:
 
 def _residuals(result: xr.DataTree) -> _Residuals | None:
     """Residuals of all variables together, since they share the parameters that absorb them."""
-    variables = [v for v in flat_variables(result) if v.observed.size]
+    variables = flat_variables(result)
     if not variables or not all(
         np.isfinite(v.predicted).all() and np.isfinite(v.noise_free).all() for v in variables
     ):
@@ -309,7 +312,7 @@ def _positions(result: xr.DataTree, variable: FlatVariable) -> _Positions:
         whole = values.broadcast_like(reading).transpose(*reading.dims)
         return np.asarray(whole)[variable.usable]
 
-    angles = [along(constants[name]) for name in GEOMETRY]
+    angles = [along(constants[name]) for name in ANGLES]
     wavelength = np.zeros(variable.observed.size)
     if "wavelength" in reading.coords and "wavelength" in reading.dims:
         wavelength = along(reading["wavelength"])
@@ -329,7 +332,6 @@ def _positions(result: xr.DataTree, variable: FlatVariable) -> _Positions:
 
 GROUPS = ("prior", "observed_data", "constant_data")
 """Groups of a result without which nothing can be checked."""
-GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
 
 
 def _residual_findings(residuals: _Residuals | None) -> dict[str, Finding]:
@@ -411,7 +413,12 @@ def _autocorrelation(residuals: _Residuals, kernels: Sequence[np.ndarray]) -> tu
     if not scores:
         return 1.0, math.nan
     observed, replicates = max(scores), np.max(null, axis=0)
-    return float((1 + np.sum(replicates >= observed)) / (1 + replicates.size)), float(observed)
+    return _p_value(observed, replicates), float(observed)
+
+
+def _p_value(observed: float, replicates: np.ndarray) -> float:
+    """Share of the replicates, the readings among them, whose statistic is as large."""
+    return float((1 + np.sum(replicates >= observed)) / (1 + replicates.size))
 
 
 def _moran(e: np.ndarray, kernel: np.ndarray) -> np.ndarray:
@@ -425,11 +432,10 @@ def _outliers(residuals: _Residuals) -> Finding:
         return np.abs(e).max(axis=-1) / np.sqrt(np.mean(e**2, axis=-1))
 
     observed = float(largest(residuals.observed))
-    p_value = float((1 + np.sum(largest(residuals.replicated) >= observed)) / (1 + REPLICATES))
-    order = np.argsort(-np.abs(residuals.observed))
-    names = [residuals.labels[i] for i in order[:1]]
+    p_value = _p_value(observed, largest(residuals.replicated))
+    farthest = residuals.labels[int(np.abs(residuals.observed).argmax())]
     sentence = (
-        f"A reading is farther out than the noise explains ({_p_text(p_value)}): {names[0]}, "
+        f"A reading is farther out than the noise explains ({_p_text(p_value)}): {farthest}, "
         f"{observed:.1f} times the rms residual; check it, or mark it valid=False."
     )
     return _finding(p_value, observed, sentence)
@@ -482,7 +488,7 @@ def _influence(
         return Finding("passed")
     named.sort(reverse=True)
     sentence = (
-        f"{len(named)} readings decide the answer: without {_list([text for _, text in named])} a "
+        f"{len(named)} readings decide the answer: without {listed([text for _, text in named])} a "
         f"parameter's mean would move by up to {named[0][0]:.1f} sd; repeat those readings."
     )
     return Finding("caution", statistic=named[0][0], sentence=sentence)
@@ -495,7 +501,7 @@ def _repeats(result: xr.DataTree) -> Finding:
     columns = [
         values.transpose("view", ...).to_numpy().reshape(observed.sizes["view"], -1)
         for values in (
-            *(constants[name] for name in GEOMETRY),
+            *(constants[name] for name in ANGLES),
             *observed.data_vars.values(),
         )
         if "view" in values.dims
@@ -509,7 +515,7 @@ def _repeats(result: xr.DataTree) -> Finding:
     zenith = [f"{table[i, 0]:g} degrees" for i in np.sort(first[counts > 1])]
     sentence = (
         f"{repeated} of {len(table)} views repeat another in every digit: those at "
-        f"{_list(zenith)}; copies are no new information, and make intervals too narrow, so enter "
+        f"{listed(zenith)}; copies are no new information, and make intervals too narrow, so enter "
         "every reading once."
     )
     return Finding("problem" if repeated > 1 else "caution", statistic=repeated, sentence=sentence)
