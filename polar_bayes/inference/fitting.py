@@ -242,7 +242,7 @@ def _model_source(model: Callable) -> str:
     while isinstance(model, Messenger):
         model = model.fn
     code = model if isinstance(model, FunctionType) else type(model)
-    if code.__module__.startswith("polar_bayes."):
+    if (code.__module__ or "").startswith("polar_bayes."):  # None: of exec() in a bare namespace
         return ""
     try:
         return inspect.getsource(code)
