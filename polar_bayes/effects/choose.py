@@ -17,7 +17,7 @@ import pandas as pd
 import xarray as xr
 from numpyro import distributions as dist
 
-from polar_bayes.effects.compare_scenes import Baseline, Comparison, SceneDensities
+from polar_bayes.effects.posterior_change import Baseline, PosteriorChange, SceneDensities
 from polar_bayes.effects.variants import (
     Effect,
     KeyPath,
@@ -75,11 +75,11 @@ class SingleComparisons:
     full: Scene
     tolerance: float
     baseline: Baseline
-    comparisons: dict[Effect, Comparison]
+    changes: dict[Effect, PosteriorChange]
 
     def change(self, effect: Effect) -> float:
         """The largest change of a judged parameter without the effect."""
-        return self.baseline.largest_change(self.comparisons[effect])
+        return self.baseline.largest_change(self.changes[effect])
 
     def operations(self, effect: Effect) -> float:
         """Operations of one log density without the effect."""
@@ -99,7 +99,7 @@ class Selection:
 
     scene: Scene
     baseline: Baseline
-    combined: Comparison
+    combined: PosteriorChange
     kept: dict[Effect, bool]
     reasons: dict[Effect, str]
 
@@ -121,11 +121,11 @@ def compare_effects(
                 where=f"parameters: {name!r}",
                 hint=f"give any of {', '.join(dict.fromkeys(density.sites))}",
             )
-    comparisons = {}
+    changes = {}
     for number, effect in enumerate(effects):
-        comparisons[effect], _ = baseline.compare(densities.density(effect.apply(full)))
+        changes[effect] = baseline.compare(densities.density(effect.apply(full)))
         densities.progress("comparing effects", (number + 1) / len(effects))
-    return SingleComparisons(densities, full, tolerance, baseline, comparisons)
+    return SingleComparisons(densities, full, tolerance, baseline, changes)
 
 
 def select_effects(single: SingleComparisons, choice: UserChoice) -> Selection:
@@ -134,14 +134,14 @@ def select_effects(single: SingleComparisons, choice: UserChoice) -> Selection:
     forced = [options[0] for options in single.by_key_path(choice.drop).values()]
     if forced:
         bare = simplify(full, forced)
-        _, fit = baseline.compare(densities.density(bare))
+        fit = baseline.compare(densities.density(bare)).fit
         baseline = dataclasses.replace(baseline, fit=fit)
         if not fit.found:
             baseline = densities.baseline(bare, baseline.names)
     forced_paths = {effect.key_path for effect in forced}
     options = single.by_key_path(
         effect
-        for effect in single.comparisons
+        for effect in single.changes
         if single.change(effect) <= single.tolerance
         and effect.key_path not in forced_paths
         and not choice.protects(effect, full)
@@ -150,7 +150,7 @@ def select_effects(single: SingleComparisons, choice: UserChoice) -> Selection:
     while True:
         dropped = [*forced, *(effects[0] for effects in options.values() if effects)]
         scene = simplify(full, dropped)
-        combined, _ = baseline.compare(densities.density(scene))
+        combined = baseline.compare(densities.density(scene))
         optional = dropped[len(forced) :]
         if baseline.largest_change(combined) <= single.tolerance or not optional:
             break
@@ -159,7 +159,7 @@ def select_effects(single: SingleComparisons, choice: UserChoice) -> Selection:
         reasons[worst] = f"with all others that could go, {baseline.describe(combined)}"
     replaced = {effect.key_path: effect for effect in dropped}
     left = [part for _, part in parts_of(scene)]
-    kept = {e: e.key_path not in replaced and e.part in left for e in single.comparisons}
+    kept = {e: e.key_path not in replaced and e.part in left for e in single.changes}
     for effect in kept.keys() - reasons.keys() - set(dropped):
         if effect.key_path in replaced:
             reasons[effect] = f"{replaced[effect.key_path].name} instead"
@@ -171,13 +171,13 @@ def select_effects(single: SingleComparisons, choice: UserChoice) -> Selection:
 
 def _reason(single: SingleComparisons, effect: Effect, remark: str, is_kept: bool) -> str:
     """Why an effect is kept or dropped: the remark, the change, and the parameters that it adds."""
-    change, comparison = single.change(effect), single.comparisons[effect]
-    seen = single.baseline.describe(comparison)
+    change = single.change(effect)
+    seen = single.baseline.describe(single.changes[effect])
     if change <= single.tolerance:
         which = "parameter" if single.baseline.names is None else "judged parameter"
         seen = f"alone no {which} changes by more than {max(change, 0.001):.2g} sd"
         remark = remark or ("a part of it stays by your choice" if is_kept else "")
-    missing = () if is_kept else single.baseline.missing(comparison)
+    missing = [] if is_kept else single.baseline.missing(single.changes[effect])
     unfitted = f"not fitted then: {', '.join(missing)}" if missing else ""
     return "; ".join(text for text in (remark, seen, unfitted) if text)
 
@@ -216,7 +216,7 @@ def make_ledger(
 ) -> xr.Dataset:
     """Comparisons, costs and the selection as one dataset."""
     full, costs = single.full, single.densities.costs()
-    effects, comparisons = tuple(single.comparisons), tuple(single.comparisons.values())
+    effects, changes = tuple(single.changes), tuple(single.changes.values())
     labels = single.baseline.fit.density.labels
     shape = (len(effects), len(labels))
 
@@ -226,10 +226,10 @@ def make_ledger(
         return [known.get(label, math.nan) for label in labels]
 
     columns: dict[str, tuple[tuple[str, ...], Any]] = {
-        "largest_move": (EFFECT, [each.largest_move for each in comparisons]),
-        "rms_move": (EFFECT, [each.rms_move for each in comparisons]),
-        "shift": (BOTH, np.reshape([each.shift for each in comparisons], shape)),
-        "sd_ratio": (BOTH, np.reshape([each.sd_ratio for each in comparisons], shape)),
+        "largest_move": (EFFECT, [each.largest_move for each in changes]),
+        "rms_move": (EFFECT, [each.rms_move for each in changes]),
+        "shift": (BOTH, np.reshape([each.shift for each in changes], shape)),
+        "sd_ratio": (BOTH, np.reshape([each.sd_ratio for each in changes], shape)),
         "change": (EFFECT, [single.change(effect) for effect in effects]),
         "kept": (EFFECT, np.asarray([selection.kept[effect] for effect in effects], bool)),
         "forced": (EFFECT, [effect in (*choice.keep, *choice.drop) for effect in effects]),
@@ -247,10 +247,10 @@ def make_ledger(
     }
     without = [costs[effect.apply(full)] for effect in effects]
     for name in COSTS:
-        whole = getattr(costs[full], name)
-        columns[name] = (EFFECT, [whole - getattr(cost, name) for cost in without])
+        whole = costs[full][name]
+        columns[name] = (EFFECT, [whole - cost[name] for cost in without])
         attributes[f"full_{name}"] = whole
-        attributes[f"chosen_{name}"] = getattr(costs[selection.scene], name)
+        attributes[f"chosen_{name}"] = costs[selection.scene][name]
     return xr.Dataset(
         {
             name: (*columns[name], {"long_name": long_name, "units": units})
