@@ -203,11 +203,10 @@ def make_plan(
     request: Request, generative_request: Request | None, settings: Method, readings: bool
 ) -> CalibrationPlan:
     """What is done to every block; without a generative request, the fitted model simulates."""
-    spec_key = engine_key(request, request.largest_view_zenith)
+    own_key = engine_key(request, request.largest_view_zenith)
     generative_key = "" if generative_request is None else engine_key(generative_request)
-    capture_key = tokenize(request.capture)
-    key = tokenize(spec_key, generative_key, repr(settings), readings, capture_key)
-    return CalibrationPlan(request, generative_request, settings, readings, spec_key, key)
+    key = tokenize(own_key, generative_key, repr(settings), readings, tokenize(request.capture))
+    return CalibrationPlan(request, generative_request, settings, readings, own_key, key)
 
 
 def _fit_all(
