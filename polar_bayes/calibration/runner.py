@@ -26,7 +26,7 @@ from polar_bayes.inference.batch_method import AbstractPixelMethod
 from polar_bayes.inference.batching import ObservationBatch, Outcome
 from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache
 from polar_bayes.inference.method import AbstractMethod
-from polar_bayes.inference.problem import CompiledModel, compile_model
+from polar_bayes.inference.problem import CompiledModel, compile_model, observe_request
 from polar_bayes.inference.program import Program, Values, compile_program
 from polar_bayes.inference.psis import Marginals
 from polar_bayes.inference.request import Request
@@ -42,7 +42,7 @@ from polar_bayes.maps.blocks import (
     locked_ledger,
     written,
 )
-from polar_bayes.observation.data import Observations, observe
+from polar_bayes.observation.data import Observations
 from polar_bayes.paths import TEMPORARY_PREFIX, replace_file, temporary_folder
 from polar_bayes.priors import describe_prior
 
@@ -110,9 +110,8 @@ class CompiledPlan:
     @functools.cached_property
     def data(self) -> Observations:
         """The capture whose layout all simulations have."""
-        request = self.plan.request
         with jax.enable_x64(True):
-            return observe(request.capture, largest_view_zenith=request.largest_view_zenith)
+            return observe_request(self.plan.request)
 
     @functools.cached_property
     def engine(self) -> CompiledModel | BatchEngine:

@@ -47,15 +47,8 @@ class DesignProblem(NamedTuple):
 
 def provenance_attrs(request: Request, **more: Any) -> dict[str, str]:
     """The attribute of a result that holds its capture, model and settings, as JSON."""
-    found = {
-        "model": request.model_name,
-        "scene": request.scene_name,
-        "scene_parts": repr(request.scene),
-        "links": {name: repr(link) for name, link in request.links.items()},
-        "seed": request.seed,
-        "capture": str(request.capture.attrs.get("name", "capture")),
-        **more,
-    }
+    capture = str(request.capture.attrs.get("name", "capture"))
+    found = {**request.describe(), "capture": capture, **more}
     return {PROVENANCE: json.dumps(found, sort_keys=True)}
 
 

@@ -34,9 +34,10 @@ from polar_bayes.inference.optimize import (
     find_modes,
     from_prior,
 )
+from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.program import Program, compile_program, inspect_model, noise_free
 from polar_bayes.inference.request import Request
-from polar_bayes.observation.data import Observations, observe
+from polar_bayes.observation.data import Observations
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import PriorTable
 from polar_bayes.progress import Progress
@@ -331,7 +332,7 @@ class SceneDensities:
     ) -> None:
         self.progress = progress
         self._request, self._priors = request, priors
-        self._data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
+        self._data = observe_request(request)
         self._densities: dict[Scene, SceneDensity] = {}
 
     def density(self, scene: Scene) -> SceneDensity:
