@@ -17,7 +17,8 @@ import numpy as np
 import xarray as xr
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.result import GEOMETRY, PROVENANCE, provenance_of
+from polar_bayes.inference.result import PROVENANCE, provenance_of
+from polar_bayes.observation.data import ANGLES
 
 Problems = Iterator[tuple[str, str]]
 """Where a tree departs from its schema, and what is wrong there."""
@@ -412,8 +413,8 @@ FIT = Schema(
         "prior_predictive": Group(DRAWS, like=Like("observed_data", {"": DRAWS})),
         "constant_data": Group(
             kinds=dict.fromkeys(_FLAGS, FLAGS),
-            names=(*GEOMETRY, *_FLAGS, "true_*"),
-            inside=dict.fromkeys((*GEOMETRY, *_FLAGS), "observed_data"),
+            names=(*ANGLES, *_FLAGS, "true_*"),
+            inside=dict.fromkeys((*ANGLES, *_FLAGS), "observed_data"),
         ),
         "without_discrepancy": Group(DRAWS, labeled=False),
         "without_instrument": Group(DRAWS, labeled=False),

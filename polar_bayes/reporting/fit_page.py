@@ -85,6 +85,7 @@ class Fit(NamedTuple):
     prior: pd.DataFrame
     method: str
     provenance: dict[str, Any]
+    checks: dict[str, PredictiveCheck]
     criticism: pd.DataFrame
     verdict: Verdict
 
@@ -125,7 +126,8 @@ class Fit(NamedTuple):
 def read_fit(result: xr.DataTree) -> Fit:
     """Summaries of a result, which is checked first."""
     scalars, table = posterior_scalars(result), convergence.summary(result)
-    criticism = criticize(result)
+    checks = predictive_checks(result)
+    criticism = criticize(result, checks)
     return Fit(
         result=result,
         posterior=result["posterior"].to_dataset(),
@@ -134,6 +136,7 @@ def read_fit(result: xr.DataTree) -> Fit:
         prior=sensitivity(result),
         method=method_of(result),
         provenance=provenance_of(result),
+        checks=checks,
         criticism=criticism,
         verdict=convergence.verdict(result, table, criticism),
     )
@@ -142,15 +145,14 @@ def read_fit(result: xr.DataTree) -> Fit:
 def fit_page(result: xr.DataTree) -> page.Page:
     """The page of a fit."""
     fit = read_fit(result)
-    checks = predictive_checks(result)
     is_point, passed = fit.method == "point", fit.verdict.passed
     pooled = [] if is_point else populations(result)
     summary = population_summary(result)
     sentences = fit.determined()
     if passed:
         sentences += text.between_members(summary, pooled, fit.posterior)
-        sentences += text.predictive_sentences(checks)
-        sentences.append(text.trust(fit.method, fit.verdict.cautions, checks))
+        sentences += text.predictive_sentences(fit.checks)
+        sentences.append(text.trust(fit.method, fit.verdict.cautions, fit.checks))
     has_draws = not is_point and bool(plots_fit.drawable(result))
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")
@@ -184,7 +186,7 @@ def fit_page(result: xr.DataTree) -> page.Page:
             _criticism(fit),
             "Model criticism",
         ),
-        page.Section("checks", "Predictive checks", _checks(result, checks)),
+        page.Section("checks", "Predictive checks", _checks(result, fit.checks)),
         page.Section("effects", "Effects", _effects(result)),
         page.Section("accuracy", "Accuracy against time", _accuracy(result)),
         page.Section("provenance", "Provenance", [*provenance_facts(fit.provenance), *source]),
@@ -275,13 +277,13 @@ def _scenes(result: xr.DataTree) -> Iterator[page.Block]:
     texts = [name for name in table.columns if name not in numbers]
     cells: page.Cells = {
         "elpd": column("elpd", ".1f"),
-        "difference": lambda row: f"{row['elpd_diff']:.1f} +- {row['dse']:.1f}",
+        "difference": text.elpd_difference,
         "weight": lambda row: percent(row["weight"]),
         **{name: operator.itemgetter(name) for name in texts},
         "criticism": lambda row: row["criticism"] or DASH,
     }
     caption = page.caption("fit.scene")
-    yield page.make_table("scene", caption, cells, table, prose=["criticism"])
+    yield page.make_table("scene", caption, cells, table, label="scene", prose=["criticism"])
 
 
 def _criticism(fit: Fit) -> Iterator[page.Block]:
@@ -297,7 +299,13 @@ def _criticism(fit: Fit) -> Iterator[page.Block]:
     }
     caption = page.caption("fit.criticism", caution=CAUTION, problem=PROBLEM)
     yield page.make_table(
-        "criticism", caption, cells, fit.criticism, descriptions=QUESTIONS, prose=["what it says"]
+        "criticism",
+        caption,
+        cells,
+        fit.criticism,
+        label="check",
+        descriptions=QUESTIONS,
+        prose=["what it says"],
     )
 
 

@@ -339,7 +339,7 @@ def _panels(
     width = {1: 4.4, 2: 6.3}.get(len(ranks), 8.2)
     figure, panels = style.grid(len(ranks), width=width, panel_height=height, header=header)
     for axes, each in zip(panels, ranks, strict=True):
-        axes.set_title(style.wrap(each.title, 38), loc="left")
+        style.set_panel_title(axes, each.title)
         draw(axes, each)
     style.set_tick_style(panels)
     figure.supxlabel(labels[0], fontsize=9)

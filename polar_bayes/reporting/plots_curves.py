@@ -23,8 +23,9 @@ from polar_bayes.diagnostics.parameters import (
 )
 from polar_bayes.errors import FitError
 from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.result import GEOMETRY, provenance_of
+from polar_bayes.inference.result import provenance_of
 from polar_bayes.inference.spectrum import predict_spectrum
+from polar_bayes.observation.data import ANGLES
 from polar_bayes.reporting import style
 from polar_bayes.reporting.style import BLUE, GRAY, QUANTITIES, SHORT, VERMILLION, lighten
 
@@ -46,7 +47,7 @@ def variables(result: xr.DataTree) -> list[str]:
 def _missing(result: xr.DataTree, name: str) -> str:
     """What a result lacks to draw the readings of a variable: a path in the tree, or nothing."""
     needed = [(group, name) for group in ("observed_data", "noise_free", "posterior_predictive")]
-    needed += [("constant_data", each) for each in (*GEOMETRY, "valid", "saturated")]
+    needed += [("constant_data", each) for each in (*ANGLES, "valid", "saturated")]
     for group, variable in needed:
         if group not in result.children or variable not in result.children[group].data_vars:
             return f"{group}/{variable}"

@@ -157,7 +157,7 @@ def plot_ranks(result: xr.DataTree) -> Figure:
             axes.stairs(share, edges, color=color, lw=1.1, baseline=None)
         axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
         axes.set(xlim=(0, 1), ylim=(0, max(2.0, axes.get_ylim()[1])), xticks=[0, 0.5, 1])
-        axes.set_title(style.wrap(parameter_title(scalar, posterior), 38), loc="left")
+        style.set_panel_title(axes, parameter_title(scalar, posterior))
     style.set_tick_style(panels)
     figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)", fontsize=9)
     figure.supylabel("density", fontsize=9)
@@ -214,7 +214,7 @@ def plot_prior_posterior(result: xr.DataTree) -> Figure:
         axes.set(xlim=limits, ylim=(-0.18, 1.08), yticks=[])
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
-        axes.set_title(style.wrap(parameter_title(scalar, posterior), 38), loc="left")
+        style.set_panel_title(axes, parameter_title(scalar, posterior))
     style.set_tick_style(panels)
     handles: list[Patch | Line2D] = [
         Patch(color=lighten(GRAY, 0.72), label="prior"),

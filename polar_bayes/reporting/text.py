@@ -81,6 +81,13 @@ def column(name: str, form: str) -> Callable[[pd.Series], str]:
     return lambda row: or_dash(row[name], form)
 
 
+def elpd_difference(row: pd.Series) -> str:
+    """Cell: the difference in expected log density to the best, with its standard error."""
+    if row["dse"] == 0.0:
+        return DASH
+    return " ± ".join(numbers([row["elpd_diff"], row["dse"]], max(row["dse"], 0.2)))
+
+
 SENSITIVITY_CELLS: Mapping[str, Callable[[pd.Series], str]] = {
     "to the priors": column("prior_sensitivity", ".3f"),
     "to the data": column("likelihood_sensitivity", ".3f"),
