@@ -105,6 +105,14 @@ NANOMETERS = (
     "give nanometers: a number around 0.5 is micrometers, to be multiplied by 1000, and one below "
     "1e-5 is meters"
 )
+
+
+def _error(name: str, units: str | None) -> Variable:
+    """The error of a reading."""
+    meaning = f"standard deviation of {name}"
+    return Variable(f"{name}_error", "reading", units, ERROR, meaning, SIGMA, name)
+
+
 NOT_LIGHT = f"no light has it: check dark level, background and channel gains; {MASK}"
 
 CONTRACT = (
@@ -117,18 +125,10 @@ CONTRACT = (
     Variable("q", "reading", "1", SIGNED_UNIT, "normalized Stokes q, s positive", FRACTION),
     Variable("u", "reading", "1", SIGNED_UNIT, "normalized Stokes u", FRACTION, "q"),
     Variable("intensity", "reading", None, BRIGHTNESS, "intensity", MASK),
-    Variable("dop_error", "reading", "1", ERROR, "standard deviation of dop", SIGMA, "dop"),
-    Variable("q_error", "reading", "1", ERROR, "standard deviation of q", SIGMA, "q"),
-    Variable("u_error", "reading", "1", ERROR, "standard deviation of u", SIGMA, "u"),
-    Variable(
-        "intensity_error",
-        "reading",
-        None,
-        ERROR,
-        "standard deviation of intensity",
-        SIGMA,
-        "intensity",
-    ),
+    _error("dop", "1"),
+    _error("q", "1"),
+    _error("u", "1"),
+    _error("intensity", None),
     Variable("saturated", "flag", "1", UNIT, "the detector saturated", ZERO_ONE),
     Variable("valid", "flag", "1", UNIT, "measured, not missing", ZERO_ONE),
     Variable("interpolated", "flag", "1", UNIT, "filled in between readings", ZERO_ONE),
@@ -271,8 +271,13 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
     if dataset.attrs.get("angle_set_by", "hand") not in ANGLE_SETTERS:
         what, hint = "no such way to set an angle", f"give one of {', '.join(ANGLE_SETTERS)}"
         raise CaptureError(what, where=f"{source}: attribute angle_set_by", hint=hint)
+    truths = {
+        str(name): _truth(variable, str(name), layout, source)
+        for name, variable in dataset.variables.items()
+        if TRUTH.fullmatch(str(name))
+    }
     return xr.Dataset(
-        {**numbers, **flags, **_truths(dataset, layout, source)},
+        {**numbers, **flags, **truths},
         coords=_labels(dataset, layout, source),
         attrs=clean_attributes(dataset.attrs, source),
     )
@@ -415,14 +420,6 @@ def _check_polarization(
             where=f"{source}: {_entry('u', layout.readings, index)}",
             hint=f"{MASK} (noise may carry the sum to {1.0 + EXCESS_POLARIZATION:g})",
         )
-
-
-def _truths(dataset: xr.Dataset, layout: Layout, source: str) -> dict[str, xr.Variable]:
-    return {
-        str(name): _truth(variable, str(name), layout, source)
-        for name, variable in dataset.variables.items()
-        if TRUTH.fullmatch(str(name))
-    }
 
 
 def _truth(variable: xr.Variable, name: str, layout: Layout, source: str) -> xr.Variable:
