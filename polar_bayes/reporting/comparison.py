@@ -121,16 +121,10 @@ def loo_table(comparison: FitComparison) -> Table:
     return page.make_table("loo", caption, cells, comparison.loo, label="fit")
 
 
-def _fit_name(row: pd.Series) -> str:
-    """The second level of the index of a table of parameters and fits."""
-    label: Any = row.name
-    return str(label[1])
-
-
 def parameter_table(comparison: FitComparison) -> Table:
     """Every parameter by every fit."""
     cells: page.Cells = {
-        "fit": _fit_name,
+        "fit": page.second_label,
         "mean": lambda row: number(row["mean"], row["sd"]),
         "sd": lambda row: number(row["sd"], row["sd"]),
         "95% interval": lambda row: interval(row["q2.5"], row["q97.5"], row["sd"]),
@@ -148,7 +142,7 @@ def sensitivity_table(comparison: FitComparison) -> Table | None:
     if known.empty:
         return None
     cells: page.Cells = {
-        "fit": _fit_name,
+        "fit": page.second_label,
         "prior inside": lambda row: percent(row["prior_inside"]),
         "by the data": lambda row: str(row["verdict"]),
         **text.SENSITIVITY_CELLS,
