@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
+from scipy.special import logsumexp
 
 from polar_bayes.diagnostics.criticism import criticize, listed
 from polar_bayes.diagnostics.parameters import (
@@ -150,21 +151,27 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
 
 def laplace_k_hat(result: xr.DataTree) -> float:
     """Pareto k-hat of the importance weights of Laplace draws or of a variational guide."""
+    return _smoothed_weights(result)[1]
+
+
+def _smoothed_weights(result: xr.DataTree) -> tuple[np.ndarray, float]:
+    """Pareto-smoothed importance weights of the draws, and k-hat: none and NaN without weights."""
     # $$ w = p(z | data) / q(z) $$
     # Source: Vehtari et al. (2024), JMLR 25(72).
     stats = stats_of(result)
     if "log_weight" not in stats:
-        return math.nan
+        return np.empty(0), math.nan
     log_weight = stats["log_weight"].to_numpy().astype(float).ravel()
     if np.any(np.isnan(log_weight) | np.isposinf(log_weight)) or np.all(np.isneginf(log_weight)):
-        return math.nan
+        return np.empty(0), math.nan
     lowest = np.min(log_weight[np.isfinite(log_weight)])
     log_weight = np.where(np.isneginf(log_weight), lowest - 700.0, log_weight) - log_weight.max()
     if np.ptp(log_weight) < 1e-12:
-        return -math.inf
+        return np.full(log_weight.size, 1.0 / log_weight.size), -math.inf
     with np.errstate(all="ignore"):  # smoothing an extreme tail overflows inside ArviZ
         # psislw expects log likelihoods, which are minus the log ratios: hence the sign.
-        return float(array_stats.psislw(-log_weight)[1])
+        smoothed, k_hat = array_stats.psislw(-log_weight)
+        return np.exp(smoothed - logsumexp(smoothed)), float(k_hat)
 
 
 def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
@@ -293,10 +300,10 @@ def _approximation_cautions(
 ) -> Iterator[str]:
     if method not in APPROXIMATIONS or "log_weight" not in stats_of(result):
         return
-    k_hat = laplace_k_hat(result)
+    weights, k_hat = _smoothed_weights(result)
     if k_hat <= LARGEST_K_HAT:
-        yield from _corrections(result, found)
-    if not k_hat <= LARGEST_K_HAT:
+        yield from _corrections(weights, found)
+    else:
         draws, shape = ("the guide's draws", "the guide")
         if method == "laplace":
             draws, shape = ("the Laplace draws", "a normal distribution")
@@ -306,11 +313,8 @@ def _approximation_cautions(
         )
 
 
-def _corrections(result: xr.DataTree, found: Sequence[Scalar]) -> Iterator[str]:
+def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
     """Means and sds of an approximation that its own smoothed weights change."""
-    ratios = stats_of(result)["log_weight"].to_numpy().astype(float).ravel()
-    weights = np.exp(array_stats.psislw(-(ratios - ratios.max()))[0])
-    weights /= weights.sum()
     changes = []
     for scalar in found:
         draws = scalar.draws.ravel()

@@ -65,6 +65,8 @@ NOISE_FACTOR = "stokes_error_factor"
 LARGE_FACTOR = 3.0
 """Stated errors that are exceeded by this factor, with probability 97.5%, give a caution."""
 MAX_LISTED = 4
+GROUPS = ("prior", "observed_data", "constant_data")
+"""Groups of a result without which nothing can be checked."""
 QUESTIONS = {
     "priors": "are posterior medians in the tails of their priors?",
     "noise": "do the readings scatter more than their stated errors?",
@@ -117,9 +119,11 @@ def criticize(
         Analysis 1, 893.
     """
     found = posterior_scalars(result)
-    missing = [name for name in GROUPS if name not in result.children]
+    missing = [f"group {name}" for name in GROUPS if name not in result.children]
+    if not missing:
+        missing = [name for name in ANGLES if name not in result["constant_data"].data_vars]
     if method_of(result) == "point" or missing:
-        why = f"The result has no group {', '.join(missing)}, so the model was not checked."
+        why = f"The result has no {', '.join(missing)}, so the model was not checked."
         if method_of(result) == "point":
             why = "A point fit has no draws to criticize."
         return _table(dict.fromkeys(CHECKS, Finding("not computed", sentence=why)))
@@ -167,7 +171,7 @@ def _prior_conflict(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     """Posterior medians in the tails of their priors: the farthest, and all of them together."""
     tails = _prior_tails(result, found)
     if not tails:
-        return Finding("passed")
+        return Finding("not computed", sentence="The fit states no prior probabilities.")
     labels, probability = list(tails), np.array(list(tails.values()))
     two_sided = 2.0 * np.minimum(probability, 1.0 - probability)
     score = stats.norm.isf(np.maximum(two_sided, 1e-300) / 2.0)
@@ -331,10 +335,6 @@ def _positions(result: xr.DataTree, variable: FlatVariable) -> _Positions:
         for zenith, length in zip(angles[0], wavelength, strict=True)
     ]
     return _Positions(np.stack(angles, axis=1), wavelength, group, labels)
-
-
-GROUPS = ("prior", "observed_data", "constant_data")
-"""Groups of a result without which nothing can be checked."""
 
 
 def _residual_findings(residuals: _Residuals | None) -> dict[str, Finding]:

@@ -73,7 +73,7 @@ def _compare(prior: np.ndarray | None, posterior: np.ndarray) -> list[Any]:
 
 
 def _interval(draws: np.ndarray) -> tuple[float, float]:
-    if not np.isfinite(draws).all():
+    if not draws.size or not np.isfinite(draws).all():
         return math.nan, math.nan
     low, high = np.quantile(draws, CENTRAL_95)
     return float(low), float(high)
