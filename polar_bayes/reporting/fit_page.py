@@ -379,7 +379,7 @@ def member_table(result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Po
 def _spectrum(fit: Fit) -> Iterator[page.Block]:
     spectra = plots_curves.spectra(fit.result) if fit.has_draws else {}
     for name, members in spectra.items():
-        key = f"fit.figure_spectrum_{'bands' if members[0].between.size else 'intervals'}"
+        key = f"fit.figure_spectrum_{'bands' if members[0].is_band else 'intervals'}"
         figure = plots_curves.plot_spectrum(fit.result, name, spectra)
         yield page.picture(figure, key, name=name.replace("_", " ").capitalize())
 
