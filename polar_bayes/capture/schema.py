@@ -13,7 +13,7 @@ import contextlib
 import dataclasses
 import difflib
 import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Any, Literal
 
@@ -326,7 +326,7 @@ def _layout(dataset: xr.Dataset, source: str) -> Layout:
     leading = next((option for option in LEADING if _same_dims(rest, option)), None)
     if leading is None or "view" not in dims or len(set(dims)) != len(dims):
         hint = "use view[, wavelength], alone or behind material, patch, or y and x together"
-        raise CaptureError(f"its dims are {_dims_text(dims)}", where=f"{source}: {name}", hint=hint)
+        raise CaptureError(f"its dims are {dims_text(dims)}", where=f"{source}: {name}", hint=hint)
     for dim in dims:
         if dataset.sizes[dim] == 0:
             hint = f"give at least one {dim}"
@@ -343,8 +343,8 @@ def _ordered(variable: xr.Variable, row: Variable, layout: Layout, source: str) 
     for dims in options:
         if _same_dims(variable.dims, dims):
             return variable.transpose(*dims)
-    what = f"its dims are {_dims_text(variable.dims)}"
-    hint = f"give it {' or '.join(_dims_text(dims) for dims in options)}"
+    what = f"its dims are {dims_text(variable.dims)}"
+    hint = f"give it {' or '.join(dims_text(dims) for dims in options)}"
     raise CaptureError(what, where=f"{source}: {row.name}", hint=hint)
 
 
@@ -352,7 +352,8 @@ def _same_dims(dims: Sequence[Hashable], wanted: Sequence[str]) -> bool:
     return len(dims) == len(wanted) and set(dims) == set(wanted)
 
 
-def _dims_text(dims: Sequence[Hashable]) -> str:
+def dims_text(dims: Iterable[Hashable]) -> str:
+    """The dims as `(view, wavelength)`."""
     return f"({', '.join(map(str, dims))})"
 
 
@@ -426,8 +427,8 @@ def _truth(variable: xr.Variable, name: str, layout: Layout, source: str) -> xr.
     where = f"{source}: {name}"
     dims = [dim for dim in layout.readings if dim in variable.dims]
     if not _same_dims(variable.dims, dims):
-        hint = f"give it any of {_dims_text(layout.readings)}"
-        raise CaptureError(f"its dims are {_dims_text(variable.dims)}", where=where, hint=hint)
+        hint = f"give it any of {dims_text(layout.readings)}"
+        raise CaptureError(f"its dims are {dims_text(variable.dims)}", where=where, hint=hint)
     values = _floats(variable.transpose(*dims).values, where)
     if np.isinf(values).any():
         hint = "give a number, or NaN where the truth is not known"
