@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 import polar_bayes as pb
-from polar_bayes.effects.compare_scenes import Cost, compile_and_count, run_seconds
+from polar_bayes.effects.posterior_change import compile_and_count, run_seconds
 from polar_bayes.effects.variants import Effect, effects_of, simplify
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
@@ -67,8 +67,8 @@ def capture() -> xr.Dataset:
     return pb.simulate("plastic", scene="camera", seed=0)
 
 
-def gradients(scenes: list[pb.Scene], data: xr.Dataset) -> list[Cost]:
-    """Cost of one value and gradient of the log posterior density, scene by scene."""
+def gradients(scenes: list[pb.Scene], data: xr.Dataset) -> list[tuple[float, float, float]]:
+    """Operations, compile and run seconds of a log density with its gradient, by scene."""
     compiled, calls = [], []
     for scene in scenes:
         request = resolve(data, "per_material", scene, None, None, None, 0, "double")
@@ -78,7 +78,7 @@ def gradients(scenes: list[pb.Scene], data: xr.Dataset) -> list[Cost]:
         compiled.append(compile_and_count(jax.value_and_grad(program.potential), z, readings))
         calls.append(lambda call=compiled[-1].call, z=z, readings=readings: call(z, readings))
     return [
-        Cost(one.operations, one.compile_seconds, seconds)
+        (one.operations, one.compile_seconds, seconds)
         for one, seconds in zip(compiled, run_seconds(calls), strict=True)
     ]
 
@@ -95,14 +95,13 @@ def table(scene: pb.Scene, data: xr.Dataset) -> list[str]:
     """A row for the plain scene and one for each effect switched on."""
     effects = list({effect.key_path: effect for effect in effects_of(scene)}.values())
     costs = gradients([plain_with(scene, effect) for effect in (None, *effects)], data)
-    plain = costs[0]
+    plain_operations, _, plain_seconds = costs[0]
     lines = []
-    for name, cost in zip(("none", *(type(e.part).__name__ for e in effects)), costs, strict=True):
-        more = cost.operations / plain.operations
-        longer = cost.run_seconds / plain.run_seconds
+    names = ("none", *(type(effect.part).__name__ for effect in effects))
+    for name, (operations, compilation, seconds) in zip(names, costs, strict=True):
         lines.append(
-            f"| {name} | {cost.operations:,.0f} | {more:.2f} | {cost.compile_seconds:.1f} s "
-            f"| {1e3 * cost.run_seconds:.3f} ms | {longer:.2f} |"
+            f"| {name} | {operations:,.0f} | {operations / plain_operations:.2f} "
+            f"| {compilation:.1f} s | {1e3 * seconds:.3f} ms | {seconds / plain_seconds:.2f} |"
         )
     return lines
 

@@ -28,10 +28,10 @@ import polar_bayes as pb
 from polar_bayes.capture.schema import CONTRACT
 from polar_bayes.cli import commands
 from polar_bayes.inference import fitting, problem
-from polar_bayes.inference.fitting import fit
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
+from polar_bayes.scenes.fitting import fit
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"

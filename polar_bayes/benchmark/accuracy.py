@@ -21,7 +21,7 @@ from polar_bayes.benchmark.run import (
     OVERRIDES,
     AbstractOverride,
     Trial,
-    run_fresh,
+    run_in_subprocess,
     run_trial,
 )
 from polar_bayes.design.setup import provenance_attrs
@@ -160,7 +160,7 @@ def _trials(
                 where=f"accuracy: methods[{name!r}]",
                 hint="give settings such as polar_bayes.methods.Nuts()",
             )
-        trials[str(name), AS_GIVEN] = Trial(request, method, request.seed)
+        trials[str(name), AS_GIVEN] = Trial(request, method)
     for override in overrides:
         for name, method in methods.items():
             try:
@@ -169,7 +169,7 @@ def _trials(
                 trials[str(name), override.name] = error
                 continue
             if changed is not None:
-                trials[str(name), override.name] = Trial(*changed, request.seed)
+                trials[str(name), override.name] = Trial(*changed)
     return trials
 
 
@@ -182,21 +182,18 @@ def _row(trial: Trial | PolarBayesError, reference: ReferenceRun, *, fresh: bool
     try:
         if isinstance(trial, PolarBayesError):
             raise trial
-        found = run_fresh(trial) if fresh else run_trial(trial)
+        found = run_in_subprocess(trial) if fresh else run_trial(trial)
     except PolarBayesError as error:  # a method that fails is a row, too
         return row | {"problems": str(error)}
-    shared = [label for label in reference.labels if label in found.labels]
-    ours, theirs = (
-        [labels.index(label) for label in shared] for labels in (found.labels, reference.labels)
-    )
+    shared, ours, theirs = np.intersect1d(found.labels, reference.labels, return_indices=True)
     draws, expected = (
-        x.reshape(len(shared), -1) for x in (found.draws[ours], reference.draws[theirs])
+        x.reshape(shared.size, -1) for x in (found.draws[ours], reference.draws[theirs])
     )
     for name, values in distances(draws, expected)._asdict().items():
         row[name][theirs] = values
-    row |= {name: getattr(found.answer, name) for name in DIAGNOSTICS}
+    row |= {name: getattr(found.posterior, name) for name in DIAGNOSTICS}
     row |= {name: getattr(found, name) for name in COSTS + (COSTS_OF_PROCESS if fresh else ())}
-    return row | {"problems": "; ".join(found.answer.problems)}
+    return row | {"problems": "; ".join(found.posterior.problems)}
 
 
 def _dataset(
@@ -215,7 +212,7 @@ def _dataset(
         "reference_sd": ("parameter", draws.std(axis=1)),
         "reference_mean_error": ("parameter", reference.mean_error),
         "reference_sd_error": ("parameter", reference.sd_error),
-        "reference_wasserstein": ("parameter", reference.halves.wasserstein),
+        "reference_wasserstein": ("parameter", reference.wasserstein),
     }
     methods, overrides = (np.array(texts, object) for texts in zip(*names, strict=True))
     return xr.Dataset(
@@ -237,6 +234,3 @@ def _dataset(
             "reference_doubts": "; ".join(reference.doubts),
         },
     )
-
-
-# --- Accuracy studies in netCDF files -------------------------------------------------------------

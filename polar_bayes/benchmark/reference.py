@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from polar_bayes.benchmark.run import labeled
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT
+from polar_bayes.diagnostics.parameters import CENTRAL_95
 from polar_bayes.errors import FitError
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.nuts import Nuts
@@ -19,9 +20,6 @@ from polar_bayes.inference.smc import PixelSMC, Tempered
 from polar_bayes.progress import no_progress
 
 # --- Distances from the reference -----------------------------------------------------------------
-
-
-INTERVAL = (0.025, 0.975)
 
 
 class Distances(NamedTuple):
@@ -42,7 +40,7 @@ def distances(
     for at in np.flatnonzero(np.isfinite(draws).all(axis=1)):
         ours, theirs = draws[at], reference[at]
         unit = theirs.std()
-        low, high = np.quantile(ours, INTERVAL) - np.quantile(theirs, INTERVAL)
+        low, high = np.quantile(ours, CENTRAL_95) - np.quantile(theirs, CENTRAL_95)
         wasserstein = scipy.stats.wasserstein_distance(ours, theirs)
         mean, sd = ours.mean() - theirs.mean(), ours.std() - unit
         found[:, at] = np.array([mean, sd, low, high, wasserstein]) / unit
@@ -99,14 +97,17 @@ class Reference:
 
 
 class ReferenceRun(NamedTuple):
-    """A reference that was run; `biases` and `noise` are reasons to doubt it."""
+    """A reference that was run; `biases` and `noise` are reasons to doubt it.
+
+    `wasserstein` is the distance of one half of its chains from the other, by parameter.
+    """
 
     labels: tuple[str, ...]
     draws: np.ndarray
     method: str
     mean_error: np.ndarray
     sd_error: np.ndarray
-    halves: Distances
+    wasserstein: np.ndarray
     posterior: PosteriorDraws
     biases: tuple[str, ...]
     noise: str = ""
@@ -168,9 +169,8 @@ def _run(
         (weight := problem.initialize().missed_mode_weight(found.z)) > 0.0
     ):
         biases.append(f"a mode of weight {weight:.2g} was not visited by every chain")
-    run = ReferenceRun(
-        labels, draws, name, mean_error, sd_error, distances(first, second), found, tuple(biases)
-    )
+    apart = distances(first, second).wasserstein
+    run = ReferenceRun(labels, draws, name, mean_error, sd_error, apart, found, tuple(biases))
     if run.error <= settings.error:
         return run
     return run._replace(noise=f"its own Monte Carlo error is {run.error:.2g} posterior sd")

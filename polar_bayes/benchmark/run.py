@@ -1,8 +1,8 @@
 """One method on one capture, run and measured: first with everything to compile, then again.
 
-    python -m polar_bayes.benchmark.run TRIAL MEASURED
+    python -m polar_bayes.benchmark.run TRIAL RESULT
 
-runs what one file holds and writes what came of it to the other.
+runs the trial that one file holds and writes its result to the other.
 """
 
 import abc
@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 from subprocess import PIPE
-from typing import ClassVar, override
+from typing import ClassVar, NamedTuple, override
 
 import cloudpickle
 import jax
@@ -50,43 +50,40 @@ POINT_DRAWS = 1000
 """Of the normal distribution around a point estimate."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Trial:
-    """What is run."""
+class Trial(NamedTuple):
+    """A method, and the request that it is run on."""
 
     request: Request
     method: AbstractMethod
-    seed: int
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Measured:
-    """What came of it."""
+class TrialResult(NamedTuple):
+    """Draws of the parameters (parameter, chain, draw), diagnostics, times [s] and memory [MiB]."""
 
     labels: tuple[str, ...]
     draws: np.ndarray
-    answer: PosteriorDraws
+    posterior: PosteriorDraws
     seconds_first: float
     seconds_again: float
     peak_memory: float
     memory_before: float
 
 
-def run_trial(trial: Trial) -> Measured:
+def run_trial(trial: Trial) -> TrialResult:
     """Run a trial in this process."""
-    before = _memory()
+    before, seed = _memory(), trial.request.seed
     with jax.enable_x64(trial.request.precision == "double"):
         begin = time.perf_counter()
-        found, labels, draws = _run(trial, trial.seed)
+        found, labels, draws = _run(trial, seed)
         first = time.perf_counter() - begin
         peak = _memory()
         begin = time.perf_counter()
-        _run(trial, trial.seed + 1)
-        seconds = time.perf_counter() - begin
+        _run(trial, seed + 1)
+        again = time.perf_counter() - begin
     bare = dataclasses.replace(
         found, problems=found.doubts, z=np.zeros(0), stats={}, weighted=None, covariance=None
     )
-    return Measured(labels, draws, bare, first, seconds, peak, before)
+    return TrialResult(labels, draws, bare, first, again, peak, before)
 
 
 def labeled(
@@ -132,10 +129,10 @@ STDERR_TAIL = 300
 """Characters of the standard error of a process that failed, for its message."""
 
 
-def run_fresh(trial: Trial) -> Measured:
+def run_in_subprocess(trial: Trial) -> TrialResult:
     """Run a trial in a new process, without the compiled programs of earlier ones."""
     with temporary_folder(Path(tempfile.gettempdir())) as folder:
-        source, target = folder / "trial", folder / "measured"
+        source, target = folder / "trial", folder / "result"
         source.write_bytes(cloudpickle.dumps(trial))
         command = [sys.executable, "-m", "polar_bayes.benchmark.run", str(source), str(target)]
         with subprocess.Popen(
@@ -169,7 +166,7 @@ def _environment() -> dict[str, str]:
 def _run_file(source: Path, target: Path) -> None:
     """What the new process does."""
     try:
-        found: Measured | PolarBayesError = run_trial(pickle.loads(source.read_bytes()))
+        found: TrialResult | PolarBayesError = run_trial(pickle.loads(source.read_bytes()))
     except PolarBayesError as error:
         found = error
     target.write_bytes(cloudpickle.dumps(found))
@@ -177,8 +174,6 @@ def _run_file(source: Path, target: Path) -> None:
 
 # --- Overrides of the request or method: facets, effects, precision, number of draws --------------
 
-
-Overridden = tuple[Request, AbstractMethod]
 
 NEARLY = 0.1
 """Relative difference between the draws that an override is called by and those that there are."""
@@ -194,7 +189,7 @@ class AbstractOverride(abc.ABC):
         """What it is called beside the method: `facets / 2`."""
 
     @abc.abstractmethod
-    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
+    def apply(self, request: Request, method: AbstractMethod) -> Trial | None:
         """What is fitted then.
 
         Args:
@@ -202,7 +197,7 @@ class AbstractOverride(abc.ABC):
             method: The method.
 
         Returns:
-            Both, changed; None where this override changes nothing.
+            The trial of both, changed; None where this override changes nothing.
 
         Raises:
             FitError: It cannot be changed for this capture; other errors of the package likewise.
@@ -238,11 +233,11 @@ class _SceneOverride(AbstractOverride):
         """The scene that is fitted in place of the request's."""
 
     @override
-    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
+    def apply(self, request: Request, method: AbstractMethod) -> Trial | None:
         scene = self.scene(request)
         if scene == request.scene:
             return None
-        return dataclasses.replace(request, scene=scene), method
+        return Trial(dataclasses.replace(request, scene=scene), method)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,7 +254,7 @@ class DrawsOverride(_Factor):
     what: ClassVar[str] = "draws"
 
     @override
-    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
+    def apply(self, request: Request, method: AbstractMethod) -> Trial | None:
         try:
             changed = method.scale_draws(self.factor)
         except FitError:  # as few as the method allows
@@ -269,7 +264,7 @@ class DrawsOverride(_Factor):
             return None
         # Numbers are rounded, or have a least: what is called so must be so.
         is_so = abs(after / before / self.factor - 1.0) < NEARLY
-        return (request, changed) if is_so and changed != method else None
+        return Trial(request, changed) if is_so and changed != method else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -282,10 +277,10 @@ class PrecisionOverride(AbstractOverride):
         return "single precision"
 
     @override
-    def apply(self, request: Request, method: AbstractMethod) -> Overridden | None:
+    def apply(self, request: Request, method: AbstractMethod) -> Trial | None:
         if request.precision == "single":
             return None
-        return dataclasses.replace(request, precision="single"), method
+        return Trial(dataclasses.replace(request, precision="single"), method)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,7 +35,6 @@ from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE, dims_of, shape_of
 from polar_bayes.inference.smc import PixelSMC
 from polar_bayes.maps.blocks import as_completed, workers
-from polar_bayes.maps.fit_map import describe_request
 from polar_bayes.observation.data import READINGS, Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.paths import as_path
@@ -160,7 +159,7 @@ def calibrate(
         done += _fit_all(plan, missing, simulations, blocks, scheduler, progress or no_progress)
     names = (name for name, each in METHODS.items() if each == settings)
     provenance = {
-        **describe_request(request),
+        **request.describe(),
         "calibration": simulations,
         "method": next(names, type(settings).__name__),
         "settings": repr(settings),
@@ -203,11 +202,10 @@ def make_plan(
     request: Request, generative_request: Request | None, settings: Method, readings: bool
 ) -> CalibrationPlan:
     """What is done to every block; without a generative request, the fitted model simulates."""
-    spec_key = engine_key(request, request.largest_view_zenith)
+    own_key = engine_key(request, request.largest_view_zenith)
     generative_key = "" if generative_request is None else engine_key(generative_request)
-    capture_key = tokenize(request.capture)
-    key = tokenize(spec_key, generative_key, repr(settings), readings, capture_key)
-    return CalibrationPlan(request, generative_request, settings, readings, spec_key, key)
+    key = tokenize(own_key, generative_key, repr(settings), readings, tokenize(request.capture))
+    return CalibrationPlan(request, generative_request, settings, readings, own_key, key)
 
 
 def _fit_all(

@@ -7,7 +7,7 @@ Source:
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ from polar_bayes.inference.batch_method import AbstractPixelMethod
 from polar_bayes.inference.batching import ObservationBatch, Outcome
 from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache
 from polar_bayes.inference.method import AbstractMethod
-from polar_bayes.inference.problem import CompiledModel, compile_model
+from polar_bayes.inference.problem import CompiledModel, compile_model, observe_request
 from polar_bayes.inference.program import Program, Values, compile_program
 from polar_bayes.inference.psis import Marginals
 from polar_bayes.inference.request import Request
@@ -42,7 +42,7 @@ from polar_bayes.maps.blocks import (
     locked_ledger,
     written,
 )
-from polar_bayes.observation.data import Observations, observe
+from polar_bayes.observation.data import Observations
 from polar_bayes.paths import TEMPORARY_PREFIX, replace_file, temporary_folder
 from polar_bayes.priors import describe_prior
 
@@ -82,7 +82,7 @@ class CalibrationPlan:
     generative_request: Request | None
     settings: Method
     readings: bool
-    recipe_key: str
+    engine_key: str
     key: str
 
     @property
@@ -110,16 +110,15 @@ class CompiledPlan:
     @functools.cached_property
     def data(self) -> Observations:
         """The capture whose layout all simulations have."""
-        request = self.plan.request
         with jax.enable_x64(True):
-            return observe(request.capture, largest_view_zenith=request.largest_view_zenith)
+            return observe_request(self.plan.request)
 
     @functools.cached_property
     def engine(self) -> CompiledModel | BatchEngine:
         """The programs that fit one capture after another, or many side by side."""
         plan = self.plan
         if not plan.is_sequential:
-            return make_engine(plan.recipe_key, plan.request, lambda: self.data)
+            return make_engine(plan.engine_key, plan.request, lambda: self.data)
         with jax.enable_x64(True):
             return compile_model(plan.request, self.data)
 
@@ -166,15 +165,14 @@ def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
     is_ranked = plan.readings and not compiled.unranked_reason
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), 1)
-        drawn = draw_captures(program, data, filled, key)
-        fresh = redraw_readings(program, data, drawn, filled, key) if is_ranked else {}
+        drawn = draw_captures(program, data, filled, key, replicate=is_ranked)
     engine: Any = compiled.engine
     truth: Arrays = {name: np.asarray(drawn.truth[name])[:count] for name in shared}
     captures = drawn.captures.subset(np.arange(count))
     marginals, scores = Marginals(count, shared, random=True), PitCrps(truth, numbers, seed)
     ranked = None
     if is_ranked:
-        again = {name: np.asarray(values)[:count] for name, values in fresh.items()}
+        again = {name: np.asarray(values)[:count] for name, values in drawn.replicated.items()}
         single = engine.single if plan.is_sequential else engine.single_program
         ranked = PredictivePit(single, captures, again, numbers, seed)
     step = plan.settings.thinning(RANKED)
@@ -225,43 +223,39 @@ def _shapes(program: Program, data: Observations) -> dict[str, tuple[int, ...]]:
 
 # --- Captures drawn from a model: parameters from the prior, readings from the links --------------
 
-_SIMULATORS: LRUCache[Callable] = LRUCache(4)
-_READERS: LRUCache[Callable] = LRUCache(4)
+_SIMULATORS: LRUCache[JitOnce] = LRUCache(4)
 
 
 class Simulations(NamedTuple):
-    """True parameters, and the captures simulated from them."""
+    """True parameters, captures simulated from them, and replicated readings, where asked for."""
 
     truth: Values
     captures: ObservationBatch
+    replicated: Values
 
 
 def draw_captures(
-    program: Program, data: Observations, numbers: np.ndarray, key: Array
+    program: Program,
+    data: Observations,
+    numbers: np.ndarray,
+    key: Array,
+    *,
+    replicate: bool = False,
 ) -> Simulations:
     """Simulate captures by their numbers, with the layout, stated errors and masks of `data`."""
+    cached = program, replicate
+    simulate = _SIMULATORS.of(cached, lambda: _simulator(*cached))
+    found = simulate(jnp.asarray(numbers, np.uint32), key, data)
+    truth, recorded, replicated = jax.tree.map(np.asarray, found)
+    return Simulations(truth, _batch(data, recorded), replicated)
+
+
+def _simulator(program: Program, replicate: bool) -> JitOnce:
+    """Compiled: parameters and readings of many captures."""
     # Where intensity is recorded, each capture's own brightness sets its noise, and readings at
     # full scale are saturated.
-    simulate = _SIMULATORS.of(program, lambda: _simulator(program))
-    found = simulate(jnp.asarray(numbers, np.uint32), key, data)
-    truth, recorded = jax.tree.map(np.asarray, found)
-    return Simulations(truth, _batch(data, recorded))
 
-
-def redraw_readings(
-    program: Program, data: Observations, drawn: Simulations, numbers: np.ndarray, key: Array
-) -> Values:
-    """Draw the readings of the same true parameters once more."""
-    read = _READERS.of(program, lambda: _reader(program))
-    captures = drawn.captures
-    found = read(np.asarray(numbers, np.uint32), key, data, captures.batched, captures.static)
-    return jax.tree.map(np.asarray, found)
-
-
-def _simulator(program: Program) -> Callable[[Array, Array, Observations], tuple[Values, tuple]]:
-    """Compiled: parameters and readings of many captures."""
-
-    def simulate(number: Array, key: Array, data: Observations) -> tuple[Values, tuple]:
+    def simulate(number: Array, key: Array, data: Observations) -> tuple[Values, tuple, Values]:
         key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
         z = program.from_prior(key_truth, data)
         draw = program.describe(key_noise, z, data)
@@ -269,29 +263,14 @@ def _simulator(program: Program) -> Callable[[Array, Array, Observations], tuple
         if "intensity" in program.observed:  # the noise of the other readings may follow it
             others = program.describe(key_noise, z, recorded).predictive
             recorded = _recorded(data, {**others, "intensity": draw.predictive["intensity"]})
-        return draw.parameters, (recorded.readings, recorded.brightness, recorded.saturated)
+        key_again = jax.random.fold_in(key_noise, 1)
+        again = program.describe(key_again, z, recorded).predictive if replicate else {}
+        drawn = recorded.readings, recorded.brightness, recorded.saturated
+        return draw.parameters, drawn, again
 
     return JitOnce(
         lambda numbers, key, data: jax.lax.map(lambda number: simulate(number, key, data), numbers)
     )
-
-
-def _reader(program: Program) -> Callable[..., Values]:
-    """Compiled: further readings of the true parameters of many captures."""
-
-    def read_all(
-        numbers: Array, key: Array, data: Observations, own: Observations, shared: Observations
-    ) -> Values:
-        def read(at: tuple[Array, Observations]) -> Values:
-            number, capture = at
-            key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
-            z = program.from_prior(key_truth, data)
-            key_noise = jax.random.fold_in(key_noise, 1)
-            return program.describe(key_noise, z, eqx.combine(capture, shared)).predictive
-
-        return jax.lax.map(read, (numbers, own))
-
-    return JitOnce(read_all)
 
 
 def _recorded(data: Observations, readings: Mapping[str, Any]) -> Observations:

@@ -93,10 +93,12 @@ class Uniformity(NamedTuple):
 
 
 def uniformity(sample: Float[np.ndarray, " size"]) -> Uniformity:
-    """Test a sample against the uniform distribution."""
+    """Test a sample against the uniform distribution; NaN for fewer than two values."""
     # The statistic is the smallest of the two-sided binomial p-values of the empirical distribution
     # at many points. Its null distribution is simulated, so that the rate of false alarms is the
     # level, and a curve leaves `ecdf_band` exactly where the test fails at that level.
+    if sample.size < 2:
+        return Uniformity(math.nan, math.nan, math.nan)
     null = null_statistics(len(sample))
     rank = 1 + np.searchsorted(null, _smallest_p_value(sample[None])[0], side="right")
     spread = sample.std() * 12.0**0.5
@@ -177,11 +179,11 @@ class Spread(NamedTuple):
 
 
 def spread_of_scores(pit: Float[np.ndarray, " size"]) -> Spread:
-    """Test the standard deviation of normal scores of PIT values, of which there are two or more.
-
-    A normal score is (truth - mean) / sd where the posterior is normal. Of any other posterior it
-    is standard normal all the same, so the test is exact, and no tail of a posterior upsets it.
-    """
+    """Test the standard deviation of normal scores of PIT values; NaN for fewer than two."""
+    # A normal score is (truth - mean) / sd where the posterior is normal. Of any other posterior it
+    # is standard normal all the same, so the test is exact, and no tail of a posterior upsets it.
+    if pit.size < 2:
+        return Spread(math.nan, math.nan)
     scores = scipy.special.ndtri(np.clip(pit, 1e-12, 1.0 - 1e-12))
     freedom = len(scores) - 1
     chi_square = freedom * float(np.var(scores, ddof=1))

@@ -144,6 +144,7 @@ def _parameter_row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> 
     pit, index = scalar.draws[0], dict(scalar.index)
     finite = pit[np.isfinite(pit)]
     bounds = marginals[f"{scalar.name}_quantile"].isel(index)
+    scatter = spread_of_scores(finite)
     held = {}
     for percent, levels in INTERVALS.items():
         low, high = (bounds.sel(quantile=level).to_numpy() for level in levels)
@@ -155,7 +156,8 @@ def _parameter_row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> 
             f"p_held_{percent}": coverage_p_value(hits, finite.size, percent / 100.0)
             for percent, hits in held.items()
         },
-        **dict(zip(("p_spread", "spread"), _spread(finite), strict=True)),
+        "p_spread": scatter.p_value,
+        "spread": scatter.spread,
         "width_95": _finite_mean(high - low),
         "crps": _finite_mean(marginals[f"{scalar.name}_crps"].isel(index).to_numpy()),
     }
@@ -163,16 +165,14 @@ def _parameter_row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> 
 
 def _rank_columns(pit: np.ndarray) -> dict[str, float]:
     finite = pit[np.isfinite(pit)]
-    moments = uniformity(finite) if finite.size > 1 else (math.nan,) * 3
+    ranks = uniformity(finite)
     return {
         "answered": finite.size,
         "failed": pit.size - finite.size,
-        **dict(zip(("p_value", "rank_mean", "rank_spread"), moments, strict=True)),
+        "p_value": ranks.p_value,
+        "rank_mean": ranks.mean,
+        "rank_spread": ranks.spread,
     }
-
-
-def _spread(pit: np.ndarray) -> tuple[float, float]:
-    return spread_of_scores(pit) if pit.size > 1 else (math.nan, math.nan)
 
 
 def _finite_mean(values: np.ndarray) -> float:
@@ -208,17 +208,16 @@ def calibration_readings(calibration: xr.DataTree) -> pd.DataFrame:
         hint = "give what polar_bayes.calibrate returns with readings=True"
         raise FitError("it holds no ranks of readings", where="calibration", hint=hint)
     rows = {}
-    for name in map(str, calibration["predictive_pit"].data_vars):
+    for label, pit in reading_ranks(calibration).items():
+        name, test = label.rsplit(", ", 1)
         pareto_k = calibration["readings"][f"{name}_pareto_k"].to_numpy()
-        for group, test in READING_TESTS.items():
-            pit = calibration[group][name].to_numpy()
-            untrusted = float(np.sum(pareto_k[np.isfinite(pit)] > MAX_PARETO_K))
-            rows[f"{name}, {test}"] = {
-                "reading": name,
-                "test": test,
-                **_rank_columns(pit),
-                "untrusted": untrusted if group == "loo_pit" else math.nan,
-            }
+        untrusted = float(np.sum(pareto_k[np.isfinite(pit)] > MAX_PARETO_K))
+        rows[label] = {
+            "reading": name,
+            "test": test,
+            **_rank_columns(pit),
+            "untrusted": untrusted if test == READING_TESTS["loo_pit"] else math.nan,
+        }
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
@@ -435,13 +434,12 @@ def comparison_sentences(compared: pd.DataFrame) -> list[str]:
     sentences = [f"Of {len(parameters)} parameters {counts}."]
     for label, rows in parameters:
         if not rows["passes"].all():
-            parts = (f"by {name} {_method_result(row)}" for (_, name), row in rows.iterrows())
+            parts = (
+                f"by {name} {row['deviation']} (95% intervals hold {row['held_95']:.1%})"
+                for (_, name), row in rows.iterrows()
+            )
             sentences.append(f"{label}: {'; '.join(parts)}.")
     return sentences
-
-
-def _method_result(row: pd.Series) -> str:
-    return f"{row['deviation']} (95% intervals hold {row['held_95']:.1%})"
 
 
 def _score_change(

@@ -115,11 +115,9 @@ def _sensor(sensor: SensorStudentT) -> FisherInformation:
     def mean_outer_score(*reading: Array) -> Array:
         return jnp.mean(jax.vmap(lambda node: outer_score(node, *reading))(nodes), axis=0)
 
-    of_all: Callable = mean_outer_score
-    for _ in range(sensor.location.ndim):
-        of_all = jax.vmap(of_all)
-    readings = jnp.broadcast_arrays(sensor.location, sensor.scale, sensor.full_scale)
-    return FisherInformation((sensor.location, sensor.scale), of_all(*readings))
+    of_all = jnp.vectorize(mean_outer_score, signature="(),(),()->(p,p)")
+    matrix = of_all(sensor.location, sensor.scale, sensor.full_scale)
+    return FisherInformation((sensor.location, sensor.scale), matrix)
 
 
 def _beta(beta: MeanConcentrationBeta) -> FisherInformation:

@@ -51,9 +51,10 @@ from polar_bayes.design.setup import (
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.optimize import from_prior
+from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
-from polar_bayes.observation.data import ANGLES, Observations, observe
+from polar_bayes.observation.data import ANGLES, Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.progress import Progress, with_progress
@@ -228,7 +229,7 @@ def _extended(
     request = resolve(
         views.capture, model, problem.request.scene, priors, links, limit, seed, "double"
     )
-    data = observe(request.capture, largest_view_zenith=limit)
+    data = observe_request(request)
     recorded = jnp.broadcast_to(problem.data.brightness, problem.data.shape)
     rest = jnp.full((*data.shape[:-1], data.shape[-1] - views.measured), jnp.median(recorded))
     data = dataclasses.replace(data, brightness=jnp.concatenate([recorded, rest], axis=-1))

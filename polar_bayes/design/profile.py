@@ -28,15 +28,15 @@ from polar_bayes.design.setup import (
     DesignProblem,
     label_coordinates,
     label_parameters,
+    label_scalars,
     log_density_of_sites,
     make_design_problem,
-    parameter_vector,
     posterior_modes,
     provenance_attrs,
 )
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
-from polar_bayes.inference.optimize import Modes
+from polar_bayes.inference.optimize import Modes, NumpyPotential, ValueAndGradient
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations
@@ -118,12 +118,13 @@ def profile(
         instrument = request.scene.instrument
         known = set() if instrument is None else {*instrument.parameters} - {coordinate.site}
         parts = partial(log_density_parts, problem.program, known)
-        potential = compile_potential(parts, problem.data)
-        modes = posterior_modes(problem, progress, lambda z: potential(z, 1.0))
+        run, dtype = compiled(jax.value_and_grad(partial(_potential, parts))), problem.prior.dtype
+        potentials = [NumpyPotential(run, (w, problem.data), dtype) for w in KINDS.values()]
+        modes = posterior_modes(problem, progress, potentials[0])
         follow = compile_continuation(parts, index)
 
         def on_grid(grid: np.ndarray) -> ProfileCurve:
-            return _trace_profile(problem, index, modes, potential, follow, grid)
+            return _trace_profile(problem, index, modes, potentials, follow, grid)
 
         if given is not None:
             curve = on_grid(np.sort(np.append(given, modes.z[0, index])))
@@ -175,16 +176,14 @@ def _unconstrained(
 
 
 def _assemble(problem: DesignProblem, coordinate: Coordinate, curve: "ProfileCurve") -> xr.Dataset:
-    program, data = problem.program, problem.data
-    labels = label_parameters(problem)
-    vectors = compiled(jax.vmap(lambda z: parameter_vector(program, z, data)))
-    others = np.asarray(vectors(curve.best.reshape(-1, program.size)))
-    others = others.reshape(*curve.value.shape, -1)[..., labels.rows]
-    grid = jnp.asarray(
-        np.where(np.arange(program.size) == coordinate.index, curve.grid[:, None], 0.0)
-    )
-    sites = compiled(jax.vmap(lambda z: jnp.ravel(program.constrain(z)[coordinate.site])))
-    theta = np.asarray(sites(grid))[:, coordinate.entry]
+    program, capture = problem.program, problem.request.capture
+    # The grid's own row gives the parameter's values where no fit converged, too.
+    grid = np.where(np.arange(program.size) == coordinate.index, curve.grid[:, None], 0.0)
+    z = jnp.asarray([*curve.best, grid])
+    at = label_scalars(program, capture, program.parameters_of_chains(z, problem.data))
+    labels = [scalar.label for scalar in at]
+    values = np.stack([scalar.draws for scalar in at], axis=-1)
+    others, theta = values[:-1], values[-1, :, labels.index(coordinate.label)]
     highest = np.array([row[np.isfinite(row)].max(initial=-np.inf) for row in curve.value])
     order = np.argsort(theta)
     theta, others = theta[order], others[:, order]
@@ -192,7 +191,8 @@ def _assemble(problem: DesignProblem, coordinate: Coordinate, curve: "ProfileCur
     low, high, open_below, open_above = zip(
         *(likelihood_interval(theta, row) for row in value), strict=True
     )
-    prior = next(each.draws for each in labels.scalars if each.label == coordinate.label)
+    known = label_parameters(problem)
+    prior = known.scalars[known.names.index(coordinate.label)].draws
     beyond = [float(np.mean(prior < theta[0])), float(np.mean(prior > theta[-1]))]
     return xr.Dataset(
         {
@@ -208,7 +208,7 @@ def _assemble(problem: DesignProblem, coordinate: Coordinate, curve: "ProfileCur
         coords={
             "kind": list(KINDS),
             "value": theta,
-            "parameter": labels.names,
+            "parameter": labels,
             "side": ["below", "above"],
         },
         attrs={
@@ -229,7 +229,6 @@ class LogDensityParts(NamedTuple):
 
 
 Parts = Callable[[Array, Observations], LogDensityParts]
-Potential = Callable[[np.ndarray, float], tuple[float, np.ndarray]]
 
 
 def log_density_parts(
@@ -247,20 +246,11 @@ def log_density_parts(
     return LogDensityParts(likelihood, whole - likelihood)
 
 
-def _weighted_potential(parts: Parts, z: Array, weight: Array, data: Observations) -> Array:
+def _potential(parts: Parts, z: Array, given: tuple[float | Array, Observations]) -> Array:
+    """Minus log likelihood and weighted log prior, given the weight and the data."""
+    weight, data = given
     terms = parts(z, data)
     return -(terms.likelihood + weight * terms.prior)
-
-
-def compile_potential(parts: Parts, data: Observations) -> Potential:
-    """Minus log likelihood and weighted log prior, with their gradient, as one program."""
-    run = compiled(jax.value_and_grad(partial(_weighted_potential, parts)))
-
-    def potential(z: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
-        value, gradient = run(jnp.asarray(z), jnp.asarray(weight), data)
-        return float(value), np.asarray(gradient, float)
-
-    return potential
 
 
 # --- Numerical continuation of the conditional modes ----------------------------------------------
@@ -304,7 +294,7 @@ def compile_continuation(parts: Parts, index: int) -> Continuation:
     weights = tuple(KINDS.values())
 
     def evaluate(y: Array, guess: Array, weight: Array, factor: Array, data: Observations) -> Array:
-        value = _weighted_potential(parts, guess + factor @ y, weight, data)
+        value = _potential(parts, guess + factor @ y, (weight, data))
         return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
     # The solver linearizes the loss and transposes that. Giving it the gradient at once halves what
@@ -355,7 +345,7 @@ def _trace_profile(
     problem: DesignProblem,
     index: int,
     modes: Modes,
-    potential: Potential,
+    potentials: Sequence[ValueAndGradient],
     follow: Continuation,
     grid: np.ndarray,
 ) -> ProfileCurve:
@@ -381,20 +371,18 @@ def _trace_profile(
     best = np.full((len(KINDS), grid.size, problem.program.size), np.nan)
     for (_, side), track in zip(tracks, np.asarray(ends), strict=True):
         for point, found in zip(sides[side], track, strict=False):
-            for kind, (z, weight) in enumerate(zip(found, KINDS.values(), strict=True)):
-                height = _log_density_at(potential, z, weight, factor)
+            for kind, z in enumerate(found):
+                height = _log_density_at(potentials[kind], z, factor)
                 if height > np.nan_to_num(value[kind, point], nan=-np.inf):
                     value[kind, point], best[kind, point] = height, z
     return ProfileCurve(grid, value, best)
 
 
-def _log_density_at(
-    potential: Potential, z: np.ndarray, weight: float, factor: np.ndarray
-) -> float:
+def _log_density_at(potential: ValueAndGradient, z: np.ndarray, factor: np.ndarray) -> float:
     """The log density at the end of an optimization; NaN where it is no conditional mode."""
     if not np.isfinite(z).all():
         return np.nan
-    loss, gradient = potential(z, weight)
+    loss, gradient = potential(z)
     converged = np.linalg.norm(factor.T @ gradient) < MAX_GRADIENT
     return -loss if converged and np.isfinite(loss) else np.nan
 

@@ -26,10 +26,11 @@ from polar_bayes.inference.optimize import (
     find_modes,
     from_prior,
 )
-from polar_bayes.inference.program import Program, compile_program
+from polar_bayes.inference.problem import compile_model, observe_request
+from polar_bayes.inference.program import Program
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import PROVENANCE, posterior_of, shape_of
-from polar_bayes.observation.data import Observations, observe
+from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress, no_progress
 
 PRIOR_DRAWS = 500
@@ -46,22 +47,15 @@ class DesignProblem(NamedTuple):
 
 def provenance_attrs(request: Request, **more: Any) -> dict[str, str]:
     """The attribute of a result that holds its capture, model and settings, as JSON."""
-    found = {
-        "model": request.model_name,
-        "scene": request.scene_name,
-        "scene_parts": repr(request.scene),
-        "links": {name: repr(link) for name, link in request.links.items()},
-        "seed": request.seed,
-        "capture": str(request.capture.attrs.get("name", "capture")),
-        **more,
-    }
+    capture = str(request.capture.attrs.get("name", "capture"))
+    found = {**request.describe(), "capture": capture, **more}
     return {PROVENANCE: json.dumps(found, sort_keys=True)}
 
 
 def make_design_problem(request: Request) -> DesignProblem:
-    """Compile the model of a request; call it with x64 enabled."""
-    data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
-    program = compile_program(request.bind(request.scene), data)
+    """Compile the model of a request, or take it from the cache; call it with x64 enabled."""
+    data = observe_request(request)
+    program = compile_model(request, data).program
     prior = from_prior(program, jax.random.key(request.seed), PRIOR_DRAWS, data)
     return DesignProblem(request, data, program, prior)
 
@@ -69,7 +63,7 @@ def make_design_problem(request: Request) -> DesignProblem:
 def posterior_modes(
     problem: DesignProblem, progress: Progress | None, potential: ValueAndGradient | None = None
 ) -> Modes:
-    """The modes of the posterior, heaviest first."""
+    """The modes of the posterior, all coordinates together, heaviest first."""
     potential = potential or NumpyPotential(
         problem.program.value_and_gradient, problem.data, problem.data.brightness.dtype
     )
@@ -120,15 +114,12 @@ class ParameterLabels(NamedTuple):
 
 def label_parameters(problem: DesignProblem) -> ParameterLabels:
     """Label every scalar parameter of a model, with its draws from the prior."""
-    program, data = problem.program, problem.data
-    draws = compiled(jax.vmap(lambda z: program.parameters(z, data)))(problem.prior)
-    flat, unravel = ravel_pytree({name: x[0] for name, x in draws.items()})
-    rows = unravel(jnp.arange(flat.size, dtype=flat.dtype))
-    by_draw, by_row = (
-        _scalars(program, problem.request.capture, values)
-        for values in (draws, {name: x[None] for name, x in rows.items()})
-    )
-    return ParameterLabels(by_draw, [int(scalar.draws.item()) for scalar in by_row])
+    program, capture = problem.program, problem.request.capture
+    draws = program.parameters_of_chains(jnp.asarray(problem.prior[None]), problem.data)
+    flat, unravel = ravel_pytree({name: x[:1, :1] for name, x in draws.items()})
+    positions = label_scalars(program, capture, unravel(jnp.arange(flat.size, dtype=flat.dtype)))
+    rows = [int(scalar.draws.item()) for scalar in positions]
+    return ParameterLabels(label_scalars(program, capture, draws), rows)
 
 
 @dataclasses.dataclass(frozen=True, order=True)
@@ -148,10 +139,10 @@ class Coordinate:
 def label_coordinates(program: Program, capture: xr.Dataset) -> list[Coordinate]:
     """All unconstrained coordinates in their order."""
     found = []
-    for site, positions in program.unravel(jnp.arange(float(program.size))).items():
-        flat = np.ravel(positions).astype(int)
+    for site, positions in coordinate_positions(program).items():
+        flat = positions.ravel()
         is_entry = flat.size == np.prod(shape_of(program, site), initial=1)
-        named = _scalars(program, capture, {site: flat[None]}) if is_entry else []
+        named = label_scalars(program, capture, {site: flat[None, None]}) if is_entry else []
         labels = {int(scalar.draws.item()): scalar.label for scalar in named}
         found += [
             Coordinate(index, labels.get(index, f"{site}[{entry}]"), site, entry, is_entry)
@@ -160,9 +151,15 @@ def label_coordinates(program: Program, capture: xr.Dataset) -> list[Coordinate]
     return sorted(found)
 
 
-def _scalars(program: Program, capture: xr.Dataset, draws: Mapping[str, Any]) -> list[Scalar]:
-    """Scalars of draws (draw, ...), with the capture's own labels of axes, such as wavelengths."""
-    group = posterior_of(program, {name: np.asarray(x)[None] for name, x in draws.items()})
+def coordinate_positions(program: Program) -> dict[str, np.ndarray]:
+    """Indices of the unconstrained coordinates, by site."""
+    positions = program.unravel(jnp.arange(float(program.size)))
+    return {site: np.asarray(x).astype(int) for site, x in positions.items()}
+
+
+def label_scalars(program: Program, capture: xr.Dataset, draws: Mapping[str, Any]) -> list[Scalar]:
+    """Scalars of chains of draws, with the capture's own labels of axes, such as wavelengths."""
+    group = posterior_of(program, draws)
     labels = {str(dim): capture[dim] for dim in group.dims if dim in capture.coords}
     return scalars(group.assign_coords(labels))
 
@@ -226,17 +223,14 @@ def unconstrain(
 
 def coordinate_indices(program: Program, extended: Program) -> Int[np.ndarray, " size"]:
     """Indices of a program's coordinates in that of the same model with more views."""
-    ours, theirs = (
-        {n: np.asarray(x) for n, x in one.unravel(jnp.arange(float(one.size))).items()}
-        for one in (program, extended)
-    )
+    theirs = coordinate_positions(extended)
     indices = np.zeros(program.size, int)
-    for name, position in ours.items():
+    for name, position in coordinate_positions(program).items():
         if name not in theirs or theirs[name].shape != position.shape:
             raise FitError(
                 f"{name} belongs to single views, and no reading of a new view determines it yet",
                 where="next_views: model",
                 hint="use a model whose parameters do not belong to single views",
             )
-        indices[position.astype(int).ravel()] = theirs[name].astype(int).ravel()
+        indices[position] = theirs[name]
     return indices

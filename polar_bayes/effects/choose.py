@@ -17,7 +17,7 @@ import pandas as pd
 import xarray as xr
 from numpyro import distributions as dist
 
-from polar_bayes.effects.compare_scenes import Baseline, Comparison, SceneDensities
+from polar_bayes.effects.posterior_change import Baseline, PosteriorChange, SceneDensities
 from polar_bayes.effects.variants import (
     Effect,
     KeyPath,
@@ -36,150 +36,134 @@ from polar_bayes.progress import Progress, no_progress, with_progress
 # --- Selection of effects -------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class UserChoice:
-    """Effects that the user decided to keep or to drop."""
+def find_forced(
+    effects: Sequence[Effect], keep: str | Iterable[str], drop: str | Iterable[str]
+) -> tuple[list[Effect], list[Effect]]:
+    """The effects that the user decided to keep, and to drop."""
 
-    keep: tuple[Effect, ...] = ()
-    drop: tuple[Effect, ...] = ()
+    def find(names: str | Iterable[str], where: str) -> list[Effect]:
+        names = (names,) if isinstance(names, str) else names
+        return [effect for name in names for effect in find_effects(name, effects, where)]
 
-    @classmethod
-    def of(
-        cls, effects: Sequence[Effect], keep: str | Iterable[str], drop: str | Iterable[str]
-    ) -> "UserChoice":
-        """The effects of these names."""
+    kept, dropped = find(keep, "keep"), find(drop, "drop")
+    for effect in dropped:
+        if effect in kept:
+            raise SceneError(
+                "it is both to keep and to drop", where=effect.name, hint="name it in one only"
+            )
+    return kept, dropped
 
-        def find(names: str | Iterable[str], where: str) -> tuple[Effect, ...]:
-            names = (names,) if isinstance(names, str) else names
-            return tuple(effect for name in names for effect in find_effects(name, effects, where))
 
-        choice = cls(find(keep, "keep"), find(drop, "drop"))
-        for effect in choice.drop:
-            if effect in choice.keep:
-                raise SceneError(
-                    "it is both to keep and to drop", where=effect.name, hint="name it in one only"
+class EffectSelection:
+    """What changes without each effect alone, and the scene with the effects that are kept."""
+
+    scene: Scene
+    selected_from: Baseline
+    """The full scene without the effects that the user drops: the selected one is judged by it."""
+    combined: PosteriorChange
+    """Of the selected scene."""
+
+    def __init__(
+        self,
+        densities: SceneDensities,
+        full: Scene,
+        effects: Sequence[Effect],
+        parameters: tuple[str, ...] | None,
+        tolerance: float,
+    ) -> None:
+        self.densities, self.full, self.tolerance = densities, full, tolerance
+        self.baseline = densities.baseline(full, parameters)
+        density = self.baseline.fit.density
+        for name in parameters or ():
+            if name not in (*density.labels, *density.sites):
+                raise FitError(
+                    "the scene with everything on has no such parameter",
+                    where=f"parameters: {name!r}",
+                    hint=f"give any of {', '.join(dict.fromkeys(density.sites))}",
                 )
-        return choice
-
-    def protects(self, effect: Effect, full: Scene) -> bool:
-        """Whether leaving out the effect would remove a part that is to be kept."""
-        rest = [part for _, part in parts_of(effect.apply(full))]
-        return any(kept.part not in rest for kept in self.keep)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class SingleComparisons:
-    """The full scene compared with itself without each effect alone."""
-
-    densities: SceneDensities
-    full: Scene
-    tolerance: float
-    baseline: Baseline
-    comparisons: dict[Effect, Comparison]
+        self.changes: dict[Effect, PosteriorChange] = {}
+        for number, effect in enumerate(effects):
+            self.changes[effect] = self.baseline.compare(densities.density(effect.apply(full)))
+            densities.progress("comparing effects", (number + 1) / len(effects))
+        self.kept: dict[Effect, bool] = {}
+        self.reasons: dict[Effect, str] = {}
 
     def change(self, effect: Effect) -> float:
         """The largest change of a judged parameter without the effect."""
-        return self.baseline.largest_change(self.comparisons[effect])
+        return self.baseline.largest_change(self.changes[effect])
 
-    def operations(self, effect: Effect) -> float:
-        """Operations of one log density without the effect."""
-        return self.densities.density(effect.apply(self.full)).compiled.operations
+    def select(self, keep: Sequence[Effect], drop: Sequence[Effect]) -> None:
+        """Leave out together all effects that change little, and those that the user drops."""
+        forced = [options[0] for options in self._by_key_path(drop).values()]
+        baseline = self._without(forced)
+        forced_paths = {effect.key_path for effect in forced}
+        options = self._by_key_path(
+            effect
+            for effect in self.changes
+            if self.change(effect) <= self.tolerance
+            and effect.key_path not in forced_paths
+            and not self._removes_any(effect, keep)
+        )
+        remarks = dict.fromkeys((*forced, *keep), "by your choice")
+        while True:
+            optional = [effects[0] for effects in options.values() if effects]
+            scene = simplify(self.full, [*forced, *optional])
+            combined = baseline.compare(self.densities.density(scene))
+            if baseline.largest_change(combined) <= self.tolerance or not optional:
+                break
+            worst = max(optional, key=self.change)
+            options[worst.key_path].remove(worst)
+            remarks[worst] = f"with all others that could go, {baseline.describe(combined)}"
+        self.scene, self.selected_from, self.combined = scene, baseline, combined
+        dropped = {effect.key_path: effect for effect in (*forced, *optional)}
+        left = [part for _, part in parts_of(scene)]
+        for effect in self.changes:
+            instead = dropped.get(effect.key_path)
+            self.kept[effect] = instead is None and effect.part in left
+            remark = remarks.get(effect, "")
+            if not remark and instead not in (None, effect):
+                remark = f"{instead.name} instead"
+            elif not remark and instead is None and not self.kept[effect]:
+                remark = "it goes with the part around it"
+            self.reasons[effect] = self._reason(effect, remark)
 
-    def by_key_path(self, effects: Iterable[Effect]) -> dict[KeyPath, list[Effect]]:
+    def _without(self, forced: list[Effect]) -> Baseline:
+        """The baseline without the effects that the user drops."""
+        if not forced:
+            return self.baseline
+        bare = simplify(self.full, forced)
+        fit = self.baseline.compare(self.densities.density(bare)).fit
+        if not fit.found:
+            return self.densities.baseline(bare, self.baseline.names)
+        return dataclasses.replace(self.baseline, fit=fit)
+
+    def _by_key_path(self, effects: Iterable[Effect]) -> dict[KeyPath, list[Effect]]:
         """Effects by the key path of their part, the replacement of fewest operations first."""
+
+        def operations(effect: Effect) -> float:
+            return self.densities.density(effect.apply(self.full)).compiled.operations
+
         groups: dict[KeyPath, list[Effect]] = {}
-        for effect in sorted(effects, key=self.operations):
+        for effect in sorted(effects, key=operations):
             groups.setdefault(effect.key_path, []).append(effect)
         return groups
 
+    def _removes_any(self, effect: Effect, keep: Sequence[Effect]) -> bool:
+        """Whether leaving out the effect would remove a part that is to be kept."""
+        rest = [part for _, part in parts_of(effect.apply(self.full))]
+        return any(kept.part not in rest for kept in keep)
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Selection:
-    """The scene with the effects that are kept, and the comparison without all others."""
-
-    scene: Scene
-    baseline: Baseline
-    combined: Comparison
-    kept: dict[Effect, bool]
-    reasons: dict[Effect, str]
-
-
-def compare_effects(
-    densities: SceneDensities,
-    full: Scene,
-    effects: Sequence[Effect],
-    parameters: tuple[str, ...] | None,
-    tolerance: float,
-) -> SingleComparisons:
-    """Leave out each effect alone."""
-    baseline = densities.baseline(full, parameters)
-    density = baseline.fit.density
-    for name in parameters or ():
-        if name not in (*density.labels, *density.sites):
-            raise FitError(
-                "the scene with everything on has no such parameter",
-                where=f"parameters: {name!r}",
-                hint=f"give any of {', '.join(dict.fromkeys(density.sites))}",
-            )
-    comparisons = {}
-    for number, effect in enumerate(effects):
-        comparisons[effect], _ = baseline.compare(densities.density(effect.apply(full)))
-        densities.progress("comparing effects", (number + 1) / len(effects))
-    return SingleComparisons(densities, full, tolerance, baseline, comparisons)
-
-
-def select_effects(single: SingleComparisons, choice: UserChoice) -> Selection:
-    """Leave out together all effects that change little, and those that the user drops."""
-    densities, full, baseline = single.densities, single.full, single.baseline
-    forced = [options[0] for options in single.by_key_path(choice.drop).values()]
-    if forced:
-        bare = simplify(full, forced)
-        _, fit = baseline.compare(densities.density(bare))
-        baseline = dataclasses.replace(baseline, fit=fit)
-        if not fit.found:
-            baseline = densities.baseline(bare, baseline.names)
-    forced_paths = {effect.key_path for effect in forced}
-    options = single.by_key_path(
-        effect
-        for effect in single.comparisons
-        if single.change(effect) <= single.tolerance
-        and effect.key_path not in forced_paths
-        and not choice.protects(effect, full)
-    )
-    reasons = dict.fromkeys((*forced, *choice.keep), "by your choice")
-    while True:
-        dropped = [*forced, *(effects[0] for effects in options.values() if effects)]
-        scene = simplify(full, dropped)
-        combined, _ = baseline.compare(densities.density(scene))
-        optional = dropped[len(forced) :]
-        if baseline.largest_change(combined) <= single.tolerance or not optional:
-            break
-        worst = max(optional, key=single.change)
-        options[worst.key_path].remove(worst)
-        reasons[worst] = f"with all others that could go, {baseline.describe(combined)}"
-    replaced = {effect.key_path: effect for effect in dropped}
-    left = [part for _, part in parts_of(scene)]
-    kept = {e: e.key_path not in replaced and e.part in left for e in single.comparisons}
-    for effect in kept.keys() - reasons.keys() - set(dropped):
-        if effect.key_path in replaced:
-            reasons[effect] = f"{replaced[effect.key_path].name} instead"
-        elif not kept[effect]:
-            reasons[effect] = "it goes with the part around it"
-    reasons = {e: _reason(single, e, reasons.get(e, ""), is_kept) for e, is_kept in kept.items()}
-    return Selection(scene, baseline, combined, kept, reasons)
-
-
-def _reason(single: SingleComparisons, effect: Effect, remark: str, is_kept: bool) -> str:
-    """Why an effect is kept or dropped: the remark, the change, and the parameters that it adds."""
-    change, comparison = single.change(effect), single.comparisons[effect]
-    seen = single.baseline.describe(comparison)
-    if change <= single.tolerance:
-        which = "parameter" if single.baseline.names is None else "judged parameter"
-        seen = f"alone no {which} changes by more than {max(change, 0.001):.2g} sd"
-        remark = remark or ("a part of it stays by your choice" if is_kept else "")
-    missing = () if is_kept else single.baseline.missing(comparison)
-    unfitted = f"not fitted then: {', '.join(missing)}" if missing else ""
-    return "; ".join(text for text in (remark, seen, unfitted) if text)
+    def _reason(self, effect: Effect, remark: str) -> str:
+        """Why an effect is kept or dropped: the remark, the change, the parameters that it adds."""
+        change, is_kept = self.change(effect), self.kept[effect]
+        found = self.baseline.describe(self.changes[effect])
+        if change <= self.tolerance:
+            which = "parameter" if self.baseline.names is None else "judged parameter"
+            found = f"alone no {which} changes by more than {max(change, 0.001):.2g} sd"
+            remark = remark or ("a part of it stays by your choice" if is_kept else "")
+        missing = [] if is_kept else self.baseline.missing(self.changes[effect])
+        unfitted = f"not fitted then: {', '.join(missing)}" if missing else ""
+        return "; ".join(text for text in (remark, found, unfitted) if text)
 
 
 # --- The ledger: what each effect changes and costs -----------------------------------------------
@@ -209,48 +193,45 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
 
 
 def make_ledger(
-    single: SingleComparisons,
-    selection: Selection,
-    choice: UserChoice,
-    settings: Mapping[str, str | float | int],
+    selection: EffectSelection, forced: Sequence[Effect], settings: Mapping[str, str | float | int]
 ) -> xr.Dataset:
-    """Comparisons, costs and the selection as one dataset."""
-    full, costs = single.full, single.densities.costs()
-    effects, comparisons = tuple(single.comparisons), tuple(single.comparisons.values())
-    labels = single.baseline.fit.density.labels
+    """Changes, costs and the selection as one dataset."""
+    full, costs = selection.full, selection.densities.costs()
+    effects, changes = tuple(selection.changes), tuple(selection.changes.values())
+    labels = selection.baseline.fit.density.labels
     shape = (len(effects), len(labels))
 
     def of_all_labels(values: np.ndarray) -> list[float]:
-        """Values of the selection's baseline; NaN for parameters that the user dropped."""
-        known = dict(zip(selection.baseline.fit.density.labels, values, strict=True))
+        """NaN for parameters that the user dropped."""
+        known = dict(zip(selection.selected_from.fit.density.labels, values, strict=True))
         return [known.get(label, math.nan) for label in labels]
 
     columns: dict[str, tuple[tuple[str, ...], Any]] = {
-        "largest_move": (EFFECT, [each.largest_move for each in comparisons]),
-        "rms_move": (EFFECT, [each.rms_move for each in comparisons]),
-        "shift": (BOTH, np.reshape([each.shift for each in comparisons], shape)),
-        "sd_ratio": (BOTH, np.reshape([each.sd_ratio for each in comparisons], shape)),
-        "change": (EFFECT, [single.change(effect) for effect in effects]),
+        "largest_move": (EFFECT, [each.largest_move for each in changes]),
+        "rms_move": (EFFECT, [each.rms_move for each in changes]),
+        "shift": (BOTH, np.reshape([each.shift for each in changes], shape)),
+        "sd_ratio": (BOTH, np.reshape([each.sd_ratio for each in changes], shape)),
+        "change": (EFFECT, [selection.change(effect) for effect in effects]),
         "kept": (EFFECT, np.asarray([selection.kept[effect] for effect in effects], bool)),
-        "forced": (EFFECT, [effect in (*choice.keep, *choice.drop) for effect in effects]),
+        "forced": (EFFECT, [effect in forced for effect in effects]),
         "reason": (EFFECT, _texts(selection.reasons[effect] for effect in effects)),
-        "judged": (PARAMETER, single.baseline.judged),
+        "judged": (PARAMETER, selection.baseline.judged),
         "combined_shift": (PARAMETER, of_all_labels(selection.combined.shift)),
         "combined_sd_ratio": (PARAMETER, of_all_labels(selection.combined.sd_ratio)),
     }
     attributes: dict[str, str | float | int] = {
         **settings,
-        "combined_change": selection.baseline.largest_change(selection.combined),
+        "combined_change": selection.selected_from.largest_change(selection.combined),
         "full_scene": repr(full),
         "chosen_scene": repr(selection.scene),
         "versions": json.dumps({name: version(name) for name in PACKAGES}),
     }
     without = [costs[effect.apply(full)] for effect in effects]
     for name in COSTS:
-        whole = getattr(costs[full], name)
-        columns[name] = (EFFECT, [whole - getattr(cost, name) for cost in without])
+        whole = costs[full][name]
+        columns[name] = (EFFECT, [whole - cost[name] for cost in without])
         attributes[f"full_{name}"] = whole
-        attributes[f"chosen_{name}"] = getattr(costs[selection.scene], name)
+        attributes[f"chosen_{name}"] = costs[selection.scene][name]
     return xr.Dataset(
         {
             name: (*columns[name], {"long_name": long_name, "units": units})
@@ -413,7 +394,7 @@ def choose_effects(
         priors: As for `polar_bayes.fit`; for parameters of the scene with everything on.
         links: As for `polar_bayes.fit`.
         largest_view_zenith: As for `polar_bayes.fit`.
-        seed: Of the search for the peak.
+        seed: Of the search for the mode.
         progress: Called with the name of a stage and the fraction of it that is done.
 
     Returns:
@@ -422,7 +403,7 @@ def choose_effects(
     Raises:
         CaptureError: The capture does not hold what a fit needs.
         SceneError: No such scene or effect.
-        FitError: A prior, link or setting cannot be used, or the full scene has no peak.
+        FitError: A prior, link or setting cannot be used, or the full scene has no mode.
     """
     if not (isinstance(tolerance, int | float) and tolerance > 0.0):
         raise FitError(
@@ -434,7 +415,7 @@ def choose_effects(
     named = not isinstance(scene, Scene)
     full = simplify(FULL_SCENES[request.scene_name] if named else request.scene, ())
     effects = effects_of(full)
-    choice = UserChoice.of(effects, keep, drop)
+    kept, dropped = find_forced(effects, keep, drop)
     names = None if parameters is None else tuple(parameters)
     settings: dict[str, str | float | int] = {
         "tolerance": float(tolerance),
@@ -448,9 +429,9 @@ def choose_effects(
         densities = SceneDensities(request, priors, progress or no_progress)
         # Unknown priors are refused before minutes are spent.
         resolve_priors(densities.priors(full).read, priors)
-        single = compare_effects(densities, full, effects, names, float(tolerance))
-        selection = select_effects(single, choice)
-        ledger = make_ledger(single, selection, choice, settings)
+        selection = EffectSelection(densities, full, effects, names, float(tolerance))
+        selection.select(kept, dropped)
+        ledger = make_ledger(selection, [*kept, *dropped], settings)
     fields = (field.name for field in dataclasses.fields(Scene))
     chosen = ChosenScene(**{name: getattr(selection.scene, name) for name in fields})
     object.__setattr__(chosen, "ledger", ledger)

@@ -26,13 +26,11 @@ from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_unti
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.problem import BLOCK, THREADS, Problem, make_problem
-from polar_bayes.inference.request import Request, resolve
+from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import assemble, posterior_of
-from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.instrument import Discrepancy
-from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior, support_bounds
-from polar_bayes.progress import Progress, no_progress
+from polar_bayes.progress import Progress
 
 PRIOR_DRAWS = 500
 
@@ -49,29 +47,6 @@ METHODS: Mapping[str, Callable[[], AbstractMethod]] = {
     "auto": lambda: methods.Auto(),
 }
 """Methods that `fit` knows by name; a function makes each, because it loads what it needs."""
-
-
-def fit(
-    capture: xr.Dataset,
-    *,
-    model: str | Callable = "per_material",
-    method: str | AbstractMethod = "nuts",
-    tolerance: float | None = None,
-    seconds: float | None = None,
-    scene: str | Scene | None = None,
-    priors: Mapping[str, dist.Distribution] | None = None,
-    links: AbstractLink | Mapping[str, AbstractLink] | None = None,
-    largest_view_zenith: float | None = None,
-    seed: int = 0,
-    precision: str = "double",
-    progress: Progress | None = None,
-) -> xr.DataTree:
-    """Fit one capture by one scene; `polar_bayes.fit` describes the arguments."""
-    start_time = time.perf_counter()
-    chosen = find_method(method, tolerance, seconds)
-    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, precision)
-    with jax.enable_x64(precision == "double"):
-        return fit_request(request, chosen, progress or no_progress, start_time)
 
 
 def fit_request(
@@ -242,7 +217,7 @@ def _model_source(model: Callable) -> str:
     while isinstance(model, Messenger):
         model = model.fn
     code = model if isinstance(model, FunctionType) else type(model)
-    if code.__module__.startswith("polar_bayes."):
+    if (code.__module__ or "").startswith("polar_bayes."):  # None: of exec() in a bare namespace
         return ""
     try:
         return inspect.getsource(code)

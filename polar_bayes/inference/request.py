@@ -21,7 +21,7 @@ from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import PriorTable, cast_prior, resolve_priors
+from polar_bayes.priors import PriorTable, cast_prior, describe_prior, resolve_priors
 from polar_bayes.setups import SETUPS, Setup, default_priors, find_setup
 
 MODELS: dict[str, Callable] = {
@@ -55,6 +55,17 @@ class Request:
     def bind(self, scene: Scene) -> Callable[[Observations], None]:
         """The model with everything but its data in place."""
         return bind_model(self.model, scene, self.priors, self.links)
+
+    def describe(self) -> dict[str, Any]:
+        """The request in what JSON can hold, for the provenance of a result."""
+        return {
+            "model": self.model_name,
+            "scene": self.scene_name,
+            "scene_parts": repr(self.scene),
+            "priors": {name: describe_prior(prior) for name, prior in self.priors.items()},
+            "links": {name: repr(link) for name, link in self.links.items()},
+            "seed": self.seed,
+        }
 
 
 def bind_model(

@@ -34,7 +34,6 @@ from polar_bayes.observation.data import ANGLES, READINGS, Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import describe_prior
 from polar_bayes.progress import Counter, no_progress, with_counter
 
 BLOCK = 4096
@@ -213,7 +212,7 @@ def provenance_json(plan: MapPlan) -> str:
     """Provenance of maps, as JSON."""
     request = plan.request
     provenance = {
-        **describe_request(request),
+        **request.describe(),
         "method": "pixels",
         "fitted_by": type(plan.settings).__name__,
         "settings": dataclasses.asdict(plan.settings),
@@ -224,18 +223,6 @@ def provenance_json(plan: MapPlan) -> str:
         "intensity_unit": plan.intensity_unit,
     }
     return json.dumps(provenance, sort_keys=True)
-
-
-def describe_request(request: Request) -> dict[str, Any]:
-    """What a request was, for the provenance of a map or a calibration."""
-    return {
-        "model": request.model_name,
-        "scene": request.scene_name,
-        "scene_parts": repr(request.scene),
-        "priors": {name: describe_prior(prior) for name, prior in request.priors.items()},
-        "links": {name: repr(link) for name, link in request.links.items()},
-        "seed": request.seed,
-    }
 
 
 # --- Blocks of an image ---------------------------------------------------------------------------

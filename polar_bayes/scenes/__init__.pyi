@@ -4,11 +4,11 @@ from .candidates import (
 )
 from .comparison import (
     compare_scenes as compare_scenes,
-    SceneComparison as SceneComparison,
-    Setting as Setting,
+    FitArguments as FitArguments,
 )
 from .fitting import fit as fit
 from .sentences import (
+    SceneComparison as SceneComparison,
     scene_sentences as scene_sentences,
     scene_table as scene_table,
 )

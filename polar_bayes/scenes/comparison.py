@@ -12,7 +12,6 @@ Source:
 """
 
 import dataclasses
-import json
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -42,14 +41,13 @@ from polar_bayes.scenes.candidates import (
     named_setup,
     scene_library,
 )
-from polar_bayes.scenes.sentences import ERRORS_APART, SMALL_DIFFERENCE
+from polar_bayes.scenes.sentences import ERRORS_APART, SMALL_DIFFERENCE, SceneComparison
 
 METHOD = Importance(draws=2048, rounds=6)
 """Of the fits that are compared."""
 
 MAX_FITS = 12
 """Candidates that are fitted at most."""
-
 
 LEAST_WEIGHT = 0.05
 """Stacking weight below which a scene does not remain."""
@@ -62,62 +60,6 @@ RESIDUAL_CHECKS = ("priors", "noise", "angle", "wavelength", "leave-one-out")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class SceneComparison:
-    """Comparison of several scenes for one capture.
-
-    Args:
-        table: A row for each scene, best first: elpd and se (nat), elpd_diff and dse (to the best),
-            weight (stacking; 0 for a scene that does not remain), unreliable (readings whose Pareto
-            k is above 0.7), seconds, criticism (checks that found a caution or problem).
-        intervals: A row for each material parameter and scene that has it, in the order of the
-            table: mean, sd, q2.5, q97.5 (unit of the parameter).
-        between: For each material parameter of all remaining scenes, the share of its stacked
-            variance that is between scenes, unit 1.
-        scenes: The scenes, by name.
-        fits: The fits that were compared, by name.
-        left_out: By scene, why it could not be fitted.
-        requests: What was fitted, by scene, with every default filled in.
-    """
-
-    table: pd.DataFrame
-    intervals: pd.DataFrame
-    between: pd.Series
-    scenes: Mapping[str, Scene]
-    fits: Mapping[str, xr.DataTree]
-    left_out: Mapping[str, str]
-    requests: Mapping[str, Request]
-
-    @property
-    def weights(self) -> dict[str, float]:
-        """Stacking weights of the scenes that remain, largest first."""
-        remaining = self.table["weight"][self.table["weight"] > 0.0]
-        return {str(k): float(v) for k, v in remaining.sort_values(ascending=False).items()}
-
-    def to_dataset(self) -> xr.Dataset:
-        """The tables as a dataset with the dims scene and parameter, as a fit holds them."""
-        table = self.table.rename_axis("scene")
-        intervals = self.intervals.rename(columns={"q2.5": "low", "q97.5": "high"})
-        labels = list(dict.fromkeys(intervals.index.get_level_values(0)))
-        wide = {
-            name: intervals[name].unstack(0).reindex(index=table.index, columns=labels).to_numpy()
-            for name in ("mean", "sd", "low", "high")
-        }
-        parts = [repr(self.scenes[name]) for name in table.index]
-        texts = {"parts": parts, "criticism": list(table["criticism"])}
-        numbers = ("elpd", "se", "elpd_diff", "dse", "weight", "unreliable", "seconds")
-        return xr.Dataset(
-            {
-                **{name: ("scene", table[name].to_numpy(float)) for name in numbers},
-                **{name: ("scene", np.array(text, dtype=str)) for name, text in texts.items()},
-                **{name: (("scene", "parameter"), values) for name, values in wide.items()},
-                "between_share": ("parameter", self.between.reindex(labels).to_numpy(float)),
-            },
-            {"scene": table.index.to_numpy(str), "parameter": np.array(labels, dtype=str)},
-            {"left_out": json.dumps(dict(self.left_out))},
-        )
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
 class _Fit:
     """One fitted candidate."""
 
@@ -126,6 +68,7 @@ class _Fit:
     seconds: float
     findings: pd.Series
     pointwise: np.ndarray
+    unreliable: int
 
     @property
     def elpd(self) -> float:
@@ -186,27 +129,29 @@ def compare_scenes(
         Vehtari, Gelman and Gabry (2017), Statistics and Computing 27, 1413 (leave-one-out); Yao et
         al. (2018), Bayesian Analysis 13, 917 (stacking).
     """
-    setting = Setting(validate(capture), model, priors, links, largest_view_zenith, seed, precision)
+    arguments = FitArguments(
+        validate(capture), model, priors, links, largest_view_zenith, seed, precision
+    )
     if scenes is None:
-        return compare_candidates(setting, progress or no_progress)
-    fits = _Fits(setting.among(_checked(scenes).values()), progress or no_progress)
+        return compare_candidates(arguments, progress or no_progress)
+    fits = _Fits(arguments.among(_checked(scenes).values()), progress or no_progress)
     with jax.enable_x64(precision == "double"):
         for name, scene in scenes.items():
             fits.add(one_line(str(name)), scene, len(scenes))
     return _comparison(fits)
 
 
-def compare_candidates(setting: "Setting", progress: Progress) -> SceneComparison:
+def compare_candidates(arguments: "FitArguments", progress: Progress) -> SceneComparison:
     """Compare the scenes that the capture allows, as far as its readings call for them."""
-    library = scene_library(setting.capture, setting.variables)
-    fits = _Fits(setting.among(library.single_parts()), progress)
-    with jax.enable_x64(setting.precision == "double"):
+    library = scene_library(arguments.capture, arguments.variables)
+    fits = _Fits(arguments.among(library.single_parts()), progress)
+    with jax.enable_x64(arguments.precision == "double"):
         _select(fits, library)
     return _comparison(fits)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Setting:
+class FitArguments:
     """What all candidates have in common: the arguments of a fit but scene and method."""
 
     capture: xr.Dataset
@@ -233,7 +178,7 @@ class Setting:
         names = links if links is not None else setup.links if setup else ()
         return set(names) & set(self.capture)
 
-    def among(self, scenes: Iterable[Scene]) -> "Setting":
+    def among(self, scenes: Iterable[Scene]) -> "FitArguments":
         """The same, for these scenes."""
         names = frozenset(name for scene in scenes for name in scene.parameters)
         return dataclasses.replace(self, scene_parameters=names)
@@ -257,8 +202,8 @@ class Setting:
 class _Fits:
     """The candidates that were fitted, by name."""
 
-    def __init__(self, setting: Setting, progress: Progress) -> None:
-        self.setting, self.progress = setting, progress
+    def __init__(self, arguments: FitArguments, progress: Progress) -> None:
+        self.arguments, self.progress = arguments, progress
         self.done: dict[str, _Fit] = {}
         self.failed: dict[str, str] = {}
 
@@ -271,11 +216,12 @@ class _Fits:
         """Fit one candidate."""
         self.progress(f"comparing scenes: {name}", self.count / most)
         begun = time.perf_counter()
-        request = self.setting.request(scene)
+        request = self.arguments.request(scene)
         try:
             tree = fit_request(request, METHOD, no_progress, begun, with_comparisons=False)
-            loo = [check.loo for check in predictive_checks(tree).values()]
-            if not loo or any(each is None for each in loo):
+            checks = predictive_checks(tree).values()
+            loo = [check.loo for check in checks if check.loo is not None]
+            if not loo or len(loo) < len(checks):
                 raise FitError(
                     "its draws do not predict the readings", where=name, hint="fit it alone"
                 )
@@ -283,10 +229,14 @@ class _Fits:
         except (FitError, np.linalg.LinAlgError) as error:
             self.failed[name] = one_line(str(error))
             return
-        pointwise = np.concatenate([each.pointwise for each in loo if each is not None])
-        findings = findings[findings.isin(["caution", "problem"])]
-        seconds = time.perf_counter() - begun
-        self.done[name] = _Fit(tree, request, seconds, findings, pointwise)
+        self.done[name] = _Fit(
+            tree,
+            request,
+            seconds=time.perf_counter() - begun,
+            findings=findings[findings.isin(["caution", "problem"])],
+            pointwise=np.concatenate([each.pointwise for each in loo]),
+            unreliable=sum(each.unreliable for each in loo),
+        )
 
 
 def _checked(scenes: Mapping[str, Scene]) -> Mapping[str, Scene]:
@@ -359,7 +309,7 @@ def _comparison(fits: _Fits) -> SceneComparison:
             where="compare_scenes",
             hint="compare scenes of one material at a time, or give priors",
         )
-    table = _predictions({name: fit.tree for name, fit in fits.done.items()})
+    table = _predictions(fits.done)
     remaining = _remaining(fits.done, table)
     weights = pd.Series(
         stacking_weights(np.stack([fits.done[name].pointwise for name in remaining], axis=1)),
@@ -370,30 +320,28 @@ def _comparison(fits: _Fits) -> SceneComparison:
     ordered = {name: fits.done[name] for name in table.index}
     table["seconds"] = [fit.seconds for fit in ordered.values()]
     table["criticism"] = [", ".join(fit.findings.index) for fit in ordered.values()]
-    intervals = _intervals({name: fit.tree for name, fit in ordered.items()})
+    trees = {name: fit.tree for name, fit in ordered.items()}
+    intervals = _intervals(trees)
     return SceneComparison(
         table=table,
         intervals=intervals,
         between=between_scenes(intervals, table["weight"]),
         scenes={name: fit.request.scene for name, fit in ordered.items()},
-        fits={name: fit.tree for name, fit in ordered.items()},
+        fits=trees,
         left_out=fits.failed,
         requests={name: fit.request for name, fit in ordered.items()},
     )
 
 
-def _predictions(trees: Mapping[str, xr.DataTree]) -> pd.DataFrame:
+def _predictions(fits: Mapping[str, _Fit]) -> pd.DataFrame:
     """Leave-one-out predictions of each fit, best first."""
     columns = ["elpd", "se", "elpd_diff", "dse", "weight", "unreliable"]
-    table, left_out = compare_predictions(trees)
-    if len(trees) == 1:
-        (name, tree), *_ = trees.items()
-        loo = [check.loo for check in predictive_checks(tree).values() if check.loo is not None]
-        pointwise = np.concatenate([each.pointwise for each in loo])
-        error = float(np.sqrt(pointwise.size * pointwise.var()))
-        unreliable = sum(each.unreliable for each in loo)
-        row = [float(pointwise.sum()), error, 0.0, 0.0, 1.0, unreliable]
+    if len(fits) == 1:
+        ((name, fit),) = fits.items()
+        error = float(np.sqrt(fit.pointwise.size * fit.pointwise.var()))
+        row = [fit.elpd, error, 0.0, 0.0, 1.0, fit.unreliable]
         return pd.DataFrame([row], columns=columns, index=pd.Index([name]))
+    table, left_out = compare_predictions({name: fit.tree for name, fit in fits.items()})
     if table.empty:
         raise FitError(
             " ".join(left_out.values()), where="compare_scenes", hint="give scenes of one capture"

@@ -1,14 +1,17 @@
 """The public verb of one capture: by one scene, or by those that remain of a comparison."""
 
+import time
 from collections.abc import Callable, Mapping
 
+import jax
 import xarray as xr
 from numpyro import distributions as dist
 
 import polar_bayes.scenes  # its names load the comparison, and with it diagnostics, on first use
 from polar_bayes.capture.schema import validate
-from polar_bayes.inference import fitting
+from polar_bayes.inference.fitting import find_method, fit_request
 from polar_bayes.inference.method import AbstractMethod
+from polar_bayes.inference.request import resolve
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
@@ -68,24 +71,13 @@ def fit(
         SceneError: No such scene.
         FitError: A model, method, prior or link cannot be used, or the memory is too small.
     """
-    if not isinstance(scene, str) or scene != "auto":
-        return fitting.fit(
-            capture,
-            model=model,
-            method=method,
-            tolerance=tolerance,
-            seconds=seconds,
-            scene=scene,
-            priors=priors,
-            links=links,
-            largest_view_zenith=largest_view_zenith,
-            seed=seed,
-            precision=precision,
-            progress=progress,
+    start_time = time.perf_counter()
+    chosen, show = find_method(method, tolerance, seconds), progress or no_progress
+    if isinstance(scene, str) and scene == "auto":
+        arguments = polar_bayes.scenes.FitArguments(
+            validate(capture), model, priors, links, largest_view_zenith, seed, precision
         )
-    chosen = fitting.find_method(method, tolerance, seconds)
-    capture = validate(capture)
-    setting = polar_bayes.scenes.Setting(
-        capture, model, priors, links, largest_view_zenith, seed, precision
-    )
-    return polar_bayes.scenes.fit_best_scenes(setting, chosen, progress or no_progress)
+        return polar_bayes.scenes.fit_best_scenes(arguments, chosen, show)
+    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, precision)
+    with jax.enable_x64(precision == "double"):
+        return fit_request(request, chosen, show, start_time)

@@ -1,29 +1,83 @@
-"""What a comparison of scenes says, as a table and in sentences."""
+"""What a comparison of scenes has found: its result, as a table and in sentences."""
 
+import dataclasses
 import json
-from typing import Protocol
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
 import xarray as xr
+
+from polar_bayes.inference.request import Request
+from polar_bayes.physics.scene import Scene
 
 SMALL_DIFFERENCE = 4.0
 """Difference in elpd, unit nat, below which two scenes are not told apart, whatever its error."""
 
 ERRORS_APART = 2.0
 """Standard errors of the difference beyond which a scene is told apart from the best."""
+
 MUCH_BETWEEN = 0.1
-"""Share of the variance of a parameter between scenes that is told."""
+"""Share of the variance of a parameter between scenes that is stated."""
 
 
-class Comparison(Protocol):
-    """What `polar_bayes.compare_scenes` returns, as far as it is read here."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class SceneComparison:
+    """Comparison of several scenes for one capture.
+
+    Args:
+        table: A row for each scene, best first: elpd and se (nat), elpd_diff and dse (to the best),
+            weight (stacking; 0 for a scene that does not remain), unreliable (readings whose Pareto
+            k is above 0.7), seconds, criticism (checks that found a caution or problem).
+        intervals: A row for each material parameter and scene that has it, in the order of the
+            table: mean, sd, q2.5, q97.5 (unit of the parameter).
+        between: For each material parameter of all remaining scenes, the share of its stacked
+            variance that is between scenes, unit 1.
+        scenes: The scenes, by name.
+        fits: The fits that were compared, by name.
+        left_out: By scene, why it could not be fitted.
+        requests: What was fitted, by scene, with every default filled in.
+    """
+
+    table: pd.DataFrame
+    intervals: pd.DataFrame
+    between: pd.Series
+    scenes: Mapping[str, Scene]
+    fits: Mapping[str, xr.DataTree]
+    left_out: Mapping[str, str]
+    requests: Mapping[str, Request]
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Stacking weights of the scenes that remain, largest first."""
+        remaining = self.table["weight"][self.table["weight"] > 0.0]
+        return {str(k): float(v) for k, v in remaining.sort_values(ascending=False).items()}
 
     def to_dataset(self) -> xr.Dataset:
-        """The tables of the comparison."""
+        """The tables as a dataset with the dims scene and parameter, as a fit holds them."""
+        table = self.table.rename_axis("scene")
+        intervals = self.intervals.rename(columns={"q2.5": "low", "q97.5": "high"})
+        labels = list(dict.fromkeys(intervals.index.get_level_values(0)))
+        wide = {
+            name: intervals[name].unstack(0).reindex(index=table.index, columns=labels).to_numpy()
+            for name in ("mean", "sd", "low", "high")
+        }
+        parts = [repr(self.scenes[name]) for name in table.index]
+        texts = {"parts": parts, "criticism": list(table["criticism"])}
+        numbers = ("elpd", "se", "elpd_diff", "dse", "weight", "unreliable", "seconds")
+        return xr.Dataset(
+            {
+                **{name: ("scene", table[name].to_numpy(float)) for name in numbers},
+                **{name: ("scene", np.array(text, dtype=str)) for name, text in texts.items()},
+                **{name: (("scene", "parameter"), values) for name, values in wide.items()},
+                "between_share": ("parameter", self.between.reindex(labels).to_numpy(float)),
+            },
+            {"scene": table.index.to_numpy(str), "parameter": np.array(labels, dtype=str)},
+            {"left_out": json.dumps(dict(self.left_out))},
+        )
 
 
-def scene_table(result: xr.DataTree | Comparison) -> pd.DataFrame:
+def scene_table(result: xr.DataTree | SceneComparison) -> pd.DataFrame:
     """A row for each scene: predictions, weight, intervals of the material, and criticism.
 
     Args:
@@ -50,7 +104,7 @@ def scene_table(result: xr.DataTree | Comparison) -> pd.DataFrame:
     return table
 
 
-def scene_sentences(result: xr.DataTree | Comparison) -> list[str]:
+def scene_sentences(result: xr.DataTree | SceneComparison) -> list[str]:
     """Which scenes were compared, which remain and why, and what the choice does to the intervals.
 
     Args:
@@ -112,7 +166,7 @@ def _between(found: xr.Dataset) -> list[str]:
     return [f"Variance between the remaining scenes: {listed}; the rest is within each of them."]
 
 
-def _dataset(result: xr.DataTree | Comparison) -> xr.Dataset | None:
+def _dataset(result: xr.DataTree | SceneComparison) -> xr.Dataset | None:
     if not isinstance(result, xr.DataTree):
         return result.to_dataset()
     return result["scenes"].to_dataset() if "scenes" in result.children else None

@@ -22,10 +22,7 @@ from polar_bayes.inference.least_squares import Point
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.progress import Progress
-from polar_bayes.scenes.comparison import (
-    Setting,
-    compare_candidates,
-)
+from polar_bayes.scenes.comparison import FitArguments, compare_candidates
 
 OF_DRAWS = (
     *("posterior", "sample_stats", "log_prior", "log_likelihood"),
@@ -43,7 +40,9 @@ BY_PARAMETER = ("priors", "bounds", "prior_probability", "fixed", "declared")
 """Entries of the provenance that are mappings by parameter."""
 
 
-def fit_best_scenes(setting: Setting, method: AbstractMethod, progress: Progress) -> xr.DataTree:
+def fit_best_scenes(
+    arguments: FitArguments, method: AbstractMethod, progress: Progress
+) -> xr.DataTree:
     """Compare scenes, and fit those that remain by a method; their posteriors are stacked."""
     if isinstance(method, Point):
         raise FitError(
@@ -51,10 +50,10 @@ def fit_best_scenes(setting: Setting, method: AbstractMethod, progress: Progress
             where="fit: scene='auto', method='point'",
             hint="use method='laplace', or compare_scenes and then a scene of your choice",
         )
-    comparison = compare_candidates(setting, progress)
+    comparison = compare_candidates(arguments, progress)
     weights = comparison.weights
     alone = len(weights) == 1
-    with jax.enable_x64(setting.precision == "double"):
+    with jax.enable_x64(arguments.precision == "double"):
         fits = {
             name: comparison.fits[name]
             if isinstance(method, Importance)  # the comparison has more rounds of the same

@@ -16,7 +16,7 @@ import polar_bayes as pb
 from polar_bayes.benchmark import run
 from polar_bayes.benchmark.advice import AS_GIVEN
 from polar_bayes.benchmark.reference import ReferenceRun, best_reference, run_reference
-from polar_bayes.benchmark.run import AbstractOverride, Trial, run_fresh
+from polar_bayes.benchmark.run import AbstractOverride, Trial, run_in_subprocess
 from polar_bayes.effects.variants import parts_of
 from polar_bayes.inference.mcse import standard_errors
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
@@ -305,11 +305,11 @@ def test_a_process_of_its_own_finds_no_compiled_programs(monkeypatch):
 @pytest.mark.thorough
 def test_a_trial_runs_in_a_process_of_its_own():
     request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
-    found = run_fresh(Trial(request, pb.methods.Laplace(draws=50), 0))
+    found = run_in_subprocess(Trial(request, pb.methods.Laplace(draws=50)))
     assert found.labels == ("level", "slope")
     assert found.draws.shape == (2, 4, 50)
     assert found.seconds_first > 0.0
     assert found.seconds_again > 0.0
     assert found.peak_memory >= found.memory_before > 50.0
     with pytest.raises(pb.FitError, match="it cannot be"):
-        run_fresh(Trial(request, Broken(), 0))
+        run_in_subprocess(Trial(request, Broken()))

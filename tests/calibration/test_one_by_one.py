@@ -76,7 +76,9 @@ def exact(capture: xr.Dataset) -> xr.DataTree:
 def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
     table = pb.summary(exact)
     assert sorted(table.index) == ["level[0]", "level[1]", "level[2]", "location"]
-    assert pb.calibration.is_calibrated(table)
+    # `is_calibrated` fails a right method once in 20 seeds; this fails it once in 1,000.
+    p_values = table.filter(like="p_")
+    assert p_values.min(axis=None) > 1e-3 / p_values.size
     assert (table["answered"] == COUNT).all()
     for percent in (50, 80, 95):
         share = percent / 100.0

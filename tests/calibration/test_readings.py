@@ -18,7 +18,7 @@ from polar_bayes.calibration.predictive import (
     _resample,
     unranked_reason,
 )
-from polar_bayes.calibration.runner import draw_captures, redraw_readings
+from polar_bayes.calibration.runner import draw_captures
 from polar_bayes.inference.program import compile_program
 from polar_bayes.observation.data import observe
 
@@ -42,8 +42,8 @@ def read():
     with jax.enable_x64(False):
         rough = compile_program(shifted, data.in_single_precision())
     program, numbers = compile_program(shifted, data), np.arange(FITS)
-    drawn = draw_captures(program, data, numbers, jax.random.key(3))
-    again = redraw_readings(program, data, drawn, numbers, jax.random.key(3))
+    drawn = draw_captures(program, data, numbers, jax.random.key(3), replicate=True)
+    again = drawn.replicated
     readings = PredictivePit(rough, drawn.captures, again, numbers, seed=4)
     q = np.asarray(drawn.captures.batched.readings["q"])[:, valid.to_numpy()]
     variance = 1.0 / (1.0 / 0.3**2 + q.shape[1] / NOISE**2)

@@ -288,5 +288,5 @@ def test_an_interrupt_ends_the_process_of_a_trial(
     monkeypatch.setattr(run.tempfile, "tempdir", str(tmp_path))
     threading.Thread(target=interrupt).start()
     with pytest.raises(pb.FitError, match="its process ended with -9"):
-        run.run_fresh(None)
+        run.run_in_subprocess(None)
     assert not list(tmp_path.iterdir())

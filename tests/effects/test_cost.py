@@ -9,7 +9,7 @@ import pytest
 from cases import each
 
 import polar_bayes as pb
-from polar_bayes.effects.compare_scenes import compile_and_count, run_seconds
+from polar_bayes.effects.posterior_change import compile_and_count, run_seconds
 from polar_bayes.effects.variants import effects_of, simplify
 from polar_bayes.physics.boundary import Medium, medium, relative_reflection, transmission
 from polar_bayes.physics.geometry import cos_degrees, mirror_facet, sin_degrees

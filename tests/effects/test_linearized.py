@@ -9,7 +9,7 @@ from plates import LINKS, plate_capture
 
 import polar_bayes as pb
 from polar_bayes.design.setup import label_coordinates
-from polar_bayes.effects.compare_scenes import Baseline, compile_density, fit_laplace
+from polar_bayes.effects.posterior_change import Baseline, compile_density, fit_laplace
 from polar_bayes.inference.optimize import find_mode
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
@@ -46,7 +46,7 @@ def test_in_a_linear_model_shift_and_width_are_exact(line: xr.Dataset) -> None:
     fewer = density_of(line, linear.SCENE.without(pb.instrument.AngleZero), **options)
     noise = full.noise_sd(peak.z)
     np.testing.assert_allclose(noise["q"], linear.NOISE)
-    change, _ = Baseline(peak, noise, None).compare(fewer)
+    change = Baseline(peak, noise, None).compare(fewer)
     less, narrower = linear.posterior(line["q"].to_numpy(), fewer.labels)
     here = [full.labels.index(label) for label in fewer.labels]
     np.testing.assert_allclose(change.shift[here], (less - mean[here]) / sd[here], atol=1e-4)
@@ -68,9 +68,9 @@ def test_on_a_plate_they_are_those_of_climbs_with_exact_gradients(
     scenes = (full, full.without(pb.instrument.Leakage))
     densities = [density_of(plate, scene) for scene in scenes]
     peak = fit_laplace(densities[0], jax.random.key(1), no_progress)
-    change, other = Baseline(peak, densities[0].noise_sd(peak.z), None).compare(densities[1])
+    change = Baseline(peak, densities[0].noise_sd(peak.z), None).compare(densities[1])
     ends = []
-    for density, start in zip(densities, (peak.z, other.z), strict=True):
+    for density, start in zip(densities, (peak.z, change.fit.z), strict=True):
         exact = jax.jit(jax.value_and_grad(density.program.potential))
 
         def potential(z, exact=exact, data=density.data):

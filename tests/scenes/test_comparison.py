@@ -10,7 +10,8 @@ from numpyro import distributions as dist
 from plates import LINKS, PLATE, plate_capture
 
 import polar_bayes as pb
-from polar_bayes.scenes.comparison import SceneComparison, Setting, between_scenes, stacking_weights
+from polar_bayes.scenes.comparison import FitArguments, between_scenes, stacking_weights
+from polar_bayes.scenes.sentences import SceneComparison
 from polar_bayes.scenes.stacking import stack_fits
 
 MIRROR = pb.Scene(pb.SmoothSurface())
@@ -38,8 +39,8 @@ def test_the_scene_of_the_data_predicts_best(comparison: SceneComparison) -> Non
 
 def test_a_prior_is_used_by_the_scenes_that_read_it(capture: xr.Dataset) -> None:
     priors = {"subsurface_fraction": dist.Beta(1.0, 9.0)}
-    setting = Setting(capture, "per_material", priors, LINKS, None, 0, "double")
-    among = setting.among(SCENES.values())
+    arguments = FitArguments(capture, "per_material", priors, LINKS, None, 0, "double")
+    among = arguments.among(SCENES.values())
     assert among.request(PLATE).priors["subsurface_fraction"] is priors["subsurface_fraction"]
     assert "subsurface_fraction" not in among.request(MIRROR).priors
     with pytest.raises(pb.FitError, match="roughness"):

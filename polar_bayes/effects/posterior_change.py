@@ -1,12 +1,12 @@
-r"""Comparison of two scenes for one capture: predicted readings, and Laplace approximations.
+r"""Change of the readings and of the posterior when another scene replaces the baseline.
 
 $$ \text{shift} = \frac{\hat z' - \hat z}{\sigma}, \qquad \text{sd ratio} = \frac{\sigma'}{\sigma},
    \qquad \sigma^2 = \operatorname{diag} F^{-1}, \quad
    F = -\frac{\partial^2 \log p(z \mid \text{readings})}{\partial z^2} $$
 
-at the mode, in the unconstrained coordinates z of the fit. F is the observed information of these
-readings under their own links, prior included. Only the posterior is approximated, not the scenes,
-so a shift above 1 only says that the effect matters.
+at the mode of the Laplace approximation, in the unconstrained coordinates z of the fit. F is the
+observed information of these readings under their own links, prior included. Only the posterior is
+approximated, not the scenes, so a shift above 1 only says that the effect matters.
 
 Derivatives are central differences of the log density. In units of the posterior's own width they
 keep enough digits, and no derivative is compiled, which takes two to four times as long as the
@@ -34,9 +34,10 @@ from polar_bayes.inference.optimize import (
     find_modes,
     from_prior,
 )
+from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.program import Program, compile_program, inspect_model, noise_free
 from polar_bayes.inference.request import Request
-from polar_bayes.observation.data import Observations, observe
+from polar_bayes.observation.data import Observations
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import PriorTable
 from polar_bayes.progress import Progress
@@ -58,15 +59,6 @@ class Compiled:
     call: Callable[..., Any]
     operations: float
     compile_seconds: float
-
-
-@dataclasses.dataclass(frozen=True)
-class Cost:
-    """What a program costs."""
-
-    operations: float
-    compile_seconds: float
-    run_seconds: float
 
 
 def compile_and_count(function: Callable[..., Any], *arguments: Any) -> Compiled:
@@ -102,7 +94,7 @@ Readings = Mapping[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Density:
+class SceneDensity:
     """The log posterior density of one scene, compiled; labels and sites name its coordinates."""
 
     program: Program
@@ -153,8 +145,10 @@ def _quantile_sd(distribution: dist.Distribution) -> Array:
     return 0.5 * (high - low)
 
 
-def compile_density(request: Request, data: Observations) -> Density:
+def compile_density(request: Request, data: Observations) -> SceneDensity:
     """Compile the log density of a request's scene."""
+    # No gradient, no method and no second capture needs this program, so it is not among those that
+    # fits of one layout share.
     program = compile_program(request.bind(request.scene), data)
 
     def evaluate(z: Array, data: Observations) -> tuple[Array, dict[str, Array]]:
@@ -165,7 +159,7 @@ def compile_density(request: Request, data: Observations) -> Density:
     compiled = compile_and_count(evaluate, jnp.zeros(program.size), data)
     coordinates = label_coordinates(program, request.capture)
     labels, sites = (tuple(getattr(c, name) for c in coordinates) for name in ("label", "site"))
-    return Density(program, data, compiled, labels, sites)
+    return SceneDensity(program, data, compiled, labels, sites)
 
 
 # --- Laplace approximations of two scenes ---------------------------------------------------------
@@ -188,7 +182,7 @@ NEW_WIDTH = 0.1
 class LaplaceFit:
     """Laplace approximation of a posterior; `found` is False where the search did not converge."""
 
-    density: Density
+    density: SceneDensity
     z: np.ndarray
     covariance: np.ndarray
     found: bool
@@ -199,23 +193,7 @@ class LaplaceFit:
         return np.sqrt(np.diagonal(self.covariance))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Comparison:
-    """Changes of readings and posterior when another scene replaces the baseline."""
-
-    largest_move: float
-    rms_move: float
-    shift: np.ndarray
-    sd_ratio: np.ndarray
-    found: bool
-
-    @property
-    def changes(self) -> np.ndarray:
-        """The larger of the shift and the change of the sd, per coordinate."""
-        return np.fmax(np.abs(self.shift), np.abs(self.sd_ratio - 1.0))
-
-
-def fit_laplace(density: Density, key: Array, progress: Progress) -> LaplaceFit:
+def fit_laplace(density: SceneDensity, key: Array, progress: Progress) -> LaplaceFit:
     """The heaviest mode of a posterior, from prior draws."""
     size = density.program.size
     starts = from_prior(density.program, key, STARTS, density.data)
@@ -224,7 +202,7 @@ def fit_laplace(density: Density, key: Array, progress: Progress) -> LaplaceFit:
     return _refine(density, modes.z[0], modes.covariance[0])
 
 
-def _refine(density: Density, z: np.ndarray, covariance: np.ndarray) -> LaplaceFit:
+def _refine(density: SceneDensity, z: np.ndarray, covariance: np.ndarray) -> LaplaceFit:
     """Search the mode in coordinates in which the posterior is about standard normal."""
     for _ in range(SEARCHES):
         factor = np.linalg.cholesky(covariance)
@@ -239,7 +217,7 @@ def _refine(density: Density, z: np.ndarray, covariance: np.ndarray) -> LaplaceF
 
 
 def _scaled_potential(
-    density: Density, origin: np.ndarray, factor: np.ndarray, step: float
+    density: SceneDensity, origin: np.ndarray, factor: np.ndarray, step: float
 ) -> ValueAndGradient:
     """Potential, and its gradient by central differences, of y in z = origin + factor y."""
 
@@ -258,6 +236,22 @@ def _scaled_potential(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class PosteriorChange:
+    """Changes of readings and posterior by another scene, per coordinate of the baseline."""
+
+    fit: LaplaceFit
+    largest_move: float
+    rms_move: float
+    shift: np.ndarray
+    sd_ratio: np.ndarray
+
+    @property
+    def changes(self) -> np.ndarray:
+        """The larger of the shift and the change of the sd; NaN where it is not known."""
+        return np.fmax(np.abs(self.shift), np.abs(self.sd_ratio - 1.0))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Baseline:
     """The scene that others are compared with; `names` are the judged parameters, None for all."""
 
@@ -271,15 +265,12 @@ class Baseline:
         density = self.fit.density
         if self.names is None:
             return np.ones(len(density.labels), bool)
-        both = zip(density.labels, density.sites, strict=True)
-        return np.asarray([bool({label, site} & set(self.names)) for label, site in both])
+        return np.isin(density.labels, self.names) | np.isin(density.sites, self.names)
 
-    def compare(self, other: Density) -> tuple[Comparison, LaplaceFit]:
+    def compare(self, other: SceneDensity) -> PosteriorChange:
         """Replace the scene by another, whose mode is sought near that of this one."""
         fit, sd = self.fit, self.fit.sd
-        index_of = {label: index for index, label in enumerate(fit.density.labels)}
-        theirs = [index for index, label in enumerate(other.labels) if label in index_of]
-        ours = [index_of[other.labels[index]] for index in theirs]
+        _, ours, theirs = np.intersect1d(fit.density.labels, other.labels, return_indices=True)
         start = np.zeros(len(other.labels))
         start[theirs] = fit.z[ours]
         covariance = np.diag(np.full(start.size, NEW_WIDTH**2))
@@ -291,9 +282,9 @@ class Baseline:
             shift[ours] = (found.z[theirs] - fit.z[ours]) / sd[ours]
             sd_ratio[ours] = found.sd[theirs] / sd[ours]
         largest, rms = float(np.max(np.abs(moves))), float(np.sqrt(np.mean(moves**2)))
-        return Comparison(largest, rms, shift, sd_ratio, found.found), found
+        return PosteriorChange(found, largest, rms, shift, sd_ratio)
 
-    def _moves(self, other: Density, start: np.ndarray) -> np.ndarray:
+    def _moves(self, other: SceneDensity, start: np.ndarray) -> np.ndarray:
         """Changes of the predictions of all valid readings in units of their noise."""
         # A sensor far beyond its full scale has no noise, and what it records does not move.
         before, after = self.fit.density.noise_free(self.fit.z), other.noise_free(start)
@@ -304,33 +295,33 @@ class Baseline:
             rows.append(np.broadcast_to(move, valid.shape)[valid])
         return np.concatenate(rows)
 
-    def largest_change(self, comparison: Comparison) -> float:
+    def largest_change(self, change: PosteriorChange) -> float:
         """The largest change of a judged parameter; infinite where it is not known."""
         # A parameter that the other scene lacks is not judged, unless the user named it.
-        changes = comparison.changes[self.judged]
+        changes = change.changes[self.judged]
         missing = np.isnan(changes)
         unknown = missing.all() or (self.names is not None and missing.any())
-        return np.inf if unknown or not comparison.found else float(np.nanmax(changes))
+        return np.inf if unknown or not change.fit.found else float(np.nanmax(changes))
 
-    def describe(self, comparison: Comparison) -> str:
+    def describe(self, change: PosteriorChange) -> str:
         """The largest change in words: `refractive_index[550] moves by +0.43 sd`."""
-        if not comparison.found:
+        if not change.fit.found:
             return "its posterior has no mode near that of the full scene"
-        changes = np.where(self.judged, np.nan_to_num(comparison.changes, nan=-1.0), -1.0)
+        changes = np.where(self.judged, np.nan_to_num(change.changes, nan=-1.0), -1.0)
         most = int(np.argmax(changes))
         if changes[most] < 0.0:
             return "it leaves nothing to judge"
         label = self.fit.density.labels[most]
-        shift, widening = comparison.shift[most], comparison.sd_ratio[most] - 1.0
+        shift, widening = change.shift[most], change.sd_ratio[most] - 1.0
         if abs(shift) >= abs(widening):
             return f"{label} moves by {shift:+.2g} sd"
         return f"the sd of {label} changes by {widening:+.0%}"
 
-    def missing(self, comparison: Comparison) -> tuple[str, ...]:
+    def missing(self, change: PosteriorChange) -> list[str]:
         """Parameters that the other scene does not have."""
         sites = np.asarray(self.fit.density.sites)
-        present = set(sites[~np.isnan(comparison.changes)])
-        return tuple(name for name in dict.fromkeys(sites.tolist()) if name not in present)
+        present = set(sites[~np.isnan(change.changes)])
+        return [name for name in dict.fromkeys(sites.tolist()) if name not in present]
 
 
 class SceneDensities:
@@ -341,10 +332,10 @@ class SceneDensities:
     ) -> None:
         self.progress = progress
         self._request, self._priors = request, priors
-        self._data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
-        self._densities: dict[Scene, Density] = {}
+        self._data = observe_request(request)
+        self._densities: dict[Scene, SceneDensity] = {}
 
-    def density(self, scene: Scene) -> Density:
+    def density(self, scene: Scene) -> SceneDensity:
         """The density of a scene; a prior for a parameter that it lacks is not used."""
         if scene not in self._densities:
             table = self.priors(scene)
@@ -365,14 +356,18 @@ class SceneDensities:
         fit = fit_laplace(density, jax.random.key(self._request.seed), self.progress)
         return Baseline(fit, density.noise_sd(fit.z), parameters)
 
-    def costs(self) -> dict[Scene, Cost]:
-        """Costs of all scenes so far, timed in turns."""
+    def costs(self) -> dict[Scene, dict[str, float]]:
+        """Operations, compile and run seconds of all scenes so far, timed in turns."""
         calls = [
             functools.partial(density.evaluate, np.zeros(density.program.size))
             for density in self._densities.values()
         ]
         timed = zip(self._densities.items(), run_seconds(calls), strict=True)
         return {
-            scene: Cost(density.compiled.operations, density.compiled.compile_seconds, seconds)
+            scene: {
+                "operations": density.compiled.operations,
+                "compile_seconds": density.compiled.compile_seconds,
+                "run_seconds": seconds,
+            }
             for (scene, density), seconds in timed
         }
