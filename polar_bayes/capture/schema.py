@@ -13,7 +13,7 @@ import contextlib
 import dataclasses
 import difflib
 import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Any, Literal
 
@@ -105,6 +105,14 @@ NANOMETERS = (
     "give nanometers: a number around 0.5 is micrometers, to be multiplied by 1000, and one below "
     "1e-5 is meters"
 )
+
+
+def _error(name: str, units: str | None) -> Variable:
+    """The error of a reading."""
+    meaning = f"standard deviation of {name}"
+    return Variable(f"{name}_error", "reading", units, ERROR, meaning, SIGMA, name)
+
+
 NOT_LIGHT = f"no light has it: check dark level, background and channel gains; {MASK}"
 
 CONTRACT = (
@@ -117,18 +125,10 @@ CONTRACT = (
     Variable("q", "reading", "1", SIGNED_UNIT, "normalized Stokes q, s positive", FRACTION),
     Variable("u", "reading", "1", SIGNED_UNIT, "normalized Stokes u", FRACTION, "q"),
     Variable("intensity", "reading", None, BRIGHTNESS, "intensity", MASK),
-    Variable("dop_error", "reading", "1", ERROR, "standard deviation of dop", SIGMA, "dop"),
-    Variable("q_error", "reading", "1", ERROR, "standard deviation of q", SIGMA, "q"),
-    Variable("u_error", "reading", "1", ERROR, "standard deviation of u", SIGMA, "u"),
-    Variable(
-        "intensity_error",
-        "reading",
-        None,
-        ERROR,
-        "standard deviation of intensity",
-        SIGMA,
-        "intensity",
-    ),
+    _error("dop", "1"),
+    _error("q", "1"),
+    _error("u", "1"),
+    _error("intensity", None),
     Variable("saturated", "flag", "1", UNIT, "the detector saturated", ZERO_ONE),
     Variable("valid", "flag", "1", UNIT, "measured, not missing", ZERO_ONE),
     Variable("interpolated", "flag", "1", UNIT, "filled in between readings", ZERO_ONE),
@@ -271,8 +271,13 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
     if dataset.attrs.get("angle_set_by", "hand") not in ANGLE_SETTERS:
         what, hint = "no such way to set an angle", f"give one of {', '.join(ANGLE_SETTERS)}"
         raise CaptureError(what, where=f"{source}: attribute angle_set_by", hint=hint)
+    truths = {
+        str(name): _truth(variable, str(name), layout, source)
+        for name, variable in dataset.variables.items()
+        if TRUTH.fullmatch(str(name))
+    }
     return xr.Dataset(
-        {**numbers, **flags, **_truths(dataset, layout, source)},
+        {**numbers, **flags, **truths},
         coords=_labels(dataset, layout, source),
         attrs=clean_attributes(dataset.attrs, source),
     )
@@ -321,7 +326,7 @@ def _layout(dataset: xr.Dataset, source: str) -> Layout:
     leading = next((option for option in LEADING if _same_dims(rest, option)), None)
     if leading is None or "view" not in dims or len(set(dims)) != len(dims):
         hint = "use view[, wavelength], alone or behind material, patch, or y and x together"
-        raise CaptureError(f"its dims are {_dims_text(dims)}", where=f"{source}: {name}", hint=hint)
+        raise CaptureError(f"its dims are {dims_text(dims)}", where=f"{source}: {name}", hint=hint)
     for dim in dims:
         if dataset.sizes[dim] == 0:
             hint = f"give at least one {dim}"
@@ -338,8 +343,8 @@ def _ordered(variable: xr.Variable, row: Variable, layout: Layout, source: str) 
     for dims in options:
         if _same_dims(variable.dims, dims):
             return variable.transpose(*dims)
-    what = f"its dims are {_dims_text(variable.dims)}"
-    hint = f"give it {' or '.join(_dims_text(dims) for dims in options)}"
+    what = f"its dims are {dims_text(variable.dims)}"
+    hint = f"give it {' or '.join(dims_text(dims) for dims in options)}"
     raise CaptureError(what, where=f"{source}: {row.name}", hint=hint)
 
 
@@ -347,7 +352,8 @@ def _same_dims(dims: Sequence[Hashable], wanted: Sequence[str]) -> bool:
     return len(dims) == len(wanted) and set(dims) == set(wanted)
 
 
-def _dims_text(dims: Sequence[Hashable]) -> str:
+def dims_text(dims: Iterable[Hashable]) -> str:
+    """The dims as `(view, wavelength)`."""
     return f"({', '.join(map(str, dims))})"
 
 
@@ -417,20 +423,12 @@ def _check_polarization(
         )
 
 
-def _truths(dataset: xr.Dataset, layout: Layout, source: str) -> dict[str, xr.Variable]:
-    return {
-        str(name): _truth(variable, str(name), layout, source)
-        for name, variable in dataset.variables.items()
-        if TRUTH.fullmatch(str(name))
-    }
-
-
 def _truth(variable: xr.Variable, name: str, layout: Layout, source: str) -> xr.Variable:
     where = f"{source}: {name}"
     dims = [dim for dim in layout.readings if dim in variable.dims]
     if not _same_dims(variable.dims, dims):
-        hint = f"give it any of {_dims_text(layout.readings)}"
-        raise CaptureError(f"its dims are {_dims_text(variable.dims)}", where=where, hint=hint)
+        hint = f"give it any of {dims_text(layout.readings)}"
+        raise CaptureError(f"its dims are {dims_text(variable.dims)}", where=where, hint=hint)
     values = _floats(variable.transpose(*dims).values, where)
     if np.isinf(values).any():
         hint = "give a number, or NaN where the truth is not known"

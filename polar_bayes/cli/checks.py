@@ -123,8 +123,7 @@ def identify(
     for name, (table, sentences) in found.items():
         if name != "parameters":
             click.echo(f"\n{name}")
-        print_frame(table)
-        click.echo("\n".join(["", *sentences]))
+        print_frame(table, sentences)
 
 
 @command()
@@ -163,8 +162,8 @@ def accuracy(
     if as_json:
         print_json({"rows": json_rows(table), "advice": advice})
         return
-    print_frame(table[["error", "worst", "k_hat", "r_hat", "seconds_first", "seconds_again"]])
-    click.echo(f"\n{advice}")
+    columns = ["error", "worst", "k_hat", "r_hat", "seconds_first", "seconds_again"]
+    print_frame(table[columns], [advice])
 
 
 COMMANDS = (calibrate, identify, accuracy)

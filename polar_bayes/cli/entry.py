@@ -34,7 +34,6 @@ import platformdirs
 from polar_bayes.cli.captures import COMMANDS as CAPTURE_COMMANDS
 from polar_bayes.cli.checks import COMMANDS as CHECK_COMMANDS
 from polar_bayes.cli.fits import COMMANDS as FIT_COMMANDS
-from polar_bayes.cli.scenes import COMMANDS as SCENE_COMMANDS
 from polar_bayes.errors import PolarBayesError, one_line
 from polar_bayes.interrupts import clean_up
 from polar_bayes.paths import system_error
@@ -278,5 +277,5 @@ def commands() -> None:
     """From polarization captures to calibrated posteriors of layered dielectrics."""
 
 
-for _command in (*CAPTURE_COMMANDS, *FIT_COMMANDS, *SCENE_COMMANDS, *CHECK_COMMANDS):
+for _command in (*CAPTURE_COMMANDS, *FIT_COMMANDS, *CHECK_COMMANDS):
     commands.add_command(_command)

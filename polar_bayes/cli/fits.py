@@ -1,4 +1,4 @@
-"""Commands that fit a capture, and show results."""
+"""Commands that fit a capture, compare scenes, and show results."""
 
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from polar_bayes.cli.options import (
     capture_argument,
     command,
     json_option,
+    json_rows,
     model_option,
     option,
     out_option,
@@ -179,13 +180,43 @@ def effects(
     if as_json:
         print_json(pb.effects.ledger_summary(ledger))
     else:
-        print_frame(pb.summary(ledger))
-        click.echo("\n".join(["", *pb.verdict(ledger).sentences]))
+        print_frame(pb.summary(ledger), pb.verdict(ledger).sentences)
 
 
 def _with_setup(capture: Any, setup: str | None) -> Any:
     """The capture, naming that set-up, so that scene, links and limits fit together."""
     return capture if setup is None else capture.assign_attrs(setup=setup)
+
+
+@command()
+@capture_argument
+@out_option(RESULT_FILE, "Fit of the scenes that remain, stacked, to write.", required=False)
+@model_option
+@option("--method", type=FIT_METHOD, default="nuts", help="Of the fit that --out writes.")
+@view_limit_option
+@seed_option
+@json_option
+def scenes(
+    capture: Path, out: Path | None, method: str, as_json: bool, **settings: Any
+) -> int | None:
+    """Compare scenes, from simple to complex; with --out, fit those that remain."""
+    data = pb.load_capture(capture)
+    found: Any
+    with stages() as progress:
+        if out is None:
+            found = pb.compare_scenes(data, progress=progress, **settings)
+        else:
+            found = pb.fit(data, scene="auto", method=method, progress=progress, **settings)
+            pb.save(found, out)
+    table, sentences = pb.scenes.scene_table(found), pb.scenes.scene_sentences(found)
+    if as_json:
+        print_json({"scenes": json_rows(table), "sentences": sentences})
+        return None if out is None else print_verdict(found)
+    print_frame(table, sentences)
+    if out is None:
+        return None
+    click.echo()
+    return print_fit(found)
 
 
 @command()
@@ -240,4 +271,4 @@ def _load_all(paths: tuple[Path, ...], kind: str) -> dict[str, Any]:
     return {path.stem: pb.load(path, kind) for path in paths}
 
 
-COMMANDS = (demo, fit, map_, effects, report, compare)
+COMMANDS = (demo, fit, map_, effects, scenes, report, compare)

@@ -6,7 +6,7 @@ Option types refuse wrong values before anything is computed and before JAX is l
 import functools
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, override
 
@@ -170,10 +170,12 @@ def json_rows(table: Any) -> dict[str, Any]:
     return json.loads(table.to_json(orient="index"))
 
 
-def print_frame(frame: Any) -> None:
-    """Print a data frame; numbers with four digits, missing ones as -."""
+def print_frame(frame: Any, sentences: Iterable[str] = ()) -> None:
+    """Print a data frame, numbers with four digits and missing ones as -, and sentences below."""
     rows = (Row(str(label), tuple(map(_text, cells))) for label, *cells in frame.itertuples())
     click.echo(Table(("", *frame.columns), tuple(rows)).to_text(sys.stdout))
+    if sentences:
+        click.echo("\n".join(["", *sentences]))
 
 
 def _text(cell: Any) -> str:

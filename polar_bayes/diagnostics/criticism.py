@@ -93,7 +93,9 @@ class Finding:
     sentence: str = ""
 
 
-def criticize(result: xr.DataTree) -> pd.DataFrame:
+def criticize(
+    result: xr.DataTree, checks: Mapping[str, PredictiveCheck] | None = None
+) -> pd.DataFrame:
     """What the readings say against the model of a fit.
 
     A check with a p-value gives a caution below 0.02 and a problem below 0.004, which is the
@@ -101,6 +103,7 @@ def criticize(result: xr.DataTree) -> pd.DataFrame:
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+        checks: Those of `predictive_checks(result)`, where they are there already.
 
     Returns:
         A row for each check: "priors", "noise", "bounds", "angle", "wavelength", "outliers",
@@ -125,7 +128,7 @@ def criticize(result: xr.DataTree) -> pd.DataFrame:
             why = "A point fit has no draws to criticize."
         return _table(dict.fromkeys(CHECKS, Finding("not computed", sentence=why)))
     residuals = _residuals(result)
-    checks = predictive_checks(result)
+    checks = predictive_checks(result) if checks is None else checks
     return _table(
         {
             "priors": _prior_conflict(result, found),

@@ -19,7 +19,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
 from numbers import Real
 from pathlib import Path
@@ -78,10 +78,11 @@ def from_table(
         CaptureError: The column, or the line and number, that is wrong.
     """
     source = str(table)
-    columns = _columns(column_names(source), columns or {}, ignored, source)
+    names, rows = _read_cells(source)
+    columns = _columns(names, columns or {}, ignored, source)
     constants = constants or {}
     _check_constants(constants, columns, source)
-    read = read_table(source, list(columns.values()))
+    read = _as_numbers(source, names, rows, columns.values())
     values = {variable: read.columns[column] for variable, column in columns.items()}
     values |= {variable: np.full(len(read.lines), float(x)) for variable, x in constants.items()}
     _check_values(values, columns, read.lines, source)
@@ -117,9 +118,7 @@ def _columns(
 ) -> dict[str, str]:
     """The column of each variable; every column is used or ignored."""
     for column in (*columns.values(), *ignored):
-        if column not in names:
-            hint = f"choose from {', '.join(names)}"
-            raise CaptureError(f"there is no column {column!r}", where=source, hint=hint)
+        _check_column(column, names, source)
     for variable, column in columns.items():
         _check_name(variable, f"{source}: column {column}")
     used = dict(columns)
@@ -131,6 +130,12 @@ def _columns(
             raise CaptureError(what, where=where, hint="ignore one of both")
         used[column] = column
     return used
+
+
+def _check_column(column: str, names: Sequence[str], source: str) -> None:
+    if column not in names:
+        hint = f"choose from {', '.join(names)}"
+        raise CaptureError(f"there is no column {column!r}", where=source, hint=hint)
 
 
 def _check_constants(
@@ -248,48 +253,39 @@ class Table:
 
 
 def read_table(path: str | os.PathLike[str], columns: Sequence[str] | None = None) -> Table:
-    """A text table of numbers."""
-    # Semicolons, tabs, commas or blanks separate the cells; runs of tabs or of blanks separate
-    # once. The first line may name the columns. From a # to the end of its line is comment. Where
-    # commas do not separate they may be decimal commas, in the whole table or not at all.
-    source, names, rows = _parts(path)
+    """A text table of numbers, by default with all its columns."""
+    names, rows = _read_cells(path)
+    return _as_numbers(str(path), names, rows, columns or names)
+
+
+def _as_numbers(source: str, names: list[str], rows: list[Row], columns: Collection[str]) -> Table:
+    """Some columns of a table of text."""
     if not rows:
         raise CaptureError("it holds names but no rows", where=source, hint=EACH_READING)
-    for line, cells in rows:
-        if len(cells) != len(names):
-            what = f"it has another number of cells ({len(cells)}) than the first ({len(names)})"
-            hint = "give every line one cell for each column"
-            raise CaptureError(what, where=f"{source}: line {line}", hint=hint)
     has_points = any("." in cell for _, cells in rows for cell in cells)
     for line, cells in rows:
+        where = f"{source}: line {line}"
+        if len(cells) != len(names):
+            what = f"it has another number of cells ({len(cells)}) than the first ({len(names)})"
+            raise CaptureError(what, where=where, hint="give every line one cell for each column")
         if has_points and any("," in cell for cell in cells):  # "1,234" could be 1.234 or 1234
             what = "decimal commas stand beside decimal points"
             hint = "use one of them, and no mark for thousands"
-            raise CaptureError(what, where=f"{source}: line {line}", hint=hint)
-    pairs = {}
-    for name in columns or names:
-        if name not in names:
-            hint = f"choose from {', '.join(names)}"
-            raise CaptureError(f"there is no column {name!r}", where=source, hint=hint)
+            raise CaptureError(what, where=where, hint=hint)
+    values, steps = {}, {}
+    for name in columns:
+        _check_column(name, names, source)
         k = names.index(name)
-        pairs[name] = np.array(
-            [_number(cells[k], f"{source}: line {line}, column {name}") for line, cells in rows]
-        )
-    return Table(
-        source=source,
-        columns={name: pair[:, 0] for name, pair in pairs.items()},
-        steps={name: pair[:, 1] for name, pair in pairs.items()},
-        lines=tuple(line for line, _ in rows),
-    )
+        pairs = [_number(cells[k], f"{source}: line {line}, column {name}") for line, cells in rows]
+        values[name], steps[name] = np.array(pairs).T
+    return Table(source, values, steps, tuple(line for line, _ in rows))
 
 
-def column_names(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Names of the columns of a text table, as `read_table` reads it."""
-    return tuple(_parts(path)[1])
-
-
-def _parts(path: str | os.PathLike[str]) -> tuple[str, list[str], list[Row]]:
-    """Path, names of the columns, and the rows below them."""
+def _read_cells(path: str | os.PathLike[str]) -> tuple[list[str], list[Row]]:
+    """Names of the columns of a text table, and the rows below them."""
+    # Semicolons, tabs, commas or blanks separate the cells; runs of tabs or of blanks separate
+    # once. The first line may name the columns. From a # to the end of its line is comment. Where
+    # commas do not separate they may be decimal commas, in the whole table or not at all.
     file = existing_file(path, "table")
     lines = []
     for number, line in enumerate(re.split("\r\n|\r|\n", _text(file)), 1):
@@ -300,7 +296,7 @@ def _parts(path: str | os.PathLike[str]) -> tuple[str, list[str], list[Row]]:
     # The second line holds numbers, whether or not the first one holds names.
     separator = _separator(lines[min(1, len(lines) - 1)][1])
     rows = [(number, [_unquoted(x) for x in separator.split(line)]) for number, line in lines]
-    return str(file), *_take_header(rows, str(file))
+    return _take_header(rows, str(file))
 
 
 def _text(file: Path) -> str:

@@ -16,8 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
+from polar_bayes.capture.schema import dims_text
 from polar_bayes.errors import FitError
-from polar_bayes.inference.result import GEOMETRY, PROVENANCE, provenance_of
+from polar_bayes.inference.result import PROVENANCE, provenance_of
+from polar_bayes.observation.data import ANGLES
 
 Problems = Iterator[tuple[str, str]]
 """Where a tree departs from its schema, and what is wrong there."""
@@ -167,7 +169,7 @@ class Group:
         expected = self.variables.get(name, self.dims)
         is_closed = name in self.variables or not self.extra_dims
         if not dims >= set(expected) or (is_closed and dims != set(expected)):
-            yield where, f"its dims are {_join(variable.dims)}, not {_join(expected)}"
+            yield where, f"its dims are {dims_text(variable.dims)}, not {dims_text(expected)}"
         if odd := [dim for dim in self.never if dim in dims]:
             yield where, f"it has the dim {odd[0]}"
         yield from _check_json(variable.attrs, self.variable_attributes, where)
@@ -177,14 +179,14 @@ class Group:
         for name, group in self.inside.items():
             for other, variable in read.get(group, {}).items() if name in own else ():
                 if not set(own[name].dims) <= set(variable.dims):
-                    what = f"{group}/{other} has not its dims {_join(own[name].dims)}"
+                    what = f"{group}/{other} has not its dims {dims_text(own[name].dims)}"
                     yield f"{where}/{name}", what
         like = self.like or Like("", {})
         for name, variable in read.get(like.group, {}).items():
             for ending, added in like.endings.items():
                 key, expected = f"{name}{ending}", (*added, *variable.dims)
                 if key in own and set(own[key].dims) != set(expected):
-                    what = f"its dims are {_join(own[key].dims)}, not {_join(expected)}"
+                    what = f"its dims are {dims_text(own[key].dims)}, not {dims_text(expected)}"
                     yield f"{where}/{key}", what
                 if key not in own and like.required:
                     yield f"{where}/{key}", "it is missing"
@@ -253,7 +255,7 @@ def _check_node(node: xr.DataTree, where: str) -> Problems:
         yield where, f"its variables do not fit together ({error})"
     for name, variable in node.variables.items():
         if len(set(variable.dims)) < variable.ndim:
-            yield f"{where}/{name}", f"its dims are {_join(variable.dims)}, one of them twice"
+            yield f"{where}/{name}", f"its dims are {dims_text(variable.dims)}, one of them twice"
 
 
 def _check_labels(labeled: Mapping[str, xr.DataTree]) -> Problems:
@@ -271,10 +273,6 @@ def _check_labels(labeled: Mapping[str, xr.DataTree]) -> Problems:
         found.dtype.kind not in "iuf" or not np.all(np.isfinite(found) & (found > 0))
     ):
         yield f"{name}/wavelength", "a label is no length in nm"
-
-
-def _join(dims: Any) -> str:
-    return f"({', '.join(map(str, dims))})"
 
 
 # --- Fits -----------------------------------------------------------------------------------------
@@ -412,8 +410,8 @@ FIT = Schema(
         "prior_predictive": Group(DRAWS, like=Like("observed_data", {"": DRAWS})),
         "constant_data": Group(
             kinds=dict.fromkeys(_FLAGS, FLAGS),
-            names=(*GEOMETRY, *_FLAGS, "true_*"),
-            inside=dict.fromkeys((*GEOMETRY, *_FLAGS), "observed_data"),
+            names=(*ANGLES, *_FLAGS, "true_*"),
+            inside=dict.fromkeys((*ANGLES, *_FLAGS), "observed_data"),
         ),
         "without_discrepancy": Group(DRAWS, labeled=False),
         "without_instrument": Group(DRAWS, labeled=False),

@@ -15,12 +15,11 @@ from arviz_base import from_dict
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Draw, Program
-from polar_bayes.observation.data import Observations
+from polar_bayes.observation.data import ANGLES, Observations
 from polar_bayes.physics.part import notation
 from polar_bayes.priors import RANGES
 
 PROVENANCE = "polar_bayes"
-GEOMETRY = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
 
 
 def assemble(
@@ -141,6 +140,6 @@ def _data_groups(
     flags = {"valid": valid.astype("int8"), "saturated": saturated.astype("int8")}
     groups = {
         "observed_data": {name: bare[name].transpose(*order).where(valid) for name in readings},
-        "constant_data": {str(name): bare[name] for name in (*GEOMETRY, *given)} | flags,
+        "constant_data": {str(name): bare[name] for name in (*ANGLES, *given)} | flags,
     }
     return {name: xr.Dataset(group, coords=dict(coords)) for name, group in groups.items()}

@@ -30,7 +30,7 @@ from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, text
 from polar_bayes.reporting import plots_calibration as figures
-from polar_bayes.reporting.maps import count_table, flag_meanings
+from polar_bayes.reporting.maps import STATUSES, count_table, flag_meanings
 from polar_bayes.reporting.plots_calibration import MAX_INTERVALS, Ranks
 from polar_bayes.reporting.style import QUANTITIES
 from polar_bayes.reporting.text import DASH, column, number
@@ -40,13 +40,6 @@ MAX_PANELS = 12
 """Parameters of one figure: more would be too small to read."""
 
 MAX_OTHERS = 4
-STATUSES = {
-    "good": "an answer that the checks let pass",
-    "masked": "no valid reading",
-    "too few views": "too few valid views",
-    "not converged": "no mode was reached",
-    "not trusted": "no check confirms its numbers",
-}
 RANKS_COLUMN, JUDGED_COLUMN = "the ranks", "the tests"
 
 
@@ -172,7 +165,7 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
     simulations = next(iter(ranks.values())).pit.size
 
     cells: page.Cells = {
-        "p": lambda row: text.p_value(row["p_value"], passes=bool(row["p_value"] >= level)),
+        "p": text.p_value(level),
         JUDGED_COLUMN: lambda row: parameter_deviation(row, level) or PASSES,
         "failed": lambda row: f"{int(row['failed']):,} of {simulations:,}",
         **_score_cells(),
@@ -188,22 +181,18 @@ def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table
     method_of_scores = compared.index.get_level_values("method")[0]
     first = one_line(str(method_of_scores))
     level = significance_level(compared.xs(method_of_scores, level="method"))
-
-    def method(row: pd.Series) -> str:
-        label: Any = row.name
-        return one_line(str(label[1]))
-
     cells: page.Cells = {
-        "method": method,
-        "p": lambda row: text.p_value(row["p_value"], passes=bool(row["p_value"] >= level)),
+        "method": page.second_label,
+        "p": text.p_value(level),
         JUDGED_COLUMN: lambda row: row["deviation"],
         "failed": lambda row: f"{int(row['failed']):,}",
         f"score against {first}": _score_change,
         **_score_cells(),
     }
     caption = page.caption("calibration.comparison", first=first)
-    prose = [JUDGED_COLUMN]
-    return page.make_table("comparison", caption, cells, compared, descriptions=titles, prose=prose)
+    return page.make_table(
+        "comparison", caption, cells, compared, descriptions=titles, prose=[JUDGED_COLUMN]
+    )
 
 
 def _score_change(row: pd.Series) -> str:
@@ -233,7 +222,7 @@ def _readings(
     ]
     pictures = _paged(ranks, lambda some: figures.ecdf_differences(some, {}, method), "readings")
     cells: page.Cells = {
-        "p": lambda row: text.p_value(row["p_value"], passes=bool(row["p_value"] >= level)),
+        "p": text.p_value(level),
         RANKS_COLUMN: lambda row: "uniform" if row["p_value"] >= level else reading_deviation(row),
         "failed": lambda row: f"{int(row['failed']):,} of {int(row['answered'] + row['failed']):,}",
         "mean rank": column("rank_mean", ".3f"),
@@ -306,12 +295,15 @@ def _provenance_facts(provenance: Mapping[str, Any]) -> Iterator[page.Block]:
         "versions": "Versions",
         "timings": "Seconds, compilation included",
     }
-    groups = {key: provenance[key] for key in titles if isinstance(provenance.get(key), Mapping)}
+    groups = {
+        title: provenance[key]
+        for key, title in titles.items()
+        if isinstance(provenance.get(key), Mapping)
+    }
     own = {
         "simulations" if key == "calibration" else key.replace("_", " "): value
         for key, value in provenance.items()
-        if key not in groups
+        if titles.get(key) not in groups
     }
-    yield from page.make_facts(own, "Calibration")
-    for key, title in titles.items():
-        yield from page.make_facts(groups.get(key, {}), title)
+    for title, values in {"Calibration": own, **groups}.items():
+        yield from page.make_facts(values, title)

@@ -63,8 +63,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
         axes.set(ylim=(0.6 - len(fits), 0.4), yticks=[])
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
-        title = style.label_text(label.replace("_", " "))
-        axes.set_title(style.wrap(title, 38), loc="left")
+        style.set_panel_title(axes, style.label_text(label.replace("_", " ")))
     style.set_tick_style(panels)
     handles = [
         Line2D([], [], color=color, marker="o", ms=4.5, lw=2.0, label=style.label_text(name, 24))
@@ -111,16 +110,9 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
 
 def loo_table(comparison: FitComparison) -> Table:
     """Expected log densities, best first."""
-
-    def difference(row: pd.Series) -> str:
-        if row["dse"] == 0.0:
-            return DASH
-        scale = max(float(row["dse"]), 0.2)
-        return f"{number(row['elpd_diff'], scale)} ± {number(row['dse'], scale)}"
-
     cells: page.Cells = {
         "elpd": lambda row: f"{row['elpd']:.1f} ± {or_dash(row['se'], '.1f')}",
-        "difference": difference,
+        "difference": text.elpd_difference,
         "p": lambda row: f"{row['p']:.1f}",
         "weight": lambda row: f"{row['weight']:.2f}",
         "k > 0.7": lambda row: f"{int(row['unreliable'])}",
@@ -129,16 +121,10 @@ def loo_table(comparison: FitComparison) -> Table:
     return page.make_table("loo", caption, cells, comparison.loo, label="fit")
 
 
-def _fit_name(row: pd.Series) -> str:
-    """The second level of the index of a table of parameters and fits."""
-    label: Any = row.name
-    return str(label[1])
-
-
 def parameter_table(comparison: FitComparison) -> Table:
     """Every parameter by every fit."""
     cells: page.Cells = {
-        "fit": _fit_name,
+        "fit": page.second_label,
         "mean": lambda row: number(row["mean"], row["sd"]),
         "sd": lambda row: number(row["sd"], row["sd"]),
         "95% interval": lambda row: interval(row["q2.5"], row["q97.5"], row["sd"]),
@@ -156,7 +142,7 @@ def sensitivity_table(comparison: FitComparison) -> Table | None:
     if known.empty:
         return None
     cells: page.Cells = {
-        "fit": _fit_name,
+        "fit": page.second_label,
         "prior inside": lambda row: percent(row["prior_inside"]),
         "by the data": lambda row: str(row["verdict"]),
         **text.SENSITIVITY_CELLS,

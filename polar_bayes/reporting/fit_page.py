@@ -36,6 +36,7 @@ from polar_bayes.inference.files import auto_sentences
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table
+from polar_bayes.reporting.page import Section
 from polar_bayes.reporting.style import QUANTITIES, parameter_title
 from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
 from polar_bayes.repr_html import Row, Table
@@ -85,8 +86,10 @@ class Fit(NamedTuple):
     prior: pd.DataFrame
     method: str
     provenance: dict[str, Any]
+    checks: dict[str, PredictiveCheck]
     criticism: pd.DataFrame
     verdict: Verdict
+    has_draws: bool  # that move and are finite
 
     def table(
         self, name: str, caption: str, cells: page.Cells, data: pd.DataFrame, prose: str = ""
@@ -125,7 +128,8 @@ class Fit(NamedTuple):
 def read_fit(result: xr.DataTree) -> Fit:
     """Summaries of a result, which is checked first."""
     scalars, table = posterior_scalars(result), convergence.summary(result)
-    criticism = criticize(result)
+    checks = predictive_checks(result)
+    criticism = criticize(result, checks)
     return Fit(
         result=result,
         posterior=result["posterior"].to_dataset(),
@@ -134,60 +138,46 @@ def read_fit(result: xr.DataTree) -> Fit:
         prior=sensitivity(result),
         method=method_of(result),
         provenance=provenance_of(result),
+        checks=checks,
         criticism=criticism,
         verdict=convergence.verdict(result, table, criticism),
+        has_draws=method_of(result) != "point" and bool(plots_fit.drawable(result)),
     )
 
 
 def fit_page(result: xr.DataTree) -> page.Page:
     """The page of a fit."""
     fit = read_fit(result)
-    checks = predictive_checks(result)
-    is_point, passed = fit.method == "point", fit.verdict.passed
-    pooled = [] if is_point else populations(result)
+    pooled = [] if fit.method == "point" else populations(result)
     summary = population_summary(result)
     sentences = fit.determined()
-    if passed:
+    if fit.verdict.passed:
         sentences += text.between_members(summary, pooled, fit.posterior)
-        sentences += text.predictive_sentences(checks)
-        sentences.append(text.trust(fit.method, fit.verdict.cautions, checks))
-    has_draws = not is_point and bool(plots_fit.drawable(result))
+        sentences += text.predictive_sentences(fit.checks)
+        sentences.append(text.trust(fit.method, fit.verdict.cautions, fit.checks))
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")
     source = [page.Details("Source of the model", code=code)] if code else []
-    pairs = []
-    if has_draws and len(plots_fit.drawable(result, material=True)) > 1:
-        pairs = [page.picture(plots_fit.plot_pairs(result), "fit.figure_pairs")]
     sections = [
-        page.Section("parameters", "Parameters", [parameter_table(fit)]),
-        page.Section("scenes", "Which scene", list(_scenes(result))),
-        page.Section("population", "Population", _population(fit, summary, pooled)),
-        page.Section("spectrum", "Spectrum", _spectrum(result) if has_draws else []),
-        page.Section(
-            "without",
-            "What trusting the instrument would claim",
-            [] if is_point else _without(fit),
-            "Instrument",
-        ),
-        page.Section("readings", "Readings and fit", _readings(result, has_draws)),
-        page.Section("pairs", "Material parameters together", pairs),
-        page.Section(
-            "prior",
-            "What the prior said, and what the data",
-            [] if is_point else _prior(fit, has_draws),
-            "Prior and data",
-        ),
-        page.Section("convergence", approximation, _convergence(fit, has_draws), approximation),
-        page.Section(
+        Section("parameters", "Parameters", [parameter_table(fit)]),
+        Section("scenes", "Which scene", _scenes(result)),
+        Section("population", "Population", _population(fit, summary, pooled)),
+        Section("spectrum", "Spectrum", _spectrum(fit)),
+        Section("without", "What trusting the instrument would claim", _without(fit), "Instrument"),
+        Section("readings", "Readings and fit", _readings(fit)),
+        Section("pairs", "Material parameters together", _pairs(fit)),
+        Section("prior", "What the prior said, and what the data", _prior(fit), "Prior and data"),
+        Section("convergence", approximation, _convergence(fit), approximation),
+        Section(
             "criticism",
             "What the readings say against the model",
             _criticism(fit),
             "Model criticism",
         ),
-        page.Section("checks", "Predictive checks", _checks(result, checks)),
-        page.Section("effects", "Effects", _effects(result)),
-        page.Section("accuracy", "Accuracy against time", _accuracy(result)),
-        page.Section("provenance", "Provenance", [*provenance_facts(fit.provenance), *source]),
+        Section("checks", "Predictive checks", _checks(fit)),
+        Section("effects", "Effects", _effects(result)),
+        Section("accuracy", "Accuracy against time", _accuracy(result)),
+        Section("provenance", "Provenance", [*provenance_facts(fit.provenance), *source]),
     ]
     method = METHODS.get(fit.method, one_line(fit.method))
     swapped = text.swapped_sentence(fit.provenance)
@@ -196,7 +186,7 @@ def fit_page(result: xr.DataTree) -> page.Page:
         name=text.capture_name(fit.provenance),
         subtitles=[text.made_by(fit.provenance, method), *filter(None, [swapped])],
         headline=fit.headline(),
-        passed=passed,
+        passed=fit.verdict.passed,
         problems=fit.verdict.problems,
         sentences=sentences,
         cautions=fit.verdict.cautions,
@@ -259,8 +249,15 @@ def sensitivity_table(fit: Fit) -> Table:
     return fit.table("sensitivity", caption, cells, fit.prior, prose="remark")
 
 
-def _prior(fit: Fit, has_draws: bool) -> Iterator[page.Block]:
-    if has_draws and "prior" in fit.result.children:
+def _pairs(fit: Fit) -> Iterator[page.Picture]:
+    if fit.has_draws and len(plots_fit.drawable(fit.result, material=True)) > 1:
+        yield page.picture(plots_fit.plot_pairs(fit.result), "fit.figure_pairs")
+
+
+def _prior(fit: Fit) -> Iterator[page.Block]:
+    if fit.method == "point":
+        return
+    if fit.has_draws and "prior" in fit.result.children:
         yield page.picture(plots_fit.plot_prior_posterior(fit.result), "fit.figure_prior")
     yield sensitivity_table(fit)
 
@@ -275,13 +272,13 @@ def _scenes(result: xr.DataTree) -> Iterator[page.Block]:
     texts = [name for name in table.columns if name not in numbers]
     cells: page.Cells = {
         "elpd": column("elpd", ".1f"),
-        "difference": lambda row: f"{row['elpd_diff']:.1f} +- {row['dse']:.1f}",
+        "difference": text.elpd_difference,
         "weight": lambda row: percent(row["weight"]),
         **{name: operator.itemgetter(name) for name in texts},
         "criticism": lambda row: row["criticism"] or DASH,
     }
     caption = page.caption("fit.scene")
-    yield page.make_table("scene", caption, cells, table, prose=["criticism"])
+    yield page.make_table("scene", caption, cells, table, label="scene", prose=["criticism"])
 
 
 def _criticism(fit: Fit) -> Iterator[page.Block]:
@@ -297,7 +294,13 @@ def _criticism(fit: Fit) -> Iterator[page.Block]:
     }
     caption = page.caption("fit.criticism", caution=CAUTION, problem=PROBLEM)
     yield page.make_table(
-        "criticism", caption, cells, fit.criticism, descriptions=QUESTIONS, prose=["what it says"]
+        "criticism",
+        caption,
+        cells,
+        fit.criticism,
+        label="check",
+        descriptions=QUESTIONS,
+        prose=["what it says"],
     )
 
 
@@ -373,11 +376,11 @@ def member_table(result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Po
     return page.make_table("member", page.caption("fit.member"), cells, data, descriptions=titles)
 
 
-def _spectrum(result: xr.DataTree) -> Iterator[page.Block]:
-    spectra = plots_curves.spectra(result)
+def _spectrum(fit: Fit) -> Iterator[page.Block]:
+    spectra = plots_curves.spectra(fit.result) if fit.has_draws else {}
     for name, members in spectra.items():
-        key = f"fit.figure_spectrum_{'bands' if members[0].between.size else 'intervals'}"
-        figure = plots_curves.plot_spectrum(result, name, spectra)
+        key = f"fit.figure_spectrum_{'bands' if members[0].is_band else 'intervals'}"
+        figure = plots_curves.plot_spectrum(fit.result, name, spectra)
         yield page.picture(figure, key, name=name.replace("_", " ").capitalize())
 
 
@@ -386,6 +389,8 @@ def _spectrum(result: xr.DataTree) -> Iterator[page.Block]:
 
 def _without(fit: Fit) -> Iterator[page.Block]:
     """Each fit without a part of the instrument, compared with the main one."""
+    if fit.method == "point":
+        return
     for at, (key, part) in enumerate(WITHOUT.items(), start=1):
         compared = compare_without(fit.result, key)
         if compared.empty:
@@ -418,8 +423,9 @@ def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) ->
 # --- Readings and checks --------------------------------------------------------------------------
 
 
-def _readings(result: xr.DataTree, has_draws: bool) -> Iterator[page.Picture]:
-    key = "fit.figure_readings" if has_draws else "fit.figure_point_readings"
+def _readings(fit: Fit) -> Iterator[page.Picture]:
+    result = fit.result
+    key = "fit.figure_readings" if fit.has_draws else "fit.figure_point_readings"
     for name in plots_curves.variables(result):
         quantity = QUANTITIES[name]
         yield page.picture(plots_curves.plot_readings(result, name), key, quantity=quantity)
@@ -428,61 +434,68 @@ def _readings(result: xr.DataTree, has_draws: bool) -> Iterator[page.Picture]:
             yield page.picture(figure, "fit.figure_residuals", quantity=quantity)
 
 
-def _checks(result: xr.DataTree, checks: dict[str, PredictiveCheck]) -> Iterator[page.Block]:
-    if checks:
-        yield check_table(checks)
-    if any(check.pit.size > 1 for check in checks.values()):
-        yield page.picture(plots_fit.plot_pit(result, checks), "fit.figure_pit")
+def _checks(fit: Fit) -> Iterator[page.Block]:
+    if fit.checks:
+        yield check_table(fit.checks)
+    if any(check.pit.size > 1 for check in fit.checks.values()):
+        yield page.picture(plots_fit.plot_pit(fit.result, fit.checks), "fit.figure_pit")
 
 
 def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
     """Residuals, coverage, and leave-one-out results of every variable."""
-    has_draws = any(check.pit.size for check in checks.values())
-    columns = ["variable", "readings", "residual RMS"]
+    data = pd.DataFrame.from_dict({n: _check_numbers(x) for n, x in checks.items()}, "index")
+    data = data.rename(columns={"standard_error": "elpd_error"})
+    cells: dict[str, Callable[[pd.Series], str]] = {
+        "readings": column("readings", ".0f"),
+        "residual RMS": column("residual_rms", ".3g"),
+    }
     caption = "Residual: reading minus the noise-free prediction, in the unit of the reading."
-    if has_draws:
-        columns += [*(f"inside {p:.0%}" for p in PROBABILITIES), "elpd", "p", "k > 0.7"]
+    if any(check.pit.size for check in checks.values()):
+        cells |= {f"inside {p:.0%}": _coverage_cell(p) for p in PROBABILITIES}
+        cells |= {
+            "elpd": _elpd_cell,
+            "p": column("p_loo", ".1f"),
+            "k > 0.7": column("unreliable", ".0f"),
+        }
         caption += page.caption("fit.predictive_check")
-    rows, data = [], {}
-    for check in checks.values():
-        cells = [str(check.count), f"{check.residual_rms:.3g}"]
-        cells += _predictive_cells(check) if has_draws else []
-        rows.append(Row(check.name, tuple(cells), QUANTITIES.get(check.name, "")))
-        data[check.name] = _check_numbers(check)
-    frame = pd.DataFrame.from_dict(data, "index")
-    return Table(tuple(columns), tuple(rows), (), "check", caption, frame)
+    return page.make_table("check", caption, cells, data, label="variable", descriptions=QUANTITIES)
 
 
 def _check_numbers(check: PredictiveCheck) -> dict[str, float]:
     numbers = {"readings": check.count, "residual_rms": check.residual_rms}
     numbers |= {f"inside_{probability:g}": share for probability, share in check.coverage.items()}
-    if check.loo:
-        numbers |= {"elpd": check.loo.elpd, "elpd_error": check.loo.standard_error}
-        numbers |= {"p_loo": check.loo.p_loo, "unreliable": check.loo.unreliable}
+    if check.pit.size:
+        names = ("elpd", "standard_error", "p_loo", "unreliable")
+        numbers |= {name: getattr(check.loo, name, math.nan) for name in names}
     return numbers
 
 
-def _predictive_cells(check: PredictiveCheck) -> list[str]:
-    loo, cells = check.loo, []
-    for probability in PROBABILITIES:
-        chance = 2.0 * math.sqrt(probability * (1.0 - probability) / check.count)
-        share = check.coverage.get(probability, math.nan)
-        cells.append(f"{share:.0%} (±{chance:.0%})" if math.isfinite(share) else DASH)
-    if loo is None:
-        return [*cells, DASH, DASH, DASH]
-    error = or_dash(loo.standard_error, ".1f")
-    return [*cells, f"{loo.elpd:.1f} ± {error}", f"{loo.p_loo:.1f}", str(loo.unreliable)]
+def _elpd_cell(row: pd.Series) -> str:
+    if not math.isfinite(row["elpd"]):
+        return DASH
+    return f"{row['elpd']:.1f} ± {or_dash(row['elpd_error'], '.1f')}"
+
+
+def _coverage_cell(probability: float) -> Callable[[pd.Series], str]:
+    """Share of the readings in an interval, and how far chance alone moves it."""
+
+    def cell(row: pd.Series) -> str:
+        share = row[f"inside_{probability:g}"]
+        chance = 2.0 * math.sqrt(probability * (1.0 - probability) / row["readings"])
+        return f"{share:.0%} (±{chance:.0%})" if math.isfinite(share) else DASH
+
+    return cell
 
 
 # --- The method -----------------------------------------------------------------------------------
 
 
-def _convergence(fit: Fit, has_draws: bool) -> Iterator[page.Block]:
+def _convergence(fit: Fit) -> Iterator[page.Block]:
     if fit.method == "nuts":
         yield convergence_table(fit)
     yield from page.make_bullets(auto_sentences(fit.result))
     yield from page.make_facts(_sampler_facts(fit))
-    if fit.method == "nuts" and has_draws:
+    if fit.method == "nuts" and fit.has_draws:
         yield page.picture(plots_fit.plot_ranks(fit.result), "fit.figure_ranks")
 
 

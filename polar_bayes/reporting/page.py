@@ -13,13 +13,14 @@ import io
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, NamedTuple
 
 import matplotlib
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 
+from polar_bayes.errors import one_line
 from polar_bayes.paths import check_output, replace_file, temporary_folder, write_errors
 from polar_bayes.reporting.style import FIXED_STYLE
 from polar_bayes.repr_html import Row, Table
@@ -59,53 +60,49 @@ def make_table(
     return Table((label, *cells), tuple(rows), prose, table, caption, data)
 
 
-# --- Blocks, each drawn by the macro of the template that `kind` names ----------------------------
+def second_label(row: pd.Series) -> str:
+    """The second level of the index, such as the fit in a table of parameters and fits."""
+    label: Any = row.name
+    return one_line(str(label[1]))
 
 
-@dataclasses.dataclass(frozen=True)
-class Picture:
+# --- Blocks, each drawn by a macro of the template ------------------------------------------------
+
+
+class Picture(NamedTuple):
     """A figure as an image that the page itself holds."""
 
     source: str
     alternative: str
     caption: str
     wide: bool
-    kind: ClassVar[str] = "picture"
 
 
-@dataclasses.dataclass(frozen=True)
-class Facts:
+class Facts(NamedTuple):
     """Names, values and marks under an optional title."""
 
     rows: tuple[tuple[str, str, str], ...]
     title: str = ""
-    kind: ClassVar[str] = "facts"
 
 
-@dataclasses.dataclass(frozen=True)
-class Heading:
+class Heading(NamedTuple):
     """A heading within a section."""
 
     text: str
-    kind: ClassVar[str] = "heading"
 
 
-@dataclasses.dataclass(frozen=True)
-class Bullets:
+class Bullets(NamedTuple):
     """A list of sentences."""
 
     sentences: tuple[str, ...]
-    kind: ClassVar[str] = "bullets"
 
 
-@dataclasses.dataclass(frozen=True)
-class Details:
+class Details(NamedTuple):
     """Blocks or a program that unfold on request."""
 
     summary: str
     blocks: "tuple[Block, ...]" = ()
     code: str = ""
-    kind: ClassVar[str] = "details"
 
 
 type Block = str | Table | Picture | Facts | Heading | Bullets | Details
@@ -237,16 +234,10 @@ def _is_page(file: Path) -> bool:
 
 def csv_link(table: pd.DataFrame, first: str) -> str:
     """A table as the address of a link, with no text that a spreadsheet would run."""
-    safe = table.map(_escape_formula)
-    if isinstance(table.index, pd.MultiIndex):
-        safe.index = pd.MultiIndex.from_tuples(
-            [tuple(map(_escape_formula, row)) for row in table.index], names=table.index.names
-        )
-        labels: str | list[str] = [str(name) for name in table.index.names]
-    else:
-        safe.index, labels = pd.Index([_escape_formula(name) for name in table.index]), first
-    safe.columns = pd.Index([_escape_formula(str(name)) for name in table.columns])
-    text = safe.to_csv(index_label=labels, quoting=csv.QUOTE_NONNUMERIC)
+    labels = [str(name) for name in table.index.names] if table.index.nlevels > 1 else [first]
+    safe = table.reset_index(names=labels, allow_duplicates=True).map(_escape_formula)
+    safe.columns = pd.Index([*labels, *(_escape_formula(str(name)) for name in table.columns)])
+    text = safe.to_csv(index=False, quoting=csv.QUOTE_NONNUMERIC)
     return f"data:text/csv;charset=utf-8;base64,{base64.b64encode(text.encode()).decode('ascii')}"
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
-from arviz_plots import PlotCollection, plot_dist, plot_ecdf_pit
+from arviz_stats.base import array_stats
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -34,12 +34,6 @@ METHOD_COLORS = (ORANGE, GREEN, PURPLE, SKY)
 
 RANK = "rank of the truth among the draws (0 lowest, 1 highest)"
 BELOW = "share below, minus rank"
-NO_ECDF_DECORATION = dict.fromkeys(
-    ("title", "xlabel", "ylabel", "suspicious_points", "p_value_text"), False
-)
-NO_HISTOGRAM_DECORATION = dict.fromkeys(
-    ("title", "point_estimate", "point_estimate_text", "credible_interval", "remove_axis"), False
-)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -103,16 +97,12 @@ def ecdf_panel(
         return
     band = ecdf_band(ranks.answered.size, ranks.level)
     axes.fill_between(band.at, band.lower, band.upper, color=style.lighten(GRAY, 0.75), lw=0)
+    axes.axhline(0.0, color=GRAY, lw=0.8, ls="--")
     own = BLUE if ranks.passes or several else VERMILLION
     for each, color in ((ranks, own), *others):
         if each.answered.size >= 2:
-            # ArviZ's own band raises, and its test is another one than that of the verdict.
-            plot_ecdf_pit(
-                xr.DataTree.from_dict({"prior_sbc": _dataset(each)}),
-                sample_dims=["simulation"],
-                plot_collection=_collection(axes, each),
-                visuals={"ecdf_lines": {"color": color, "width": 1.3}, **NO_ECDF_DECORATION},
-            )
+            curve = array_stats.ecdf(each.answered, pit=True)
+            axes.step(*curve, where="pre", color=color, lw=1.3, zorder=2)
     _mark_outside(axes, ranks, band)
     reach = [np.abs(np.asarray(line.get_ydata(), float)).max() for line in axes.lines]
     largest = 1.1 * max(*reach, np.abs(band.lower).max(), band.upper.max())
@@ -142,35 +132,10 @@ def histogram_panel(axes: Axes, ranks: Ranks) -> None:
     axes.axhspan(low, high, color=style.lighten(GRAY, 0.75), lw=0)
     axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
     color = BLUE if ranks.passes else VERMILLION
-    plot_dist(
-        _dataset(ranks),
-        kind="hist",
-        sample_dims=["simulation"],
-        plot_collection=_collection(axes, ranks),
-        stats={"dist": {"bins": np.linspace(0.0, 1.0, bins + 1)}},
-        visuals={"dist": {"color": color, "width": 1.3}, **NO_HISTOGRAM_DECORATION},
-    )
+    density, edges = np.histogram(ranks.answered, bins, range=(0.0, 1.0), density=True)
+    axes.stairs(density, edges, baseline=None, color=color, lw=1.3)
     axes.set(xlim=(0, 1), xticks=[0, 0.5, 1])
     axes.set_ylim(0.0, max(1.12 * high, 1.06 * axes.get_ylim()[1]))
-
-
-def _dataset(ranks: Ranks) -> xr.Dataset:
-    return xr.Dataset({"rank": ("simulation", ranks.answered)})
-
-
-def _collection(axes: Axes, ranks: Ranks) -> PlotCollection:
-    """ArviZ draws into axes of ours, so that no figure belongs to pyplot."""
-    boxed = {key: np.array(None, dtype=object) for key in ("figure", "rank")}
-    boxed["figure"][()], boxed["rank"][()] = axes.figure, axes
-    viz = xr.DataTree.from_dict(
-        {
-            "/": xr.Dataset({"figure": ((), boxed["figure"])}),
-            "plot": xr.Dataset({"rank": ((), boxed["rank"])}),
-            "row": xr.Dataset({"rank": 0}),
-            "col": xr.Dataset({"rank": 0}),
-        }
-    )
-    return PlotCollection(_dataset(ranks), viz, aes_dt=xr.DataTree(), backend="matplotlib")
 
 
 def _too_few(axes: Axes) -> None:
@@ -339,7 +304,7 @@ def _panels(
     width = {1: 4.4, 2: 6.3}.get(len(ranks), 8.2)
     figure, panels = style.grid(len(ranks), width=width, panel_height=height, header=header)
     for axes, each in zip(panels, ranks, strict=True):
-        axes.set_title(style.wrap(each.title, 38), loc="left")
+        style.set_panel_title(axes, each.title)
         draw(axes, each)
     style.set_tick_style(panels)
     figure.supxlabel(labels[0], fontsize=9)

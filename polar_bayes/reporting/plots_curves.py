@@ -23,8 +23,9 @@ from polar_bayes.diagnostics.parameters import (
 )
 from polar_bayes.errors import FitError
 from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.result import GEOMETRY, provenance_of
+from polar_bayes.inference.result import provenance_of
 from polar_bayes.inference.spectrum import predict_spectrum
+from polar_bayes.observation.data import ANGLES
 from polar_bayes.reporting import style
 from polar_bayes.reporting.style import BLUE, GRAY, QUANTITIES, SHORT, VERMILLION, lighten
 
@@ -46,7 +47,7 @@ def variables(result: xr.DataTree) -> list[str]:
 def _missing(result: xr.DataTree, name: str) -> str:
     """What a result lacks to draw the readings of a variable: a path in the tree, or nothing."""
     needed = [(group, name) for group in ("observed_data", "noise_free", "posterior_predictive")]
-    needed += [("constant_data", each) for each in (*GEOMETRY, "valid", "saturated")]
+    needed += [("constant_data", each) for each in (*ANGLES, "valid", "saturated")]
     for group, variable in needed:
         if group not in result.children or variable not in result.children[group].data_vars:
             return f"{group}/{variable}"
@@ -310,15 +311,19 @@ BEYOND = 0.05
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Spectrum:
-    """One parameter of one member over wavelength."""
+    """One parameter of one member: quantiles `at` the measured wavelengths, or between them."""
 
     title: str
     label: str
     measured: np.ndarray
-    levels: np.ndarray
     true: np.ndarray
-    between: np.ndarray
-    band: np.ndarray
+    at: np.ndarray
+    levels: np.ndarray
+
+    @property
+    def is_band(self) -> bool:
+        """Whether it is known between the measured wavelengths."""
+        return self.at is not self.measured
 
 
 def spectra(result: xr.DataTree) -> dict[str, list[Spectrum]]:
@@ -397,18 +402,14 @@ def _spectrum(
     posterior = result["posterior"].to_dataset()
     measured = posterior["wavelength"].to_numpy().astype(float)
     order = np.argsort(measured, kind="stable")
-    draws = np.stack([scalar.draws.ravel() for scalar in own])[order]
-    if band is None or not np.isfinite(band).all():
-        between, band = np.empty(0), np.empty((len(LEVELS), 0))
-    return Spectrum(
-        title=style.label_text(title),
-        label=style.short_title(own[0], posterior),
-        measured=measured[order],
-        levels=np.quantile(draws, LEVELS, axis=1),
-        true=np.array([truth_of(result, scalar) for scalar in own])[order],
-        between=between,
-        band=band,
-    )
+    measured, own = measured[order], [own[i] for i in order]
+    at, levels = between, band
+    if levels is None or not np.isfinite(levels).all():
+        draws = np.stack([scalar.draws.ravel() for scalar in own])
+        at, levels = measured, np.quantile(draws, LEVELS, axis=1)
+    label = style.short_title(own[0], posterior)
+    true = np.array([truth_of(result, scalar) for scalar in own])
+    return Spectrum(style.label_text(title), label, measured, true, at, levels)
 
 
 @style.styled
@@ -459,14 +460,14 @@ def plot_spectrum(
 
 
 def _draw_spectrum(axes: Axes, each: Spectrum) -> None:
-    if each.between.size:
+    if each.is_band:
         for at in each.measured:
             axes.axvline(at, color=lighten(GRAY, 0.6), lw=0.7, ls=(0, (2, 2)), zorder=3)
         for low, high, share in ((0, 4, 0.75), (1, 3, 0.45)):
             color = lighten(BLUE, share)
-            axes.fill_between(each.between, each.band[low], each.band[high], color=color, lw=0)
-        axes.plot(each.between, each.band[2], color=BLUE, lw=1.4, zorder=4)
-        limits = each.between[[0, -1]]
+            axes.fill_between(each.at, each.levels[low], each.levels[high], color=color, lw=0)
+        axes.plot(each.at, each.levels[2], color=BLUE, lw=1.4, zorder=4)
+        limits = each.at[[0, -1]]
     else:
         axes.vlines(each.measured, each.levels[0], each.levels[4], color=BLUE, lw=1.1)
         axes.vlines(each.measured, each.levels[1], each.levels[3], color=BLUE, lw=3.6)
@@ -488,7 +489,7 @@ def _spectrum_handles(shown: Sequence[Spectrum]) -> list[Artist]:
         Line2D([], [], color=BLUE, lw=3.6, label="50%"),
         Line2D([], [], color=BLUE, lw=1.1, label="95%"),
     ]
-    if shown[0].between.size:
+    if shown[0].is_band:
         handles = [
             Line2D([], [], color=BLUE, lw=1.4, label="posterior median"),
             Patch(color=lighten(BLUE, 0.45), label="50%"),

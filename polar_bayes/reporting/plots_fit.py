@@ -88,7 +88,8 @@ def plot_pairs(result: xr.DataTree) -> Figure:
     if len(found) < 2:
         raise _nothing_to_draw("plot_pairs", "two material parameters with draws")
     posterior = result["posterior"].to_dataset()
-    labels = [_narrow_label(parameter_title(scalar, posterior)) for scalar in found]
+    titles = [parameter_title(scalar, posterior).split(", ") for scalar in found]
+    labels = ["\n".join(style.wrap(part, 19) for part in title) for title in titles]
     size = len(found)
     figure, panels = _pair_panels(size, lines=max(label.count("\n") for label in labels) + 1)
     draws = np.stack([scalar.draws.ravel() for scalar in found])
@@ -157,7 +158,7 @@ def plot_ranks(result: xr.DataTree) -> Figure:
             axes.stairs(share, edges, color=color, lw=1.1, baseline=None)
         axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
         axes.set(xlim=(0, 1), ylim=(0, max(2.0, axes.get_ylim()[1])), xticks=[0, 0.5, 1])
-        axes.set_title(style.wrap(parameter_title(scalar, posterior), 38), loc="left")
+        style.set_panel_title(axes, parameter_title(scalar, posterior))
     style.set_tick_style(panels)
     figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)", fontsize=9)
     figure.supylabel("density", fontsize=9)
@@ -214,7 +215,7 @@ def plot_prior_posterior(result: xr.DataTree) -> Figure:
         axes.set(xlim=limits, ylim=(-0.18, 1.08), yticks=[])
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
-        axes.set_title(style.wrap(parameter_title(scalar, posterior), 38), loc="left")
+        style.set_panel_title(axes, parameter_title(scalar, posterior))
     style.set_tick_style(panels)
     handles: list[Patch | Line2D] = [
         Patch(color=lighten(GRAY, 0.72), label="prior"),
@@ -324,11 +325,6 @@ def _pair_ticks(axes: Axes, row: int, column: int, size: int) -> None:
         axes.set_yticks([])
 
 
-def _narrow_label(text: str) -> str:
-    """Break a label at its commas, and long parts at a space, for narrow panels."""
-    return "\n".join(style.wrap(part, 19) for part in text.split(", "))
-
-
 def _nothing_to_draw(what: str, needed: str) -> FitError:
     return FitError("there is nothing to draw", where=what, hint=f"give a result that has {needed}")
 
@@ -387,7 +383,7 @@ def plot_shrinkage(
     rows["name"] = [_member_name(scalar, population) for scalar in population.members]
     rows = rows.sort_values("mean", kind="stable", ignore_index=True)
     count = len(rows)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_MEMBERS)).astype(int))
+    chosen = np.linspace(0, count - 1, min(count, MAX_MEMBERS)).astype(int)
     rows = rows.iloc[chosen].reset_index(drop=True)
     is_dense = len(rows) > MANY_MEMBERS
     height = (LOW_ROW_HEIGHT if is_dense else ROW_HEIGHT) * len(rows)

@@ -167,17 +167,17 @@ class Kind(NamedTuple):
     file: str = ""
 
 
-def _is_several_fits(result: Any) -> bool:
-    return isinstance(result, Mapping) and not isinstance(result, xr.Dataset | xr.DataTree)
-
-
-def _is_dataset(result: Any) -> bool:
+def _is_map(result: Any) -> bool:
     return isinstance(result, xr.Dataset)
 
 
+def _is_several_fits(result: Any) -> bool:
+    return isinstance(result, Mapping) and not isinstance(result, xr.DataTree)
+
+
 KINDS = (
+    Kind("map", _is_map, maps.map_page, _map_card, ("truth", "uncorrected")),
     Kind("several fits", _is_several_fits, comparison_page),
-    Kind("map", _is_dataset, maps.map_page, _map_card, ("truth", "uncorrected")),
     Kind("accuracy", is_accuracy, accuracy_page, _accuracy_card, file="accuracy.nc"),
     Kind(
         "calibration",

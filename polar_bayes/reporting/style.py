@@ -153,6 +153,11 @@ def set_tick_style(axes: Axes | Iterable[Axes]) -> None:
         each.tick_params(labelsize=matplotlib.rcParams["xtick.labelsize"], length=3.0, color=GRAY)
 
 
+def set_panel_title(axes: Axes, title: str) -> None:
+    """A title of at most two lines, as wide as one of three panels."""
+    axes.set_title(wrap(title, 42), loc="left")
+
+
 def plain_numbers(*axes: Axis) -> None:
     """Tick labels of logarithmic axes without math text, which the style does not parse."""
     for axis in axes:

@@ -25,6 +25,7 @@ from polar_bayes.errors import one_line
 from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.reporting.style import QUANTITIES, coordinate_labels, short_title
+from polar_bayes.results import MIN_GOOD_SHARE
 
 # --- Numbers as text, with the digits that they deserve -------------------------------------------
 
@@ -81,6 +82,13 @@ def column(name: str, form: str) -> Callable[[pd.Series], str]:
     return lambda row: or_dash(row[name], form)
 
 
+def elpd_difference(row: pd.Series) -> str:
+    """Cell: the difference in expected log density to the best, with its standard error."""
+    if row["dse"] == 0.0:
+        return DASH
+    return " ± ".join(numbers([row["elpd_diff"], row["dse"]], max(row["dse"], 0.2)))
+
+
 SENSITIVITY_CELLS: Mapping[str, Callable[[pd.Series], str]] = {
     "to the priors": column("prior_sensitivity", ".3f"),
     "to the data": column("likelihood_sensitivity", ".3f"),
@@ -88,10 +96,13 @@ SENSITIVITY_CELLS: Mapping[str, Callable[[pd.Series], str]] = {
 }
 
 
-def p_value(value: float, *, passes: bool) -> str:
-    """A p-value, marked where the test fails."""
-    text = or_dash(value, ".2g")
-    return text if passes or not math.isfinite(value) else f"{text} (fails)"
+def p_value(level: float) -> Callable[[pd.Series], str]:
+    """Cells of a table: p-values, marked where the test fails at that level."""
+
+    def cell(row: pd.Series) -> str:
+        return or_dash(row["p_value"], ".2g") + (" (fails)" if row["p_value"] < level else "")
+
+    return cell
 
 
 def join(names: Sequence[str]) -> str:
@@ -442,9 +453,6 @@ def _disagreements(table: pd.DataFrame) -> list[str]:
 
 # --- Maps -----------------------------------------------------------------------------------------
 
-FEW = 0.95
-"""Below this share of answers the page warns."""
-
 SLIGHT = 0.01
 """A smaller error of the coverage gives no warning, however many pixels show it."""
 
@@ -475,7 +483,7 @@ def map_headline(counts: pd.DataFrame) -> tuple[str, bool]:
         return f"{lost:,} of {total:,} pixels are not fitted: this map has holes.", False
     share = count_percent(good, read)
     headline = f"{good:,} of {read:,} pixels that were read have an answer ({share})."
-    return headline, good >= FEW * read
+    return headline, good >= MIN_GOOD_SHARE * read
 
 
 def pixel_sentences(counts: pd.DataFrame) -> list[str]:
@@ -557,7 +565,7 @@ def calibration_headline(table: pd.DataFrame, readings: pd.DataFrame | None) -> 
     headline = "Calibrated" if passed else "Not calibrated"
     if passed and readings is not None and not is_calibrated(readings):
         headline, passed = "Parameters are calibrated, predicted readings are not", False
-    if answered < FEW:
+    if answered < MIN_GOOD_SHARE:
         link = ", but" if passed else ", and"
         return f"{headline}{link} {1.0 - answered:.0%} of the fits failed.", False
     return f"{headline}.", passed

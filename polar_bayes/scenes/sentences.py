@@ -150,12 +150,10 @@ def _why_not(scene: xr.Dataset) -> str:
     name, difference = str(scene["scene"].item()), abs(float(scene["elpd_diff"]))
     error = float(scene["dse"])
     if difference > max(SMALL_DIFFERENCE, ERRORS_APART * error):
-        return f"Not {name}: it predicts worse, by {difference:.1f} +- {error:.1f} nat in all."
+        return f"Not {name}: it predicts worse, by {difference:.1f} ± {error:.1f} nat in all."
     if "priors" in str(scene["criticism"].item()):
         return f"Not {name}: its parameters are where their priors hardly allow them."
-    return (
-        f"Not {name}: it adds nothing to the others ({difference:.1f} +- {error:.1f} nat behind)."
-    )
+    return f"Not {name}: it adds nothing to the others ({difference:.1f} ± {error:.1f} nat behind)."
 
 
 def _between(found: xr.Dataset) -> list[str]:

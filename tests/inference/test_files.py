@@ -22,7 +22,8 @@ from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
-from polar_bayes.inference.result import GEOMETRY, assemble, posterior_of
+from polar_bayes.inference.result import assemble, posterior_of
+from polar_bayes.observation.data import ANGLES
 
 SMALL = {"views": 4, "draws": 30, "chains": 2}
 AUTO = {
@@ -338,7 +339,7 @@ def test_comparisons_have_the_labels_of_the_fit():
         plates={"wavelength": 2},
         observed=(),
     )
-    views = {name: ("view", np.zeros(3)) for name in GEOMETRY}
+    views = {name: ("view", np.zeros(3)) for name in ANGLES}
     capture = xr.Dataset(views, {"wavelength": [450.0, 650.0]})
     data = SimpleNamespace(
         dims=(("view", 3), ("wavelength", 2)),

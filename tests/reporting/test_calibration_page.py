@@ -91,7 +91,7 @@ def test_failed_fits_are_counted_everywhere(page: Page) -> None:
         "3 of 400 fits: not converged.",
         "3 of 400 fits have no answer.",
         "all tests pass 3 of 400",
-        "not converged no mode was reached 3 0.8% 0",
+        "not converged no answer was reached; NaN 3 0.8% 0",
         "none no numbers 3 0.8% 0",
         "Pareto k above 0.7 39 of 397 fits that know it (9.8%)",
         "effective draws: median 302",

@@ -43,7 +43,7 @@ def test_intervals_where_nothing_ties_the_colors() -> None:
     (index,) = found["refractive_index"]
     draws = result["posterior"]["refractive_index"].to_numpy().reshape(-1, 3)
     assert index.levels == pytest.approx(np.quantile(draws, LEVELS, axis=0))
-    assert index.between.size == 0
+    assert not index.is_band
     true = result["constant_data"]["true_refractive_index"].to_numpy()
     assert index.true == pytest.approx(true)
     figure = plot_spectrum(result, "refractive_index")
@@ -54,11 +54,12 @@ def test_a_law_of_dispersion_has_bands_between_and_beyond_the_colors() -> None:
     result = with_law()
     found = spectra(result)
     (index,) = found["refractive_index"]
-    assert index.between.min() == pytest.approx(440.0)
-    assert index.between.max() == pytest.approx(660.0)
-    at = np.searchsorted(index.between, [450.0, 550.0, 650.0])
-    assert index.band[:, at] == pytest.approx(index.levels)
-    assert found["absorption"][0].between.size == 0
+    assert index.at.min() == pytest.approx(440.0)
+    assert index.at.max() == pytest.approx(660.0)
+    at = np.searchsorted(index.at, [450.0, 550.0, 650.0])
+    draws = result["posterior"]["refractive_index"].to_numpy().reshape(-1, 3)
+    assert index.levels[:, at] == pytest.approx(np.quantile(draws, LEVELS, axis=0))
+    assert not found["absorption"][0].is_band
     for name in found:
         assert clipped(plot_spectrum(result, name, found)) == []
 
@@ -66,7 +67,7 @@ def test_a_law_of_dispersion_has_bands_between_and_beyond_the_colors() -> None:
 @pytest.mark.thorough
 @each("scene", ["Scene(dispersion=<function law at 0x7f>)", "Scene(dispersion=Mine(a=1))"])
 def test_a_law_that_cannot_be_read_leaves_intervals(scene: str) -> None:
-    assert spectra(with_law(scene))["refractive_index"][0].between.size == 0
+    assert not spectra(with_law(scene))["refractive_index"][0].is_band
 
 
 def test_a_process_is_drawn_from_its_prediction(monkeypatch) -> None:
@@ -89,9 +90,9 @@ def test_a_process_is_drawn_from_its_prediction(monkeypatch) -> None:
     found = spectra(edit_provenance(result, scene_parts=""))
     assert asked["draws"] == 1200
     assert len(found["absorption"]) == module.MAX_MEMBERS
-    assert found["absorption"][3].between.size > module.FINE
+    assert found["absorption"][3].at.size > module.FINE
     assert found["absorption"][3].title == "material d"
-    assert found["refractive_index"][0].between.size == 0
+    assert not found["refractive_index"][0].is_band
     figure = plot_spectrum(result, "absorption", found)
     assert clipped(figure) == []
     assert len(figure.axes) == module.MAX_MEMBERS
@@ -105,7 +106,7 @@ def test_a_fit_that_cannot_be_predicted_has_intervals(monkeypatch) -> None:
         raise FitError("the fit's kernel has no name", where="x", hint="y")
 
     monkeypatch.setattr(module, "predict_spectrum", predict)
-    assert spectra(make_result(**SMALL))["absorption"][0].between.size == 0
+    assert not spectra(make_result(**SMALL))["absorption"][0].is_band
 
 
 @pytest.mark.thorough
