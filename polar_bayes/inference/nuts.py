@@ -197,44 +197,61 @@ def sample(
 
     rounds: list[Step] = []
     warmup_steps = np.zeros(settings.chains, int)
-    warmup_blocks, least, most = (
-        -(-draws // settings.block) for draws in (warmup, settings.draws, settings.most_draws)
-    )
+    warmup_blocks = -(-warmup // settings.block)
+    blocks = warmup_blocks - (-settings.draws // settings.block)
+
+    done = 0
 
     def advance_all(states: list[infer.hmc.HMCState]) -> tuple[list[infer.hmc.HMCState], Step]:
+        nonlocal done
         advanced = list(pool.map(lambda state: advance(state, target.given), states))
         joined = jax.tree.map(lambda *x: np.stack(x), *(steps for _, steps in advanced))
+        done += 1
+        progress(min(done / blocks, 1.0))
         return [state for state, _ in advanced], joined._replace(z=target.transform(joined.z))
 
     progress(0.0)
     with ThreadPoolExecutor(settings.threads) as pool:
-        for done in range(warmup_blocks):
+        for block in range(warmup_blocks):
             states, steps = advance_all(states)
             # The last block may hold the end of the warm-up and the first draws.
-            before = min(warmup - done * settings.block, settings.block)
+            before = min(warmup - block * settings.block, settings.block)
             warmup_steps += steps.n_steps[:, :before].sum(axis=1)
-            progress((done + 1) / (warmup_blocks + least))
         if before < settings.block:
             rounds.append(jax.tree.map(lambda x: x[:, before:], steps))
         for halvings in range(MOST_HALVINGS + 1):
             if halvings:
                 states, rounds = [_with_half_the_step(state) for state in states], []
-            for done in range(most):
-                states, steps = advance_all(states)
-                rounds.append(steps)
-                progress(min((warmup_blocks + done + 1) / (warmup_blocks + least), 1.0))
-                if done + 1 >= least and _converged(rounds, settings):
-                    break
-            if not np.concatenate([steps.diverging for steps in rounds], axis=1).any():
+            states = _until_converged(states, rounds, advance_all, settings)
+            if not _stacked(rounds).diverging.any():
                 break
-    joined = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *rounds)
-    stats = jax.tree.map(lambda x: x[:, : settings.most_draws], joined)._asdict()
+    stats = jax.tree.map(lambda x: x[:, : settings.most_draws], _stacked(rounds))._asdict()
     z = stats.pop("z")
     step_size = np.array([float(state.adapt_state.step_size) for state in states])
     stats["step_size"] = np.broadcast_to(step_size[:, None], z.shape[:2])
     stats["warmup_steps"] = np.broadcast_to(warmup_steps[:, None], z.shape[:2])
     stats["reached_max_treedepth"] = stats["n_steps"] >= 2**settings.max_tree_depth - 1
     return z, stats, _converged(rounds, settings)
+
+
+def _until_converged(
+    states: list[infer.hmc.HMCState],
+    rounds: list[Step],
+    advance_all: Callable[[list[infer.hmc.HMCState]], tuple[list[infer.hmc.HMCState], Step]],
+    settings: Nuts,
+) -> list[infer.hmc.HMCState]:
+    """Add blocks of draws to `rounds` until the goals or the limit of the settings are reached."""
+    least, most = (-(-count // settings.block) for count in (settings.draws, settings.most_draws))
+    for done in range(1, most + 1):
+        states, steps = advance_all(states)
+        rounds.append(steps)
+        if done >= least and _converged(rounds, settings):
+            break
+    return states
+
+
+def _stacked(rounds: list[Step]) -> Step:
+    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *rounds)
 
 
 def _with_half_the_step(state: infer.hmc.HMCState) -> infer.hmc.HMCState:
@@ -244,7 +261,7 @@ def _with_half_the_step(state: infer.hmc.HMCState) -> infer.hmc.HMCState:
 
 def _converged(rounds: list[Step], settings: Nuts) -> bool:
     """Whether every coordinate has reached the goals; both are invariant to monotone maps."""
-    z = np.concatenate([steps.z for steps in rounds], axis=1)
+    z = np.asarray(_stacked(rounds).z)
     bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))
     smallest = min(bulk.min(), tail.min())
     return bool(smallest >= settings.effective_draws and r_hat.max() <= LARGEST_R_HAT)

@@ -188,7 +188,7 @@ def test_laplace_says_where_it_is_not_to_be_trusted(
 
     result = pb.fit(capture, model=tails, scene=PLATE, links=LINKS, method="laplace", seed=1)
     verdict = pb.verdict(result)
-    assert verdict.passed
+    assert verdict.converged  # the readings are not judged: they stand for no scene
     assert any("k-hat" in caution for caution in verdict.cautions) != trusted
 
 

@@ -147,7 +147,7 @@ def test_the_posterior_is_that_of_another_density_and_another_sampler() -> None:
     result = fit(
         capture, method=pb.methods.Nuts(draws=1000, most_draws=3000, effective_draws=1500.0)
     )
-    assert pb.verdict(result).passed
+    assert pb.verdict(result).converged
     posterior = result["posterior"]
     for label, other in theirs.items():
         name, _, number = label.removeprefix("log ").partition("[")
