@@ -50,6 +50,8 @@ def fit(
         scene: A name in `SETUPS` or a `Scene`; by default the set-up that the capture names in
             its attribute `setup`, else "paper". "auto" compares scenes, as
             `polar_bayes.compare_scenes` does, and stacks the posteriors of those that remain.
+            With the default method, weighted draws of the comparison that pass the rules of
+            convergence serve as they are; the other scenes are sampled.
         priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
         links: One link for the polarization, or a mapping from variable to link.
         largest_view_zenith: Views beyond it are set aside and counted. Unit degree.

@@ -20,6 +20,7 @@ from polar_bayes.inference.fitting import fit_request
 from polar_bayes.inference.laplace import Importance
 from polar_bayes.inference.least_squares import Point
 from polar_bayes.inference.method import AbstractMethod
+from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.progress import Progress
 from polar_bayes.scenes.comparison import FitArguments, compare_candidates
@@ -57,6 +58,7 @@ def fit_best_scenes(
         fits = {
             name: comparison.fits[name]
             if isinstance(method, Importance)  # the comparison has more rounds of the same
+            or (method == Nuts() and verdict(comparison.fits[name]).converged)
             else fit_request(
                 comparison.requests[name],
                 method,

@@ -64,14 +64,8 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize(
-    "broken",
-    [
-        pytest.param("prior", marks=pytest.mark.thorough),
-        "noise",
-        pytest.param("link", marks=pytest.mark.thorough),
-    ],
-)
+@pytest.mark.thorough
+@each("broken", BROKEN)
 def test_what_is_broken_on_purpose_is_caught(capture: xr.Dataset, broken: str) -> None:
     truth, parameter = BROKEN[broken]
     calibration = pb.calibrate(capture, simulations=COUNT, truth=truth, **ASKED)

@@ -22,7 +22,8 @@ PLATES = {
 }
 
 
-@pytest.mark.parametrize("plate", [pytest.param("glass", marks=pytest.mark.thorough), "plexiglas"])
+@pytest.mark.thorough
+@pytest.mark.parametrize("plate", ["glass", "plexiglas"])
 def test_a_measured_plate_from_table_to_interval(
     plate: str, measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -348,6 +348,7 @@ def test_what_cannot_be_asked_is_refused(asked, said):
         pb.fit(capture(), model=line, links=LINKS, **asked)
 
 
+@pytest.mark.thorough
 def test_chains_come_before_tempered_draws_that_must_still_compile() -> None:
     """And after them once they are compiled, as by an earlier fit of this layout."""
     here = problem(line)

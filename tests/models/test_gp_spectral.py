@@ -252,16 +252,15 @@ def test_one_wavelength_has_the_prior_of_one_wavelength() -> None:
 THREE = spectral_plate({450.0: 1.525, 550.0: 1.5185, 650.0: 1.5145}, error=0.01, seed=7)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("kernel", "length"),
     [
-        pytest.param("Matern52", True, id="name", marks=pytest.mark.thorough),
+        pytest.param("Matern52", True, id="name"),
         pytest.param(
             lambda length: kernels.RationalQuadratic(scale=length, alpha=1.0), True, id="function"
         ),
-        pytest.param(
-            kernels.ExpSquared(scale=200.0), False, id="object", marks=pytest.mark.thorough
-        ),
+        pytest.param(kernels.ExpSquared(scale=200.0), False, id="object"),
     ],
 )
 def test_other_kernels_are_fitted_and_predict(kernel: Any, length: bool) -> None:
