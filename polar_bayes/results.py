@@ -20,11 +20,12 @@ from polar_bayes.calibration.verdict import (
 )
 from polar_bayes.capture.files import is_result, read_netcdf, write_netcdf
 from polar_bayes.diagnostics import convergence
-from polar_bayes.diagnostics.convergence import Verdict
+from polar_bayes.diagnostics.convergence import Verdict, setup_cautions
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.errors import FitError, OutputError
 from polar_bayes.inference.batching import Status
 from polar_bayes.inference.files import FIT, check_fit
+from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.lazy import count_pixels, open_map
 from polar_bayes.paths import as_path, atomic_write, existing_file
 
@@ -190,7 +191,12 @@ def verdict(result: xr.DataTree | xr.Dataset) -> Verdict:
     Raises:
         FitError: It is no result, or its parts do not fit together.
     """
-    return _kind_of(result).verdict(result)
+    kind = _kind_of(result)
+    judged = kind.verdict(result)
+    if kind.name == "fit":
+        return judged
+    cautions = (*setup_cautions(provenance_of(result)), *judged.cautions)
+    return dataclasses.replace(judged, cautions=cautions)
 
 
 def save(result: xr.DataTree | xr.Dataset, path: str | os.PathLike[str]) -> None:

@@ -377,13 +377,20 @@ def _reading_cautions(counts: Mapping[str, Any]) -> Iterator[str]:
 
 def _capture_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
     """A set-up that nobody stated, and what is unlikely in the capture."""
-    if not provenance.get("setup_stated", True):
-        yield (
-            f"No set-up was stated, so {provenance.get('scene', 'paper')!r} was used, a point "
-            "source and an unsigned degree of polarization: state it by setup= at import or "
-            "scene=, or let scene='auto' choose."
-        )
+    yield from setup_cautions(provenance)
     yield from provenance.get("capture_cautions", ())
+
+
+def setup_cautions(provenance: Mapping[str, Any]) -> tuple[str, ...]:
+    """A caution where nobody stated the set-up of a capture, whatever was made of it."""
+    if provenance.get("scene_chosen_by") != "default":
+        return ()
+    sentence = (
+        f"No set-up was stated, so {provenance.get('scene', 'paper')!r} was used, a point "
+        "source and an unsigned degree of polarization: state it by setup= at import or "
+        "scene=, or let scene='auto' of a fit choose."
+    )
+    return (sentence,)
 
 
 def _number(value: float) -> float | None:

@@ -301,7 +301,6 @@ _FIT_PROVENANCE: Mapping[str, Spec] = {
     "declared?": {EACH: ANY},
     "fixed?": {EACH: ANY},
     "scene_chosen_by?": TEXT,
-    "setup_stated?": FLAG,
     "capture_cautions?": [TEXT],
     "swapped?": [TEXT],
     "largest_view_zenith?": FINITE,

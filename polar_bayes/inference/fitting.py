@@ -29,7 +29,7 @@ from polar_bayes.inference.problem import BLOCK, THREADS, Problem, make_problem
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.physics.instrument import Discrepancy
-from polar_bayes.priors import describe_prior, support_bounds
+from polar_bayes.priors import support_bounds
 from polar_bayes.progress import Progress
 
 PRIOR_DRAWS = 500
@@ -255,22 +255,15 @@ def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> d
     used = {"used": int(np.sum(data.valid)), "at_margin": at_boundary}
     return {
         "settings": dataclasses.asdict(method),
-        "model": request.model_name,
+        **request.describe(),
         "model_settings": _model_settings(request.model),
         "model_source": _model_source(request.model),
-        "scene": request.scene_name,
-        "scene_chosen_by": request.scene_chosen_by,
-        "setup_stated": request.scene_chosen_by != "default",
         "capture_cautions": list(cautions(request.capture)),
-        "scene_parts": repr(request.scene),
-        "priors": {name: describe_prior(prior) for name, prior in request.priors.items()},
         "bounds": {name: _finite_bounds(prior) for name, prior in request.priors.items()},
         "declared": request.declared,
         "fixed": request.fixed,
-        "links": {name: repr(link) for name, link in request.links.items()},
         "swapped": list(request.swapped),
         "largest_view_zenith": request.largest_view_zenith,
-        "seed": request.seed,
         "precision": request.precision,
         "chain_method": "threads",
         "versions": {name: version(name) for name in packages},

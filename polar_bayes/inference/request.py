@@ -61,6 +61,7 @@ class Request:
         return {
             "model": self.model_name,
             "scene": self.scene_name,
+            "scene_chosen_by": self.scene_chosen_by,
             "scene_parts": repr(self.scene),
             "priors": {name: describe_prior(prior) for name, prior in self.priors.items()},
             "links": {name: repr(link) for name, link in self.links.items()},

@@ -9,8 +9,10 @@ import pytest
 import xarray as xr
 from cases import each
 from scipy import stats
+from synthetic_calibrations import make_calibration
 from synthetic_results import edit_provenance, make_result, replace
 
+import polar_bayes as pb
 from polar_bayes.diagnostics.convergence import json_summary, laplace_k_hat, summary, verdict
 from polar_bayes.diagnostics.parameters import method_of
 from polar_bayes.errors import FitError
@@ -77,7 +79,7 @@ def test_a_good_fit_converges_without_a_word() -> None:
 
 
 def test_a_set_up_that_nobody_stated_and_an_unlikely_capture_are_cautions() -> None:
-    tree = edit_provenance(make_result(), setup_stated=False, capture_cautions=["Swapped."])
+    tree = edit_provenance(make_result(), scene_chosen_by="default", capture_cautions=["Swapped."])
     judged = verdict(tree)
     assert judged.passed
     assert judged.cautions[0].startswith("No set-up was stated, so 'paper' was used")
@@ -327,3 +329,9 @@ def test_chains_of_a_method_of_a_user_are_judged_as_those_of_nuts() -> None:
     judged = verdict(tree)
     assert not judged.passed
     assert any("Bulk ESS below 400" in problem for problem in judged.problems)
+
+
+def test_a_set_up_that_nobody_stated_is_a_caution_of_every_kind_of_result() -> None:
+    calibration = edit_provenance(make_calibration(), scene_chosen_by="default", scene="paper")
+    assert "No set-up was stated, so 'paper' was used" in pb.verdict(calibration).cautions[0]
+    assert not pb.verdict(edit_provenance(calibration, scene_chosen_by="argument")).cautions
