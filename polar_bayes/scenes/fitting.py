@@ -76,10 +76,10 @@ def fit(
     start_time = time.perf_counter()
     chosen, show = find_method(method, tolerance, seconds), progress or no_progress
     if isinstance(scene, str) and scene == "auto":
-        arguments = polar_bayes.scenes.FitArguments(
+        arguments = polar_bayes.scenes.stacking.FitArguments(
             validate(capture), model, priors, links, largest_view_zenith, seed, precision
         )
-        return polar_bayes.scenes.fit_best_scenes(arguments, chosen, show)
+        return polar_bayes.scenes.stacking.fit_best_scenes(arguments, chosen, show)
     request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, precision)
     with jax.enable_x64(precision == "double"):
         return fit_request(request, chosen, show, start_time)
