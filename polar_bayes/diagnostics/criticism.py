@@ -490,8 +490,9 @@ def _influence(
     if not named:
         return Finding("passed")
     named.sort(reverse=True)
+    which = "A reading decides" if len(named) == 1 else f"{len(named)} readings decide"
     sentence = (
-        f"{len(named)} readings decide the answer: without {listed([text for _, text in named])} a "
+        f"{which} the answer: without {listed([text for _, text in named])} a "
         f"parameter's mean would move by up to {named[0][0]:.1f} sd; repeat those readings."
     )
     return Finding("caution", statistic=named[0][0], sentence=sentence)
