@@ -2,6 +2,7 @@
 
     python benchmarks/model_criticism.py right --fits 1000   share of right models flagged
     python benchmarks/model_criticism.py wrong --fits 5      wrong worlds at 16, 40, 120 readings
+    python benchmarks/model_criticism.py cost                seconds beside those of a warm fit
 
 A fit is flagged where its verdict has a caution or a problem. It is silent and wrong where it is
 not flagged although the 95% interval of a material parameter misses the truth by more than 2 sds.
@@ -13,6 +14,7 @@ import argparse
 import dataclasses
 import json
 import platform
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -298,6 +300,22 @@ def _right(setup: str, readings: int, seed: int) -> dict[str, Any]:
     return judge(capture, truth, scene=setup, seed=seed)
 
 
+def cost() -> None:
+    """Print CPU seconds of a fit whose layout is compiled, and of its criticism."""
+
+    def seconds(run: Callable[[], Any]) -> tuple[Any, float]:
+        begun = time.process_time()
+        return run(), time.process_time() - begun
+
+    for setup in ("paper", "camera", "goniometer"):
+        scene, links = SETUPS[setup].scene, SETUPS[setup].links
+        first, second = (pb.simulate("plastic", scene=scene, links=links, seed=s) for s in (0, 1))
+        pb.diagnostics.criticize(pb.fit(first, scene=setup))
+        result, of_fit = seconds(lambda capture=second, name=setup: pb.fit(capture, scene=name))
+        _, of_checks = seconds(lambda fit=result: pb.diagnostics.criticize(fit))
+        print(f"{setup:12}fit {of_fit:6.2f} s  criticism {of_checks:5.2f} s")
+
+
 # --- Tables ---------------------------------------------------------------------------------------
 
 
@@ -328,11 +346,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("part", choices=("right", "wrong"))
+    parser.add_argument("part", choices=("right", "wrong", "cost"))
     parser.add_argument("--fits", type=int, default=5)
     parser.add_argument("--only", default="", help="worlds whose name holds this text")
-    parser.add_argument("--keep", type=Path, required=True, help="file of JSON lines")
+    parser.add_argument("--keep", type=Path, help="file of JSON lines", default="criticism.jsonl")
     asked = parser.parse_args()
+    if asked.part == "cost":
+        cost()
+        return
     lines = (
         [json.loads(text) for text in asked.keep.read_text().splitlines()]
         if asked.keep.exists()
