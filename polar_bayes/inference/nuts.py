@@ -221,6 +221,7 @@ def sample(
             rounds.append(jax.tree.map(lambda x: x[:, before:], steps))
         for halvings in range(MOST_HALVINGS + 1):
             if halvings:
+                warmup_steps += _stacked(rounds).n_steps.sum(axis=1)  # they are paid for, too
                 states, rounds = [_with_half_the_step(state) for state in states], []
             states = _until_converged(states, rounds, advance_all, settings)
             if not _stacked(rounds).diverging.any():

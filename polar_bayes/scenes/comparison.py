@@ -219,13 +219,13 @@ class _Fits:
         request = self.arguments.request(scene)
         try:
             tree = fit_request(request, METHOD, no_progress, begun, with_comparisons=False)
-            checks = predictive_checks(tree).values()
-            loo = [check.loo for check in checks if check.loo is not None]
+            checks = predictive_checks(tree)
+            loo = [check.loo for check in checks.values() if check.loo is not None]
             if not loo or len(loo) < len(checks):
                 raise FitError(
                     "its draws do not predict the readings", where=name, hint="fit it alone"
                 )
-            findings = criticize(tree)["level"]
+            findings = criticize(tree, checks)["level"]
         except (FitError, np.linalg.LinAlgError) as error:
             self.failed[name] = one_line(str(error))
             return
