@@ -64,7 +64,7 @@ print(checks[["level", "p_value"]].round(4).to_string())
 
 # %%
 comparison = pb.compare_scenes(capture)
-print(pb.scenes.scene_table(comparison).to_string())
+print(comparison.table[["elpd_diff", "dse", "weight", "criticism"]].round(2).to_string())
 print(*pb.scenes.scene_sentences(comparison), sep="\n")
 
 # %% [markdown]
@@ -80,6 +80,7 @@ print(f"{best}: n from {index.loc[best, 'q2.5']:.3f} to {index.loc[best, 'q97.5'
 
 # %% [markdown]
 # These are weighted draws, quick and approximate. `pb.fit(capture, scene="auto")` does the same and
-# samples the scenes that remain by NUTS, which takes some minutes under a sky, and stacks them;
+# samples the scenes that remain by NUTS, which can take a quarter of an hour under a sky, and
+# stacks them;
 # `pb.verdict` then judges the result as that of any other fit. What it still criticizes is worth
 # reading: no candidate explains all of these readings.
