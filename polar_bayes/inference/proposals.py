@@ -208,6 +208,7 @@ def fit_mixture(
     counts = weights / jnp.sum(weights**2)  # their sum is the effective sample size
     begin = jax.random.choice(key, len(x), (components,), replace=False, p=weights)
     unit = PRIOR_SCALE * jnp.eye(size, dtype=z.dtype)
+    products = (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)
 
     def improve(_: int, parts: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         log_share, mean, scale = parts
@@ -215,8 +216,8 @@ def fit_mixture(
         share = jax.nn.softmax(log_share - 0.5 * squares - log_volume, axis=-1) * counts[:, None]
         total = jnp.sum(share, axis=0) + 1e-3
         mean = (share.T @ x) / total[:, None]
-        centered = x[:, None] - mean
-        found = jnp.einsum("dk,dki,dkj->kij", share, centered, centered) / total[:, None, None]
+        second = ((share.T @ products) / total[:, None]).reshape(components, size, size)
+        found = second - mean[:, :, None] * mean[:, None, :]
         own = (total / (total + size + 2.0))[:, None, None]
         covariance = own * found + (1.0 - own) * unit
         return jnp.log(total / jnp.sum(total)), mean, jnp.linalg.cholesky(covariance)
