@@ -155,8 +155,8 @@ class Importance(AbstractMethod):
         )
 
 
-LEAST_COMPONENTS, DRAWS_PER_COMPONENT = 8, 512
-"""Of the mixtures of further rounds: a curved ridge needs many components, and each needs draws."""
+COMPONENTS = 8
+"""Of the mixtures of further rounds."""
 
 ENOUGH_SHARE = 0.2
 """Effective sample size, as a share of the draws of one round, after which no round follows."""
@@ -208,8 +208,7 @@ class _Rounds:
         missing = self._settings.rounds * self._settings.draws - len(self.z)
         z = np.pad(self.z, ((0, missing), (0, 0)))
         padded = np.pad(weights, (0, missing)).astype(z.dtype)
-        components = max(LEAST_COMPONENTS, self._settings.draws // DRAWS_PER_COMPONENT)
-        return _fit_mixture(jnp.asarray(z), jnp.asarray(padded), components, key)
+        return _fit_mixture(jnp.asarray(z), jnp.asarray(padded), COMPONENTS, key)
 
     def _blocks(self) -> list[np.ndarray]:
         return np.split(self.z, len(self.proposals)) if self.proposals else []
