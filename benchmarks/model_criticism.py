@@ -2,11 +2,13 @@
 
     python benchmarks/model_criticism.py right --fits 1000   share of right models flagged
     python benchmarks/model_criticism.py wrong --fits 5      wrong worlds at 16, 40, 120 readings
+    python benchmarks/model_criticism.py chosen --fits 100   coverage where the scene is chosen, too
     python benchmarks/model_criticism.py cost                seconds beside those of a warm fit
 
 A fit is flagged where its verdict has a caution or a problem. It is silent and wrong where it is
 not flagged although the 95% interval of a material parameter misses the truth by more than 2 sds.
-`right` draws the truth from the priors. Results are appended to a file of JSON lines, so that
+`right` draws the truth from the priors; `chosen` draws the scene as well, of ten, and fits with
+`scene="auto"`. Results are appended to a file of JSON lines, so that
 a run that was stopped goes on where it was.
 """
 
@@ -28,6 +30,7 @@ from scipy import stats
 import polar_bayes as pb
 from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.observation.links import noise_parameters
+from polar_bayes.scenes import scene_library
 from polar_bayes.setups import SETUPS
 from polar_bayes.simulation import Protocol
 
@@ -245,6 +248,9 @@ def judge(capture: xr.Dataset, truth: Mapping[str, float], **settings: Any) -> d
         for name, row in rows.items()
     }
     return {
+        "holds": {
+            name: bool(row["q2.5"] <= truth[name] <= row["q97.5"]) for name, row in rows.items()
+        },
         "levels": table["level"].to_dict(),
         "p_values": {name: p for name, p in table["p_value"].items() if np.isfinite(p)},
         "cautions": len(found.cautions),
@@ -279,7 +285,16 @@ def right(fits: int) -> Any:
 
 
 def _right(setup: str, readings: int, seed: int) -> dict[str, Any]:
-    scene, links = SETUPS[setup].scene, SETUPS[setup].links
+    layout = Protocol(views=readings, wavelengths=(), largest_view_zenith=80.0)
+    capture, truth = drawn_from_priors(setup, SETUPS[setup].scene, layout, seed)
+    return judge(capture, truth, scene=setup, seed=seed)
+
+
+def drawn_from_priors(
+    setup: str, scene: pb.Scene, layout: Protocol, seed: int
+) -> tuple[xr.Dataset, dict[str, float]]:
+    """A capture whose parameters are drawn from their priors, and those of its material."""
+    links = SETUPS[setup].links
     keys = iter(jax.random.split(jax.random.key(seed), 64))
 
     def drawn(names: Any) -> dict[str, Any]:
@@ -291,13 +306,67 @@ def _right(setup: str, readings: int, seed: int) -> dict[str, Any]:
         "plastic",
         scene=scene,
         links=links,
-        protocol=Protocol(views=readings, wavelengths=(), largest_view_zenith=80.0),
+        protocol=layout,
         parameters=parameters,
         noise=noise,
         seed=seed,
     )
-    truth = {name: float(parameters[name]) for name in MATERIAL if name in parameters}
-    return judge(capture, truth, scene=setup, seed=seed)
+    return capture, {name: float(parameters[name]) for name in MATERIAL if name in parameters}
+
+
+# --- The scene is drawn, too ----------------------------------------------------------------------
+
+
+class Mirrored(Protocol):
+    """Every view is in the mirror direction of the light, as on a goniometer."""
+
+    def angles(self) -> dict[str, np.ndarray]:
+        """Directions of every view."""
+        found = super().angles()
+        zenith = found["view_zenith"]
+        return found | {
+            "light_zenith": zenith,
+            "view_azimuth": np.full(zenith.size, 180.0),
+        }
+
+
+LAYOUTS: Mapping[str, Protocol] = {
+    "goniometer": Mirrored(views=30, largest_view_zenith=78.0, wavelengths=()),
+    "paper": Protocol(views=40, largest_view_zenith=80.0, wavelengths=()),
+    "camera": Protocol(views=24, largest_view_zenith=80.0, wavelengths=()),
+}
+CHOICES: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("goniometer", ("mirror", "", "")),
+    ("goniometer", ("mirror", "unpolarized body", "")),
+    ("goniometer", ("mirror", "", "systematic errors")),
+    ("goniometer", ("mirror", "unpolarized body", "systematic errors")),
+    ("goniometer", ("sky", "", "systematic errors")),
+    ("paper", ("rough surface", "depolarizing body", "")),
+    ("paper", ("rough surface", "Lambertian body", "")),
+    ("paper", ("rough surface", "depolarizing body", "systematic errors")),
+    ("camera", ("rough surface", "Lambertian body", "", "")),
+    ("camera", ("rough surface", "unpolarized body", "", "leaning normal")),
+)
+"""Set-ups and the options that make a scene, as `scene_library` names them."""
+
+
+def chosen(fits: int) -> Any:
+    """Scenes drawn at random, with their parameters; the fit chooses its scene."""
+    random = np.random.default_rng(0)
+    for seed, which in enumerate(random.integers(0, len(CHOICES), fits)):
+        setup, choice = CHOICES[which]
+        name = f"{setup}: {' + '.join(filter(None, choice))}"
+        yield f"{name}|{seed}", lambda s=setup, c=choice, k=seed: _chosen(s, c, k)
+
+
+def _chosen(setup: str, choice: tuple[str, ...], seed: int) -> dict[str, Any]:
+    layout = LAYOUTS[setup]
+    blank = pb.simulate("plastic", scene=setup, protocol=layout).assign_attrs(setup=setup)
+    library = scene_library(blank)
+    capture, truth = drawn_from_priors(setup, library.scene(choice), layout, seed)
+    begun = time.perf_counter()
+    found = judge(capture.assign_attrs(setup=setup), truth, scene="auto", seed=seed)
+    return found | {"seconds": round(time.perf_counter() - begun, 1)}
 
 
 def cost() -> None:
@@ -346,7 +415,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("part", choices=("right", "wrong", "cost"))
+    parser.add_argument("part", choices=("right", "wrong", "chosen", "cost"))
     parser.add_argument("--fits", type=int, default=5)
     parser.add_argument("--only", default="", help="worlds whose name holds this text")
     parser.add_argument("--keep", type=Path, help="file of JSON lines", default="criticism.jsonl")
@@ -360,7 +429,7 @@ def main() -> None:
         else []
     )
     done = {line["key"] for line in lines}
-    for key, run in {"right": right, "wrong": wrong}[asked.part](asked.fits):
+    for key, run in {"right": right, "wrong": wrong, "chosen": chosen}[asked.part](asked.fits):
         if key in done or asked.only not in key:
             continue
         try:
@@ -379,6 +448,10 @@ def main() -> None:
     silent = round(float((found["silent_and_wrong"] * found["fits"]).sum()))
     print("with a problem:", wilson(failed, len(lines)))
     print("silent and wrong:", wilson(silent, len(lines)))
+    held = pd.DataFrame([line.get("holds", {}) for line in lines])
+    for name, column in held.items():
+        known = column.dropna()
+        print(f"95% interval of {name} holds:", wilson(int(known.sum()), known.size))
     print("machine:", platform.machine(), "python", platform.python_version())
 
 

@@ -97,7 +97,7 @@ class Nuts(AbstractMethod):
         initialization = problem.initialize(progress)
         key_starts, key_chains = jax.random.split(key)
         target = initialization.target(key_starts, self.chains)
-        z, stats, mixed = sample(
+        z, stats, mixed, halvings = sample(
             self._sampler(target, problem),
             target,
             key_chains,
@@ -115,7 +115,11 @@ class Nuts(AbstractMethod):
             effective_draws=float(min(np.min(bulk), np.min(tail))),
             gradients=search + float(warmup + np.sum(stats["n_steps"])),
             densities=0.0,
-            metadata={"modes": initialization.metadata, "goals_reached": mixed},
+            metadata={
+                "modes": initialization.metadata,
+                "goals_reached": mixed,
+                "step_size_halvings": halvings,
+            },
         )
 
     @override
@@ -187,8 +191,8 @@ def sample(
     key: Array,
     settings: Nuts,
     progress: Callable[[float], None] = lambda _: None,
-) -> tuple[np.ndarray, dict[str, np.ndarray], bool]:
-    """Draws (chain, draw, size), statistics by name, and whether the chains reached the goals."""
+) -> tuple[np.ndarray, dict[str, np.ndarray], bool, int]:
+    """Draws (chain, draw, size), statistics, whether the goals were reached, halvings of steps."""
     warmup = sampler.static.warmup
     keys = jax.random.split(key, settings.chains)
     states = [sampler.init(target, key, at) for key, at in zip(keys, target.starts, strict=True)]
@@ -223,7 +227,9 @@ def sample(
             if halvings:
                 warmup_steps += _stacked(rounds).n_steps.sum(axis=1)  # they are paid for, too
                 states, rounds = [_with_half_the_step(state) for state in states], []
-            states = _until_converged(states, rounds, advance_all, settings)
+            states = _until_converged(
+                states, rounds, advance_all, settings, may_restart=halvings < MOST_HALVINGS
+            )
             if not _stacked(rounds).diverging.any():
                 break
     stats = jax.tree.map(lambda x: x[:, : settings.most_draws], _stacked(rounds))._asdict()
@@ -232,7 +238,7 @@ def sample(
     stats["step_size"] = np.broadcast_to(step_size[:, None], z.shape[:2])
     stats["warmup_steps"] = np.broadcast_to(warmup_steps[:, None], z.shape[:2])
     stats["reached_max_treedepth"] = stats["n_steps"] >= 2**settings.max_tree_depth - 1
-    return z, stats, _converged(rounds, settings)
+    return z, stats, _converged(rounds, settings), halvings
 
 
 def _until_converged(
@@ -240,13 +246,16 @@ def _until_converged(
     rounds: list[Step],
     advance_all: Callable[[list[infer.hmc.HMCState]], tuple[list[infer.hmc.HMCState], Step]],
     settings: Nuts,
+    *,
+    may_restart: bool,
 ) -> list[infer.hmc.HMCState]:
-    """Add blocks of draws to `rounds` until the goals or the limit of the settings are reached."""
+    """Add blocks of draws to `rounds` until the goals, the limit or a divergence is reached."""
     least, most = (-(-count // settings.block) for count in (settings.draws, settings.most_draws))
     for done in range(1, most + 1):
         states, steps = advance_all(states)
         rounds.append(steps)
-        if done >= least and _converged(rounds, settings):
+        diverged = may_restart and _stacked(rounds).diverging.any()
+        if diverged or (done >= least and _converged(rounds, settings)):
             break
     return states
 

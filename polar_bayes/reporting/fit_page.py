@@ -580,7 +580,7 @@ def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
 def provenance_facts(provenance: Mapping[str, Any]) -> list[page.Block]:
     """How the fit was made, in titled groups of names and values; swapped parts are marked."""
     keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
-    keys += ["chain_method", "largest_view_zenith"]
+    keys += ["chain_method", "step_size_halvings", "largest_view_zenith"]
     fit = {key.replace("_", " "): provenance[key] for key in keys if key in provenance}
     swapped = [str(name) for name in provenance.get("swapped") or ()]
     fit["swapped by the user"] = swapped or "nothing: all defaults"
