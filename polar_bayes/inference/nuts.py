@@ -227,9 +227,7 @@ def sample(
             if halvings:
                 warmup_steps += _stacked(rounds).n_steps.sum(axis=1)  # they are paid for, too
                 states, rounds = [_with_half_the_step(state) for state in states], []
-            states = _until_converged(
-                states, rounds, advance_all, settings, may_restart=halvings < MOST_HALVINGS
-            )
+            states = _until_converged(states, rounds, advance_all, settings)
             if not _stacked(rounds).diverging.any():
                 break
     stats = jax.tree.map(lambda x: x[:, : settings.most_draws], _stacked(rounds))._asdict()
@@ -246,16 +244,13 @@ def _until_converged(
     rounds: list[Step],
     advance_all: Callable[[list[infer.hmc.HMCState]], tuple[list[infer.hmc.HMCState], Step]],
     settings: Nuts,
-    *,
-    may_restart: bool,
 ) -> list[infer.hmc.HMCState]:
-    """Add blocks of draws to `rounds` until the goals, the limit or a divergence is reached."""
+    """Add blocks of draws to `rounds` until the goals or the limit of the settings are reached."""
     least, most = (-(-count // settings.block) for count in (settings.draws, settings.most_draws))
     for done in range(1, most + 1):
         states, steps = advance_all(states)
         rounds.append(steps)
-        diverged = may_restart and _stacked(rounds).diverging.any()
-        if diverged or (done >= least and _converged(rounds, settings)):
+        if done >= least and _converged(rounds, settings):
             break
     return states
 

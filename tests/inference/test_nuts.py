@@ -33,7 +33,7 @@ def test_how_draws_are_cut_into_blocks_changes_nothing() -> None:
             here = target(3, 2)
             sampler = nuts.Sampler(density, settings.static(here))
             told.append(nuts.sample(sampler, here, jax.random.key(1), settings))
-    (z, stats, _), (again, others, _) = told
+    (z, stats, *_), (again, others, *_) = told
     assert z.shape == (2, 120, 3)
     assert np.array_equal(z, again)
     for name in ("n_steps", "warmup_steps", "energy"):
