@@ -8,10 +8,13 @@ materials before a camera, by roughness: each pixel infers its own exposure, noi
 
 import itertools
 import sys
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 
 import jax
 import numpy as np
+import xarray as xr
 
 import polar_bayes as pb
 
@@ -27,10 +30,12 @@ METHODS = {
 
 CAMERA_SIDE = 30
 BANDS = (0.0, 0.03, 0.1, 0.2, 0.4, np.inf)
+BY_CHAINS = 12
+"""Good pixels of the lowest band that are also fitted by chains."""
 
 
 def by_roughness() -> None:
-    """Print how often 95% intervals of good pixels hold the truth, by the true roughness."""
+    """Print how often intervals of good pixels hold the truth, by the true roughness."""
     keys = jax.random.split(jax.random.key(3), 4)
     names = ("roughness", "subsurface_fraction", "refractive_index", "dolp_gain")
     truth = {
@@ -41,17 +46,22 @@ def by_roughness() -> None:
     image = pb.simulate("plastic", scene="camera", protocol=protocol, parameters=truth, seed=1)
     maps = pb.fit_pixels(image)
     print(f"camera: {pb.maps.count_pixels(maps)}")
-    good = maps["status"].to_numpy() == 0
+    roughness = image["true_roughness"]
     for low, high in itertools.pairwise(BANDS):
-        band = good & (truth["roughness"] >= low) & (truth["roughness"] < high)
-        held = {}
-        for name in names:
-            ends = (maps[f"{name}_quantile"].sel(quantile=q).to_numpy() for q in (0.025, 0.975))
-            least, most = ends
-            held[name] = float(
-                ((least <= truth[name]) & (truth[name] <= most))[band].mean().round(3)
-            )
-        print(f"roughness {low} to {high}: {band.sum()} pixels, 95% holds", held)
+        # Pixels of other bands have no known truth, and are not counted.
+        in_band = image.where((roughness >= low) & (roughness < high))
+        print(f"roughness {low} to {high}")
+        print(pb.diagnostics.map_coverage(maps, in_band)[["answered", "held_95"]].round(3))
+    good = np.argwhere(((maps["status"] == 0) & (roughness < BANDS[1])).to_numpy())
+    held = [held_by_chains(image.isel(y=y, x=x, drop=True), names) for y, x in good[:BY_CHAINS]]
+    print(f"by NUTS, of {len(held)} such pixels below {BANDS[1]}:", dict(sum(held, Counter())))
+
+
+def held_by_chains(pixel: xr.Dataset, names: Iterable[str]) -> Counter[str]:
+    """Parameters whose 95% interval holds the truth where the pixel is a capture of its own."""
+    rows = pb.summary(pb.fit(pixel))
+    truth = {name: float(pixel[f"true_{name}"]) for name in names}
+    return Counter(n for n in names if rows["q2.5"][n] <= truth[n] <= rows["q97.5"][n])
 
 
 def main() -> None:
