@@ -265,7 +265,7 @@ class Priors(dict[str, dist.Distribution]):
 
 _ROWS: dict[str, dist.Distribution] = {
     # The material: the paper, section 2.
-    "roughness": dist.HalfNormal(0.2),
+    "roughness": HalfNormal(0.2),
     "subsurface_fraction": Beta(2.0, 2.0),
     "absorption": dist.LogNormal(-1.0, 0.5),
     "refractive_index": dist.TruncatedNormal(1.45, 0.15, low=1.2, high=2.0),

@@ -15,6 +15,7 @@ from numpyro import distributions as dist
 
 from polar_bayes.errors import SceneError
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
+from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.priors import (
@@ -94,6 +95,9 @@ def default_priors(setup: Setup, capture: xr.Dataset) -> dict[str, dist.Distribu
     priors = {**setup.priors, "angle_zero": ANGLE_ZERO[attrs.get("angle_set_by", "hand")]}
     if attrs.get("incident_levels") == "not given":
         priors["channel_gain_ratio"] = UNCHECKED_GAIN
+    for term in setup.scene.instrument.terms if setup.scene.instrument else ():
+        if isinstance(term, Discrepancy):  # as many weights as it has basis functions
+            priors["discrepancy_weights"] = dist.Normal(0.0, 1.0).expand([term.basis]).to_event(1)
     return {name: prior for name, prior in priors.items() if name in setup.scene.parameters}
 
 

@@ -22,6 +22,7 @@ from numpyro.infer.autoguide import AutoLaplaceApproximation
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.conditional_reparam import ConditionalReparam, find_coefficients
 from polar_bayes.inference.hierarchical_reparam import (
     FittedReparam,
     GroupModel,
@@ -34,10 +35,13 @@ from polar_bayes.inference.optimize import (
     Modes,
     NumpyPotential,
     ValueAndGradient,
+    distinct_modes,
+    find_mode,
     find_modes,
     from_prior,
+    ignore_line_search_warnings,
 )
-from polar_bayes.inference.program import Model, Program
+from polar_bayes.inference.program import Model, Program, finite_log_density, in_blocks
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress
 
@@ -69,6 +73,40 @@ class Target(NamedTuple):
     warmup: int = 300
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Coordinates:
+    """Coordinates of the posterior of one material: the program's, or standardized ones.
+
+    Args:
+        density: Minus the log density, from coordinates and `given`; one object for all captures
+            of a layout.
+        given: The capture, and what the coordinates depend on.
+        potential: `density` of this capture, with its gradient.
+        log_densities: Log densities of a block of vectors, compiled.
+        modes: The modes in these coordinates.
+        to_program: From these coordinates to the program's, for a block of vectors, compiled; None
+            where they are the same.
+    """
+
+    density: Callable[[Array, Any], Array]
+    given: Any
+    potential: ValueAndGradient
+    log_densities: JitOnce
+    modes: Modes
+    to_program: JitOnce | None = None
+
+    def log_density(self, x: np.ndarray) -> np.ndarray:
+        """Log posterior densities of vectors, (draw, size)."""
+        return finite_log_density(self.log_densities, x, self.given, self.modes.z.dtype)
+
+    def forward(self, x: np.ndarray) -> np.ndarray:
+        """Coordinates of the program, (..., size)."""
+        if self.to_program is None:
+            return x
+        flat = x.reshape(-1, x.shape[-1])
+        return in_blocks(self.to_program, flat, self.given, x.dtype).reshape(x.shape)
+
+
 class AbstractInit(abc.ABC):
     """Where draws start: what every method may ask of the modes, however they were found."""
 
@@ -93,6 +131,10 @@ class AbstractInit(abc.ABC):
         """The modes of all coordinates together; a `FitError` where groups have modes each."""
 
     @abc.abstractmethod
+    def joint_coordinates(self, where: str) -> Coordinates:
+        """Coordinates for draws of all together; a `FitError` where groups have modes each."""
+
+    @abc.abstractmethod
     def missed_mode_weight(self, z: np.ndarray) -> float:
         """Weight of the heaviest mode to which some chain of draws never came nearest."""
 
@@ -110,12 +152,50 @@ class JointInit(AbstractInit):
     @override
     def target(self, key: Array, chains: int) -> Target:
         random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-        modes, starts = self.modes, []
+        coordinates, starts = self.joint_coordinates("Nuts"), []
+        modes, potential = coordinates.modes, coordinates.potential
         for mode in random.choice(len(modes.weight), size=chains, p=modes.weight):
             start = random.multivariate_normal(modes.z[mode], modes.covariance[mode])
-            starts.append(start if np.isfinite(self.potential(start)[0]) else modes.z[mode])
-        density = self.initializer.program.potential_jit
-        return Target(density, self.data, self.potential, np.stack(starts), modes.covariance[0])
+            starts.append(start if np.isfinite(potential(start)[0]) else modes.z[mode])
+        return Target(
+            coordinates.density,
+            coordinates.given,
+            potential,
+            np.stack(starts),
+            modes.covariance[0],
+            coordinates.forward,
+        )
+
+    @override
+    def joint_coordinates(self, where: str) -> Coordinates:
+        return self._coordinates
+
+    @functools.cached_property
+    def _coordinates(self) -> Coordinates:
+        reparam, program = self.initializer.reparam, self.initializer.program
+        own = Coordinates(
+            program.potential_jit, self.data, self.potential, program.log_densities, self.modes
+        )
+        if reparam is None:
+            return own
+        dtype = self.data.brightness.dtype
+        given = reparam.inputs(self.modes.z[0], self.modes.covariance[0], self.data)
+        potential = NumpyPotential(reparam.value_and_gradient, given, dtype)
+        starts = [
+            np.asarray(reparam.inverse_jit(jnp.asarray(z, dtype), given)) for z in self.modes.z
+        ]
+        with ignore_line_search_warnings():
+            modes = distinct_modes([find_mode(potential, start) for start in starts])
+        if modes is None:
+            return own
+        return Coordinates(
+            reparam.potential_jit,
+            given,
+            potential,
+            reparam.log_densities,
+            modes,
+            reparam.forward_of_block,
+        )
 
     @override
     def laplace(self, key: Array, chains: int, draws: int) -> Draws:
@@ -177,8 +257,16 @@ class HierarchicalInit(AbstractInit):
         return self._to_program(noise), _weigh(self.fitted.potential, noise, noise)
 
     @override
+    def joint_coordinates(self, where: str) -> Coordinates:
+        raise self._no_joint_approximation(where)
+
+    @override
     def joint_modes(self, where: str) -> Modes:
-        raise FitError(
+        raise self._no_joint_approximation(where)
+
+    @staticmethod
+    def _no_joint_approximation(where: str) -> FitError:
+        return FitError(
             "it approximates one material; weights of many patches together are useless",
             where=where,
             hint="use method='nuts'",
@@ -210,8 +298,11 @@ class AbstractInitializer(abc.ABC):
         """The modes of one capture; a `FitError` where no start reached one."""
 
     @abc.abstractmethod
-    def expected_target(self, data: Observations) -> Target | None:
-        """A target of the shapes that the search will give; None where they are not known."""
+    def prepare_target(self, data: Observations) -> Target | None:
+        """A target of the shapes that the search will give, whose programs begin to compile.
+
+        None where the shapes are not known.
+        """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -219,6 +310,7 @@ class JointInitializer(AbstractInitializer):
     """For captures whose coordinates are optimized together."""
 
     program: Program
+    reparam: ConditionalReparam | None
 
     @functools.cached_property
     def guide(self) -> Callable[[Array, Array, Observations], tuple[Array, Array, Array]]:
@@ -239,10 +331,18 @@ class JointInitializer(AbstractInitializer):
         return JointInit(self, data, potential, modes, metadata)
 
     @override
-    def expected_target(self, data: Observations) -> Target:
-        size = self.program.size
+    def prepare_target(self, data: Observations) -> Target:
+        size, reparam = self.program.size, self.reparam
         starts, metric = np.zeros((1, size)), np.eye(size)
-        return Target(self.program.potential_jit, data, lambda z: (0.0, z), starts, metric)
+
+        def target(density: Callable, given: Any) -> Target:
+            return Target(density, given, lambda z: (0.0, z), starts, metric)
+
+        if reparam is None:
+            return target(self.program.potential_jit, data)
+        given = reparam.inputs(starts[0], metric, data)
+        reparam.value_and_gradient.begin(jnp.asarray(starts[0]), given)
+        return target(reparam.potential_jit, given)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -265,7 +365,7 @@ class HierarchicalInitializer(AbstractInitializer):
         return HierarchicalInit(fitted, metadata)
 
     @override
-    def expected_target(self, data: Observations) -> None:
+    def prepare_target(self, data: Observations) -> None:
         return None
 
 
@@ -274,7 +374,7 @@ def make_initializer(model: Model, program: Program, data: Observations) -> Abst
     groups = find_groups(program, data)
     group_model = None if groups is None else find_group_model(model, groups, data)
     if groups is None or group_model is None:
-        return JointInitializer(program)
+        return JointInitializer(program, find_coefficients(program, data))
     return HierarchicalInitializer(group_model, HierarchicalReparam(program, groups))
 
 

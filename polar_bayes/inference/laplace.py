@@ -20,7 +20,7 @@ import scipy.special
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.initialization import STARTS
+from polar_bayes.inference.initialization import STARTS, Coordinates
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import SETTLED, Modes
 from polar_bayes.inference.problem import Problem
@@ -119,14 +119,15 @@ class Importance(AbstractMethod):
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
         initialization = problem.initialize(progress)
         key_draw, key_resample = jax.random.split(key)
-        sample = _Rounds(problem, self)
-        proposal = laplace_mixture(initialization.joint_modes("Importance"), problem.dtype)
+        coordinates = initialization.joint_coordinates("Importance")
+        sample = _Rounds(coordinates, self, problem.dtype)
+        proposal = laplace_mixture(coordinates.modes, problem.dtype)
         sample.add(proposal, key_draw)
         while sample.calls_for_more and len(sample.proposals) < self.rounds:
             progress("weighting draws", len(sample.proposals) / self.rounds)
             key_draw, key_fit = jax.random.split(key_draw)
             sample.add(sample.fit(key_fit), key_draw)
-        z, weights, k_hat = sample.z, sample.weights, sample.k_hat
+        weights, k_hat = sample.weights, sample.k_hat
         if not np.isfinite(weights).all():
             raise FitError(
                 "the posterior density is zero at every draw",
@@ -134,6 +135,7 @@ class Importance(AbstractMethod):
                 hint="use method='nuts'",
             )
         effective = sample.effective
+        z = coordinates.forward(sample.z)
         index = systematic_resample(weights, effective, numpy_generator(key_resample))
         problems = []
         if not k_hat <= MAX_PARETO_K:
@@ -169,11 +171,11 @@ raised to a power below 1."""
 class _Rounds:
     """Draws of all rounds, weighted over the mean density of their proposals."""
 
-    def __init__(self, problem: Problem, settings: Importance) -> None:
-        self._problem, self._settings = problem, settings
+    def __init__(self, coordinates: Coordinates, settings: Importance, dtype: np.dtype) -> None:
+        self._coordinates, self._settings = coordinates, settings
         self.proposals: list[Mixture] = []
-        size = problem.program.size
-        self.z, self.log_posterior = np.empty((0, size), problem.dtype), np.empty(0)
+        size = coordinates.modes.z.shape[1]
+        self.z, self.log_posterior = np.empty((0, size), dtype), np.empty(0)
         self._log_proposals = np.empty((0, 0))  # (proposal, draw)
 
     def add(self, proposal: Mixture, key: Array) -> None:
@@ -187,7 +189,7 @@ class _Rounds:
         self._log_proposals = np.concatenate([above, below[None]])
         self.proposals.append(proposal)
         self.z = np.concatenate([self.z, z])
-        self.log_posterior = np.concatenate([self.log_posterior, self._problem.log_density(z)])
+        self.log_posterior = np.concatenate([self.log_posterior, self._coordinates.log_density(z)])
         mean = scipy.special.logsumexp(self._log_proposals, axis=0) - math.log(len(self.proposals))
         self.log_ratios = self.log_posterior - mean
         weights, k_hat = smooth(self.log_ratios[None])

@@ -124,7 +124,7 @@ class Nuts(AbstractMethod):
 
     @override
     def prepare(self, problem: Problem) -> None:
-        target = problem.compiled_model.initializer.expected_target(problem.data)
+        target = problem.compiled_model.initializer.prepare_target(problem.data)
         if target is None:
             return
         sampler = self._sampler(target, problem)
@@ -136,7 +136,7 @@ class Nuts(AbstractMethod):
         """The compiled sampler of these settings."""
         static = self.static(target)
         return problem.compiled_model.programs.of(
-            ("nuts", static), lambda: Sampler(target.density, static)
+            ("nuts", target.density, static), lambda: Sampler(target.density, static)
         )
 
     def static(self, target: Target) -> "Static":

@@ -20,7 +20,6 @@ from numpyro import distributions as dist
 
 from polar_bayes.inference.compile import (
     TRACING_LOCK,
-    JitOnce,
     LRUCache,
     cache_key,
     layout_of,
@@ -32,6 +31,7 @@ from polar_bayes.inference.program import (
     Program,
     Values,
     compile_program,
+    finite_log_density,
 )
 from polar_bayes.inference.request import Request, bind_model
 from polar_bayes.observation.data import Observations, observe
@@ -43,12 +43,6 @@ MAX_LAYOUTS = 8
 
 MAX_PROGRAMS = 16
 """Further programs that methods have made of one of them, by settings, that stay compiled."""
-
-DENSITY_BLOCK = 1024
-"""Draws whose density one call computes: one compiled program serves any number."""
-
-SIDE_BY_SIDE = 64
-"""Of these, draws that are vectorized over."""
 
 BLOCK = 500
 """Draws that one call predicts or constrains."""
@@ -85,17 +79,6 @@ class CompiledModel:
             return self.program
         with jax.enable_x64(False), TRACING_LOCK:
             return compile_program(self.bind(), self.layout.in_single_precision())
-
-    @functools.cached_property
-    def log_densities(self) -> Callable[[Array, Observations], Array]:
-        """Log posterior density of a block of unconstrained vectors, compiled."""
-
-        def compute(z: Array, data: Observations) -> Array:
-            return jax.lax.map(
-                lambda z: -self.program.potential_jit(z, data), z, batch_size=SIDE_BY_SIDE
-            )
-
-        return JitOnce(compute)
 
 
 _COMPILED: LRUCache[CompiledModel] = LRUCache(MAX_LAYOUTS)
@@ -221,13 +204,7 @@ class Problem:
         Returns:
             Log densities, shape (draw,); minus infinity where there is none.
         """
-        count, parts = len(z), []
-        for begin in range(0, count, DENSITY_BLOCK):
-            index = np.minimum(np.arange(begin, begin + DENSITY_BLOCK), count - 1)
-            found = self.compiled_model.log_densities(jnp.asarray(z[index]), self.data)
-            parts.append(np.asarray(found, float))
-        whole = np.concatenate(parts)[:count]
-        return np.where(np.isnan(whole), -np.inf, whole)
+        return finite_log_density(self.program.log_densities, z, self.data, self.dtype)
 
     def constrain(self, z: Float[np.ndarray, "chain draw size"]) -> Values:
         """Parameters of draws, in their supports.

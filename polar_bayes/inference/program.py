@@ -29,6 +29,12 @@ from polar_bayes.priors import PriorTable, check_support
 
 Model = Callable[[Observations], None]
 
+DENSITY_BLOCK = 1024
+"""Vectors that one call evaluates: one compiled program serves any number."""
+
+SIDE_BY_SIDE = 64
+"""Of these, vectors that are vectorized over."""
+
 Values = dict[str, Array] | dict[str, np.ndarray]
 
 
@@ -78,16 +84,22 @@ class Program:
 
     def constrain(self, z: Float[Array, " size"]) -> dict[str, Array]:
         """The latent sites in their supports."""
-        return {
-            name: dist.biject_to(self.supports[name])(value)
-            for name, value in self.unravel(z).items()
-        }
+        return self._constrain(self.unravel(z))
+
+    def _constrain(self, sites: dict[str, Array]) -> dict[str, Array]:
+        return {name: dist.biject_to(self.supports[name])(x) for name, x in sites.items()}
 
     def trace(
         self, z: Float[Array, " size"], data: Observations, key: Array | None = None
     ) -> dict[str, dict]:
         """The sites of the model at an unconstrained vector."""
-        fixed = handlers.substitute(self.model, data=self.constrain(z))
+        return self.trace_at(self.unravel(z), data, key)
+
+    def trace_at(
+        self, sites: dict[str, Array], data: Observations, key: Array | None = None
+    ) -> dict[str, dict]:
+        """The same of the unconstrained latent sites by name."""
+        fixed = handlers.substitute(self.model, data=self._constrain(sites))
         return _trace(fixed, jax.random.key(0) if key is None else key, data)
 
     def parameters(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
@@ -149,6 +161,11 @@ class Program:
         return JitOnce(jax.value_and_grad(self.potential_jit))
 
     @functools.cached_property
+    def log_densities(self) -> JitOnce:
+        """Log posterior density of many unconstrained vectors, compiled."""
+        return side_by_side(lambda z, data: -self.potential_jit(z, data))
+
+    @functools.cached_property
     def drawn_from_prior(self) -> Callable[[np.ndarray, int, Observations], Array]:
         """Vectors drawn from the prior, compiled: one for each of the first `count` keys."""
         # The others are zero, so that one program serves any count.
@@ -182,6 +199,30 @@ class Program:
     def slopes(self) -> Callable[[Array], dict[str, Array]]:
         """Jacobian of `constrain`, compiled."""
         return JitOnce(jax.jacfwd(self.constrain))
+
+
+def side_by_side(function: Callable[[Array, Any], Array]) -> JitOnce:
+    """A function of a vector and further inputs, compiled for a block of vectors."""
+
+    def of_block(z: Array, given: Any) -> Array:
+        return jax.lax.map(lambda one: function(one, given), z, batch_size=SIDE_BY_SIDE)
+
+    return JitOnce(of_block)
+
+
+def in_blocks(function: JitOnce, z: np.ndarray, given: Any, dtype: np.dtype) -> np.ndarray:
+    """What a function that `side_by_side` compiled gives for any number of vectors."""
+    count, parts = len(z), []
+    for begin in range(0, count, DENSITY_BLOCK):
+        index = np.minimum(np.arange(begin, begin + DENSITY_BLOCK), count - 1)
+        parts.append(np.asarray(function(jnp.asarray(z[index], dtype), given), float))
+    return np.concatenate(parts)[:count]
+
+
+def finite_log_density(function: JitOnce, z: np.ndarray, given: Any, dtype: np.dtype) -> np.ndarray:
+    """Log densities of vectors; minus infinity where there is none."""
+    found = in_blocks(function, z, given, dtype)
+    return np.where(np.isnan(found), -np.inf, found)
 
 
 def compile_program(model: Model, data: Observations) -> Program:

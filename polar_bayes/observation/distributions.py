@@ -145,6 +145,13 @@ class SensorStudentT(dist.Distribution):
         """The noise-free reading, within the limits of the sensor."""
         return jnp.clip(self.location, 0.0, self.full_scale)
 
+    @property
+    @override
+    def variance(self) -> Array:
+        """That of the noise, as if the sensor had no limits."""
+        freedom = self.degrees_of_freedom
+        return self.scale**2 * (freedom / (freedom - 2.0) if freedom > 2.0 else math.inf)
+
 
 def log_density(distance: Float[Array, "..."], degrees_of_freedom: float) -> Float[Array, "..."]:
     """Log density of Student's t, in the precision of `distance`."""

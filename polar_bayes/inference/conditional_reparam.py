@@ -1,0 +1,200 @@
+r"""Coefficients of a linear term, standardized given all other coordinates.
+
+The weights w of a smooth discrepancy can imitate most of what the other parameters do to the
+readings. Each set of those parameters therefore has weights of its own, known to the accuracy of
+the readings, and the posterior is a thin curved sheet that chains follow in short steps. Given the
+other coordinates, however, the weights have a posterior about normal, whose mean and precision one
+Gauss-Newton step finds. Chains run in the coordinates c that it standardizes:
+
+$$ w = w_0 + P^{-1} g + L^{-T} c, \qquad P = L L^T = J^T K J + \Lambda, \qquad
+   g = J^T K r - \Lambda (w_0 - \mu) $$
+
+with J the slopes of the readings' means by w, K one over their variances, r the residuals at $w_0$,
+and $\mu$ and $\Lambda$ mean and precision of the normal prior. The point
+$w_0$ follows the regression of w on the other coordinates at the posterior mode. The density is
+exact whatever J, K and $w_0$ are: they only decide how efficient sampling is.
+
+Source:
+    Papaspiliopoulos, Roberts and Skold 2007, "A general framework for the parametrization of
+    hierarchical models", Statist. Sci. 22(1), 59-73 (partial non-centering).
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array, Float
+from numpyro import distributions as dist
+
+from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.program import Program, side_by_side
+from polar_bayes.observation.data import Observations
+
+MOST_COEFFICIENTS = 16
+"""More than so many are left as they are: their precision is factored for every gradient."""
+
+
+class ExpansionPoint(eqx.Module):
+    """The posterior mode, and the regression of the coefficients on the other coordinates there."""
+
+    others: Float[Array, " other"]
+    coefficients: Float[Array, " coefficient"]
+    slope: Float[Array, "coefficient other"]
+
+
+class ReparamInputs(eqx.Module):
+    """The arguments of the potential besides the coordinates."""
+
+    point: ExpansionPoint
+    data: Observations
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ConditionalReparam:
+    """The map between coordinates x, in which the coefficients are standardized, and a program's.
+
+    Other coordinates are the same in both, and every coordinate keeps its position.
+    """
+
+    program: Program
+    names: tuple[str, ...]
+    coefficients: np.ndarray
+    others: np.ndarray
+
+    def potential(self, x: Float[Array, " size"], given: ReparamInputs) -> Float[Array, ""]:
+        """Minus the log density of x, up to a constant."""
+        w, log_volume = self._coefficients(x, given)
+        # Not of one flat vector: the optics, which depend on other sites only, are then found to be
+        # the same as in the Gauss-Newton step, and computed once.
+        sites = self.program.unravel(x) | self._by_name(w)
+        return self.program.potential_at(sites, given.data) - log_volume
+
+    def forward(self, x: Float[Array, " size"], given: ReparamInputs) -> Float[Array, " size"]:
+        """Coordinates of the program."""
+        return x.at[self.coefficients].set(self._coefficients(x, given)[0])
+
+    def inverse(self, z: Float[Array, " size"], given: ReparamInputs) -> Float[Array, " size"]:
+        """The coordinates x of a vector of the program."""
+        mean, lower = self._conditional(z, given)
+        return z.at[self.coefficients].set(lower.T @ (z[self.coefficients] - mean))
+
+    @functools.cached_property
+    def potential_jit(self) -> Callable[[Array, ReparamInputs], Array]:
+        """The potential; the model is traced once, however many programs compute it."""
+        return jax.jit(self.potential, inline=True)
+
+    @functools.cached_property
+    def value_and_gradient(self) -> JitOnce:
+        """The potential with its gradient, compiled."""
+        return JitOnce(jax.value_and_grad(self.potential_jit))
+
+    @functools.cached_property
+    def log_densities(self) -> JitOnce:
+        """Log densities of many vectors, compiled."""
+        return side_by_side(lambda x, given: -self.potential_jit(x, given))
+
+    @functools.cached_property
+    def forward_of_block(self) -> JitOnce:
+        """`forward` of many vectors, compiled."""
+        return side_by_side(self.forward)
+
+    @functools.cached_property
+    def inverse_jit(self) -> JitOnce:
+        """`inverse`, compiled."""
+        return JitOnce(self.inverse)
+
+    def inputs(self, mode: np.ndarray, covariance: np.ndarray, data: Observations) -> ReparamInputs:
+        """The map around a mode of the program, with the posterior covariance there."""
+        among = covariance[np.ix_(self.others, self.others)]
+        across = covariance[np.ix_(self.coefficients, self.others)]
+        parts = mode[self.others], mode[self.coefficients], np.linalg.solve(among, across.T).T
+        dtype = data.brightness.dtype
+        return ReparamInputs(ExpansionPoint(*(jnp.asarray(part, dtype) for part in parts)), data)
+
+    def _coefficients(
+        self, x: Float[Array, " size"], given: ReparamInputs
+    ) -> tuple[Float[Array, " coefficient"], Float[Array, ""]]:
+        """The coefficients, and the log volume of the map."""
+        mean, lower = self._conditional(x, given)
+        noise = solve_triangular(lower, x[self.coefficients], trans=1, lower=True)
+        return mean + noise, -jnp.sum(jnp.log(jnp.diagonal(lower)))
+
+    def _conditional(
+        self, x: Float[Array, " size"], given: ReparamInputs
+    ) -> tuple[Float[Array, " coefficient"], Float[Array, "coefficient coefficient"]]:
+        """Mean of the coefficients given the others, and Cholesky factor of their precision."""
+        point, program = given.point, self.program
+        sites = program.unravel(x)
+        start = point.coefficients + point.slope @ (x[self.others] - point.others)
+
+        def predict(w: Array) -> tuple[list[Array], Any]:
+            """Means of all readings; and these with variances, readings and the priors of w."""
+            trace = program.trace_at(sites | self._by_name(w), given.data)
+            noise = [moments(trace[name]["fn"], trace[name]["value"]) for name in program.observed]
+            priors = [trace[name]["fn"] for name in self.names]
+            means, variances, readings = zip(*noise, strict=True)
+            return list(means), (means, variances, readings, priors)
+
+        slopes, (means, variances, readings, priors) = jax.jacfwd(predict, has_aux=True)(start)
+        center = jnp.concatenate([jnp.ravel(prior.mean) for prior in priors])
+        stiffness = 1.0 / jnp.concatenate([jnp.ravel(prior.variance) for prior in priors])
+        precision, pull = jnp.diag(stiffness), stiffness * (center - start)
+        for slope, mean, variance, reading in zip(slopes, means, variances, readings, strict=True):
+            weight = jnp.where(given.data.valid, 1.0 / variance, 0.0)
+            residual = jnp.where(given.data.valid, reading - mean, 0.0)
+            precision = precision + jnp.einsum("...i,...,...j->ij", slope, weight, slope)
+            pull = pull + jnp.einsum("...i,...->i", slope, weight * residual)
+        lower = jnp.linalg.cholesky(precision)
+        return start + cho_solve((lower, True), pull), lower
+
+    def _by_name(self, w: Array) -> dict[str, Array]:
+        found, begin = {}, 0
+        for name in self.names:
+            shape = self.program.events[name]
+            count = int(np.prod(shape))
+            found[name] = w[begin : begin + count].reshape(shape)
+            begin += count
+        return found
+
+
+def moments(distribution: dist.Distribution, reading: Array) -> tuple[Array, Array, Array]:
+    """Mean and variance of a reading and the reading, where they are normal if anything is."""
+    while isinstance(distribution, dist.MaskedDistribution | dist.TransformedDistribution):
+        if isinstance(distribution, dist.TransformedDistribution):
+            for transform in reversed(distribution.transforms):
+                reading = transform.inv(reading)
+        distribution = distribution.base_dist
+    return distribution.mean, distribution.variance, reading
+
+
+def find_coefficients(program: Program, data: Observations) -> ConditionalReparam | None:
+    """The map over vectors with a normal prior that no plate repeats; None without any."""
+    positions = program.unravel(jnp.arange(float(program.size)))
+    names = tuple(
+        name
+        for name in positions
+        if program.families[name] == "Normal"
+        and program.events[name]
+        and not program.dims[name]
+        and name not in program.auxiliary
+    )
+    found = [np.asarray(positions[name]).ravel().astype(int) for name in names]
+    count = sum(len(each) for each in found)
+    if not 0 < count <= MOST_COEFFICIENTS or count == program.size:
+        return None
+    coefficients = np.concatenate(found)
+    others = np.setdiff1d(np.arange(program.size), coefficients)
+    reparam = ConditionalReparam(program, names, coefficients, others)
+    size = program.size
+    try:
+        given = reparam.inputs(np.zeros(size), np.eye(size), data)
+        jax.eval_shape(reparam.potential, jnp.zeros(size), given)
+    except NotImplementedError:  # a link's distribution without mean or variance
+        return None
+    return reparam
