@@ -5,6 +5,7 @@ import inspect
 import pytest
 from cases import each
 
+import polar_bayes as pb
 from polar_bayes.errors import SceneError
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import SCENES, Scene
@@ -71,3 +72,11 @@ def test_an_unknown_name_is_answered_with_the_known_ones(name):
 def test_the_docstring_of_a_setup_names_every_field():
     for field in Setup.__dataclass_fields__:
         assert f"{field}:" in inspect.getdoc(Setup)
+
+
+def test_a_discrepancy_of_more_functions_has_as_many_weights():
+    layout = pb.simulation.Protocol(views=24, wavelengths=(), azimuths=(180.0,))
+    plate = pb.simulate("glass", scene="goniometer", protocol=layout)
+    local = pb.instrument.Instrument((pb.instrument.Discrepancy(basis=6, length=15.0),))
+    fitted = pb.fit(plate, scene=Scene(pb.SmoothSurface(), instrument=local), method="point")
+    assert fitted["posterior"]["discrepancy_weights"].shape[-1] == 6

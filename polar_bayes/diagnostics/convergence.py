@@ -24,6 +24,7 @@ from polar_bayes.diagnostics.parameters import (
     posterior_scalars,
     stats_of,
 )
+from polar_bayes.diagnostics.predictive import pareto_smoothed
 from polar_bayes.inference.result import bounds_of, provenance_of
 from polar_bayes.priors import RANGES
 
@@ -169,9 +170,8 @@ def _smoothed_weights(result: xr.DataTree) -> tuple[np.ndarray, float]:
     if np.ptp(log_weight) < 1e-12:
         return np.full(log_weight.size, 1.0 / log_weight.size), -math.inf
     with np.errstate(all="ignore"):  # smoothing an extreme tail overflows inside ArviZ
-        # psislw expects log likelihoods, which are minus the log ratios: hence the sign.
-        smoothed, k_hat = array_stats.psislw(-log_weight)
-        return np.exp(smoothed - logsumexp(smoothed)), float(k_hat)
+        smoothed, k_hat = pareto_smoothed(log_weight)
+        return np.exp(smoothed - logsumexp(smoothed)), k_hat
 
 
 def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:

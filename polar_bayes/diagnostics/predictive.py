@@ -200,7 +200,7 @@ def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | N
     log_weights, pareto_k = np.zeros_like(ratios), np.full(count, -np.inf)
     with np.errstate(all="ignore"):  # an extreme tail overflows: what is not known is NaN
         for i in np.flatnonzero(np.ptp(ratios, axis=0) > 1e-12):
-            log_weights[:, i], pareto_k[i] = array_stats.psislw(-ratios[:, i], r_eff=relative_ess)
+            log_weights[:, i], pareto_k[i] = pareto_smoothed(ratios[:, i], relative_ess)
         log_weights = log_weights - logsumexp(log_weights, axis=0)
         elpd = logsumexp(log_weights + log_likelihood, axis=0)
         p_loo = logsumexp(log_likelihood + base, axis=0) - logsumexp(base) - elpd
@@ -214,6 +214,16 @@ def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | N
         pointwise=elpd,
         weights=np.exp(log_weights),
     )
+
+
+def pareto_smoothed(log_ratios: np.ndarray, relative_ess: float = 1.0) -> tuple[np.ndarray, float]:
+    """Pareto-smoothed log weights of draws and k-hat; as they are and infinity without a tail."""
+    try:
+        # psislw expects log likelihoods, which are minus the log ratios: hence the sign.
+        smoothed, k_hat = array_stats.psislw(-log_ratios, r_eff=relative_ess)
+    except ValueError:  # chains that stand still have some values only, and the largest fills it
+        return log_ratios, math.inf
+    return smoothed, float(k_hat)
 
 
 def _relative_ess(result: xr.DataTree) -> float:

@@ -6,7 +6,6 @@ angle zero without a discrepancy explains by a shifted angle what a smooth error
 """
 
 import dataclasses
-import itertools
 from collections.abc import Collection, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -27,9 +26,6 @@ from polar_bayes.setups import SETUPS, Setup
 
 MIRROR_TOLERANCE = 0.5
 """Largest difference of a view from the mirror direction of the light, unit degree."""
-
-LOCAL = Discrepancy(basis=12, length=8.0)
-"""Errors of some neighboring views, such as a reflection of the bench."""
 
 Choice = tuple[str, ...]
 """The option of each slot, by name; "" where the slot stays empty."""
@@ -59,8 +55,7 @@ class SceneLibrary:
         bodies: Bodies under the surface, by name; the first is the one that is added, the others
             are compared with it.
         mixing: How surface and body add up.
-        others: Parts by the field of the scene and by name; one of each field may be there, the
-            simplest first.
+        others: Parts by the field of the scene and by name, each of which may be there or not.
     """
 
     surfaces: Mapping[str, Any]
@@ -117,10 +112,8 @@ class SceneLibrary:
             if surface != choice[0]:
                 yield (surface, *choice[1:])
         for slot, options in enumerate((self.bodies, *self.others.values()), start=1):
-            steps = ["", next(iter(options))] if slot == 1 else ["", *options]
-            following = dict(itertools.pairwise(steps)).get(choice[slot])
-            if following:
-                yield (*choice[:slot], following, *choice[slot + 1 :])
+            if not choice[slot]:
+                yield (*choice[:slot], next(iter(options)), *choice[slot + 1 :])
 
     def alternatives(self, choice: Choice) -> Iterator[Choice]:
         """Choices with another body, and those with one part less.
@@ -169,10 +162,7 @@ def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None)
         bodies=_bodies(setup, bool({"intensity", "dop"} & fitted)),
         mixing=StokesMixing() if mixing is None else mixing,
         others={
-            "instrument": {
-                "systematic errors": _systematic_errors(setup, Discrepancy()),
-                "local systematic errors": _systematic_errors(setup, LOCAL),
-            },
+            "instrument": {"systematic errors": _systematic_errors(setup)},
             **({"normal": {"leaning normal": TiltedNormal()}} if "u" in fitted else {}),
             **({"coat": {"thin film": _FILM}} if several_colors else {}),
         },
@@ -232,8 +222,8 @@ def _bodies(setup: Setup | None, shows_absorption: bool) -> Mapping[str, Any]:
     }
 
 
-def _systematic_errors(setup: Setup | None, discrepancy: Discrepancy) -> Instrument:
+def _systematic_errors(setup: Setup | None) -> Instrument:
     """The instrument terms of the set-up, an unknown angle zero, and a discrepancy."""
     given = setup.scene.instrument.terms if setup and setup.scene.instrument else ()
     kinds = (AngleZero, Discrepancy)
-    return Instrument((AngleZero(), *(t for t in given if not isinstance(t, kinds)), discrepancy))
+    return Instrument((AngleZero(), *(t for t in given if not isinstance(t, kinds)), Discrepancy()))
