@@ -84,6 +84,7 @@ class Coordinates:
         potential: `density` of this capture, with its gradient.
         log_densities: Log densities of a block of vectors, compiled.
         modes: The modes in these coordinates.
+        axes: Positions of the coordinates that are not standardized.
         to_program: From these coordinates to the program's, for a block of vectors, compiled; None
             where they are the same.
     """
@@ -93,6 +94,7 @@ class Coordinates:
     potential: ValueAndGradient
     log_densities: JitOnce
     modes: Modes
+    axes: np.ndarray
     to_program: JitOnce | None = None
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
@@ -174,7 +176,12 @@ class JointInit(AbstractInit):
     def _coordinates(self) -> Coordinates:
         reparam, program = self.initializer.reparam, self.initializer.program
         own = Coordinates(
-            program.potential_jit, self.data, self.potential, program.log_densities, self.modes
+            program.potential_jit,
+            self.data,
+            self.potential,
+            program.log_densities,
+            self.modes,
+            np.arange(program.size),
         )
         if reparam is None:
             return own
@@ -194,6 +201,7 @@ class JointInit(AbstractInit):
             potential,
             reparam.log_densities,
             modes,
+            reparam.others,
             reparam.forward_of_block,
         )
 

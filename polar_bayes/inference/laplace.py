@@ -20,12 +20,14 @@ import scipy.special
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.initialization import STARTS, Coordinates
+from polar_bayes.inference.initialization import Coordinates
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
-from polar_bayes.inference.optimize import SETTLED, Modes
+from polar_bayes.inference.optimize import SETTLED
 from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.profile_mixture import profile_mixture
 from polar_bayes.inference.proposals import Mixture, draw_mixture, fit_mixture, log_density
 from polar_bayes.inference.psis import (
+    FINITE_VARIANCE,
     MAX_PARETO_K,
     effective_draws,
     numpy_generator,
@@ -33,9 +35,6 @@ from polar_bayes.inference.psis import (
     systematic_resample,
 )
 from polar_bayes.progress import Progress
-
-LEAST_WEIGHT = 1e-3
-"""Share of the Laplace evidence; modes of less get no draws."""
 
 SIDE_BY_SIDE = 1024
 """Draws whose proposal density is computed together: that of all at once would fill the memory."""
@@ -92,11 +91,13 @@ class Laplace(AbstractMethod):
 class Importance(AbstractMethod):
     """Laplace with importance correction.
 
-    Draws come from a mixture of Student t distributions with 8 degrees of freedom, one at each
-    mode that holds 0.1% of the Laplace evidence or more, as heavy as its evidence. Weighting them
-    by the posterior corrects what the normal approximation gets wrong, as far as the mixture
-    reaches; Pareto k-hat says how far. In further rounds a mixture that is fitted to the weighted
-    draws of all rounds before proposes as many draws again, until there are enough effective ones.
+    Draws come from a mixture of Student t distributions with 8 degrees of freedom, at each mode
+    that holds 0.1% of the Laplace evidence or more and along the profiles of every coordinate
+    through it, each as heavy as the square root of its evidence. Weighting them by the posterior
+    corrects what the normal approximation gets wrong, as far as the mixture reaches; Pareto k-hat
+    says how far. In further rounds a mixture that is fitted to the weighted draws of all rounds
+    before proposes as many draws again, until there are enough effective ones and their weights
+    have a finite variance.
 
     Args:
         draws: Of the mixture of each round, at least 256.
@@ -121,8 +122,7 @@ class Importance(AbstractMethod):
         key_draw, key_resample = jax.random.split(key)
         coordinates = initialization.joint_coordinates("Importance")
         sample = _Rounds(coordinates, self, problem.dtype)
-        proposal = laplace_mixture(coordinates.modes, problem.dtype)
-        sample.add(proposal, key_draw)
+        sample.add(profile_mixture(coordinates), key_draw)
         while sample.calls_for_more and len(sample.proposals) < self.rounds:
             progress("weighting draws", len(sample.proposals) / self.rounds)
             key_draw, key_fit = jax.random.split(key_draw)
@@ -200,7 +200,7 @@ class _Rounds:
     def calls_for_more(self) -> bool:
         """Whether a further round is needed, and there are draws to which it can be fitted."""
         enough = self.effective >= ENOUGH_SHARE * self._settings.draws
-        reaches = self.k_hat <= MAX_PARETO_K
+        reaches = self.k_hat <= FINITE_VARIANCE
         return bool(np.isfinite(self.weights).all()) and not (enough and reaches)
 
     def fit(self, key: Array) -> Mixture:
@@ -246,20 +246,3 @@ def _temper(log_ratios: np.ndarray, least: float) -> np.ndarray:
 def _propose(proposal: Mixture, count: int, key: Array) -> tuple[Array, Array]:
     z = draw_mixture(proposal, count, key)
     return z, _log_densities(proposal, z)
-
-
-def laplace_mixture(modes: Modes, dtype: np.dtype) -> Mixture:
-    """A component for each heavy mode; always as many, so that one program draws from all."""
-    # There are never more modes than starts; a mode has several components where there are fewer.
-    heavy = np.flatnonzero(modes.weight >= LEAST_WEIGHT)
-    which = np.resize(heavy, max(STARTS, heavy.size))
-    times = np.bincount(which, minlength=len(modes.weight))[which]
-    share = modes.weight[which] / times
-    size = modes.z.shape[1]
-    return Mixture(
-        center=jnp.zeros(size, dtype),
-        half=jnp.eye(size, dtype=dtype),
-        log_share=jnp.asarray(np.log(share / share.sum()), dtype),
-        mean=jnp.asarray(modes.z[which], dtype),
-        scale=jnp.asarray(np.linalg.cholesky(modes.covariance[which]), dtype),
-    )

@@ -21,6 +21,7 @@ from polar_bayes.inference.laplace import Importance
 from polar_bayes.inference.least_squares import Point
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.psis import FINITE_VARIANCE
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.progress import Progress
 from polar_bayes.scenes.comparison import FitArguments, compare_candidates
@@ -36,10 +37,6 @@ SHARED = ("prior", "prior_predictive", "observed_data", "constant_data")
 
 NOT_STACKED = ("log_weight", "lp")
 """Statistics whose constants differ between scenes."""
-
-FINITE_VARIANCE = 0.5
-"""Pareto k-hat up to which weights have a variance. Between it and 0.7, where weighted draws may be
-used, an arm of a posterior was missed in 3 of 3 seeds."""
 
 BY_PARAMETER = ("priors", "bounds", "prior_probability", "fixed", "declared")
 """Entries of the provenance that are mappings by parameter."""

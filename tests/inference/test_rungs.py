@@ -12,9 +12,7 @@ import polar_bayes as pb
 from polar_bayes.benchmark.run import labeled, sample_point
 from polar_bayes.errors import FitError
 from polar_bayes.inference.auto import expected_error
-from polar_bayes.inference.laplace import laplace_mixture
 from polar_bayes.inference.mcse import draws_needed, quantile
-from polar_bayes.inference.optimize import Modes
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import resolve
 from polar_bayes.progress import no_progress
@@ -116,20 +114,6 @@ def test_both_modes_are_weighed_alike(name):
     _, draws = labeled(here, found.z)
     share = float(np.mean(draws[-1] > 0.0))  # the root is the last in the alphabet
     assert abs(share - 0.5) < 5.0 * 0.5 / np.sqrt(min(found.effective_draws, draws[0].size))
-
-
-def test_every_mode_of_weight_gets_draws():
-    weight = np.array([0.25, 0.2, 0.2, 0.15, 0.1, 0.0995, 0.0005])
-    z = np.arange(7.0)[:, None] * np.ones(2)
-    modes = Modes(z, np.tile(np.eye(2), (7, 1, 1)), weight, np.zeros(7), 16, 9)
-    mixture = laplace_mixture(modes, np.dtype(float))
-    at, share = np.asarray(mixture.mean)[:, 0], np.exp(np.asarray(mixture.log_share))
-    held = np.array([share[at == number].sum() for number in range(7)])
-    np.testing.assert_allclose(held[:6], weight[:6] / weight[:6].sum(), rtol=1e-12)
-    assert held[6] == 0.0
-    # One program serves any number of modes.
-    one = Modes(z[:1], modes.covariance[:1], np.ones(1), np.zeros(1), 16, 0)
-    assert laplace_mixture(one, np.dtype(float)).mean.shape == mixture.mean.shape
 
 
 @pytest.mark.thorough
