@@ -79,11 +79,6 @@ class ConditionalReparam:
         """Coordinates of the program."""
         return x.at[self.coefficients].set(self._coefficients(x, given)[0])
 
-    def inverse(self, z: Float[Array, " size"], given: ReparamInputs) -> Float[Array, " size"]:
-        """The coordinates x of a vector of the program."""
-        mean, lower = self._conditional(z, given)
-        return z.at[self.coefficients].set(lower.T @ (z[self.coefficients] - mean))
-
     @functools.cached_property
     def potential_jit(self) -> Callable[[Array, ReparamInputs], Array]:
         """The potential; the model is traced once, however many programs compute it."""
@@ -103,11 +98,6 @@ class ConditionalReparam:
     def forward_of_block(self) -> JitOnce:
         """`forward` of many vectors, compiled."""
         return side_by_side(self.forward)
-
-    @functools.cached_property
-    def inverse_jit(self) -> JitOnce:
-        """`inverse`, compiled."""
-        return JitOnce(self.inverse)
 
     def inputs(self, mode: np.ndarray, covariance: np.ndarray, data: Observations) -> ReparamInputs:
         """The map around a mode of the program, with the posterior covariance there."""

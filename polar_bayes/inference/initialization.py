@@ -188,9 +188,8 @@ class JointInit(AbstractInit):
         dtype = self.data.brightness.dtype
         given = reparam.inputs(self.modes.z[0], self.modes.covariance[0], self.data)
         potential = NumpyPotential(reparam.value_and_gradient, given, dtype)
-        starts = [
-            np.asarray(reparam.inverse_jit(jnp.asarray(z, dtype), given)) for z in self.modes.z
-        ]
+        starts = self.modes.z.copy()
+        starts[:, reparam.coefficients] = 0.0  # given the others, their mean
         with ignore_line_search_warnings():
             modes = distinct_modes([find_mode(potential, start) for start in starts])
         if modes is None:

@@ -58,14 +58,14 @@ def made(capture: xr.Dataset) -> tuple[ConditionalReparam, Observations]:
     return reparam, data
 
 
-def test_there_and_back_with_the_volume_of_the_map(made) -> None:
+def test_the_density_is_that_of_the_program_with_the_volume_of_the_map(made) -> None:
     reparam, data = made
     random = np.random.default_rng(0)
     half = random.normal(size=(4, 4))
     given = reparam.inputs(random.normal(size=4), half @ half.T + np.eye(4), data)
     x = jnp.asarray(random.normal(size=4))
     z = reparam.forward(x, given)
-    np.testing.assert_allclose(reparam.inverse(z, given), x, atol=1e-9)
+    np.testing.assert_array_equal(z[reparam.others], x[reparam.others])
     volume = np.linalg.slogdet(jax.jacfwd(lambda x: reparam.forward(x, given))(x))[1]
     expected = reparam.program.potential(z, data) - volume
     np.testing.assert_allclose(reparam.potential(x, given), expected, rtol=1e-12)
