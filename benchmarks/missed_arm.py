@@ -25,7 +25,7 @@ METHODS = {
 }
 
 
-def main(seeds: int) -> None:
+def main(seeds: int, methods: list[str]) -> None:
     water = pb.from_table(
         Path(os.environ["POLAR_BAYES_DATA"]) / "river_water" / "river_water_q.csv",
         columns={"view_zenith": "aoi", "light_zenith": "aoi", "q_error": "err"},
@@ -34,7 +34,7 @@ def main(seeds: int) -> None:
     )
     scene = scene_library(water).scene(("sky", "Lambertian body", "systematic errors"))
     links = {"q": pb.links.StokesLink(degrees_of_freedom=4.0, stated_errors=True)}
-    for name, method in METHODS.items():
+    for name, method in ((name, METHODS[name]) for name in methods):
         for seed in range(seeds):
             begun = time.perf_counter()
             result = pb.fit(water, scene=scene, links=links, method=method, seed=seed)
@@ -60,4 +60,6 @@ if __name__ == "__main__":
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--seeds", type=int, default=4)
-    main(parser.parse_args().seeds)
+    parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=list(METHODS))
+    given = parser.parse_args()
+    main(given.seeds, given.methods)

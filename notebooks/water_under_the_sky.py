@@ -79,8 +79,7 @@ best = comparison.table.index[0]
 print(f"{best}: n from {index.loc[best, 'q2.5']:.3f} to {index.loc[best, 'q97.5']:.3f}")
 
 # %% [markdown]
-# These are weighted draws, quick and approximate. `pb.fit(capture, scene="auto")` does the same and
-# samples the scenes that remain by NUTS, which can take a quarter of an hour under a sky, and
-# stacks them;
+# These are weighted draws. `pb.fit(capture, scene="auto")` does the same, samples those scenes by
+# NUTS whose weighted draws are not good enough, which takes minutes under a sky, and stacks them;
 # `pb.verdict` then judges the result as that of any other fit. What it still criticizes is worth
 # reading: no candidate explains all of these readings.
