@@ -40,7 +40,7 @@ MOST_COEFFICIENTS = 16
 """More than so many are left as they are: their precision is factored for every gradient."""
 
 
-class ExpansionPoint(eqx.Module):
+class ModeRegression(eqx.Module):
     """The posterior mode, and the regression of the coefficients on the other coordinates there."""
 
     others: Float[Array, " other"]
@@ -48,10 +48,10 @@ class ExpansionPoint(eqx.Module):
     slope: Float[Array, "coefficient other"]
 
 
-class ReparamInputs(eqx.Module):
+class ConditionalInputs(eqx.Module):
     """The arguments of the potential besides the coordinates."""
 
-    point: ExpansionPoint
+    point: ModeRegression
     data: Observations
 
 
@@ -67,7 +67,7 @@ class ConditionalReparam:
     coefficients: np.ndarray
     others: np.ndarray
 
-    def potential(self, x: Float[Array, " size"], given: ReparamInputs) -> Float[Array, ""]:
+    def potential(self, x: Float[Array, " size"], given: ConditionalInputs) -> Float[Array, ""]:
         """Minus the log density of x, up to a constant."""
         w, log_volume = self._coefficients(x, given)
         # Not of one flat vector: the optics, which depend on other sites only, are then found to be
@@ -75,12 +75,12 @@ class ConditionalReparam:
         sites = self.program.unravel(x) | self._by_name(w)
         return self.program.potential_at(sites, given.data) - log_volume
 
-    def forward(self, x: Float[Array, " size"], given: ReparamInputs) -> Float[Array, " size"]:
+    def forward(self, x: Float[Array, " size"], given: ConditionalInputs) -> Float[Array, " size"]:
         """Coordinates of the program."""
         return x.at[self.coefficients].set(self._coefficients(x, given)[0])
 
     @functools.cached_property
-    def potential_jit(self) -> Callable[[Array, ReparamInputs], Array]:
+    def potential_jit(self) -> Callable[[Array, ConditionalInputs], Array]:
         """The potential; the model is traced once, however many programs compute it."""
         return jax.jit(self.potential, inline=True)
 
@@ -99,16 +99,20 @@ class ConditionalReparam:
         """`forward` of many vectors, compiled."""
         return side_by_side(self.forward)
 
-    def inputs(self, mode: np.ndarray, covariance: np.ndarray, data: Observations) -> ReparamInputs:
+    def inputs(
+        self, mode: np.ndarray, covariance: np.ndarray, data: Observations
+    ) -> ConditionalInputs:
         """The map around a mode of the program, with the posterior covariance there."""
         among = covariance[np.ix_(self.others, self.others)]
         across = covariance[np.ix_(self.coefficients, self.others)]
         parts = mode[self.others], mode[self.coefficients], np.linalg.solve(among, across.T).T
         dtype = data.brightness.dtype
-        return ReparamInputs(ExpansionPoint(*(jnp.asarray(part, dtype) for part in parts)), data)
+        return ConditionalInputs(
+            ModeRegression(*(jnp.asarray(part, dtype) for part in parts)), data
+        )
 
     def _coefficients(
-        self, x: Float[Array, " size"], given: ReparamInputs
+        self, x: Float[Array, " size"], given: ConditionalInputs
     ) -> tuple[Float[Array, " coefficient"], Float[Array, ""]]:
         """The coefficients, and the log volume of the map."""
         mean, lower = self._conditional(x, given)
@@ -116,7 +120,7 @@ class ConditionalReparam:
         return mean + noise, -jnp.sum(jnp.log(jnp.diagonal(lower)))
 
     def _conditional(
-        self, x: Float[Array, " size"], given: ReparamInputs
+        self, x: Float[Array, " size"], given: ConditionalInputs
     ) -> tuple[Float[Array, " coefficient"], Float[Array, "coefficient coefficient"]]:
         """Mean of the coefficients given the others, and Cholesky factor of their precision."""
         point, program = given.point, self.program

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
-from polar_bayes.inference.initialization import STARTS, Coordinates
+from polar_bayes.inference.initialization import Coordinates
 from polar_bayes.inference.optimize import (
     ValueAndGradient,
     central_difference_hessian,
@@ -67,7 +67,7 @@ def profile_mixture(coordinates: Coordinates) -> Mixture:
     evidence = np.array([each.log_evidence for each in components])
     # The square root: tails need more draws than they weigh.
     share = np.exp(0.5 * (evidence - evidence.max()))
-    which = np.resize(np.arange(share.size), max(COMPONENTS, STARTS, share.size))
+    which = np.resize(np.arange(share.size), max(COMPONENTS, share.size))
     share = (share / np.bincount(which))[which]
     scale = np.linalg.cholesky(np.stack([components[i].covariance for i in which]))
     size = modes.z.shape[1]
@@ -85,11 +85,10 @@ def _along_profiles(
 ) -> Iterator[_Component]:
     potential = finite_potential(coordinates.potential)
     sd, factor = np.sqrt(np.diagonal(covariance)), np.linalg.cholesky(covariance)
-    lowest = potential(mode)[0]
+    lowest, precision = potential(mode)[0], np.linalg.inv(covariance)
     for axis in coordinates.axes:
         others = np.setdiff1d(np.arange(mode.size), axis)
-        precision = np.linalg.inv(covariance)[np.ix_(others, others)]
-        half = np.linalg.cholesky(np.linalg.inv(precision))
+        half = np.linalg.cholesky(np.linalg.inv(precision[np.ix_(others, others)]))
         for sign in (-1.0, 1.0):
             x, step = mode, FIRST_STEP * sd[axis]
             for _ in range(MOST_STEPS):
