@@ -37,6 +37,9 @@ LARGE_CORRECTION = 0.1
 """Error of an approximate mean in sds, or of an sd in its log, that is told."""
 WEIGHTED = ("importance", "tempered")
 MAX_SECOND_MODE = 0.01
+TAIL_ERRORS = 3.5
+"""Standard errors by which the share in a tail must exceed that of chains: of twenty tails of two
+right methods one does so in 0.5% of the fits."""
 MAX_MASKED = 0.25
 MAX_DEEP_TREES = 0.01
 ROUNDING = 1e-6
@@ -103,6 +106,7 @@ def verdict(
     cautions = (
         *_approximation_cautions(result, found, method),
         *_mode_cautions(provenance),
+        *_tail_cautions(provenance, found, table),
         *_estimate_cautions(result, table, method),
         *_reading_cautions(provenance.get("counts", {})),
         *_capture_cautions(provenance),
@@ -341,6 +345,34 @@ def _mode_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
         yield (
             f"The posterior has another mode, of weight {weights[1]:.2g}: another explanation of "
             f"the readings exists{effect}add views that tell them apart."
+        )
+
+
+def _tail_cautions(
+    provenance: Mapping[str, Any], found: Sequence[Scalar], table: pd.DataFrame
+) -> Iterator[str]:
+    """Tails of chains that are too light by weighted draws, which reach what chains may miss."""
+    tails = provenance.get("tails") or {}
+    if not tails or not tails["k_hat"] <= LARGEST_K_HAT:
+        return
+    entries = {name: iter(shares) for name, shares in tails["shares"].items()}
+    nominal, missed = CENTRAL_95[0], []
+    for scalar in found:
+        shares = next(entries.get(scalar.name, iter(())), None)
+        if shares is None:
+            continue
+        row = table.loc[scalar.label]
+        variance = nominal * (1.0 - nominal)
+        error = math.sqrt(variance / row["ess_tail"] + variance / tails["effective_draws"])
+        for share, side, end in zip(shares, ("below", "above"), ("q2.5", "q97.5"), strict=True):
+            if share > max(2.0 * nominal, nominal + TAIL_ERRORS * error):
+                missed.append((share, f"{scalar.label} {side} {row[end]:.3g} ({share:.1%})"))
+    if missed:
+        names = listed(text for _, text in sorted(missed, reverse=True))
+        yield (
+            "The chains may have missed an arm of the posterior: where they have 2.5% of their "
+            f"draws, weighted draws (Pareto k-hat {tails['k_hat']:.2f}) have more, {names}; "
+            "compare Importance(draws=2048, rounds=6), or sample longer."
         )
 
 

@@ -33,11 +33,15 @@ from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
 from polar_bayes.inference.compile import JitOnce
-from polar_bayes.inference.program import Program, side_by_side
+from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 
 MOST_COEFFICIENTS = 16
 """More than so many are left as they are: their precision is factored for every gradient."""
+
+
+SIDE_BY_SIDE = 50
+"""Vectors that are vectorized over."""
 
 
 class ModeRegression(eqx.Module):
@@ -75,9 +79,12 @@ class ConditionalReparam:
         sites = self.program.unravel(x) | self._by_name(w)
         return self.program.potential_at(sites, given.data) - log_volume
 
-    def forward(self, x: Float[Array, " size"], given: ConditionalInputs) -> Float[Array, " size"]:
-        """Coordinates of the program."""
-        return x.at[self.coefficients].set(self._coefficients(x, given)[0])
+    def forward(
+        self, x: Float[Array, " size"], given: ConditionalInputs
+    ) -> tuple[Float[Array, " size"], Float[Array, ""]]:
+        """Coordinates of the program, and the log volume of the map."""
+        w, log_volume = self._coefficients(x, given)
+        return x.at[self.coefficients].set(w), log_volume
 
     @functools.cached_property
     def potential_jit(self) -> Callable[[Array, ConditionalInputs], Array]:
@@ -90,14 +97,13 @@ class ConditionalReparam:
         return JitOnce(jax.value_and_grad(self.potential_jit))
 
     @functools.cached_property
-    def log_densities(self) -> JitOnce:
-        """Log densities of many vectors, compiled."""
-        return side_by_side(lambda x, given: -self.potential_jit(x, given))
-
-    @functools.cached_property
     def forward_of_block(self) -> JitOnce:
         """`forward` of many vectors, compiled."""
-        return side_by_side(self.forward)
+        return JitOnce(
+            lambda x, given: jax.lax.map(
+                lambda one: self.forward(one, given), x, batch_size=SIDE_BY_SIDE
+            )
+        )
 
     def inputs(
         self, mode: np.ndarray, covariance: np.ndarray, data: Observations

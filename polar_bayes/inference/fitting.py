@@ -25,7 +25,8 @@ from polar_bayes.inference import methods
 from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_until
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import from_prior
-from polar_bayes.inference.problem import BLOCK, THREADS, Problem, make_problem
+from polar_bayes.inference.problem import Problem, make_problem
+from polar_bayes.inference.program import BLOCK, THREADS
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.physics.instrument import Discrepancy
@@ -62,6 +63,7 @@ def fit_request(
         jax.random.key(request.seed), 4
     )
     key_search, key_draws = jax.random.split(key)
+    key_check = jax.random.fold_in(key, 1)
     problem = make_problem(request, key_search, start_time)
     _check_room(problem, PRIOR_DRAWS)
     method.prepare(problem)
@@ -76,6 +78,8 @@ def fit_request(
     prior_z = from_prior(problem.program, key_prior, PRIOR_DRAWS, problem.data)
     prior = problem.predict(key_prior, prior_z[None])
     timings.record("prediction")
+    checked = method.cross_check(problem, posterior.parameters, key_check)
+    timings.record("cross-check")
 
     comparisons, failed = (
         _fit_comparisons(request, method, draws, key_comparisons, progress)
@@ -95,6 +99,7 @@ def fit_request(
         "method": draws.method,
         **{name: value if math.isfinite(value) else None for name, value in stated.items()},
         **draws.metadata,
+        **checked,
         **({"comparisons_failed": failed} if failed else {}),
     }
     return assemble(

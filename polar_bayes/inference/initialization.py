@@ -41,7 +41,7 @@ from polar_bayes.inference.optimize import (
     from_prior,
     ignore_line_search_warnings,
 )
-from polar_bayes.inference.program import Model, Program, finite_log_density, in_blocks
+from polar_bayes.inference.program import Model, Program, in_blocks
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress
 
@@ -82,31 +82,34 @@ class Coordinates:
             of a layout.
         given: The capture, and what the coordinates depend on.
         potential: `density` of this capture, with its gradient.
-        log_densities: Log densities of a block of vectors, compiled.
+        log_density_of: Log densities of vectors of the program, (draw, size).
         modes: The modes in these coordinates.
         axes: Positions of the coordinates that are not standardized.
-        to_program: From these coordinates to the program's, for a block of vectors, compiled; None
-            where they are the same.
+        to_program: From these coordinates to the program's, with the log volume, for a block of
+            vectors, compiled; None where they are the same.
     """
 
     density: Callable[[Array, Any], Array]
     given: Any
     potential: ValueAndGradient
-    log_densities: JitOnce
+    log_density_of: Callable[[np.ndarray], np.ndarray]
     modes: Modes
     axes: np.ndarray
     to_program: JitOnce | None = None
 
-    def log_density(self, x: np.ndarray) -> np.ndarray:
-        """Log posterior densities of vectors, (draw, size)."""
-        return finite_log_density(self.log_densities, x, self.given, self.modes.z.dtype)
-
     def forward(self, x: np.ndarray) -> np.ndarray:
         """Coordinates of the program, (..., size)."""
+        return self._forward(x.reshape(-1, x.shape[-1]))[0].reshape(x.shape)
+
+    def log_density(self, x: np.ndarray) -> np.ndarray:
+        """Log posterior densities of vectors, (draw, size)."""
+        z, log_volume = self._forward(x)
+        return np.asarray(self.log_density_of(z) + log_volume, float)
+
+    def _forward(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if self.to_program is None:
-            return x
-        flat = x.reshape(-1, x.shape[-1])
-        return in_blocks(self.to_program, flat, self.given, x.dtype).reshape(x.shape)
+            return x, np.zeros(len(x))
+        return in_blocks(self.to_program, (x.astype(self.modes.z.dtype),), self.given)
 
 
 class AbstractInit(abc.ABC):
@@ -179,7 +182,7 @@ class JointInit(AbstractInit):
             program.potential_jit,
             self.data,
             self.potential,
-            program.log_densities,
+            lambda z: program.log_density(z, self.data),
             self.modes,
             np.arange(program.size),
         )
@@ -198,7 +201,7 @@ class JointInit(AbstractInit):
             reparam.potential_jit,
             given,
             potential,
-            reparam.log_densities,
+            own.log_density_of,
             modes,
             reparam.others,
             reparam.forward_of_block,

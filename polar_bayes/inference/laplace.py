@@ -10,7 +10,7 @@ Source:
 import dataclasses
 import functools
 import math
-from typing import override
+from typing import Any, override
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,8 @@ from polar_bayes.inference.initialization import Coordinates
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import SETTLED
 from polar_bayes.inference.problem import Problem
-from polar_bayes.inference.profile_mixture import profile_mixture
+from polar_bayes.inference.profile_mixture import MOST_COORDINATES, profile_mixture
+from polar_bayes.inference.program import Values
 from polar_bayes.inference.proposals import Mixture, draw_mixture, fit_mixture, log_density
 from polar_bayes.inference.psis import (
     FINITE_VARIANCE,
@@ -34,7 +35,7 @@ from polar_bayes.inference.psis import (
     smooth,
     systematic_resample,
 )
-from polar_bayes.progress import Progress
+from polar_bayes.progress import Progress, no_progress
 
 SIDE_BY_SIDE = 1024
 """Draws whose proposal density is computed together: that of all at once would fill the memory."""
@@ -155,6 +156,34 @@ class Importance(AbstractMethod):
             densities=float(len(z)),
             metadata={"modes": initialization.metadata},
         )
+
+
+INTERVAL = (0.025, 0.975)
+"""Probabilities of the ends beyond which the shares of two methods are compared."""
+
+
+def tail_shares(problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
+    """Shares of weighted draws beyond the 95% intervals of chains, an entry of the provenance.
+
+    Chains that never entered an arm of the posterior agree with each other; draws along its
+    profiles reach the arm. None where such draws do not suit the problem.
+    """
+    if problem.program.size > MOST_COORDINATES:
+        return {}
+    try:
+        found = Importance(draws=2048).run(problem, key, no_progress)
+    except FitError:
+        return {}
+    assert found.weighted is not None
+    z, weights = found.weighted
+    shares = {}
+    for name, x in problem.constrain(z[None]).items():
+        draws = np.reshape(x, (len(weights), -1))
+        low, high = np.quantile(np.reshape(parameters[name], (-1, draws.shape[1])), INTERVAL, 0)
+        beyond = np.stack([weights @ (draws < low), weights @ (draws > high)], axis=1)
+        shares[name] = np.round(beyond, 5).tolist()
+    known = {"k_hat": found.k_hat, "effective_draws": found.effective_draws}
+    return {"tails": {**known, "shares": shares}}
 
 
 COMPONENTS = 8

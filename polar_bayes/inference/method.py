@@ -202,6 +202,22 @@ class AbstractMethod(AbstractBatchMethod[CompiledModel]):
         """
         del problem
 
+    def cross_check(self, problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
+        """What other draws of the same posterior say of those of this method.
+
+        `polar_bayes.fit` asks for it; simulations of many fits do not.
+
+        Args:
+            problem: The capture and its model.
+            parameters: Draws of this method by name, each (chain, draw, ...).
+            key: Random key of the other draws.
+
+        Returns:
+            Entries of the provenance, which JSON can hold; none by default.
+        """
+        del problem, parameters, key
+        return {}
+
     @override
     def run_batch(
         self,

@@ -25,9 +25,11 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.batching import Describe, ObservationBatch, Outcome
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.initialization import Target
+from polar_bayes.inference.laplace import tail_shares
 from polar_bayes.inference.mcse import measure
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import CompiledModel, Problem
+from polar_bayes.inference.program import Values
 from polar_bayes.progress import Progress
 
 LARGEST_R_HAT = 1.008
@@ -131,6 +133,10 @@ class Nuts(AbstractMethod):
         if not sampler.advance.is_begun:
             state = sampler.init(target, jax.random.key(0), target.starts[0])
             sampler.advance.begin(state, target.given)
+
+    @override
+    def cross_check(self, problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
+        return tail_shares(problem, parameters, key)
 
     def _sampler(self, target: Target, problem: Problem) -> "Sampler":
         """The compiled sampler of these settings."""

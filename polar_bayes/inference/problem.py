@@ -8,7 +8,6 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -26,12 +25,13 @@ from polar_bayes.inference.compile import (
 )
 from polar_bayes.inference.initialization import AbstractInit, AbstractInitializer, make_initializer
 from polar_bayes.inference.program import (
+    BLOCK,
     Draw,
     Model,
     Program,
     Values,
     compile_program,
-    finite_log_density,
+    in_blocks,
 )
 from polar_bayes.inference.request import Request, bind_model
 from polar_bayes.observation.data import Observations, observe
@@ -44,13 +44,8 @@ MAX_LAYOUTS = 8
 MAX_PROGRAMS = 16
 """Further programs that methods have made of one of them, by settings, that stay compiled."""
 
-BLOCK = 500
-"""Draws that one call predicts or constrains."""
-
 KEYS = 1 << 15
 """Random keys are split in multiples of this number: one compiled program serves any number."""
-
-THREADS = 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -204,7 +199,7 @@ class Problem:
         Returns:
             Log densities, shape (draw,); minus infinity where there is none.
         """
-        return finite_log_density(self.program.log_densities, z, self.data, self.dtype)
+        return self.program.log_density(z.astype(self.dtype), self.data)
 
     def constrain(self, z: Float[np.ndarray, "chain draw size"]) -> Values:
         """Parameters of draws, in their supports.
@@ -249,25 +244,8 @@ class Problem:
         every = jax.random.split(key, KEYS * -(-len(flat) // KEYS))
         keys = np.asarray(jax.random.key_data(every))
 
-        # Posterior and prior have different lengths; blocks of one length compile once, and run on
-        # threads as the chains do.
-        def run(start: int) -> Draw:
-            index = np.minimum(np.arange(start, start + BLOCK), len(flat) - 1)
-            with jax.enable_x64(self.dtype == np.float64):  # a thread does not inherit it
-                of_block, drawn = jnp.asarray(keys[index]), jnp.asarray(flat[index])
-                return jax.tree.map(np.asarray, self.program.described(of_block, drawn, self.data))
-
-        first = run(0)  # compiled before the threads start
-        joined = jax.tree.map(lambda x: np.empty((len(flat), *x.shape[1:]), x.dtype), first)
-
-        def fill(start: int, block: Draw) -> None:
-            for whole, part in zip(jax.tree.leaves(joined), jax.tree.leaves(block), strict=True):
-                whole[start : start + BLOCK] = part[: len(flat) - start]
-
-        fill(0, first)
-        with ThreadPoolExecutor(THREADS) as pool:
-            list(pool.map(lambda start: fill(start, run(start)), range(BLOCK, len(flat), BLOCK)))
-        return jax.tree.map(lambda x: x.reshape(*z.shape[:2], *x.shape[1:]), joined)
+        found = in_blocks(self.program.described, (keys[: len(flat)], flat), self.data)
+        return jax.tree.map(lambda x: x.reshape(*z.shape[:2], *x.shape[1:]), found)
 
 
 def observe_request(request: Request) -> Observations:

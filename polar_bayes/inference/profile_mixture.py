@@ -90,10 +90,10 @@ def _along_profiles(
         others = np.setdiff1d(np.arange(mode.size), axis)
         half = np.linalg.cholesky(np.linalg.inv(precision[np.ix_(others, others)]))
         for sign in (-1.0, 1.0):
-            x, step = mode, FIRST_STEP * sd[axis]
+            x, own, step = mode, covariance, FIRST_STEP * sd[axis]
             for _ in range(MOST_STEPS):
-                x = x.copy()
-                x[axis] += sign * step
+                # The others are first moved to where a normal distribution has their mean.
+                x = x + sign * step * own[axis] / own[axis, axis]
                 x, value = _conditional_mode(potential, x, others, half)
                 if not value - lowest <= LARGEST_DROP:
                     break

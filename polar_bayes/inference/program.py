@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 from numpyro import handlers
-from numpyro.infer.util import potential_energy
+from numpyro.infer.util import compute_log_probs, potential_energy
 from numpyro.primitives import Messenger
 
 from polar_bayes.errors import FitError
@@ -29,11 +30,11 @@ from polar_bayes.priors import PriorTable, check_support
 
 Model = Callable[[Observations], None]
 
-DENSITY_BLOCK = 1024
-"""Vectors that one call evaluates: one compiled program serves any number."""
+BLOCK = 500
+"""Draws that one call describes or constrains: one compiled program serves any number."""
 
-SIDE_BY_SIDE = 64
-"""Of these, vectors that are vectorized over."""
+THREADS = 2
+"""That run such calls."""
 
 Values = dict[str, Array] | dict[str, np.ndarray]
 
@@ -47,6 +48,7 @@ class Draw(NamedTuple):
     log_likelihood: Values
     log_prior: Values
     predictive: Values
+    log_density: Array | np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -122,7 +124,14 @@ class Program:
 
     def describe(self, key: Array, z: Float[Array, " size"], data: Observations) -> Draw:
         """Parameters, densities and predicted readings of one draw."""
-        trace = self.trace(z, data, key)
+        sites = self.unravel(z)
+        values = self._constrain(sites)
+        seeded = handlers.seed(self.model, key)
+        log_probs, trace = compute_log_probs(seeded, (data,), {}, values)
+        volumes = [
+            dist.biject_to(self.supports[name]).log_abs_det_jacobian(x, values[name])
+            for name, x in sites.items()
+        ]
         keys = dict(zip(self.observed, jax.random.split(key, len(self.observed)), strict=True))
         readings = {name: trace[name] for name in self.observed}
         return Draw(
@@ -140,6 +149,7 @@ class Program:
                 if n not in self.auxiliary
             },
             predictive={name: site["fn"].sample(keys[name]) for name, site in readings.items()},
+            log_density=sum(map(jnp.sum, (*log_probs.values(), *volumes)), jnp.zeros(())),
         )
 
     def residuals(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
@@ -159,11 +169,6 @@ class Program:
     def value_and_gradient(self) -> JitOnce:
         """The potential with its gradient, compiled."""
         return JitOnce(jax.value_and_grad(self.potential_jit))
-
-    @functools.cached_property
-    def log_densities(self) -> JitOnce:
-        """Log posterior density of many unconstrained vectors, compiled."""
-        return side_by_side(lambda z, data: -self.potential_jit(z, data))
 
     @functools.cached_property
     def drawn_from_prior(self) -> Callable[[np.ndarray, int, Observations], Array]:
@@ -189,6 +194,12 @@ class Program:
 
         return JitOnce(describe)
 
+    def log_density(self, z: np.ndarray, data: Observations) -> np.ndarray:
+        """Log posterior densities of vectors, (draw, size); minus infinity where there is none."""
+        keys = jax.random.key_data(jax.random.key(0))
+        found = in_blocks(self.described, (np.broadcast_to(keys, (len(z), *keys.shape)), z), data)
+        return np.where(np.isnan(found.log_density), -np.inf, found.log_density)
+
     @functools.cached_property
     def parameters_of_chains(self) -> Callable[[Array, Observations], dict[str, Array]]:
         """`parameters` of chains of draws, (chain, draw, size), compiled."""
@@ -201,28 +212,26 @@ class Program:
         return JitOnce(jax.jacfwd(self.constrain))
 
 
-def side_by_side(function: Callable[[Array, Any], Array]) -> JitOnce:
-    """A function of a vector and further inputs, compiled for a block of vectors."""
+def in_blocks(function: JitOnce, rows: tuple[np.ndarray, ...], given: Any) -> Any:
+    """What a function that is compiled for a block of rows gives for any number of them."""
+    count, double = len(rows[0]), rows[-1].dtype == np.float64
 
-    def of_block(z: Array, given: Any) -> Array:
-        return jax.lax.map(lambda one: function(one, given), z, batch_size=SIDE_BY_SIDE)
+    def run(start: int) -> Any:
+        index = np.minimum(np.arange(start, start + BLOCK), count - 1)
+        with jax.enable_x64(double):  # a thread does not inherit it
+            return jax.tree.map(np.asarray, function(*(jnp.asarray(x[index]) for x in rows), given))
 
-    return JitOnce(of_block)
+    first = run(0)  # compiled before the threads start
+    joined = jax.tree.map(lambda x: np.empty((count, *x.shape[1:]), x.dtype), first)
 
+    def fill(start: int, block: Any) -> None:
+        for whole, part in zip(jax.tree.leaves(joined), jax.tree.leaves(block), strict=True):
+            whole[start : start + BLOCK] = part[: count - start]
 
-def in_blocks(function: JitOnce, z: np.ndarray, given: Any, dtype: np.dtype) -> np.ndarray:
-    """What a function that `side_by_side` compiled gives for any number of vectors."""
-    count, parts = len(z), []
-    for begin in range(0, count, DENSITY_BLOCK):
-        index = np.minimum(np.arange(begin, begin + DENSITY_BLOCK), count - 1)
-        parts.append(np.asarray(function(jnp.asarray(z[index], dtype), given), float))
-    return np.concatenate(parts)[:count]
-
-
-def finite_log_density(function: JitOnce, z: np.ndarray, given: Any, dtype: np.dtype) -> np.ndarray:
-    """Log densities of vectors; minus infinity where there is none."""
-    found = in_blocks(function, z, given, dtype)
-    return np.where(np.isnan(found), -np.inf, found)
+    fill(0, first)
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(lambda start: fill(start, run(start)), range(BLOCK, count, BLOCK)))
+    return joined
 
 
 def compile_program(model: Model, data: Observations) -> Program:

@@ -174,6 +174,20 @@ def test_cautions_do_not_fail(change: dict, words: str) -> None:
     assert any(words in caution for caution in judged.cautions)
 
 
+def test_tails_that_chains_may_have_missed_are_told() -> None:
+    even = {name: [[0.025, 0.03]] for name in ("refractive_index", "roughness")}
+    tails = {"k_hat": 0.3, "effective_draws": 800.0, "shares": even}
+    tree = make_result(wavelengths=(), draws=1000)
+    assert not verdict(edit_provenance(tree, tails=tails)).cautions
+    heavy = tails | {"shares": even | {"roughness": [[0.02, 0.12]]}}
+    (caution,) = verdict(edit_provenance(tree, tails=heavy)).cautions
+    end = pb.summary(tree)["q97.5"]["roughness"]
+    assert f"roughness above {end:.3g} (12.0%)" in caution
+    assert "index" not in caution
+    # Weights that do not reach the posterior themselves say nothing of chains.
+    assert not verdict(edit_provenance(tree, tails=heavy | {"k_hat": 0.9})).cautions
+
+
 @pytest.mark.thorough
 @each(
     ("method", "words"),

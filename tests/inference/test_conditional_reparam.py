@@ -64,9 +64,10 @@ def test_the_density_is_that_of_the_program_with_the_volume_of_the_map(made) -> 
     half = random.normal(size=(4, 4))
     given = reparam.inputs(random.normal(size=4), half @ half.T + np.eye(4), data)
     x = jnp.asarray(random.normal(size=4))
-    z = reparam.forward(x, given)
+    z, log_volume = reparam.forward(x, given)
     np.testing.assert_array_equal(z[reparam.others], x[reparam.others])
-    volume = np.linalg.slogdet(jax.jacfwd(lambda x: reparam.forward(x, given))(x))[1]
+    volume = np.linalg.slogdet(jax.jacfwd(lambda x: reparam.forward(x, given)[0])(x))[1]
+    np.testing.assert_allclose(log_volume, volume, rtol=1e-12)
     expected = reparam.program.potential(z, data) - volume
     np.testing.assert_allclose(reparam.potential(x, given), expected, rtol=1e-12)
 

@@ -8,7 +8,6 @@ from jaxtyping import Array
 from polar_bayes.inference.initialization import Coordinates
 from polar_bayes.inference.optimize import Modes, NumpyPotential
 from polar_bayes.inference.profile_mixture import profile_mixture
-from polar_bayes.inference.program import side_by_side
 from polar_bayes.inference.proposals import draw_mixture, log_density
 from polar_bayes.inference.psis import effective_draws, smooth
 
@@ -31,7 +30,7 @@ def coordinates_at(density, z: np.ndarray, covariance: np.ndarray, axes: np.ndar
         density=density,
         given=None,
         potential=NumpyPotential(gradient, None, z.dtype),
-        log_densities=side_by_side(lambda x, given: -density(x, given)),
+        log_density_of=lambda x: -np.asarray(jax.vmap(lambda one: density(one, None))(x)),
         modes=modes,
         axes=axes,
     )

@@ -12,6 +12,7 @@ import polar_bayes as pb
 from polar_bayes.benchmark.run import labeled, sample_point
 from polar_bayes.errors import FitError
 from polar_bayes.inference.auto import expected_error
+from polar_bayes.inference.laplace import tail_shares
 from polar_bayes.inference.mcse import draws_needed, quantile
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import resolve
@@ -130,6 +131,22 @@ def test_chains_that_missed_a_mode_are_told():
     some[0] = one[0]
     assert here.initialize().missed_mode_weight(some) > 0.4
     assert problem(line).initialize().missed_mode_weight(both.z) == 0.0
+
+
+def test_weighted_draws_find_what_chains_left_out():
+    here = problem(squared)
+    both = here.constrain(run(SMALL["importance"], here).z)
+    key = jax.random.key(5)
+    told = tail_shares(here, both, key)["tails"]
+    assert told["k_hat"] < 0.7
+    for below, above in told["shares"]["root"] + told["shares"]["other"]:
+        # Five standard errors of 2.5%, of both methods.
+        error = np.sqrt(0.025 * 0.975 * (1.0 / told["effective_draws"] + 1.0 / 1000.0))
+        assert max(abs(below - 0.025), abs(above - 0.025)) < 5.0 * error
+    one = tail_shares(here, both | {"root": np.abs(both["root"])}, key)["tails"]
+    ((below, above),) = one["shares"]["root"]
+    assert below == pytest.approx(0.5, abs=0.1)
+    assert above < 0.05
 
 
 @pytest.mark.thorough
