@@ -137,7 +137,7 @@ def fit(
 @scene_option
 @view_limit_option
 @option(
-    "--method", type=click.Choice(("laplace", "tempered")), default="laplace",
+    "--method", type=click.Choice(("laplace", "importance", "tempered")), default="laplace",
     help="One mode of each pixel, corrected; or all modes, many times slower.",
 )  # fmt: skip
 @option("--draws", type=int, help="Of laplace, weighted, in each pixel.  [default: 256]")
@@ -150,8 +150,12 @@ def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: A
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
     given: dict[str, Any] = {} if draws is None else {"draws": draws}
-    chosen = pb.methods.PixelLaplace(**given) if method == "laplace" else pb.methods.PixelSMC()
-    maps = pb.maps.map_file(capture, out, method=chosen, **settings)
+    methods: dict[str, Any] = {
+        "laplace": pb.methods.PixelLaplace(**given),
+        "importance": pb.methods.PixelByPixel(),
+        "tempered": pb.methods.PixelSMC(),
+    }
+    maps = pb.maps.map_file(capture, out, method=methods[method], **settings)
     counts = ", ".join(
         f"{count} {what}" for what, count in pb.maps.count_pixels(maps).items() if count
     )

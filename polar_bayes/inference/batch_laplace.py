@@ -3,7 +3,8 @@
 Each pixel takes the first of these that can be trusted: quasi-random draws of the normal
 approximation at the mode, weighted by Pareto-smoothed importance sampling; draws of Student t
 proposals that are fitted to the weighted draws of the previous round (population Monte Carlo);
-draws of a sampler (`PixelNuts` or `PixelSMC`).
+draws of a sampler (`PixelByPixel`, `PixelNuts` or `PixelSMC`), which also fits pixels whose mode
+was not found.
 """
 
 import dataclasses
@@ -17,7 +18,7 @@ from jaxtyping import Array
 
 from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
-from polar_bayes.inference.batch_nuts import PixelNuts
+from polar_bayes.inference.batch_one_by_one import PixelByPixel
 from polar_bayes.inference.batching import (
     MethodUsed,
     Status,
@@ -56,8 +57,10 @@ SAME_MODE = 1e-3
 STUDENT_T_FACTOR = 2
 """Draws of a Student t proposal for each draw of the normal approximation."""
 
-MIN_EFFECTIVE = 100
-"""Least effective sample size of the weighted draws of a round."""
+NORMAL_SHARE, STUDENT_T_SHARE = 0.6, 0.4
+"""Least effective sample size of weighted draws, as a share of their number. Pareto k does not see
+an arm of the posterior that no draw has reached, but the effective draws are few where there is
+one: docs/maps.md has the measurement. The longer tails of Student t distributions cost draws."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,10 +73,12 @@ class PixelLaplace(AbstractPixelMethod):
         weighted: True weights them by the posterior, which corrects the approximation and
             diagnoses it (Pareto k); False takes them as they are, without a diagnosis.
         candidates: Prior draws among which the start of each pixel is chosen, >= 8.
-        rounds: In which the proposal of a pixel with Pareto k above 0.7 is fitted to its own
-            weighted draws, until k is below; >= 0. Without weights there are none.
-        sampler: The method of pixels whose k is still above, `PixelNuts` or `PixelSMC`; None
-            marks them only.
+        rounds: In which the proposal of a pixel with Pareto k above 0.7, or with too few effective
+            draws, is fitted to its own weighted draws, until it has neither; >= 0. Without weights
+            there are none.
+        sampler: The method of pixels that still have, and of those whose mode was not found, such
+            as `PixelByPixel()` or `PixelNuts()`; None marks them only, and so do maps without
+            weights.
 
     Raises:
         FitError: A setting is outside its range.
@@ -83,7 +88,7 @@ class PixelLaplace(AbstractPixelMethod):
     weighted: bool = True
     candidates: int = PRIOR_DRAWS
     rounds: int = 3
-    sampler: AbstractPixelMethod | None = dataclasses.field(default_factory=PixelNuts)
+    sampler: AbstractPixelMethod | None = dataclasses.field(default_factory=PixelByPixel)
 
     memory_limit: ClassVar[int] = 4096
 
@@ -105,6 +110,9 @@ class PixelLaplace(AbstractPixelMethod):
             left = some[run.adapt(some, take_rows(found, some))]
             if self.sampler is not None and left.size:
                 self.sampler.fit(batch, at[left], take_rows(found.search.mode, left))
+        lost = at[~found.search.converged]
+        if self.sampler is not None and self.weighted and lost.size:
+            self.sampler.fit(batch, lost)
 
 
 class Approximation(NamedTuple):
@@ -118,7 +126,8 @@ class Approximation(NamedTuple):
     @property
     def is_trusted(self) -> np.ndarray:
         """Whether the weights correct the errors of the approximation, (pixel,)."""
-        return self.search.converged & (self.pareto_k <= MAX_PARETO_K)
+        enough = effective_draws(self.weights) >= NORMAL_SHARE * self.weights.shape[1]
+        return self.search.converged & (self.pareto_k <= MAX_PARETO_K) & enough
 
 
 class _Run:
@@ -199,7 +208,8 @@ class _Run:
             parameters, ratios = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
             weights, pareto_k = smooth(ratios)
             effective = effective_draws(weights)
-            enough = (pareto_k <= MAX_PARETO_K) & (effective >= MIN_EFFECTIVE)
+            least = STUDENT_T_SHARE * weights.shape[1]
+            enough = (pareto_k <= MAX_PARETO_K) & (effective >= least)
             answers = take_rows((parameters, weights, effective), enough)
             self.batch.record(self.at[some[enough]], *answers, MethodUsed.ADAPTED)
             left, weights, proposal = take_rows((left, weights, proposal), ~enough)

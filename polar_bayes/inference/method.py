@@ -235,10 +235,11 @@ class AbstractMethod(AbstractBatchMethod[CompiledModel]):
             empty_outcome(len(observations)),
             jax.random.fold_in(jax.random.key(seed), 3),
         )
-        with jax.enable_x64(True), TRACING_LOCK:  # two threads that begin at once share it
+        double = engine.precision == "double"
+        with jax.enable_x64(double), TRACING_LOCK:  # two threads that begin at once share it
             _ = engine.initializer
         for at, number in enumerate(numbers):
-            with jax.enable_x64(True):  # a thread does not inherit it
+            with jax.enable_x64(double):  # a thread does not inherit it
                 key_search, key_draws = jax.random.split(jax.random.fold_in(base, int(number)))
                 problem = Problem(engine, observations.pixel(at), key_search)
                 try:

@@ -4,6 +4,7 @@ from .auto import (
 )
 from .batch_laplace import PixelLaplace as PixelLaplace
 from .batch_nuts import PixelNuts as PixelNuts
+from .batch_one_by_one import PixelByPixel as PixelByPixel
 from .laplace import (
     Importance as Importance,
     Laplace as Laplace,

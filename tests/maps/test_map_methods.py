@@ -58,6 +58,25 @@ def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, tempered: xr.Datase
         assert (np.abs(one - other) < 4.0 * error).all()
 
 
+def test_any_method_of_one_capture_makes_a_map(image: xr.Dataset) -> None:
+    some = image.isel(y=[0, 1], x=[0, 1])
+    method = pb.methods.PixelByPixel(pb.methods.Importance(draws=1024))
+    maps = pb.fit_pixels(some, method=method, **ASKED)
+    assert (maps["status"] == Status.GOOD).all()
+    assert (maps["approach"] == MethodUsed.IMPORTANCE).all()
+    for y, x in np.ndindex(2, 2):
+        truth = on_a_grid(some["q"].values[y, x], NOISE, VIEWS)
+        for name in NAMES:
+            mean, sd, _ = truth[name]
+            error = sd / np.sqrt(maps["effective_draws"].values[y, x])
+            # Eight standard normals, in pairs: the largest is above 4.5 in fewer than one of ten
+            # thousand cases.
+            assert abs(maps[name].values[y, x] - mean) < 4.5 * error
+    # A pixel's answer does not depend on the others.
+    alone = pb.fit_pixels(some.isel(y=[0], x=[0]), method=method, **ASKED)
+    assert (alone[NAMES[0]].values == maps[NAMES[0]].values[:1, :1]).all()
+
+
 @pytest.mark.thorough
 def test_the_map_says_how_it_was_made(tempered: xr.Dataset, tmp_path: Path) -> None:
     assert json.loads(tempered.attrs[PROVENANCE])["fitted_by"] == "PixelSMC"
