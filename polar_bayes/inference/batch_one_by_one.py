@@ -54,6 +54,8 @@ class PixelByPixel(AbstractPixelMethod):
             outcomes = list(pool.map(run, parts))
         for part, outcome in zip(parts, outcomes, strict=True):
             for i, pixel in enumerate(part):
+                if np.isnan(batch.outcome.pareto_k[pixel]):  # else it is that of another proposal
+                    batch.outcome.pareto_k[pixel] = outcome.pareto_k[i]
                 if int(pixel) in answers:
                     batch.record(
                         part[i : i + 1],

@@ -459,7 +459,7 @@ SLIGHT = 0.01
 APPROACHES = {
     "none": "no numbers",
     "laplace": "the normal approximation as it is",
-    "importance": "the normal approximation corrected by weights",
+    "importance": "weighted draws of normal approximations",
     "adapted": "a proposal fitted to its own draws and corrected by weights",
     "nuts": "sampling (NUTS)",
     "tempered": "tempered draws",

@@ -64,6 +64,7 @@ def test_any_method_of_one_capture_makes_a_map(image: xr.Dataset) -> None:
     maps = pb.fit_pixels(some, method=method, **ASKED)
     assert (maps["status"] == Status.GOOD).all()
     assert (maps["approach"] == MethodUsed.IMPORTANCE).all()
+    assert (maps["pareto_k"] <= 0.7).all()
     for y, x in np.ndindex(2, 2):
         truth = on_a_grid(some["q"].values[y, x], NOISE, VIEWS)
         for name in NAMES:

@@ -60,7 +60,7 @@ def test_the_verdict_says_what_became_of_the_pixels(page: str) -> None:
     text = text_of(page)
     for said in (
         "160 of 165 pixels that were read have an answer (97%).",
-        "Of 200 pixels 160 are good (80%): 100 by the normal approximation corrected by weights, "
+        "Of 200 pixels 160 are good (80%): 100 by weighted draws of normal approximations, "
         "50 by a proposal fitted to its own draws and corrected by weights and 10 by sampling",
         "35 pixels are masked: no reading there is valid.",
         "2 pixels are read in fewer than 2 views and not fitted.",
