@@ -11,11 +11,11 @@ from jaxtyping import Array, Float
 
 from polar_bayes.benchmark.run import labeled
 from polar_bayes.diagnostics.convergence import LARGEST_R_HAT
-from polar_bayes.diagnostics.parameters import CENTRAL_95
 from polar_bayes.errors import FitError
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.inference.smc import PixelSMC, Tempered
 from polar_bayes.progress import no_progress
 

@@ -12,7 +12,6 @@ from arviz_stats.utils import ELPDDataLOO
 
 from polar_bayes.diagnostics.convergence import Verdict, summary, verdict
 from polar_bayes.diagnostics.parameters import (
-    CENTRAL_95,
     SAMPLE_DIMS,
     method_of,
     posterior_scalars,
@@ -22,6 +21,7 @@ from polar_bayes.diagnostics.predictive import MAX_PARETO_K, Loo, predictive_che
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import check_fit
+from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.observation.data import ANGLES
 
 SUMMARY_COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")

@@ -18,14 +18,14 @@ from scipy.special import logsumexp
 from polar_bayes.diagnostics.criticism import criticize, listed
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
-    CENTRAL_95,
     Scalar,
     method_of,
     posterior_scalars,
     stats_of,
+    with_entries,
 )
 from polar_bayes.diagnostics.predictive import pareto_smoothed
-from polar_bayes.inference.result import bounds_of, provenance_of
+from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
 from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
@@ -355,14 +355,10 @@ def _tail_cautions(
     tails = provenance.get("tails") or {}
     if not tails or not tails["k_hat"] <= LARGEST_K_HAT:
         return
-    entries = {name: iter(shares) for name, shares in tails["shares"].items()}
     nominal, missed = CENTRAL_95[0], []
-    for scalar in found:
-        shares = next(entries.get(scalar.name, iter(())), None)
-        if shares is None:
-            continue
+    variance = nominal * (1.0 - nominal)
+    for scalar, shares in with_entries(found, tails["shares"]):
         row = table.loc[scalar.label]
-        variance = nominal * (1.0 - nominal)
         error = math.sqrt(variance / row["ess_tail"] + variance / tails["effective_draws"])
         for share, side, end in zip(shares, ("below", "above"), ("q2.5", "q97.5"), strict=True):
             if share > max(2.0 * nominal, nominal + TAIL_ERRORS * error):

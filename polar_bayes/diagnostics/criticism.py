@@ -27,11 +27,11 @@ from arviz_stats.base import array_stats
 from scipy import stats
 
 from polar_bayes.diagnostics.parameters import (
-    CENTRAL_95,
     Scalar,
     method_of,
     posterior_scalars,
     scalars,
+    with_entries,
 )
 from polar_bayes.diagnostics.predictive import (
     FlatVariable,
@@ -39,7 +39,7 @@ from polar_bayes.diagnostics.predictive import (
     flat_variables,
     predictive_checks,
 )
-from polar_bayes.inference.result import bounds_of, provenance_of
+from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
 from polar_bayes.observation.data import ANGLES
 
 CAUTION = 0.02
@@ -198,13 +198,11 @@ def _prior_tails(result: xr.DataTree, found: Sequence[Scalar]) -> dict[str, floa
     """Prior probability below the posterior median of each parameter that has a prior."""
     stated = provenance_of(result).get("prior_probability") or {}
     fixed = provenance_of(result).get("fixed") or {}
-    entries = {name: iter(values) for name, values in stated.items()}
-    tails: dict[str, float] = {}
-    for scalar in found:
-        below = next(entries.get(scalar.name, iter(())), None)
-        if below is not None and scalar.name not in fixed:
-            tails[scalar.label] = float(below)
-    return tails
+    return {
+        scalar.label: float(below)
+        for scalar, below in with_entries(found, stated)
+        if scalar.name not in fixed
+    }
 
 
 def _noise(found: Sequence[Scalar]) -> Finding:

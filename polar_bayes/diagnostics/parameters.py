@@ -1,7 +1,8 @@
 """The scalar parameters of a fit: each with a label and an array of draws, the material first."""
 
 import dataclasses
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -15,9 +16,6 @@ SAMPLE_DIMS = ("chain", "draw")
 APPROXIMATIONS = ("laplace", "variational")
 """Methods whose draws are of the approximation, stored with `log_weight`: log posterior minus log
 approximation, up to a constant."""
-
-CENTRAL_95 = (0.025, 0.975)
-"""Probabilities of the ends of the equal-tailed 95% interval."""
 
 # Of a population, and of a process over wavelength.
 HYPERPARAMETER_SUFFIXES = ("_location", "_spread", "_level", "_amplitude", "_length")
@@ -37,6 +35,16 @@ class Scalar:
     def is_material(self) -> bool:
         """True for roughness, subsurface fraction, absorption and refractive index."""
         return self.name in MATERIAL_PARAMETERS
+
+
+def with_entries[T](
+    found: Iterable[Scalar], stated: Mapping[str, Iterable[T]]
+) -> Iterator[tuple[Scalar, T]]:
+    """Each scalar with its entry of what the provenance states by name, where it has one."""
+    entries = {name: iter(values) for name, values in stated.items()}
+    for scalar in found:
+        for entry in itertools.islice(entries.get(scalar.name, iter(())), 1):
+            yield scalar, entry
 
 
 def is_hyperparameter(name: str, names: Collection[str]) -> bool:

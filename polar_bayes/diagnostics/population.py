@@ -16,9 +16,9 @@ import scipy.special
 import scipy.stats
 import xarray as xr
 
-from polar_bayes.diagnostics.parameters import CENTRAL_95, Scalar, method_of, posterior_scalars
+from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars
 from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.result import bounds_of, provenance_of
+from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
 from polar_bayes.priors import RANGES
 
 NEW_MEMBERS = 20_000

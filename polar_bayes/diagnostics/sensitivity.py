@@ -19,12 +19,12 @@ import xarray as xr
 from arviz_stats.base import array_stats
 
 from polar_bayes.diagnostics.parameters import (
-    CENTRAL_95,
     SAMPLE_DIMS,
     method_of,
     posterior_scalars,
     scalars,
 )
+from polar_bayes.inference.result import CENTRAL_95
 
 DETERMINED = 0.5
 """Prior probability inside the posterior's 95% interval; normal ones, a third as wide, have it."""

@@ -39,31 +39,25 @@ class PixelByPixel(AbstractPixelMethod):
     ) -> None:
         del modes  # the method finds its own, from more starts
         compiled = batch.engine.programs.of("one by one", lambda: _compiled_model(batch.engine))
-        answers: dict[int, tuple[Values, np.ndarray]] = {}
 
-        def run(part: np.ndarray) -> Outcome:
-            def keep(index: np.ndarray, draws: Values, weights: np.ndarray) -> None:
-                answers[int(part[index[0]])] = draws, weights
+        def run(pixel: int) -> tuple[np.ndarray, Outcome, list[tuple[Values, np.ndarray]]]:
+            one, found = np.array([pixel]), []
+            outcome = self.method.run_batch(
+                compiled,
+                batch.pixels.subset(one),
+                batch.keys[one, -1],  # a number of the pixel's own, on which its answer depends
+                batch.seed,
+                lambda _, draws, weights: found.append((draws, weights)),
+            )
+            return one, outcome, found
 
-            numbers = batch.keys[part][:, -1]  # of each pixel's own
-            pixels = batch.pixels.subset(part)
-            return self.method.run_batch(compiled, pixels, numbers, batch.seed, keep)
-
-        parts = [part for part in np.array_split(at, THREADS) if part.size]
-        with ThreadPoolExecutor(THREADS) as pool:  # a pixel's answer depends on its number alone
-            outcomes = list(pool.map(run, parts))
-        for part, outcome in zip(parts, outcomes, strict=True):
-            for i, pixel in enumerate(part):
-                if np.isnan(batch.outcome.pareto_k[pixel]):  # else it is that of another proposal
-                    batch.outcome.pareto_k[pixel] = outcome.pareto_k[i]
-                if int(pixel) in answers:
-                    batch.record(
-                        part[i : i + 1],
-                        *answers[int(pixel)],
-                        outcome.effective_draws[i],
-                        outcome.approach[i],
-                        outcome.status[i],
-                    )
+        with ThreadPoolExecutor(THREADS) as pool:
+            for one, outcome, found in pool.map(run, at):
+                if np.isnan(batch.outcome.pareto_k[one]):  # else it is that of another proposal
+                    batch.outcome.pareto_k[one] = outcome.pareto_k
+                for draws, weights in found:
+                    judged = outcome.effective_draws, outcome.approach, outcome.status
+                    batch.record(one, draws, weights, *judged)
 
 
 def _compiled_model(engine: BatchEngine) -> CompiledModel:

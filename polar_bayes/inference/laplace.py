@@ -35,6 +35,7 @@ from polar_bayes.inference.psis import (
     smooth,
     systematic_resample,
 )
+from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.progress import Progress, no_progress
 
 SIDE_BY_SIDE = 1024
@@ -158,15 +159,11 @@ class Importance(AbstractMethod):
         )
 
 
-INTERVAL = (0.025, 0.975)
-"""Probabilities of the ends beyond which the shares of two methods are compared."""
-
-
 def tail_shares(problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
     """Shares of weighted draws beyond the 95% intervals of chains, an entry of the provenance.
 
     Chains that never entered an arm of the posterior agree with each other; draws along its
-    profiles reach the arm. None where such draws do not suit the problem.
+    profiles reach the arm. Empty where such draws do not suit the problem.
     """
     if problem.program.size > MOST_COORDINATES:
         return {}
@@ -179,7 +176,7 @@ def tail_shares(problem: Problem, parameters: Values, key: Array) -> dict[str, A
     shares = {}
     for name, x in problem.constrain(z[None]).items():
         draws = np.reshape(x, (len(weights), -1))
-        low, high = np.quantile(np.reshape(parameters[name], (-1, draws.shape[1])), INTERVAL, 0)
+        low, high = np.quantile(np.reshape(parameters[name], (-1, draws.shape[1])), CENTRAL_95, 0)
         beyond = np.stack([weights @ (draws < low), weights @ (draws > high)], axis=1)
         shares[name] = np.round(beyond, 5).tolist()
     known = {"k_hat": found.k_hat, "effective_draws": found.effective_draws}

@@ -91,18 +91,14 @@ class Program:
     def _constrain(self, sites: dict[str, Array]) -> dict[str, Array]:
         return {name: dist.biject_to(self.supports[name])(x) for name, x in sites.items()}
 
-    def trace(
-        self, z: Float[Array, " size"], data: Observations, key: Array | None = None
-    ) -> dict[str, dict]:
+    def trace(self, z: Float[Array, " size"], data: Observations) -> dict[str, dict]:
         """The sites of the model at an unconstrained vector."""
-        return self.trace_at(self.unravel(z), data, key)
+        return self.trace_at(self.unravel(z), data)
 
-    def trace_at(
-        self, sites: dict[str, Array], data: Observations, key: Array | None = None
-    ) -> dict[str, dict]:
+    def trace_at(self, sites: dict[str, Array], data: Observations) -> dict[str, dict]:
         """The same of the unconstrained latent sites by name."""
         fixed = handlers.substitute(self.model, data=self._constrain(sites))
-        return _trace(fixed, jax.random.key(0) if key is None else key, data)
+        return _trace(fixed, jax.random.key(0), data)
 
     def parameters(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
         """The parameters: latent sites that are not auxiliary, and what derives from them."""

@@ -21,6 +21,9 @@ from polar_bayes.priors import RANGES
 
 PROVENANCE = "polar_bayes"
 
+CENTRAL_95 = (0.025, 0.975)
+"""Probabilities of the ends of the equal-tailed 95% interval."""
+
 
 def assemble(
     program: Program,

@@ -25,12 +25,13 @@ from numpyro import distributions as dist
 from polar_bayes.capture.schema import validate
 from polar_bayes.diagnostics.compare import compare_predictions
 from polar_bayes.diagnostics.criticism import criticize
-from polar_bayes.diagnostics.parameters import CENTRAL_95, scalars
+from polar_bayes.diagnostics.parameters import scalars
 from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.errors import FitError, SceneError, one_line
 from polar_bayes.inference.fitting import fit_request
 from polar_bayes.inference.laplace import Importance
 from polar_bayes.inference.request import Request, resolve
+from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
