@@ -1,9 +1,12 @@
 """How often the intervals of a map hold the truth, with and without the correction by weights.
 
-    python benchmarks/map_coverage.py
+python benchmarks/map_coverage.py plates camera shared
 
-Ten thousand smooth plates drawn from the priors, with noise from .005 to .08; then 900 rough
-materials before a camera, by roughness: each pixel infers its own exposure, noise and polarizer.
+plates    ten thousand smooth plates drawn from the priors, with noise from .005 to .08
+camera    900 rough materials before a camera, by roughness: each pixel infers its own exposure,
+          noise and polarizer; then the same pixels where an image shares these
+shared    100 images of ten thousand plates, each with a noise of its own, which all of its
+          pixels share; beside maps whose pixels each infer it, and maps that are told
 """
 
 import itertools
@@ -13,6 +16,11 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pandas as pd
+import xarray as xr
+from numpyro import handlers
+from polar_bayes.models.per_material import per_material
+from scipy import stats
 
 import polar_bayes as pb
 
@@ -58,14 +66,52 @@ def by_roughness() -> None:
     print(pb.diagnostics.map_coverage(maps, rows)[["answered", "held_95"]].round(3))
 
 
-def main() -> None:
+IMAGES = 100
+FACTOR = "stokes_error_factor"
+
+
+def shared() -> None:
+    """Print how often intervals of the noise and of n hold the truth, over many images."""
+    random, links = np.random.default_rng(5), {"q": pb.links.StokesLink(stated_errors=True)}
+    asked = {"scene": ASKED["scene"], "links": links}
+    held, scores, pixels, widths = [], [], [], []
+    for seed in range(IMAGES):
+        factor = float(np.exp(np.log(1.5) + 0.7 * random.normal()))
+        image = plate_image(SIDE, SIDE, noise=0.01 * factor, seed=seed)
+        image = image.assign(q_error=xr.full_like(image["q_error"], 0.01))
+        maps = pb.fit_pixels(image, shared=(FACTOR,), **asked)
+        row = pb.maps.shared_parameters(maps).loc[FACTOR]
+        held.append(row["q2.5"] <= factor <= row["q97.5"])
+        scores.append(3.92 * np.log(factor / row["q50"]) / np.log(row["q97.5"] / row["q2.5"]))
+        pixels.append(pb.diagnostics.map_coverage(maps, image)["held_95"])
+        if seed < 3:  # sds of n over those of a map that is told the noise
+            model = handlers.condition(per_material, data={FACTOR: factor})
+            told = pb.fit_pixels(image, model=model, **asked)["refractive_index_sd"]
+            own = pb.fit_pixels(image, **asked)["refractive_index_sd"]
+            widths.append([float((x / told).median()) for x in (maps["refractive_index_sd"], own)])
+    interval = stats.binomtest(sum(held), IMAGES).proportion_ci(method="wilson")
+    print(f"noise held in {sum(held)} of {IMAGES} images [{interval.low:.1%}, {interval.high:.1%}]")
+    print(f"standard scores: mean {np.mean(scores):.2f}, sd {np.std(scores):.2f}")
+    print(pd.DataFrame(pixels).describe().loc[["mean", "min", "max"]].round(3))
+    print("sd of n over that of a map that is told the noise: shared, each its own", widths)
+
+
+def plates() -> None:
+    """Print how often intervals of smooth plates hold the truth."""
     noise = np.exp(np.random.default_rng(2).uniform(np.log(0.005), np.log(0.08), (SIDE, SIDE)))
     image = plate_image(SIDE, SIDE, noise=noise, seed=12)
     for name, method in METHODS.items():
         maps = pb.fit_pixels(image, method=method, **ASKED)
         print(f"{name}: {pb.maps.count_pixels(maps)}")
         print(pb.diagnostics.map_coverage(maps, image)[["held_50", "held_80", "held_95"]].round(3))
-    by_roughness()
+
+
+PARTS = {"plates": plates, "camera": by_roughness, "shared": shared}
+
+
+def main() -> None:
+    for name in sys.argv[1:] or PARTS:
+        PARTS[name]()
 
 
 if __name__ == "__main__":

@@ -149,6 +149,30 @@ def _slope_of_unfolded(x: tuple, dx: tuple) -> tuple[Array, Array]:
     return z, 2.0 * jnp.exp(0.5 * (z**2 - x[0] ** 2)) * dx[0]
 
 
+# --- Priors that come from other pixels -----------------------------------------------------------
+
+
+class NormalCoordinate(dist.TransformedDistribution):
+    """Normal in the unconstrained coordinate of a support.
+
+    Args:
+        mean: Of the coordinate, in the shape of one draw.
+        sd: The same.
+        support: Of the distribution.
+    """
+
+    def __init__(self, mean: Array, sd: Array, support: constraints.Constraint) -> None:
+        self._support = support
+        base = dist.Normal(mean, sd)
+        transform = dist.biject_to(support)
+        super().__init__(base.to_event(transform.domain.event_dim), [transform])
+
+    @property
+    @override
+    def support(self) -> constraints.Constraint:
+        return self._support
+
+
 # --- Description for reports ----------------------------------------------------------------------
 
 

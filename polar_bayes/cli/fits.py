@@ -141,25 +141,39 @@ def fit(
     help="One mode of each pixel, corrected; or all modes, many times slower.",
 )  # fmt: skip
 @option("--draws", type=int, help="Of laplace, weighted, in each pixel.  [default: 256]")
+@option("--share", "shared", multiple=True, help="Noise or instrument parameter; repeatable.")
 @seed_option
 @option("--precision", default="double", help="double or single.")
 @scheduler_option
 @option("--resume", is_flag=True, help="Continue an interrupted map.")
-def map_(capture: Path, out: Path, method: str, draws: int | None, **settings: Any) -> None:
+def map_(
+    capture: Path,
+    out: Path,
+    method: str,
+    draws: int | None,
+    shared: tuple[str, ...],
+    **settings: Any,
+) -> None:
     """Fit every pixel of an image."""
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
     given: dict[str, Any] = {} if draws is None else {"draws": draws}
+    given |= {"starts": 4} if shared else {}
     methods: dict[str, Any] = {
         "laplace": pb.methods.PixelLaplace(**given),
         "importance": pb.methods.PixelByPixel(),
         "tempered": pb.methods.PixelSMC(),
     }
-    maps = pb.maps.map_file(capture, out, method=methods[method], **settings)
+    maps = pb.maps.map_file(capture, out, method=methods[method], shared=shared, **settings)
     counts = ", ".join(
         f"{count} {what}" for what, count in pb.maps.count_pixels(maps).items() if count
     )
     click.echo(f"{out}: {counts}")
+    for name, row in pb.maps.shared_parameters(maps).iterrows():
+        interval = f"{row['q50']:.5g} [{row['q2.5']:.5g}, {row['q97.5']:.5g}]"
+        click.echo(f"{name}: {interval} in all pixels, from {row['pixels']:.0f} of them")
+    for sentence in pb.maps.shared_cautions(maps):
+        click.echo(f"caution: {sentence}", err=True)
 
 
 @command()

@@ -8,6 +8,7 @@ was not found.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple, override
 
@@ -54,6 +55,15 @@ LANES = 8
 SAME_MODE = 1e-3
 """Two modes whose potentials differ by less count as one."""
 
+LEAST_RIVAL, LEAST_DISTANCE = 0.02, 1.0
+"""Evidence of another mode, as a share of that of the heaviest, from which a pixel is fitted at all
+of its modes; and the distance, in posterior sds, from which it counts as another."""
+
+ARM, LONGEST_ARM, MOST_IN_ARM = 2.5, 8.0, 0.025
+"""Distance along the profile of a coordinate, in sds of a proposal, where an arm of the posterior
+begins, and to which it is looked for; the share of a profile in arms, .012 of a normal one, above
+which the proposal misses one."""
+
 STUDENT_T_FACTOR = 2
 """Draws of a Student t proposal for each draw of the normal approximation."""
 
@@ -73,6 +83,8 @@ class PixelLaplace(AbstractPixelMethod):
         weighted: True weights them by the posterior, which corrects the approximation and
             diagnoses it (Pareto k); False takes them as they are, without a diagnosis.
         candidates: Prior draws among which the start of each pixel is chosen, >= 8.
+        starts: From how many of them every pixel is searched, 1 to 4; the lowest mode counts.
+            Pixels whose weights cannot be trusted are searched from four in any case.
         rounds: In which the proposal of a pixel with Pareto k above 0.7, or with too few effective
             draws, is fitted to its own weighted draws, until it has neither; >= 0. Without weights
             there are none.
@@ -87,6 +99,7 @@ class PixelLaplace(AbstractPixelMethod):
     draws: int = 256
     weighted: bool = True
     candidates: int = PRIOR_DRAWS
+    starts: int = 1
     rounds: int = 3
     sampler: AbstractPixelMethod | None = dataclasses.field(default_factory=PixelByPixel)
 
@@ -104,7 +117,12 @@ class PixelLaplace(AbstractPixelMethod):
         run = _Run(self, batch, at)
         found = run.approximate()
         run.record(found)
-        hard = np.flatnonzero(found.search.converged & ~found.is_trusted)
+        several = np.zeros(at.size, bool)
+        if self.sampler is not None and self.weighted:
+            several = found.search.converged & found.has_rival
+            if several.any():
+                self.sampler.fit(batch, at[several])
+        hard = np.flatnonzero(found.search.converged & ~found.is_trusted & ~several)
         for begin in range(0, hard.size, HARD):
             some = hard[begin : begin + HARD]
             left = some[run.adapt(some, take_rows(found, some))]
@@ -122,12 +140,18 @@ class Approximation(NamedTuple):
     parameters: Values
     weights: np.ndarray
     pareto_k: np.ndarray
+    rival: np.ndarray  # log evidence of the heaviest other mode
 
     @property
     def is_trusted(self) -> np.ndarray:
         """Whether the weights correct the errors of the approximation, (pixel,)."""
         enough = effective_draws(self.weights) >= NORMAL_SHARE * self.weights.shape[1]
         return self.search.converged & (self.pareto_k <= MAX_PARETO_K) & enough
+
+    @property
+    def has_rival(self) -> np.ndarray:
+        """Whether another mode was found that weighs too much to be left out, (pixel,)."""
+        return self.rival - _log_evidence(self.search.mode) > math.log(LEAST_RIVAL)
 
 
 class _Run:
@@ -146,27 +170,34 @@ class _Run:
         candidates = self.settings.candidates
         search = find_modes(self.engine, self.pixels, candidates=candidates)
         found = jax.tree.map(np.array, self._weigh(np.arange(self.at.size), search))
-        for rank in RESTARTS:
-            untrusted = np.flatnonzero(~found.is_trusted)
+        for start, rank in enumerate(RESTARTS, 2):
+            everywhere = start <= self.settings.starts
+            untrusted = np.flatnonzero(everywhere | ~found.is_trusted)
             if not untrusted.size:
                 break
             old = take_rows(found.search, untrusted)
             new = find_modes(self.engine, self.pixels.subset(untrusted), rank, candidates)
             is_lower = new.mode.value < old.mode.value - SAME_MODE
-            better = np.flatnonzero(new.converged & (~old.converged | is_lower))
-            if better.size:
-                which = untrusted[better]
-                put_rows(found, which, self._weigh(which, take_rows(new, better)))
+            is_better = new.converged & (~old.converged | is_lower)
+            is_other = _distance(old.mode, new.mode) > LEAST_DISTANCE  # False where one is NaN
+            left_out = np.where(is_better, _log_evidence(old.mode), _log_evidence(new.mode))
+            both = new.converged & old.converged & is_other
+            rival = np.fmax(found.rival[untrusted], np.where(both, left_out, -np.inf))
+            if is_better.any():
+                which = untrusted[is_better]
+                put_rows(found, which, self._weigh(which, take_rows(new, is_better)))
+            found.rival[untrusted] = rival
         return found
 
     def _weigh(self, which: np.ndarray, search: ModeSearch) -> Approximation:
         """Draws of the normal approximations, and their weights where they are asked for."""
         proposal = _proposal_at(search.mode).rotated(self.rotations[which])
         parameters, ratios = self._draw(which, proposal, self.points)
+        none = np.full(which.size, -np.inf)
         if self.settings.weighted:
-            return Approximation(search, parameters, *smooth(ratios))
+            return Approximation(search, parameters, *smooth(ratios), none)
         weights = np.full((which.size, self.settings.draws), 1.0 / self.settings.draws)
-        return Approximation(search, parameters, weights, np.zeros(which.size))
+        return Approximation(search, parameters, weights, np.zeros(which.size), none)
 
     def _draw(
         self, which: np.ndarray, proposal: Proposal, points: Points
@@ -210,10 +241,42 @@ class _Run:
             effective = effective_draws(weights)
             least = STUDENT_T_SHARE * weights.shape[1]
             enough = (pareto_k <= MAX_PARETO_K) & (effective >= least)
+            if self.settings.sampler is not None and enough.any():
+                enough[enough] = ~self._has_arm(some[enough], take_rows(proposal, enough))
             answers = take_rows((parameters, weights, effective), enough)
             self.batch.record(self.at[some[enough]], *answers, MethodUsed.ADAPTED)
             left, weights, proposal = take_rows((left, weights, proposal), ~enough)
         return left
+
+    def _has_arm(self, which: np.ndarray, proposal: Proposal) -> np.ndarray:
+        """Whether the posterior goes on along an axis, where the proposal has ended, (pixel,)."""
+        size, draws = self.points.z.shape[1], self.settings.draws
+        steps = np.linspace(0.0, LONGEST_ARM, draws // (2 * size))
+        along = np.einsum("ij,s->isj", np.eye(size), np.concatenate([-steps[::-1], steps]))
+        z = np.zeros_like(self.points.z)
+        z[: along.shape[0] * along.shape[1]] = along.reshape(-1, size)
+        covariance = np.swapaxes(proposal.root, 1, 2) @ proposal.root
+        sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        line = proposal._replace(root=covariance / sd[:, :, None])
+        _, log_density = self._draw(which, line, Points(z, np.zeros(draws)))
+        profiles = log_density[:, : along.shape[0] * along.shape[1]].reshape(-1, *along.shape[:2])
+        profiles = np.exp(profiles - np.max(profiles, axis=(1, 2), keepdims=True))
+        beyond = np.concatenate([steps[::-1], steps]) > ARM
+        share = profiles[..., beyond].sum(axis=-1) / profiles.sum(axis=-1)
+        return np.any(share > MOST_IN_ARM, axis=1)
+
+
+def _log_evidence(mode: NormalApproximation) -> np.ndarray:
+    """That of normal approximations, up to a constant."""
+    with np.errstate(invalid="ignore"):  # of pixels without a mode
+        return np.log(np.diagonal(mode.root, axis1=1, axis2=2)).sum(axis=1) - mode.value
+
+
+def _distance(mode: NormalApproximation, other: NormalApproximation) -> np.ndarray:
+    """From one to another, in posterior sds of the first."""
+    with np.errstate(invalid="ignore"):  # of pixels without a mode
+        away = np.linalg.solve(np.swapaxes(mode.root, 1, 2), (other.z - mode.z)[..., None])
+    return np.linalg.norm(away[..., 0], axis=1)
 
 
 def _proposal_at(mode: NormalApproximation) -> Proposal:

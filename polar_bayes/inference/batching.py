@@ -97,6 +97,7 @@ def batch_pixels(
             saturated=take(image.saturated, True),
             dims=tuple(axis for axis in image.dims if axis[0] not in IMAGE),
             confidence=take(image.confidence, "normal_confidence" in batched_directions),
+            shared=jax.tree.map(lambda x: None if is_batched else np.asarray(x), image.shared),
         )
 
     valid = np.broadcast_to(np.asarray(image.valid), image.shape)

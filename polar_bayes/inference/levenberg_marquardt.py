@@ -24,6 +24,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 from numpyro import distributions as dist
 from numpyro.infer.util import compute_log_probs
@@ -437,10 +438,15 @@ def _starts(engine: BatchEngine, candidates: int) -> Callable:
     """A program that chooses the prior draw of some rank."""
     draws = engine.prior_draws(candidates).astype(np.float32)
 
+    program = engine.single_program
+
     def start(rank: Array, data: Observations) -> Array:
-        values = jax.vmap(lambda z: engine.single_program.potential(z, data))(draws)
+        # Parameters whose priors come from other pixels start at those.
+        known = {name: mean for name, (mean, _) in data.shared.items()}
+        starts = jax.vmap(lambda z: ravel_pytree({**program.unravel(z), **known})[0])(draws)
+        values = jax.vmap(lambda z: program.potential(z, data))(starts)
         order = jnp.argsort(jnp.where(jnp.isnan(values), jnp.inf, values))
-        return jnp.asarray(draws)[order[rank]]
+        return starts[order[rank]]
 
     return batched(start, given=1)
 

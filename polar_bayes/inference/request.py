@@ -21,7 +21,13 @@ from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import PriorTable, cast_prior, describe_prior, resolve_priors
+from polar_bayes.priors import (
+    NormalCoordinate,
+    PriorTable,
+    cast_prior,
+    describe_prior,
+    resolve_priors,
+)
 from polar_bayes.setups import SETUPS, Setup, default_priors, find_setup
 
 MODELS: dict[str, Callable] = {
@@ -77,7 +83,22 @@ def bind_model(
 ) -> Callable[[Observations], None]:
     """A model with everything but its data in place, in the precision that is switched on."""
     own = {name: cast_prior(prior) for name, prior in priors.items()}
-    return functools.partial(model, scene=scene, priors=own, links=links)
+    return functools.partial(_run, model=model, scene=scene, priors=own, links=links)
+
+
+def _run(
+    data: Observations,
+    model: Callable,
+    scene: Scene,
+    priors: dict[str, dist.Distribution],
+    links: Mapping[str, AbstractLink],
+) -> None:
+    """The model, with priors from other pixels in the place of those that they replace."""
+    shared = {
+        name: NormalCoordinate(mean, sd, priors[name].support)
+        for name, (mean, sd) in data.shared.items()
+    }
+    model(data, scene=scene, priors={**priors, **shared}, links=links)
 
 
 def resolve(

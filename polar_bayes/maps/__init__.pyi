@@ -3,5 +3,7 @@ from .lazy import (
     count_pixels as count_pixels,
     open_capture as open_capture,
     open_map as open_map,
+    shared_cautions as shared_cautions,
+    shared_parameters as shared_parameters,
 )
 from .store import map_file as map_file

@@ -3,10 +3,11 @@
 import dataclasses
 import enum
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
@@ -20,6 +21,7 @@ from polar_bayes.inference.batching import (
     IMAGE,
     MIN_VIEWS,
     MethodUsed,
+    ObservationBatch,
     Outcome,
     Status,
     batch_pixels,
@@ -29,11 +31,18 @@ from polar_bayes.inference.batching import (
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.inference.shared import PIXELS as SHARED_PIXELS
+from polar_bayes.inference.shared import (
+    SharedParameter,
+    as_priors,
+    estimate_shared,
+    of_priors,
+)
 from polar_bayes.maps.blocks import as_completed, workers
 from polar_bayes.observation.data import ANGLES, READINGS, Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.part import notation
-from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.progress import Counter, no_progress, with_counter
 
 BLOCK = 4096
@@ -67,31 +76,37 @@ def fit_pixels(
     largest_view_zenith: float | None = None,
     seed: int = 0,
     precision: str = "double",
+    shared: Sequence[str] = (),
     progress: Counter | None = None,
 ) -> xr.Dataset:
     """Fit every pixel of an image by itself.
 
     Each pixel is the fit that `polar_bayes.fit` makes of it, by the normal approximation at its
-    mode unless `method` says otherwise: the same model, priors and links. Noise parameters are
-    each pixel's own unless the model holds them (`numpyro.handlers.condition`). A map has the
-    marginals of each pixel and nothing joint: to ask for the mean of a region, fit the region.
+    mode unless `method` says otherwise: the same model, priors and links. Parameters in `shared`
+    are one unknown of the whole image: their posterior, estimated from 512 pixels drawn at random,
+    is the prior of every pixel. A map has the marginals of each pixel and nothing joint: to ask for
+    the mean of a region, fit the region.
 
     Args:
         capture: A capture with dims y and x. In chunks (Dask), it is read block by block, and the
             maps come in the same chunks, computed when they are asked for.
         model: See `polar_bayes.fit`; the other arguments too.
-        method: By default `PixelLaplace()`. `PixelSMC()` explores all modes of a pixel, at many
-            times the cost; `PixelNuts()` runs chains in each.
+        method: By default `PixelLaplace()`, with four starts where anything is shared.
+            `PixelSMC()` explores all modes of a pixel, at many times the cost; `PixelNuts()` runs
+            chains in each.
         scene: A name in `SETUPS` or a `Scene`.
         priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
         links: One link for the polarization, or a mapping from variable to link.
         largest_view_zenith: Views beyond it are set aside. Unit degree.
         seed: The same seed gives the same maps, however the image is cut.
         precision: "double" or "single".
+        shared: Parameters of the noise or instrument, such as `("stokes_scale", "dolp_gain")`,
+            that have one value in all of the image.
         progress: Called with the pixels that are done, and all.
 
     Returns:
         For each parameter its mean `<name>`, `<name>_sd` and `<name>_quantile`, each (y, x, ...);
+        what is shared has no map, and is told by `maps.shared_parameters`;
         `pareto_k`, `effective_draws`, `condition`, `steps`, `approach` (the method by which the
         numbers were found) and `status` of each pixel. NaN where a pixel has no answer; the
         attribute `polar_bayes` holds the provenance.
@@ -102,7 +117,7 @@ def fit_pixels(
         FitError: A model, prior, link or setting cannot be used.
     """
     plan = plan_map(
-        capture, model, method, scene, priors, links, largest_view_zenith, seed, precision
+        capture, model, method, scene, priors, links, largest_view_zenith, seed, precision, shared
     )
     if capture.chunks:
         numbered = with_pixel_numbers(capture)
@@ -122,14 +137,22 @@ class MapPlan:
     settings: AbstractPixelMethod = dataclasses.field(compare=False)
     intensity_unit: float | None = dataclasses.field(compare=False)
     own_directions: frozenset[str] = dataclasses.field(compare=False)
+    shared: tuple[SharedParameter, ...] = ()
 
     def observe(self, capture: xr.Dataset) -> Observations:
         """A block, or one pixel, as arrays."""
-        return observe(
+        data = observe(
             capture,
             largest_view_zenith=self.request.largest_view_zenith,
             intensity_unit=self.intensity_unit,
         )
+        priors = jax.tree.map(jnp.asarray, as_priors(self.shared))
+        return dataclasses.replace(data, shared=priors)
+
+    def pixels(self, image: xr.Dataset) -> ObservationBatch:
+        """The pixels of an image, or of a block of it, row by row."""
+        with jax.enable_x64(True):
+            return batch_pixels(self.observe(validate(image)), self.own_directions)
 
     @property
     def engine(self) -> BatchEngine:
@@ -142,9 +165,16 @@ class MapPlan:
         return make_engine(self.key, self.request, pixel)
 
     @property
+    def axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
+        """Names and lengths of the axes, within a pixel, of every parameter that has a map."""
+        shared = {each.name for each in self.shared}
+        found = self.engine.parameter_axes
+        return {name: axes for name, axes in found.items() if name not in shared}
+
+    @property
     def sizes(self) -> dict[str, tuple[int, ...]]:
-        """Lengths of the axes of every parameter within a pixel."""
-        return {name: own for name, (_, own) in self.engine.parameter_axes.items()}
+        """Lengths of the same axes."""
+        return {name: own for name, (_, own) in self.axes.items()}
 
 
 def plan_map(
@@ -157,9 +187,11 @@ def plan_map(
     largest_view_zenith: float | None,
     seed: int,
     precision: str,
+    shared: Sequence[str],
 ) -> MapPlan:
-    """Check the request of a map on one of its pixels."""
-    settings = PixelLaplace() if method is None else method
+    """Check the request of a map on one of its pixels, and estimate what all of them share."""
+    # Where noise is known, modes are narrow, and one start is often caught in the wrong one.
+    settings = PixelLaplace(starts=4 if shared else 1) if method is None else method
     if not isinstance(settings, AbstractPixelMethod):
         hint = "give settings such as PixelLaplace(draws=512) or PixelSMC()"
         raise FitError(f"{method!r} is no method for pixels", where="fit_pixels: method", hint=hint)
@@ -176,8 +208,57 @@ def plan_map(
         if name in capture and set(IMAGE) & set(capture[name].dims)
     )
     unit = _intensity_unit(capture)
-    key = engine_key(request, settings, sorted(own), unit is None)
-    return MapPlan(key, request, settings, unit, own)
+    _check_shared(shared, request)
+    key = engine_key(request, settings, sorted(own), unit is None, tuple(shared))
+    begin = tuple(of_priors(shared, request.priors))
+    plan = MapPlan(key, request, settings, unit, own, begin)
+    return _with_shared(plan, capture) if shared else plan
+
+
+def _check_shared(names: Sequence[str], request: Request) -> None:
+    """Refuse what is no number of the model's, or is part of the material."""
+    for name in names:
+        known = [each for each in request.priors if each not in MATERIAL_PARAMETERS]
+        if isinstance(names, str) or name not in known or request.priors[name].event_shape:
+            raise FitError(
+                "an image cannot share it",
+                where=f"fit_pixels: shared={name!r}",
+                hint=f"give names among {', '.join(known)}",
+            )
+
+
+def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
+    """The plan with the posterior of what pixels share, from some of them drawn at random."""
+    request, settings = plan.request, plan.settings
+    pixels = plan.pixels(_random_pixels(capture, request.seed))
+    if isinstance(settings, PixelLaplace) and settings.weighted:
+        method = dataclasses.replace(settings, sampler=None, starts=4)
+    else:
+        method = PixelLaplace(sampler=None)
+    found = estimate_shared(plan.engine, pixels, method, request.priors, plan.shared, request.seed)
+    return dataclasses.replace(plan, shared=tuple(found))
+
+
+def _random_pixels(capture: xr.Dataset, seed: int) -> xr.Dataset:
+    """As many pixels with enough views as are wanted, or all there are, as an image of one row."""
+    rows, columns = (capture.sizes[dim] for dim in IMAGE)
+    order = np.random.default_rng(seed).permutation(rows * columns)
+    found: list[xr.Dataset] = []
+    for begin in range(0, order.size, 2 * SHARED_PIXELS):
+        y, x = np.unravel_index(np.sort(order[begin : begin + 2 * SHARED_PIXELS]), (rows, columns))
+        some = capture.drop_vars(IMAGE, errors="ignore").isel(
+            y=xr.DataArray(y, dims="x_"), x=xr.DataArray(x, dims="x_")
+        )
+        some = mask_missing(some.load().rename(x_="x"))
+        some = some.map(lambda v: v.expand_dims("y") if "x" in v.dims else v, keep_attrs=True)
+        valid = some["valid"]
+        views = valid.any([d for d in valid.dims if d not in (*IMAGE, "view")]).sum("view")
+        enough = np.flatnonzero(views.transpose(*IMAGE).to_numpy()[0] >= MIN_VIEWS)
+        found.append(some.isel(x=enough))
+        if sum(each.sizes["x"] for each in found) >= SHARED_PIXELS:
+            break
+    joined = xr.concat(found, "x", data_vars="minimal", coords="minimal", compat="override")
+    return joined.isel(x=slice(SHARED_PIXELS))
 
 
 def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
@@ -221,8 +302,20 @@ def provenance_json(plan: MapPlan) -> str:
         "largest_view_zenith": request.largest_view_zenith,
         "precision": request.precision,
         "intensity_unit": plan.intensity_unit,
+        "shared": {each.name: _described(each, request) for each in plan.shared},
     }
     return json.dumps(provenance, sort_keys=True)
+
+
+def _described(parameter: SharedParameter, request: Request) -> dict[str, Any]:
+    """A shared parameter in what JSON can hold."""
+    with jax.enable_x64(True):
+        quantiles = parameter.quantiles(request.priors[parameter.name], LEVELS)
+    return {
+        "quantiles": dict(zip(map(str, LEVELS), quantiles.tolist(), strict=True)),
+        "pixels": parameter.pixels,
+        "disagreement": parameter.disagreement,
+    }
 
 
 # --- Blocks of an image ---------------------------------------------------------------------------
@@ -276,11 +369,10 @@ def fit_block(block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     """Fit every pixel of a block."""
     numbers = block[NUMBER].transpose(*IMAGE).to_numpy().ravel()
     found = Marginals(numbers.size, plan.sizes)
-    with jax.enable_x64(True):
-        readings = mask_missing(block.drop_vars(NUMBER))
-        if not readings["valid"].any():  # a corner of a picture; as a capture it would be refused
-            return maps_of(found, empty_outcome(numbers.size, Status.MASKED), block, plan)
-        pixels = batch_pixels(plan.observe(validate(readings)), plan.own_directions)
+    readings = mask_missing(block.drop_vars(NUMBER))
+    if not readings["valid"].any():  # a corner of a picture; as a capture it would be refused
+        return maps_of(found, empty_outcome(numbers.size, Status.MASKED), block, plan)
+    pixels = plan.pixels(readings)
     seed = plan.request.seed
     outcome = plan.settings.run_batch(plan.engine, pixels, numbers, seed, found.describe)
     return maps_of(found, outcome, block, plan)
@@ -299,7 +391,7 @@ def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, plan: MapPlan
     """The marginals of a block as labeled maps."""
     shape = tuple(block.sizes[dim] for dim in IMAGE)
     variables: dict[str, Any] = {}
-    for name, (own, sizes) in plan.engine.parameter_axes.items():
+    for name, (own, sizes) in plan.axes.items():
         symbol, meaning, unit = notation(name)
         for ending, statistic, values, first in (
             ("", "mean of", found.mean[name], ()),

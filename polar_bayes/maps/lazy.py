@@ -6,6 +6,7 @@ from typing import Any
 
 import lazy_loader
 import numpy as np
+import pandas as pd
 import xarray as xr
 from xarray.backends import BackendArray
 from xarray.core import indexing
@@ -240,6 +241,44 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
         for each in Status:
             counts[each] += int(np.sum(found == each))
     return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
+
+
+DISAGREEMENT = 3.1
+"""Of a standard normal number, which is larger once in a thousand cases."""
+
+
+def shared_parameters(maps: xr.Dataset) -> pd.DataFrame:
+    """The posterior of what all pixels of a map share.
+
+    Args:
+        maps: Of `fit_pixels`, or opened from a store.
+
+    Returns:
+        A row for each shared parameter: quantiles q2.5, q50 and q97.5 (unit of the parameter), the
+        number of pixels from which it was estimated, and `disagreement`: a standard normal number
+        where all pixels have one value, and large where they have several (information matrix
+        test, White 1982). Empty where each pixel has parameters of its own.
+
+    Raises:
+        FitError: The provenance of the map cannot be read.
+    """
+    rows = {}
+    for name, found in (provenance_of(maps).get("shared") or {}).items():
+        low, middle, high = (found["quantiles"][str(level)] for level in (0.025, 0.5, 0.975))
+        rows[name] = [low, middle, high, found["pixels"], found["disagreement"]]
+    columns = ["q2.5", "q50", "q97.5", "pixels", "disagreement"]
+    return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+
+
+def shared_cautions(maps: xr.Dataset) -> list[str]:
+    """A sentence for each shared parameter in which pixels do not agree."""
+    found = shared_parameters(maps)
+    return [
+        f"{name} is shared by all pixels, and they do not agree about it (information matrix test "
+        f"{row['disagreement']:.1f}, above {DISAGREEMENT:g} once in a thousand right models): "
+        "intervals may be too narrow. Let each pixel have its own."
+        for name, row in found[found["disagreement"] > DISAGREEMENT].iterrows()
+    ]
 
 
 def checked_status(maps: xr.Dataset) -> xr.DataArray:

@@ -32,6 +32,8 @@ class Observations(eqx.Module):
         dims: Names and lengths of all axes, outermost first, ending with the view.
         confidence: Confidence in the stated normal, in (0, 1], which broadcasts with the readings;
             None where the capture states none.
+        shared: Means and sds of normal priors, in the unconstrained coordinates, of parameters
+            that other pixels determine too; they replace the priors of those names.
     """
 
     geometry: Geometry
@@ -44,6 +46,9 @@ class Observations(eqx.Module):
     saturated: Bool[Array, "... view"]
     dims: tuple[tuple[str, int], ...] = eqx.field(static=True)
     confidence: Float[Array, "... #view"] | None = None
+    shared: dict[str, tuple[Float[Array, "..."], Float[Array, "..."]]] = eqx.field(
+        default_factory=dict
+    )
 
     @property
     def shape(self) -> tuple[int, ...]:

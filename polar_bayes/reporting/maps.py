@@ -17,7 +17,13 @@ from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, cut
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.maps.lazy import COPY, checked_status, ensure_loaded
+from polar_bayes.maps.lazy import (
+    COPY,
+    checked_status,
+    ensure_loaded,
+    shared_cautions,
+    shared_parameters,
+)
 from polar_bayes.physics.part import notation
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts
@@ -219,6 +225,9 @@ def map_page(
         sentences += conclusions
     regions = page.caption("map.regions")
     tables: list[page.Block] = [parameter_table(maps, titles), regions]
+    shared = shared_parameters(maps)
+    if not shared.empty:
+        tables.append(shared_table(shared))
     sections = [
         page.Section("maps", "Maps", list(_pictures(maps, list(titles)))),
         page.Section("pixels", "Pixels", _pixel_tables(counts)),
@@ -234,7 +243,10 @@ def map_page(
         headline=headline,
         passed=passed,
         sentences=sentences,
-        cautions=[] if is_weighted else [page.caption("map.unchecked")],
+        cautions=[
+            *([] if is_weighted else [page.caption("map.unchecked")]),
+            *shared_cautions(maps),
+        ],
         sections=sections,
         footer="Computed from the maps of every pixel, which stay where they are.",
     )
@@ -353,6 +365,26 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
         pd.DataFrame.from_dict(data, orient="index", columns=columns),
         descriptions={scalar.label: title for scalar, title in titles.items()},
         groups={scalar.label: _group(scalar) for scalar in titles},
+    )
+
+
+def shared_table(shared: pd.DataFrame) -> Table:
+    """What all pixels have in common."""
+    width = (shared["q97.5"] - shared["q2.5"]) / 4.0
+
+    def cell(column: str) -> Callable[[pd.Series], str]:
+        return lambda row: number(row[column], width[row.name])
+
+    return page.make_table(
+        "shared",
+        page.caption("map.shared"),
+        {
+            **{column: cell(column) for column in ("q2.5", "q50", "q97.5")},
+            "pixels": text.column("pixels", ",.0f"),
+            "disagreement": text.column("disagreement", ".1f"),
+        },
+        shared,
+        descriptions={name: notation(name).meaning for name in shared.index},
     )
 
 

@@ -1,0 +1,290 @@
+r"""Parameters that all pixels of an image share, such as the gain of the polarizer or the noise.
+
+Their posterior given many pixels is
+
+$$ p(\varphi \mid y) \propto p(\varphi) \prod_i \int p(\theta_i)\, p(y_i \mid \theta_i, \varphi)\,
+d\theta_i $$
+
+with $\theta_i$ the parameters of pixel i alone. Slope and curvature of each log integral are
+expectations over the posterior of that pixel, and come from its weighted draws:
+
+$$ s_i = E[\partial_\varphi \ell_i], \qquad
+J_i = -E[\partial_\varphi^2 \ell_i] - Var[\partial_\varphi \ell_i], \qquad
+\ell_i = \log p(y_i, \theta_i \mid \varphi). $$
+
+Newton's method on their sums gives mode and covariance. Under normal approximations
+$J_i$ is the Schur complement of the block of $\theta_i$ in an arrowhead matrix.
+
+Source:
+    Louis (1982), J. R. Stat. Soc. B 44(2), 226-233, eqs. 3.1 and 3.2 (slope and curvature); Minka
+    (2001), UAI 17, 362-369 (expectation propagation, by which the search begins); White (1982),
+    Econometrica 50(1), 1-25 (the information matrix test of whether pixels agree, and the
+    covariance that holds where they do not).
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+from jaxtyping import Array
+from numpyro import distributions as dist
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.batch_engine import BatchEngine
+from polar_bayes.inference.batch_laplace import PixelLaplace
+from polar_bayes.inference.batching import LANES, ObservationBatch, Status, batched
+from polar_bayes.inference.program import Program, Values
+from polar_bayes.observation.data import Observations
+
+PIXELS = 512
+"""Pixels from which shared parameters are estimated. Errors of weighted means add up over pixels,
+so that many more would call for more draws of each."""
+
+LEAST_PIXELS = 32
+
+DRAWS = 64
+"""Resampled draws of each pixel at which derivatives are taken."""
+
+LONGEST_STEP, SHRINKAGE, GROWTH, MOST_STEPS = 4.0, 30.0, 2.0, 20
+"""Of Newton's method: the longest step in sds of the priors of pixels, how fast these narrow and
+widen, and the number of steps."""
+
+SETTLED, WIDE, NARROW = 0.25, 50.0, 2.0
+"""The last step in posterior sds; variances of the priors of pixels over those of the posterior,
+above which derivatives at one place say too little, and below which the search may end."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SharedParameter:
+    """The posterior of a parameter that all pixels share, normal in its coordinate.
+
+    Args:
+        name: Of the parameter.
+        mean: Of the unconstrained coordinate.
+        sd: The same.
+        pixels: From which it was estimated.
+        disagreement: Information matrix test, a standard normal number where all pixels have one
+            value of the parameter, and large where they have several.
+    """
+
+    name: str
+    mean: float
+    sd: float
+    pixels: int = 0
+    disagreement: float = 0.0
+
+    def quantiles(self, prior: dist.Distribution, levels: Sequence[float]) -> np.ndarray:
+        """Quantiles of the parameter itself."""
+        scores = self.mean + self.sd * scipy.special.ndtri(np.asarray(levels))
+        return np.asarray(dist.biject_to(prior.support)(scores), float)
+
+
+def as_priors(shared: Sequence[SharedParameter]) -> dict[str, tuple[Any, Any]]:
+    """What `Observations.shared` holds."""
+    return {each.name: (np.asarray(each.mean), np.asarray(each.sd)) for each in shared}
+
+
+def of_priors(
+    names: Sequence[str], priors: Mapping[str, dist.Distribution]
+) -> list[SharedParameter]:
+    """The priors themselves as normal distributions, from which the search begins."""
+    found = []
+    for name in names:
+        draws = priors[name].sample(jax.random.key(0), (4000,))
+        scores = np.asarray(dist.biject_to(priors[name].support).inv(draws), float)
+        found.append(SharedParameter(name, float(scores.mean()), float(scores.std())))
+    return found
+
+
+def estimate_shared(
+    engine: BatchEngine,
+    pixels: ObservationBatch,
+    method: PixelLaplace,
+    priors: Mapping[str, dist.Distribution],
+    shared: Sequence[SharedParameter],
+    seed: int,
+) -> list[SharedParameter]:
+    """The posterior of shared parameters, from the pixels that the method can be trusted in.
+
+    Raises:
+        FitError: Too few pixels have an answer, or the search does not settle.
+    """
+    names = tuple(each.name for each in shared)
+    where = f"shared parameters {', '.join(names)}"
+    mean, sd = (np.array([getattr(each, part) for each in shared]) for part in ("mean", "sd"))
+    for _ in range(MOST_STEPS):
+        now = [
+            dataclasses.replace(each, mean=m, sd=s)
+            for each, m, s in zip(shared, mean.tolist(), sd.tolist(), strict=True)
+        ]
+        found = _expectations(engine, pixels, method, now, seed)
+        count = len(found.slope)
+        if count < LEAST_PIXELS:
+            raise FitError(
+                f"only {count} pixels have an answer (at least {LEAST_PIXELS})",
+                where=where,
+                hint="let each pixel have its own: shared=()",
+            )
+        slope, curvature = _prior_derivatives(names, priors, mean)
+        total, whole = slope + found.slope.sum(axis=0), curvature + found.information.sum(axis=0)
+        ratio = np.max(sd**2 * _precision(whole))
+        if not ratio < WIDE:
+            # Under a wide prior the posterior of a pixel, divided by that prior, says more than
+            # derivatives do (expectation propagation).
+            inverse = np.linalg.inv(found.covariance) * (1.0 - (sd.size + 1) / (DRAWS - 1))
+            total = slope + np.einsum("pij,pj->i", inverse, found.mean - mean)
+            whole = curvature + np.sum(inverse - np.diag(sd**-2.0), axis=0)
+        if not np.isfinite(_precision(whole)).all():
+            whole = np.diag(sd**-2.0) * count**0.5
+        step, reached = np.linalg.solve(whole, total), _precision(whole) ** -0.5
+        if ratio < NARROW and np.all(np.abs(step) < SETTLED * reached):
+            return [
+                dataclasses.replace(each, mean=m, sd=s, pixels=count, disagreement=d)
+                for each, m, s, d in zip(
+                    now,
+                    (mean + step).tolist(),
+                    _sandwich_sd(found.slope, curvature, whole).tolist(),
+                    _information_test(found).tolist(),
+                    strict=True,
+                )
+            ]
+        step = step / max(1.0, np.max(np.abs(step) / sd) / LONGEST_STEP)
+        mean, reached = mean + step, np.maximum(reached, 0.5 * np.abs(step))
+        sd = np.clip(reached, sd / SHRINKAGE, GROWTH * sd)
+    raise FitError(
+        f"their search has not settled in {MOST_STEPS} steps",
+        where=where,
+        hint="let each pixel have its own: shared=(), or share fewer",
+    )
+
+
+def _precision(information: np.ndarray) -> np.ndarray:
+    """One over the variance of each parameter; infinite where that is not positive."""
+    if not np.linalg.eigvalsh(information)[0] > 0.0:
+        return np.full(len(information), np.inf)
+    return 1.0 / np.diag(np.linalg.inv(information))
+
+
+class _Expectations(NamedTuple):
+    """Of every pixel: slope, its Monte Carlo error, information; mean and covariance of draws."""
+
+    slope: np.ndarray
+    error: np.ndarray
+    information: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
+def _information_test(found: _Expectations) -> np.ndarray:
+    """White's test of each parameter by itself."""
+    expected = np.diagonal(found.information, axis1=1, axis2=2) + found.error**2
+    excess = found.slope**2 - expected
+    return excess.sum(axis=0) / np.sqrt(np.sum((excess - excess.mean(axis=0)) ** 2, axis=0))
+
+
+def _sandwich_sd(slope: np.ndarray, prior: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Standard deviations that hold where slopes spread more than the information says."""
+    # They do where expectations have Monte Carlo errors, and where pixels do not agree.
+    spread = prior + len(slope) * np.atleast_2d(np.cov(slope.T, ddof=0))
+    inverse = np.linalg.inv(whole)
+    return np.sqrt(np.diag(inverse @ spread @ inverse))
+
+
+def _prior_derivatives(
+    names: Sequence[str], priors: Mapping[str, dist.Distribution], at: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slope of the log prior density of the coordinates, and minus its curvature."""
+
+    def log_density(name: str, x: Array) -> Array:
+        transform = dist.biject_to(priors[name].support)
+        value = transform(x)
+        return priors[name].log_prob(value) + transform.log_abs_det_jacobian(x, value)
+
+    with jax.enable_x64(True):
+        slopes = [jax.grad(lambda x, n=n: log_density(n, x)) for n in names]
+        first = [float(f(x)) for f, x in zip(slopes, at, strict=True)]
+        second = [float(jax.grad(f)(x)) for f, x in zip(slopes, at, strict=True)]
+    return np.array(first), -np.diag(second)
+
+
+def _expectations(
+    engine: BatchEngine,
+    pixels: ObservationBatch,
+    method: PixelLaplace,
+    shared: Sequence[SharedParameter],
+    seed: int,
+) -> _Expectations:
+    """What each pixel says about the shared parameters, at the priors that they have now."""
+    static = dataclasses.replace(pixels.static, shared=as_priors(shared))
+    pixels = dataclasses.replace(pixels, static=static)
+    z = np.zeros((len(pixels), DRAWS, engine.program.size))
+
+    def keep(at: np.ndarray, draws: Values, weights: np.ndarray) -> None:
+        z[at] = _coordinates(engine.program, draws, _resampled(weights))
+
+    outcome = method.run_batch(engine, pixels, np.arange(len(pixels)), seed, keep)
+    good = np.flatnonzero(outcome.status == Status.GOOD)
+    names = tuple(each.name for each in shared)
+    if not good.size:
+        return _Expectations(*(np.zeros((0, len(names))) for _ in range(5)))
+    coordinates = z[good][..., _positions(engine.program, names)]
+    mean = coordinates.mean(axis=1)
+    centered = coordinates - mean[:, None]
+    covariance = np.einsum("pdi,pdj->pij", centered, centered) / (DRAWS - 1)
+    own = pixels.subset(good), z[good].astype(engine.dtype)
+    slope, error, information = engine.run(_slopes, names, *own)
+    return _Expectations(slope, error, information, mean, covariance)
+
+
+def _resampled(weights: np.ndarray) -> np.ndarray:
+    """Indices of draws, each as often as it weighs: (pixel, draw)."""
+    levels = (np.arange(DRAWS) + 0.5) / DRAWS
+    below = np.cumsum(weights, axis=1)
+    return np.stack([np.minimum(np.searchsorted(row, levels), row.size - 1) for row in below])
+
+
+def _coordinates(program: Program, draws: Values, which: np.ndarray) -> np.ndarray:
+    """Unconstrained vectors of some draws, (pixel, draw, size)."""
+    rows = np.arange(len(which))[:, None]
+    layout = jax.eval_shape(program.unravel, jnp.zeros(program.size))
+    parts = []
+    for name in layout:  # in the order of `unravel`
+        values = np.asarray(draws[name], float)[rows, which]
+        part = np.asarray(dist.biject_to(program.supports[name]).inv(values), float)
+        parts.append(part.reshape(*which.shape, -1))
+    return np.concatenate(parts, axis=-1)
+
+
+def _positions(program: Program, names: Sequence[str]) -> np.ndarray:
+    """Where numbers of these names stand in the unconstrained vector."""
+    found = program.unravel(jnp.arange(program.size, dtype=float))
+    return np.array([int(found[name]) for name in names], int)
+
+
+def _slopes(engine: BatchEngine, names: tuple[str, ...]) -> Callable:
+    """The program of slope and information of one pixel."""
+    program = engine.program
+    where = _positions(program, names)
+
+    def of_pixel(data: Observations, z: Array) -> tuple[Array, Array, Array]:
+        mean, sd = (jnp.stack([data.shared[name][part] for name in names]) for part in (0, 1))
+
+        def of_draw(z: Array) -> tuple[Array, Array]:
+            def potential(x: Array) -> Array:
+                # Without the prior of the shared parameters, which counts once for all pixels.
+                own = 0.5 * jnp.sum(((x - mean) / sd) ** 2)
+                return program.potential(z.at[where].set(x), data) - own
+
+            return -jax.grad(potential)(z[where]), jax.hessian(potential)(z[where])
+
+        slope, curvature = jax.vmap(of_draw)(z)
+        centered = slope - slope.mean(axis=0)
+        spread = centered.T @ centered / (len(slope) - 1)
+        error = 0.5 * (slope[::2].mean(axis=0) - slope[1::2].mean(axis=0))
+        return slope.mean(axis=0), error, curvature.mean(axis=0) - spread
+
+    return batched(of_pixel, lanes=LANES)

@@ -1,0 +1,121 @@
+"""Parameters that all pixels of an image share: one unknown of the whole image."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from numpyro import handlers
+from plate_images import ASKED, plate_image
+from plates import PLATE
+from polar_bayes.models.per_material import per_material
+
+import polar_bayes as pb
+from polar_bayes.inference.batching import Status
+
+SHARED = ("stokes_error_factor",)
+FACTOR = 1.6
+SIDE = 15
+LINKS = {"q": pb.links.StokesLink(stated_errors=True)}
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
+
+def noisy(factor: float | np.ndarray, seed: int = 4) -> xr.Dataset:
+    """Plates whose readings scatter by a multiple of the stated errors."""
+    stated = 0.02
+    image = plate_image(SIDE, SIDE, noise=factor * stated, seed=seed)
+    return image.assign(q_error=xr.full_like(image["q_error"], stated))
+
+
+@pytest.fixture(scope="module")
+def image() -> xr.Dataset:
+    return noisy(FACTOR)
+
+
+@pytest.fixture(scope="module")
+def maps(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
+    return pb.fit_pixels(image, scene=PLATE, links=LINKS, shared=SHARED)
+
+
+def test_the_noise_of_an_image_is_one_number(image: xr.Dataset, maps: xr.Dataset) -> None:
+    row = pb.maps.shared_parameters(maps).loc["stokes_error_factor"]
+    sd = np.log(row["q97.5"] / row["q2.5"]) / 3.92
+    # Six readings less two parameters leave four degrees of freedom in each pixel, each of which
+    # has an information of two about the log of a scale.
+    assert sd == pytest.approx((2.0 * 4.0 * SIDE**2) ** -0.5, rel=0.25)
+    assert abs(np.log(row["q50"] / FACTOR)) < 3.5 * sd  # once in 2,000 seeds
+    assert row["pixels"] > 0.95 * SIDE**2
+    assert row["disagreement"] < 3.1
+    assert not pb.maps.shared_cautions(maps)
+
+
+def test_what_is_shared_has_no_map_and_pixels_keep_theirs(maps: xr.Dataset) -> None:
+    assert not any(name.startswith("stokes_error_factor") for name in maps.data_vars)
+    assert (maps["status"] == Status.GOOD).all()
+
+
+def test_pixels_know_as_much_as_if_the_noise_were_given(
+    image: xr.Dataset, maps: xr.Dataset
+) -> None:
+    held = handlers.condition(per_material, data={"stokes_error_factor": FACTOR})
+    given = pb.fit_pixels(image, model=held, scene=PLATE, links=LINKS)
+    for name in ("refractive_index", "subsurface_fraction"):
+        ratio = maps[f"{name}_sd"] / given[f"{name}_sd"]
+        # The scale differs from the truth by at most 3.5 of its sds of 2.4%.
+        assert float(abs(ratio.median() - 1.0)) < 0.085
+
+
+def test_pixels_that_disagree_are_told() -> None:
+    """The noise of the right half is three times that of the left one."""
+    halves = np.where(np.arange(SIDE) < SIDE // 2, 0.8, 2.4) * np.ones((SIDE, 1))
+    maps = pb.fit_pixels(noisy(halves), scene=PLATE, links=LINKS, shared=SHARED)
+    (sentence,) = pb.maps.shared_cautions(maps)
+    assert "stokes_error_factor is shared by all pixels, and they do not agree" in sentence
+
+
+def test_it_does_not_matter_how_the_image_is_cut(
+    image: xr.Dataset, maps: xr.Dataset, tmp_path: Path
+) -> None:
+    image.chunk(y=4, x=8).to_zarr(tmp_path / "image.zarr", consolidated=False)
+    settings = {"scene": PLATE, "links": LINKS, "shared": SHARED}
+    stored = pb.maps.map_file(tmp_path / "image.zarr", tmp_path / "map.zarr", **settings)
+    for name in maps.data_vars:
+        np.testing.assert_array_equal(stored[name], maps[name], err_msg=str(name))
+    resumed = pb.maps.map_file(
+        tmp_path / "image.zarr", tmp_path / "map.zarr", resume=True, **settings
+    )
+    xr.testing.assert_identical(resumed.load(), stored.load())
+    page = pb.report(stored, tmp_path / "report").read_text()
+    assert "What all pixels have in common" in page
+
+
+def test_masked_pixels_say_nothing_about_what_is_shared(image: xr.Dataset) -> None:
+    holes = image.assign(q=image["q"].where((image["y"] % 2 == 0) | (image["x"] % 3 > 0)))
+    maps = pb.fit_pixels(holes, scene=PLATE, links=LINKS, shared=SHARED)
+    masked = int((maps["status"] == Status.MASKED).sum())
+    assert masked == int(holes["q"].isnull().all("view").sum())
+    found = pb.maps.shared_parameters(maps).loc["stokes_error_factor"]
+    assert found["pixels"] <= SIDE**2 - masked
+
+
+@pytest.mark.parametrize(
+    ("shared", "what"),
+    [
+        (("refractive_index",), "an image cannot share it"),
+        (("stokes_eror_factor",), "an image cannot share it"),
+        ("stokes_error_factor", "an image cannot share it"),
+    ],
+)
+def test_what_cannot_be_shared_is_refused(image: xr.Dataset, shared: object, what: str) -> None:
+    with pytest.raises(pb.FitError, match=what):
+        pb.fit_pixels(image, scene=PLATE, links=LINKS, shared=shared)
+
+
+def test_too_few_pixels_are_an_error(image: xr.Dataset) -> None:
+    with pytest.raises(pb.FitError, match="only 20 pixels have an answer"):
+        pb.fit_pixels(image.isel(y=slice(4), x=slice(5)), scene=PLATE, links=LINKS, shared=SHARED)
+
+
+def test_nothing_is_shared_unless_it_is_asked_for(image: xr.Dataset) -> None:
+    maps = pb.fit_pixels(image.isel(y=[0], x=[0]), **ASKED)
+    assert pb.maps.shared_parameters(maps).empty
