@@ -224,7 +224,8 @@ def _expectations(
     z = np.zeros((len(pixels), DRAWS, engine.program.size))
 
     def keep(at: np.ndarray, draws: Values, weights: np.ndarray) -> None:
-        z[at] = _coordinates(engine.program, draws, _resampled(weights))
+        if at.size:
+            z[at] = _coordinates(engine.program, draws, _resampled(weights))
 
     outcome = method.run_batch(engine, pixels, np.arange(len(pixels)), seed, keep)
     good = np.flatnonzero(outcome.status == Status.GOOD)
@@ -242,9 +243,13 @@ def _expectations(
 
 def _resampled(weights: np.ndarray) -> np.ndarray:
     """Indices of draws, each as often as it weighs: (pixel, draw)."""
+    # In random order: every sixteenth of quasi-random points would not be spread like all of them.
+    order = np.broadcast_to(np.arange(weights.shape[1]), weights.shape)
+    order = np.random.default_rng(0).permuted(order, axis=1)
+    below = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
     levels = (np.arange(DRAWS) + 0.5) / DRAWS
-    below = np.cumsum(weights, axis=1)
-    return np.stack([np.minimum(np.searchsorted(row, levels), row.size - 1) for row in below])
+    places = [np.minimum(np.searchsorted(row, levels), row.size - 1) for row in below]
+    return np.take_along_axis(order, np.stack(places), axis=1)
 
 
 def _coordinates(program: Program, draws: Values, which: np.ndarray) -> np.ndarray:

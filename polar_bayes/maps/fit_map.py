@@ -187,7 +187,7 @@ def plan_map(
     largest_view_zenith: float | None,
     seed: int,
     precision: str,
-    shared: Sequence[str],
+    shared: Sequence[str] = (),
 ) -> MapPlan:
     """Check the request of a map on one of its pixels, and estimate what all of them share."""
     # Where noise is known, modes are narrow, and one start is often caught in the wrong one.

@@ -9,6 +9,7 @@ from cases import each
 from plate_images import plate_image
 from synthetic_maps import make_maps
 
+import polar_bayes as pb
 from polar_bayes.cli import main
 from polar_bayes.maps import store
 from polar_bayes.maps.fit_map import blank
@@ -71,3 +72,27 @@ def test_a_finished_map_is_resumed_with_status_0(
     plate_image(3, 4, seed=1)[["q"]].to_zarr(capture, mode="r+", consolidated=False)
     assert main([*words, "--resume"]) == 1
     assert "it was begun with another capture or other settings" in capsys.readouterr().err
+
+
+def test_what_an_image_shares_is_told_with_its_interval(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plate_image(3, 4).to_zarr(tmp_path / "plates.zarr", consolidated=False)
+    words = ["map", str(tmp_path / "plates.zarr"), "--out", str(tmp_path / "map.zarr")]
+    assert main([*words, "--scene", "goniometer", "--share", "roughness"]) == 1
+    told = capsys.readouterr().err
+    assert "shared='roughness': an image cannot share it; give names among" in told
+    assert "stokes_error_factor" in told
+    assert not (tmp_path / "map.zarr").exists()
+    shared = {
+        "stokes_error_factor": {
+            "quantiles": {"0.025": 0.9, "0.5": 1.0, "0.975": 1.1},
+            "pixels": 512,
+            "disagreement": 5.2,
+        }
+    }
+    maps = make_maps({"refractive_index": np.full((2, 2), 1.5)}, shared=shared)
+    row = pb.maps.shared_parameters(maps).loc["stokes_error_factor"]
+    assert row.tolist() == [0.9, 1.0, 1.1, 512, 5.2]
+    page = pb.report(maps, tmp_path / "report").read_text()
+    assert "stokes_error_factor is shared by all pixels, and they do not agree" in page

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, plate_image
+from toy_models import squared
 
 import polar_bayes as pb
 from polar_bayes.inference.batching import MethodUsed, Status
@@ -76,6 +77,21 @@ def test_any_method_of_one_capture_makes_a_map(image: xr.Dataset) -> None:
     # A pixel's answer does not depend on the others.
     alone = pb.fit_pixels(some.isel(y=[0], x=[0]), method=method, **ASKED)
     assert (alone[NAMES[0]].values == maps[NAMES[0]].values[:1, :1]).all()
+
+
+def test_a_second_mode_that_another_start_finds_is_not_left_out(image: xr.Dataset) -> None:
+    """Roots of either sign: half of the posterior has each, and normal draws at one look good."""
+    positive = image.assign(q=xr.full_like(image["q"], 0.36)).isel(y=[0], x=slice(3))
+    asked = ASKED | {"model": squared}
+    one = pb.fit_pixels(positive, **asked)
+    assert (one["approach"] == MethodUsed.IMPORTANCE).all()
+    maps = pb.fit_pixels(positive, method=pb.methods.PixelLaplace(starts=4), **asked)
+    assert (maps["status"] == Status.GOOD).all()
+    for x in range(3):
+        error = 0.6 / np.sqrt(float(maps["effective_draws"][0, x]))
+        assert abs(float(maps["root"][0, x])) < 4.5 * error
+        low, high = maps["root_quantile"][[0, -1], 0, x]
+        assert float(low) < -0.5 < 0.5 < float(high)
 
 
 @pytest.mark.thorough
