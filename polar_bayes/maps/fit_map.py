@@ -76,7 +76,7 @@ def fit_pixels(
     largest_view_zenith: float | None = None,
     seed: int = 0,
     precision: str = "double",
-    shared: Sequence[str] = (),
+    shared: str | Sequence[str] = (),
     progress: Counter | None = None,
 ) -> xr.Dataset:
     """Fit every pixel of an image by itself.
@@ -187,9 +187,10 @@ def plan_map(
     largest_view_zenith: float | None,
     seed: int,
     precision: str,
-    shared: Sequence[str] = (),
+    shared: str | Sequence[str] = (),
 ) -> MapPlan:
     """Check the request of a map on one of its pixels, and estimate what all of them share."""
+    shared = (shared,) if isinstance(shared, str) else tuple(shared)
     # Where noise is known, modes are narrow, and one start is often caught in the wrong one.
     settings = PixelLaplace(starts=4 if shared else 1) if method is None else method
     if not isinstance(settings, AbstractPixelMethod):
@@ -209,7 +210,7 @@ def plan_map(
     )
     unit = _intensity_unit(capture)
     _check_shared(shared, request)
-    key = engine_key(request, settings, sorted(own), unit is None, tuple(shared))
+    key = engine_key(request, settings, sorted(own), unit is None, shared)
     begin = tuple(of_priors(shared, request.priors))
     plan = MapPlan(key, request, settings, unit, own, begin)
     return _with_shared(plan, capture) if shared else plan
@@ -219,7 +220,7 @@ def _check_shared(names: Sequence[str], request: Request) -> None:
     """Refuse what is no number of the model's, or is part of the material."""
     for name in names:
         known = [each for each in request.priors if each not in MATERIAL_PARAMETERS]
-        if isinstance(names, str) or name not in known or request.priors[name].event_shape:
+        if name not in known or request.priors[name].event_shape:
             raise FitError(
                 "an image cannot share it",
                 where=f"fit_pixels: shared={name!r}",
@@ -234,7 +235,7 @@ def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     if isinstance(settings, PixelLaplace) and settings.weighted:
         method = dataclasses.replace(settings, sampler=None, starts=4)
     else:
-        method = PixelLaplace(sampler=None)
+        method = PixelLaplace(sampler=None, starts=4)
     found = estimate_shared(plan.engine, pixels, method, request.priors, plan.shared, request.seed)
     return dataclasses.replace(plan, shared=tuple(found))
 
@@ -245,7 +246,7 @@ def _random_pixels(capture: xr.Dataset, seed: int) -> xr.Dataset:
     order = np.random.default_rng(seed).permutation(rows * columns)
     found: list[xr.Dataset] = []
     for begin in range(0, order.size, 2 * SHARED_PIXELS):
-        y, x = np.unravel_index(np.sort(order[begin : begin + 2 * SHARED_PIXELS]), (rows, columns))
+        y, x = np.unravel_index(order[begin : begin + 2 * SHARED_PIXELS], (rows, columns))
         some = capture.drop_vars(IMAGE, errors="ignore").isel(
             y=xr.DataArray(y, dims="x_"), x=xr.DataArray(x, dims="x_")
         )

@@ -101,9 +101,8 @@ def test_masked_pixels_say_nothing_about_what_is_shared(image: xr.Dataset) -> No
 @pytest.mark.parametrize(
     ("shared", "what"),
     [
-        (("refractive_index",), "an image cannot share it"),
-        (("stokes_eror_factor",), "an image cannot share it"),
-        ("stokes_error_factor", "an image cannot share it"),
+        ("refractive_index", "shared='refractive_index': an image cannot share it"),
+        (("stokes_eror_factor",), "give names among stokes_error_factor"),
     ],
 )
 def test_what_cannot_be_shared_is_refused(image: xr.Dataset, shared: object, what: str) -> None:
