@@ -108,7 +108,9 @@ class PixelLaplace(AbstractPixelMethod):
     def __post_init__(self) -> None:
         if self.draws < 64 or self.draws & (self.draws - 1):
             self._refuse(f"draws is {self.draws}", "give 64, 128, 256 or so")
-        self._check_least(candidates=8, rounds=0)
+        self._check_least(candidates=8, rounds=0, starts=1)
+        if self.starts > 1 + len(RESTARTS):
+            self._refuse(f"starts is {self.starts}", f"give {1 + len(RESTARTS)} at most")
 
     @override
     def fit(
@@ -252,6 +254,8 @@ class _Run:
         """Whether the posterior goes on along an axis, where the proposal has ended, (pixel,)."""
         size, draws = self.points.z.shape[1], self.settings.draws
         steps = np.linspace(0.0, LONGEST_ARM, draws // (2 * size))
+        if steps.size < 2:
+            return np.zeros(which.size, bool)  # too many axes for so few points
         along = np.einsum("ij,s->isj", np.eye(size), np.concatenate([-steps[::-1], steps]))
         z = np.zeros_like(self.points.z)
         z[: along.shape[0] * along.shape[1]] = along.reshape(-1, size)
@@ -260,6 +264,7 @@ class _Run:
         line = proposal._replace(root=covariance / sd[:, :, None])
         _, log_density = self._draw(which, line, Points(z, np.zeros(draws)))
         profiles = log_density[:, : along.shape[0] * along.shape[1]].reshape(-1, *along.shape[:2])
+        profiles = np.where(np.isnan(profiles), -np.inf, profiles)
         profiles = np.exp(profiles - np.max(profiles, axis=(1, 2), keepdims=True))
         beyond = np.concatenate([steps[::-1], steps]) > ARM
         share = profiles[..., beyond].sum(axis=-1) / profiles.sum(axis=-1)
@@ -274,9 +279,12 @@ def _log_evidence(mode: NormalApproximation) -> np.ndarray:
 
 def _distance(mode: NormalApproximation, other: NormalApproximation) -> np.ndarray:
     """From one to another, in posterior sds of the first."""
-    with np.errstate(invalid="ignore"):  # of pixels without a mode
-        away = np.linalg.solve(np.swapaxes(mode.root, 1, 2), (other.z - mode.z)[..., None])
-    return np.linalg.norm(away[..., 0], axis=1)
+    root, known = np.swapaxes(mode.root, 1, 2), np.isfinite(mode.root).all(axis=(1, 2))
+    known &= (np.diagonal(root, axis1=1, axis2=2) > 0.0).all(axis=1)
+    away = np.full(known.size, np.nan)
+    moved = np.linalg.solve(root[known], (other.z - mode.z)[known, :, None])
+    away[known] = np.linalg.norm(moved[..., 0], axis=1)
+    return away
 
 
 def _proposal_at(mode: NormalApproximation) -> Proposal:
