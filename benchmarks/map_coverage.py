@@ -1,12 +1,14 @@
 """How often the intervals of a map hold the truth, with and without the correction by weights.
 
-python benchmarks/map_coverage.py plates camera shared
+    python benchmarks/map_coverage.py plates camera shared
 
-plates    ten thousand smooth plates drawn from the priors, with noise from .005 to .08
-camera    900 rough materials before a camera, by roughness: each pixel infers its own exposure,
-          noise and polarizer; then the same pixels where an image shares these
-shared    100 images of ten thousand plates, each with a noise of its own, which all of its
-          pixels share; beside maps whose pixels each infer it, and maps that are told
+    plates    ten thousand smooth plates drawn from the priors, with noise from .005 to .08
+    camera    900 rough materials before a camera, by roughness: each pixel infers its own exposure,
+              noise and polarizer; then images that share these, with a usual and a perfect one
+    shared    100 images of ten thousand plates, each with a noise of its own, which all of its
+              pixels share; beside maps whose pixels each infer it, and maps that are told
+
+Without a part, all of them are run.
 """
 
 import sys

@@ -43,9 +43,8 @@ from numpyro.infer.autoguide import AutoLaplaceApproximation
 from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
-from polar_bayes.capture.schema import validate
 from polar_bayes.inference.batch_engine import BatchEngine
-from polar_bayes.inference.batching import LANES, ObservationBatch, batch_pixels
+from polar_bayes.inference.batching import LANES, ObservationBatch
 from polar_bayes.inference.levenberg_marquardt import (
     exact_derivatives,
     find_modes,
@@ -219,7 +218,7 @@ def main(count: int) -> None:
     }
     engine = plans["double"].engine
     with jax.enable_x64(True):
-        pixels = batch_pixels(plans["double"].observe(validate(mask_missing(capture))))
+        pixels = plans["double"].pixels(mask_missing(capture))
         many = len(pixels)
         ours, settled = rate(many, lambda: find_modes(engine, pixels))
         threads, _ = rate(many, threaded(engine, pixels))

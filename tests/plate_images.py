@@ -9,9 +9,8 @@ from scipy import stats
 from textbook import plate_q
 
 import polar_bayes as pb
-from polar_bayes.capture.schema import validate
 from polar_bayes.inference.batch_laplace import PixelLaplace
-from polar_bayes.inference.batching import ObservationBatch, batch_pixels, cut
+from polar_bayes.inference.batching import ObservationBatch, cut
 from polar_bayes.maps.fit_map import (
     MapPlan,
     blank,
@@ -100,7 +99,7 @@ def planned(
 
 def stacked(capture: xr.Dataset, plan: MapPlan) -> ObservationBatch:
     """The pixels of an image in a row."""
-    return batch_pixels(plan.observe(validate(mask_missing(capture))))
+    return plan.pixels(mask_missing(capture))
 
 
 def mapped(capture: xr.Dataset, plan: MapPlan, block: int = 4096) -> xr.Dataset:

@@ -158,7 +158,7 @@ def map_(
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
     given: dict[str, Any] = {} if draws is None else {"draws": draws}
-    given |= {"starts": 4} if shared else {}
+    given |= {"starts": pb.methods.PixelLaplace.most_starts} if shared else {}
     methods: dict[str, Any] = {
         "laplace": pb.methods.PixelLaplace(**given),
         "importance": pb.methods.PixelByPixel(),

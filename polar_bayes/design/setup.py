@@ -139,7 +139,7 @@ class Coordinate:
 def label_coordinates(program: Program, capture: xr.Dataset) -> list[Coordinate]:
     """All unconstrained coordinates in their order."""
     found = []
-    for site, positions in coordinate_positions(program).items():
+    for site, positions in program.positions.items():
         flat = positions.ravel()
         is_entry = flat.size == np.prod(shape_of(program, site), initial=1)
         named = label_scalars(program, capture, {site: flat[None, None]}) if is_entry else []
@@ -149,12 +149,6 @@ def label_coordinates(program: Program, capture: xr.Dataset) -> list[Coordinate]
             for entry, index in enumerate(flat.tolist())
         ]
     return sorted(found)
-
-
-def coordinate_positions(program: Program) -> dict[str, np.ndarray]:
-    """Indices of the unconstrained coordinates, by site."""
-    positions = program.unravel(jnp.arange(float(program.size)))
-    return {site: np.asarray(x).astype(int) for site, x in positions.items()}
 
 
 def label_scalars(program: Program, capture: xr.Dataset, draws: Mapping[str, Any]) -> list[Scalar]:
@@ -211,21 +205,15 @@ def unconstrain(
     program: Program, values: Mapping[str, Float[np.ndarray, "draw ..."]]
 ) -> Float[np.ndarray, "draw size"]:
     """Draws of all latent sites as unconstrained vectors."""
-
-    def inverse(values: dict[str, Array]) -> Array:
-        return ravel_pytree(
-            {n: dist.biject_to(s).inv(values[n]) for n, s in program.supports.items()}
-        )[0]
-
     sites = {name: jnp.asarray(values[name]) for name in program.supports}
-    return np.asarray(compiled(jax.vmap(inverse))(sites))
+    return np.asarray(compiled(jax.vmap(program.unconstrain))(sites))
 
 
 def coordinate_indices(program: Program, extended: Program) -> Int[np.ndarray, " size"]:
     """Indices of a program's coordinates in that of the same model with more views."""
-    theirs = coordinate_positions(extended)
+    theirs = extended.positions
     indices = np.zeros(program.size, int)
-    for name, position in coordinate_positions(program).items():
+    for name, position in program.positions.items():
         if name not in theirs or theirs[name].shape != position.shape:
             raise FitError(
                 f"{name} belongs to single views, and no reading of a new view determines it yet",

@@ -104,13 +104,14 @@ class PixelLaplace(AbstractPixelMethod):
     sampler: AbstractPixelMethod | None = dataclasses.field(default_factory=PixelByPixel)
 
     memory_limit: ClassVar[int] = 4096
+    most_starts: ClassVar[int] = 1 + len(RESTARTS)
 
     def __post_init__(self) -> None:
         if self.draws < 64 or self.draws & (self.draws - 1):
             self._refuse(f"draws is {self.draws}", "give 64, 128, 256 or so")
         self._check_least(candidates=8, rounds=0, starts=1)
-        if self.starts > 1 + len(RESTARTS):
-            self._refuse(f"starts is {self.starts}", f"give {1 + len(RESTARTS)} at most")
+        if self.starts > self.most_starts:
+            self._refuse(f"starts is {self.starts}", f"give {self.most_starts} at most")
 
     @override
     def fit(

@@ -175,7 +175,7 @@ def moments(distribution: dist.Distribution, reading: Array) -> tuple[Array, Arr
 
 def find_coefficients(program: Program, data: Observations) -> ConditionalReparam | None:
     """The map over vectors with a normal prior that no plate repeats; None without any."""
-    positions = program.unravel(jnp.arange(float(program.size)))
+    positions = program.positions
     names = tuple(
         name
         for name in positions
@@ -184,7 +184,7 @@ def find_coefficients(program: Program, data: Observations) -> ConditionalRepara
         and not program.dims[name]
         and name not in program.auxiliary
     )
-    found = [np.asarray(positions[name]).ravel().astype(int) for name in names]
+    found = [positions[name].ravel() for name in names]
     count = sum(len(each) for each in found)
     if not 0 < count <= MOST_COEFFICIENTS or count == program.size:
         return None

@@ -88,6 +88,17 @@ class Program:
         """The latent sites in their supports."""
         return self._constrain(self.unravel(z))
 
+    def unconstrain(self, values: Mapping[str, Array]) -> Float[Array, " size"]:
+        """The vector of the latent sites in their supports, as `constrain` undoes it."""
+        supports = self.supports.items()
+        return ravel_pytree({n: dist.biject_to(s).inv(values[n]) for n, s in supports})[0]
+
+    @functools.cached_property
+    def positions(self) -> dict[str, np.ndarray]:
+        """Indices of the unconstrained coordinates, by site."""
+        found = self.unravel(jnp.arange(float(self.size)))
+        return {name: np.asarray(index).astype(int) for name, index in found.items()}
+
     def _constrain(self, sites: dict[str, Array]) -> dict[str, Array]:
         return {name: dist.biject_to(self.supports[name])(x) for name, x in sites.items()}
 
@@ -111,12 +122,7 @@ class Program:
     def from_prior(self, key: Array, data: Observations) -> Float[Array, " size"]:
         """An unconstrained vector drawn from the prior."""
         trace = _trace(self.model, key, data)
-        return ravel_pytree(
-            {
-                name: dist.biject_to(support).inv(trace[name]["value"])
-                for name, support in self.supports.items()
-            }
-        )[0]
+        return self.unconstrain({name: trace[name]["value"] for name in self.supports})
 
     def describe(self, key: Array, z: Float[Array, " size"], data: Observations) -> Draw:
         """Parameters, densities and predicted readings of one draw."""

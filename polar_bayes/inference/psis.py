@@ -174,8 +174,15 @@ def systematic_resample(
     # Source: Kitagawa (1996), J. Comput. Graph. Stat. 5(1), 1-25.
     each = int(np.clip(effective / CHAINS, FEWEST, MOST))
     levels = (np.arange(CHAINS * each) + random.random()) / (CHAINS * each)
-    index = np.clip(np.searchsorted(np.cumsum(weights), levels), 0, len(weights) - 1)
+    index = draws_at(levels, weights)
     return random.permutation(index).reshape(CHAINS, each)
+
+
+def draws_at(
+    levels: Float[np.ndarray, " level"], weights: Float[np.ndarray, " draw"]
+) -> Float[np.ndarray, " level"]:
+    """Indices of the draws at which the summed weights reach each level."""
+    return np.clip(np.searchsorted(np.cumsum(weights), levels), 0, len(weights) - 1)
 
 
 def max_effective_size(count: int) -> float:

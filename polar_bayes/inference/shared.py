@@ -38,6 +38,7 @@ from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batching import LANES, ObservationBatch, Status, batched
 from polar_bayes.inference.program import Program, Values
+from polar_bayes.inference.psis import draws_at
 from polar_bayes.observation.data import Observations
 
 PIXELS = 512
@@ -246,28 +247,21 @@ def _resampled(weights: np.ndarray) -> np.ndarray:
     # In random order: every sixteenth of quasi-random points would not be spread like all of them.
     order = np.broadcast_to(np.arange(weights.shape[1]), weights.shape)
     order = np.random.default_rng(0).permuted(order, axis=1)
-    below = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
     levels = (np.arange(DRAWS) + 0.5) / DRAWS
-    places = [np.minimum(np.searchsorted(row, levels), row.size - 1) for row in below]
-    return np.take_along_axis(order, np.stack(places), axis=1)
+    rows = np.take_along_axis(weights, order, axis=1)
+    return np.take_along_axis(order, np.stack([draws_at(levels, row) for row in rows]), axis=1)
 
 
 def _coordinates(program: Program, draws: Values, which: np.ndarray) -> np.ndarray:
     """Unconstrained vectors of some draws, (pixel, draw, size)."""
     rows = np.arange(len(which))[:, None]
-    layout = jax.eval_shape(program.unravel, jnp.zeros(program.size))
-    parts = []
-    for name in layout:  # in the order of `unravel`
-        values = np.asarray(draws[name], float)[rows, which]
-        part = np.asarray(dist.biject_to(program.supports[name]).inv(values), float)
-        parts.append(part.reshape(*which.shape, -1))
-    return np.concatenate(parts, axis=-1)
+    values = {name: jnp.asarray(draws[name])[rows, which] for name in program.supports}
+    return np.asarray(jax.vmap(jax.vmap(program.unconstrain))(values), float)
 
 
 def _positions(program: Program, names: Sequence[str]) -> np.ndarray:
     """Where numbers of these names stand in the unconstrained vector."""
-    found = program.unravel(jnp.arange(program.size, dtype=float))
-    return np.array([int(found[name]) for name in names], int)
+    return np.array([int(program.positions[name]) for name in names])
 
 
 def _slopes(engine: BatchEngine, names: tuple[str, ...]) -> Callable:

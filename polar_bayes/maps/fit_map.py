@@ -192,7 +192,8 @@ def plan_map(
     """Check the request of a map on one of its pixels, and estimate what all of them share."""
     shared = (shared,) if isinstance(shared, str) else tuple(shared)
     # Where noise is known, modes are narrow, and one start is often caught in the wrong one.
-    settings = PixelLaplace(starts=4 if shared else 1) if method is None else method
+    usual = PixelLaplace(starts=PixelLaplace.most_starts if shared else 1)
+    settings = usual if method is None else method
     if not isinstance(settings, AbstractPixelMethod):
         hint = "give settings such as PixelLaplace(draws=512) or PixelSMC()"
         raise FitError(f"{method!r} is no method for pixels", where="fit_pixels: method", hint=hint)
@@ -232,10 +233,10 @@ def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     """The plan with the posterior of what pixels share, from some of them drawn at random."""
     request, settings = plan.request, plan.settings
     pixels = plan.pixels(_random_pixels(capture, request.seed))
+    method = PixelLaplace()
     if isinstance(settings, PixelLaplace) and settings.weighted:
-        method = dataclasses.replace(settings, sampler=None, starts=4)
-    else:
-        method = PixelLaplace(sampler=None, starts=4)
+        method = settings
+    method = dataclasses.replace(method, sampler=None, starts=PixelLaplace.most_starts)
     found = estimate_shared(plan.engine, pixels, method, request.priors, plan.shared, request.seed)
     return dataclasses.replace(plan, shared=tuple(found))
 
@@ -252,9 +253,7 @@ def _random_pixels(capture: xr.Dataset, seed: int) -> xr.Dataset:
         )
         some = mask_missing(some.load().rename(x_="x"))
         some = some.map(lambda v: v.expand_dims("y") if "x" in v.dims else v, keep_attrs=True)
-        valid = some["valid"]
-        views = valid.any([d for d in valid.dims if d not in (*IMAGE, "view")]).sum("view")
-        enough = np.flatnonzero(views.transpose(*IMAGE).to_numpy()[0] >= MIN_VIEWS)
+        enough = np.flatnonzero(_count_views(some).transpose(*IMAGE).to_numpy()[0] >= MIN_VIEWS)
         found.append(some.isel(x=enough))
         if sum(each.sizes["x"] for each in found) >= SHARED_PIXELS:
             break
@@ -267,8 +266,7 @@ def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
     best, most = None, 0
     for y in range(capture.sizes["y"]):
         row = mask_missing(capture.isel(y=y).load())
-        views = row["valid"].any([d for d in row["valid"].dims if d not in ("x", "view")])
-        counts = views.sum("view")
+        counts = _count_views(row)
         found, x = int(counts.max()), int(counts.argmax("x")) if "x" in counts.dims else 0
         if found > most:
             best, most = row.isel(x=x), found
@@ -279,6 +277,12 @@ def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
         hint = "check `valid` and the readings: NaN counts as missing"
         raise CaptureError(what, where=str(capture.attrs.get("name", "capture")), hint=hint)
     return best
+
+
+def _count_views(readings: xr.Dataset) -> xr.DataArray:
+    """Views of each pixel in which any reading is valid."""
+    valid = readings["valid"]
+    return valid.any([d for d in valid.dims if d not in (*IMAGE, "view")]).sum("view")
 
 
 def _intensity_unit(capture: xr.Dataset) -> float | None:
