@@ -158,7 +158,6 @@ def map_(
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
     given: dict[str, Any] = {} if draws is None else {"draws": draws}
-    given |= {"starts": pb.methods.PixelLaplace.most_starts} if shared else {}
     methods: dict[str, Any] = {
         "laplace": pb.methods.PixelLaplace(**given),
         "importance": pb.methods.PixelByPixel(),
@@ -172,6 +171,8 @@ def map_(
     for name, row in pb.maps.shared_parameters(maps).iterrows():
         interval = f"{row['q50']:.5g} [{row['q2.5']:.5g}, {row['q97.5']:.5g}]"
         click.echo(f"{name}: {interval} in all pixels, from {row['pixels']:.0f} of them")
+    for sentence in pb.maps.start_sentences(maps):
+        click.echo(sentence)
     for sentence in pb.maps.shared_cautions(maps):
         click.echo(f"caution: {sentence}", err=True)
 

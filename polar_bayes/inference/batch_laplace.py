@@ -10,7 +10,7 @@ was not found.
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple, override
+from typing import Any, ClassVar, NamedTuple, Self, override
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +59,11 @@ LEAST_RIVAL, LEAST_DISTANCE = 0.02, 1.0
 """Evidence of another mode, as a share of that of the heaviest, from which a pixel is fitted at all
 of its modes; and the distance, in posterior sds, from which it counts as another."""
 
+SMALL_IMAGE, SAMPLE, MOST_MISSED = 2048, 512, 0.01
+"""Pixels of an image that is searched from all starts; pixels of a larger one on which starts are
+compared; share of them in which one start misses a mode though its weights look good, up to which
+one start serves."""
+
 ARM, LONGEST_ARM, MOST_IN_ARM = 2.5, 8.0, 0.025
 """Distance along the profile of a coordinate, in sds of a proposal, where an arm of the posterior
 begins, and to which it is looked for; the share of a profile in arms, .012 of a normal one, above
@@ -83,8 +88,10 @@ class PixelLaplace(AbstractPixelMethod):
         weighted: True weights them by the posterior, which corrects the approximation and
             diagnoses it (Pareto k); False takes them as they are, without a diagnosis.
         candidates: Prior draws among which the start of each pixel is chosen, >= 8.
-        starts: From how many of them every pixel is searched, 1 to 4; the lowest mode counts.
-            Pixels whose weights cannot be trusted are searched from four in any case.
+        starts: From how many of them every pixel is searched, 1 to 8; the lowest mode counts. By
+            default 8 in an image of at most 2,048 pixels, or of parameters that all pixels share;
+            of larger ones 512 pixels drawn at random decide: 1 where 8 find another mode in at
+            most 1% of them. Pixels whose weights cannot be trusted are searched from 8 in any case.
         rounds: In which the proposal of a pixel with Pareto k above 0.7, or with too few effective
             draws, is fitted to its own weighted draws, until it has neither; >= 0. Without weights
             there are none.
@@ -99,7 +106,7 @@ class PixelLaplace(AbstractPixelMethod):
     draws: int = 256
     weighted: bool = True
     candidates: int = PRIOR_DRAWS
-    starts: int = 1
+    starts: int | None = None
     rounds: int = 3
     sampler: AbstractPixelMethod | None = dataclasses.field(default_factory=PixelByPixel)
 
@@ -109,9 +116,9 @@ class PixelLaplace(AbstractPixelMethod):
     def __post_init__(self) -> None:
         if self.draws < 64 or self.draws & (self.draws - 1):
             self._refuse(f"draws is {self.draws}", "give 64, 128, 256 or so")
-        self._check_least(candidates=8, rounds=0, starts=1)
-        if self.starts > self.most_starts:
-            self._refuse(f"starts is {self.starts}", f"give {self.most_starts} at most")
+        self._check_least(candidates=8, rounds=0)
+        if self.starts is not None and not 1 <= self.starts <= self.most_starts:
+            self._refuse(f"starts is {self.starts}", f"give 1 to {self.most_starts}")
 
     @override
     def fit(
@@ -124,7 +131,7 @@ class PixelLaplace(AbstractPixelMethod):
         if self.sampler is not None and self.weighted:
             several = found.search.converged & found.has_rival
             if several.any():
-                self.sampler.fit(batch, at[several])
+                self.sampler.fit(batch, at[several], take_rows(found.search.mode, several))
         hard = np.flatnonzero(found.search.converged & ~found.is_trusted & ~several)
         for begin in range(0, hard.size, HARD):
             some = hard[begin : begin + HARD]
@@ -134,6 +141,23 @@ class PixelLaplace(AbstractPixelMethod):
         lost = at[~found.search.converged]
         if self.sampler is not None and self.weighted and lost.size:
             self.sampler.fit(batch, lost)
+
+    @override
+    def for_image(
+        self, size: int, sample: Callable[[int], BatchFit], *, is_shared: bool
+    ) -> tuple[Self, dict[str, Any]]:
+        if self.starts is not None or not self.weighted:
+            return self, {}
+        every = dataclasses.replace(self, starts=self.most_starts)
+        if is_shared or size <= SMALL_IMAGE:
+            return every, {}
+        batch = sample(SAMPLE)
+        at, once = np.arange(len(batch.pixels)), dataclasses.replace(self, starts=1)
+        one, best = (_Run(method, batch, at).approximate() for method in (once, every))
+        is_lower = best.search.mode.value < one.search.mode.value - SAME_MODE
+        missed = int(np.sum(one.is_trusted & (is_lower | best.has_rival)))
+        chosen = once if missed <= MOST_MISSED * at.size else every
+        return chosen, {"starts_compared": {"pixels": at.size, "missed": missed}}
 
 
 class Approximation(NamedTuple):
@@ -154,7 +178,7 @@ class Approximation(NamedTuple):
     @property
     def has_rival(self) -> np.ndarray:
         """Whether another mode was found that weighs too much to be left out, (pixel,)."""
-        return self.rival - _log_evidence(self.search.mode) > math.log(LEAST_RIVAL)
+        return self.rival - self.search.mode.log_evidence > math.log(LEAST_RIVAL)
 
 
 class _Run:
@@ -174,7 +198,7 @@ class _Run:
         search = find_modes(self.engine, self.pixels, candidates=candidates)
         found = jax.tree.map(np.array, self._weigh(np.arange(self.at.size), search))
         for start, rank in enumerate(RESTARTS, 2):
-            everywhere = start <= self.settings.starts
+            everywhere = start <= (self.settings.starts or 1)
             untrusted = np.flatnonzero(everywhere | ~found.is_trusted)
             if not untrusted.size:
                 break
@@ -182,8 +206,8 @@ class _Run:
             new = find_modes(self.engine, self.pixels.subset(untrusted), rank, candidates)
             is_lower = new.mode.value < old.mode.value - SAME_MODE
             is_better = new.converged & (~old.converged | is_lower)
-            is_other = _distance(old.mode, new.mode) > LEAST_DISTANCE  # False where one is NaN
-            left_out = np.where(is_better, _log_evidence(old.mode), _log_evidence(new.mode))
+            is_other = old.mode.distance(new.mode) > LEAST_DISTANCE  # False where one is NaN
+            left_out = np.where(is_better, old.mode.log_evidence, new.mode.log_evidence)
             both = new.converged & old.converged & is_other
             rival = np.fmax(found.rival[untrusted], np.where(both, left_out, -np.inf))
             if is_better.any():
@@ -270,22 +294,6 @@ class _Run:
         beyond = np.concatenate([steps[::-1], steps]) > ARM
         share = profiles[..., beyond].sum(axis=-1) / profiles.sum(axis=-1)
         return np.any(share > MOST_IN_ARM, axis=1)
-
-
-def _log_evidence(mode: NormalApproximation) -> np.ndarray:
-    """That of normal approximations, up to a constant."""
-    with np.errstate(invalid="ignore"):  # of pixels without a mode
-        return np.log(np.diagonal(mode.root, axis1=1, axis2=2)).sum(axis=1) - mode.value
-
-
-def _distance(mode: NormalApproximation, other: NormalApproximation) -> np.ndarray:
-    """From one to another, in posterior sds of the first."""
-    root, known = np.swapaxes(mode.root, 1, 2), np.isfinite(mode.root).all(axis=(1, 2))
-    known &= (np.diagonal(root, axis1=1, axis2=2) > 0.0).all(axis=1)
-    away = np.full(known.size, np.nan)
-    moved = np.linalg.solve(root[known], (other.z - mode.z)[known, :, None])
-    away[known] = np.linalg.norm(moved[..., 0], axis=1)
-    return away
 
 
 def _proposal_at(mode: NormalApproximation) -> Proposal:

@@ -2,7 +2,8 @@
 
 import abc
 import dataclasses
-from typing import ClassVar, NoReturn, override
+from collections.abc import Callable
+from typing import Any, ClassVar, NoReturn, Self, override
 
 import jax
 import numpy as np
@@ -97,6 +98,17 @@ class AbstractPixelMethod(AbstractBatchMethod[BatchEngine]):
         self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
     ) -> None:
         """Fit the pixels `at` these indices, and record their outcome; modes may be known."""
+
+    def for_image(
+        self, size: int, sample: Callable[[int], BatchFit], *, is_shared: bool
+    ) -> tuple[Self, dict[str, Any]]:
+        """Settings for an image, and entries of its provenance.
+
+        `size` is the number of its pixels, `sample` gives some of them drawn at random, and
+        `is_shared` says whether pixels share parameters.
+        """
+        del size, sample, is_shared
+        return self, {}
 
     def _check_least(self, **least: int) -> None:
         """Refuse settings below their least values."""

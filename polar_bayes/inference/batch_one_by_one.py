@@ -10,7 +10,7 @@ from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batching import Outcome
 from polar_bayes.inference.laplace import Importance
-from polar_bayes.inference.levenberg_marquardt import NormalApproximation
+from polar_bayes.inference.levenberg_marquardt import NormalApproximation, find_all_modes
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.problem import CompiledModel
 from polar_bayes.inference.program import THREADS, Values
@@ -37,10 +37,14 @@ class PixelByPixel(AbstractPixelMethod):
     def fit(
         self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
     ) -> None:
-        del modes  # the method finds its own, from more starts
+        known: list[np.ndarray | None] = [None] * at.size
+        if modes is not None:  # the search of many pixels at once is compiled, and faster
+            known = find_all_modes(batch.engine, batch.pixels.subset(at))
         compiled = batch.engine.programs.of("one by one", lambda: _compiled_model(batch.engine))
 
-        def run(pixel: int) -> tuple[np.ndarray, Outcome, list[tuple[Values, np.ndarray]]]:
+        def run(
+            pixel: int, starts: np.ndarray | None
+        ) -> tuple[np.ndarray, Outcome, list[tuple[Values, np.ndarray]]]:
             one, found = np.array([pixel]), []
             outcome = self.method.run_batch(
                 compiled,
@@ -48,11 +52,12 @@ class PixelByPixel(AbstractPixelMethod):
                 batch.keys[one, -1],  # a number of the pixel's own, on which its answer depends
                 batch.seed,
                 lambda _, draws, weights: found.append((draws, weights)),
+                [starts],
             )
             return one, outcome, found
 
         with ThreadPoolExecutor(THREADS) as pool:
-            for one, outcome, found in pool.map(run, at):
+            for one, outcome, found in pool.map(run, at, known):
                 if np.isnan(batch.outcome.pareto_k[one]):  # else it is that of another proposal
                     batch.outcome.pareto_k[one] = outcome.pareto_k
                 for draws, weights in found:

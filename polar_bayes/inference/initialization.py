@@ -304,8 +304,14 @@ class AbstractInitializer(abc.ABC):
     """The search for modes in all captures of one layout."""
 
     @abc.abstractmethod
-    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
-        """The modes of one capture; a `FitError` where no start reached one."""
+    def find(
+        self,
+        data: Observations,
+        key: Array,
+        progress: Progress,
+        starts: np.ndarray | None = None,
+    ) -> AbstractInit:
+        """The modes of one capture, by default from prior draws; a `FitError` where it has none."""
 
     @abc.abstractmethod
     def prepare_target(self, data: Observations) -> Target | None:
@@ -328,9 +334,17 @@ class JointInitializer(AbstractInitializer):
         return JitOnce(functools.partial(_guide, self.program))
 
     @override
-    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
+    def find(
+        self,
+        data: Observations,
+        key: Array,
+        progress: Progress,
+        starts: np.ndarray | None = None,
+    ) -> AbstractInit:
         potential = NumpyPotential(self.program.value_and_gradient, data, data.brightness.dtype)
-        modes = find_modes(potential, from_prior(self.program, key, STARTS, data), progress)
+        if starts is None:
+            starts = from_prior(self.program, key, STARTS, data)
+        modes = find_modes(potential, starts, progress)
         metadata = {
             "starts": modes.starts,
             "failures": modes.failures,
@@ -363,7 +377,14 @@ class HierarchicalInitializer(AbstractInitializer):
     reparam: HierarchicalReparam
 
     @override
-    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
+    def find(
+        self,
+        data: Observations,
+        key: Array,
+        progress: Progress,
+        starts: np.ndarray | None = None,
+    ) -> AbstractInit:
+        del starts  # each group is searched from draws of its own
         fitted = fit_reparam(self.group_model, self.reparam, data, key, progress)
         modes = fitted.modes
         metadata = {

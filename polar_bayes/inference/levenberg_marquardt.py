@@ -298,6 +298,21 @@ class NormalApproximation(NamedTuple):
     decrement: Float[AnyArray, ""]
     condition: Float[AnyArray, ""]
 
+    @property
+    def log_evidence(self) -> np.ndarray:
+        """Of many pixels: that of the normal approximation, up to a constant, (pixel,)."""
+        with np.errstate(invalid="ignore"):  # of pixels without a mode
+            return np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum(axis=1) - self.value
+
+    def distance(self, other: "NormalApproximation") -> np.ndarray:
+        """Of many pixels: from one mode to another, in posterior sds of the first, (pixel,)."""
+        root, known = np.swapaxes(self.root, 1, 2), np.isfinite(self.root).all(axis=(1, 2))
+        known &= (np.diagonal(root, axis1=1, axis2=2) > 0.0).all(axis=1)
+        away = np.full(known.size, np.nan)
+        moved = np.linalg.solve(root[known], (other.z - self.z)[known, :, None])
+        away[known] = np.linalg.norm(moved[..., 0], axis=1)
+        return away
+
 
 def init(z: Float[np.ndarray, "pixel size"]) -> LMState:
     """States at the starts; the first step only evaluates the derivatives there."""
@@ -369,8 +384,11 @@ def finalize(z: Float[Array, " size"], derivatives: Derivatives) -> NormalApprox
 PRIOR_DRAWS = 32
 """Draws from the prior among which a starting point is chosen unless settings say otherwise."""
 
-RESTARTS = (1, 3, 7)
+RESTARTS = tuple(range(1, 8))
 """Ranks of the prior draws from which pixels without a good mode start again."""
+
+ALL_RANKS, SAME_MODE = range(16), 0.1
+"""Ranks of a search for all modes; posterior sds within which two ends are the same mode."""
 
 SINGLE_PASSES, EXACT_PASSES = (5, 4), (1, 1, 1, 2, 4, 8, 16)
 """Steps of each pass; pixels that have converged leave between passes. The first exact pass only
@@ -432,6 +450,25 @@ def find_modes_again(engine: BatchEngine, pixels: ObservationBatch) -> ModeSearc
         again = find_modes(engine, pixels.subset(left), rank)
         put_rows(found, left[again.converged], take_rows(again, again.converged))
     return found
+
+
+def find_all_modes(engine: BatchEngine, pixels: ObservationBatch) -> list[np.ndarray | None]:
+    """Distinct modes of every pixel, (mode, size), the heaviest first; None where there is none."""
+    ends: list[NormalApproximation] = []
+    is_new: list[np.ndarray] = []
+    for rank in ALL_RANKS:
+        mode, _, converged = find_modes(engine, pixels, rank)
+        for other in ends:
+            converged = converged & ~(other.distance(mode) < SAME_MODE)
+        ends.append(mode)
+        is_new.append(converged)
+    evidence = np.where(is_new, [mode.log_evidence for mode in ends], -np.inf)
+    order = np.argsort(-evidence, axis=0, kind="stable")
+    z = np.stack([mode.z for mode in ends])
+    modes: list[np.ndarray | None] = []
+    for pixel, count in enumerate(np.sum(is_new, axis=0)):
+        modes.append(z[order[:count, pixel], pixel] if count else None)
+    return modes
 
 
 def _starts(engine: BatchEngine, candidates: int) -> Callable:

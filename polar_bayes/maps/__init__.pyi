@@ -5,5 +5,6 @@ from .lazy import (
     open_map as open_map,
     shared_cautions as shared_cautions,
     shared_parameters as shared_parameters,
+    start_sentences as start_sentences,
 )
 from .store import map_file as map_file

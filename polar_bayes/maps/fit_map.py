@@ -16,7 +16,7 @@ from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.batch_engine import BatchEngine, engine_key, make_engine
 from polar_bayes.inference.batch_laplace import PixelLaplace
-from polar_bayes.inference.batch_method import AbstractPixelMethod
+from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit, random_keys
 from polar_bayes.inference.batching import (
     IMAGE,
     MIN_VIEWS,
@@ -91,7 +91,7 @@ def fit_pixels(
         capture: A capture with dims y and x. In chunks (Dask), it is read block by block, and the
             maps come in the same chunks, computed when they are asked for.
         model: See `polar_bayes.fit`; the other arguments too.
-        method: By default `PixelLaplace()`, with four starts where anything is shared.
+        method: By default `PixelLaplace()`.
             `PixelSMC()` explores all modes of a pixel, at many times the cost; `PixelNuts()` runs
             chains in each.
         scene: A name in `SETUPS` or a `Scene`.
@@ -134,10 +134,11 @@ class MapPlan:
 
     key: str  # that of the compiled programs; plans with the same key are equal
     request: Request = dataclasses.field(compare=False)
-    settings: AbstractPixelMethod = dataclasses.field(compare=False)
+    settings: AbstractPixelMethod
     intensity_unit: float | None = dataclasses.field(compare=False)
     own_directions: frozenset[str] = dataclasses.field(compare=False)
     shared: tuple[SharedParameter, ...] = ()
+    found: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)
 
     def observe(self, capture: xr.Dataset) -> Observations:
         """A block, or one pixel, as arrays."""
@@ -191,9 +192,7 @@ def plan_map(
 ) -> MapPlan:
     """Check the request of a map on one of its pixels, and estimate what all of them share."""
     shared = (shared,) if isinstance(shared, str) else tuple(shared)
-    # Where noise is known, modes are narrow, and one start is often caught in the wrong one.
-    usual = PixelLaplace(starts=PixelLaplace.most_starts if shared else 1)
-    settings = usual if method is None else method
+    settings = PixelLaplace() if method is None else method
     if not isinstance(settings, AbstractPixelMethod):
         hint = "give settings such as PixelLaplace(draws=512) or PixelSMC()"
         raise FitError(f"{method!r} is no method for pixels", where="fit_pixels: method", hint=hint)
@@ -214,7 +213,7 @@ def plan_map(
     key = engine_key(request, settings, sorted(own), unit is None, shared)
     begin = tuple(of_priors(shared, request.priors))
     plan = MapPlan(key, request, settings, unit, own, begin)
-    return _with_shared(plan, capture) if shared else plan
+    return _with_settings(_with_shared(plan, capture) if shared else plan, capture)
 
 
 def _check_shared(names: Sequence[str], request: Request) -> None:
@@ -232,7 +231,7 @@ def _check_shared(names: Sequence[str], request: Request) -> None:
 def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     """The plan with the posterior of what pixels share, from some of them drawn at random."""
     request, settings = plan.request, plan.settings
-    pixels = plan.pixels(_random_pixels(capture, request.seed))
+    pixels = plan.pixels(_random_pixels(capture, request.seed, SHARED_PIXELS))
     method = PixelLaplace()
     if isinstance(settings, PixelLaplace) and settings.weighted:
         method = settings
@@ -241,13 +240,26 @@ def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     return dataclasses.replace(plan, shared=tuple(found))
 
 
-def _random_pixels(capture: xr.Dataset, seed: int) -> xr.Dataset:
+def _with_settings(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
+    """The plan with the settings that the image calls for."""
+
+    def sample(count: int) -> BatchFit:
+        seed = plan.request.seed
+        pixels = plan.pixels(_random_pixels(capture, seed, count))
+        return BatchFit(plan.engine, pixels, random_keys(seed, np.arange(len(pixels))), seed=seed)
+
+    size = capture.sizes["y"] * capture.sizes["x"]
+    settings, found = plan.settings.for_image(size, sample, is_shared=bool(plan.shared))
+    return dataclasses.replace(plan, settings=settings, found=found)
+
+
+def _random_pixels(capture: xr.Dataset, seed: int, count: int) -> xr.Dataset:
     """As many pixels with enough views as are wanted, or all there are, as an image of one row."""
     rows, columns = (capture.sizes[dim] for dim in IMAGE)
     order = np.random.default_rng(seed).permutation(rows * columns)
     found: list[xr.Dataset] = []
-    for begin in range(0, order.size, 2 * SHARED_PIXELS):
-        y, x = np.unravel_index(order[begin : begin + 2 * SHARED_PIXELS], (rows, columns))
+    for begin in range(0, order.size, 2 * count):
+        y, x = np.unravel_index(order[begin : begin + 2 * count], (rows, columns))
         some = capture.drop_vars(IMAGE, errors="ignore").isel(
             y=xr.DataArray(y, dims="x_"), x=xr.DataArray(x, dims="x_")
         )
@@ -255,10 +267,10 @@ def _random_pixels(capture: xr.Dataset, seed: int) -> xr.Dataset:
         some = some.map(lambda v: v.expand_dims("y") if "x" in v.dims else v, keep_attrs=True)
         enough = np.flatnonzero(_count_views(some).transpose(*IMAGE).to_numpy()[0] >= MIN_VIEWS)
         found.append(some.isel(x=enough))
-        if sum(each.sizes["x"] for each in found) >= SHARED_PIXELS:
+        if sum(each.sizes["x"] for each in found) >= count:
             break
     joined = xr.concat(found, "x", data_vars="minimal", coords="minimal", compat="override")
-    return joined.isel(x=slice(SHARED_PIXELS))
+    return joined.isel(x=slice(count))
 
 
 def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
@@ -308,6 +320,7 @@ def provenance_json(plan: MapPlan) -> str:
         "precision": request.precision,
         "intensity_unit": plan.intensity_unit,
         "shared": {each.name: _described(each, request) for each in plan.shared},
+        **plan.found,
     }
     return json.dumps(provenance, sort_keys=True)
 

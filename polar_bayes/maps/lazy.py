@@ -8,6 +8,7 @@ import lazy_loader
 import numpy as np
 import pandas as pd
 import xarray as xr
+from scipy.stats import binomtest
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
@@ -268,6 +269,21 @@ def shared_parameters(maps: xr.Dataset) -> pd.DataFrame:
         rows[name] = [low, middle, high, found["pixels"], found["disagreement"]]
     columns = ["q2.5", "q50", "q97.5", "pixels", "disagreement"]
     return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+
+
+def start_sentences(maps: xr.Dataset) -> list[str]:
+    """From how many starts each pixel was searched, and what a sample of pixels said about that."""
+    provenance = provenance_of(maps)
+    compared, settings = provenance.get("starts_compared"), provenance.get("settings") or {}
+    if not compared:
+        return []
+    missed, pixels = compared["missed"], compared["pixels"]
+    low, high = binomtest(missed, pixels).proportion_ci(method="wilson")
+    return [
+        f"Of {pixels} pixels drawn at random, {missed} (95% interval {100 * low:.1f} to "
+        f"{100 * high:.1f}%) look good from one start though others find another mode that counts; "
+        f"all pixels were searched from {settings['starts']}."
+    ]
 
 
 def shared_cautions(maps: xr.Dataset) -> list[str]:

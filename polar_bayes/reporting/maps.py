@@ -23,6 +23,7 @@ from polar_bayes.maps.lazy import (
     ensure_loaded,
     shared_cautions,
     shared_parameters,
+    start_sentences,
 )
 from polar_bayes.physics.part import notation
 from polar_bayes.reporting import page, style, text
@@ -218,7 +219,7 @@ def map_page(
     is_weighted = _is_weighted(provenance, default=True)
     method = FITTED_BY[provenance.get("fitted_by", "PixelLaplace")] if is_weighted else UNCORRECTED
     size = " x ".join(f"{maps.sizes[dim]:,}" for dim in IMAGE)
-    sentences = text.pixel_sentences(counts)
+    sentences = [*text.pixel_sentences(counts), *start_sentences(maps)]
     coverage: list[page.Block] = []
     if truth is not None:
         conclusions, coverage = _coverage(maps, titles, truth, uncorrected)
