@@ -336,7 +336,7 @@ _ROWS: dict[str, dist.Distribution] = {
     "absorption_amplitude": dist.LogNormal(math.log(0.5), 0.5),
     "absorption_length": dist.LogNormal(math.log(60.0), 0.5),
     # The instrument: what a careful set-up leaves unknown.
-    "dolp_gain": Beta(10.0, 1.5),
+    "dolp_gain": Beta(10.0, 1.0),
     "channel_gain_ratio": dist.LogNormal(0.0, 0.1),
     "leakage": HalfNormal(0.01),
     "dark_level": dist.Normal(0.0, 0.001),

@@ -29,6 +29,9 @@ SMALL_BATCH = 4
 
 MOST_PROGRAMS = 64
 
+MOMENTS = 4000
+"""Draws by which the moments of priors are found."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BatchEngine:
@@ -101,6 +104,21 @@ class BatchEngine:
                 return np.asarray(from_prior(self.program, key, count, self.layout))
 
         return self.programs.of(("prior draws", count), draw)
+
+    @property
+    def prior_moments(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Mean and sd of every parameter before any reading, where they are finite."""
+
+        def find() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+            z = self.prior_draws(MOMENTS)
+            with jax.enable_x64(self.precision == "double"):
+                constrain = jax.jit(jax.vmap(self.program.parameters, (0, None)))
+                draws = constrain(z, self.layout)
+            found = {name: np.asarray(x, float) for name, x in draws.items()}
+            moments = {name: (x.mean(axis=0), x.std(axis=0)) for name, x in found.items()}
+            return {name: two for name, two in moments.items() if np.isfinite(two).all()}
+
+        return self.programs.of("prior moments", find)
 
 
 _ENGINES: LRUCache[BatchEngine] = LRUCache(4)

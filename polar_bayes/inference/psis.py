@@ -8,7 +8,7 @@ Source:
     Stephens (2009), Technometrics 51(3), 316-325: the fit of the tail.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -203,23 +203,39 @@ LEVELS = (0.025, 0.1, 0.25, 0.5, 0.75, 0.9, 0.975)
 
 
 class Marginals:
-    """Marginals of a batch of pixels, filled in as answers come: NaN where a pixel has none."""
+    """Marginals of a batch of pixels, filled in as answers come: NaN where a pixel has none.
+
+    `scores` are functions of draws, each (pixel, draw), for which the slopes of means are kept.
+    """
 
     def __init__(
-        self, count: int, sizes: Mapping[str, tuple[int, ...]], *, random: bool = False
+        self,
+        count: int,
+        sizes: Mapping[str, tuple[int, ...]],
+        *,
+        random: bool = False,
+        scores: Sequence[Callable[[Values], np.ndarray]] = (),
     ) -> None:
-        self._random = random
+        self._random, self._scores = random, scores
         self.mean = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
         self.sd = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
         self.quantiles = {
             name: np.full((len(LEVELS), count, *own), np.nan) for name, own in sizes.items()
         }
+        self.slopes = {
+            name: np.full((len(scores), count, *own), np.nan) for name, own in sizes.items()
+        }
 
     def describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
         """Summarize the weighted draws of some pixels."""
+        scores = [score(parameters) for score in self._scores]
+        centered = [x - np.sum(weights * x, axis=1, keepdims=True) for x in scores]
+        gains = [weights * x / np.sum(weights * x**2, axis=1, keepdims=True) for x in centered]
         for name, mean in self.mean.items():
             draws = np.asarray(parameters[name], float)
             for own in np.ndindex(mean.shape[1:]):
                 found = summarize(draws[(..., *own)], weights, LEVELS, random=self._random)
                 mean[(at, *own)], self.sd[name][(at, *own)] = found[:2]
                 self.quantiles[name][(slice(None), at, *own)] = found[2]
+                for slope, gain in zip(self.slopes[name], gains, strict=True):
+                    slope[(at, *own)] = np.sum(gain * draws[(..., *own)], axis=1)

@@ -83,6 +83,12 @@ class SharedParameter:
         scores = self.mean + self.sd * scipy.special.ndtri(np.asarray(levels))
         return np.asarray(dist.biject_to(prior.support)(scores), float)
 
+    def scores(self, prior: dist.Distribution, draws: Values) -> np.ndarray:
+        """Standard scores of draws, in the shape of these."""
+        with jax.enable_x64(True):
+            x = dist.biject_to(prior.support).inv(jnp.asarray(draws[self.name], float))
+        return (np.asarray(x) - self.mean) / self.sd
+
 
 def as_priors(shared: Sequence[SharedParameter]) -> dict[str, tuple[Any, Any]]:
     """What `Observations.shared` holds."""

@@ -7,4 +7,5 @@ from .lazy import (
     shared_parameters as shared_parameters,
     start_sentences as start_sentences,
 )
+from .regions import region_means as region_means
 from .store import map_file as map_file

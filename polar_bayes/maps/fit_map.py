@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -84,8 +85,8 @@ def fit_pixels(
     Each pixel is the fit that `polar_bayes.fit` makes of it, by the normal approximation at its
     mode unless `method` says otherwise: the same model, priors and links. Parameters in `shared`
     are one unknown of the whole image: their posterior, estimated from 512 pixels drawn at random,
-    is the prior of every pixel. A map has the marginals of each pixel and nothing joint: to ask for
-    the mean of a region, fit the region.
+    is the prior of every pixel. A map has the marginals of each pixel, from which
+    `maps.region_means` tells means and contrasts of regions.
 
     Args:
         capture: A capture with dims y and x. In chunks (Dask), it is read block by block, and the
@@ -106,7 +107,8 @@ def fit_pixels(
 
     Returns:
         For each parameter its mean `<name>`, `<name>_sd` and `<name>_quantile`, each (y, x, ...);
-        what is shared has no map, and is told by `maps.shared_parameters`;
+        what is shared has no map, and is told by `maps.shared_parameters`; `<name>_slope` is the
+        change of the mean with one standard deviation of each shared parameter;
         `pareto_k`, `effective_draws`, `condition`, `steps`, `approach` (the method by which the
         numbers were found) and `status` of each pixel. NaN where a pixel has no answer; the
         attribute `polar_bayes` holds the provenance.
@@ -149,6 +151,12 @@ class MapPlan:
         )
         priors = jax.tree.map(jnp.asarray, as_priors(self.shared))
         return dataclasses.replace(data, shared=priors)
+
+    def marginals(self, count: int) -> Marginals:
+        """Those of so many pixels, to be filled in."""
+        priors = self.request.priors
+        scores = [functools.partial(each.scores, priors[each.name]) for each in self.shared]
+        return Marginals(count, self.sizes, scores=scores)
 
     def pixels(self, image: xr.Dataset) -> ObservationBatch:
         """The pixels of an image, or of a block of it, row by row."""
@@ -353,7 +361,7 @@ def blank(capture: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     """Maps of the image without values: names, axes, types and attributes."""
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
     nothing = empty_outcome(1, Status.NOT_FITTED)
-    tiny = maps_of(Marginals(1, plan.sizes), nothing, corner, plan)
+    tiny = maps_of(plan.marginals(1), nothing, corner, plan)
     one = tiny.isel({dim: 0 for dim in IMAGE}, drop=True)
     whole = one.expand_dims({dim: capture.sizes[dim] for dim in IMAGE})
     whole = whole.assign_coords({dim: capture[dim] for dim in IMAGE if dim in capture.coords})
@@ -361,6 +369,9 @@ def blank(capture: xr.Dataset, plan: MapPlan) -> xr.Dataset:
         {n: v.transpose(*tiny[n].dims) for n, v in whole.items()},
         attrs={PROVENANCE: provenance_json(plan)},
     )
+    for name, (mean, sd) in plan.engine.prior_moments.items():
+        if name in plan.axes:
+            whole[name].attrs |= {"prior_mean": mean.tolist(), "prior_sd": sd.tolist()}
     chunks = {dim: capture.chunks[dim] for dim in IMAGE if dim in capture.chunks}
     return whole.chunk(chunks) if chunks else whole
 
@@ -386,7 +397,7 @@ def _in_memory(capture: xr.Dataset, plan: MapPlan, progress: Counter) -> xr.Data
 def fit_block(block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     """Fit every pixel of a block."""
     numbers = block[NUMBER].transpose(*IMAGE).to_numpy().ravel()
-    found = Marginals(numbers.size, plan.sizes)
+    found = plan.marginals(numbers.size)
     readings = mask_missing(block.drop_vars(NUMBER))
     if not readings["valid"].any():  # a corner of a picture; as a capture it would be refused
         return maps_of(found, empty_outcome(numbers.size, Status.MASKED), block, plan)
@@ -415,7 +426,10 @@ def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, plan: MapPlan
             ("", "mean of", found.mean[name], ()),
             ("_sd", "standard deviation of", found.sd[name], ()),
             ("_quantile", "quantiles of", found.quantiles[name], ("quantile",)),
+            ("_slope", "change with one sd of what is shared of", found.slopes[name], ("shared",)),
         ):
+            if ending == "_slope" and not plan.shared:
+                continue
             whole = values.reshape(*values.shape[: len(first)], *shape, *sizes)
             labels = {"units": unit, "long_name": f"{statistic} {meaning}", "symbol": symbol}
             variables[f"{name}{ending}"] = ((*first, *IMAGE, *own), np.float32(whole), labels)
@@ -430,4 +444,6 @@ def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, plan: MapPlan
             }
         variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), attrs)
     coords = {dim: block.coords[dim] for dim in (*IMAGE, "wavelength") if dim in block.coords}
-    return xr.Dataset(variables, coords={**coords, "quantile": list(LEVELS)})
+    found_maps = xr.Dataset(variables, coords={**coords, "quantile": list(LEVELS)})
+    names = [each.name for each in plan.shared]
+    return found_maps.assign_coords(shared=names) if names else found_maps

@@ -113,9 +113,12 @@ def _check_maps(maps: xr.Dataset, store: Path) -> None:
         if variable.dtype.kind not in ("iu" if is_flag else "iufUOT"):
             what = f"it holds {variable.dtype.name}, which no map does"
             raise FitError(what, where=where, hint=COPY)
-        mean = str(name).removesuffix("_sd").removesuffix("_quantile")
+        mean = str(name).removesuffix("_sd").removesuffix("_quantile").removesuffix("_slope")
         own = set(maps[mean].dims) if mean in maps else set(IMAGE)
-        if name in maps.data_vars and not set(IMAGE) <= set(variable.dims) - {"quantile"} == own:
+        if (
+            name in maps.data_vars
+            and not set(IMAGE) <= set(variable.dims) - {"quantile", "shared"} == own
+        ):
             raise FitError("its axes are not those of a map", where=where, hint=COPY)
         if is_flag and not _has_meanings(variable):
             raise FitError("its flags have no meanings", where=where, hint=COPY)

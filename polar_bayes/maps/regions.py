@@ -1,0 +1,209 @@
+r"""Means of regions of a map, and their contrasts, with what all pixels share counted once.
+
+Given the shared parameters, pixels are independent. With $u_k$ the standard score of shared
+parameter k and $b_{ik} = dE[x_i]/du_k$, the mean of a region of N pixels has the variance
+
+$$ \frac{1}{N^2} \sum_i \left(\sigma_i^2 - \sum_k b_{ik}^2\right) + \sum_k \bar b_k^2 . $$
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from scipy.special import ndtri
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.batching import IMAGE, Status, cut
+from polar_bayes.maps.lazy import CHUNK, checked_status
+
+BOUNDS = (0.025, 0.975)
+"""Levels of the ends of an interval."""
+
+LARGEST_PULL = 0.5
+"""Of the priors of all pixels together on the mean of a region, in units of its sd, above which
+it is told: where pixels are alike, a 95% interval that is moved so far holds in 92%."""
+
+SIGNIFICANT = 3.0
+"""Standard errors from which a pull is not chance."""
+
+
+class _Sums(NamedTuple):
+    """Of one parameter over the pixels of every region: each (region, ...)."""
+
+    mean: np.ndarray
+    own_variance: np.ndarray
+    slope: np.ndarray  # (shared, region, ...)
+    pull: np.ndarray
+    pull_variance: np.ndarray
+
+
+def region_means(
+    maps: xr.Dataset, labels: xr.DataArray | np.ndarray, *, against: object = None
+) -> xr.Dataset:
+    """The mean of each parameter over every region of a map, or how regions differ.
+
+    The answer is that of the map's own model: pixels have priors of their own and are independent
+    given what they share, which is counted once. Where pixels are alike, their priors all pull the
+    same way, and the mean of many pixels shows it; the answer tells that pull. Such a region is
+    better fitted as one capture, or as patches with `model="hierarchical"`.
+
+    Args:
+        maps: Of `polar_bayes.fit_pixels`, or opened from a store, which is read block by block.
+        labels: The region of each pixel, (y, x): truth values (a mask), integers or texts. False,
+            0 and the empty text are no region.
+        against: Label of a region from which the others are subtracted.
+
+    Returns:
+        Over the axis `region`: each parameter (its mean over the pixels with an answer; with
+        `against` the difference), `<name>_sd`, `<name>_interval` (its normal 95% interval, axis
+        `bound`), `<name>_prior_pull` (by how much the priors of the pixels move that mean, if
+        pixels are alike; NaN without a known prior), and the numbers `pixels` and `unanswered`.
+        The attribute `cautions` lists sentences.
+
+    Raises:
+        FitError: It holds no maps, the labels do not fit, or no region has an answer.
+
+    Source:
+        The laws of total mean and variance; the pull is that of a normal prior and likelihood.
+    """
+    names = [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
+    if not names or "status" not in maps:
+        raise FitError(
+            "it holds no maps", where="region_means", hint="give what fit_pixels returns"
+        )
+    number, found = _numbered(maps, labels)
+    reference = None if against is None else _position(found, against)
+    counts = np.zeros((2, len(found)), int)
+    sums: dict[str, _Sums] = {}
+    for place in cut(maps, CHUNK):
+        block, region = maps.isel(place), number[place["y"], place["x"]].ravel()
+        is_good = (checked_status(block) == Status.GOOD).transpose(*IMAGE).to_numpy().ravel()
+        for at, which in enumerate((is_good, ~is_good)):
+            counts[at] += np.bincount(region[which & (region >= 0)], minlength=len(found))
+        use = np.flatnonzero(is_good & (region >= 0))
+        for name in names:
+            added = _sums_of(block, name, use, region[use], len(found))
+            old = sums.get(name)
+            sums[name] = added if old is None else _Sums(*map(np.add, old, added))
+    if not counts[0].any():
+        what = "no pixel of any region has an answer"
+        raise FitError(what, where="region_means: labels", hint="see pb.maps.count_pixels")
+    variables: dict[str, tuple] = {
+        "pixels": (("region",), counts[0]),
+        "unanswered": (("region",), counts[1]),
+    }
+    shown = np.delete(np.arange(found.size), [] if reference is None else reference)
+    cautions: list[str] = []
+    for name, total in sums.items():
+        means = _of_regions(total, counts[0], reference)
+        sd = np.sqrt(means.own_variance + np.sum(means.slope**2, axis=0))
+        cautions += _cautions(name, found, means, sd, shown)
+        interval = means.mean + ndtri(BOUNDS).reshape(-1, *[1] * sd.ndim) * sd
+        attrs = {key: maps[name].attrs.get(key, "") for key in ("units", "symbol")}
+        axes = ("region", *_own_dims(maps, name))
+        variables[name] = (axes, means.mean, attrs)
+        variables[f"{name}_sd"] = (axes, sd, attrs)
+        variables[f"{name}_interval"] = (("bound", *axes), interval, attrs)
+        variables[f"{name}_prior_pull"] = (axes, means.pull, attrs)
+    own = {dim: x for dim, x in maps.coords.items() if any(dim in v[0] for v in variables.values())}
+    answer = xr.Dataset(variables, {**own, "region": found, "bound": list(BOUNDS)})
+    return answer.isel(region=shown).assign_attrs(cautions=cautions)
+
+
+def _numbered(maps: xr.Dataset, labels: xr.DataArray | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number of each pixel's region, -1 for none, (y, x); and the labels of regions."""
+    if isinstance(labels, xr.DataArray) and set(labels.dims) == set(IMAGE):
+        labels = labels.transpose(*IMAGE).to_numpy()
+    values, shape = np.asarray(labels), tuple(maps.sizes[dim] for dim in IMAGE)
+    if values.shape != shape or values.dtype.kind not in "biuU":
+        raise FitError(
+            f"they are {values.dtype} of shape {values.shape}",
+            where="region_means: labels",
+            hint=f"give truth values, integers or texts, one for each of {shape} pixels",
+        )
+    found, number = np.unique(values, return_inverse=True)
+    is_region = found != np.zeros((), found.dtype)
+    if not is_region.any():
+        hint = "give a label other than False, 0 or '' to some pixels"
+        raise FitError("no pixel is in a region", where="region_means: labels", hint=hint)
+    order = np.where(is_region, np.cumsum(is_region) - 1, -1)
+    return order[number].reshape(shape), found[is_region]
+
+
+def _position(labels: np.ndarray, against: object) -> int:
+    """Which of the regions has this label."""
+    where = np.flatnonzero(labels == against)
+    if not where.size:
+        hint = f"give one of {', '.join(map(str, labels[:10]))}"
+        raise FitError(f"no region has the label {against}", where="region_means", hint=hint)
+    return int(where[0])
+
+
+def _sums_of(
+    block: xr.Dataset, name: str, use: np.ndarray, region: np.ndarray, count: int
+) -> _Sums:
+    """What the pixels `use` of a block add to the sums of their regions."""
+    own = _own_dims(block, name)
+
+    def values(name: str) -> np.ndarray:
+        x = block[name].transpose(..., *IMAGE, *own).to_numpy().astype(float)
+        lead = x.ndim - len(IMAGE) - len(own)
+        return x.reshape(*x.shape[:lead], -1, *x.shape[lead + len(IMAGE) :]).take(use, axis=lead)
+
+    def total(x: np.ndarray) -> np.ndarray:
+        whole = np.zeros((count, *x.shape[1:]))
+        np.add.at(whole, region, x)
+        return whole
+
+    mean, variance = values(name), values(f"{name}_sd") ** 2
+    shares = f"{name}_slope" in block
+    slope = values(f"{name}_slope") if shares else np.zeros((0, *mean.shape))
+    prior_mean, prior_sd = (
+        np.reshape(block[name].attrs.get(f"prior_{part}", np.nan), mean.shape[1:] or -1)
+        for part in ("mean", "sd")
+    )
+    # A pixel that says nothing has the variance of the prior: its pull can be anything.
+    gain = variance / np.maximum(prior_sd**2 - variance, 0.01 * prior_sd**2)
+    return _Sums(
+        total(mean),
+        total(np.maximum(variance - np.sum(slope**2, axis=0), 0.0)),
+        np.reshape([total(each) for each in slope], (len(slope), count, *mean.shape[1:])),
+        total(gain * (prior_mean - mean)),
+        total(gain * variance),
+    )
+
+
+def _own_dims(maps: xr.Dataset, name: str) -> list[str]:
+    """Axes of a parameter within a pixel."""
+    return [str(dim) for dim in maps[name].dims if dim not in IMAGE]
+
+
+def _of_regions(sums: _Sums, count: np.ndarray, reference: int | None) -> _Sums:
+    """The same of means rather than sums, less those of the region of reference."""
+    size = count.reshape(-1, *[1] * (sums.mean.ndim - 1)).astype(float)
+    with np.errstate(divide="ignore", invalid="ignore"):  # regions without an answer are NaN
+        mean, slope, pull = (x / size for x in (sums.mean, sums.slope, sums.pull))
+        variance, spread = (x / size**2 for x in (sums.own_variance, sums.pull_variance))
+    if reference is not None:
+        mean, pull = mean - mean[reference], pull - pull[reference]
+        slope = slope - slope[:, reference, None]
+        variance, spread = variance + variance[reference], spread + spread[reference]
+    return _Sums(mean, variance, slope, pull, spread)
+
+
+def _cautions(
+    name: str, labels: np.ndarray, found: _Sums, sd: np.ndarray, shown: np.ndarray
+) -> Iterator[str]:
+    """Where an interval would not hold if all pixels of a region were alike."""
+    pull, chance = np.abs(found.pull), np.sqrt(found.pull_variance)
+    is_moved = (pull > LARGEST_PULL * sd) & (pull > SIGNIFICANT * chance)
+    for at in shown:
+        if np.any(is_moved[at]):
+            sds = np.max(pull[at] / sd[at])
+            why = f"if its pixels are alike, their priors move the mean by {sds:.1f} sds"
+        elif np.any(chance[at] > sd[at]):
+            why = "its pixels say less than their priors, which count once for each pixel"
+        else:
+            continue
+        yield f"{name} of region {labels[at]}: {why}. Fit the region as one capture, or as patches."

@@ -1,0 +1,150 @@
+"""Means and contrasts of regions, with what all pixels share counted once."""
+
+from pathlib import Path
+
+import numpy as np
+import numpyro
+import pytest
+import xarray as xr
+from numpyro import distributions as dist
+from numpyro import handlers
+from plate_images import ASKED, plate_image
+
+import polar_bayes as pb
+from polar_bayes.inference.batching import Status
+
+SIDE, NOISE, SPREAD, ZERO = 16, 0.05, 0.1, 0.07
+PRIORS = {"dark_level": dist.Normal(0.0, 0.3)}
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
+
+def above_zero(data, scene, priors, links) -> None:
+    """Readings of a level in each pixel, above a zero that all pixels share."""
+    del scene, links
+    level = numpyro.sample("level", dist.Normal(0.0, SPREAD))
+    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+    zero = numpyro.sample("dark_level", priors["dark_level"])
+    with numpyro.plate("view", data.shape[-1]):
+        mean = level + zero + slope * np.linspace(-1.0, 1.0, data.shape[-1])
+        numpyro.sample("q", dist.Normal(mean, NOISE), obs=data.readings["q"])
+
+
+def readings(level: np.ndarray, seed: int) -> xr.Dataset:
+    """An image whose pixels have these levels."""
+    image = plate_image(SIDE, SIDE, seed=seed)
+    noise = NOISE * np.random.default_rng(seed).normal(size=image["q"].shape)
+    return image.assign(q=(image["q"].dims, level[..., None] + ZERO + noise))
+
+
+@pytest.fixture(scope="module")
+def image() -> xr.Dataset:
+    return readings(np.random.default_rng(1).normal(0.0, SPREAD, (SIDE, SIDE)), seed=2)
+
+
+@pytest.fixture(scope="module")
+def maps(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
+    asked = ASKED | {"model": above_zero, "priors": PRIORS}
+    return pb.fit_pixels(image, shared="dark_level", **asked)
+
+
+def quarters() -> np.ndarray:
+    """Four regions, and a pixel in none of them."""
+    labels = 1 + 2 * (np.arange(SIDE)[:, None] // (SIDE // 2)) + np.arange(SIDE) // (SIDE // 2)
+    labels[0, 0] = 0
+    return labels
+
+
+def of_levels(image: xr.Dataset, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Of the levels: mean and own variance of each region given no zero; variance by the zero."""
+    level = image["q"].mean("view").to_numpy()
+    noise = NOISE**2 / image.sizes["view"]
+    shrinkage = SPREAD**2 / (SPREAD**2 + noise)
+    precision = level.size / (SPREAD**2 + noise) + 0.3**-2
+    zero = level.sum() / (SPREAD**2 + noise) / precision
+    mean = np.array([shrinkage * (level[labels == k].mean() - zero) for k in range(1, 5)])
+    pixels = np.array([(labels == k).sum() for k in range(1, 5)])
+    return mean, shrinkage * noise / pixels, shrinkage**2 / precision
+
+
+def test_a_region_counts_what_is_shared_once(image: xr.Dataset, maps: xr.Dataset) -> None:
+    labels = quarters()
+    found = pb.maps.region_means(maps, labels)
+    mean, own, common = of_levels(image, labels)
+    assert found["region"].values.tolist() == [1, 2, 3, 4]
+    assert found["pixels"].values.tolist() == [63, 64, 64, 64]
+    sd = np.sqrt(own + common)
+    # The zero has an error of Monte Carlo, which its sd tells: half of the sd without it.
+    np.testing.assert_allclose(found["level_sd"], sd, rtol=0.25)
+    assert (abs(found["level"] - mean) < 4.0 * 0.5 * sd).all()
+    low, high = found["level_interval"]
+    np.testing.assert_allclose(high - low, 2.0 * 1.96 * found["level_sd"], rtol=1e-4)
+    assert not found.attrs["cautions"]
+
+
+def test_in_a_contrast_what_is_shared_cancels(image: xr.Dataset, maps: xr.Dataset) -> None:
+    labels = quarters()
+    found = pb.maps.region_means(maps, xr.DataArray(labels.T, dims=("x", "y")), against=4)
+    mean, own, _ = of_levels(image, labels)
+    assert found["region"].values.tolist() == [1, 2, 3]
+    sd = np.sqrt(own[:3] + own[3])
+    np.testing.assert_allclose(found["level_sd"], sd, rtol=0.05)
+    # Means of 256 points in each of 64 pixels are known to a fraction of an sd of one pixel.
+    assert (abs(found["level"] - (mean[:3] - mean[3])) < 0.1 * sd).all()
+
+
+def test_pixels_that_are_alike_are_told() -> None:
+    """Priors pull all of them the same way, which the mean of many shows."""
+    alike = readings(np.full((SIDE, SIDE), 0.2), seed=3)
+    held = handlers.condition(above_zero, data={"dark_level": ZERO})
+    maps = pb.fit_pixels(alike, **ASKED | {"model": held})
+    found = pb.maps.region_means(maps, np.full((SIDE, SIDE), "leaf"))
+    noise = NOISE**2 / alike.sizes["view"]
+    level = float(alike["q"].mean()) - ZERO
+    pull = -noise / (SPREAD**2 + noise) * level
+    # The squared sd of a pixel is known to some percent from 256 points.
+    np.testing.assert_allclose(found["level_prior_pull"], pull, rtol=0.05)
+    assert float(found["level_interval"][1, 0]) < 0.2
+    (sentence,) = found.attrs["cautions"]
+    assert sentence.startswith("level of region leaf: if its pixels are alike, their priors move")
+
+
+def test_regions_of_a_store_and_pixels_without_an_answer(maps: xr.Dataset, tmp_path: Path) -> None:
+    lost = maps.assign(status=maps["status"].where(maps["y"] > 0, Status.NOT_TRUSTED))
+    lost.to_zarr(tmp_path / "map.zarr", consolidated=False)
+    found = pb.maps.region_means(pb.maps.open_map(tmp_path / "map.zarr"), quarters() > 2)
+    assert found["region"].values.tolist() == [True]
+    assert found["pixels"].item() == 8 * SIDE
+    whole = pb.maps.region_means(lost, quarters() < 3)
+    assert (whole["pixels"].item(), whole["unanswered"].item()) == (7 * SIDE, SIDE)
+
+
+@pytest.mark.parametrize(
+    ("labels", "against", "what"),
+    [
+        (np.ones((SIDE, 3), int), None, "they are int64 of shape"),
+        (np.ones((SIDE, SIDE)), None, "they are float64"),
+        (np.zeros((SIDE, SIDE), bool), None, "no pixel is in a region"),
+        (np.ones((SIDE, SIDE), int), 7, "no region has the label 7; give one of 1"),
+    ],
+)
+def test_labels_that_do_not_fit_are_refused(
+    maps: xr.Dataset, labels: np.ndarray, against: object, what: str
+) -> None:
+    with pytest.raises(pb.FitError, match=what):
+        pb.maps.region_means(maps, labels, against=against)
+
+
+def test_what_is_no_map_has_no_regions(image: xr.Dataset) -> None:
+    with pytest.raises(pb.FitError, match="it holds no maps"):
+        pb.maps.region_means(image, np.ones((SIDE, SIDE), bool))
+
+
+def test_pixels_that_say_nothing_are_told(maps: xr.Dataset) -> None:
+    """Their mean is that of as many priors, and looks certain."""
+    ignorant = maps.assign(level=0.0 * maps["level"], level_sd=0.0 * maps["level_sd"] + SPREAD)
+    ignorant["level"].attrs |= maps["level"].attrs
+    ignorant["level_slope"] = 0.0 * maps["level_slope"]
+    found = pb.maps.region_means(ignorant, quarters() == 1)
+    assert found["level_sd"].item() == pytest.approx(SPREAD / np.sqrt(63), rel=1e-6)
+    (sentence,) = found.attrs["cautions"]
+    assert "level of region True: its pixels say less than their priors, which" in sentence
