@@ -89,9 +89,9 @@ class PixelLaplace(AbstractPixelMethod):
             diagnoses it (Pareto k); False takes them as they are, without a diagnosis.
         candidates: Prior draws among which the start of each pixel is chosen, >= 8.
         starts: From how many of them every pixel is searched, 1 to 8; the lowest mode counts. By
-            default 8 in an image of at most 2,048 pixels, or of parameters that all pixels share;
-            of larger ones 512 pixels drawn at random decide: 1 where 8 find another mode in at
-            most 1% of them. Pixels whose weights cannot be trusted are searched from 8 in any case.
+            default 8, and 1 without weights. Of an image of more than 2,048 pixels that share
+            nothing, 512 drawn at random decide: 1 serves where 8 find another mode in at most 1%
+            of them. Pixels whose weights cannot be trusted are searched from 8 in any case.
         rounds: In which the proposal of a pixel with Pareto k above 0.7, or with too few effective
             draws, is fitted to its own weighted draws, until it has neither; >= 0. Without weights
             there are none.
@@ -194,11 +194,12 @@ class _Run:
 
     def approximate(self) -> Approximation:
         """Fit from the best candidate; untrusted pixels start again and keep the lower mode."""
-        candidates = self.settings.candidates
+        candidates, weighted = self.settings.candidates, self.settings.weighted
+        starts = self.settings.starts or (PixelLaplace.most_starts if weighted else 1)
         search = find_modes(self.engine, self.pixels, candidates=candidates)
         found = jax.tree.map(np.array, self._weigh(np.arange(self.at.size), search))
         for start, rank in enumerate(RESTARTS, 2):
-            everywhere = start <= (self.settings.starts or 1)
+            everywhere = start <= starts
             untrusted = np.flatnonzero(everywhere | ~found.is_trusted)
             if not untrusted.size:
                 break
