@@ -28,7 +28,7 @@ from paper_study import (
 
 import polar_bayes as pb
 from polar_bayes.calibration.runner import Simulations, draw_captures
-from polar_bayes.inference.laplace import Estimate, estimate
+from polar_bayes.inference.least_squares import Estimate, estimate
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import resolve
@@ -75,7 +75,8 @@ class LeastSquares:
             story = compile_program(generative_program.bind(SCENE), data)
             key = jax.random.key(study.seed)
             # The captures that `calibrate` draws for this seed.
-            self.drawn = draw_captures(story, data, study.simulations, jax.random.fold_in(key, 1))
+            numbers, own = np.arange(study.simulations), jax.random.fold_in(key, 1)
+            self.drawn = draw_captures(story, data, numbers, own)
             starts = from_prior(self.program, key, pb.methods.Point().starts, data)
         self._run = jax.jit(lambda own, shared: _each(self.program, own, shared, starts))
 

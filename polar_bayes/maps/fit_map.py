@@ -218,7 +218,7 @@ def plan_map(
     )
     unit = _intensity_unit(capture)
     _check_shared(shared, request)
-    key = engine_key(request, settings, sorted(own), unit is None, shared)
+    key = engine_key(request, sorted(own), unit is None, shared)
     begin = tuple(of_priors(shared, request.priors))
     plan = MapPlan(key, request, settings, unit, own, begin)
     return _with_settings(_with_shared(plan, capture) if shared else plan, capture)
