@@ -4,9 +4,9 @@ Programs are made by functions `make(engine, settings)` in the file of their alg
 compiles each once and keeps it, so all pixels of all images of one layout share the programs.
 """
 
+import contextlib
 import dataclasses
-import functools
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
 import jax
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from polar_bayes.inference.batching import ObservationBatch, map_batches
-from polar_bayes.inference.compile import TRACING_LOCK, LRUCache, cache_key
+from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache, cache_key
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request
@@ -53,14 +53,14 @@ class BatchEngine:
         return np.float64 if self.precision == "double" else np.float32
 
     def compiled[S: Hashable](
-        self, make: Callable[["BatchEngine", S], Callable], settings: S
-    ) -> Callable:
+        self, make: Callable[["BatchEngine", S], JitOnce], settings: S
+    ) -> JitOnce:
         """The program for these settings, made at its first use."""
         return self.programs.of((make, settings), lambda: make(self, settings))
 
     def run[S: Hashable](
         self,
-        make: Callable[["BatchEngine", S], Callable],
+        make: Callable[["BatchEngine", S], JitOnce],
         settings: S,
         pixels: ObservationBatch,
         *states: Any,
@@ -69,18 +69,42 @@ class BatchEngine:
         single: bool = False,
     ) -> Any:
         """Run a program on all pixels; `given` arguments are the same for all of them."""
+        with self._arguments(pixels, states, given, batch, single) as arguments:
+            program = self.compiled(make, settings)
+            return map_batches(lambda index: program(*arguments(index)), len(pixels), batch)
+
+    def begin[S: Hashable](
+        self,
+        make: Callable[["BatchEngine", S], JitOnce],
+        settings: S,
+        pixels: ObservationBatch,
+        *states: Any,
+        given: tuple = (),
+        batch: int = BATCH,
+        single: bool = False,
+    ) -> None:
+        """Begin to compile what `run` needs of these arguments, in parallel with what follows."""
+        program = self.compiled(make, settings)
+        if not program.is_begun:
+            with self._arguments(pixels, states, given, batch, single) as arguments:
+                program.begin(*arguments(np.zeros(batch, int)))
+
+    @contextlib.contextmanager
+    def _arguments(
+        self, pixels: ObservationBatch, states: tuple, given: tuple, batch: int, single: bool
+    ) -> Iterator[Callable[[np.ndarray], tuple]]:
+        """The arguments of a program for the pixels of a batch, in its precision."""
         dtype = np.float32 if single else self.dtype
         with jax.enable_x64(dtype == np.float64):
-            program = functools.partial(self.compiled(make, settings), *given)
             pixels = pixels.in_precision(dtype)
             static, count = jax.tree.map(jnp.asarray, pixels.static), len(pixels)
 
-            def of_batch(index: np.ndarray) -> Any:
+            def arguments(index: np.ndarray) -> tuple:
                 wanted = np.int32(min(batch, count - index[0]))
                 state = jax.tree.map(lambda x: x[index], states)
-                return program(wanted, pixels.take(index), static, *state)
+                return (*given, wanted, pixels.take(index), static, *state)
 
-            return map_batches(of_batch, count, batch)
+            yield arguments
 
     @property
     def parameter_axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:

@@ -27,6 +27,7 @@ from polar_bayes.inference.batching import (
     put_rows,
     take_rows,
 )
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.levenberg_marquardt import (
     PRIOR_DRAWS,
     RESTARTS,
@@ -302,7 +303,7 @@ def _proposal_at(mode: NormalApproximation) -> Proposal:
     return Proposal(np.asarray(mode.z), np.asarray(mode.root))
 
 
-def _draws(engine: BatchEngine, weighted: bool) -> Callable:
+def _draws(engine: BatchEngine, weighted: bool) -> JitOnce:
     """The program that draws from the proposal of one pixel."""
     program = engine.single_program
 

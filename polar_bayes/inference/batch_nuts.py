@@ -5,7 +5,6 @@ Source:
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, override
 
 import jax
@@ -26,6 +25,7 @@ from polar_bayes.inference.batching import (
     batched,
     take_rows,
 )
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.levenberg_marquardt import NormalApproximation, find_modes_again
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.inference.proposals import LIFT
@@ -128,7 +128,7 @@ def sample_chains(
     return draws, np.array(r_hat), np.min(effective, axis=-1)
 
 
-def _chains(engine: BatchEngine, settings: PixelNuts) -> Callable:
+def _chains(engine: BatchEngine, settings: PixelNuts) -> JitOnce:
     """The program of the chains of one pixel."""
 
     def pixel(data: Observations, z: Array, root: Array, key: Array) -> tuple[Array, Values]:

@@ -199,7 +199,7 @@ def map_batches(function: Callable[[np.ndarray], Any], count: int, size: int) ->
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
-def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> Callable:
+def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnce:
     """A function of one pixel, mapped over a batch, compiled."""
     # The compiled program takes: arguments that are the same for all pixels, as many as `given`;
     # the number of pixels that are wanted; the batched and the static readings; and the state of

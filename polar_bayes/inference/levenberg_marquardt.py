@@ -38,6 +38,7 @@ from polar_bayes.inference.batching import (
     put_rows,
     take_rows,
 )
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 
@@ -418,6 +419,9 @@ def find_modes(
         some = pixels.subset(which), take_rows(state, which)
         return engine.run(_stepping, single, *some, given=(np.int32(count),), single=single)
 
+    # The largest program compiles while the others are traced and run.
+    unknown = init(np.zeros((len(pixels), engine.program.size), engine.dtype))
+    engine.begin(_stepping, False, pixels, unknown, given=(np.int32(1),))
     start = engine.run(_starts, candidates, pixels, given=(np.int32(rank),), single=True)
     fast = jax.tree.map(np.array, init(start))
     for count in SINGLE_PASSES:
@@ -471,7 +475,7 @@ def find_all_modes(engine: BatchEngine, pixels: ObservationBatch) -> list[np.nda
     return modes
 
 
-def _starts(engine: BatchEngine, candidates: int) -> Callable:
+def _starts(engine: BatchEngine, candidates: int) -> JitOnce:
     """A program that chooses the prior draw of some rank."""
     draws = engine.prior_draws(candidates).astype(np.float32)
 
@@ -488,7 +492,7 @@ def _starts(engine: BatchEngine, candidates: int) -> Callable:
     return batched(start, given=1)
 
 
-def _stepping(engine: BatchEngine, single: bool) -> Callable:
+def _stepping(engine: BatchEngine, single: bool) -> JitOnce:
     """A program of any number of steps."""
     goal = SINGLE_GOAL if single else 0.1 * GOALS[engine.precision]
     program = engine.single_program if single else engine.program

@@ -23,7 +23,7 @@ Source:
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -37,6 +37,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batching import LANES, ObservationBatch, Status, batched
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.inference.psis import draws_at
 from polar_bayes.observation.data import Observations
@@ -270,7 +271,7 @@ def _positions(program: Program, names: Sequence[str]) -> np.ndarray:
     return np.array([int(program.positions[name]) for name in names])
 
 
-def _slopes(engine: BatchEngine, names: tuple[str, ...]) -> Callable:
+def _slopes(engine: BatchEngine, names: tuple[str, ...]) -> JitOnce:
     """The program of slope and information of one pixel."""
     program = engine.program
     where = _positions(program, names)

@@ -41,6 +41,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status, batched, take_rows
+from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.levenberg_marquardt import NormalApproximation
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import CompiledModel, Problem
@@ -529,7 +530,7 @@ class TemperedParticles(NamedTuple):
     stages: Array
 
 
-def _particles(engine: BatchEngine, settings: PixelSMC) -> Callable:
+def _particles(engine: BatchEngine, settings: PixelSMC) -> JitOnce:
     """The program of tempered SMC in one pixel."""
 
     def pixel(number: Array, data: Observations, key: Array) -> TemperedParticles:
@@ -538,7 +539,7 @@ def _particles(engine: BatchEngine, settings: PixelSMC) -> Callable:
     return batched(pixel, given=1, lanes=1)
 
 
-def _mixture_draws(engine: BatchEngine, settings: PixelSMC) -> Callable:
+def _mixture_draws(engine: BatchEngine, settings: PixelSMC) -> JitOnce:
     """The program of one round: fit a mixture to weighted draws, and draw from it (or again)."""
 
     def pixel(

@@ -8,4 +8,5 @@ from .lazy import (
     start_sentences as start_sentences,
 )
 from .regions import region_means as region_means
+from .smoothing import smooth as smooth
 from .store import map_file as map_file
