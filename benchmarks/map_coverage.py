@@ -6,7 +6,8 @@
     camera    900 rough materials before a camera, by roughness: each pixel infers its own exposure,
               noise and polarizer; then images that share these, with a usual and a perfect one
     shared    100 images of ten thousand plates, each with a noise of its own, which all of its
-              pixels share; beside maps whose pixels each infer it, and maps that are told
+              pixels share; beside maps whose pixels each infer it, and maps that are told; means
+              of 25 regions of each
 
 Without a part, all of them are run.
 """
@@ -79,15 +80,30 @@ def camera() -> None:
     print(pb.diagnostics.map_coverage(maps, rows)[["answered", "held_95"]].round(3))
 
 
-IMAGES = 100
+IMAGES, BLOCKS = 100, 5
 FACTOR = "stokes_error_factor"
+
+
+def hold_means(maps: xr.Dataset, image: xr.Dataset) -> dict[str, int]:
+    """How many square regions have means within their intervals."""
+    at = np.arange(SIDE) * BLOCKS // SIDE
+    labels = 1 + BLOCKS * at[:, None] + at
+    found = pb.maps.region_means(maps, labels)
+    is_good = maps["status"].to_numpy() == 0
+    hits = {}
+    for name in ("refractive_index", "subsurface_fraction"):
+        true = image[f"true_{name}"].to_numpy()
+        means = [true[(labels == k) & is_good].mean() for k in found["region"].to_numpy()]
+        low, high = found[f"{name}_interval"].to_numpy()
+        hits[name] = int(np.sum((low <= means) & (means <= high)))
+    return hits
 
 
 def shared() -> None:
     """Print how often intervals of the noise and of n hold the truth, over many images."""
     random, links = np.random.default_rng(5), {"q": pb.links.StokesLink(stated_errors=True)}
     asked = {"scene": ASKED["scene"], "links": links}
-    held, scores, pixels, widths = [], [], [], []
+    held, scores, pixels, regions, widths = [], [], [], [], []
     for seed in range(IMAGES):
         factor = float(np.exp(np.log(1.5) + 0.7 * random.normal()))
         image = plate_image(SIDE, SIDE, noise=0.01 * factor, seed=seed)
@@ -97,6 +113,7 @@ def shared() -> None:
         held.append(row["q2.5"] <= factor <= row["q97.5"])
         scores.append(3.92 * np.log(factor / row["q50"]) / np.log(row["q97.5"] / row["q2.5"]))
         pixels.append(pb.diagnostics.map_coverage(maps, image)["held_95"])
+        regions.append(hold_means(maps, image))
         if seed < 3:  # sds of n over those of a map that is told the noise
             model = handlers.condition(per_material, data={FACTOR: factor})
             told = pb.fit_pixels(image, model=model, **asked)["refractive_index_sd"]
@@ -106,6 +123,10 @@ def shared() -> None:
     print(f"noise held in {sum(held)} of {IMAGES} images [{interval.low:.1%}, {interval.high:.1%}]")
     print(f"standard scores: mean {np.mean(scores):.2f}, sd {np.std(scores):.2f}")
     print(pd.DataFrame(pixels).describe().loc[["mean", "min", "max"]].round(3))
+    for name, hits in pd.DataFrame(regions).sum().items():
+        count = IMAGES * BLOCKS**2
+        low, high = stats.binomtest(int(hits), count).proportion_ci(method="wilson")
+        print(f"means of {name} held in {hits} of {count} regions [{low:.1%}, {high:.1%}]")
     print("sd of n over that of a map that is told the noise: shared, each its own", widths)
 
 

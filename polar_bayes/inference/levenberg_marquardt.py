@@ -471,8 +471,8 @@ def find_all_modes(engine: BatchEngine, pixels: ObservationBatch) -> list[np.nda
     is_new: list[np.ndarray] = []
     for rank in ALL_RANKS:
         mode, _, converged = find_modes(engine, pixels, rank)
-        for other in ends:
-            converged = converged & ~(other.distance(mode) < SAME_MODE)
+        for other, kept in zip(ends, is_new, strict=True):
+            converged = converged & ~(kept & (other.distance(mode) < SAME_MODE))
         ends.append(mode)
         is_new.append(converged)
     evidence = np.where(is_new, [mode.log_evidence for mode in ends], -np.inf)
