@@ -11,6 +11,7 @@ import os
 import shutil
 import stat
 import tempfile
+import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -159,3 +160,15 @@ def sync(path: Path) -> None:
         os.fsync(opened)
     finally:
         os.close(opened)
+
+
+SCENE_KEYS = ("setup", "model", "method", "largest_view_zenith", "scene", "links", "priors")
+"""What a scene file may state (`polar_bayes.load_scene`)."""
+
+
+def is_scene_file(path: Path) -> bool:
+    """Whether a file is TOML with the keys of a scene file."""
+    try:
+        return set(tomllib.loads(path.read_text("utf-8"))) <= set(SCENE_KEYS)
+    except (OSError, ValueError):
+        return False

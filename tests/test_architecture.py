@@ -12,6 +12,7 @@ LAYERS = (
     (
         "polar_bayes.namespace",
         "polar_bayes.errors",
+        "polar_bayes.expressions",
         "polar_bayes.interrupts",
         "polar_bayes.paths",
         "polar_bayes.repr_html",

@@ -20,10 +20,10 @@ from polar_bayes.cli.options import (
     out_option,
     print_frame,
     print_json,
-    scene_option,
+    read_scene_options,
+    scene_options,
     scheduler_option,
     seed_option,
-    view_limit_option,
 )
 from polar_bayes.progress import stages
 
@@ -37,8 +37,7 @@ from polar_bayes.progress import stages
     help="laplace, importance, tempered or nuts; by default what suits the capture.",
 )  # fmt: skip
 @option("--simulations", type=int, default=1000)
-@scene_option
-@view_limit_option
+@scene_options
 @seed_option
 @option("--no-readings", is_flag=True, help="Rank parameters only.")
 @scheduler_option
@@ -51,6 +50,7 @@ def calibrate(
     capture: Path, out: Path, no_readings: bool, resume: bool, as_json: bool, **settings: Any
 ) -> int:
     """Simulate captures of this layout, fit each, and test the coverage of the intervals."""
+    settings = read_scene_options(settings)
     data = pb.load_capture(capture)
     store = out.with_name(f"{out.name}.fits")
     if resume and out.exists() and not store.exists():
@@ -78,8 +78,7 @@ def calibrate(
 
 @command()
 @capture_argument
-@scene_option
-@view_limit_option
+@scene_options
 @option(
     "--profile", "profiled", multiple=True, metavar="PARAMETER",
     help="Profile likelihood of this parameter; give it once per parameter.",
@@ -103,6 +102,7 @@ def identify(
     **settings: Any,
 ) -> None:
     """Which parameters a capture determines, which trade off, and where to look next."""
+    settings = read_scene_options(settings)
     data = pb.load_capture(capture)
     with stages() as progress:
         settings["progress"] = progress
@@ -130,8 +130,7 @@ def identify(
 @capture_argument
 @out_option(RESULT_FILE, "Study to write.")
 @model_option
-@scene_option
-@view_limit_option
+@scene_options
 @option(
     "--method", "methods", type=STUDY_METHOD, multiple=True,
     help="Method to try, once for each; by default all of them.",
@@ -150,6 +149,7 @@ def accuracy(
     **settings: Any,
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
+    settings = read_scene_options(settings)
     settings["methods"] = {
         name: pb.methods.STUDY_METHODS[name] for name in methods or pb.methods.STUDY_METHODS
     }

@@ -34,6 +34,7 @@ from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, s
 from polar_bayes.errors import one_line
 from polar_bayes.inference.files import auto_sentences
 from polar_bayes.inference.result import provenance_of
+from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table
 from polar_bayes.reporting.page import Section
@@ -585,6 +586,7 @@ def provenance_facts(provenance: Mapping[str, Any]) -> list[page.Block]:
     swapped = [str(name) for name in provenance.get("swapped") or ()]
     fit["swapped by the user"] = swapped or "nothing: all defaults"
     groups = {name: provenance.get(name) or {} for name in PROVENANCE_GROUPS}
+    groups["priors"] = {n: short_numbers(str(x)) for n, x in groups["priors"].items()}
     if timings := groups["timings"]:
         groups["timings"] = {**timings, "total": round(sum(timings.values()), 3)}
     groups["versions"] = {**groups["versions"], **(provenance.get("machine") or {})}
