@@ -14,6 +14,7 @@ import xarray as xr
 from numpyro import distributions as dist
 
 from polar_bayes.errors import SceneError
+from polar_bayes.frames import PrintedFrame
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
 from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.physics.part import notation
@@ -139,7 +140,7 @@ def prior_table(
         levels = np.quantile(draws, LEVELS).tolist()
         rows[name] = [*notation(name), describe_prior(prior), *levels]
     columns = ["symbol", "meaning", "unit", "prior", "q2.5", "q50", "q97.5"]
-    return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+    return PrintedFrame.from_dict(rows, orient="index", columns=columns)
 
 
 def _names(

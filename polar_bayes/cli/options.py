@@ -318,7 +318,17 @@ def print_fit(result: Any) -> int:
     columns = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
     titles = ["mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"]
     print_frame(pb.summary(result)[[*columns]].set_axis(titles, axis="columns"))
+    if words := list(_explanations(result["posterior"].dataset)):
+        click.echo("\n".join(["", *words]))
     return print_verdict(result)
+
+
+def _explanations(posterior: Any) -> Iterator[str]:
+    """What parameters mean whose names do not say it, with their units."""
+    for name, variable in posterior.data_vars.items():
+        meaning, unit = (variable.attrs.get(key, "") for key in ("long_name", "units"))
+        if meaning and not meaning.startswith(str(name).replace("_", " ")):
+            yield f"{name}: {meaning}{'' if unit == '1' else f' [{unit}]'}"
 
 
 def print_verdict(result: Any) -> int:
