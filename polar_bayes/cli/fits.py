@@ -274,6 +274,7 @@ def scenes(capture: Path, out: Path | None, as_json: bool, **settings: Any) -> i
 @command()
 @click.argument("fit", type=INPUT)
 @out_option(FOLDER, "Folder to write.")
+@option("--next-views/--no-next-views", default=True, help="Of a fit: which views to take next.")
 @option("--truth", type=INPUT, help="Of a map: its simulated capture.")
 @option("--uncorrected", type=INPUT, help="With --truth: the same map without weights, to compare.")
 @option(
@@ -283,19 +284,37 @@ def scenes(capture: Path, out: Path | None, as_json: bool, **settings: Any) -> i
 def report(
     fit: Path,
     out: Path,
+    next_views: bool,
     truth: Path | None,
     uncorrected: Path | None,
     comparisons: tuple[Path, ...],
 ) -> None:
     """Write the standardized report of a fit, calibration, accuracy study, or map (.zarr)."""
+    result = pb.load(fit)
+    if next_views and _is_new_fit(result):
+        _add_next_views(result)
     page = pb.report(
-        pb.load(fit),
+        result,
         out,
         truth=None if truth is None else pb.maps.open_capture(truth),
         uncorrected=None if uncorrected is None else pb.maps.open_map(uncorrected),
         comparisons=_load_all(comparisons, "calibration") or None,
     )
     click.echo(f"report: {page}")
+
+
+def _is_new_fit(result: Any) -> bool:
+    """Whether it is a fit of which nobody has asked yet what to measure next."""
+    return "posterior" in result and "next_views" not in result and pb.verdict(result).passed
+
+
+def _add_next_views(result: Any) -> None:
+    """Keep with a fit which views to take next; where that is not known, say why."""
+    try:
+        with stages() as progress:
+            result["next_views"] = pb.next_views(result, progress=progress)
+    except pb.PolarBayesError as error:
+        click.echo(f"no next views: {error}", err=True)
 
 
 @command()

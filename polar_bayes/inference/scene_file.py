@@ -110,6 +110,21 @@ def load_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         what, hint = f"it is no TOML ({error})", "write it as `polar-bayes scene` does"
         raise SceneError(what, where=where, hint=hint) from error
+    return _arguments(stated, where)
+
+
+def arguments_of(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
+    """What a result was asked for, as `load_scene` has it.
+
+    Raises:
+        SceneError: The result states no scene.
+        FitError: It has a part, link, prior or model of a user's own.
+    """
+    return _arguments(tomllib.loads(scene_text(result)), "result")
+
+
+def _arguments(stated: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """What a scene file states, as arguments."""
     _check_keys(stated, SCENE_KEYS, where)
     found: dict[str, Any] = {}
     if scene := _scene_of(stated, where):

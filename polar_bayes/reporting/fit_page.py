@@ -153,9 +153,11 @@ def fit_page(result: xr.DataTree) -> page.Page:
     summary = population_summary(result)
     sentences = fit.determined()
     if fit.verdict.passed:
+        trust = text.trust(fit.method, fit.verdict.cautions, fit.checks)
+        following = text.next_sentence(result)
+        sentences = [*text.index_sentences(fit), trust, following, *sentences]
         sentences += text.between_members(summary, pooled, fit.posterior)
         sentences += text.predictive_sentences(fit.checks)
-        sentences.append(text.trust(fit.method, fit.verdict.cautions, fit.checks))
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")
     source = [page.Details("Source of the model", code=code)] if code else []
