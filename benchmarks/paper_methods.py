@@ -28,7 +28,7 @@ from paper_study import (
 
 import polar_bayes as pb
 from polar_bayes.calibration.runner import Simulations, draw_captures
-from polar_bayes.inference.laplace import Estimate, estimate
+from polar_bayes.inference.least_squares import Estimate, estimate
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import resolve

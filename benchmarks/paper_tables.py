@@ -37,6 +37,13 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations, observe
 
 PRIOR_DRAWS = 100_000
+LEVELS = (0.5, 0.8, 0.95)
+PAPER_CLASSES = {
+    "leaves": ("leaf",),
+    "fruit": ("fruit",),
+    "plastics and coatings": ("plastic", "coating"),
+}
+"""Classes of the paper's table 1, each with the presets that stand for it."""
 
 
 def table1(study: Study) -> None:
@@ -59,7 +66,20 @@ def table1(study: Study) -> None:
                 share_of(found.held),
                 mean_of(found.width),
             )
-    print(f"\nfits: {told(trees)}")
+    print(f"\nfits: {told(trees)}\n")
+    header("class", *(f"{level:.0%} holds" for level in LEVELS))
+    by_class = dict(zip(CLASSES, trees, strict=True))
+    for title, names in PAPER_CLASSES.items():
+        row(title, *(coverage([by_class[name] for name in names], level) for level in LEVELS))
+
+
+def coverage(trees: list[xr.DataTree], level: float) -> Figure:
+    """Share of the central intervals that hold the truth: mean over parameters, then captures."""
+    held = []
+    for tree in trees:
+        ranks = np.stack([tree["prior_sbc"][name].to_numpy().ravel() for name in NAMES])
+        held.append(np.mean(np.abs(ranks - 0.5) <= 0.5 * level, axis=0))
+    return mean_of(np.concatenate(held))
 
 
 def prior_moments() -> tuple[dict[str, float], dict[str, float]]:
