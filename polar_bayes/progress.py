@@ -39,8 +39,8 @@ Counter = Callable[[int, int], None]
 REFRESH_SECONDS = 0.2
 """Shortest time between two updates of a notebook."""
 
-LINE_SECONDS = 10.0
-"""Time between two lines of a log."""
+LINE_SECONDS, MOST_LINE_SECONDS = 10.0, 80.0
+"""Time until the first line of a log; it doubles from line to line, up to the second."""
 
 _write_line: list[Callable[[str], object]] = []
 """Where lines of a log go, if anywhere."""
@@ -136,7 +136,7 @@ def _bars(*columns: ProgressColumn) -> Iterator[Callable[[str, float, float], No
 
 @contextmanager
 def _lines(write: Callable[[str], object]) -> Iterator[Callable[[str, float, float], None]]:
-    """The same in lines: what has been going on, every ten seconds."""
+    """The same in lines: what is going on, from time to time."""
     begin, ended, now = time.monotonic(), threading.Event(), ["compiling"]
 
     def show(stage: str, done: float, total: float) -> None:
@@ -144,8 +144,10 @@ def _lines(write: Callable[[str], object]) -> Iterator[Callable[[str, float, flo
         now[0] = f"{stage}, {done / total:.0%}" if done < total else f"compiling, after {stage}"
 
     def tell() -> None:
-        while not ended.wait(LINE_SECONDS):
+        wait = LINE_SECONDS
+        while not ended.wait(wait):
             write(f"{time.monotonic() - begin:.0f} s: {now[0]}")
+            wait = min(2.0 * wait, MOST_LINE_SECONDS)
 
     teller = threading.Thread(target=tell, daemon=True)
     teller.start()

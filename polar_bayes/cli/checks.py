@@ -27,6 +27,19 @@ from polar_bayes.cli.options import (
 )
 from polar_bayes.progress import stages
 
+CALIBRATION_COLUMNS = (
+    "answered, failed: fits with an answer, and without one",
+    "p_value: of uniform ranks; small where the method is wrong",
+    "held_50, held_80, held_95: share of intervals that hold the truth; a failed fit is a miss",
+    "crps: mean distance of the posterior from the truth, in the unit of the parameter",
+)
+NEXT_STEPS = {
+    True: "Next: polar-bayes fit {capture} with the same --scene, --model and --prior; its 95% "
+    "intervals may be quoted as such. polar-bayes report {out} --out report draws the ranks.",
+    False: "Next: polar-bayes report {out} --out report shows where the ranks fail; try another "
+    "--method first (nuts is the slowest and the surest), then the model.",
+}
+
 
 @command()
 @capture_argument
@@ -68,11 +81,12 @@ def calibrate(
         print_json({**rows, "verdict": verdict.sentences})
     else:
         columns = ["answered", "failed", "p_value", "held_50", "held_80", "held_95", "crps"]
-        print_frame(table[columns])
+        print_frame(table[columns], CALIBRATION_COLUMNS)
         if "readings" in tables:
             click.echo()
             print_frame(tables["readings"].drop(columns=["reading", "test"]))
-        click.echo("\n".join(["", *verdict.sentences]))
+        next_step = NEXT_STEPS[verdict.passed].format(capture=capture, out=out)
+        click.echo("\n".join(["", *verdict.sentences, "", next_step]))
     return 0 if verdict.passed else NOT_CONVERGED
 
 
@@ -150,20 +164,52 @@ def accuracy(
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
     settings = read_scene_options(settings)
-    settings["methods"] = {
-        name: pb.methods.STUDY_METHODS[name] for name in methods or pb.methods.STUDY_METHODS
-    }
+    data, names = pb.load_capture(capture), methods or tuple(pb.methods.STUDY_METHODS)
+    settings["methods"] = {name: pb.methods.STUDY_METHODS[name] for name in names}
+    quick = {name: pb.methods.STUDY_METHODS[name] for name in QUICK if name in names}
+    if quick and not as_json:
+        click.echo("First answer, by a rough reference:\n")
+        rough = pb.benchmark.Reference(error=ROUGH, longer=0)
+        first = {"methods": quick, "overrides": (), "reference": rough, "fresh": False}
+        study = pb.accuracy(data, **settings | first)
+        pb.save(study, out)
+        print_frame(pb.summary(study)[SHOWN], pb.benchmark.accuracy_sentences(study, tolerance))
+        click.echo(f"\nIt is refined now, which takes minutes; {out} holds what is known so far.")
     if no_overrides:
         settings["overrides"] = ()
-    study = pb.accuracy(pb.load_capture(capture), **settings)
+
+    def keep(study: Any) -> None:
+        """Write the study so far, and tell its last row."""
+        pb.save(study, out)
+        name, row = list(pb.summary(study).iterrows())[-1]
+        told = f"off by {row['error']:.2g} sd ({row['worst']}), {row['seconds_first']:.0f} s"
+        click.echo(f"{name}: {row['problems'] if row['error'] != row['error'] else told}", err=True)
+
+    study = pb.accuracy(data, partial=keep, **settings)
     pb.save(study, out)
     table = pb.summary(study)
     advice = " ".join(pb.benchmark.accuracy_sentences(study, tolerance))
     if as_json:
         print_json({"rows": json_rows(table), "advice": advice})
         return
-    columns = ["error", "worst", "k_hat", "r_hat", "seconds_first", "seconds_again"]
-    print_frame(table[columns], [advice])
+    click.echo()
+    next_step = f"Next: polar-bayes fit {capture} --method NAME --out fit.nc, by the method named."
+    print_frame(table[SHOWN], [*ACCURACY_COLUMNS, "", advice, "", next_step])
+
+
+QUICK = ("point", "laplace", "importance", "nuts short")
+"""Methods of a first answer."""
+
+ROUGH = 0.06
+"""Error of the reference of a first answer, in posterior sds."""
+
+SHOWN = ["error", "worst", "k_hat", "r_hat", "seconds_first", "seconds_again"]
+ACCURACY_COLUMNS = (
+    "error: largest error of a posterior mean or sd, in posterior sds of the reference",
+    "worst: the parameter that has it",
+    "k_hat, r_hat: what the method says of itself; at most 0.7 and 1.01 are good",
+    "seconds_first, seconds_again: of the first fit, compilation included, and of the next",
+)
 
 
 COMMANDS = (calibrate, identify, accuracy)
