@@ -17,10 +17,12 @@ from paper_study import (
     NAMES,
     SCENE,
     Figure,
+    NormalScores,
     Population,
     Study,
     change_of,
     header,
+    joined,
     layout,
     mean_of,
     row,
@@ -195,15 +197,11 @@ def table2(study: Study) -> None:
             values = asked[label].eigenvalues(tree["truth"].to_dataset())
             own = scores(tree, INDEX)
             found[label].append((own, values))
-            row(
-                name,
-                label,
-                geometric(values.paper),
-                geometric(values.whole),
-                mean_of(own.error),
-                share_of(own.held),
-                mean_of(own.width),
-            )
+            row(name, label, *_summary(own, values))
+    for label, pairs in found.items():
+        own = joined([each for each, _ in pairs])
+        values = Eigenvalues(*(np.concatenate(x) for x in zip(*(x for _, x in pairs), strict=True)))
+        row("all classes", label, *_summary(own, values))
     first, *others = kinds
     for other in others:
         print(f"\n{first} degrees instead of {other}, paired by material:\n")
@@ -212,6 +210,12 @@ def table2(study: Study) -> None:
         for name, pair in zip(CLASSES, pairs, strict=True):
             row(name, *_differences([pair]))
         row("all classes", *_differences(pairs))
+
+
+def _summary(own: NormalScores, values: Eigenvalues) -> tuple:
+    """Eigenvalues, error, coverage and width of some captures."""
+    eigenvalues = geometric(values.paper), geometric(values.whole)
+    return *eigenvalues, mean_of(own.error), share_of(own.held), mean_of(own.width)
 
 
 def _differences(pairs: list) -> tuple:

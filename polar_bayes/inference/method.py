@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 import difflib
+import inspect
 import math
 from collections.abc import Callable
 from typing import Any, Self, override
@@ -123,9 +124,13 @@ class AbstractBatchMethod[Engine](HTMLRepr, abc.ABC):
 
     def __new__(cls, *_: object, **settings: object) -> Self:
         """Refuse a setting that it does not have, naming the one that is meant."""
-        names = [field.name for field in dataclasses.fields(cls) if field.init]  # type: ignore[arg-type]
+        found = [*inspect.signature(cls.__init__).parameters.values()][1:]
+        names, takes_any = (
+            [each.name for each in found],
+            any(x.kind is x.VAR_KEYWORD for x in found),
+        )
         for name in settings:
-            if name not in names:
+            if name not in names and not takes_any:
                 near = [SYNONYMS.get(name, ""), *difflib.get_close_matches(name, names, n=1)]
                 meant = next((f"did you mean {each}? " for each in near if each in names), "")
                 raise FitError(
