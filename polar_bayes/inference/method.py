@@ -125,12 +125,11 @@ class AbstractBatchMethod[Engine](HTMLRepr, abc.ABC):
     def __new__(cls, *_: object, **settings: object) -> Self:
         """Refuse a setting that it does not have, naming the one that is meant."""
         found = [*inspect.signature(cls.__init__).parameters.values()][1:]
-        names, takes_any = (
-            [each.name for each in found],
-            any(x.kind is x.VAR_KEYWORD for x in found),
-        )
+        if any(each.kind is each.VAR_KEYWORD for each in found):
+            return super().__new__(cls)
+        names = [each.name for each in found]
         for name in settings:
-            if name not in names and not takes_any:
+            if name not in names:
                 near = [SYNONYMS.get(name, ""), *difflib.get_close_matches(name, names, n=1)]
                 meant = next((f"did you mean {each}? " for each in near if each in names), "")
                 raise FitError(
