@@ -57,9 +57,9 @@ def demo(out: Path, seed: int) -> int:
     with stages() as progress:
         result = pb.fit(capture, seed=seed, progress=progress)
         pb.save(result, out / "fit.nc")
-        progress("writing the report", 0.0)
-        page = pb.report(result, out / "report")
-        progress("writing the report", 1.0)
+    if _is_new_fit(result):
+        _add_next_views(result)
+    page = pb.report(result, out / "report")
     status = print_fit(result)
     click.echo(f"report: {page}")
     return status

@@ -357,10 +357,20 @@ def next_sentence(result: xr.DataTree) -> str:
             "What to measure next is not worked out here: polar-bayes report does it, or "
             "result['next_views'] = pb.next_views(result)."
         )
-    first, *gains = verdict(result["next_views"].to_dataset()).sentences
-    about = [gain for gain in gains if "refractive_index" in gain] or gains
-    shown = "; ".join(gain.rstrip(".").replace("The 95%", "the 95%", 1) for gain in about)
-    return f"{first.replace('Look next', 'Measure next').rstrip('.')}: {shown}."
+    found = result["next_views"].to_dataset()
+    views = verdict(found).sentences[0].rstrip(".").replace("Look next", "Measure next")
+    widths = found["interval_width"].transpose("step", "parameter").to_pandas()
+    of_index = widths.filter(like="refractive_index")
+    before, after = (of_index if of_index.size else widths).iloc[[0, -1]].to_numpy()
+    of = " of n" if of_index.size else ""
+    if len(before) == 1:
+        return (
+            f"{views}: the 95% interval{of} is expected to narrow from {before[0]:.3g} to "
+            f"{after[0]:.3g}."
+        )
+    least, most = (f"{end(1.0 - after / before):.0%}" for end in (np.min, np.max))
+    by = least if least == most else f"{least} to {most}"
+    return f"{views}: the 95% intervals{of} are expected to narrow by {by}."
 
 
 def trust(method: str, cautions: Sequence[str], checks: Mapping[str, PredictiveCheck]) -> str:

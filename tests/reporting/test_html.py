@@ -199,9 +199,11 @@ def test_the_first_screen_tells_the_index_the_trust_and_the_next_views(small) ->
         coords={"parameter": ["refractive_index", "absorption"]},
     )
     assert (
-        "Measure next at zenith 70, azimuth 180: the 95% interval of refractive_index is expected "
-        "to narrow from 0.4 to 0.1."
+        "Measure next at zenith 70, azimuth 180: the 95% interval of n is expected to narrow from "
+        "0.4 to 0.1."
     ) in Page(render(told)).text
+    told["next_views"] = told["next_views"].to_dataset().assign_coords(parameter=["a", "b"])
+    assert "the 95% intervals are expected to narrow by 0% to 75%." in Page(render(told)).text
 
 
 @pytest.mark.thorough
