@@ -388,8 +388,8 @@ def _entries(
 
 def hint_for(row: Variable, wrong: np.ndarray) -> str:
     """What to do about numbers outside their range, by their likely cause."""
-    if row.kind == "reading" and np.isnan(wrong).any():
-        return f"mark what is missing: capture['valid'] = capture[{row.name!r}].notnull()"
+    if row.name in SIGNALS and np.isnan(wrong).any():
+        return f"{MASK}, as by capture['valid'] = capture[{row.name!r}].notnull()"
     is_polarization = row.kind == "reading" and row.hint == FRACTION
     if is_polarization and np.all(np.abs(wrong) <= LIKELY_PERCENT):  # False where one is NaN
         return NOT_LIGHT
