@@ -197,7 +197,7 @@ def accuracy(
     print_frame(table[SHOWN], [*ACCURACY_COLUMNS, "", advice, "", next_step])
 
 
-QUICK = ("point", "laplace", "importance", "nuts short")
+QUICK = ("point", "laplace", "importance")
 """Methods of a first answer."""
 
 ROUGH = 0.06
