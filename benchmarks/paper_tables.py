@@ -17,10 +17,12 @@ from paper_study import (
     NAMES,
     SCENE,
     Figure,
+    NormalScores,
     Population,
     Study,
     change_of,
     header,
+    joined,
     layout,
     mean_of,
     row,
@@ -37,6 +39,13 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations, observe
 
 PRIOR_DRAWS = 100_000
+LEVELS = (0.5, 0.8, 0.95)
+PAPER_CLASSES = {
+    "leaves": ("leaf",),
+    "fruit": ("fruit",),
+    "plastics and coatings": ("plastic", "coating"),
+}
+"""Classes of the paper's table 1, each with the presets that stand for it."""
 
 
 def table1(study: Study) -> None:
@@ -59,7 +68,20 @@ def table1(study: Study) -> None:
                 share_of(found.held),
                 mean_of(found.width),
             )
-    print(f"\nfits: {told(trees)}")
+    print(f"\nfits: {told(trees)}\n")
+    header("class", *(f"{level:.0%} holds" for level in LEVELS))
+    by_class = dict(zip(CLASSES, trees, strict=True))
+    for title, names in PAPER_CLASSES.items():
+        row(title, *(coverage([by_class[name] for name in names], level) for level in LEVELS))
+
+
+def coverage(trees: list[xr.DataTree], level: float) -> Figure:
+    """Share of the central intervals that hold the truth: mean over parameters, then captures."""
+    held = []
+    for tree in trees:
+        ranks = np.stack([tree["prior_sbc"][name].to_numpy().ravel() for name in NAMES])
+        held.append(np.mean(np.abs(ranks - 0.5) <= 0.5 * level, axis=0))
+    return mean_of(np.concatenate(held))
 
 
 def prior_moments() -> tuple[dict[str, float], dict[str, float]]:
@@ -175,15 +197,11 @@ def table2(study: Study) -> None:
             values = asked[label].eigenvalues(tree["truth"].to_dataset())
             own = scores(tree, INDEX)
             found[label].append((own, values))
-            row(
-                name,
-                label,
-                geometric(values.paper),
-                geometric(values.whole),
-                mean_of(own.error),
-                share_of(own.held),
-                mean_of(own.width),
-            )
+            row(name, label, *_summary(own, values))
+    for label, pairs in found.items():
+        own = joined([each for each, _ in pairs])
+        values = Eigenvalues(*(np.concatenate(x) for x in zip(*(x for _, x in pairs), strict=True)))
+        row("all classes", label, *_summary(own, values))
     first, *others = kinds
     for other in others:
         print(f"\n{first} degrees instead of {other}, paired by material:\n")
@@ -192,6 +210,12 @@ def table2(study: Study) -> None:
         for name, pair in zip(CLASSES, pairs, strict=True):
             row(name, *_differences([pair]))
         row("all classes", *_differences(pairs))
+
+
+def _summary(own: NormalScores, values: Eigenvalues) -> tuple:
+    """Eigenvalues, error, coverage and width of some captures."""
+    eigenvalues = geometric(values.paper), geometric(values.whole)
+    return *eigenvalues, mean_of(own.error), share_of(own.held), mean_of(own.width)
 
 
 def _differences(pairs: list) -> tuple:

@@ -39,6 +39,10 @@ from .importers.images import (
 )
 from .importers.table import from_table as from_table
 from .inference import methods as methods
+from .inference.scene_file import (
+    load_scene as load_scene,
+    save_scene as save_scene,
+)
 from .maps.fit_map import fit_pixels as fit_pixels
 from .observation import links as links
 from .physics import instrument as instrument

@@ -1,12 +1,15 @@
 """Names of a package, each loaded when it is first used, as the stub beside it declares them."""
 
 import contextlib
+import os
 import random
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import lazy_loader
+
+LOG_LEVEL = "TF_CPP_MIN_LOG_LEVEL"
 
 Attached = tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]
 
@@ -17,7 +20,7 @@ def attach(package: str, file: str) -> Attached:
 
     def load_guarded(name: str) -> Any:
         force_numpyro_import()
-        with _callers_random_state():
+        with _callers_random_state(), _quiet_compiler():
             return load(name)
 
     return load_guarded, listed, names
@@ -30,6 +33,20 @@ def force_numpyro_import() -> None:
     stand_in = sys.modules.get("numpyro")
     if stand_in is not None:
         stand_in.__path__  # noqa: B018
+
+
+@contextlib.contextmanager
+def _quiet_compiler() -> Iterator[None]:
+    """Hide what XLA logs, such as alarms of slow compilation, where it is loaded now."""
+    # It reads the variable when it is loaded, so that others find their environment unchanged.
+    if LOG_LEVEL in os.environ or "jaxlib" in sys.modules:
+        yield
+        return
+    os.environ[LOG_LEVEL] = "3"
+    try:
+        yield
+    finally:
+        os.environ.pop(LOG_LEVEL, None)
 
 
 @contextlib.contextmanager

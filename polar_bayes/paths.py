@@ -11,8 +11,11 @@ import os
 import shutil
 import stat
 import tempfile
+import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+
+import platformdirs
 
 from polar_bayes.errors import CaptureError, OutputError, PolarBayesError
 from polar_bayes.interrupts import on_interrupt
@@ -159,3 +162,46 @@ def sync(path: Path) -> None:
         os.fsync(opened)
     finally:
         os.close(opened)
+
+
+# --- The folder of compiled programs --------------------------------------------------------------
+
+
+def compiled_folder() -> Path:
+    """Where programs are kept once they are compiled, unless the user says where."""
+    return platformdirs.user_cache_path("polar_bayes") / "compiled"
+
+
+def make_private(folder: Path) -> str:
+    """Why others could write to the folder, which is made if it is not there; empty if not."""
+    ours = (folder.parent, folder)
+    try:
+        folder.parent.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for each in ours:
+            each.mkdir(mode=0o700, exist_ok=True)
+        if os.name != "posix":
+            return ""
+        for each in (folder.parent.parent, *ours):
+            found = each.stat()
+            shared = each not in ours and found.st_mode & stat.S_ISVTX  # such as /tmp
+            if found.st_uid != os.getuid() and (each in ours or found.st_uid != 0):
+                return f"{each} belongs to another user"
+            if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not shared:
+                return f"other users can write to {each}"
+    except OSError as error:
+        return f"it cannot be used ({(error.strerror or str(error)).lower()})"
+    return ""
+
+
+# --- Scene files ----------------------------------------------------------------------------------
+
+SCENE_KEYS = ("setup", "model", "method", "largest_view_zenith", "scene", "links", "priors")
+"""What a scene file may state (`polar_bayes.load_scene`)."""
+
+
+def is_scene_file(path: Path) -> bool:
+    """Whether a file is TOML with the keys of a scene file."""
+    try:
+        return set(tomllib.loads(path.read_text("utf-8"))) <= set(SCENE_KEYS)
+    except (OSError, ValueError):
+        return False

@@ -15,10 +15,12 @@ the fit chooses the precision.
 """
 
 import difflib
+import functools
 import math
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import override
+from typing import Any, NoReturn, override
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +31,7 @@ from numpyro import distributions as dist
 from numpyro.distributions import constraints, transforms
 
 from polar_bayes.errors import FitError
+from polar_bayes.expressions import parse_value
 from polar_bayes.physics.part import notation
 from polar_bayes.repr_html import DisplaySummary, Row, Table
 
@@ -173,81 +176,190 @@ class NormalCoordinate(dist.TransformedDistribution):
         return self._support
 
 
-# --- Description for reports ----------------------------------------------------------------------
+# --- Priors as text -------------------------------------------------------------------------------
 
 
 def describe_prior(prior: dist.Distribution) -> str:
     """A prior as text, for reports: `TruncatedNormal(loc=1.45, scale=0.15, low=1.2, high=2)`."""
+    return _safely_described(prior, _Readable())
+
+
+def prior_text(prior: dist.Distribution) -> str:
+    """A prior as text with every digit, which `parse_prior` reads."""
+    return _safely_described(prior, _Exact())
+
+
+def parse_prior(text: object, where: str) -> dist.Distribution:
+    """The NumPyro distribution that a text such as `Normal(0, 3)` describes.
+
+    Args:
+        text: As `prior_text` writes it, or as it stands in a program. `HalfNormal` and `Beta` are
+            those of this file, which have the same densities.
+        where: Where the text is, for the message of an error.
+
+    Raises:
+        FitError: It describes no distribution.
+    """
+    found = parse_value(text, _distributions(), where)
+    if not isinstance(found, dist.Distribution):
+        _refuse_prior(found, where)
+    return found
+
+
+def short_numbers(text: str) -> str:
+    """The text of a prior, its numbers in six digits."""
+    return re.sub(r"\d+\.\d+(?:e[+-]?\d+)?", lambda found: f"{float(found[0]):g}", text)
+
+
+def _safely_described(prior: dist.Distribution, style: "_Readable") -> str:
     try:
-        return _description(prior)
+        return style.describe(prior)
     except Exception:
         # A report must not fail because of a user-defined distribution.
         return type(prior).__name__
 
 
-def _description(prior: dist.Distribution) -> str:
-    shape = (*prior.batch_shape, *prior.event_shape)
-    while isinstance(
-        prior, dist.Independent | dist.ExpandedDistribution | dist.distribution.MaskedDistribution
-    ):
-        prior = prior.base_dist
-    copies = f" x {shape}" if shape != (*prior.batch_shape, *prior.event_shape) else ""
-    return f"{_name(prior)}({', '.join(_arguments(prior))}){copies}"
+class _Readable:
+    """Descriptions for readers."""
 
+    def describe(self, prior: dist.Distribution) -> str:
+        """A distribution with its arguments."""
+        shape = (*prior.batch_shape, *prior.event_shape)
+        while isinstance(prior, _WRAPPERS):
+            prior = prior.base_dist
+        copies = f" x {shape}" if shape != (*prior.batch_shape, *prior.event_shape) else ""
+        return f"{self._call(prior)}{copies}"
 
-def _name(prior: dist.Distribution) -> str:
-    if _is_truncated(prior):
-        return f"Truncated{type(prior.base_dist).__name__}"
-    if isinstance(prior, dist.MixtureSameFamily | dist.MixtureGeneral):
-        return "Mixture"
-    return type(prior).__name__
+    def number(self, number: float) -> str:
+        return f"{number:g}"
 
+    def text(self, numbers: np.ndarray) -> str:
+        """A number, a short list in brackets, a longer one by its shape."""
+        if numbers.size == 1:
+            return self.number(numbers.item())
+        if numbers.ndim == 1 and numbers.size <= 8:
+            return f"[{', '.join(map(self.number, numbers.tolist()))}]"
+        return f"<array {numbers.shape}>"
 
-def _arguments(prior: dist.Distribution) -> list[str]:
-    """The arguments of a distribution, as texts."""
-    if _is_truncated(prior):
+    def _call(self, prior: dist.Distribution) -> str:
+        if isinstance(prior, _TRUNCATED):
+            return self.truncated(prior)
+        if isinstance(prior, dist.MixtureSameFamily | dist.MixtureGeneral):
+            return self.mixture(prior)
+        if isinstance(prior, dist.TransformedDistribution) and not prior.arg_constraints:
+            steps = [
+                f"{type(step).__name__}({self.fields(vars(step))})" for step in prior.transforms
+            ]
+            return f"{type(prior).__name__}({self.describe(prior.base_dist)}, {self.steps(steps)})"
+        return f"{type(prior).__name__}({self.arguments(prior)})"
+
+    def arguments(self, prior: dist.Distribution) -> str:
+        return self.fields({key: getattr(prior, key, None) for key in prior.arg_constraints})
+
+    def truncated(self, prior: dist.Distribution) -> str:
+        inner = f"{self.arguments(prior.base_dist)}, {self.bounds(prior)}"
+        return f"Truncated{type(prior.base_dist).__name__}({inner})"
+
+    def bounds(self, prior: dist.Distribution) -> str:
         bounds = zip(("low", "high"), support_bounds(prior), strict=True)
-        said = [f"{key}={bound:g}" for key, bound in bounds if math.isfinite(bound)]
-        return _arguments(prior.base_dist) + said
-    if isinstance(prior, dist.MixtureSameFamily | dist.MixtureGeneral):
-        same = isinstance(prior, dist.MixtureSameFamily)
-        parts = [prior.component_distribution] if same else prior.component_distributions
-        return [
-            f"weights={_text(np.asarray(prior.mixing_distribution.probs))}",
-            *map(_description, parts),
-        ]
-    if isinstance(prior, dist.TransformedDistribution) and not prior.arg_constraints:
-        steps = (f"{type(step).__name__}({_fields(vars(step))})" for step in prior.transforms)
-        return [_description(prior.base_dist), *steps]
-    return [_fields({key: getattr(prior, key, None) for key in prior.arg_constraints})]
+        return ", ".join(f"{key}={self.number(x)}" for key, x in bounds if math.isfinite(x))
+
+    def mixture(self, prior: Any) -> str:
+        weights = self.text(np.asarray(prior.mixing_distribution.probs))
+        return f"Mixture(weights={weights}, {', '.join(map(self.describe, _components(prior)))})"
+
+    def steps(self, steps: list[str]) -> str:
+        return ", ".join(steps)
+
+    def fields(self, values: Mapping[str, object]) -> str:
+        """The numeric values among these, as `loc=1, scale=2`."""
+        numbers = {
+            key: np.asarray(value)
+            for key, value in values.items()
+            if not key.startswith("_") and np.asarray(value).dtype.kind in "iuf"
+        }
+        return ", ".join(f"{key}={self.text(number)}" for key, number in numbers.items())
 
 
-def _fields(values: Mapping[str, object]) -> str:
-    """The numeric values among these, as `loc=1, scale=2`."""
-    numbers = {
-        key: np.asarray(value)
-        for key, value in values.items()
-        if not key.startswith("_") and np.asarray(value).dtype.kind in "iuf"
-    }
-    return ", ".join(f"{key}={_text(number)}" for key, number in numbers.items())
+class _Exact(_Readable):
+    """Descriptions that `parse_prior` reads."""
+
+    @override
+    def describe(self, prior: dist.Distribution) -> str:
+        if isinstance(prior, dist.Independent):
+            return f"{self.describe(prior.base_dist)}.to_event({prior.reinterpreted_batch_ndims})"
+        if isinstance(prior, dist.ExpandedDistribution):
+            return f"{self.describe(prior.base_dist)}.expand({list(prior.batch_shape)})"
+        return self._call(prior)
+
+    @override
+    def number(self, number: float) -> str:
+        short = f"{number:g}"
+        return short if float(short) == number else repr(number)
+
+    @override
+    def text(self, numbers: np.ndarray) -> str:
+        if numbers.ndim == 0:
+            return self.number(numbers.item())
+        return f"[{', '.join(map(self.text, numbers))}]"
+
+    @override
+    def truncated(self, prior: dist.Distribution) -> str:
+        if hasattr(dist, f"Truncated{type(prior.base_dist).__name__}"):
+            return super().truncated(prior)
+        return f"TruncatedDistribution({self.describe(prior.base_dist)}, {self.bounds(prior)})"
+
+    @override
+    def mixture(self, prior: Any) -> str:
+        weights = f"CategoricalProbs({self.fields({'probs': prior.mixing_distribution.probs})})"
+        inner = ", ".join(map(self.describe, _components(prior)))
+        several = isinstance(prior, dist.MixtureGeneral)
+        return f"{type(prior).__name__}({weights}, {f'[{inner}]' if several else inner})"
+
+    @override
+    def steps(self, steps: list[str]) -> str:
+        return f"[{', '.join(steps)}]"
 
 
-def _is_truncated(prior: dist.Distribution) -> bool:
-    return isinstance(
-        prior,
-        dist.LeftTruncatedDistribution
-        | dist.RightTruncatedDistribution
-        | dist.TwoSidedTruncatedDistribution,
-    )
+_WRAPPERS = (dist.Independent, dist.ExpandedDistribution, dist.distribution.MaskedDistribution)
+_TRUNCATED = (
+    dist.LeftTruncatedDistribution,
+    dist.RightTruncatedDistribution,
+    dist.TwoSidedTruncatedDistribution,
+)
 
 
-def _text(numbers: np.ndarray) -> str:
-    """A number in six digits, a short list in brackets, a longer one by its shape."""
-    if numbers.size == 1:
-        return f"{numbers.item():g}"
-    if numbers.ndim == 1 and numbers.size <= 8:
-        return f"[{', '.join(f'{number:g}' for number in numbers)}]"
-    return f"<array {numbers.shape}>"
+def _components(prior: Any) -> Sequence[dist.Distribution]:
+    """Components of a mixture."""
+    is_general = isinstance(prior, dist.MixtureGeneral)
+    return prior.component_distributions if is_general else [prior.component_distribution]
+
+
+@functools.cache
+def _distributions() -> Mapping[str, Callable[..., Any]]:
+    """What the text of a prior may name: the distributions and transforms of NumPyro."""
+    names = (name for name in dist.__all__ if name[:1].isupper())
+    own = {"HalfNormal": HalfNormal, "Beta": Beta}
+    known = {name: getattr(dist, name) for name in names} | own
+    known |= {name: getattr(transforms, name) for name in transforms.__all__ if name[:1].isupper()}
+    return {name: _with_arrays(made) for name, made in known.items()}
+
+
+def _with_arrays(made: Callable[..., Any]) -> Callable[..., Any]:
+    """The same for arguments that are tuples of numbers, which NumPyro takes as arrays."""
+
+    def convert(argument: object) -> object:
+        if not isinstance(argument, tuple):
+            return argument
+        parts = dist.Distribution | transforms.Transform
+        of_parts = any(isinstance(each, parts) for each in argument)
+        return list(argument) if of_parts else np.asarray(argument, float)
+
+    @functools.wraps(made)
+    def make(*arguments: object, **keywords: object) -> Any:
+        return made(*map(convert, arguments), **{k: convert(x) for k, x in keywords.items()})
+
+    return make
 
 
 # --- The table: one NumPyro distribution for every named parameter --------------------------------
@@ -428,6 +540,8 @@ class PriorTable(Mapping[str, dist.Distribution]):
                 hint=f"give one: priors={{{name!r}: <a NumPyro distribution>}}",
             )
         self._read[name] = None
+        if not isinstance(self._rows[name], dist.Distribution):
+            _refuse_prior(self._rows[name], f"priors[{name!r}]")
         return self._rows[name]
 
     @override
@@ -491,7 +605,8 @@ def _in_range(least: float, most: float) -> str:
 def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> None:
     where = f"priors[{name!r}]"
     if name not in parameters:
-        near = difflib.get_close_matches(name, parameters, n=1)
+        near = [known for known in parameters if notation(known).symbol == name]
+        near = near or difflib.get_close_matches(name, parameters, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise FitError(
             "no such parameter in this model",
@@ -499,13 +614,22 @@ def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> No
             hint=f"{hint}the parameters are {', '.join(parameters)}",
         )
     if not isinstance(prior, dist.Distribution):
-        raise FitError(
-            f"a {type(prior).__name__} is not a NumPyro distribution",
-            where=where,
-            hint="give an object such as numpyro.distributions.Normal(0.0, 1.0)",
-        )
+        _refuse_prior(prior, where)
     _check_shape(name, prior, where)
     check_support(name, prior, where)
+
+
+def _refuse_prior(prior: object, where: str) -> NoReturn:
+    """Refuse what is no distribution, and say what to give in its place."""
+    kind, example = type(prior), "numpyro.distributions.Normal(0.0, 1.0)"
+    hint = f"give an object such as {example}"
+    if isinstance(prior, int | float):
+        near = f"numpyro.distributions.Normal({prior:g}, 0.01)"
+        hint = f"give a distribution around it, such as {near}, truncated where it has a range"
+    elif kind.__module__.startswith("scipy."):
+        name = getattr(getattr(prior, "dist", None), "name", "norm")
+        hint = f"NumPyro has the like of scipy.stats.{name}: give an object such as {example}"
+    raise FitError(f"a {kind.__name__} is not a NumPyro distribution", where=where, hint=hint)
 
 
 def _check_shape(name: str, prior: dist.Distribution, where: str) -> None:

@@ -3,6 +3,9 @@
 A function that takes minutes has an argument `progress`. If it is omitted, Rich draws bars in a
 notebook and in a terminal, and nothing is written to a file, a pipe or a log. Bars are erased when
 the run ends, so that a saved notebook does not contain them.
+
+The command line, whose error stream is often a pipe, calls `write_lines`: a stage that takes long
+is then told in a line from time to time.
 """
 
 import functools
@@ -36,8 +39,23 @@ Counter = Callable[[int, int], None]
 REFRESH_SECONDS = 0.2
 """Shortest time between two updates of a notebook."""
 
+LINE_SECONDS, MOST_LINE_SECONDS = 10.0, 80.0
+"""Time until the first line of a log; it doubles from line to line, up to the second."""
+
+_write_line: list[Callable[[str], object]] = []
+"""Where lines of a log go, if anywhere."""
+
 _bars_are_shown = threading.Lock()
 """Held while bars are shown, so that nested runs add none."""
+
+
+def write_lines(write: Callable[[str], object]) -> None:
+    """Tell long runs in lines from now on, where nobody watches bars.
+
+    Args:
+        write: Called with each line.
+    """
+    _write_line[:] = [write]
 
 
 def no_progress(stage: object, done: object) -> None:
@@ -87,8 +105,12 @@ def _bars(*columns: ProgressColumn) -> Iterator[Callable[[str, float, float], No
     """Context that yields a function of stage, completed amount and total."""
     notebook, console = _in_notebook(), Console(stderr=True)
     watched = notebook or console.is_terminal
-    if not watched or not _bars_are_shown.acquire(blocking=False):
+    if not (watched or _write_line) or not _bars_are_shown.acquire(blocking=False):
         yield lambda stage, done, total: None
+        return
+    if not watched:
+        with _lines(_write_line[0]) as tell:
+            yield tell
         return
     bars = (_NotebookBars if notebook else Bars)(
         TextColumn("{task.description}", markup=False),
@@ -109,6 +131,31 @@ def _bars(*columns: ProgressColumn) -> Iterator[Callable[[str, float, float], No
         with on_interrupt(bars.stop), bars:  # `stop` shows the cursor of the terminal again
             yield show
     finally:
+        _bars_are_shown.release()
+
+
+@contextmanager
+def _lines(write: Callable[[str], object]) -> Iterator[Callable[[str, float, float], None]]:
+    """The same in lines: what is going on, from time to time."""
+    begin, ended, now = time.monotonic(), threading.Event(), ["compiling"]
+
+    def show(stage: str, done: float, total: float) -> None:
+        # What comes after the end of a stage is compiled before it begins.
+        now[0] = f"{stage}, {done / total:.0%}" if done < total else f"compiling, after {stage}"
+
+    def tell() -> None:
+        wait = LINE_SECONDS
+        while not ended.wait(wait):
+            write(f"{time.monotonic() - begin:.0f} s: {now[0]}")
+            wait = min(2.0 * wait, MOST_LINE_SECONDS)
+
+    teller = threading.Thread(target=tell, daemon=True)
+    teller.start()
+    try:
+        yield show
+    finally:
+        ended.set()
+        teller.join()
         _bars_are_shown.release()
 
 

@@ -23,6 +23,7 @@ from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.convergence import Verdict, setup_cautions
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.errors import FitError, OutputError
+from polar_bayes.frames import PrintedFrame
 from polar_bayes.inference.batching import Status
 from polar_bayes.inference.files import FIT, check_fit
 from polar_bayes.inference.result import provenance_of
@@ -148,7 +149,7 @@ def _kind_of(result: object) -> Kind:
 
 
 def summary(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
-    """The table of a result of any kind, numbers unrounded.
+    """The table of a result of any kind, numbers unrounded; printed, it shows every column.
 
     Args:
         result: What `polar_bayes.fit`, `fit_pixels`, `calibrate`, `accuracy`, `identify`,
@@ -169,7 +170,7 @@ def summary(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
     Source:
         Vehtari et al. (2021), Bayesian Analysis 16(2): rank-normalized split R-hat and ESS.
     """
-    return _kind_of(result).summary(result)
+    return PrintedFrame(_kind_of(result).summary(result))
 
 
 def verdict(result: xr.DataTree | xr.Dataset) -> Verdict:

@@ -14,6 +14,7 @@ import xarray as xr
 from numpyro import distributions as dist
 
 from polar_bayes.errors import SceneError
+from polar_bayes.frames import PrintedFrame
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
 from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.physics.part import notation
@@ -78,8 +79,10 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
 )
 
 
-def find_setup(name: str) -> Setup:
-    """The set-up of that name."""
+def find_setup(name: str | Setup) -> Setup:
+    """The set-up of that name; one of a user's own is returned as it is."""
+    if isinstance(name, Setup):
+        return name
     if not isinstance(name, str) or name not in SETUPS:
         raise SceneError(
             "no such scene",
@@ -87,6 +90,11 @@ def find_setup(name: str) -> Setup:
             hint=f"give one of {', '.join(SETUPS)}, or a polar_bayes.Scene",
         )
     return SETUPS[name]
+
+
+def setup_name(setup: Setup) -> str:
+    """The name of the set-up that has this scene, or "custom"."""
+    return next((name for name, own in SETUPS.items() if own.scene == setup.scene), "custom")
 
 
 def default_priors(setup: Setup, capture: xr.Dataset) -> dict[str, dist.Distribution]:
@@ -106,12 +114,14 @@ LEVELS = (0.025, 0.5, 0.975)
 
 
 def prior_table(
-    scene: str | Scene | None = None, *, priors: Mapping[str, dist.Distribution] | None = None
+    scene: str | Scene | Setup | None = None,
+    *,
+    priors: Mapping[str, dist.Distribution] | None = None,
 ) -> pd.DataFrame:
     """The priors as a table.
 
     Args:
-        scene: The name of a set-up, whose links' noise is listed too, or a scene; by default every
+        scene: A set-up or its name, whose links' noise is listed too, or a scene; by default every
             parameter that has a prior.
         priors: Distributions that replace or extend `polar_bayes.PRIORS`, as for `polar_bayes.fit`.
 
@@ -124,17 +134,17 @@ def prior_table(
         FitError: A prior cannot be used, or belongs to no parameter of the scene.
     """
     rows = {}
-    own = find_setup(scene).priors if isinstance(scene, str) else {}
+    own = find_setup(scene).priors if isinstance(scene, str | Setup) else {}
     for name, prior in resolve_priors(_names(scene, priors), {**own, **(priors or {})}).items():
         draws = np.asarray(prior.sample(jax.random.key(0), (DRAWS,)))
         levels = np.quantile(draws, LEVELS).tolist()
         rows[name] = [*notation(name), describe_prior(prior), *levels]
     columns = ["symbol", "meaning", "unit", "prior", "q2.5", "q50", "q97.5"]
-    return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+    return PrintedFrame.from_dict(rows, orient="index", columns=columns)
 
 
 def _names(
-    scene: str | Scene | None, priors: Mapping[str, dist.Distribution] | None
+    scene: str | Scene | Setup | None, priors: Mapping[str, dist.Distribution] | None
 ) -> tuple[str, ...]:
     if scene is None:
         return tuple({**PRIORS, **(priors or {})})

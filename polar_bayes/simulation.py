@@ -25,7 +25,7 @@ from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import RANGES
-from polar_bayes.setups import SETUPS, Setup, find_setup
+from polar_bayes.setups import SETUPS, Setup, find_setup, setup_name
 
 __all__ = ["PRESETS", "Material", "Protocol", "simulate"]
 
@@ -284,11 +284,12 @@ BRIGHT_LEVEL = 0.6
 def simulate(
     preset: str | Material = "leaf",
     *,
-    scene: str | Scene = "paper",
+    scene: str | Scene | Setup = "paper",
     links: Mapping[str, AbstractLink] | None = None,
     protocol: Protocol | None = None,
     parameters: Mapping[str, float | np.ndarray] | None = None,
     noise: Mapping[str, float | np.ndarray] | None = None,
+    name: str | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
     """Draw a capture of a known material, or an image of many.
@@ -300,13 +301,14 @@ def simulate(
 
     Args:
         preset: A name in `PRESETS` or a `Material`.
-        scene: A name in `SETUPS` or a `Scene`.
+        scene: A name in `SETUPS`, a `Scene` or a `Setup`.
         links: How each variable scatters; by default those of the scene's set-up.
         protocol: Where to look from; the paper's by default.
         parameters: Values that replace the preset's, and those of instrument terms (which are
             otherwise 0 for offsets and 1 for gains); shape (), (wavelength,) or (y, x).
         noise: Values that replace those of `NOISE`; shape () or (y, x). `exposure` is otherwise
             one number, chosen so that the brighter views come to 60% of full scale.
+        name: Name of the capture; by default that of the preset.
         seed: The same seed gives the same capture.
 
     Returns:
@@ -348,10 +350,10 @@ def simulate(
     image = image_shape(truth, levels)
     with jax.enable_x64(True):
         recorded = _record(setup.scene, links, _layout(protocol, links, image), truth, levels, seed)
-    name = preset if isinstance(preset, str) else "simulated"
+    name = name or (preset if isinstance(preset, str) else "simulated")
     attributes: dict[str, str | int] = {"name": name, "seed": seed}
-    if isinstance(scene, str):  # a fit then takes the same set-up by default
-        attributes["setup"] = scene
+    if (set_up := setup_name(setup)) != "custom" and not isinstance(scene, Scene):
+        attributes["setup"] = set_up  # a fit then takes the same set-up by default
     return _label(recorded, protocol, IMAGE if image else (), truth, attributes)
 
 

@@ -12,6 +12,8 @@ LAYERS = (
     (
         "polar_bayes.namespace",
         "polar_bayes.errors",
+        "polar_bayes.expressions",
+        "polar_bayes.frames",
         "polar_bayes.interrupts",
         "polar_bayes.paths",
         "polar_bayes.repr_html",

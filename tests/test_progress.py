@@ -3,6 +3,7 @@
 import contextlib
 import io
 import sys
+import time
 import types
 
 import pytest
@@ -59,6 +60,30 @@ def test_a_log_holds_no_bar() -> None:
         assert two_steps() == ["done"]
         two_pixels()
     assert log.getvalue() == ""
+
+
+def test_a_command_tells_long_stages_in_lines(monkeypatch) -> None:
+    """Before the first stage, within one, and after it, when the next is compiled."""
+    lines: list[str] = []
+    monkeypatch.setattr(progress, "_write_line", [])
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.05)
+    progress.write_lines(lines.append)
+
+    def wait_for(words: str) -> None:
+        limit = time.monotonic() + 20.0
+        while not any(line.endswith(words) for line in lines):
+            assert time.monotonic() < limit, lines
+            time.sleep(0.01)
+
+    with stages() as show:
+        wait_for("s: compiling")
+        show("climbing", 0.5)
+        wait_for("s: climbing, 50%")
+        show("climbing", 1.0)
+        wait_for("s: compiling, after climbing")
+    count = len(lines)
+    time.sleep(0.2)
+    assert len(lines) == count
 
 
 def test_a_terminal_shows_bars_and_takes_them_back(monkeypatch) -> None:

@@ -4,6 +4,7 @@ Imports are counted in fresh processes, by the modules that are there afterwards
 """
 
 import inspect
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -106,6 +107,33 @@ for name in commands.commands:
 
 def test_errors_of_the_package_load_no_array_library():
     assert run(f"import polar_bayes\npolar_bayes.CaptureError{LOADED}") == ""
+
+
+QUIET = """
+import os, sys
+import polar_bayes as pb
+pb.Geometry
+assert "jax" in sys.modules and "TF_CPP_MIN_LOG_LEVEL" not in os.environ
+import jax
+from polar_bayes.inference.compile import compiled
+assert jax.config.jax_compilation_cache_dir is None
+jax.jit(lambda x: x + 2.0)(1.0)
+compiled(lambda x: x + 1.0)(1.0)
+print(jax.config.jax_compilation_cache_dir)
+"""
+
+
+def test_programs_are_kept_on_the_disk_from_the_first_that_is_compiled(tmp_path, monkeypatch):
+    """What JAX compiled before does not keep them from it; the environment stays what it was."""
+    for name in [name for name in os.environ if "COMPILATION_CACHE" in name or "TF_CPP" in name]:
+        monkeypatch.delenv(name)
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = Path(run(QUIET).strip())
+    assert folder == tmp_path / "cache" / "polar_bayes" / "compiled"
+    assert list(folder.glob("*-cache"))
+    monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "false")
+    assert run(QUIET).strip() == "None"
 
 
 # --- what importing leaves behind -----------------------------------------------------------------

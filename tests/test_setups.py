@@ -74,6 +74,26 @@ def test_the_docstring_of_a_setup_names_every_field():
         assert f"{field}:" in inspect.getdoc(Setup)
 
 
+def test_every_parameter_is_explained_in_words():
+    table = pb.setups.prior_table()
+    plain = {
+        "roughness",
+        "albedo",
+        "refractive_index",
+        "subsurface_fraction",
+        "cauchy_a",
+        "cauchy_b",
+    }
+    unexplained = set(table.index[table["meaning"] == table.index.str.replace("_", " ")])
+    assert unexplained <= plain
+
+
+def test_a_table_prints_every_column_within_80_characters():
+    text = repr(pb.setups.prior_table("goniometer"))
+    assert all(column in text for column in pb.setups.prior_table("goniometer").columns)
+    assert max(map(len, text.splitlines())) <= 80
+
+
 def test_a_discrepancy_of_more_functions_has_as_many_weights():
     layout = pb.simulation.Protocol(views=24, wavelengths=(), azimuths=(180.0,))
     plate = pb.simulate("glass", scene="goniometer", protocol=layout)

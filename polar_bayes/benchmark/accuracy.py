@@ -80,6 +80,7 @@ def accuracy(
     links: AbstractLink | Mapping[str, AbstractLink] | None = None,
     largest_view_zenith: float | None = None,
     seed: int = 0,
+    partial: Callable[[xr.DataTree], object] | None = None,
     progress: Progress | None = None,
 ) -> xr.DataTree:
     """Compare methods on one capture with a reference posterior: their errors and their costs.
@@ -98,6 +99,7 @@ def accuracy(
         links: One link, a mapping or None.
         largest_view_zenith: Unit degree, or None for the set-up's own.
         seed: Of the random numbers.
+        partial: Called with the study of the rows so far, after each row but the last.
         progress: Called with the name of a stage and the fraction of it that is done.
 
     Returns:
@@ -121,21 +123,26 @@ def accuracy(
         problem = make_problem(request, key_search)
         reference_run = run_reference(reference or Reference(), problem, key_draws)
     show("reference", 1.0)
-    rows = []
+    rows: list[dict[str, Any]] = []
+
+    def study() -> xr.DataTree:
+        dataset = _dataset(list(trials)[: len(rows)], rows, reference_run)
+        tree = xr.DataTree(children={"accuracy": xr.DataTree(dataset)})
+        tree.attrs |= provenance_attrs(
+            request,
+            accuracy=len(rows),
+            fresh_processes=fresh,
+            versions={name: version(name) for name in ("polar_bayes", "jax", "numpyro")},
+        )
+        return tree
+
     for number, trial in enumerate(trials.values()):
         show("trials", number / len(trials))
+        if rows and partial is not None:
+            partial(study())
         rows.append(_row(trial, reference_run, fresh=fresh))
     show("trials", 1.0)
-    tree = xr.DataTree(
-        children={"accuracy": xr.DataTree(_dataset(list(trials), rows, reference_run))}
-    )
-    tree.attrs |= provenance_attrs(
-        request,
-        accuracy=len(rows),
-        fresh_processes=fresh,
-        versions={name: version(name) for name in ("polar_bayes", "jax", "numpyro")},
-    )
-    return tree
+    return study()
 
 
 Trials = dict[tuple[str, str], Trial | PolarBayesError]

@@ -100,6 +100,9 @@ def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
 
 # --- Tables ---------------------------------------------------------------------------------------
 
+HALF = 0.5
+"""Share of failed fits from which another method is named."""
+
 MOST_UNTRUSTED = 0.5
 """Share of fits that are not trusted above which their ranks do not judge the model."""
 
@@ -259,6 +262,12 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
         if status != Status.GOOD and lost:
             name = status.name.lower().replace("_", " ")
             sentences.append(f"{lost} of {statuses.size} fits: {name}.")
+    failed = int(table["failed"].max())
+    if failed:
+        counted = f"{failed} of {statuses.size} fits have no answer, and count as misses of every"
+        sentences.append(f"{counted} interval above.")
+    if failed >= HALF * statuses.size:
+        sentences.append(_better_method(calibration))
     if np.mean(statuses == Status.NOT_TRUSTED) > MOST_UNTRUSTED:
         sentences.append(
             "Most fits say themselves that they cannot be trusted: the ranks judge the method, not "
@@ -266,6 +275,19 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
             "the slowest and the surest."
         )
     return sentences + _reading_sentences(calibration)
+
+
+def _better_method(calibration: xr.DataTree) -> str:
+    """What to try where half of the fits have failed."""
+    method = str(provenance_of(calibration).get("method", ""))
+    several = {"material", "patch", "wavelength"} & set(calibration["prior_sbc"].dims)
+    if method == "nuts":
+        advice = "give longer chains, as in --method 'Nuts(most_draws=20000)', or narrower priors"
+    elif method == "tempered" or several:
+        advice = "try --method nuts, whose chains begin at every mode"
+    else:
+        advice = "try --method tempered, which begins at the prior and finds every mode"
+    return f"Half of the fits or more have failed: {advice}."
 
 
 def _reading_sentences(calibration: xr.DataTree) -> list[str]:

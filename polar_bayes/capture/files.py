@@ -83,6 +83,9 @@ def _digest(path: Path, size: int) -> str:
     return digest.hexdigest()
 
 
+TABLES = (".csv", ".dat", ".tsv", ".txt")
+"""Endings of files that hold tables."""
+
 # --- Captures -------------------------------------------------------------------------------------
 
 
@@ -103,6 +106,9 @@ def load_capture(path: str | os.PathLike[str]) -> xr.Dataset:
     """
     file = existing_file(path, "capture")
     hint = "write it again with save_capture"
+    if file.suffix.lower() in TABLES:
+        hint = f"a table is imported first: polar-bayes import table {file} --out {file.stem}.nc"
+        hint += f", or pb.from_table({str(file)!r})"
     broken = CaptureError("it cannot be read as netCDF", where=str(file), hint=hint)
     dataset = read_netcdf(xr.Dataset, file, broken)
     dataset.attrs.setdefault("name", file.stem)

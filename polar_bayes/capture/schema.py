@@ -12,9 +12,11 @@ over any of the capture's dims, NaN where it is not known.
 import contextlib
 import dataclasses
 import difflib
+import os
 import re
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from numbers import Real
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -246,8 +248,11 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
         CaptureError: The first departure from the contract, with its variable and index.
     """
     if not isinstance(dataset, xr.Dataset):
-        what = f"a {type(dataset).__name__} is not a capture"
-        raise CaptureError(what, where=source, hint="give an xarray.Dataset")
+        what, hint = f"a {type(dataset).__name__} is not a capture", "give an xarray.Dataset"
+        if isinstance(dataset, str | os.PathLike):
+            read = "load_capture" if Path(dataset).suffix in ("", ".nc") else "from_table"
+            hint = f"read it first: pb.{read}({os.fspath(dataset)!r})"
+        raise CaptureError(what, where=source, hint=hint)
     _check_names(dataset, source)
     layout = _layout(dataset, source)
     present = [row for row in CONTRACT if row.name in dataset]
@@ -383,6 +388,8 @@ def _entries(
 
 def hint_for(row: Variable, wrong: np.ndarray) -> str:
     """What to do about numbers outside their range, by their likely cause."""
+    if row.name in SIGNALS and np.isnan(wrong).any():
+        return f"{MASK}, as by capture['valid'] = capture[{row.name!r}].notnull()"
     is_polarization = row.kind == "reading" and row.hint == FRACTION
     if is_polarization and np.all(np.abs(wrong) <= LIKELY_PERCENT):  # False where one is NaN
         return NOT_LIGHT

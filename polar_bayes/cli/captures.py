@@ -1,6 +1,7 @@
 """Commands that make captures."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,10 @@ from polar_bayes.cli.options import (
     SCENE,
     Command,
     command,
+    link_option,
     option,
     out_option,
+    read_scene_options,
     seed_option,
 )
 
@@ -29,8 +32,23 @@ wavelength_option = option("--wavelength", type=float, help="Nanometers.")
 def _save(capture: Any, out: Path) -> None:
     """Write a capture, and print its counts."""
     pb.save_capture(capture, out)
-    counts = ", ".join(f"{number} {what}" for what, number in pb.capture.count(capture).items())
-    click.echo(f"{out}: {counts}")
+    counts = pb.capture.count(capture)
+    flagged = (f"{counts[what]} {what}" for what in ("masked", "saturated"))
+    click.echo(f"{out}: {', '.join([_layout(capture), *flagged])}")
+
+
+def _layout(capture: Any) -> str:
+    """Lengths of the axes of a capture: `12 views x 4 wavelengths`."""
+    words = {"view": "view", "wavelength": "wavelength", "material": "material", "patch": "patch"}
+    sizes = {word: capture.sizes[dim] for dim, word in words.items() if dim in capture.sizes}
+    plural = {"patch": "patches"}
+    found = [
+        f"{size} {word if size == 1 else plural.get(word, f'{word}s')}"
+        for word, size in sizes.items()
+    ]
+    if "y" in capture.sizes:
+        found.append(f"{capture.sizes['y']} x {capture.sizes['x']} pixels")
+    return " x ".join(found)
 
 
 def _save_import(capture: Any, out: Path) -> None:
@@ -42,10 +60,17 @@ def _save_import(capture: Any, out: Path) -> None:
         click.echo(f"caution: {sentence}", err=True)
 
 
+OF_PROTOCOL = ("views", "largest_view_zenith", "wavelengths")
+
+
 @command()
 @out_capture
 @option("--preset", type=MATERIAL, default="leaf", help="Material to simulate.")
-@option("--scene", type=SCENE, default="paper", help="Named scene to simulate.")
+@option(
+    "--scene", type=SCENE, default="paper", metavar="NAME|FILE", help="Named set-up or scene file."
+)
+@link_option
+@name_option
 @option("--views", type=int, default=40)
 @option("--largest-view-zenith", type=float, default=85.0, help="Degrees.")
 @option(
@@ -53,12 +78,11 @@ def _save_import(capture: Any, out: Path) -> None:
     help="Nanometers; give it once per wavelength.",
 )  # fmt: skip
 @seed_option
-def simulate(out: Path, preset: str, scene: str, seed: int, **protocol: Any) -> None:
+def simulate(out: Path, **settings: Any) -> None:
     """Draw a capture of a known material, by the paper's protocol."""
-    _save(
-        pb.simulate(preset, scene=scene, protocol=pb.simulation.Protocol(**protocol), seed=seed),
-        out,
-    )
+    settings = read_scene_options(settings)
+    protocol = {name: settings.pop(name) for name in OF_PROTOCOL}
+    _save(pb.simulate(protocol=pb.simulation.Protocol(**protocol), **settings), out)
 
 
 @command()
@@ -67,19 +91,26 @@ def simulate(out: Path, preset: str, scene: str, seed: int, **protocol: Any) -> 
 @option("--drop", multiple=True, help="Variable to leave out; give it once per variable.")
 @out_capture
 def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Path) -> None:
-    """Combine captures that are to be fitted together; each is labeled by its name."""
-    named: dict[str, Any] = {}
-    for path in captures:
-        capture = pb.load_capture(path)
-        label = str(capture.attrs["name"])
-        if label in named:
-            raise pb.CaptureError(
-                f"a capture named {label} is there already",
-                where=str(path),
-                hint="import or simulate one of the two again under another --name or file name",
-            )
-        named[label] = capture
+    """Combine captures that are to be fitted together; each is labeled by its name.
+
+    Captures of one name are numbered in the order in which they are given.
+    """
+    loaded = [pb.load_capture(path) for path in captures]
+    labels = _numbered([str(capture.attrs["name"]) for capture in loaded])
+    named = dict(zip(labels, loaded, strict=True))
     _save(pb.capture.combine(named, dim=dim, drop=drop), out)
+    for label, path in zip(labels, captures, strict=True):
+        click.echo(f"{label}: {path}")
+
+
+def _numbered(names: list[str]) -> list[str]:
+    """The names, each only once: those that are equal with numbers behind them."""
+    labels: list[str] = []
+    for name in names:
+        numbered = (f"{name} {number}" for number in itertools.count(1))
+        free = (each for each in numbered if each not in labels and each not in names)
+        labels.append(name if names.count(name) == 1 else next(free))
+    return labels
 
 
 angle_option = option(

@@ -20,12 +20,25 @@ from polar_bayes.cli.options import (
     out_option,
     print_frame,
     print_json,
-    scene_option,
+    read_scene_options,
+    scene_options,
     scheduler_option,
     seed_option,
-    view_limit_option,
 )
 from polar_bayes.progress import stages
+
+CALIBRATION_COLUMNS = (
+    "answered, failed: fits with an answer, and without one",
+    "p_value: of uniform ranks; small where the method is wrong",
+    "held_50, held_80, held_95: share of intervals that hold the truth; a failed fit is a miss",
+    "crps: mean distance of the posterior from the truth, in the unit of the parameter",
+)
+NEXT_STEPS = {
+    True: "Next: polar-bayes fit {capture} with the same --scene, --model and --prior; its 95% "
+    "intervals may be quoted as such. polar-bayes report {out} --out report draws the ranks.",
+    False: "Next: polar-bayes report {out} --out report shows where the ranks fail; try another "
+    "--method first (nuts is the slowest and the surest), then the model.",
+}
 
 
 @command()
@@ -37,8 +50,7 @@ from polar_bayes.progress import stages
     help="laplace, importance, tempered or nuts; by default what suits the capture.",
 )  # fmt: skip
 @option("--simulations", type=int, default=1000)
-@scene_option
-@view_limit_option
+@scene_options
 @seed_option
 @option("--no-readings", is_flag=True, help="Rank parameters only.")
 @scheduler_option
@@ -51,6 +63,7 @@ def calibrate(
     capture: Path, out: Path, no_readings: bool, resume: bool, as_json: bool, **settings: Any
 ) -> int:
     """Simulate captures of this layout, fit each, and test the coverage of the intervals."""
+    settings = read_scene_options(settings)
     data = pb.load_capture(capture)
     store = out.with_name(f"{out.name}.fits")
     if resume and out.exists() and not store.exists():
@@ -68,18 +81,18 @@ def calibrate(
         print_json({**rows, "verdict": verdict.sentences})
     else:
         columns = ["answered", "failed", "p_value", "held_50", "held_80", "held_95", "crps"]
-        print_frame(table[columns])
+        print_frame(table[columns], CALIBRATION_COLUMNS)
         if "readings" in tables:
             click.echo()
             print_frame(tables["readings"].drop(columns=["reading", "test"]))
-        click.echo("\n".join(["", *verdict.sentences]))
+        next_step = NEXT_STEPS[verdict.passed].format(capture=capture, out=out)
+        click.echo("\n".join(["", *verdict.sentences, "", next_step]))
     return 0 if verdict.passed else NOT_CONVERGED
 
 
 @command()
 @capture_argument
-@scene_option
-@view_limit_option
+@scene_options
 @option(
     "--profile", "profiled", multiple=True, metavar="PARAMETER",
     help="Profile likelihood of this parameter; give it once per parameter.",
@@ -103,6 +116,7 @@ def identify(
     **settings: Any,
 ) -> None:
     """Which parameters a capture determines, which trade off, and where to look next."""
+    settings = read_scene_options(settings)
     data = pb.load_capture(capture)
     with stages() as progress:
         settings["progress"] = progress
@@ -130,8 +144,7 @@ def identify(
 @capture_argument
 @out_option(RESULT_FILE, "Study to write.")
 @model_option
-@scene_option
-@view_limit_option
+@scene_options
 @option(
     "--method", "methods", type=STUDY_METHOD, multiple=True,
     help="Method to try, once for each; by default all of them.",
@@ -150,20 +163,53 @@ def accuracy(
     **settings: Any,
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
-    settings["methods"] = {
-        name: pb.methods.STUDY_METHODS[name] for name in methods or pb.methods.STUDY_METHODS
-    }
+    settings = read_scene_options(settings)
+    data, names = pb.load_capture(capture), methods or tuple(pb.methods.STUDY_METHODS)
+    settings["methods"] = {name: pb.methods.STUDY_METHODS[name] for name in names}
+    quick = {name: pb.methods.STUDY_METHODS[name] for name in QUICK if name in names}
+    if quick and not as_json:
+        click.echo("First answer, by a rough reference:\n")
+        rough = pb.benchmark.Reference(error=ROUGH, longer=0)
+        first = {"methods": quick, "overrides": (), "reference": rough, "fresh": False}
+        study = pb.accuracy(data, **settings | first)
+        pb.save(study, out)
+        print_frame(pb.summary(study)[SHOWN], pb.benchmark.accuracy_sentences(study, tolerance))
+        click.echo(f"\nIt is refined now, which takes minutes; {out} holds what is known so far.")
     if no_overrides:
         settings["overrides"] = ()
-    study = pb.accuracy(pb.load_capture(capture), **settings)
+
+    def keep(study: Any) -> None:
+        """Write the study so far, and tell its last row."""
+        pb.save(study, out)
+        name, row = list(pb.summary(study).iterrows())[-1]
+        told = f"off by {row['error']:.2g} sd ({row['worst']}), {row['seconds_first']:.0f} s"
+        click.echo(f"{name}: {row['problems'] if row['error'] != row['error'] else told}", err=True)
+
+    study = pb.accuracy(data, partial=keep, **settings)
     pb.save(study, out)
     table = pb.summary(study)
     advice = " ".join(pb.benchmark.accuracy_sentences(study, tolerance))
     if as_json:
         print_json({"rows": json_rows(table), "advice": advice})
         return
-    columns = ["error", "worst", "k_hat", "r_hat", "seconds_first", "seconds_again"]
-    print_frame(table[columns], [advice])
+    click.echo()
+    next_step = f"Next: polar-bayes fit {capture} --method NAME --out fit.nc, by the method named."
+    print_frame(table[SHOWN], [*ACCURACY_COLUMNS, "", advice, "", next_step])
+
+
+QUICK = ("point", "laplace", "importance")
+"""Methods of a first answer."""
+
+ROUGH = 0.06
+"""Error of the reference of a first answer, in posterior sds."""
+
+SHOWN = ["error", "worst", "k_hat", "r_hat", "seconds_first", "seconds_again"]
+ACCURACY_COLUMNS = (
+    "error: largest error of a posterior mean or sd, in posterior sds of the reference",
+    "worst: the parameter that has it",
+    "k_hat, r_hat: what the method says of itself; at most 0.7 and 1.01 are good",
+    "seconds_first, seconds_again: of the first fit, compilation included, and of the next",
+)
 
 
 COMMANDS = (calibrate, identify, accuracy)

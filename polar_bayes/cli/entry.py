@@ -14,10 +14,10 @@ A compiled program is native code that the next run loads, so whoever can write 
 
 import contextlib
 import contextvars
+import functools
 import logging
 import os
 import signal
-import stat
 import sys
 import threading
 import time
@@ -29,14 +29,14 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import click
-import platformdirs
 
 from polar_bayes.cli.captures import COMMANDS as CAPTURE_COMMANDS
 from polar_bayes.cli.checks import COMMANDS as CHECK_COMMANDS
 from polar_bayes.cli.fits import COMMANDS as FIT_COMMANDS
 from polar_bayes.errors import PolarBayesError, one_line
 from polar_bayes.interrupts import clean_up
-from polar_bayes.paths import system_error
+from polar_bayes.paths import compiled_folder, make_private, system_error
+from polar_bayes.progress import write_lines
 
 # --- The process of a command ---------------------------------------------------------------------
 
@@ -162,35 +162,14 @@ def keep_compiled_programs() -> None:
     # The folder that the user gives by JAX_COMPILATION_CACHE_DIR is used as it is. The own one is
     # not used where other users could write to it; one line on stderr says so.
     if FOLDER not in os.environ:
-        folder = platformdirs.user_cache_path("polar_bayes") / "compiled"
-        if problem := _folder_problem(folder):
+        folder = compiled_folder()
+        if problem := make_private(folder):
             hint = f"change that, or set {FOLDER} to a folder of your own"
             click.echo(f"{folder}: compiled programs are not kept: {problem}; {hint}", err=True)
             return
         os.environ[FOLDER] = str(folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
-
-
-def _folder_problem(folder: Path) -> str:
-    """Why others could write to the folder, which is made if it is not there; empty if not."""
-    ours = (folder.parent, folder)
-    try:
-        folder.parent.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        for each in ours:
-            each.mkdir(mode=0o700, exist_ok=True)
-        if os.name != "posix":
-            return ""
-        for each in (folder.parent.parent, *ours):
-            found = each.stat()
-            shared = each not in ours and found.st_mode & stat.S_ISVTX  # such as /tmp
-            if found.st_uid != os.getuid() and (each in ours or found.st_uid != 0):
-                return f"{each} belongs to another user"
-            if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not shared:
-                return f"other users can write to {each}"
-    except OSError as error:
-        return f"it cannot be used ({(error.strerror or str(error)).lower()})"
-    return ""
 
 
 # --- Running a command ----------------------------------------------------------------------------
@@ -216,6 +195,7 @@ def _own_process() -> int:
     """The command of the process itself; its output is flushed while an error still has a line."""
     quiet_libraries()
     keep_compiled_programs()
+    write_lines(functools.partial(click.echo, err=True))
     status = _run(None)
     try:
         sys.stdout.flush()

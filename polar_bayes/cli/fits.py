@@ -1,5 +1,6 @@
 """Commands that fit a capture, compare scenes, and show results."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +14,30 @@ from polar_bayes.cli.options import (
     INPUT,
     NOT_CONVERGED,
     RESULT_FILE,
+    SCENE_FILE,
+    SCENE_HELP,
+    SCENE_SOURCE,
     STORE,
     capture_argument,
     command,
     json_option,
     json_rows,
+    link_option,
     model_option,
+    nuts_options,
     option,
     out_option,
     print_fit,
     print_frame,
     print_json,
     print_verdict,
-    scene_option,
+    prior_option,
+    read_scene_options,
+    scene_options,
     scheduler_option,
     seed_option,
     view_limit_option,
+    with_nuts_options,
 )
 from polar_bayes.paths import write_errors
 from polar_bayes.progress import stages
@@ -48,9 +57,9 @@ def demo(out: Path, seed: int) -> int:
     with stages() as progress:
         result = pb.fit(capture, seed=seed, progress=progress)
         pb.save(result, out / "fit.nc")
-        progress("writing the report", 0.0)
-        page = pb.report(result, out / "report")
-        progress("writing the report", 1.0)
+    if _is_new_fit(result):
+        _add_next_views(result)
+    page = pb.report(result, out / "report")
     status = print_fit(result)
     click.echo(f"report: {page}")
     return status
@@ -80,11 +89,14 @@ def _make_folder(folder: Path) -> None:
     "--method", type=FIT_METHOD, default="nuts",
     help="point, laplace, importance, tempered, nuts, or auto: the cheapest that is good enough.",
 )  # fmt: skip
+@nuts_options
 @option("--seconds", type=float, help="Of --method auto; 60 by default.")
 @option(
-    "--scene", type=FIT_SCENE,
-    help="Named set-up; by default the one that the capture names. auto: what `scenes` finds.",
+    "--scene", type=FIT_SCENE, metavar="NAME|FILE",
+    help=f"{SCENE_HELP} auto: what `scenes` finds.",
 )  # fmt: skip
+@prior_option
+@link_option
 @view_limit_option
 @option("--choose-effects", "choose", is_flag=True, help="Fit what `effects` would keep.")
 @option("--tolerance", type=float, help="Of --choose-effects and --method auto; 0.1 sd.")
@@ -96,10 +108,10 @@ def fit(
     as_json: bool,
     choose: bool,
     tolerance: float | None,
-    scene: Any,
     **settings: Any,
 ) -> int:
     """Fit a capture; prints a row per parameter and writes everything to --out."""
+    settings = with_nuts_options(read_scene_options(settings))
     is_auto = settings["method"] == "auto"
     if tolerance is not None and not (choose or is_auto):
         raise click.UsageError("--tolerance needs --choose-effects or --method auto")
@@ -108,13 +120,13 @@ def fit(
     data = pb.load_capture(capture)
     with stages() as progress:
         if choose:
-            data = _with_setup(data, scene)
-            options = {key: settings[key] for key in ("model", "largest_view_zenith", "seed")}
+            options = {key: settings[key] for key in OF_CHOICE}
             options |= {} if tolerance is None else {"tolerance": tolerance}
-            scene = pb.choose_effects(data, progress=progress, **options)
-            click.echo("\n".join(pb.verdict(scene.ledger).sentences), err=True)
+            chosen: Any = pb.choose_effects(data, progress=progress, **options)
+            click.echo("\n".join(pb.verdict(chosen.ledger).sentences), err=True)
+            settings["scene"] = _in_setup(chosen, settings["scene"])
         settings |= {"tolerance": tolerance} if is_auto else {}
-        result = pb.fit(data, scene=scene, progress=progress, **settings)
+        result = pb.fit(data, progress=progress, **settings)
     pb.save(result, out)
     told = (
         *pb.capture.inferred(data),
@@ -130,12 +142,22 @@ def fit(
     return print_verdict(result)
 
 
+OF_CHOICE = ("scene", "model", "priors", "links", "largest_view_zenith", "seed")
+"""Options of a fit that matter for the choice of its effects."""
+
+
+def _in_setup(chosen: Any, scene: Any) -> Any:
+    """The chosen scene with the links and limits of the set-up from which it was chosen."""
+    if scene is None or isinstance(scene, pb.Scene):
+        return chosen
+    return dataclasses.replace(pb.setups.find_setup(scene), scene=chosen)
+
+
 @command(name="map")
 @capture_argument
 @out_option(STORE, "Zarr store to write.")
 @model_option
-@scene_option
-@view_limit_option
+@scene_options
 @option(
     "--method", type=click.Choice(("laplace", "importance", "tempered")), default="laplace",
     help="One mode of each pixel, corrected; or all modes, many times slower.",
@@ -157,6 +179,7 @@ def map_(
     """Fit every pixel of an image."""
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
+    settings = read_scene_options(settings)
     given: dict[str, Any] = {} if draws is None else {"draws": draws}
     methods: dict[str, Any] = {
         "laplace": pb.methods.PixelLaplace(**given),
@@ -179,19 +202,17 @@ def map_(
 
 @command()
 @capture_argument
-@scene_option
+@scene_options
 @option("--tolerance", type=float, default=0.1, help="Posterior sd.")
 @option("--keep", multiple=True, help="Effect that stays; give it once per effect.")
 @option("--drop", multiple=True, help="Effect that goes; give it once per effect.")
-@view_limit_option
 @seed_option
 @json_option
 @out_option(RESULT_FILE, "Ledger to write.", required=False)
-def effects(
-    capture: Path, scene: str | None, as_json: bool, out: Path | None, **settings: Any
-) -> None:
+def effects(capture: Path, as_json: bool, out: Path | None, **settings: Any) -> None:
     """What each effect changes and costs; which of them this capture can see."""
-    data = _with_setup(pb.load_capture(capture), scene)
+    settings = read_scene_options(settings)
+    data = pb.load_capture(capture)
     with stages() as progress:
         ledger: Any = pb.choose_effects(data, progress=progress, **settings).ledger
     if out is not None:
@@ -202,9 +223,20 @@ def effects(
         print_frame(pb.summary(ledger), pb.verdict(ledger).sentences)
 
 
-def _with_setup(capture: Any, setup: str | None) -> Any:
-    """The capture, naming that set-up, so that scene, links and limits fit together."""
-    return capture if setup is None else capture.assign_attrs(setup=setup)
+@command()
+@option(
+    "--from", "source", type=SCENE_SOURCE, required=True, metavar="RESULT|NAME",
+    help="A result, or the name of a set-up.",
+)  # fmt: skip
+@out_option(SCENE_FILE, "File to write; by default it is printed.", required=False)
+def scene(source: Path | str, out: Path | None) -> None:
+    """Write the scene, links, priors and method of a result as a file that --scene takes."""
+    found = source if isinstance(source, str) else pb.load(source)
+    if out is None:
+        click.echo(pb.inference.scene_text(found), nl=False)
+    else:
+        pb.save_scene(found, out)
+        click.echo(f"{out}: edit it, and give it as --scene {out}")
 
 
 @command()
@@ -212,13 +244,15 @@ def _with_setup(capture: Any, setup: str | None) -> Any:
 @out_option(RESULT_FILE, "Fit of the scenes that remain, stacked, to write.", required=False)
 @model_option
 @option("--method", type=FIT_METHOD, default="nuts", help="Of the fit that --out writes.")
+@prior_option
+@link_option
 @view_limit_option
 @seed_option
 @json_option
-def scenes(
-    capture: Path, out: Path | None, method: str, as_json: bool, **settings: Any
-) -> int | None:
+def scenes(capture: Path, out: Path | None, as_json: bool, **settings: Any) -> int | None:
     """Compare scenes, from simple to complex; with --out, fit those that remain."""
+    settings = read_scene_options(settings)
+    method = settings.pop("method")
     data = pb.load_capture(capture)
     found: Any
     with stages() as progress:
@@ -241,6 +275,7 @@ def scenes(
 @command()
 @click.argument("fit", type=INPUT)
 @out_option(FOLDER, "Folder to write.")
+@option("--next-views/--no-next-views", default=True, help="Of a fit: which views to take next.")
 @option("--truth", type=INPUT, help="Of a map: its simulated capture.")
 @option("--uncorrected", type=INPUT, help="With --truth: the same map without weights, to compare.")
 @option(
@@ -250,19 +285,37 @@ def scenes(
 def report(
     fit: Path,
     out: Path,
+    next_views: bool,
     truth: Path | None,
     uncorrected: Path | None,
     comparisons: tuple[Path, ...],
 ) -> None:
     """Write the standardized report of a fit, calibration, accuracy study, or map (.zarr)."""
+    result = pb.load(fit)
+    if next_views and _is_new_fit(result):
+        _add_next_views(result)
     page = pb.report(
-        pb.load(fit),
+        result,
         out,
         truth=None if truth is None else pb.maps.open_capture(truth),
         uncorrected=None if uncorrected is None else pb.maps.open_map(uncorrected),
         comparisons=_load_all(comparisons, "calibration") or None,
     )
     click.echo(f"report: {page}")
+
+
+def _is_new_fit(result: Any) -> bool:
+    """Whether it is a fit of which nobody has asked yet what to measure next."""
+    return "posterior" in result and "next_views" not in result and pb.verdict(result).passed
+
+
+def _add_next_views(result: Any) -> None:
+    """Keep with a fit which views to take next; where that is not known, say why."""
+    try:
+        with stages() as progress:
+            result["next_views"] = pb.next_views(result, progress=progress)
+    except pb.PolarBayesError as error:
+        click.echo(f"no next views: {error}", err=True)
 
 
 @command()
@@ -290,4 +343,4 @@ def _load_all(paths: tuple[Path, ...], kind: str) -> dict[str, Any]:
     return {path.stem: pb.load(path, kind) for path in paths}
 
 
-COMMANDS = (demo, fit, map_, effects, scenes, report, compare)
+COMMANDS = (demo, fit, map_, effects, scene, scenes, report, compare)

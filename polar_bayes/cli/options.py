@@ -3,18 +3,20 @@
 Option types refuse wrong values before anything is computed and before JAX is loaded.
 """
 
+import dataclasses
 import functools
 import json
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, override
 
 import click
+from click.core import ParameterSource
 
 import polar_bayes as pb
 from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
-from polar_bayes.paths import as_path, check_output, refuse_inputs
+from polar_bayes.paths import as_path, check_output, is_scene_file, refuse_inputs
 from polar_bayes.repr_html import Row, Table
 
 NOT_CONVERGED = 2
@@ -40,14 +42,40 @@ class Name(click.ParamType):
         return str(value)
 
 
+class Settings(Name):
+    """The same, or settings such as `Nuts(draws=2000)`, which are parsed when they are needed."""
+
+    @override
+    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+        return str(value) if "(" in str(value) else super().convert(value, param, ctx)
+
+
+class Assignment(click.ParamType):
+    """NAME=CALL, such as `angle_zero=Normal(0,3)`; the name may be left out where one is enough."""
+
+    name = "text"
+
+    def __init__(self, *, is_named: bool) -> None:
+        self.is_named = is_named
+
+    @override
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, str]:
+        name, equals, text = str(value).partition("=")
+        if equals and name.strip().isidentifier():
+            return name.strip(), text
+        if self.is_named:
+            what = "it does not say of what"
+            hint = "write NAME=DISTRIBUTION, such as 'angle_zero=Normal(0,3)'"
+            raise FitError(what, where=f"{param.opts[0]} {value}", hint=hint)
+        return "", str(value)
+
+
 MODEL = Name("model", ("per_material", "hierarchical", "gp_spectral"), FitError)
-SCENE = Name("scene", ("paper", "camera", "picture", "goniometer"), SceneError)
-FIT_SCENE = Name("scene", (*SCENE.names, "auto"), SceneError)
 MATERIAL = Name("material", ("leaf", "fruit", "plastic", "coating", "glass", "water"), CaptureError)
-FIT_METHOD = Name(
+FIT_METHOD = Settings(
     "method", ("nuts", "laplace", "point", "importance", "tempered", "auto"), FitError
 )
-CALIBRATION_METHOD = Name("method", ("laplace", "importance", "tempered", "nuts"), FitError)
+CALIBRATION_METHOD = Settings("method", ("laplace", "importance", "tempered", "nuts"), FitError)
 STUDY_METHOD = Name(
     "method",
     (
@@ -77,6 +105,24 @@ class Input(click.ParamType):
             raise CaptureError(f"there is no such {what}", where=str(path), hint="check the path")
 
 
+class NamedInput(Input):
+    """A name that the package knows, or the path of a file that is read in its place."""
+
+    def __init__(self, names: tuple[str, ...], suffix: str, otherwise: str) -> None:
+        super().__init__()
+        self.names, self.suffix, self.otherwise = names, suffix, otherwise
+
+    @override
+    def convert(self, value: Any, param: Any, ctx: Any) -> Path | str:
+        if value in self.names:
+            return str(value)
+        path = as_path(value, param.opts[0])
+        if path.suffix == self.suffix or path.exists():
+            return path
+        hint = f"give one of {', '.join(self.names)}, or {self.otherwise}"
+        raise SceneError("no such scene", where=f"scene={value!r}", hint=hint)
+
+
 class Output(click.ParamType):
     """Path of an output; it is checked when all inputs are known."""
 
@@ -98,11 +144,17 @@ class Output(click.ParamType):
             return
         from polar_bayes.capture.files import is_capture, is_result
 
-        check_output(path, is_capture if self.kind == "capture" else is_result, inputs)
+        kinds = {"capture": is_capture, "result": is_result, "scene": is_scene_file}
+        check_output(path, kinds[self.kind], inputs)
 
 
 INPUT, COLUMN_OR_INPUT = Input(), Input(is_path=False)
 CAPTURE_FILE, RESULT_FILE, FOLDER, STORE = Output("capture"), Output("result"), Output(), Output()
+SCENE_FILE = Output("scene")
+SETUP_NAMES = ("paper", "camera", "picture", "goniometer")
+SCENE = NamedInput(SETUP_NAMES, ".toml", "a scene file (.toml)")
+FIT_SCENE = NamedInput((*SETUP_NAMES, "auto"), ".toml", "a scene file (.toml)")
+SCENE_SOURCE = NamedInput(SETUP_NAMES, ".nc", "a result")
 
 
 class Command(click.Command):
@@ -114,7 +166,7 @@ class Command(click.Command):
         for param in self.params:
             kinds = param.type.types if isinstance(param.type, click.Tuple) else [param.type]
             for kind in (kind for kind in kinds if isinstance(kind, Input)):
-                for path in _paths(ctx.params[str(param.name)]):
+                for path in _paths(ctx.params[str(param.name)], kind):
                     kind.check(path)
                     inputs.append(path)
         for param in self.params:
@@ -124,13 +176,13 @@ class Command(click.Command):
         return super().invoke(ctx)
 
 
-def _paths(value: Any) -> Iterator[Path]:
+def _paths(value: Any, kind: Input) -> Iterator[Path]:
     """Every path in the value of an option that may be given several times."""
-    if isinstance(value, str | Path):
+    if isinstance(value, Path) or (isinstance(value, str) and not isinstance(kind, NamedInput)):
         yield Path(value)
     elif isinstance(value, tuple):
         for item in value:
-            yield from _paths(item)
+            yield from _paths(item, kind)
 
 
 command = functools.partial(click.command, cls=Command)
@@ -139,12 +191,55 @@ option = functools.partial(click.option, show_default=True)
 
 capture_argument = click.argument("capture", type=INPUT)
 model_option = option("--model", type=MODEL, default="per_material")
-scene_option = option(
-    "--scene", type=SCENE, help="Named set-up; by default the one that the capture names."
-)
+SCENE_HELP = "Named set-up or scene file; by default the set-up that the capture names."
+scene_option = option("--scene", type=SCENE, metavar="NAME|FILE", help=SCENE_HELP)
+prior_option = option(
+    "--prior", "priors", type=Assignment(is_named=True), multiple=True,
+    metavar="NAME=DISTRIBUTION", help="Such as 'angle_zero=Normal(0,3)'; once per parameter.",
+)  # fmt: skip
+link_option = option(
+    "--link", "links", type=Assignment(is_named=False), multiple=True, metavar="[VARIABLE=]LINK",
+    help="Such as 'q=StokesLink(degrees_of_freedom=4)'; once per variable.",
+)  # fmt: skip
 view_limit_option = option(
     "--largest-view-zenith", type=float, help="Set aside views beyond it [degrees]."
 )
+
+
+def scene_options(function: Callable) -> Callable:
+    """The options of every command that fits a scene."""
+    return scene_option(prior_option(link_option(view_limit_option(function))))
+
+
+NUTS_OPTIONS = {
+    "warmup": (int, "Draws that adapt the sampler, per chain."),
+    "most_draws": (int, "Draws kept at most, per chain."),
+    "target_acceptance": (float, "Higher means smaller steps."),
+    "max_tree_depth": (int, "A trajectory has at most 2 to this power steps."),
+}
+
+
+def nuts_options(function: Callable) -> Callable:
+    """What messages recommend where chains have not converged."""
+    for name, (kind, words) in reversed(NUTS_OPTIONS.items()):
+        flag = f"--{name.replace('_', '-')}"
+        function = option(flag, type=kind, help=f"{words} Of --method nuts.")(function)
+    return function
+
+
+def with_nuts_options(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a fit, with those of its sampler in the method."""
+    given = {name: settings.pop(name) for name in NUTS_OPTIONS}
+    given = {name: value for name, value in given.items() if value is not None}
+    if given:
+        method = pb.methods.Nuts() if settings["method"] == "nuts" else settings["method"]
+        if not isinstance(method, pb.methods.Nuts):
+            flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise click.UsageError(f"{flags}: of --method nuts only")
+        settings["method"] = dataclasses.replace(method, **given)
+    return settings
+
+
 seed_option = option("--seed", type=click.IntRange(0, 2**32 - 1), default=0)
 scheduler_option = option(
     "--scheduler", help="Address of a dask.distributed scheduler; default: threads."
@@ -155,6 +250,38 @@ json_option = option("--json", "as_json", is_flag=True, help="Print the tables a
 def out_option(kind: Output, help_text: str, **settings: Any) -> Any:
     """The option --out, required unless it has a default."""
     return option("--out", type=kind, help=help_text, **{"required": True, **settings})
+
+
+# --- Scenes, priors, links and methods as values --------------------------------------------------
+
+
+def read_scene_options(settings: dict[str, Any]) -> dict[str, Any]:
+    """The options of a command, with what they and a scene file state as values.
+
+    What is given on the command line counts more than what the file says.
+    """
+    from polar_bayes.inference.scene_file import load_scene, parse_link, parse_method
+    from polar_bayes.priors import parse_prior
+
+    source = click.get_current_context().get_parameter_source
+    found, stated = dict(settings), {}
+    if isinstance(found.get("scene"), Path):
+        stated = load_scene(found["scene"])
+        found["scene"] = stated.pop("scene", None)
+    for name in ("model", "method", "largest_view_zenith"):
+        if name in stated and name in found and source(name) is not ParameterSource.COMMANDLINE:
+            found[name] = stated[name]
+    if isinstance(found.get("method"), str):
+        found["method"] = parse_method(found["method"], "--method")
+    if "priors" in found:
+        given = {n: parse_prior(text, f"--prior {n}={text}") for n, text in found["priors"]}
+        found["priors"] = {**stated.get("priors", {}), **given} or None
+    texts = found.pop("links", ())
+    links = {name: parse_link(text, f"--link {text}") for name, text in texts}
+    if "" in links and len(links) > 1:
+        raise click.UsageError("--link without a variable stands for all: give it once")
+    found["links"] = links.get("") or links or stated.get("links")
+    return found
 
 
 # --- Printing -------------------------------------------------------------------------------------
@@ -191,7 +318,17 @@ def print_fit(result: Any) -> int:
     columns = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
     titles = ["mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"]
     print_frame(pb.summary(result)[[*columns]].set_axis(titles, axis="columns"))
+    if words := list(_explanations(result["posterior"].dataset)):
+        click.echo("\n".join(["", *words]))
     return print_verdict(result)
+
+
+def _explanations(posterior: Any) -> Iterator[str]:
+    """What parameters mean whose names do not say it, with their units."""
+    for name, variable in posterior.data_vars.items():
+        meaning, unit = (variable.attrs.get(key, "") for key in ("long_name", "units"))
+        if meaning and not meaning.startswith(str(name).replace("_", " ")):
+            yield f"{name}: {meaning}{'' if unit == '1' else f' [{unit}]'}"
 
 
 def print_verdict(result: Any) -> int:

@@ -54,6 +54,8 @@ from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
+from polar_bayes.inference.result import capture_of
+from polar_bayes.inference.scene_file import arguments_of
 from polar_bayes.observation.data import ANGLES, Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
@@ -97,7 +99,7 @@ class Design(NamedTuple):
 
 @with_progress
 def next_views(
-    capture: xr.Dataset,
+    capture: xr.Dataset | xr.DataTree,
     candidates: xr.Dataset | None = None,
     *,
     count: int = 3,
@@ -123,7 +125,8 @@ def next_views(
     picked greedily, then exchanged until no exchange of one helps.
 
     Args:
-        capture: The views that were measured; as for `polar_bayes.fit`.
+        capture: The views that were measured; as for `polar_bayes.fit`. Or a fit, which tells its
+            capture, scene, links, priors and draws where they are not given.
         candidates: Views that could be: view_zenith and view_azimuth (degree) by `view`,
             light_zenith and light_azimuth unless the capture has one light, and a coordinate
             `wavelength` where only some of the capture's are measured. By default every 2.5
@@ -174,6 +177,13 @@ def next_views(
             where="next_views",
             hint=f"give some of {', '.join(APART)}",
         )
+    if isinstance(capture, xr.DataTree):
+        asked = arguments_of(capture)
+        model, scene = asked.get("model", model), scene or asked.get("scene")
+        priors, links = priors or asked.get("priors"), links or asked.get("links")
+        if largest_view_zenith is None:
+            largest_view_zenith = asked.get("largest_view_zenith")
+        result, capture = result or capture, capture_of(capture)
     criterion, constraints = criterion or DOptimal(), constraints or Constraints()
     request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
     with jax.enable_x64(True):

@@ -412,8 +412,7 @@ def choose_effects(
             hint="give posterior standard deviations above 0, such as 0.1",
         )
     request = resolve(capture, model, scene, None, links, largest_view_zenith, seed, "double")
-    named = not isinstance(scene, Scene)
-    full = simplify(FULL_SCENES[request.scene_name] if named else request.scene, ())
+    full = simplify(FULL_SCENES.get(request.scene_name, request.scene), ())
     effects = effects_of(full)
     kept, dropped = find_forced(effects, keep, drop)
     names = None if parameters is None else tuple(parameters)

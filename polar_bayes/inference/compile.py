@@ -7,6 +7,7 @@ in parallel with everything else.
 
 import contextvars
 import dataclasses
+import functools
 import gc
 import os
 import queue
@@ -23,11 +24,13 @@ import cachetools
 import jax
 import numpy as np
 from dask.base import tokenize
+from jax.experimental.compilation_cache import compilation_cache
 from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
+from polar_bayes.paths import compiled_folder, make_private
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress
 
@@ -76,8 +79,28 @@ TRACING_LOCK = _TracingLock()
 """Held while a model is traced, and never while a program is compiled or runs."""
 
 
+@functools.cache
+def keep_compiled_programs() -> None:
+    """Keep compiled programs on the disk between sessions, unless JAX was told where, or not to.
+
+    A compiled program is native code that the next session loads, so a folder to which others can
+    write is not used.
+    """
+    config = jax.config
+    if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache:
+        return
+    folder = compiled_folder()
+    if make_private(folder):
+        return
+    config.update("jax_compilation_cache_dir", str(folder))
+    config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    compilation_cache.reset_cache()  # JAX looks for the folder once, when it first compiles
+
+
 def compiled(function: Callable) -> Any:
     """The function under `jax.jit`, with `COMPILER_OPTIONS` on a CPU."""
+    keep_compiled_programs()
     return jax.jit(
         function, compiler_options=COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
     )

@@ -20,6 +20,7 @@ from polar_bayes.capture.schema import dims_text
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.observation.data import ANGLES
+from polar_bayes.priors import short_numbers
 
 Problems = Iterator[tuple[str, str]]
 """Where a tree departs from its schema, and what is wrong there."""
@@ -295,6 +296,7 @@ _STEP = {"name": TEXT, "taken": FLAG, "why": TEXT, "seconds": FINITE, "monte_car
 _FIT_PROVENANCE: Mapping[str, Spec] = {
     **COMMON_PROVENANCE,
     "settings?": {EACH: ANY},
+    "method_parts?": TEXT,
     "model_settings?": {EACH: ANY},
     "model_source?": TEXT,
     "bounds?": {EACH: BOUNDS},
@@ -460,7 +462,8 @@ def choice_sentences(result: xr.DataTree) -> list[str]:
     )
     for name, attribute, words in follows:
         if name in priors and attribute in capture:
-            said = f"{words}: {capture[attribute]}; the prior of {name} is {priors[name]}."
+            said = f"{words}: {capture[attribute]}; the prior of {name} is "
+            said += f"{short_numbers(priors[name])}."
             sentences.append(said)
     return sentences
 

@@ -260,6 +260,7 @@ def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> d
     used = {"used": int(np.sum(data.valid)), "at_margin": at_boundary}
     return {
         "settings": dataclasses.asdict(method),
+        "method_parts": repr(method),
         **request.describe(),
         "model_settings": _model_settings(request.model),
         "model_source": _model_source(request.model),

@@ -2,6 +2,8 @@
 
 import abc
 import dataclasses
+import difflib
+import inspect
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Self, override
@@ -99,12 +101,43 @@ class PosteriorDraws:
         return np.hypot(weighted[0], mean), np.hypot(weighted[1], sd)
 
 
+SYNONYMS = {
+    "num_chains": "chains",
+    "num_draws": "draws",
+    "num_samples": "draws",
+    "num_warmup": "warmup",
+    "n_draws": "draws",
+    "samples": "draws",
+    "target_accept": "target_acceptance",
+    "target_accept_prob": "target_acceptance",
+    "tune": "warmup",
+}
+"""What NumPyro, PyMC and others call settings."""
+
+
 class AbstractBatchMethod[Engine](HTMLRepr, abc.ABC):
     """A way to fit many captures of one layout together.
 
     `Engine` is what is compiled for the layout: `BatchEngine` where the captures run side by side
     in one program, `CompiledModel` where they are fitted one after another.
     """
+
+    def __new__(cls, *_: object, **settings: object) -> Self:
+        """Refuse a setting that it does not have, naming the one that is meant."""
+        found = [*inspect.signature(cls.__init__).parameters.values()][1:]
+        if any(each.kind is each.VAR_KEYWORD for each in found):
+            return super().__new__(cls)
+        names = [each.name for each in found]
+        for name in settings:
+            if name not in names:
+                near = [SYNONYMS.get(name, ""), *difflib.get_close_matches(name, names, n=1)]
+                meant = next((f"did you mean {each}? " for each in near if each in names), "")
+                raise FitError(
+                    f"there is no setting {name}",
+                    where=cls.__name__,
+                    hint=f"{meant}there are {', '.join(names)}",
+                )
+        return super().__new__(cls)
 
     @abc.abstractmethod
     def run_batch(

@@ -22,13 +22,14 @@ from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import (
+    PRIORS,
     NormalCoordinate,
     PriorTable,
     cast_prior,
-    describe_prior,
+    prior_text,
     resolve_priors,
 )
-from polar_bayes.setups import SETUPS, Setup, default_priors, find_setup
+from polar_bayes.setups import SETUPS, Setup, default_priors, find_setup, setup_name
 
 MODELS: dict[str, Callable] = {
     "per_material": per_material,
@@ -69,7 +70,7 @@ class Request:
             "scene": self.scene_name,
             "scene_chosen_by": self.scene_chosen_by,
             "scene_parts": repr(self.scene),
-            "priors": {name: describe_prior(prior) for name, prior in self.priors.items()},
+            "priors": {name: prior_text(prior) for name, prior in self.priors.items()},
             "links": {name: repr(link) for name, link in self.links.items()},
             "seed": self.seed,
         }
@@ -104,7 +105,7 @@ def _run(
 def resolve(
     capture: xr.Dataset,
     model: str | Callable,
-    scene: str | Scene | None,
+    scene: str | Scene | Setup | None,
     priors: Mapping[str, dist.Distribution] | None,
     links: AbstractLink | Mapping[str, AbstractLink] | None,
     largest_view_zenith: float | None,
@@ -123,7 +124,7 @@ def resolve(
     if scene is None:
         chosen_by = "capture" if "setup" in capture.attrs else "default"
         scene = str(capture.attrs.get("setup", "paper"))
-    setup = find_setup(scene) if isinstance(scene, str) else _setup_around(scene, capture)
+    setup, scene_name = _find_scene(scene, capture)
     chosen = _choose_links(capture, setup, links)
     limit = setup.largest_view_zenith if largest_view_zenith is None else largest_view_zenith
     if not 0.0 < limit <= 90.0:
@@ -137,16 +138,20 @@ def resolve(
         raise FitError(f"seed is {seed!r}", where="fit", hint="give an integer from 0 to 2**32 - 1")
     function = model if callable(model) else _find_model(model)
     stated = {} if priors is None else priors
+    own: dict[str, dist.Distribution] = {}
     if isinstance(stated, Mapping):  # anything else is refused where the priors are read
-        stated = {**default_priors(setup, capture), **stated}
+        usual = default_priors(setup, capture)
+        same = {n: x for n, x in {**PRIORS, **usual}.items() if _are_same(stated.get(n), x)}
+        own = {name: prior for name, prior in stated.items() if name not in same}
+        stated = {**usual, **own, **same}
     with jax.enable_x64(precision == "double"):
         data = observe(capture, largest_view_zenith=limit)
         found = _inspect(function, data, setup.scene, stated, chosen)
     swapped = {
-        "scene": not isinstance(scene, str),
+        "scene": scene_name == "custom",
         "model": callable(model),
-        "links": links is not None,
-        **{f"prior of {name}": True for name in priors or {}},
+        "links": links is not None and chosen != _usual_links(capture, setup),
+        **{f"prior of {name}": True for name in own},
         **{f"{name} held fixed": True for name in found.fixed},
     }
     return Request(
@@ -154,7 +159,7 @@ def resolve(
         model=function,
         model_name=_name_of(model) if callable(model) else model,
         scene=setup.scene,
-        scene_name=scene if isinstance(scene, str) else "custom",
+        scene_name=scene_name,
         scene_chosen_by=chosen_by,
         priors=resolve_priors(
             found.priors,
@@ -168,6 +173,29 @@ def resolve(
         seed=int(seed),
         precision=precision,
     )
+
+
+def _find_scene(scene: object, capture: xr.Dataset) -> tuple[Setup, str]:
+    """The set-up that a caller gives, by name or as it is, and its name."""
+    if isinstance(scene, str):
+        return find_setup(scene), scene
+    if isinstance(scene, Setup):
+        return scene, setup_name(scene)
+    return _setup_around(scene, capture), "custom"
+
+
+def _usual_links(capture: xr.Dataset, setup: Setup) -> dict[str, AbstractLink]:
+    """The links of a set-up for the variables that a capture holds."""
+    return {name: link for name, link in setup.links.items() if name in capture}
+
+
+def _are_same(prior: object, usual: object) -> bool:
+    """Whether a prior is the default one, as where a scene file lists every prior."""
+    if not isinstance(prior, dist.Distribution) or not isinstance(usual, dist.Distribution):
+        return False
+    # A class of the user's own may have any name.
+    is_known = type(prior).__module__.startswith(("numpyro.", "polar_bayes."))
+    return is_known and prior_text(prior) == prior_text(usual)
 
 
 def _find_model(name: object) -> Callable:
@@ -208,7 +236,7 @@ def _setup_around(scene: object, capture: xr.Dataset) -> Setup:
         raise FitError(
             f"a {type(scene).__name__} is not a scene",
             where="scene",
-            hint=f"give a polar_bayes.Scene or one of {', '.join(SETUPS)}",
+            hint=f"give a polar_bayes.Scene, a Setup, or one of {', '.join(SETUPS)}",
         )
     base = SETUPS.get(str(capture.attrs.get("setup")), SETUPS["paper"])
     return dataclasses.replace(base, scene=scene)
@@ -219,7 +247,7 @@ def _choose_links(
 ) -> dict[str, AbstractLink]:
     """The links of the variables that the capture holds."""
     if links is None:
-        chosen = {name: link for name, link in setup.links.items() if name in capture}
+        chosen = _usual_links(capture, setup)
         wanted = list(setup.links)
     elif isinstance(links, AbstractLink):
         kept = {n: link for n, link in setup.links.items() if n == "intensity" and n in capture}

@@ -67,6 +67,15 @@ def assemble(
     return tree
 
 
+def capture_of(result: xr.DataTree) -> xr.Dataset:
+    """The capture of a fit, with the variables that were fitted."""
+    parts = (result[name].to_dataset() for name in ("observed_data", "constant_data"))
+    capture = xr.merge(parts, join="exact", compat="equals")
+    found = capture.drop_vars([dim for dim in ("view", "x", "y") if dim in capture.coords])
+    flags = {name: found[name].astype(bool) for name in ("valid", "saturated")}
+    return found.assign(flags).assign_attrs(provenance_of(result).get("capture", {}))
+
+
 def attributes_of(name: str) -> dict[str, str]:
     """Meaning, unit and symbol of a parameter, as attributes of its variable."""
     symbol, meaning, unit = notation(name)

@@ -15,6 +15,7 @@ import xarray as xr
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
+from polar_bayes.expressions import parse_value
 from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import attributes_of, bounds_of, provenance_of
@@ -109,10 +110,9 @@ def _law_of(provenance: Mapping[str, Any], scene: Scene | None) -> AbstractDispe
     try:
         for node in ast.walk(ast.parse(parts, mode="eval")):
             law = node.value if isinstance(node, ast.keyword) and node.arg == "dispersion" else None
-            if isinstance(law, ast.Call) and isinstance(law.func, ast.Name):
-                fields = {str(part.arg): ast.literal_eval(part.value) for part in law.keywords}
-                return LAWS[law.func.id](**fields)
-    except (SyntaxError, ValueError, KeyError) as error:  # the user's own part or law
+            if isinstance(law, ast.Call):
+                return parse_value(ast.unparse(law), LAWS, "dispersion")
+    except (SyntaxError, ValueError) as error:  # the user's own part or law
         if "dispersion=" in parts and "dispersion=None" not in parts:
             raise FitError(
                 "the law of dispersion of the fit's scene is not one of this package",

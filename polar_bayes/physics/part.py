@@ -122,7 +122,7 @@ def like(values: ArrayLike, array: Array) -> Array:
     return jnp.asarray(values, jnp.result_type(float, array))
 
 
-# --- Parameters of scenes as readers see them: symbol, meaning, unit ------------------------------
+# --- Parameters of scenes and links as readers see them: symbol, meaning, unit --------------------
 
 
 class Quantity(NamedTuple):
@@ -166,6 +166,19 @@ NOTATION: dict[str, Quantity] = {
     "normal_tilt_y": Quantity("", "lean of the normal towards azimuth 90", "degree"),
     "angle_zero": Quantity("", "offset of both zenith angles", "degree"),
     "beam_overlap_zenith": Quantity("", "zenith where the beam fills the sample", "degree"),
+    "dolp_gain": Quantity("", "share of the polarization that is recorded"),
+    "channel_gain_ratio": Quantity("", "gain of the s channel over the p channel"),
+    "leakage": Quantity("", "share of each channel seen in the other"),
+    "dark_level": Quantity("", "unpolarized light added to every view"),
+    "discrepancy_amplitude": Quantity("", "size of smooth errors over angle"),
+    "discrepancy_weights": Quantity("", "shape of smooth errors over angle"),
+    "concentration_scale": Quantity("", "concentration of the noise of dop"),
+    "logit_scale": Quantity("", "noise of the log odds of dop"),
+    "normal_scale": Quantity("", "noise of the readings"),
+    "stokes_scale": Quantity("", "noise of q and u in full light"),
+    "stokes_error_factor": Quantity("", "true over stated errors of q and u"),
+    "exposure": Quantity("", "recorded over predicted intensity"),
+    "intensity_scale": Quantity("", "noise of the intensity"),
 }
 
 

@@ -28,6 +28,7 @@ from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
+from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, text
 from polar_bayes.reporting import plots_calibration as figures
 from polar_bayes.reporting.maps import STATUSES, count_table, flag_meanings
@@ -305,5 +306,7 @@ def _provenance_facts(provenance: Mapping[str, Any]) -> Iterator[page.Block]:
         for key, value in provenance.items()
         if titles.get(key) not in groups
     }
+    priors = groups.get(titles["priors"], {})
+    groups |= {titles["priors"]: {n: short_numbers(str(x)) for n, x in priors.items()}}
     for title, values in {"Calibration": own, **groups}.items():
         yield from page.make_facts(values, title)

@@ -34,6 +34,7 @@ from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, s
 from polar_bayes.errors import one_line
 from polar_bayes.inference.files import auto_sentences
 from polar_bayes.inference.result import provenance_of
+from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table
 from polar_bayes.reporting.page import Section
@@ -152,9 +153,11 @@ def fit_page(result: xr.DataTree) -> page.Page:
     summary = population_summary(result)
     sentences = fit.determined()
     if fit.verdict.passed:
+        trust = text.trust(fit.method, fit.verdict.cautions, fit.checks)
+        following = text.next_sentence(result)
+        sentences = [*text.index_sentences(fit), trust, following, *sentences]
         sentences += text.between_members(summary, pooled, fit.posterior)
         sentences += text.predictive_sentences(fit.checks)
-        sentences.append(text.trust(fit.method, fit.verdict.cautions, fit.checks))
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")
     source = [page.Details("Source of the model", code=code)] if code else []
@@ -585,6 +588,7 @@ def provenance_facts(provenance: Mapping[str, Any]) -> list[page.Block]:
     swapped = [str(name) for name in provenance.get("swapped") or ()]
     fit["swapped by the user"] = swapped or "nothing: all defaults"
     groups = {name: provenance.get(name) or {} for name in PROVENANCE_GROUPS}
+    groups["priors"] = {n: short_numbers(str(x)) for n, x in groups["priors"].items()}
     if timings := groups["timings"]:
         groups["timings"] = {**timings, "total": round(sum(timings.values()), 3)}
     groups["versions"] = {**groups["versions"], **(provenance.get("machine") or {})}

@@ -1,19 +1,28 @@
 """The standard report of every kind of result, and its summary for a notebook or a terminal."""
 
+import dataclasses
 import functools
+import inspect
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import xarray as xr
+from numpyro import distributions as dist
 
 from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences, is_accuracy
 from polar_bayes.calibration.verdict import calibration_table, calibration_verdict, is_calibration
+from polar_bayes.capture import plausibility
+from polar_bayes.capture.schema import validate
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.errors import FitError
-from polar_bayes.inference.result import provenance_of
+from polar_bayes.expressions import short_text
+from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.paths import as_path
+from polar_bayes.physics.part import notation
+from polar_bayes.priors import describe_prior
 from polar_bayes.reporting import maps, text
 from polar_bayes.reporting.accuracy import accuracy_page, study_table
 from polar_bayes.reporting.calibration_page import calibration_page, rank_table
@@ -22,8 +31,8 @@ from polar_bayes.reporting.fit_page import fit_page, parameter_table, read_fit
 from polar_bayes.reporting.page import Page, write_page
 from polar_bayes.reporting.plots_calibration import parameter_ranks
 from polar_bayes.reporting.style import in_default_style
-from polar_bayes.repr_html import DisplaySummary, Table
-from polar_bayes.results import save
+from polar_bayes.repr_html import DisplaySummary, HTMLRepr, Row, Table
+from polar_bayes.results import save, summary, verdict
 
 MAX_ROWS = 40
 """Rows of a table in a notebook or a terminal."""
@@ -93,19 +102,26 @@ def render(result: Any, **options: Any) -> str:
     return kind.page(result, **given).html
 
 
-def show(result: xr.DataTree | xr.Dataset) -> DisplaySummary:
-    """What a result says, for the last line of a cell.
+def show(result: Any) -> DisplaySummary:
+    """What a result, a capture, a scene or a table of priors says, for the last line of a cell.
 
     Args:
-        result: What `polar_bayes.fit`, `polar_bayes.calibrate`, `polar_bayes.accuracy` or
-            `polar_bayes.fit_pixels` returned, or one read back from a file. It is not changed.
+        result: A result of any kind, or one read back from a file; a capture; a scene, a set-up, or
+            a part, link or method; or priors by name. It is not changed.
 
     Returns:
         A card: HTML in a notebook, text from `print` or in a terminal.
 
     Raises:
-        FitError: It is no result.
+        CaptureError: A capture does not hold together.
+        FitError: It is none of these.
     """
+    card = next((card for applies, card in VALUES if applies(result)), _result_card)
+    return card(result)
+
+
+def _result_card(result: Any) -> DisplaySummary:
+    """The card of a result."""
     kind = _kind_of(result)
     sentences, table, passed = kind.card(result)
     total = len(table.rows)
@@ -151,6 +167,93 @@ def _accuracy_card(result: xr.DataTree) -> Card:
     study = accuracy_dataset(result)
     sentences = [*accuracy_sentences(study), text.reference_sentence(study)]
     return sentences, study_table(study), not study.attrs["reference_doubts"]
+
+
+# --- Cards of what goes into a fit ----------------------------------------------------------------
+
+SHOWN = {"view_zenith", "view_azimuth", "light_zenith", "light_azimuth"}
+"""Variables of every capture."""
+
+
+def _is_capture(value: Any) -> bool:
+    is_dataset = isinstance(value, xr.Dataset) and set(value.data_vars) >= SHOWN
+    return is_dataset and "status" not in value and PROVENANCE not in value.attrs
+
+
+def _capture_card(given: xr.Dataset) -> DisplaySummary:
+    """Variables with their range, what they say at first sight, and what is unlikely."""
+    capture = validate(given)
+    columns = ("variable", "dims", "unit", "least", "largest", "meaning")
+    rows = []
+    for name, variable in {**capture.coords, **capture.data_vars}.items():
+        values = np.asarray(variable.to_numpy())
+        is_number = values.dtype.kind in "biuf" and np.isfinite(values).any()
+        ends = [f"{end(values):.4g}" if is_number else text.DASH for end in (np.nanmin, np.nanmax)]
+        words = (str(variable.attrs.get(key, "")) for key in ("units", "long_name"))
+        unit, meaning = words
+        rows.append(Row(str(name), (" x ".join(map(str, variable.dims)), unit, *ends, meaning)))
+    cautions = [f"Caution: {sentence}" for sentence in plausibility.cautions(capture)]
+    sentences = (*plausibility.inferred(capture), *plausibility.stated(capture), *cautions)
+    table = Table(columns, tuple(rows), prose=("variable", "dims", "unit", "meaning"))
+    return DisplaySummary(f"{capture.attrs.get('name', 'capture')}: capture", sentences, (table,))
+
+
+def _value_card(value: HTMLRepr) -> DisplaySummary:
+    """The fields of a scene, set-up, part, link or method, and the parameters of a scene."""
+    fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}  # type: ignore[arg-type]
+    about = (inspect.getdoc(type(value)) or "").partition("\n")[0]
+    sentences = [about, *(f"{name}: {_field_text(each)}" for name, each in fields.items())]
+    return DisplaySummary(type(value).__name__, tuple(sentences), value.extra_tables())
+
+
+def _field_text(value: object) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_field_text(each)}" for name, each in value.items()) or "none"
+    if isinstance(value, dist.Distribution):
+        return describe_prior(value)
+    return short_text(value)
+
+
+def _are_priors(value: Any) -> bool:
+    are_named = isinstance(value, Mapping) and not isinstance(value, xr.Dataset | xr.DataTree)
+    return are_named and all(isinstance(each, dist.Distribution) for each in value.values())
+
+
+def _prior_card(priors: Mapping[str, dist.Distribution]) -> DisplaySummary:
+    """What each parameter means, its unit and its prior."""
+    columns = ("parameter", "meaning", "unit", "prior")
+    rows = []
+    for name, prior in priors.items():
+        words = notation(name)
+        rows.append(Row(name, (words.meaning, words.unit, describe_prior(prior))))
+    return DisplaySummary("Priors", (), (Table(columns, tuple(rows), prose=columns),))
+
+
+def _is_described(value: Any) -> bool:
+    return isinstance(value, xr.Dataset) and "status" not in value
+
+
+def _described_card(result: xr.Dataset) -> DisplaySummary:
+    """A result that describes and cannot fail: its table and its sentences."""
+    found = summary(result)
+    rows = tuple(
+        Row(str(label), tuple(f"{x:.4g}" if isinstance(x, float) else str(x) for x in cells))
+        for label, *cells in found.itertuples()
+    )
+    prose = found.select_dtypes(exclude="number").columns
+    table = Table(("", *found.columns), rows, ("", *prose))
+    return DisplaySummary(
+        text.capture_name(provenance_of(result)), tuple(verdict(result).sentences), (table,)
+    )
+
+
+VALUES: tuple[tuple[Callable[[Any], bool], Callable[[Any], DisplaySummary]], ...] = (
+    (_is_capture, _capture_card),
+    (lambda value: isinstance(value, HTMLRepr), _value_card),
+    (_are_priors, _prior_card),
+    (_is_described, _described_card),
+)
+"""Cards of what is not reported on a page, in the order in which they are tried."""
 
 
 # --- Kinds of results -----------------------------------------------------------------------------

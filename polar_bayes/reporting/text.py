@@ -25,11 +25,14 @@ from polar_bayes.errors import one_line
 from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.reporting.style import QUANTITIES, coordinate_labels, short_title
-from polar_bayes.results import MIN_GOOD_SHARE
+from polar_bayes.results import MIN_GOOD_SHARE, verdict
 
 # --- Numbers as text, with the digits that they deserve -------------------------------------------
 
 DASH = "\N{EN DASH}"
+SEVERAL = 4
+"""Of more entries a sentence tells the range."""
+
 MAX_NAMED = 6
 """Longer lists of names end with `and 3 more`."""
 
@@ -192,13 +195,13 @@ def determined(scalars: Sequence[Scalar], prior: pd.DataFrame, posterior: xr.Dat
         "do not quote it as a measurement.",
     }
     sentences = []
-    for verdict, phrase in phrases.items():
+    for judged, phrase in phrases.items():
         group = [
             scalar
             for scalar in scalars
             if scalar.is_material
             and scalar.label in prior.index
-            and prior.loc[scalar.label, "verdict"] == verdict
+            and prior.loc[scalar.label, "verdict"] == judged
         ]
         if group:
             sentences.append(phrase.format(parameter_names(group, posterior)))
@@ -319,6 +322,55 @@ def _departure(band: PitBand) -> str:
     if above.size and below.size:
         return f"they scatter {'more' if above[0] < below[0] else 'less'} than it says"
     return f"more of them lie {'low' if above.size else 'high'} than it says"
+
+
+def index_sentences(fit: Any, quantity: str = "refractive_index") -> list[str]:
+    """What is the refractive index, in a sentence; of many, the range of them.
+
+    Args:
+        fit: The `Fit` of a page.
+        quantity: The parameter.
+    """
+    found = [scalar for scalar in fit.scalars if scalar.name == quantity]
+    if not found or fit.method == "point":
+        return []
+    rows = fit.summary.loc[[scalar.label for scalar in found]]
+    ends = [interval(row["q2.5"], row["q97.5"]) for _, row in rows.iterrows()]
+    if len(found) > SEVERAL:
+        low, high = numbers([rows["mean"].min(), rows["mean"].max()], rows["sd"].median())
+        return [
+            f"The refractive index n of {len(found)} entries lies between {low} and {high}; the "
+            f"table below has the 95% interval of each."
+        ]
+    phrases = []
+    for scalar, (_, row), end in zip(found, rows.iterrows(), ends, strict=True):
+        places = coordinate_labels(scalar)
+        at = f" at {join(places)}" if places else ""
+        phrases.append(f"{number(row['mean'], row['sd'])}{at} (95% interval {end})")
+    return [f"The refractive index n is {join(phrases)}."]
+
+
+def next_sentence(result: xr.DataTree) -> str:
+    """What to measure next, where the result has the answer of `polar_bayes.next_views`."""
+    if "next_views" not in result.children:
+        return (
+            "What to measure next is not worked out here: polar-bayes report does it, or "
+            "result['next_views'] = pb.next_views(result)."
+        )
+    found = result["next_views"].to_dataset()
+    views = verdict(found).sentences[0].rstrip(".").replace("Look next", "Measure next")
+    widths = found["interval_width"].transpose("step", "parameter").to_pandas()
+    of_index = widths.filter(like="refractive_index")
+    before, after = (of_index if of_index.size else widths).iloc[[0, -1]].to_numpy()
+    of = " of n" if of_index.size else ""
+    if len(before) == 1:
+        return (
+            f"{views}: the 95% interval{of} is expected to narrow from {before[0]:.3g} to "
+            f"{after[0]:.3g}."
+        )
+    least, most = (f"{end(1.0 - after / before):.0%}" for end in (np.min, np.max))
+    by = least if least == most else f"{least} to {most}"
+    return f"{views}: the 95% intervals{of} are expected to narrow by {by}."
 
 
 def trust(method: str, cautions: Sequence[str], checks: Mapping[str, PredictiveCheck]) -> str:

@@ -75,7 +75,12 @@ class Stuck(AbstractOverride):
 
 
 @pytest.fixture(scope="module")
-def study() -> xr.DataTree:
+def partial() -> list[xr.DataTree]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def study(partial) -> xr.DataTree:
     return pb.accuracy(
         capture(),
         model=line,
@@ -89,7 +94,17 @@ def study() -> xr.DataTree:
         ),
         reference=ROUGHLY,
         fresh=False,
+        partial=partial.append,
     )
+
+
+def test_what_is_known_so_far_is_told_after_each_row(study, partial):
+    whole = study["accuracy"].to_dataset()
+    assert [tree["accuracy"].sizes["row"] for tree in partial] == [*range(1, whole.sizes["row"])]
+    for tree in (partial[0], partial[-1]):
+        known = tree["accuracy"].to_dataset()
+        xr.testing.assert_identical(known, whole.isel(row=slice(known.sizes["row"])))
+        assert pb.benchmark.accuracy_sentences(tree)
 
 
 def test_errors_are_in_sds_of_the_reference(study):

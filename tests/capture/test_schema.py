@@ -172,7 +172,12 @@ OUT_OF_RANGE = [
     ("light_azimuth", np.inf, "inf is outside", "around the surface normal"),
     ("dop", 1.01, "0 <= value <= 1", "no light has it"),
     ("dop", -0.01, "0 <= value <= 1", "valid=False"),
-    ("dop", np.nan, "nan is outside", "valid=False"),
+    (
+        "dop",
+        np.nan,
+        "nan is outside",
+        "valid=False, as by capture['valid'] = capture['dop'].notnull()",
+    ),
     ("q", 7.0, "-1 <= value <= 1", "a fraction, not percent"),
     ("u", -np.inf, "-inf is outside", "valid=False"),
     ("intensity", -1e-9, "0 <= value < 1e+30", "valid=False"),
@@ -427,7 +432,9 @@ def test_attribute_names_that_no_file_holds_are_refused(make_capture, name):
 @each("thing", [None, "leaf.nc", np.ones(3), {"dop": 1}, xr.DataArray([1.0])])
 def test_only_a_dataset_is_a_capture(thing):
     message = refused(thing, "is not a capture")
-    assert "give an xarray.Dataset" in message
+    of_path = "read it first: pb.load_capture('leaf.nc')"
+    assert (of_path if isinstance(thing, str) else "give an xarray.Dataset") in message
+    assert "pb.from_table('leaf.csv')" in refused("leaf.csv", "a str is not a capture")
 
 
 @pytest.mark.thorough

@@ -16,8 +16,11 @@ def studied(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     """Stands in for the study, and holds what it was asked."""
     asked: dict[str, object] = {}
 
-    def accuracy(capture, **settings):
+    def accuracy(capture, partial=None, **settings):
+        asked.clear()
         asked.update(settings)
+        if partial is not None:
+            partial(make_accuracy())
         return make_accuracy()
 
     monkeypatch.setattr(pb, "accuracy", accuracy)
@@ -27,9 +30,15 @@ def studied(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
 def test_it_prints_table_and_advice_and_writes_the_study(plate, tmp_path, capsys, studied):
     out = tmp_path / "accuracy.nc"
     assert main(["accuracy", str(plate), "--out", str(out)]) == 0
-    told = capsys.readouterr().out
-    assert told.splitlines()[0].split()[:2] == ["error", "worst"]
-    assert told.splitlines()[-1] == " ".join(pb.benchmark.accuracy_sentences(make_accuracy()))
+    told = capsys.readouterr()
+    first, refined = told.out.split(f"\nIt is refined now, which takes minutes; {out} holds what")
+    assert first.splitlines()[0] == "First answer, by a rough reference:"
+    assert first.splitlines()[2].split()[:2] == ["error", "worst"]
+    advice = " ".join(pb.benchmark.accuracy_sentences(make_accuracy()))
+    assert advice in refined.splitlines()
+    assert "worst: the parameter that has it" in refined
+    assert refined.splitlines()[-1].startswith(f"Next: polar-bayes fit {plate} --method NAME")
+    assert ": off by " in told.err
     assert set(studied["methods"]) == set(pb.methods.STUDY_METHODS)
     assert "overrides" not in studied
     assert pb.summary(pb.load(out)).equals(pb.summary(make_accuracy()))

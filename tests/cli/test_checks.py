@@ -20,6 +20,8 @@ def test_calibrate_prints_a_table_and_writes_every_fit(
     header, *rows = capsys.readouterr().out.splitlines()
     assert header.split()[:3] == ["answered", "failed", "p_value"]
     assert rows[1].split()[0] == "refractive_index"
+    assert any(row.startswith("held_50, held_80, held_95: share of intervals") for row in rows)
+    assert rows[-1].startswith("Next: ")
     verdict = next(row for row in rows if "alibrated: " in row)
     assert status == (0 if verdict.startswith("Calibrated") else 2)
     assert any(row.startswith("q, left out") for row in rows)

@@ -66,6 +66,30 @@ def test_a_table_of_readings_becomes_a_capture(
     assert pb.load_capture(out).attrs["setup"] == "camera"
 
 
+def test_the_command_line_says_what_python_can(
+    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Priors, links and settings by call; a scene file of the result; both recorded."""
+    out, again, file = (tmp_path / name for name in ("fit.nc", "again.nc", "plate.toml"))
+    words = ["fit", str(plate), "--prior", "angle_zero=Normal(0,3)", "--method", "Point(starts=4)"]
+    main([*words, "--link", "q=StokesLink(stated_errors=True)", "--out", str(out)])
+    capsys.readouterr()
+    assert main(["scene", "--from", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert 'method = "Point(starts=4)"' in text
+    assert 'angle_zero = "Normal(loc=0, scale=3)"' in text
+    assert main(["scene", "--from", str(out), "--out", str(file)]) == 0
+    main(["fit", str(plate), "--scene", str(file), "--out", str(again)])
+    assert pb.load(again)["posterior"].equals(pb.load(out)["posterior"])
+    assert pb.inference.scene_text(pb.load(again)) == text == file.read_text()
+    main(["fit", str(plate), "--scene", str(file), "--method", "laplace", "--out", str(again)])
+    assert 'method = "Laplace()"' in pb.inference.scene_text(pb.load(again))
+    words = ["simulate", "--scene", str(file), "--name", "mine", "--out", str(tmp_path / "s.nc")]
+    assert main(words) == 0
+    capture = pb.load_capture(tmp_path / "s.nc")
+    assert (capture.attrs["name"], capture.attrs["setup"]) == ("mine", "goniometer")
+
+
 def test_a_fit_says_what_it_chose_and_what_is_unlikely(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -92,19 +116,20 @@ def test_a_fit_says_what_it_chose_and_what_is_unlikely(
 def test_combine_puts_captures_side_by_side(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Labels are the captures' names; two of one name are refused."""
+    """Labels are the captures' names; those of one name are numbered."""
     other, both = tmp_path / "other.nc", tmp_path / "both.nc"
     pb.save_capture(pb.load_capture(plate).isel(view=slice(12)).assign_attrs(name="thin"), other)
     assert main(["combine", str(plate), str(other), "--out", str(both)]) == 0
-    assert capsys.readouterr().out == f"{both}: 40 views, 8 masked, 0 saturated\n"
+    counts, *labels = capsys.readouterr().out.splitlines()
+    assert counts == f"{both}: 20 views x 2 materials, 8 masked, 0 saturated"
+    assert labels == [f"plate: {plate}", f"thin: {other}"]
     capture = pb.load_capture(both)
     assert capture["material"].values.tolist() == ["plate", "thin"]
     assert capture.attrs["setup"] == "goniometer"
     words = ["combine", str(plate), str(plate), "--dim", "patch", "--out", str(both)]
-    assert main(words) == 1
-    error = capsys.readouterr().err
-    assert "a capture named plate is there already" in error
-    assert error.count("\n") == 1
+    assert main(words) == 0
+    assert "20 views x 2 patches" in capsys.readouterr().out
+    assert pb.load_capture(both)["patch"].values.tolist() == ["plate 1", "plate 2"]
     assert main(["combine", str(plate), "--drop", "q", "--drop", "dop", "--out", str(both)]) == 1
     assert "no reading is there" in capsys.readouterr().err
 
@@ -116,6 +141,19 @@ WRONG = {
     "model": (["fit", "PLATE", "--model", "x", "--out", "OUT"], "no such model"),
     "method": (["fit", "PLATE", "--method", "x", "--out", "OUT"], "no such method"),
     "scene": (["fit", "PLATE", "--scene", "x", "--out", "OUT"], "no such scene"),
+    "scene file": (["fit", "PLATE", "--scene", "x.toml", "--out", "OUT"], "no such file"),
+    "prior": (["fit", "PLATE", "--prior", "angle_zero", "--out", "OUT"], "does not say of what"),
+    "link": (["fit", "PLATE", "--link", "q=X()", "--out", "OUT"], "X is not known here"),
+    "two links": (
+        ["fit", "PLATE", "--link", "q=StokesLink()", "--link", "StokesLink()", "--out", "OUT"],
+        "--link without a variable",
+    ),
+    "settings": (["fit", "PLATE", "--method", "Nuts(num_samples=9)", "--out", "OUT"], "draws?"),
+    "tree depth": (
+        ["fit", "PLATE", "--method", "laplace", "--max-tree-depth", "9", "--out", "OUT"],
+        "--max-tree-depth: of --method nuts only",
+    ),
+    "scene of a capture": (["scene", "--from", "PLATE"], "it holds no result"),
     "seed": (["fit", "PLATE", "--seed", "-1", "--out", "OUT"], "--seed"),
     "limit": (["fit", "PLATE", "--largest-view-zenith", "0", "--out", "OUT"], "give degrees"),
     "one view": (

@@ -49,7 +49,7 @@ def test_frames_behind_a_polarizer(
     found = pb.load_capture(out)
     assert found.drop_attrs().equals(wanted.drop_attrs())
     assert f"{wanted.attrs['masked_outside']} outside" in said
-    assert "480 views" in said
+    assert "1 view x 20 x 24 pixels" in said
 
 
 @pytest.mark.thorough

@@ -104,6 +104,15 @@ def test_light_and_viewer_keep_apart() -> None:
     assert pb.design.Constraints(repeatable=True).allows(there, there).all()
 
 
+def test_a_fit_tells_its_capture_scene_and_priors() -> None:
+    plate = plate_capture(np.linspace(20.0, 60.0, 6), 0.01, seed=2)
+    asked = {"scene": PLATE, "links": LINKS}
+    asked["priors"] = {"refractive_index": dist.Uniform(1.3, 1.8)}
+    fit = pb.fit(plate, method=pb.methods.Laplace(draws=50), **asked)
+    told, found = pb.next_views(fit, count=1), pb.next_views(plate, count=1, result=fit, **asked)
+    xr.testing.assert_identical(told.drop_attrs(), found.drop_attrs())
+
+
 def lamp(data, scene, priors, links):
     """A level read the more sharply, the brighter the view; brightness grows with the zenith."""
     level = numpyro.sample("level", dist.Normal(0.0, PRIOR))

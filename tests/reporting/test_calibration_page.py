@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from clipping import clipped
 from pages import EVIL, Page
 from synthetic_calibrations import NAMES, make_calibration
@@ -249,3 +250,19 @@ def test_dots_mark_where_the_curve_leaves_its_band(broken: xr.DataTree) -> None:
     marked = [any(line.get_marker() == "o" for line in axes.lines) for axes in figure.axes[::3]]
     assert marked == [not part.passes for part in parameter_ranks(broken).values()]
     assert np.sum(marked) == 2
+
+
+@each(
+    "method",
+    {"laplace": "--method tempered", "tempered": "--method nuts", "nuts": "longer"}.items(),
+)
+def test_where_half_of_the_fits_fail_a_better_method_is_named(method) -> None:
+    name, advice = method
+    failed = make_calibration(count=40, failed=tuple(range(20)), method=name)
+    told = " ".join(pb.verdict(failed).sentences)
+    assert "20 of 40 fits have no answer, and count as misses of every interval above." in told
+    assert "Half of the fits or more have failed" in told
+    assert advice in told
+    few = " ".join(pb.verdict(make_calibration(count=40, failed=(1,), method=name)).sentences)
+    assert "1 of 40 fits have no answer" in few
+    assert "Half of the fits" not in few

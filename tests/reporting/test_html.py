@@ -182,6 +182,30 @@ def test_it_says_whether_intervals_can_be_trusted(small) -> None:
     assert "Trust the intervals with care" in Page(render(repeated)).text
 
 
+def test_the_first_screen_tells_the_index_the_trust_and_the_next_views(small) -> None:
+    result, page = small
+    first = page.text.partition("parameter mean sd")[0]
+    row = summary(result).loc["refractive_index"]
+    assert f"The refractive index n is {numbers([row['mean']], row['sd'])[0]} (95% int" in first
+    assert first.index("The refractive index n is") < first.index("Nothing here speaks against")
+    assert "What to measure next is not worked out here" in first
+    told = result.copy()
+    told["next_views"] = xr.Dataset(
+        {
+            "interval_width": (("step", "parameter"), [[0.4, 0.2], [0.1, 0.2]]),
+            **{name: ("pick", [70.0]) for name in ("view_zenith", "light_zenith")},
+            **{name: ("pick", [180.0]) for name in ("view_azimuth", "light_azimuth")},
+        },
+        coords={"parameter": ["refractive_index", "absorption"]},
+    )
+    assert (
+        "Measure next at zenith 70, azimuth 180: the 95% interval of n is expected to narrow from "
+        "0.4 to 0.1."
+    ) in Page(render(told)).text
+    told["next_views"] = told["next_views"].to_dataset().assign_coords(parameter=["a", "b"])
+    assert "the 95% intervals are expected to narrow by 0% to 75%." in Page(render(told)).text
+
+
 @pytest.mark.thorough
 def test_no_comparison_without_one(small) -> None:
     assert "Without the discrepancy" not in small[1].text

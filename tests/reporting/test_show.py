@@ -39,6 +39,27 @@ def test_a_long_table_is_cut_and_says_so() -> None:
     assert "The first 40 of 121 rows." in repr(pb.show(result))
 
 
+def test_a_capture_tells_its_variables_and_what_is_unlikely() -> None:
+    capture = pb.simulate("glass", protocol=pb.simulation.Protocol(views=5, wavelengths=()))
+    text = repr(pb.show(capture.drop_attrs(deep=False)))
+    assert text.startswith("capture: capture\nReadings: dop")
+    assert "Set-up: not stated" in text
+    assert "view_zenith" in text.partition("variable")[2]
+    with pytest.raises(pb.CaptureError, match="no such variable"):
+        pb.show(capture.assign(view_zenit=capture["view_zenith"]))
+
+
+def test_a_scene_a_set_up_and_priors_tell_what_they_hold() -> None:
+    text = repr(pb.show(pb.setups.SETUPS["goniometer"].scene))
+    assert "surface: SmoothSurface()" in text
+    assert "gain of the s channel over the p channel" in text
+    assert "links: q StokesLink(" in repr(pb.show(pb.setups.SETUPS["goniometer"]))
+    text = repr(pb.show({"angle_zero": pb.PRIORS["angle_zero"]}))
+    assert "offset of both zenith angles" in text
+    assert "degree" in text
+    assert "Normal(loc=0, scale=0.75)" in text
+
+
 def test_what_is_no_result_is_refused() -> None:
     with pytest.raises(FitError, match="it holds no fit"):
         pb.show("fit.nc")
