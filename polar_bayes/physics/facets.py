@@ -33,7 +33,7 @@ from polar_bayes.physics.geometry import (
     sin_degrees,
 )
 from polar_bayes.physics.microfacet import AbstractMicrofacet, AbstractShadowing, SlopeEllipse
-from polar_bayes.physics.part import Part
+from polar_bayes.physics.part import Part, quotient
 from polar_bayes.physics.stokes import Light
 
 # Facets steeper than this are not met by any distribution in use.
@@ -286,7 +286,7 @@ def sum_facets(
     if least is not None:
         total = jnp.maximum(total, least)
     polarized = weight * power.contrast
-    q = jnp.sum(polarized * sample.along_s, axis=-2) / total
+    q = quotient(jnp.sum(polarized * sample.along_s, axis=-2), total)
     if sample.across_s is None:
         return Light(total, q, jnp.zeros_like(q))
-    return Light(total, q, -jnp.sum(polarized * sample.across_s, axis=-2) / total)
+    return Light(total, q, -quotient(jnp.sum(polarized * sample.across_s, axis=-2), total))

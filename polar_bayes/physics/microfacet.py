@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, at_least, value_of
 
 # A roughness below this is taken as this: the width of a highlight is then 0.001 degree, which no
 # instrument resolves, and its peak brightness stays within single precision.
@@ -106,24 +106,25 @@ class Beckmann(AbstractMicrofacet):
 
     @override
     def density(self, tan_squared: Array, roughness: Array) -> Array:
-        alpha = jnp.maximum(roughness, SMOOTHEST)
+        alpha = at_least(roughness, SMOOTHEST)
         # Far from the mirror direction the exponential would underflow and take the derivatives
         # with it; it stops just above the smallest number instead.
         darkest = -0.9 * np.log(np.finfo(jnp.result_type(tan_squared, alpha)).tiny).item()
-        exponent = jnp.minimum(tan_squared / alpha**2, darkest)
-        # The square is taken last: each factor alone overflows single precision in a Hessian.
+        # Single precision holds a Hessian only if the width is divided out step by step, and only
+        # where there is light; for the same reason the square is taken last.
+        exponent = jnp.minimum(tan_squared, darkest * alpha**2) / alpha / alpha
         return (jnp.exp(-0.5 * exponent) * (1.0 + tan_squared) / alpha) ** 2 / jnp.pi
 
     @override
     def shadowing(self, tan_squared: Array, roughness: Array) -> Array:
-        steepness = (jnp.maximum(roughness, SMOOTHEST)) ** 2 * tan_squared
+        steepness = at_least(roughness, SMOOTHEST) ** 2 * tan_squared
         shadowed = steepness > 0.625**2
         y = jnp.sqrt(jnp.where(shadowed, steepness, 1.0))
         return jnp.where(shadowed, (3.535 * y + 2.181) / (y**2 + 2.276 * y + 2.577), 1.0)
 
     @override
     def across(self, limit: Array, roughness: Array, share: Array) -> tuple[Array, Array]:
-        width = jnp.maximum(roughness, SMOOTHEST) * BROADENING**0.5
+        width = at_least(roughness, SMOOTHEST) * BROADENING**0.5
         end = jax.lax.erf(jnp.minimum(limit / width, TAIL))
         x = jax.lax.erf_inv(end * share)
         return width * x, end * BROADENING**0.5 * jnp.exp(-(BROADENING - 1.0) * x**2)
@@ -132,7 +133,7 @@ class Beckmann(AbstractMicrofacet):
     def along(
         self, lower: Array, upper: Array, across: Array, roughness: Array, share: Array
     ) -> tuple[Array, Array]:
-        width = jnp.maximum(roughness, SMOOTHEST) * BROADENING**0.5
+        width = at_least(roughness, SMOOTHEST) * BROADENING**0.5
         start = jax.lax.erf(jnp.clip(lower / width, -TAIL, TAIL))
         extent = jax.lax.erf(jnp.clip(upper / width, -TAIL, TAIL)) - start
         # Where both limits lie far out on one side nothing has weight, but all must be finite.
@@ -155,17 +156,19 @@ class GGX(AbstractMicrofacet):
 
     @override
     def density(self, tan_squared: Array, roughness: Array) -> Array:
-        alpha = jnp.maximum(roughness, SMOOTHEST)
-        return (alpha * (1.0 + tan_squared) / (alpha**2 + tan_squared)) ** 2 / jnp.pi
+        alpha = at_least(roughness, SMOOTHEST)
+        # Two small steps in place of a large one: a Hessian would leave single precision.
+        width = jnp.sqrt(alpha**2 + tan_squared)
+        return (alpha / width * ((1.0 + tan_squared) / width)) ** 2 / jnp.pi
 
     @override
     def shadowing(self, tan_squared: Array, roughness: Array) -> Array:
-        alpha = jnp.maximum(roughness, SMOOTHEST)
+        alpha = at_least(roughness, SMOOTHEST)
         return 2.0 / (1.0 + jnp.sqrt(1.0 + alpha**2 * tan_squared))
 
     @override
     def across(self, limit: Array, roughness: Array, share: Array) -> tuple[Array, Array]:
-        alpha = jnp.maximum(roughness, SMOOTHEST)
+        alpha = at_least(roughness, SMOOTHEST)
         end = _quarter(limit, alpha)
         tangent, widening = _fourfold(end * share)
         return alpha * tangent, end * widening / jnp.sqrt(1.0 + tangent**2)
@@ -174,7 +177,7 @@ class GGX(AbstractMicrofacet):
     def along(
         self, lower: Array, upper: Array, across: Array, roughness: Array, share: Array
     ) -> tuple[Array, Array]:
-        width = jnp.sqrt(jnp.maximum(roughness, SMOOTHEST) ** 2 + across**2)
+        width = jnp.sqrt(at_least(roughness, SMOOTHEST) ** 2 + across**2)
         start = _quarter(lower, width)
         extent = _quarter(upper, width) - start
         tangent, widening = _fourfold(start + extent * share)
@@ -269,8 +272,8 @@ class AnisotropicSlopes(AbstractSlopes):
 
     @override
     def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
-        first = jnp.maximum(parameters["roughness"], SMOOTHEST)
-        second = jnp.maximum(parameters["roughness_across"], SMOOTHEST)
+        first = at_least(parameters["roughness"], SMOOTHEST)
+        second = at_least(parameters["roughness_across"], SMOOTHEST)
         turn = value_of(self.azimuth, parameters) - geometry.view_azimuth
         sin, cos = sin_degrees(turn), cos_degrees(turn)
         across = jnp.sqrt((first * sin) ** 2 + (second * cos) ** 2)

@@ -29,7 +29,7 @@ from polar_bayes.physics.geometry import (
     sin_degrees,
     turn_between_frames,
 )
-from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, quotient, value_of
 from polar_bayes.physics.stack import Stack
 
 # Rounds the tip of the cone |(q, u)|: small against any reading, large enough that the Hessian at
@@ -139,10 +139,9 @@ def mirror_light(
     incident: tuple[Array, Array] | None,
 ) -> Light:
     """Light that one facet mirrors to the viewer."""
-    power = stack.relative_reflection(facet.cos_incidence, facet.sin_squared)
+    mean, power = stack.mirror(facet.cos_incidence, facet.sin_squared)
     if incident is None:
         polarizance = power.contrast / power.mean
-        mean = stack.scale * power.mean
         return Light(mean, polarizance * facet.along_s, -polarizance * facet.across_s)
     (q, u), source = incident, mirror_facet(geometry.reversed())
     along = q * source.along_s - u * source.across_s
@@ -163,14 +162,15 @@ def mirror_light(
     )
     # Fully p-polarized light at Brewster's angle is not reflected at all: 0/0 is then kept finite.
     lit = jnp.maximum(total, jnp.finfo(total.dtype).eps * power.mean)
-    return Light(stack.scale * total, first / lit, second / lit)
+    return Light(mean * total / power.mean, first / lit, second / lit)
 
 
 def transmit_inward(
     passing: Diattenuation, cos_light: Array, incident: tuple[Array, Array] | None
 ) -> Light:
     """Light that passes the surface into the body, in the frame of the light."""
-    light, q = cos_light * passing.mean, passing.contrast * passing.sin_squared / passing.mean
+    light = cos_light * passing.mean
+    q = quotient(passing.contrast * passing.sin_squared, passing.mean)
     if incident is None:
         return Light(light, q, jnp.zeros_like(q))
     return diattenuate(Light(light, *incident), q, passing.cross / passing.mean)

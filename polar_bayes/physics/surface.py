@@ -20,7 +20,7 @@ from polar_bayes.physics.microfacet import (
     SeparableShadowing,
     SlopeEllipse,
 )
-from polar_bayes.physics.part import Parameters, Part, check_part, parameters_of
+from polar_bayes.physics.part import Parameters, Part, check_part, parameters_of, quotient
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, mirror_light
 
@@ -80,7 +80,7 @@ class RoughExit(AbstractExit):
         passing = per_facet(stack).transmission(sample.cos_incidence, sample.sin_squared)
         area = jnp.sum(sample.weight, axis=-2)
         light = sum_facets(sample, sample.weight, passing)
-        light = light._replace(intensity=light.intensity / area)
+        light = light._replace(intensity=quotient(light.intensity, area))
         return Light(*jax.lax.optimization_barrier(tuple(light)))
 
 
@@ -88,7 +88,7 @@ def exit_through_plane(stack: Stack, geometry: Geometry) -> Light:
     """Transmittance and polarization of a plane surface; the shapes of `AbstractExit.light`."""
     cos_view, sin_view = cos_degrees(geometry.view_zenith), sin_degrees(geometry.view_zenith)
     passing = stack.transmission(cos_view, sin_view**2)
-    q = passing.contrast * sin_view**2 / passing.mean
+    q = quotient(passing.contrast * sin_view**2, passing.mean)
     return Light(passing.mean, q, jnp.zeros_like(q))
 
 
