@@ -88,6 +88,24 @@ class AbstractMicrofacet(Part):
             `(slope, weight)` of the conditional distribution, as in `across`.
         """
 
+    def along_whole(
+        self, lower: Array, upper: Array, across: Array, roughness: Array
+    ) -> Array | None:
+        """What the weights of `along` should sum to, or None where a few nodes come close enough.
+
+        Args:
+            lower: As in `along`, and so are the others.
+            upper: Largest slope.
+            across: Slope across the plane.
+            roughness: Slope parameter alpha.
+
+        Returns:
+            Share of the facets with that slope across that are between the limits. Broadcast
+            shape, 1, in [0, 1].
+        """
+        del lower, upper, across, roughness
+        return None
+
 
 @dataclasses.dataclass(frozen=True)
 class Beckmann(AbstractMicrofacet):
@@ -183,6 +201,18 @@ class GGX(AbstractMicrofacet):
         tangent, widening = _fourfold(start + extent * share)
         return width * tangent, extent * (2.0 / jnp.pi) * widening / (1.0 + tangent**2)
 
+    @override
+    def along_whole(
+        self, lower: Array, upper: Array, across: Array, roughness: Array
+    ) -> Array | None:
+        # (d + sin d cos e)/pi, d and e difference and sum of the angles whose tangents are the
+        # limits over the width.
+        width = jnp.sqrt(at_least(roughness, SMOOTHEST) ** 2 + across**2)
+        low, high = jnp.sqrt(width**2 + lower**2), jnp.sqrt(width**2 + upper**2)
+        square, product = width / low * (width / high), lower / low * (upper / high)
+        sine = width / low * ((upper - lower) / high)
+        return (jnp.arctan2(sine, square + product) + sine * (square - product)) / jnp.pi
+
 
 def _quarter(slope: Array, width: Array) -> Array:
     """Tangent of a quarter of the angle whose tangent is slope / width."""
@@ -200,6 +230,22 @@ def _fourfold(quarter: Array) -> tuple[Array, Array]:
 # --- How steep facets are in which direction: alike all around, or along and across grooves -------
 
 
+class Axes(NamedTuple):
+    """The axes of an ellipse of slopes: along grooves that are steep across.
+
+    Args:
+        gentle: Roughness of slopes along the axis of the gentler slopes. Shape (..., view), 1.
+        steep: Roughness along the other axis, which is the first turned by 90 degrees.
+        cos: Cosine of the angle from the direction of the viewer to the gentle axis.
+        sin: Its sine.
+    """
+
+    gentle: Array
+    steep: Array
+    cos: Array
+    sin: Array
+
+
 class SlopeEllipse(NamedTuple):
     """Slopes seen by one viewer: x towards it, y across.
 
@@ -210,11 +256,13 @@ class SlopeEllipse(NamedTuple):
         along: Roughness of x for a given y. Same shape, 1.
         shear: How far x follows y; None where the surface is the same on both sides of the plane
             of the viewer, so that one side need not be sampled.
+        axes: The frame in which such slopes are sampled.
     """
 
     across: Array
     along: Array
     shear: Array | None
+    axes: Axes | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -278,7 +326,16 @@ class AnisotropicSlopes(AbstractSlopes):
         sin, cos = sin_degrees(turn), cos_degrees(turn)
         across = jnp.sqrt((first * sin) ** 2 + (second * cos) ** 2)
         shear = (first - second) * (first + second) * sin * cos / across
-        return SlopeEllipse(across, first * second / across, shear)
+        # Nodes follow the steep slopes line by line, so that a border that cuts through them is met
+        # exactly. Where both roughnesses are equal the axes change places.
+        given = first < second
+        axes = Axes(
+            jnp.where(given, first, second),
+            jnp.where(given, second, first),
+            jnp.where(given, cos, -sin),
+            jnp.where(given, sin, cos),
+        )
+        return SlopeEllipse(across, first * second / across, shear, axes)
 
 
 # --- Which facets see the viewer, the light, or both: Smith's shadowing and masking ---------------

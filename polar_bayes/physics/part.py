@@ -126,8 +126,9 @@ def at_least(value: Array, floor: float) -> Array:
 def quotient(numerator: Array, denominator: Array) -> Array:
     """A quotient that single precision can derive twice, however small the denominator."""
     # The Hessian divides by the denominator's cube, which for light of 1e-13 does not exist there.
-    size = jax.lax.stop_gradient(denominator)
-    return numerator / size / (denominator / size)
+    # A factor, since XLA would turn two quotients into one of products.
+    scale = 1.0 / jax.lax.stop_gradient(denominator)
+    return numerator * scale / (denominator * scale)
 
 
 def like(values: ArrayLike, array: Array) -> Array:

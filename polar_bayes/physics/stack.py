@@ -215,7 +215,7 @@ def _hemispherical_reflection(refractive_index: Array) -> Array:
 
 
 def _air(cos_incidence: Array) -> Medium:
-    return Medium(jnp.ones_like(cos_incidence), cos_incidence)
+    return Medium(jnp.ones((), cos_incidence.dtype), cos_incidence)
 
 
 def _boundaries(
