@@ -317,8 +317,8 @@ class Microsurface:
         if ellipse.axes is None:
             across, along = rule.rule_across(), rule.rule_along()
         else:
-            across = tuple(np.tile(row, 2) for row in rule.rule_gentle())
-            along = rule.rule_steep()
+            node, weight = rule.rule_gentle()
+            across, along = (np.tile(node, 2), np.tile(weight, 2)), rule.rule_steep()
         # Axes (..., across, along, view): what one of the two does not touch is found once for all
         # of it, and the views, the longest axis, are the innermost loop.
         share_across, weight_across = (jnp.asarray(row[:, None, None], dtype) for row in across)

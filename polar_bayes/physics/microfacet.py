@@ -267,7 +267,13 @@ class SlopeEllipse(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class AbstractSlopes(Part):
-    """The roughness of a surface, direction by direction."""
+    """The roughness of a surface, direction by direction.
+
+    Args:
+        turned: Whether it changes with azimuth.
+    """
+
+    turned: ClassVar[bool] = True
 
     @abc.abstractmethod
     def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
@@ -284,6 +290,7 @@ class IsotropicSlopes(AbstractSlopes):
     """The same roughness all around."""
 
     parameters: ClassVar[tuple[str, ...]] = ("roughness",)
+    turned: ClassVar[bool] = False
 
     @override
     def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:

@@ -21,7 +21,11 @@ BARE_SHARES, BARE_WEIGHTS = unit_rule(24)
 
 # Cosines and weights of that integral for layers: Gauss-Legendre nodes in the square root of the
 # cosine, because reflection gathers at grazing.
-HEMISPHERE_COSINES, HEMISPHERE_WEIGHTS = squared_rule(24)
+HEMISPHERE_RULE = squared_rule(24)
+
+# More of them where films make fringes over the angle: the integral is then right to 2e-4 up to a
+# thickness of 1e4 nm, where 24 nodes were off by 5 %, to 2e-3 at 2e4 nm and to 2 % at 1e5 nm.
+FRINGE_RULE = squared_rule(96)
 
 # Squared sines of inner angles that reach a coat but not the air, crowded towards grazing.
 _FROM_END, TRAPPED_WEIGHT = squared_rule(24)
@@ -139,8 +143,10 @@ class Stack(NamedTuple):
 
     def _hemisphere(self) -> tuple[Array, Array]:
         """Cosines in air, and weights that average over diffuse light."""
-        weight = 2.0 * HEMISPHERE_COSINES * HEMISPHERE_WEIGHTS
-        return like(HEMISPHERE_COSINES, self.refractive_index), like(weight, self.refractive_index)
+        has_film = any(layer.wavenumber is not None for layer in self.layers)
+        cosine, weight = FRINGE_RULE if has_film else HEMISPHERE_RULE
+        index = self.refractive_index
+        return like(cosine, index), like(2.0 * cosine * weight, index)
 
     def _respond(
         self, cos_incidence: Array, sin_squared: Array

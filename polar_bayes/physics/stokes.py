@@ -96,6 +96,22 @@ def diattenuate(light: Light, contrast: Array, balance: Array) -> Light:
     return Light(light.intensity * total, (light.q + contrast) / total, light.u * balance / total)
 
 
+def polarized_through(passing: Light, q: Array, u: Array) -> Light:
+    r"""Polarized light through a filter that does this to unpolarized light.
+
+    $$ I' = I (1 + d \cdot s), \qquad (1 + d \cdot s) s' = b s
+       + \left(1 + \frac{d \cdot s}{1 + b}\right) d, \qquad b = \sqrt{1-d^2} $$
+    """
+    along = passing.q * q + passing.u * u
+    balance = jnp.sqrt(jnp.maximum(1.0 - passing.q**2 - passing.u**2, 0.0))
+    total, share = 1.0 + along, 1.0 + along / (1.0 + balance)
+    return Light(
+        passing.intensity * total,
+        (balance * q + share * passing.q) / total,
+        (balance * u + share * passing.u) / total,
+    )
+
+
 def angle_of_linear_polarization(q: Array, u: Array) -> Array:
     """Angle of polarization from the s axis, atan2(u, q)/2; 0 where there is none."""
     cos_double, sin_double = direction(q, u)

@@ -69,7 +69,7 @@ class DiffuseBody(AbstractSubsurface):
         entering = interface.entering(parameters, geometry).intensity
         brightness = albedo / jnp.pi * entering
         if self.internal_reflection is not None:
-            escape = interface.escape()
+            escape = interface.escape(parameters, geometry)
             # 1 - A Fi, as a sum of two positive terms.
             not_trapped = (1.0 - albedo) + albedo * escape
             brightness = brightness / (parameters["refractive_index"] ** 2 * not_trapped)
@@ -139,7 +139,7 @@ class Depolarizer(AbstractSubsurface):
         if self.internal_reflection is None:
             not_trapped, kept = jnp.ones_like(lost), lost
         else:
-            escape = interface.escape()
+            escape = interface.escape(parameters, geometry)
             # 1 - Fi Rd, as a sum of two positive terms.
             not_trapped = lost + (1.0 - lost) * escape
             kept = body_loss(parameters["absorption"], escape)
