@@ -45,7 +45,13 @@ from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, TurbidMedium, Unpolarized
-from polar_bayes.physics.surface import InternalReflection, RoughSurface, SmoothExit, SmoothSurface
+from polar_bayes.physics.surface import (
+    InternalReflection,
+    RoughPassage,
+    RoughSurface,
+    SmoothExit,
+    SmoothSurface,
+)
 
 READINGS = ("dop", "q", "u", "intensity")
 
@@ -95,6 +101,9 @@ ALL_SCENES = (
     | EFFECT_SCENES
     | {
         "GGX, point": Scene(RoughSurface(GGX()), Depolarizer(), StokesMixing()),
+        "facets both ways": Scene(
+            RoughSurface(quadrature=FEW, way_out=RoughPassage()), Depolarizer(), StokesMixing()
+        ),
         "GGX, sky": Scene(RoughSurface(GGX(), UniformSky()), Lambertian(), StokesMixing()),
         "Beckmann, sky": Scene(
             RoughSurface(Beckmann(), UniformSky()), Depolarizer(), DopMixing(signed=True)

@@ -103,7 +103,7 @@ def test_only_the_rough_way_out_has_something_simpler() -> None:
     assert SmoothExit().simpler() == ()
 
 
-# --- what may pass both ways: energy and reciprocity -----------------------------------------------
+# --- what may pass both ways: energy and reciprocity ---------------------------------------------
 
 WHITE = Lambertian(1.0, InternalReflection())
 
@@ -129,16 +129,16 @@ def returned(way_out: AbstractExit, light_zenith: float, roughness: float) -> fl
     return float(2.0 * sent / np.cos(np.deg2rad(light_zenith)))
 
 
-@each("light_zenith", [0.0, 30.0, 60.0])
+@each("light_zenith", [20.0, 50.0])
 def test_what_passes_facets_both_ways_gives_back_no_more_than_comes(light_zenith: float) -> None:
     """A white body; what facets turn into the surface or hide is lost, and nothing is made.
 
-    The rule over directions is good to 2e-4. Light that enters as through a plane makes up to .015.
+    The rule over directions is good to 2e-4. What other ways make is stated in docs/scenes.md.
     """
-    for roughness in (0.1, 0.3, 0.5):
+    for roughness in (0.2, 0.5):
         assert returned(RoughPassage(), light_zenith, roughness) <= 1.0 + 2e-4
-        for cheap in (RoughExit(), SmoothExit()):
-            assert returned(cheap, light_zenith, roughness) <= 1.035
+        assert returned(RoughExit(), light_zenith, roughness) <= 1.0 + 0.014
+        assert returned(SmoothExit(), light_zenith, roughness) <= 1.0 + 0.003
 
 
 def swapped(way_out: AbstractExit, roughness: float, zenith: float, **parts: object) -> float:
