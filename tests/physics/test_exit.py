@@ -133,12 +133,13 @@ def returned(way_out: AbstractExit, light_zenith: float, roughness: float) -> fl
 def test_what_passes_facets_both_ways_gives_back_no_more_than_comes(light_zenith: float) -> None:
     """A white body; what facets turn into the surface or hide is lost, and nothing is made.
 
-    The rule over directions is good to 2e-4. What other ways make is stated in docs/scenes.md.
+    The rule over directions is good to 2e-4, which is allowed on top of what docs/scenes.md states.
     """
+    rule = 2e-4
     for roughness in (0.2, 0.5):
-        assert returned(RoughPassage(), light_zenith, roughness) <= 1.0 + 2e-4
-        assert returned(RoughExit(), light_zenith, roughness) <= 1.0 + 0.014
-        assert returned(SmoothExit(), light_zenith, roughness) <= 1.0 + 0.003
+        assert returned(RoughPassage(), light_zenith, roughness) <= 1.0 + rule
+        assert returned(RoughExit(), light_zenith, roughness) <= 1.014 + rule
+        assert returned(SmoothExit(), light_zenith, roughness) <= 1.003 + rule
 
 
 def swapped(way_out: AbstractExit, roughness: float, zenith: float, **parts: object) -> float:
