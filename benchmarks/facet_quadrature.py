@@ -24,7 +24,12 @@ import numpy as np
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.illumination import Disc, UniformSky
-from polar_bayes.physics.microfacet import GGX, AbstractMicrofacet, Beckmann
+from polar_bayes.physics.microfacet import (
+    GGX,
+    AbstractMicrofacet,
+    AnisotropicSlopes,
+    Beckmann,
+)
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.surface import RoughSurface
 
@@ -35,6 +40,11 @@ ZENITH = np.concatenate([np.arange(0.0, 75.0, 2.5), np.arange(75.0, 89.1, 0.5)])
 RULES = ((4, 4), (5, 4), (5, 5), (6, 5), (8, 6), (10, 8), (16, 16))
 PLAIN_RULES = ((4, 8), (8, 8), (8, 16), (16, 16))
 TRUTH = FacetQuadrature(64, 64)
+
+# Roughness along and across grooves, their azimuth from the viewer, and zeniths.
+GROOVES = ((0.3, 0.2), (0.1, 0.3), (0.1, 0.4), (0.04, 0.3), (0.02, 0.3), (0.01, 0.2), (0.05, 1.0))
+AZIMUTH = (0.0, 5.0, 15.0, 30.0, 60.0, 85.0, 90.0)
+GROOVE_ZENITH = (0.0, 20.0, 40.0, 56.0, 70.0, 80.0, 85.0)
 
 # Half width of the source in degrees; the horizon bounds the sky, and None is the way out.
 INTEGRALS = {"sky": 90.0, "exit": None, "Disc(1)": 1.0, "Disc(5)": 5.0, "Disc(15)": 15.0}
@@ -167,6 +177,47 @@ def table(distribution: AbstractMicrofacet, roughness: tuple[float, ...]) -> Non
         click.echo(f"| {name} | {facets} | " + " | ".join(errors) + f" | {relative:.2f} |")
 
 
+def light_on_grooves(
+    distribution: AbstractMicrofacet, nodes: FacetQuadrature, integral: str, at: np.ndarray
+) -> np.ndarray:
+    """Intensity, q and u of rows of roughness along and across, azimuth and zenith."""
+    half_width = INTEGRALS[integral]
+    source = Disc(half_width) if half_width and half_width < 90.0 else UniformSky()
+    surface = RoughSurface(distribution, source, nodes, AnisotropicSlopes("azimuth"))
+
+    def one(row: jax.Array) -> jax.Array:
+        names = ("roughness", "roughness_across", "azimuth")
+        zenith, index = row[3:], jnp.full(1, 1.5)
+        views = Geometry(zenith, 0.0 * zenith, zenith, 0.0 * zenith + 180.0)
+        law = surface.exit if half_width is None else surface.light
+        return jnp.concatenate(
+            law(dict(zip(names, row[:, None], strict=False)), views, Stack(index))
+        )
+
+    return np.asarray(jax.jit(lambda rows: jax.lax.map(one, rows, batch_size=35))(at))
+
+
+def groove_table(distribution: AbstractMicrofacet) -> None:
+    """Print what the dial buys on grooves, against 40 x 40."""
+    at = np.array([(*r, t, z) for r, t, z in itertools.product(GROOVES, AZIMUTH, GROOVE_ZENITH)])
+    click.echo(f"\n{distribution!r}, grooves\n")
+    click.echo("| along x across | facets | " + " | ".join(INTEGRALS) + " | brightness |")
+    click.echo("|---" * (len(INTEGRALS) + 3) + "|")
+    many = FacetQuadrature(40, 40)
+    truth = {name: light_on_grooves(distribution, many, name, at) for name in INTEGRALS}
+    for along, across in RULES[1:-1]:
+        cells, bright = [], 0.0
+        for name in INTEGRALS:
+            found = light_on_grooves(distribution, FacetQuadrature(along, across), name, at)
+            error = np.hypot(*(found - truth[name])[:, 1:].T)
+            place = int(np.argmax(error))
+            where = ", ".join(f"{x:.4g}" for x in at[place])
+            cells.append(f"{error[place]:.2g} ({where})")
+            bright = max(bright, np.max(np.abs(found[:, 0] / truth[name][:, 0] - 1.0)))
+        facets = 2 * across * (along + across)
+        click.echo(f"| {along} x {across} | {facets} | {' | '.join(cells)} | {bright:.2g} |")
+
+
 @click.command(help=__doc__.splitlines()[0])
 @click.option("--roughness", multiple=True, default=ROUGHNESS, help="Repeat for several.")
 def main(roughness: tuple[float, ...]) -> None:
@@ -174,6 +225,7 @@ def main(roughness: tuple[float, ...]) -> None:
     jax.config.update("jax_enable_x64", True)
     for distribution in (Beckmann(), GGX()):
         table(distribution, roughness)
+        groove_table(distribution)
 
 
 if __name__ == "__main__":

@@ -50,6 +50,7 @@ from .surface import (
     AbstractSurface as AbstractSurface,
     InternalReflection as InternalReflection,
     RoughExit as RoughExit,
+    RoughPassage as RoughPassage,
     RoughSurface as RoughSurface,
     SmoothExit as SmoothExit,
     SmoothSurface as SmoothSurface,

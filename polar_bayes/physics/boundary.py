@@ -156,23 +156,31 @@ def relative_reflection(
 ) -> Diattenuation:
     """The same without the factor (n_2^2 - n_1^2)^2, whose root `step` would put back."""
     a, b = above.normal * below.normal, sin_squared
-    # Squared last: near grazing the derivatives of the whole would overflow single precision.
-    scale = (step / ((above.normal + below.normal) ** 2 * (a + b))) ** 2
-    return Diattenuation(scale * (a**2 + b**2), 2.0 * scale * a, 2.0 * scale, b)
+    # Inverse by inverse, and squared last: near grazing, derivatives of the whole would overflow
+    # single precision.
+    inverse = 1.0 / (above.normal + below.normal)
+    scale = (step * inverse * inverse / (a + b)) ** 2
+    return reflection_shape(above, below, sin_squared).scaled(scale)
+
+
+def reflection_shape(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
+    """The same in proportion, without any factor: its size is near 1."""
+    a, b = above.normal * below.normal, sin_squared
+    return Diattenuation(a**2 + b**2, 2.0 * a, 2.0 * jnp.ones_like(a), b)
 
 
 def transmission(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
     """Power that a bare boundary lets pass, the same in both directions."""
     a, b, total = above.normal * below.normal, sin_squared, above.normal + below.normal
-    indexes = above.refractive_index * below.refractive_index
-    p_like = indexes / (total * (a + b))
-    scale = (_rho(above, below) / (a + b)) ** 2
+    inverse = 1.0 / total
+    share = inverse / (a + b)
+    p_like = above.refractive_index * below.refractive_index * share
+    scale = (_square_difference(above, below) * inverse * share) ** 2
     # sqrt(s) - sqrt(p) of the transmittances, over B.
-    change = below.refractive_index - above.refractive_index
-    ratio = change / total
-    roots = 2.0 * ratio**2 / (total * (a + b) * (1.0 - ratio) * (1.0 + ratio))
+    ratio = (below.refractive_index - above.refractive_index) * inverse
+    roots = 2.0 * ratio**2 * share / ((1.0 - ratio) * (1.0 + ratio))
     return Diattenuation(
-        mean=2.0 * a * (1.0 / total**2 + p_like**2),
+        mean=2.0 * a * (inverse**2 + p_like**2),
         contrast=-2.0 * scale * a,
         shortfall=2.0 * a * roots**2,
         sin_squared=b,
@@ -210,7 +218,8 @@ def filmed(
 
 def _rho(above: Medium, below: Medium) -> Array:
     """Field reflected along s, without its sign."""
-    return _square_difference(above, below) / (above.normal + below.normal) ** 2
+    inverse = 1.0 / (above.normal + below.normal)
+    return _square_difference(above, below) * inverse * inverse
 
 
 def _square_difference(above: Medium, below: Medium) -> Array:

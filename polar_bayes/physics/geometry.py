@@ -11,6 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
+# Nearest to grazing, in degrees, that single precision or a shifted angle may come.
+STEEPEST_ZENITH = 89.999
+
 
 class Geometry(NamedTuple):
     """Directions of viewer and light, in degrees, one entry per view.
@@ -76,6 +79,16 @@ class Geometry(NamedTuple):
         """Light and viewer in each other's place."""
         view, light = self[:2], self[2:4]
         return Geometry(*light, *view, self.wavelength)
+
+    def resolved(self) -> "Geometry":
+        """In single precision, whose zeniths are known to 8e-6 degrees: none beyond 89.999."""
+        if jnp.finfo(self.dtype).eps < 1e-10:
+            return self
+        view, light = (
+            jnp.clip(zenith, -STEEPEST_ZENITH, STEEPEST_ZENITH)
+            for zenith in (self.view_zenith, self.light_zenith)
+        )
+        return self._replace(view_zenith=view, light_zenith=light)
 
     @property
     def dtype(self) -> jnp.dtype:

@@ -37,7 +37,7 @@ from jaxtyping import Array
 
 from polar_bayes.physics.boundary import medium
 from polar_bayes.physics.geometry import cos_degrees, double_angle, sin_degrees
-from polar_bayes.physics.part import squared_rule, unit_rule
+from polar_bayes.physics.part import at_least, squared_rule, unit_rule
 from polar_bayes.physics.stack import Stack
 
 # Scattered light changes with the square root of absorption, whose slope at zero is infinite: less
@@ -174,7 +174,7 @@ def _material(*properties: Array | float) -> tuple[Array, Array, Array]:
     """Absorption above its floor, polarized fraction and index, of one shape and precision."""
     dtype = jnp.result_type(float, *properties)
     a, p, n = jnp.broadcast_arrays(*(jnp.asarray(x, dtype) for x in properties))
-    return jnp.maximum(a, CLEAREST), p, n
+    return at_least(a, CLEAREST), p, n
 
 
 def _column(nodes: np.ndarray, like: Array) -> Array:

@@ -17,7 +17,13 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.geometry import Geometry, cos_degrees, double_angle, sin_degrees
+from polar_bayes.physics.geometry import (
+    STEEPEST_ZENITH,
+    Geometry,
+    cos_degrees,
+    double_angle,
+    sin_degrees,
+)
 from polar_bayes.physics.part import (
     Parameters,
     Part,
@@ -43,9 +49,6 @@ __all__ = [
     "Saturation",
     "TiltedNormal",
 ]
-
-# Nearest to grazing, in degrees, that a shifted angle may come.
-STEEPEST_ZENITH = 89.999
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, at_least, value_of
 
 # A roughness below this is taken as this: the width of a highlight is then 0.001 degree, which no
 # instrument resolves, and its peak brightness stays within single precision.
@@ -88,6 +88,24 @@ class AbstractMicrofacet(Part):
             `(slope, weight)` of the conditional distribution, as in `across`.
         """
 
+    def along_whole(
+        self, lower: Array, upper: Array, across: Array, roughness: Array
+    ) -> Array | None:
+        """What the weights of `along` should sum to, or None where a few nodes come close enough.
+
+        Args:
+            lower: As in `along`, and so are the others.
+            upper: Largest slope.
+            across: Slope across the plane.
+            roughness: Slope parameter alpha.
+
+        Returns:
+            Share of the facets with that slope across that are between the limits. Broadcast
+            shape, 1, in [0, 1].
+        """
+        del lower, upper, across, roughness
+        return None
+
 
 @dataclasses.dataclass(frozen=True)
 class Beckmann(AbstractMicrofacet):
@@ -106,24 +124,25 @@ class Beckmann(AbstractMicrofacet):
 
     @override
     def density(self, tan_squared: Array, roughness: Array) -> Array:
-        alpha = jnp.maximum(roughness, SMOOTHEST)
+        alpha = at_least(roughness, SMOOTHEST)
         # Far from the mirror direction the exponential would underflow and take the derivatives
         # with it; it stops just above the smallest number instead.
         darkest = -0.9 * np.log(np.finfo(jnp.result_type(tan_squared, alpha)).tiny).item()
-        exponent = jnp.minimum(tan_squared / alpha**2, darkest)
-        # The square is taken last: each factor alone overflows single precision in a Hessian.
+        # Single precision holds a Hessian only if the width is divided out step by step, and only
+        # where there is light; for the same reason the square is taken last.
+        exponent = jnp.minimum(tan_squared, darkest * alpha**2) / alpha / alpha
         return (jnp.exp(-0.5 * exponent) * (1.0 + tan_squared) / alpha) ** 2 / jnp.pi
 
     @override
     def shadowing(self, tan_squared: Array, roughness: Array) -> Array:
-        steepness = (jnp.maximum(roughness, SMOOTHEST)) ** 2 * tan_squared
+        steepness = at_least(roughness, SMOOTHEST) ** 2 * tan_squared
         shadowed = steepness > 0.625**2
         y = jnp.sqrt(jnp.where(shadowed, steepness, 1.0))
         return jnp.where(shadowed, (3.535 * y + 2.181) / (y**2 + 2.276 * y + 2.577), 1.0)
 
     @override
     def across(self, limit: Array, roughness: Array, share: Array) -> tuple[Array, Array]:
-        width = jnp.maximum(roughness, SMOOTHEST) * BROADENING**0.5
+        width = at_least(roughness, SMOOTHEST) * BROADENING**0.5
         end = jax.lax.erf(jnp.minimum(limit / width, TAIL))
         x = jax.lax.erf_inv(end * share)
         return width * x, end * BROADENING**0.5 * jnp.exp(-(BROADENING - 1.0) * x**2)
@@ -132,7 +151,7 @@ class Beckmann(AbstractMicrofacet):
     def along(
         self, lower: Array, upper: Array, across: Array, roughness: Array, share: Array
     ) -> tuple[Array, Array]:
-        width = jnp.maximum(roughness, SMOOTHEST) * BROADENING**0.5
+        width = at_least(roughness, SMOOTHEST) * BROADENING**0.5
         start = jax.lax.erf(jnp.clip(lower / width, -TAIL, TAIL))
         extent = jax.lax.erf(jnp.clip(upper / width, -TAIL, TAIL)) - start
         # Where both limits lie far out on one side nothing has weight, but all must be finite.
@@ -155,17 +174,19 @@ class GGX(AbstractMicrofacet):
 
     @override
     def density(self, tan_squared: Array, roughness: Array) -> Array:
-        alpha = jnp.maximum(roughness, SMOOTHEST)
-        return (alpha * (1.0 + tan_squared) / (alpha**2 + tan_squared)) ** 2 / jnp.pi
+        alpha = at_least(roughness, SMOOTHEST)
+        # Two small steps in place of a large one: a Hessian would leave single precision.
+        width = jnp.sqrt(alpha**2 + tan_squared)
+        return (alpha / width * ((1.0 + tan_squared) / width)) ** 2 / jnp.pi
 
     @override
     def shadowing(self, tan_squared: Array, roughness: Array) -> Array:
-        alpha = jnp.maximum(roughness, SMOOTHEST)
+        alpha = at_least(roughness, SMOOTHEST)
         return 2.0 / (1.0 + jnp.sqrt(1.0 + alpha**2 * tan_squared))
 
     @override
     def across(self, limit: Array, roughness: Array, share: Array) -> tuple[Array, Array]:
-        alpha = jnp.maximum(roughness, SMOOTHEST)
+        alpha = at_least(roughness, SMOOTHEST)
         end = _quarter(limit, alpha)
         tangent, widening = _fourfold(end * share)
         return alpha * tangent, end * widening / jnp.sqrt(1.0 + tangent**2)
@@ -174,11 +195,23 @@ class GGX(AbstractMicrofacet):
     def along(
         self, lower: Array, upper: Array, across: Array, roughness: Array, share: Array
     ) -> tuple[Array, Array]:
-        width = jnp.sqrt(jnp.maximum(roughness, SMOOTHEST) ** 2 + across**2)
+        width = jnp.sqrt(at_least(roughness, SMOOTHEST) ** 2 + across**2)
         start = _quarter(lower, width)
         extent = _quarter(upper, width) - start
         tangent, widening = _fourfold(start + extent * share)
         return width * tangent, extent * (2.0 / jnp.pi) * widening / (1.0 + tangent**2)
+
+    @override
+    def along_whole(
+        self, lower: Array, upper: Array, across: Array, roughness: Array
+    ) -> Array | None:
+        # (d + sin d cos e)/pi, d and e difference and sum of the angles whose tangents are the
+        # limits over the width.
+        width = jnp.sqrt(at_least(roughness, SMOOTHEST) ** 2 + across**2)
+        low, high = jnp.sqrt(width**2 + lower**2), jnp.sqrt(width**2 + upper**2)
+        square, product = width / low * (width / high), lower / low * (upper / high)
+        sine = width / low * ((upper - lower) / high)
+        return (jnp.arctan2(sine, square + product) + sine * (square - product)) / jnp.pi
 
 
 def _quarter(slope: Array, width: Array) -> Array:
@@ -197,6 +230,22 @@ def _fourfold(quarter: Array) -> tuple[Array, Array]:
 # --- How steep facets are in which direction: alike all around, or along and across grooves -------
 
 
+class Axes(NamedTuple):
+    """The axes of an ellipse of slopes: along grooves that are steep across.
+
+    Args:
+        gentle: Roughness of slopes along the axis of the gentler slopes. Shape (..., view), 1.
+        steep: Roughness along the other axis, which is the first turned by 90 degrees.
+        cos: Cosine of the angle from the direction of the viewer to the gentle axis.
+        sin: Its sine.
+    """
+
+    gentle: Array
+    steep: Array
+    cos: Array
+    sin: Array
+
+
 class SlopeEllipse(NamedTuple):
     """Slopes seen by one viewer: x towards it, y across.
 
@@ -207,16 +256,24 @@ class SlopeEllipse(NamedTuple):
         along: Roughness of x for a given y. Same shape, 1.
         shear: How far x follows y; None where the surface is the same on both sides of the plane
             of the viewer, so that one side need not be sampled.
+        axes: The frame in which such slopes are sampled.
     """
 
     across: Array
     along: Array
     shear: Array | None
+    axes: Axes | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class AbstractSlopes(Part):
-    """The roughness of a surface, direction by direction."""
+    """The roughness of a surface, direction by direction.
+
+    Args:
+        turned: Whether it changes with azimuth.
+    """
+
+    turned: ClassVar[bool] = True
 
     @abc.abstractmethod
     def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
@@ -233,6 +290,7 @@ class IsotropicSlopes(AbstractSlopes):
     """The same roughness all around."""
 
     parameters: ClassVar[tuple[str, ...]] = ("roughness",)
+    turned: ClassVar[bool] = False
 
     @override
     def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
@@ -269,13 +327,22 @@ class AnisotropicSlopes(AbstractSlopes):
 
     @override
     def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
-        first = jnp.maximum(parameters["roughness"], SMOOTHEST)
-        second = jnp.maximum(parameters["roughness_across"], SMOOTHEST)
+        first = at_least(parameters["roughness"], SMOOTHEST)
+        second = at_least(parameters["roughness_across"], SMOOTHEST)
         turn = value_of(self.azimuth, parameters) - geometry.view_azimuth
         sin, cos = sin_degrees(turn), cos_degrees(turn)
         across = jnp.sqrt((first * sin) ** 2 + (second * cos) ** 2)
         shear = (first - second) * (first + second) * sin * cos / across
-        return SlopeEllipse(across, first * second / across, shear)
+        # Nodes follow the steep slopes line by line, so that a border that cuts through them is met
+        # exactly. Where both roughnesses are equal the axes change places.
+        given = first < second
+        axes = Axes(
+            jnp.where(given, first, second),
+            jnp.where(given, second, first),
+            jnp.where(given, cos, -sin),
+            jnp.where(given, sin, cos),
+        )
+        return SlopeEllipse(across, first * second / across, shear, axes)
 
 
 # --- Which facets see the viewer, the light, or both: Smith's shadowing and masking ---------------

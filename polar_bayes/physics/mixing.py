@@ -93,7 +93,7 @@ def _share(fraction: Array, surface: Array, subsurface: Array) -> Array:
     # share, so intensities are scaled by a constant first.
     trace = jnp.finfo(jnp.result_type(surface, subsurface)).eps ** 1.25
     # Darker than any reading: a black body on a surface far from its highlight is the surface's.
-    surface = surface + jnp.finfo(jnp.result_type(surface, subsurface)).eps ** 2
+    surface = surface + jnp.finfo(jnp.result_type(surface, subsurface)).eps ** 1.5
     scale = jax.lax.stop_gradient(surface + subsurface)
     surface, subsurface = surface / scale, subsurface / scale
     from_surface = (1.0 - fraction) * surface + trace * subsurface

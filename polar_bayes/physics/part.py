@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
@@ -115,6 +116,19 @@ def squared_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
     """The same in the square root: denser at 0, where light meets an interface at grazing."""
     node, weight = unit_rule(count)
     return node**2, 2.0 * node * weight
+
+
+def at_least(value: Array, floor: float) -> Array:
+    """The larger of both; at the floor itself the slope is that from above, not half of it."""
+    return jnp.where(value < floor, floor, value)
+
+
+def quotient(numerator: Array, denominator: Array) -> Array:
+    """A quotient that single precision can derive twice, however small the denominator."""
+    # The Hessian divides by the denominator's cube, which for light of 1e-13 does not exist there.
+    # A factor, since XLA would turn two quotients into one of products.
+    scale = 1.0 / jax.lax.stop_gradient(denominator)
+    return numerator * scale / (denominator * scale)
 
 
 def like(values: ArrayLike, array: Array) -> Array:

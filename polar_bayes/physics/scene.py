@@ -240,6 +240,7 @@ class Scene(HTMLRepr):
 
     def _optics(self, parameters: Parameters, geometry: Geometry) -> Light:
         """Light in the stated frame of the viewer, for parameters that have a view axis."""
+        geometry = geometry.resolved()
         if self.normal is None:
             return self._material(parameters, geometry)
         inside, turn = self.normal.enter(parameters, geometry)

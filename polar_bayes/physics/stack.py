@@ -14,12 +14,18 @@ from jaxtyping import Array
 from polar_bayes.physics import boundary
 from polar_bayes.physics.boundary import EVANESCENT, Diattenuation, Film, Medium
 from polar_bayes.physics.geometry import per_ray
-from polar_bayes.physics.part import like, squared_rule
+from polar_bayes.physics.part import like, squared_rule, unit_rule
 
-# Cosines and weights for integrals over the hemisphere: 24 Gauss-Legendre nodes in the square root
-# of the cosine, because near n = 1 all reflection gathers at grazing. The error of a bare body's
-# is 1e-15 from n = 1.1 on, 2e-14 at 1.01 and at most 3e-9 anywhere.
-HEMISPHERE_COSINES, HEMISPHERE_WEIGHTS = squared_rule(24)
+# Shares and weights for the integral of a bare body's reflectance over the hemisphere.
+BARE_SHARES, BARE_WEIGHTS = unit_rule(24)
+
+# Cosines and weights of that integral for layers: Gauss-Legendre nodes in the square root of the
+# cosine, because reflection gathers at grazing.
+HEMISPHERE_RULE = squared_rule(24)
+
+# More of them where films make fringes over the angle: the integral is then right to 2e-4 up to a
+# thickness of 1e4 nm, where 24 nodes were off by 5 %, to 2e-3 at 2e4 nm and to 2 % at 1e5 nm.
+FRINGE_RULE = squared_rule(96)
 
 # Squared sines of inner angles that reach a coat but not the air, crowded towards grazing.
 _FROM_END, TRAPPED_WEIGHT = squared_rule(24)
@@ -69,6 +75,15 @@ class Stack(NamedTuple):
         trace = jnp.finfo(power.mean.dtype).eps ** 1.75
         return power._replace(mean=jnp.maximum(power.mean, trace))
 
+    def mirror(self, cos_incidence: Array, sin_squared: Array) -> tuple[Array, Diattenuation]:
+        """Reflectance, mean of s and p, and a reflection in proportion whose size is near 1."""
+        if not self.layers:
+            air, body = self._bare(cos_incidence)
+            mean = boundary.reflection(air, body, sin_squared).mean
+            return mean, boundary.reflection_shape(air, body, sin_squared)
+        power = self.relative_reflection(cos_incidence, sin_squared)
+        return power.mean, power.scaled(1.0 / jax.lax.stop_gradient(power.mean))
+
     @property
     def scale(self) -> Array:
         """Factor that `relative_reflection` leaves out, shape of the index."""
@@ -88,6 +103,8 @@ class Stack(NamedTuple):
 
         $$ 1 - F_e = \int_0^1 2\mu T_+(\mu)\, d\mu $$
         """
+        if not self.layers:
+            return 1.0 - _hemispherical_reflection(self.refractive_index)
         cosine, weight = self._hemisphere()
         through = per_ray(self).transmission(cosine, (1.0 - cosine) * (1.0 + cosine))
         # A sum, since matrix products of accelerators drop digits in single precision.
@@ -126,8 +143,10 @@ class Stack(NamedTuple):
 
     def _hemisphere(self) -> tuple[Array, Array]:
         """Cosines in air, and weights that average over diffuse light."""
-        weight = 2.0 * HEMISPHERE_COSINES * HEMISPHERE_WEIGHTS
-        return like(HEMISPHERE_COSINES, self.refractive_index), like(weight, self.refractive_index)
+        has_film = any(layer.wavenumber is not None for layer in self.layers)
+        cosine, weight = FRINGE_RULE if has_film else HEMISPHERE_RULE
+        index = self.refractive_index
+        return like(cosine, index), like(2.0 * cosine * weight, index)
 
     def _respond(
         self, cos_incidence: Array, sin_squared: Array
@@ -179,8 +198,30 @@ class Stack(NamedTuple):
         return sections
 
 
+def _hemispherical_reflection(refractive_index: Array) -> Array:
+    r"""Share of diffuse light that a bare body reflects, F_e.
+
+    $$ F_e = N^2 W \int_0^1 \tfrac12 (s - s^3) \frac{A^2 + B^2}{(A+B)^2} dh, \qquad
+       \mu = N \sinh w,\; N^2 = n^2 - 1,\; w = W h,\; s = e^{-2w} $$
+
+    where W = asinh(1/N): for s light the reflectance is then s^2 exactly, and however close n comes
+    to 1 the nodes follow the angles at which light is reflected. The error is 1e-15.
+    """
+    # A step that rounding does not swallow: it counts as an index that is higher by 4 eps.
+    eps = jnp.finfo(refractive_index.dtype).eps
+    step = (refractive_index - 1.0) * (refractive_index + 1.0) + 8.0 * eps
+    end = jnp.log1p(jnp.sqrt(1.0 + step)) - 0.5 * jnp.log(step)
+    share, weight = like(BARE_SHARES, step), like(BARE_WEIGHTS, step)
+    s = jnp.exp(-2.0 * end[..., None] * share)
+    quarter = 0.25 * step[..., None]
+    a, b = quarter * (1.0 / s - s), 1.0 - quarter * (1.0 / s + s - 2.0)
+    # A sum, since matrix products of accelerators drop digits in single precision.
+    total = jnp.sum(0.5 * weight * (s - s**3) * (a**2 + b**2) / (a + b) ** 2, axis=-1)
+    return step * end * total
+
+
 def _air(cos_incidence: Array) -> Medium:
-    return Medium(jnp.ones_like(cos_incidence), cos_incidence)
+    return Medium(jnp.ones((), cos_incidence.dtype), cos_incidence)
 
 
 def _boundaries(

@@ -29,7 +29,7 @@ from polar_bayes.physics.geometry import (
     sin_degrees,
     turn_between_frames,
 )
-from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, quotient, value_of
 from polar_bayes.physics.stack import Stack
 
 # Rounds the tip of the cone |(q, u)|: small against any reading, large enough that the Hessian at
@@ -96,6 +96,22 @@ def diattenuate(light: Light, contrast: Array, balance: Array) -> Light:
     return Light(light.intensity * total, (light.q + contrast) / total, light.u * balance / total)
 
 
+def polarized_through(passing: Light, q: Array, u: Array) -> Light:
+    r"""Polarized light through a filter that does this to unpolarized light.
+
+    $$ I' = I (1 + d \cdot s), \qquad (1 + d \cdot s) s' = b s
+       + \left(1 + \frac{d \cdot s}{1 + b}\right) d, \qquad b = \sqrt{1-d^2} $$
+    """
+    along = passing.q * q + passing.u * u
+    balance = jnp.sqrt(jnp.maximum(1.0 - passing.q**2 - passing.u**2, 0.0))
+    total, share = 1.0 + along, 1.0 + along / (1.0 + balance)
+    return Light(
+        passing.intensity * total,
+        (balance * q + share * passing.q) / total,
+        (balance * u + share * passing.u) / total,
+    )
+
+
 def angle_of_linear_polarization(q: Array, u: Array) -> Array:
     """Angle of polarization from the s axis, atan2(u, q)/2; 0 where there is none."""
     cos_double, sin_double = direction(q, u)
@@ -139,10 +155,9 @@ def mirror_light(
     incident: tuple[Array, Array] | None,
 ) -> Light:
     """Light that one facet mirrors to the viewer."""
-    power = stack.relative_reflection(facet.cos_incidence, facet.sin_squared)
+    mean, power = stack.mirror(facet.cos_incidence, facet.sin_squared)
     if incident is None:
         polarizance = power.contrast / power.mean
-        mean = stack.scale * power.mean
         return Light(mean, polarizance * facet.along_s, -polarizance * facet.across_s)
     (q, u), source = incident, mirror_facet(geometry.reversed())
     along = q * source.along_s - u * source.across_s
@@ -163,14 +178,15 @@ def mirror_light(
     )
     # Fully p-polarized light at Brewster's angle is not reflected at all: 0/0 is then kept finite.
     lit = jnp.maximum(total, jnp.finfo(total.dtype).eps * power.mean)
-    return Light(stack.scale * total, first / lit, second / lit)
+    return Light(mean * total / power.mean, first / lit, second / lit)
 
 
 def transmit_inward(
     passing: Diattenuation, cos_light: Array, incident: tuple[Array, Array] | None
 ) -> Light:
     """Light that passes the surface into the body, in the frame of the light."""
-    light, q = cos_light * passing.mean, passing.contrast * passing.sin_squared / passing.mean
+    light = cos_light * passing.mean
+    q = quotient(passing.contrast * passing.sin_squared, passing.mean)
     if incident is None:
         return Light(light, q, jnp.zeros_like(q))
     return diattenuate(Light(light, *incident), q, passing.cross / passing.mean)

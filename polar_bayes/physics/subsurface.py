@@ -10,7 +10,15 @@ from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.half_space import CLEAREST, refract, scatter
-from polar_bayes.physics.part import Parameters, Part, Range, Setting, value_of
+from polar_bayes.physics.part import (
+    Parameters,
+    Part,
+    Range,
+    Setting,
+    at_least,
+    quotient,
+    value_of,
+)
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import Interface, InternalReflection
 
@@ -61,7 +69,7 @@ class DiffuseBody(AbstractSubsurface):
         entering = interface.entering(parameters, geometry).intensity
         brightness = albedo / jnp.pi * entering
         if self.internal_reflection is not None:
-            escape = interface.escape()
+            escape = interface.escape(parameters, geometry)
             # 1 - A Fi, as a sum of two positive terms.
             not_trapped = (1.0 - albedo) + albedo * escape
             brightness = brightness / (parameters["refractive_index"] ** 2 * not_trapped)
@@ -131,7 +139,7 @@ class Depolarizer(AbstractSubsurface):
         if self.internal_reflection is None:
             not_trapped, kept = jnp.ones_like(lost), lost
         else:
-            escape = interface.escape()
+            escape = interface.escape(parameters, geometry)
             # 1 - Fi Rd, as a sum of two positive terms.
             not_trapped = lost + (1.0 - lost) * escape
             kept = body_loss(parameters["absorption"], escape)
@@ -151,7 +159,7 @@ def half_space_loss(absorption: Array) -> Array:
     Source:
         van de Hulst 1980, Multiple light scattering, the spherical albedo of a half space.
     """
-    absorption = jnp.maximum(absorption, CLEAREST)
+    absorption = at_least(absorption, CLEAREST)
     g = jnp.sqrt(absorption / (1.0 + absorption))
     return g * (2.309 - 0.139 * g) / (1.0 + 1.170 * g)
 
@@ -234,6 +242,6 @@ class TurbidMedium(AbstractSubsurface):
         diagonal = jnp.sqrt(jnp.maximum((1.0 - leaving.q) * (1.0 + leaving.q), 0.0))
         return Light(
             leaving.intensity * total / n**2,
-            (intensity * leaving.q + q) / total,
-            (intensity * leaving.u - u * diagonal) / total,
+            quotient(intensity * leaving.q + q, total),
+            quotient(intensity * leaving.u - u * diagonal, total),
         )

@@ -2,14 +2,21 @@
 
 import abc
 import dataclasses
-from typing import override
+from typing import ClassVar, override
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.physics.facets import FacetQuadrature, Facets, Microsurface, seen, sum_facets
-from polar_bayes.physics.geometry import Geometry, cos_degrees, mirror_facet, per_facet, sin_degrees
+from polar_bayes.physics.geometry import (
+    Geometry,
+    cos_degrees,
+    mirror_facet,
+    per_facet,
+    per_ray,
+    sin_degrees,
+)
 from polar_bayes.physics.illumination import AbstractIllumination, PointSource
 from polar_bayes.physics.microfacet import (
     AbstractMicrofacet,
@@ -20,16 +27,33 @@ from polar_bayes.physics.microfacet import (
     SeparableShadowing,
     SlopeEllipse,
 )
-from polar_bayes.physics.part import Parameters, Part, check_part, parameters_of
+from polar_bayes.physics.part import (
+    Parameters,
+    Part,
+    check_part,
+    like,
+    parameters_of,
+    quotient,
+    squared_rule,
+)
 from polar_bayes.physics.stack import Stack
-from polar_bayes.physics.stokes import Light, mirror_light
+from polar_bayes.physics.stokes import Light, mirror_light, polarized_through
+
+# Directions inside, by zenith and by azimuth of grooves, where facets turn light back.
+HEMISPHERE_NODES, GROOVE_AZIMUTHS = 8, 4
 
 # --- The way out: what a surface does to light that leaves the body -------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class AbstractExit(Part):
-    """How unpolarized light passes from the body to the viewer."""
+    """How unpolarized light passes from the body to the viewer.
+
+    Args:
+        both_ways: Whether light enters the body as it leaves it, or as through a plane.
+    """
+
+    both_ways: ClassVar[bool] = False
 
     @abc.abstractmethod
     def light(
@@ -64,6 +88,11 @@ class RoughExit(AbstractExit):
     r"""Through the facets that the viewer sees.
 
     $$ E_0 = \sum_i w_i T_+, \qquad E_1 = -\sum_i w_i K \sin^2\theta_i \cos 2\psi_i $$
+
+    Light enters as through a plane, which costs nothing. So viewer and light may not change
+    places: at roughness .3 a body lit at 80 degrees and seen from the normal is 20 % darker than
+    lit from the normal and seen at 80 degrees, over both cosines; at roughness .1, 4.5 %. Where
+    that matters, `RoughPassage` enters through the facets, too.
     """
 
     @override
@@ -80,15 +109,33 @@ class RoughExit(AbstractExit):
         passing = per_facet(stack).transmission(sample.cos_incidence, sample.sin_squared)
         area = jnp.sum(sample.weight, axis=-2)
         light = sum_facets(sample, sample.weight, passing)
-        light = light._replace(intensity=light.intensity / area)
+        light = light._replace(intensity=quotient(light.intensity, area))
         return Light(*jax.lax.optimization_barrier(tuple(light)))
+
+
+@dataclasses.dataclass(frozen=True)
+class RoughPassage(RoughExit):
+    r"""Through facets on the way in, on the way out, and where light is turned back inside.
+
+    $$ S_0 = \frac{A \cos\theta_l E_0(l) E_0(v)}{\pi n^2 (1 - A F_i)}, \qquad
+       1 - F_i = \frac{1}{n^2} \int_0^1 2\mu E_0(\mu)\, d\mu $$
+
+    Viewer and light may change places, and surface and body together give back no more than comes.
+    Each ray that enters, and each of 8 directions inside, costs as much as the way out.
+    """
+
+    both_ways: ClassVar[bool] = True
+
+    @override
+    def simpler(self) -> tuple[Part | None, ...]:
+        return (RoughExit(), SmoothExit())
 
 
 def exit_through_plane(stack: Stack, geometry: Geometry) -> Light:
     """Transmittance and polarization of a plane surface; the shapes of `AbstractExit.light`."""
     cos_view, sin_view = cos_degrees(geometry.view_zenith), sin_degrees(geometry.view_zenith)
     passing = stack.transmission(cos_view, sin_view**2)
-    q = passing.contrast * sin_view**2 / passing.mean
+    q = quotient(passing.contrast * sin_view**2, passing.mean)
     return Light(passing.mean, q, jnp.zeros_like(q))
 
 
@@ -139,6 +186,11 @@ class AbstractSurface(Part):
             Light whose intensity is the transmittance; q <= 0, along the plane of the viewer.
         """
 
+    def escape(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Array:
+        """Share of diffuse light in the body that is not turned back, broadcasts with views."""
+        del parameters, geometry
+        return stack.escape()
+
 
 @dataclasses.dataclass(frozen=True)
 class SmoothSurface(AbstractSurface):
@@ -188,7 +240,8 @@ class RoughSurface(AbstractSurface):
         quadrature: How many facets stand for all.
         slopes: How steep they are in which direction.
         shadowing: Which of them are seen.
-        way_out: Whether light from the body leaves through facets or a plane.
+        way_out: Whether light from the body leaves through facets or a plane, or passes facets both
+            ways.
 
     Raises:
         SceneError: A part is of the wrong kind.
@@ -208,7 +261,7 @@ class RoughSurface(AbstractSurface):
             ("quadrature", FacetQuadrature, "FacetQuadrature(along=6, across=5)"),
             ("slopes", AbstractSlopes, "IsotropicSlopes() or AnisotropicSlopes(azimuth=0.0)"),
             ("shadowing", AbstractShadowing, "SeparableShadowing(), NoShadowing()"),
-            ("way_out", AbstractExit, "RoughExit() or SmoothExit()"),
+            ("way_out", AbstractExit, "RoughExit() or SmoothExit(), RoughPassage()"),
         ):
             check_part(getattr(self, name), f"RoughSurface: {name}", kind, examples)
 
@@ -229,18 +282,48 @@ class RoughSurface(AbstractSurface):
 
     @override
     def entering(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
-        return self.illumination.entering(stack, geometry, parameters)
+        if not self.way_out.both_ways:
+            return self.illumination.entering(stack, geometry, parameters)
+        light = self.beams(parameters, geometry, stack)[1]
+        total = jnp.sum(light.intensity, axis=-1)
+        q, u = (jnp.sum(light.intensity * share, axis=-1) for share in (light.q, light.u))
+        return Light(total, quotient(q, total), quotient(u, total))
 
     @override
     def beams(
         self, parameters: Parameters, geometry: Geometry, stack: Stack
     ) -> tuple[Geometry, Light]:
-        return self.illumination.beams(stack, geometry, parameters)
+        if not self.way_out.both_ways:
+            return self.illumination.beams(stack, geometry, parameters)
+        rays, irradiance = self.illumination.rays(geometry)
+        each = per_ray(dict(parameters))
+        passing = self.exit(each, rays.reversed(), per_ray(stack))
+        power = irradiance * cos_degrees(rays.light_zenith) * passing.intensity
+        incident = self.illumination.incident(each, rays)
+        if incident is None:
+            return rays, passing._replace(intensity=power)
+        return rays, polarized_through(passing._replace(intensity=power), *incident)
 
     @override
     def exit(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
         ellipse = self.slopes.ellipse(parameters, geometry)
         return self.way_out.light(self.facets, ellipse, stack, geometry)
+
+    @override
+    def escape(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Array:
+        if not self.way_out.both_ways:
+            return stack.escape()
+        # Azimuths a right angle apart see the same grooves from both sides of an axis of theirs.
+        cosine, weight = (like(x, geometry.view_zenith) for x in squared_rule(HEMISPHERE_NODES))
+        turns = jnp.arange(0.0, 180.0, 180.0 / GROOVE_AZIMUTHS) if self.slopes.turned else [0.0]
+        zenith, azimuth = jnp.meshgrid(jnp.rad2deg(jnp.arccos(cosine)), jnp.asarray(turns))
+        some = per_ray(geometry.view_zenith) * 0.0
+        down, around = some + zenith.ravel(), some + azimuth.ravel()
+        views = Geometry(down, around, down, around)
+        passing = self.exit(per_ray(dict(parameters)), views, per_ray(stack)).intensity
+        share = jnp.tile(2.0 * cosine * weight, len(turns)) / len(turns)
+        more = jnp.sum(share * passing, axis=-1) - stack.hemispherical_transmission()
+        return stack.escape() + more / parameters["refractive_index"] ** 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,9 +345,9 @@ class Interface:
         """What happens to light on its way out; see `AbstractSurface.exit`."""
         return self.surface.exit(parameters, geometry, self.stack)
 
-    def escape(self) -> Array:
+    def escape(self, parameters: Parameters, geometry: Geometry) -> Array:
         """Share of diffuse light in the body that is not turned back; see `Stack.escape`."""
-        return self.stack.escape()
+        return self.surface.escape(parameters, geometry, self.stack)
 
 
 # --- What the interface turns back into the body: light gets another chance to come out -----------

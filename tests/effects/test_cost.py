@@ -11,7 +11,13 @@ from cases import each
 import polar_bayes as pb
 from polar_bayes.effects.posterior_change import compile_and_count, run_seconds
 from polar_bayes.effects.variants import effects_of, simplify
-from polar_bayes.physics.boundary import Medium, medium, relative_reflection, transmission
+from polar_bayes.physics.boundary import (
+    Medium,
+    medium,
+    reflection,
+    reflection_shape,
+    transmission,
+)
 from polar_bayes.physics.geometry import cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization
 
@@ -110,12 +116,14 @@ def by_hand(parameters, geometry):
     )
     seen = [facets.shadowing((sin / cos) ** 2, roughness) for cos, sin in (views, lights)]
     air = Medium(jnp.ones(()), facet.cos_incidence)
-    mirrored = relative_reflection(air, medium(index, facet.cos_incidence**2), facet.sin_squared)
+    inside = medium(index, facet.cos_incidence**2)
+    mirrored = reflection(air, inside, facet.sin_squared)
+    shape = reflection_shape(air, inside, facet.sin_squared)
     density = facets.density(facet.tan_squared_tilt, roughness)
     brightness = density * (seen[0] * seen[1]) / (4.0 * views[0])
-    polarized = mirrored.contrast / mirrored.mean
+    polarized = shape.contrast / shape.mean
     surface = Light(
-        brightness * ((index**2 - 1.0) ** 2 * mirrored.mean),
+        brightness * mirrored.mean,
         polarized * facet.along_s,
         -polarized * facet.across_s,
     )

@@ -25,6 +25,7 @@ DIRECTIONS = {
     "azimuth past a full turn": (50.0, 60.0, 530.0),
     "far from the mirror direction": (80.0, 10.0, 30.0),
     "mirror direction, grazing": (89.0, 89.0, 180.0),
+    "mirror direction, beyond any instrument": (89.9, 89.9, 180.0),
     "light grazing from the side": (20.0, 89.9, 135.0),
     "viewer grazing, light high": (89.9, 5.0, 180.0),
     "both grazing, same side": (89.9, 89.8, 1.0),
@@ -32,8 +33,9 @@ DIRECTIONS = {
     "viewer alone close to 90": (89.999, 45.0, 170.0),
 }
 
-# Directions that single precision does not tell from 90 degrees.
-DOUBLE_ONLY = {
+# Directions beyond 89.999 degrees, which single precision counts as 89.999.
+UNRESOLVED = {
+    "last number before 90 in single precision": (89.99999237, 89.99999237, 180.0),
     "a hair before 90": (89.9999999, 89.9999999, 180.0),
     "viewer a hair before 90": (89.9999999, 45.0, 170.0),
 }
@@ -177,18 +179,6 @@ EFFECTS: dict[str, dict[str, float | tuple[str, float]]] = {
     "colorless body like air": {"cauchy_a": 1.0, "cauchy_b": 0.0, "sellmeier_strength": 0.0},
 }
 
-# Here second derivatives leave the range of single precision, 3e38: the highlight is 1e-5 wide and
-# 1e13 bright, or the inner angle turns by 90 degrees within an index change of 1e-10.
-BEYOND_SINGLE = {
-    f"{direction} / {material}"
-    for direction in ("close to 90", "viewer alone close to 90")
-    for material in ("at the floor of roughness", "everything at once")
-}
-
-
-# Effects that leave less light than single precision can divide by.
-TOO_DARK_FOR_SINGLE = {"black coat", "black, depolarizing body under absorbing air"}
-
 
 class Cases(NamedTuple):
     """Named cases with their directions (case, 3) and materials (case, 4)."""
@@ -198,13 +188,12 @@ class Cases(NamedTuple):
     materials: np.ndarray
 
 
-def every_case(dtype: type) -> Cases:
-    """Every direction with every material, in one precision."""
-    directions = DIRECTIONS | (DOUBLE_ONLY if dtype == np.float64 else {})
+def every_case(dtype: type, *, exact: bool = False) -> Cases:
+    """Every direction with every material, in one precision; `exact`: as they were given."""
+    directions = DIRECTIONS | ({} if exact and dtype == np.float32 else UNRESOLVED)
     pairs = [
         (f"{direction} / {material}", directions[direction], MATERIALS[material])
         for direction, material in itertools.product(directions, MATERIALS)
-        if dtype == np.float64 or f"{direction} / {material}" not in BEYOND_SINGLE
     ]
     names, angles, materials = zip(*pairs, strict=True)
     return Cases(list(names), np.array(angles, dtype), np.array(materials, dtype))
@@ -223,22 +212,73 @@ def every_effect(dtype: type, count: int) -> EffectCases:
 
     The cases are repeated up to a count: operations of one shape compile once.
     """
-    directions = DIRECTIONS | (DOUBLE_ONLY if dtype == np.float64 else {})
-    effects = [e for e in EFFECTS if dtype == np.float64 or e not in TOO_DARK_FOR_SINGLE]
+    directions = DIRECTIONS | UNRESOLVED
     others = [name for name in MATERIALS if name != "ordinary"]
     rows = []
-    for turn, (direction, effect) in enumerate(itertools.product(directions, effects)):
+    for turn, (direction, effect) in enumerate(itertools.product(directions, EFFECTS)):
         # Steps without a common factor: each direction and each effect meets every material.
         for material in ("ordinary", *(others[(turn * step) % len(others)] for step in (5, 7))):
-            if dtype == np.float64 or f"{direction} / {material}" not in BEYOND_SINGLE:
-                values = ORDINARY | EFFECTS[effect] | MATERIALS[material]._asdict()
-                values = {
-                    name: values[value[0]] * value[1] if isinstance(value, tuple) else value
-                    for name, value in values.items()
-                }
-                name = f"{direction} / {material} / {effect}"
-                rows.append((name, directions[direction], values))
+            values = ORDINARY | EFFECTS[effect] | MATERIALS[material]._asdict()
+            values = {
+                name: values[value[0]] * value[1] if isinstance(value, tuple) else value
+                for name, value in values.items()
+            }
+            name = f"{direction} / {material} / {effect}"
+            rows.append((name, directions[direction], values))
     rows = [rows[i % len(rows)] for i in range(max(count, len(rows)))]
     names, angles, values = zip(*rows, strict=True)
     parameters = {name: np.array([one[name] for one in values], dtype) for name in values[0]}
     return EffectCases(list(names), np.array(angles, dtype), parameters)
+
+
+# Lowest and highest value of parameters drawn at random; True: uniform in the logarithm. A third
+# of the draws take an end or a state of the catalogue.
+SPANS: dict[str, tuple[float, float, bool]] = {
+    "roughness": (1e-5, 10.0, True),
+    "roughness_across": (1e-5, 10.0, True),
+    "subsurface_fraction": (0.0, 1.0, False),
+    "absorption": (1e-4, 1e6, True),
+    "refractive_index": (1.0, 3.0, False),
+    "roughness_azimuth": (-180.0, 180.0, False),
+    "albedo": (0.0, 1.0, False),
+    "polarized_fraction": (0.0, 1.0, False),
+    "coat_refractive_index": (1.0, 3.0, False),
+    "coat_absorbance": (1e-4, 100.0, True),
+    "film_refractive_index": (1.0, 3.0, False),
+    "film_thickness": (1.0, 1e4, True),
+    "cauchy_a": (1.0, 2.0, False),
+    "cauchy_b": (0.0, 0.02, False),
+    "sellmeier_strength": (0.0, 2.0, False),
+    "sellmeier_resonance": (0.0, 0.02, False),
+    "light_degree": (0.0, 1.0, False),
+    "light_angle": (-180.0, 180.0, False),
+    "beam_overlap_zenith": (45.0, 89.9, False),
+    "normal_tilt_x": (-5.0, 5.0, False),
+    "normal_tilt_y": (-5.0, 5.0, False),
+}
+
+
+def random_directions(count: int, generator: np.random.Generator) -> np.ndarray:
+    """Half of them grazing, down to 1e-5 degrees; four in ten in or near the mirror direction."""
+
+    def zeniths() -> np.ndarray:
+        grazing = 90.0 - 10.0 ** generator.uniform(-5.0, 1.0, count)
+        return np.where(generator.random(count) < 0.5, grazing, generator.uniform(0, 90.0, count))
+
+    view, light = zeniths(), zeniths()
+    kind = generator.random(count)
+    near = np.abs(view - 10.0 ** generator.uniform(-6.0, 0.0, count))
+    light = np.where(kind < 0.3, view, np.where(kind < 0.4, near, light))
+    turn = generator.uniform(-180.0, 360.0, count)
+    return np.stack([view, light, np.where(generator.random(count) < 0.6, 180.0, turn)], axis=1)
+
+
+def random_parameter(name: str, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Values of one parameter all over its span, its ends and its states of the catalogue."""
+    low, high, logarithmic = SPANS[name]
+    share = generator.random(count)
+    drawn = low * (high / low) ** share if logarithmic else low + (high - low) * share
+    states = [getattr(m, name) for m in MATERIALS.values()] if name in Material._fields else []
+    states += [e[name] for e in EFFECTS.values() if isinstance(e.get(name), float)]
+    special = generator.choice(np.array([low, high, *states]), count)
+    return np.where(generator.random(count) < 1 / 3, special, drawn)

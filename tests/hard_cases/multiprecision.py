@@ -111,8 +111,18 @@ def half_space_albedo(absorption: mp.mpf) -> mp.mpf:
     return (1 - g) * (1 - mp.mpf("0.139") * g) / (1 + mp.mpf("1.170") * g)
 
 
-def hemispherical_reflection(n: mp.mpf, nodes: list, weights: list) -> mp.mpf:
-    return mp.fsum(2 * w * x * interface(x, n).mean for x, w in zip(nodes, weights, strict=True))
+def hemispherical_reflection(n: mp.mpf) -> mp.mpf:
+    """Walsh's closed form (1926), in Duntley's writing (1942)."""
+    if n == 1:
+        return mp.mpf(0)
+    square = n**2
+    return (
+        mp.mpf(1) / 2
+        + (n - 1) * (3 * n + 1) / (6 * (n + 1) ** 2)
+        + square * (square - 1) ** 2 / (square + 1) ** 3 * mp.log((n - 1) / (n + 1))
+        - 2 * n**3 * (square + 2 * n - 1) / ((square + 1) * (square**2 - 1))
+        + 8 * square**2 * (square**2 + 1) / ((square + 1) * (square**2 - 1) ** 2) * mp.log(n)
+    )
 
 
 class Boundary(NamedTuple):

@@ -13,10 +13,13 @@ from hard_cases.catalogue import (
     INSTRUMENTS,
     MATERIALS,
     ORDINARY,
+    SPANS,
     WAVELENGTH,
     Material,
     every_case,
     every_effect,
+    random_directions,
+    random_parameter,
 )
 from jaxtyping import Array
 
@@ -42,7 +45,13 @@ from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, TurbidMedium, Unpolarized
-from polar_bayes.physics.surface import InternalReflection, RoughSurface, SmoothExit, SmoothSurface
+from polar_bayes.physics.surface import (
+    InternalReflection,
+    RoughPassage,
+    RoughSurface,
+    SmoothExit,
+    SmoothSurface,
+)
 
 READINGS = ("dop", "q", "u", "intensity")
 
@@ -92,6 +101,9 @@ ALL_SCENES = (
     | EFFECT_SCENES
     | {
         "GGX, point": Scene(RoughSurface(GGX()), Depolarizer(), StokesMixing()),
+        "facets both ways": Scene(
+            RoughSurface(quadrature=FEW, way_out=RoughPassage()), Depolarizer(), StokesMixing()
+        ),
         "GGX, sky": Scene(RoughSurface(GGX(), UniformSky()), Lambertian(), StokesMixing()),
         "Beckmann, sky": Scene(
             RoughSurface(Beckmann(), UniformSky()), Depolarizer(), DopMixing(signed=True)
@@ -144,13 +156,7 @@ def readings(scene: Scene, row: Array) -> Array:
     return jnp.concatenate([predicted[name] for name in READINGS])
 
 
-# Single precision of the turbid body is tested where it is made: tests/physics/test_half_space.py.
-RUNS = [
-    (name, dtype)
-    for name in ALL_SCENES
-    for dtype in (np.float64, np.float32)
-    if (name, dtype) != ("a turbid body", np.float32)
-]
+RUNS = [(name, dtype) for name in ALL_SCENES for dtype in (np.float64, np.float32)]
 # Every state of the catalogue meets them. They hold nearly every kind of part; the turbid body and
 # the beam's overlap, whose scenes compile longest, and parts that repeat are in the others.
 DOUBLE = {
@@ -164,19 +170,40 @@ FIRST = [(n, dtype) for n, dtype in RUNS if n in (SINGLE if dtype == np.float32 
 
 @each(("name", "dtype"), FIRST)
 def test_value_gradient_and_hessian_are_finite(name: str, dtype: type) -> None:
-    check_finite(name, dtype)
+    check_finite(name, *rows(ALL_SCENES[name], dtype))
 
 
 @pytest.mark.thorough
 @each(("name", "dtype"), [run for run in RUNS if run not in FIRST])
 def test_value_gradient_and_hessian_of_other_scenes_are_finite(name: str, dtype: type) -> None:
-    check_finite(name, dtype)
+    check_finite(name, *rows(ALL_SCENES[name], dtype))
 
 
-def check_finite(name: str, dtype: type) -> None:
+# Points drawn at random, of all scenes together.
+POINTS = 65_000
+
+
+@pytest.mark.thorough
+@each(("name", "dtype"), RUNS)
+def test_random_points_are_finite(name: str, dtype: type) -> None:
+    scene, generator = ALL_SCENES[name], np.random.default_rng(25)
+    count = POINTS // len(ALL_SCENES)
+    columns = [random_directions(count, generator)]
+    for parameter in scene.parameters:
+        if parameter in SPANS:
+            columns.append(random_parameter(parameter, count, generator)[:, None])
+        else:
+            usual = np.atleast_1d(INSTRUMENTS["ordinary"][parameter])
+            columns.append(np.tile(usual, (count, 1)))
+    # The last number before 90 degrees belongs to the contract, 90 itself does not.
+    inputs = np.concatenate(columns, axis=1).astype(dtype)
+    inputs[:, :2] = np.minimum(inputs[:, :2], np.nextafter(dtype(90.0), dtype(0.0)))
+    check_finite(name, [str(row) for row in inputs], inputs)
+
+
+def check_finite(name: str, names: list[str], inputs: np.ndarray) -> None:
     """Every row of one scene, in one precision."""
-    scene = ALL_SCENES[name]
-    names, inputs = rows(scene, dtype)
+    scene, dtype = ALL_SCENES[name], inputs.dtype
     generator = np.random.default_rng(20)
     # A sum over readings, and a Hessian times a vector, hide nothing: one entry that is not
     # finite spoils its row. They compile in a fraction of the time of the full Hessian.

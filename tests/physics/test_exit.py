@@ -8,12 +8,23 @@ from cases import each
 from textbook import mirror_and_body
 
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.microfacet import AnisotropicSlopes
+from polar_bayes.physics.illumination import PointSource
+from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Layer, Stack
+from polar_bayes.physics.stokes import Light, LinearPolarization
 from polar_bayes.physics.subsurface import Lambertian
-from polar_bayes.physics.surface import RoughExit, RoughSurface, SmoothExit, SmoothSurface
+from polar_bayes.physics.surface import (
+    AbstractExit,
+    Interface,
+    InternalReflection,
+    RoughExit,
+    RoughPassage,
+    RoughSurface,
+    SmoothExit,
+    SmoothSurface,
+)
 
 ZENITHS = jnp.array([0.0, 30.0, 60.0, 80.0])
 VIEWS = Geometry(ZENITHS, jnp.full(4, 20.0), ZENITHS, jnp.full(4, 200.0))
@@ -90,3 +101,94 @@ def test_a_scene_takes_its_way_out_from_the_surface() -> None:
 def test_only_the_rough_way_out_has_something_simpler() -> None:
     assert RoughExit().simpler() == (SmoothExit(),)
     assert SmoothExit().simpler() == ()
+
+
+# --- what may pass both ways: energy and reciprocity ---------------------------------------------
+
+WHITE = Lambertian(1.0, InternalReflection())
+
+
+def body(way_out: AbstractExit) -> Scene:
+    return Scene(RoughSurface(way_out=way_out), WHITE, StokesMixing())
+
+
+def returned(way_out: AbstractExit, light_zenith: float, roughness: float) -> float:
+    """Share of a beam that surface and body together send back, over 40 x 40 directions."""
+    node, weight = np.polynomial.legendre.leggauss(40)
+    cosine, turn = 0.5 * (1.0 + node), 4.5 + 9.0 * np.arange(40)
+    zenith, azimuth = (
+        grid.ravel() for grid in np.meshgrid(np.rad2deg(np.arccos(cosine)), turn, indexing="ij")
+    )
+    geometry = Geometry.from_degrees(
+        view_zenith=zenith, view_azimuth=azimuth, light_zenith=light_zenith, light_azimuth=0.0
+    )
+    # Half surface and half body, twice: both together.
+    material = {"roughness": roughness, "refractive_index": 1.5, "subsurface_fraction": 0.5}
+    light = body(way_out).light(material, geometry).intensity.reshape(40, 40)
+    sent = np.sum(light * (0.5 * weight * cosine)[:, None]) * 2.0 * np.pi / 40.0
+    return float(2.0 * sent / np.cos(np.deg2rad(light_zenith)))
+
+
+@each("light_zenith", [20.0, 50.0])
+def test_what_passes_facets_both_ways_gives_back_no_more_than_comes(light_zenith: float) -> None:
+    """A white body; what facets turn into the surface or hide is lost, and nothing is made.
+
+    The rule over directions is good to 2e-4, which is allowed on top of what docs/scenes.md states.
+    """
+    rule = 2e-4
+    for roughness in (0.2, 0.5):
+        assert returned(RoughPassage(), light_zenith, roughness) <= 1.0 + rule
+        assert returned(RoughExit(), light_zenith, roughness) <= 1.014 + rule
+        assert returned(SmoothExit(), light_zenith, roughness) <= 1.003 + rule
+
+
+def swapped(way_out: AbstractExit, roughness: float, zenith: float, **parts: object) -> float:
+    """Brightness lit from that zenith and seen from the normal, over that of the reverse."""
+    there = Geometry(*(jnp.array([x]) for x in (0.0, 180.0, zenith, 0.0)))
+    material = {"roughness": roughness, "roughness_across": 0.2, "refractive_index": 1.5}
+    material = {name: jnp.array([value]) for name, value in material.items()}
+    interface = Interface(
+        RoughSurface(way_out=way_out, **parts), Stack(material["refractive_index"])
+    )
+    forth, back = (
+        WHITE.light(material, geometry, interface).intensity
+        for geometry in (there, there.reversed())
+    )
+    return float((forth / back)[0] / np.cos(np.deg2rad(zenith)))
+
+
+def test_viewer_and_light_may_change_places_where_light_passes_facets_both_ways() -> None:
+    for parts in ({}, {"slopes": AnisotropicSlopes(30.0)}, {"distribution": GGX()}):
+        for roughness, zenith in ((0.1, 60.0), (0.3, 85.0)):
+            assert swapped(RoughPassage(), roughness, zenith, **parts) == pytest.approx(
+                1.0, rel=1e-12
+            )
+            assert swapped(SmoothExit(), roughness, zenith, **parts) == pytest.approx(
+                1.0, rel=1e-12
+            )
+
+
+def test_how_far_a_plane_on_the_way_in_is_from_reciprocal() -> None:
+    """The numbers that `RoughExit` states."""
+    for roughness, zenith, short in ((0.1, 80.0, 0.045), (0.3, 80.0, 0.20), (0.3, 85.0, 0.47)):
+        assert 1.0 - swapped(RoughExit(), roughness, zenith) == pytest.approx(short, rel=0.05)
+
+
+def test_polarized_light_enters_through_facets_as_it_leaves() -> None:
+    """s and p light together are unpolarized light; a smooth surface is a plane."""
+    views = Geometry(
+        *(jnp.array([x, x]) for x in (40.0, 0.0)), *(jnp.array([x, 20.0]) for x in (60.0, 180.0))
+    )
+    material = {"roughness": jnp.array([0.2]), "refractive_index": jnp.array([1.5])}
+    stack = Stack(material["refractive_index"])
+
+    def entering(angle: float | None, way_out: AbstractExit, roughness: float) -> Light:
+        light = None if angle is None else LinearPolarization(1.0, angle)
+        surface = RoughSurface(illumination=PointSource(light), way_out=way_out)
+        return surface.entering(material | {"roughness": jnp.array([roughness])}, views, stack)
+
+    s, p, none = (entering(angle, RoughPassage(), 0.2).intensity for angle in (0.0, 90.0, None))
+    np.testing.assert_allclose((s + p) / 2.0, none, rtol=1e-12)
+    for angle in (None, 0.0, 30.0, 90.0):
+        rough, plane = (entering(angle, way, 1e-5) for way in (RoughPassage(), SmoothExit()))
+        np.testing.assert_allclose(rough, plane, atol=1e-8)

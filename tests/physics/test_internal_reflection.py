@@ -32,7 +32,7 @@ BODIES = each("body", [Lambertian, Unpolarized])
 @each("albedo", [0.0, 0.3, 0.9, 1.0])
 def test_light_comes_out_after_any_number_of_round_trips(body: type, albedo: float) -> None:
     """The closed form against 400 terms of the series; n^2 spreads the light over air."""
-    inside = 1.0 - float(INTERFACE.escape()[0])
+    inside = 1.0 - float(INTERFACE.stack.escape()[0])
     series = np.sum((albedo * inside) ** np.arange(400)) / 1.5**2
     once = body(albedo).light(MATERIAL, VIEWS, INTERFACE)
     all_trips = body(albedo, InternalReflection()).light(MATERIAL, VIEWS, INTERFACE)
@@ -72,7 +72,7 @@ def test_without_it_a_depolarizer_keeps_what_a_half_space_loses() -> None:
     np.testing.assert_allclose(once.q, lost * leaving.q, rtol=1e-14)
     # Light that is turned back is scattered again: brighter and less polarized.
     assert np.all(all_trips.intensity > once.intensity)
-    escaping = INTERFACE.escape()
+    escaping = INTERFACE.stack.escape()
     np.testing.assert_allclose(
         all_trips.intensity * (lost + (1.0 - lost) * escaping), once.intensity, rtol=1e-14
     )

@@ -1,5 +1,6 @@
 """Distributions of slopes: every one obeys the same laws."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -80,6 +81,8 @@ def test_shadowing_falls_towards_grazing(distribution: Beckmann | GGX) -> None:
 def test_roughness_has_a_floor(distribution: Beckmann | GGX) -> None:
     assert distribution.density(0.0, 0.0) == distribution.density(0.0, SMOOTHEST)
     assert np.isfinite(distribution.density(0.0, 0.0))
+    slope = float(jax.grad(distribution.density, 1)(0.0, SMOOTHEST))
+    assert slope == pytest.approx(float(-2.0 * distribution.density(0.0, SMOOTHEST) / SMOOTHEST))
 
 
 @each("dtype", [np.float64, np.float32])

@@ -76,13 +76,14 @@ def material(along: float, across: float, turn: float = 0.0) -> dict[str, float]
     ids=["point", "disc", "sky"],
 )
 def test_equal_roughnesses_are_isotropic(source: object, name: str) -> None:
-    """To rounding for every source: both sides of the plane are sampled at the same slopes."""
+    """Averages take other facets in the grooves' frame, each within its error."""
     same = material(0.3, 0.3, 37.0)
     both, one = (
         stokes_of(scene(source, slopes, DISTRIBUTIONS[name]), same, seen())
         for slopes in (ALONG, IsotropicSlopes())
     )
-    np.testing.assert_allclose(both, one, rtol=1e-11, atol=1e-15)
+    np.testing.assert_allclose(both[:, 0], one[:, 0], rtol=3e-3)
+    np.testing.assert_allclose(both[:, 1:] / one[:, :1], one[:, 1:] / one[:, :1], atol=3e-3)
 
 
 @pytest.mark.thorough
@@ -115,7 +116,7 @@ def test_along_an_axis_of_symmetry_there_is_no_u(source: object) -> None:
     plane = seen()._replace(view_azimuth=jnp.full(4, 40.0), light_azimuth=jnp.full(4, 220.0))
     for turn in (40.0, 130.0):
         found = stokes_of(scene(source, ALONG), material(0.4, 0.15, turn), plane)
-        np.testing.assert_allclose(found[:, 2], 0.0, atol=1e-14)
+        np.testing.assert_allclose(found[:, 2], 0.0, atol=1e-10)
 
 
 @given(
@@ -149,11 +150,7 @@ GROOVES = np.array(
 @pytest.mark.thorough
 @each("name", DISTRIBUTIONS)
 def test_sky_and_way_out_agree_with_brute_force(name: str) -> None:
-    """360,000 facets by vectors, to 1e-5, against 30 x 30; and what the default of 30 costs.
-
-    Up to a ratio of 4 that is 6e-4 in every number; at a ratio of 10 seen from the side, 3.5 % of
-    the brightness and .022 of q and u.
-    """
+    """360,000 facets by vectors, to 1e-5, against 30 x 30; and what the default costs."""
     along, across, turn, view = (jnp.asarray(column)[:, None] for column in GROOVES.T)
     geometry = Geometry(view, jnp.full_like(view, 30.0), view, jnp.zeros_like(view))
     parameters = {"roughness": along, "roughness_across": across, "roughness_azimuth": turn}
@@ -163,10 +160,10 @@ def test_sky_and_way_out_agree_with_brute_force(name: str) -> None:
         population = twin.Population(name, *row[:3], steps=600)
         skies.append(population.sky(row[3], 30.0, 1.5, correlated=True))
         exits.append(population.way_out(row[3], 30.0, 1.5))
-    steep = GROOVES[:, :1] > 0.45
+    stated = 3e-3 if name == "GGX" else 1e-3
     for quadrature, bright, polarized in (
         (FacetQuadrature(30, 30), 2e-5, 5e-6),
-        (FacetQuadrature(), np.where(steep, 0.036, 6e-4), np.where(steep, 0.023, 6e-4)),
+        (FacetQuadrature(), 2.0 * stated, stated),
     ):
         surface = RoughSurface(
             DISTRIBUTIONS[name], UniformSky(), quadrature, ALONG, HeightCorrelatedShadowing()
@@ -182,6 +179,45 @@ def test_sky_and_way_out_agree_with_brute_force(name: str) -> None:
             assert np.all(np.abs(light.intensity / total - 1.0) <= bright)
             assert np.all(np.abs(light.q - q / total) <= polarized)
             assert np.all(np.abs(light.u - u / total) <= polarized)
+
+
+@each("name", DISTRIBUTIONS)
+def test_the_default_serves_steep_grooves_from_any_side(name: str) -> None:
+    """A slope ratio of 20, where nodes in the viewer's frame were off by .07 in q and u."""
+    views = jnp.array([20.0, 40.0, 56.0, 70.0, 80.0])
+    turns = jnp.array([0.0, 15.0, 30.0, 60.0, 90.0])[:, None]
+    geometry = Geometry(*jnp.broadcast_arrays(views, 0.0, views, 180.0))
+    parameters = material(0.02, 0.4) | {"roughness_azimuth": turns}
+    stack = Stack(jnp.array([1.5]))
+
+    def light(quadrature: FacetQuadrature) -> list:
+        surface = RoughSurface(DISTRIBUTIONS[name], UniformSky(), quadrature, ALONG)
+        return [
+            surface.light(parameters, geometry, stack),
+            surface.exit(parameters, geometry, stack),
+        ]
+
+    both = jax.jit(lambda: (light(FacetQuadrature()), light(FacetQuadrature(24, 24))))()
+    stated = 3e-3 if name == "GGX" else 1e-3
+    for found, truth in zip(*both, strict=True):
+        np.testing.assert_allclose(found.q, truth.q, atol=stated)
+        np.testing.assert_allclose(found.u, truth.u, atol=stated)
+        np.testing.assert_allclose(found.intensity, truth.intensity, rtol=2.0 * stated)
+
+
+@each("name", DISTRIBUTIONS)
+@each("slopes", [IsotropicSlopes(), ALONG], ids=["isotropic", "grooves"])
+def test_facets_of_a_smooth_surface_sum_to_one(name: str, slopes: object) -> None:
+    """Under a sky a surface as smooth as can be is a mirror; nodes of GGX were .0015 short."""
+    views = jnp.array([0.0, 30.0, 56.0, 80.0])
+    geometry = Geometry(*jnp.broadcast_arrays(views, 20.0, views, 200.0))
+    found = RoughSurface(DISTRIBUTIONS[name], UniformSky(), slopes=slopes)
+    stack = Stack(jnp.array([1.5]))
+    smooth = {key: jnp.asarray(value) for key, value in material(0.0, 0.0).items()}
+    light = found.light(smooth, geometry, stack)
+    cosine, square = jnp.cos(jnp.deg2rad(views)), jnp.sin(jnp.deg2rad(views)) ** 2
+    bound = 2e-5 if name == "GGX" else 2e-4
+    np.testing.assert_allclose(light.intensity, stack.reflection(cosine, square).mean, rtol=bound)
 
 
 def test_the_azimuth_is_a_number_or_a_parameter() -> None:

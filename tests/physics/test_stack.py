@@ -246,3 +246,19 @@ def test_shapes_broadcast_over_facets() -> None:
     cosine = jnp.full((2, 5), 0.5)
     assert stack.reflection(cosine, 1.0 - cosine**2).mean.shape == (2, 5)
     assert stack.transmission(cosine, 1.0 - cosine**2).contrast.shape == (2, 5)
+
+
+@each(("thickness", "bound"), [(230.0, 1e-12), (3000.0, 1e-9), (1e4, 2e-4)])
+def test_fringes_over_the_hemisphere_have_enough_nodes(thickness: float, bound: float) -> None:
+    """Films of several indices against 800 nodes; too few make a body return what it never got."""
+    film, n = (jnp.asarray(x.ravel()) for x in np.meshgrid([1.38, 2.0, 2.4], [1.2, 1.5, 2.0]))
+    wavenumber = jnp.full(9, 4.0 * np.pi * thickness / 550.0)
+    found = jax.jit(lambda: Stack(n, (Layer(film, wavenumber=wavenumber),)).escape())()
+    node, weight = np.polynomial.legendre.leggauss(800)
+    cosine = jnp.asarray(np.tile((0.5 * (1.0 + node)) ** 2, (9, 1)))
+    each_ray = (array[:, None] for array in (n, film, wavenumber))
+    index, inside, phase = each_ray
+    stack = Stack(index, (Layer(inside, wavenumber=phase),))
+    through = jax.jit(lambda: stack.transmission(cosine, (1.0 - cosine) * (1.0 + cosine)).mean)()
+    truth = np.sum(through * cosine * (1.0 + node) * weight, axis=-1) / n**2
+    np.testing.assert_allclose(found, truth, rtol=bound)

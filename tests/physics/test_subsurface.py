@@ -1,5 +1,6 @@
 """Bodies: how bright they are and how much polarization they keep."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -120,6 +121,11 @@ def test_half_space_is_near_adding_doubling(half_space: np.ndarray) -> None:
 
 def test_absorption_has_a_floor() -> None:
     assert half_space_loss(jnp.array(0.0)) == half_space_loss(jnp.array(CLEAREST))
+    slope = jax.grad(half_space_loss)
+    assert slope(0.0) == 0.0
+    # At the floor the slope is that from above: it goes as the root of a, 1e-9 higher by 5e-10.
+    nearby = float(slope(CLEAREST * (1.0 + 1e-9)))
+    assert float(slope(CLEAREST)) == pytest.approx(nearby, rel=1e-9)
 
 
 @each("part", [Lambertian, Unpolarized])
