@@ -63,8 +63,8 @@ def calibrate(
     capture: Path, out: Path, no_readings: bool, resume: bool, as_json: bool, **settings: Any
 ) -> int:
     """Simulate captures of this layout, fit each, and test the coverage of the intervals."""
-    settings = read_scene_options(settings)
     data = pb.load_capture(capture)
+    settings = read_scene_options(settings)
     store = out.with_name(f"{out.name}.fits")
     if resume and out.exists() and not store.exists():
         raise pb.FitError("nothing is left to resume", where=str(out), hint="give another --out")
@@ -116,8 +116,8 @@ def identify(
     **settings: Any,
 ) -> None:
     """Which parameters a capture determines, which trade off, and where to look next."""
-    settings = read_scene_options(settings)
     data = pb.load_capture(capture)
+    settings = read_scene_options(settings)
     with stages() as progress:
         settings["progress"] = progress
         results = {"parameters": pb.identify(data, **settings)}

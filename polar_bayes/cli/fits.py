@@ -111,13 +111,13 @@ def fit(
     **settings: Any,
 ) -> int:
     """Fit a capture; prints a row per parameter and writes everything to --out."""
+    data = pb.load_capture(capture)  # a wrong file is told before JAX is loaded
     settings = with_nuts_options(read_scene_options(settings))
     is_auto = settings["method"] == "auto"
     if tolerance is not None and not (choose or is_auto):
         raise click.UsageError("--tolerance needs --choose-effects or --method auto")
     if settings["seconds"] is not None and not is_auto:
         raise click.UsageError("--seconds needs --method auto")
-    data = pb.load_capture(capture)
     with stages() as progress:
         if choose:
             options = {key: settings[key] for key in OF_CHOICE}
@@ -211,8 +211,8 @@ def map_(
 @out_option(RESULT_FILE, "Ledger to write.", required=False)
 def effects(capture: Path, as_json: bool, out: Path | None, **settings: Any) -> None:
     """What each effect changes and costs; which of them this capture can see."""
-    settings = read_scene_options(settings)
     data = pb.load_capture(capture)
+    settings = read_scene_options(settings)
     with stages() as progress:
         ledger: Any = pb.choose_effects(data, progress=progress, **settings).ledger
     if out is not None:
