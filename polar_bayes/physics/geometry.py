@@ -5,6 +5,7 @@ two nearly equal numbers: cosines near grazing come from the complement of the z
 differences of directions from half angles.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -122,6 +123,13 @@ def sin_degrees(angle: Array) -> Array:
 def cos_degrees(angle: Array) -> Array:
     """Cosine of an angle in degrees, accurate up to 90, where a plain cosine loses its digits."""
     return jnp.sin(jnp.deg2rad(90.0 - angle))
+
+
+def resolved_cosine(cosine: Array) -> Array:
+    """Cosine of a zenith from 0 to 90 degrees, as `Geometry.resolved` takes it."""
+    if jnp.finfo(cosine.dtype).eps < 1e-10:
+        return cosine
+    return jnp.maximum(cosine, math.cos(math.radians(STEEPEST_ZENITH)))
 
 
 def double_angle(cos: Array, sin: Array) -> tuple[Array, Array]:

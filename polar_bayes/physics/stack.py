@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from polar_bayes.physics import boundary
 from polar_bayes.physics.boundary import EVANESCENT, Diattenuation, Film, Medium
-from polar_bayes.physics.geometry import per_ray
+from polar_bayes.physics.geometry import per_ray, resolved_cosine
 from polar_bayes.physics.part import like, squared_rule, unit_rule
 
 # Shares and weights for the integral of a bare body's reflectance over the hemisphere.
@@ -146,7 +146,7 @@ class Stack(NamedTuple):
         has_film = any(layer.wavenumber is not None for layer in self.layers)
         cosine, weight = FRINGE_RULE if has_film else HEMISPHERE_RULE
         index = self.refractive_index
-        return like(cosine, index), like(2.0 * cosine * weight, index)
+        return resolved_cosine(like(cosine, index)), like(2.0 * cosine * weight, index)
 
     def _respond(
         self, cos_incidence: Array, sin_squared: Array
