@@ -224,7 +224,10 @@ def _quarter(slope: Array, width: Array) -> Array:
 def _fourfold(quarter: Array) -> tuple[Array, Array]:
     """Tangent of the angle with that tangent of its quarter, and the angle's derivative by it."""
     half = 2.0 * quarter / (1.0 - quarter**2)
-    return 2.0 * half / (1.0 - half**2), 4.0 / (1.0 + quarter**2)
+    # Slopes far out on one side have no weight, but must be finite: rounding may reach 90 degrees.
+    furthest = 1.0 - jnp.finfo(half.dtype).eps
+    half = jnp.clip(half, -furthest, furthest)
+    return 2.0 * half / ((1.0 - half) * (1.0 + half)), 4.0 / (1.0 + quarter**2)
 
 
 # --- How steep facets are in which direction: alike all around, or along and across grooves -------
