@@ -394,9 +394,18 @@ class Priors(dict[str, dist.Distribution]):
     """A dictionary of priors that a notebook shows with their numbers."""
 
     def _repr_html_(self) -> str:
-        columns = ("parameter", "meaning", "prior")
-        rows = tuple(Row(n, (notation(n).meaning, describe_prior(x))) for n, x in self.items())
-        return DisplaySummary("Priors", (), (Table(columns, rows, prose=columns),))._repr_html_()
+        return prior_card(self)._repr_html_()
+
+
+def prior_card(priors: Mapping[str, dist.Distribution]) -> DisplaySummary:
+    """What each parameter means, its prior and its unit."""
+    columns = ("parameter", "meaning", "prior", "unit")
+    words = {name: notation(name) for name in priors}
+    rows = tuple(
+        Row(name, (words[name].meaning, describe_prior(prior), words[name].unit))
+        for name, prior in priors.items()
+    )
+    return DisplaySummary("Priors", (), (Table(columns, rows, prose=columns),))
 
 
 _ROWS: dict[str, dist.Distribution] = {

@@ -163,8 +163,9 @@ def accuracy(
     **settings: Any,
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
+    data = pb.load_capture(capture)
     settings = read_scene_options(settings)
-    data, names = pb.load_capture(capture), methods or tuple(pb.methods.STUDY_METHODS)
+    names = methods or tuple(pb.methods.STUDY_METHODS)
     settings["methods"] = {name: pb.methods.STUDY_METHODS[name] for name in names}
     quick = {name: pb.methods.STUDY_METHODS[name] for name in QUICK if name in names}
     if quick and not as_json:

@@ -251,9 +251,9 @@ def scene(source: Path | str, out: Path | None) -> None:
 @json_option
 def scenes(capture: Path, out: Path | None, as_json: bool, **settings: Any) -> int | None:
     """Compare scenes, from simple to complex; with --out, fit those that remain."""
+    data = pb.load_capture(capture)
     settings = read_scene_options(settings)
     method = settings.pop("method")
-    data = pb.load_capture(capture)
     found: Any
     with stages() as progress:
         if out is None:

@@ -11,7 +11,7 @@ import xarray as xr
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.batching import IMAGE, Status, cut
-from polar_bayes.maps.lazy import ensure_loaded
+from polar_bayes.maps.lazy import ensure_loaded, map_parameters
 
 INTERVALS = {50: (0.25, 0.75), 80: (0.1, 0.9), 95: (0.025, 0.975)}
 """Percent, and the levels of both ends."""
@@ -92,7 +92,7 @@ def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
 
 def map_scalars(maps: xr.Dataset) -> list[Scalar]:
     """The numbers that a map has in each pixel, labeled and in the order of a fit of one."""
-    names = [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
+    names = map_parameters(maps)
     if not names or "status" not in maps:
         raise FitError("it holds no maps", where="maps", hint="give what fit_pixels returns")
     # One pixel of zeros has the axes and labels of all, and nothing is read from a store.

@@ -69,7 +69,7 @@ class BatchEngine:
         single: bool = False,
     ) -> Any:
         """Run a program on all pixels; `given` arguments are the same for all of them."""
-        with self._arguments(pixels, states, given, batch, single) as arguments:
+        with self._arguments(pixels, states, given, batch, single=single) as arguments:
             program = self.compiled(make, settings)
             return map_batches(lambda index: program(*arguments(index)), len(pixels), batch)
 
@@ -78,20 +78,18 @@ class BatchEngine:
         make: Callable[["BatchEngine", S], JitOnce],
         settings: S,
         pixels: ObservationBatch,
-        *states: Any,
-        given: tuple = (),
-        batch: int = BATCH,
-        single: bool = False,
+        state: Any,
+        given: tuple,
     ) -> None:
-        """Begin to compile what `run` needs of these arguments, in parallel with what follows."""
+        """Begin to compile what `run` needs, in parallel with what follows; one state is enough."""
         program = self.compiled(make, settings)
         if not program.is_begun:
-            with self._arguments(pixels, states, given, batch, single) as arguments:
-                program.begin(*arguments(np.zeros(batch, int)))
+            with self._arguments(pixels, (state,), given, BATCH, single=False) as arguments:
+                program.begin(*arguments(np.zeros(BATCH, int)))
 
     @contextlib.contextmanager
     def _arguments(
-        self, pixels: ObservationBatch, states: tuple, given: tuple, batch: int, single: bool
+        self, pixels: ObservationBatch, states: tuple, given: tuple, batch: int, *, single: bool
     ) -> Iterator[Callable[[np.ndarray], tuple]]:
         """The arguments of a program for the pixels of a batch, in its precision."""
         dtype = np.float32 if single else self.dtype
@@ -136,9 +134,8 @@ class BatchEngine:
         def find() -> dict[str, tuple[np.ndarray, np.ndarray]]:
             z = self.prior_draws(MOMENTS)
             with jax.enable_x64(self.precision == "double"):
-                constrain = jax.jit(jax.vmap(self.program.parameters, (0, None)))
-                draws = constrain(z, self.layout)
-            found = {name: np.asarray(x, float) for name, x in draws.items()}
+                draws = self.program.parameters_of_chains(jnp.asarray(z[None]), self.layout)
+            found = {name: np.asarray(x[0], float) for name, x in draws.items()}
             moments = {name: (x.mean(axis=0), x.std(axis=0)) for name, x in found.items()}
             return {name: two for name, two in moments.items() if np.isfinite(two).all()}
 

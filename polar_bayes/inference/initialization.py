@@ -54,6 +54,9 @@ LARGEST_DENSE = 60
 """Most coordinates whose covariance a warm-up of some hundred draws can estimate. The posterior of
 the common parameters can have any shape with few groups; with many it is close to normal."""
 
+Starts = np.ndarray | None
+"""Unconstrained vectors from which modes are searched, (start, size); None: draws of the prior."""
+
 Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 """Unconstrained draws (chain, draw, size), and statistics, each (chain, draw)."""
 
@@ -305,11 +308,7 @@ class AbstractInitializer(abc.ABC):
 
     @abc.abstractmethod
     def find(
-        self,
-        data: Observations,
-        key: Array,
-        progress: Progress,
-        starts: np.ndarray | None = None,
+        self, data: Observations, key: Array, progress: Progress, starts: Starts = None
     ) -> AbstractInit:
         """The modes of one capture, by default from prior draws; a `FitError` where it has none."""
 
@@ -335,11 +334,7 @@ class JointInitializer(AbstractInitializer):
 
     @override
     def find(
-        self,
-        data: Observations,
-        key: Array,
-        progress: Progress,
-        starts: np.ndarray | None = None,
+        self, data: Observations, key: Array, progress: Progress, starts: Starts = None
     ) -> AbstractInit:
         potential = NumpyPotential(self.program.value_and_gradient, data, data.brightness.dtype)
         if starts is None:
@@ -378,11 +373,7 @@ class HierarchicalInitializer(AbstractInitializer):
 
     @override
     def find(
-        self,
-        data: Observations,
-        key: Array,
-        progress: Progress,
-        starts: np.ndarray | None = None,
+        self, data: Observations, key: Array, progress: Progress, starts: Starts = None
     ) -> AbstractInit:
         del starts  # each group is searched from draws of its own
         fitted = fit_reparam(self.group_model, self.reparam, data, key, progress)

@@ -417,7 +417,7 @@ def find_modes(
 ) -> ModeSearch:
     """The mode of every pixel, from the prior draw with the `rank`-th highest density."""
     # The largest program compiles while the others are traced and run.
-    unknown = init(np.zeros((len(pixels), engine.program.size), engine.dtype))
+    unknown = init(np.zeros((1, engine.program.size), engine.dtype))
     engine.begin(_stepping, False, pixels, unknown, given=(np.int32(1),))
     start = engine.run(_starts, candidates, pixels, given=(np.int32(rank),), single=True)
     return find_modes_from(engine, pixels, start)

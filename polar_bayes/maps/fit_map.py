@@ -422,14 +422,15 @@ def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, plan: MapPlan
     variables: dict[str, Any] = {}
     for name, (own, sizes) in plan.axes.items():
         symbol, meaning, unit = notation(name)
-        for ending, statistic, values, first in (
+        statistics = [
             ("", "mean of", found.mean[name], ()),
             ("_sd", "standard deviation of", found.sd[name], ()),
             ("_quantile", "quantiles of", found.quantiles[name], ("quantile",)),
-            ("_slope", "change with one sd of what is shared of", found.slopes[name], ("shared",)),
-        ):
-            if ending == "_slope" and not plan.shared:
-                continue
+        ]
+        if plan.shared:
+            what = "change with one sd of what is shared of"
+            statistics.append(("_slope", what, found.slopes[name], ("shared",)))
+        for ending, statistic, values, first in statistics:
             whole = values.reshape(*values.shape[: len(first)], *shape, *sizes)
             labels = {"units": unit, "long_name": f"{statistic} {meaning}", "symbol": symbol}
             variables[f"{name}{ending}"] = ((*first, *IMAGE, *own), np.float32(whole), labels)

@@ -300,13 +300,17 @@ def shared_cautions(maps: xr.Dataset) -> list[str]:
     ]
 
 
+def map_parameters(maps: xr.Dataset) -> list[str]:
+    """Names of the parameters that have a map."""
+    return [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
+
+
 def checked_status(maps: xr.Dataset) -> xr.DataArray:
     """Statuses of maps, in memory; a pixel that is called good without numbers is not fitted."""
     # A chunk that was lost from a store reads as not a number.
     answers = [
         f"{name}{ending}"
-        for name in maps.data_vars
-        if f"{name}_quantile" in maps
+        for name in map_parameters(maps)
         for ending in ("", "_sd", "_quantile")
         if f"{name}{ending}" in maps
     ]

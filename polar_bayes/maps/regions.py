@@ -15,7 +15,7 @@ from scipy.special import ndtri
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batching import IMAGE, Status, cut
-from polar_bayes.maps.lazy import CHUNK, checked_status
+from polar_bayes.maps.lazy import CHUNK, checked_status, map_parameters
 
 BOUNDS = (0.025, 0.975)
 """Levels of the ends of an interval."""
@@ -67,7 +67,7 @@ def region_means(
     Source:
         The laws of total mean and variance; the pull is that of a normal prior and likelihood.
     """
-    names = [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
+    names = map_parameters(maps)
     if not names or "status" not in maps:
         raise FitError(
             "it holds no maps", where="region_means", hint="give what fit_pixels returns"

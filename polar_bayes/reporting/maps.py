@@ -21,6 +21,7 @@ from polar_bayes.maps.lazy import (
     COPY,
     checked_status,
     ensure_loaded,
+    map_parameters,
     shared_cautions,
     shared_parameters,
     start_sentences,
@@ -68,7 +69,7 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
     Raises:
         FitError: It holds no maps, or not that wavelength.
     """
-    names = [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
+    names = map_parameters(maps)
     if not names:
         raise FitError("it holds no maps", where="plot_maps", hint="give what fit_pixels returns")
     shown, place = _at_wavelength(maps, wavelength)

@@ -21,8 +21,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.expressions import short_text
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.paths import as_path
-from polar_bayes.physics.part import notation
-from polar_bayes.priors import describe_prior
+from polar_bayes.priors import describe_prior, prior_card
 from polar_bayes.reporting import maps, text
 from polar_bayes.reporting.accuracy import accuracy_page, study_table
 from polar_bayes.reporting.calibration_page import calibration_page, rank_table
@@ -219,16 +218,6 @@ def _are_priors(value: Any) -> bool:
     return are_named and all(isinstance(each, dist.Distribution) for each in value.values())
 
 
-def _prior_card(priors: Mapping[str, dist.Distribution]) -> DisplaySummary:
-    """What each parameter means, its unit and its prior."""
-    columns = ("parameter", "meaning", "unit", "prior")
-    rows = []
-    for name, prior in priors.items():
-        words = notation(name)
-        rows.append(Row(name, (words.meaning, words.unit, describe_prior(prior))))
-    return DisplaySummary("Priors", (), (Table(columns, tuple(rows), prose=columns),))
-
-
 def _is_described(value: Any) -> bool:
     return isinstance(value, xr.Dataset) and "status" not in value
 
@@ -250,7 +239,7 @@ def _described_card(result: xr.Dataset) -> DisplaySummary:
 VALUES: tuple[tuple[Callable[[Any], bool], Callable[[Any], DisplaySummary]], ...] = (
     (_is_capture, _capture_card),
     (lambda value: isinstance(value, HTMLRepr), _value_card),
-    (_are_priors, _prior_card),
+    (_are_priors, prior_card),
     (_is_described, _described_card),
 )
 """Cards of what is not reported on a page, in the order in which they are tried."""
