@@ -199,11 +199,11 @@ def _cautions(
     pull, chance = np.abs(found.pull), np.sqrt(found.pull_variance)
     is_moved = (pull > LARGEST_PULL * sd) & (pull > SIGNIFICANT * chance)
     for at in shown:
-        if np.any(is_moved[at]):
+        if np.any(chance[at] > sd[at]):  # then the pull is not known
+            why = "its pixels say less than their priors, which count once for each pixel"
+        elif np.any(is_moved[at]):
             sds = np.max(pull[at] / sd[at])
             why = f"if its pixels are alike, their priors move the mean by {sds:.1f} sds"
-        elif np.any(chance[at] > sd[at]):
-            why = "its pixels say less than their priors, which count once for each pixel"
         else:
             continue
         yield f"{name} of region {labels[at]}: {why}. Fit the region as one capture, or as patches."
