@@ -5,7 +5,8 @@ an unbounded left tail, which mixes slowly. `HalfNormal` is sampled in its norma
 
 $$ z = \Phi^{-1}\big(2 \Phi(v/\sigma) - 1\big) $$
 
-under which the prior is standard normal.
+under which the prior is standard normal. So are `Beta(1, b)` and `Beta(a, 1)`, whose log odds
+have such a tail towards the bound where their density is finite.
 
 Every model reads the table `PRIORS`. A caller replaces any row with any NumPyro distribution of the
 right support: `priors={"refractive_index": dist.Normal(1.5, 0.02)}` is
@@ -25,7 +26,7 @@ from typing import Any, NoReturn, override
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import erf, erfc, erfinv, ndtr, ndtri
+from jax.scipy.special import erf, erfc, erfinv, gammaln, log_ndtr, ndtr, ndtri
 from jaxtyping import Array, ArrayLike, Float
 from numpyro import distributions as dist
 from numpyro.distributions import constraints, transforms
@@ -46,6 +47,47 @@ def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
     return float(np.min(low)), float(np.max(high))
 
 
+# --- Coordinates that are normal scores -----------------------------------------------------------
+
+
+class ByNormalScore(constraints.Constraint):
+    """The values of a transform, whose coordinate is its argument."""
+
+    def __init__(self, transform: transforms.Transform) -> None:
+        self.transform = transform
+
+    @property
+    def lower_bound(self) -> float:
+        """The least value."""
+        return getattr(self.transform.codomain, "lower_bound", -math.inf)
+
+    @property
+    def upper_bound(self) -> float:
+        """The largest value."""
+        return getattr(self.transform.codomain, "upper_bound", math.inf)
+
+    @override
+    def __call__(self, x: ArrayLike) -> Array:
+        return (jnp.asarray(x) > self.lower_bound) & (jnp.asarray(x) < self.upper_bound)
+
+    @override
+    def feasible_like(self, prototype: Array) -> Array:
+        return self.transform(jnp.zeros_like(prototype))
+
+    @override
+    def eq(self, other: object, static: bool = False) -> bool:
+        return isinstance(other, ByNormalScore) and other.transform == self.transform
+
+    @override
+    def tree_flatten(self) -> tuple:
+        return (self.transform,), (("transform",), {})
+
+
+@dist.biject_to.register(ByNormalScore)
+def _by_score(support: ByNormalScore) -> transforms.Transform:
+    return support.transform
+
+
 # --- Half-normal prior ----------------------------------------------------------------------------
 
 
@@ -58,41 +100,11 @@ class HalfNormal(dist.HalfNormal):
     @property
     @override
     def support(self) -> constraints.Constraint:
-        return PositiveByNormalScore(self.scale)
-
-
-class PositiveByNormalScore(constraints.Constraint):
-    """Positive values, whose coordinate is the normal score under a half-normal distribution."""
-
-    lower_bound = 0.0
-
-    def __init__(self, scale: float) -> None:
-        self.scale = scale
-
-    @override
-    def __call__(self, x: ArrayLike) -> Array:
-        return jnp.greater(x, 0.0)
-
-    @override
-    def feasible_like(self, prototype: Array) -> Array:
-        return jnp.broadcast_to(self.scale, jnp.shape(prototype))
-
-    def eq(self, other: object, static: bool = False) -> bool:
-        """Whether it is the same, as NumPyro asks."""
-        return isinstance(other, PositiveByNormalScore) and other.scale == self.scale
-
-    def tree_flatten(self) -> tuple:
-        """As NumPyro has it."""
-        return (self.scale,), (("scale",), {})
-
-
-@dist.biject_to.register(PositiveByNormalScore)
-def _by_score(support: PositiveByNormalScore) -> "NormalScoreToHalfNormal":
-    return NormalScoreToHalfNormal(support.scale)
+        return ByNormalScore(NormalScoreToHalfNormal(self.scale))
 
 
 class NormalScoreToHalfNormal(transforms.Transform):
-    """From a normal score to the value of that score."""
+    """From a normal score to the half-normal value of that score."""
 
     domain = constraints.real
     codomain = constraints.positive
@@ -114,8 +126,12 @@ class NormalScoreToHalfNormal(transforms.Transform):
     ) -> Array:
         return jnp.log(0.5 * self.scale) + 0.5 * ((y / self.scale) ** 2 - x**2)
 
+    @override
+    def eq(self, other: object, static: bool = False) -> bool:
+        return isinstance(other, NormalScoreToHalfNormal) and other.scale == self.scale
+
+    @override
     def tree_flatten(self) -> tuple:
-        """As NumPyro has it."""
         return (self.scale,), (("scale",), {})
 
 
@@ -150,6 +166,107 @@ def score_of_half_normal(x: Float[Array, "..."]) -> Float[Array, "..."]:
 def _slope_of_unfolded(x: tuple, dx: tuple) -> tuple[Array, Array]:
     z = score_of_half_normal(*x)
     return z, 2.0 * jnp.exp(0.5 * (z**2 - x[0] ** 2)) * dx[0]
+
+
+# --- Beta prior -----------------------------------------------------------------------------------
+
+
+class Beta(dist.Beta):
+    """The Beta distribution, sampled in its normal score where one of its shapes is 1."""
+
+    # NumPyro's own converts the shapes to arrays at once, in the current precision: a table of
+    # priors would start JAX on import and stay in single precision. Here they are Python numbers.
+
+    def __init__(
+        self,
+        concentration1: float,
+        concentration0: float,
+        *,
+        validate_args: bool | None = None,
+    ) -> None:
+        self.concentration1, self.concentration0 = concentration1, concentration0
+        dist.Distribution.__init__(self, validate_args=validate_args)
+
+    @property
+    @override
+    def support(self) -> constraints.Constraint:
+        for power, other, falls in (
+            (self.concentration0, self.concentration1, True),
+            (self.concentration1, self.concentration0, False),
+        ):
+            if isinstance(power, float | int) and isinstance(other, float | int) and other == 1.0:
+                return ByNormalScore(NormalScoreToPower(float(power), falls))
+        return constraints.unit_interval
+
+    @override
+    def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
+        return dist.Beta(self.concentration1, self.concentration0).sample(key, sample_shape)
+
+    @override
+    def log_prob(self, value: Array) -> Array:
+        shapes = self.concentration1, self.concentration0
+        # A shape of 1 adds nothing, not even a derivative of zero times infinity at its bound.
+        logs = zip(shapes, (jnp.log, lambda x: jnp.log1p(-x)), strict=True)
+        terms = (
+            (shape - 1.0) * log(value)
+            for shape, log in logs
+            if not (isinstance(shape, float | int) and shape == 1.0)
+        )
+        total = gammaln(shapes[0] + shapes[1])
+        return sum(terms, total - gammaln(shapes[0]) - gammaln(shapes[1]))
+
+
+class NormalScoreToPower(transforms.Transform):
+    r"""From a normal score z to the value of that score whose distribution is a power.
+
+    $x = \Phi(z)^{1/p}$ under Beta(p, 1), and $x = 1 - \Phi(-z)^{1/p}$ under Beta(1, p), which
+    `falls`.
+    """
+
+    domain = constraints.real
+    codomain = constraints.unit_interval
+
+    def __init__(self, power: float, falls: bool) -> None:
+        self.power, self.falls = power, falls
+
+    def __call__(self, x: Array) -> Array:
+        """The value of a score, inside the numbers between 0 and 1 whose square is one."""
+        log_share = self._log_share(x)
+        value = -jnp.expm1(log_share) if self.falls else jnp.exp(log_share)
+        number = jnp.finfo(value.dtype)
+        return jnp.clip(value, 2.0 * number.tiny**0.5, 1.0 - number.eps)
+
+    @override
+    def _inverse(self, y: Array) -> Array:
+        y = jnp.asarray(y)
+        log_tail = self.power * (jnp.log1p(-y) if self.falls else jnp.log(y))
+        # Each half is computed from the tail that is small there.
+        score = jnp.where(
+            log_tail < -math.log(2.0), -ndtri(jnp.exp(log_tail)), ndtri(-jnp.expm1(log_tail))
+        )
+        return score if self.falls else -score
+
+    @override
+    def log_abs_det_jacobian(
+        self, x: Array, y: Array, intermediates: object | None = None
+    ) -> Array:
+        density = math.log(self.power) + (self.power - 1.0) * self._log_share(x)
+        return -0.5 * jnp.square(x) - 0.5 * math.log(2.0 * math.pi) - density
+
+    @override
+    def eq(self, other: object, static: bool = False) -> bool:
+        mine = self.power, self.falls
+        return isinstance(other, NormalScoreToPower) and (other.power, other.falls) == mine
+
+    @override
+    def tree_flatten(self) -> tuple:
+        return (), ((), {"power": self.power, "falls": self.falls})
+
+    def _log_share(self, x: Array) -> Array:
+        z = -jnp.asarray(x) if self.falls else jnp.asarray(x)
+        # Above zero the small tail tells how far the share is from 1.
+        above = jnp.log1p(-ndtr(-jnp.maximum(z, 0.0)))
+        return jnp.where(z > 0.0, above, log_ndtr(z)) / self.power
 
 
 # --- Priors that come from other pixels -----------------------------------------------------------
@@ -363,31 +480,6 @@ def _with_arrays(made: Callable[..., Any]) -> Callable[..., Any]:
 
 
 # --- The table: one NumPyro distribution for every named parameter --------------------------------
-
-
-class Beta(dist.Beta):
-    """The Beta distribution, two Python numbers until it is used."""
-
-    # NumPyro's own converts them to arrays at once, in the current precision: a table of priors
-    # would start JAX on import and stay in single precision.
-
-    def __init__(
-        self,
-        concentration1: float,
-        concentration0: float,
-        *,
-        validate_args: bool | None = None,
-    ) -> None:
-        self.concentration1, self.concentration0 = concentration1, concentration0
-        dist.Distribution.__init__(self, validate_args=validate_args)
-
-    @override
-    def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
-        return dist.Beta(self.concentration1, self.concentration0).sample(key, sample_shape)
-
-    @override
-    def log_prob(self, value: Array) -> Array:
-        return dist.Beta(self.concentration1, self.concentration0).log_prob(value)
 
 
 class Priors(dict[str, dist.Distribution]):

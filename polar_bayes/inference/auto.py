@@ -125,9 +125,10 @@ class Auto(AbstractMethod):
             attempts.append(attempt)
             # Of two in doubt the more expensive one is nearer to exact.
             if draws is not None and (best is None or attempt.error <= best[0].error):
+                other = draws.comparison_method or method
                 best = (
                     attempt,
-                    dataclasses.replace(draws, comparison_method=method, deadline=deadline),
+                    dataclasses.replace(draws, comparison_method=other, deadline=deadline),
                 )
             if attempt.taken:
                 break

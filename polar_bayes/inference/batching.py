@@ -209,11 +209,15 @@ def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnc
         common, (wanted, own, static, *states) = arguments[:given], arguments[given:]
         grouped = jax.tree.map(lambda x: x.reshape(-1, lanes, *x.shape[1:]), (own, states))
 
-        def group(at: Array) -> Any:
+        @jax.jit  # asked for its shape and then in the loop, it is traced once
+        def of_lanes(own: Any, states: Any, static: Any, common: tuple) -> Any:
             def of_pixel(pixel: Any, state: Any) -> Any:
                 return function(*common, eqx.combine(pixel, static), *state)
 
-            return jax.vmap(of_pixel)(*jax.tree.map(lambda x: x[at], grouped))
+            return jax.vmap(of_pixel)(own, states)
+
+        def group(at: Array) -> Any:
+            return of_lanes(*jax.tree.map(lambda x: x[at], grouped), static, common)
 
         def fill(at: Array, found: Any) -> Any:
             return jax.tree.map(lambda whole, part: whole.at[at].set(part), found, group(at))

@@ -122,6 +122,7 @@ class Nuts(AbstractMethod):
                 "goals_reached": mixed,
                 "step_size_halvings": halvings,
             },
+            comparison_method=self._for_comparison(),
         )
 
     @override
@@ -133,6 +134,13 @@ class Nuts(AbstractMethod):
         if not sampler.advance.is_begun:
             state = sampler.init(target, jax.random.key(0), target.starts[0])
             sampler.advance.begin(state, target.given)
+
+    def _for_comparison(self) -> Self:
+        """Half the effective draws: the ends of an interval then move by a tenth of a sd."""
+        draws = max(self.draws // 2, 50)
+        most = max(self.most_draws // 4, draws)
+        half = 0.5 * self.effective_draws
+        return dataclasses.replace(self, draws=draws, most_draws=most, effective_draws=half)
 
     @override
     def cross_check(self, problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A half-normal prior in its normal score: against fifty digits, and far out in both tails."""
+"""Priors in their normal score: against fifty digits, and far out in both tails."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,13 @@ from cases import each
 from numpyro import distributions as dist
 from numpyro.distributions import biject_to
 
-from polar_bayes.priors import PRIORS, HalfNormal, half_normal_of_score, score_of_half_normal
+from polar_bayes.priors import (
+    PRIORS,
+    Beta,
+    HalfNormal,
+    half_normal_of_score,
+    score_of_half_normal,
+)
 
 SCALE = 0.01
 SCORES = (-37.0, -20.0, -9.0, -5.0, -1.0, -1e-3, 0.0, 1e-3, 1.0, 5.0, 9.0, 20.0, 36.0)
@@ -75,15 +81,58 @@ def test_what_is_far_out_is_finite_and_comes_back(z: float, dtype: type) -> None
         )
 
 
-def test_scores_of_draws_are_standard_normal() -> None:
+@each("prior", [HalfNormal(SCALE), Beta(1.0, 3.0), Beta(10.0, 1.0), Beta(1.0, 1.0)])
+def test_scores_of_draws_are_standard_normal(prior: dist.Distribution) -> None:
     """Mean, variance and every tenth of 20,000, within 4 standard errors."""
-    drawn = HalfNormal(SCALE).sample(jax.random.key(3), (20_000,))
-    scores = np.asarray(biject_to(HalfNormal(SCALE).support).inv(drawn))
+    drawn = prior.sample(jax.random.key(3), (20_000,))
+    scores = np.asarray(biject_to(prior.support).inv(drawn))
     assert abs(scores.mean()) < 4.0 / 20_000**0.5
     assert abs(scores.var() - 1.0) < 4.0 * (2.0 / 20_000) ** 0.5
     shares = np.arange(0.1, 0.95, 0.1)
     below = [(scores < dist.Normal().icdf(share)).mean() for share in shares]
     assert (np.abs(below - shares) < 4.0 * np.sqrt(shares * (1 - shares) / 20_000)).all()
+
+
+def power_in_digits(z: float, prior: Beta) -> mpmath.mpf:
+    """The value of a score under Beta(1, p) or Beta(p, 1), to fifty digits."""
+    with mpmath.workdps(50):
+        first, second = prior.concentration1, prior.concentration0
+        if first == 1.0:
+            return -mpmath.expm1(mpmath.log1p(-mpmath.ncdf(mpmath.mpf(z))) / second)
+        return mpmath.ncdf(mpmath.mpf(z)) ** (1 / mpmath.mpf(first))
+
+
+@each("dtype", [np.float64, np.float32])
+@each("prior", [Beta(1.0, 3.0), Beta(10.0, 1.0), Beta(1.0, 1.0)])
+@each("z", [*SCORES, *FAR])
+def test_a_beta_with_a_shape_of_one(prior: Beta, z: float, dtype: type) -> None:
+    """Its value, a finite density everywhere, and the standard normal one where values have it."""
+    move = biject_to(prior.support)
+    number = np.finfo(dtype)
+    at = jnp.asarray(z, dtype)
+    exact = power_in_digits(float(at), prior)
+    clipped = min(max(exact, 2.0 * float(number.tiny) ** 0.5), 1.0 - float(number.eps))
+    # A rounded score moves the log of its tail by z dz, and an inverse cannot undo a clip.
+    allowed = 30.0 * float(number.eps) * max(1.0, z**2)
+    assert float(move(at)) == pytest.approx(float(clipped), rel=allowed)
+
+    def log_density(z: jax.Array) -> jax.Array:
+        value = move(z)
+        return prior.log_prob(value) + move.log_abs_det_jacobian(z, value)
+
+    found = [f(at) for f in (log_density, jax.grad(log_density), jax.grad(jax.grad(log_density)))]
+    assert np.isfinite(found).all()
+    left = min(exact, 1 - exact)
+    if clipped == exact and left > 1e3 * float(number.eps):
+        normal = -0.5 * np.log(2.0 * np.pi) - 0.5 * float(at) ** 2
+        rounding = 300.0 * float(number.eps) * (1.0 + z**2) / float(left)
+        assert float(found[0]) == pytest.approx(normal, abs=rounding)
+        assert float(move.inv(move(at))) == pytest.approx(float(at), abs=rounding)
+
+
+def test_other_shapes_have_the_support_of_numpyro() -> None:
+    assert Beta(2.0, 2.0).support == dist.Beta(2.0, 2.0).support
+    assert Beta(1.0, 3.0).support != Beta(1.0, 2.0).support
 
 
 @pytest.mark.thorough
