@@ -80,8 +80,8 @@ OF_PROTOCOL = ("views", "largest_view_zenith", "wavelengths")
 @seed_option
 def simulate(out: Path, **settings: Any) -> None:
     """Draw a capture of a known material, by the paper's protocol."""
+    protocol = {name: settings.pop(name) for name in OF_PROTOCOL}  # a scene file says what is used
     settings = read_scene_options(settings)
-    protocol = {name: settings.pop(name) for name in OF_PROTOCOL}
     _save(pb.simulate(protocol=pb.simulation.Protocol(**protocol), **settings), out)
 
 

@@ -88,6 +88,7 @@ def test_the_command_line_says_what_python_can(
     assert main(words) == 0
     capture = pb.load_capture(tmp_path / "s.nc")
     assert (capture.attrs["name"], capture.attrs["setup"]) == ("mine", "goniometer")
+    assert float(capture["view_zenith"].max()) == 85.0  # the file says what a fit uses: 78
 
 
 def test_a_fit_says_what_it_chose_and_what_is_unlikely(
