@@ -268,7 +268,7 @@ def _choose_links(
         raise CaptureError(
             f"no polarization that these links describe (wanted {' or '.join(wanted)})",
             where=str(capture.attrs.get("name", "capture")),
-            hint="links name every variable that is fitted; add BetaLink for dop, or StokesLink for "
+            hint="links name every variable that is fitted: add BetaLink for dop, StokesLink for "
             "q and u, or choose another scene",
         )
     return chosen
