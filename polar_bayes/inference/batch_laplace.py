@@ -50,7 +50,7 @@ from polar_bayes.observation.data import Observations
 HARD = 1024
 """Pixels with further draws that are in memory at a time."""
 
-LANES = 8
+LANES = 4
 """Pixels of a batch that are computed together where each has hundreds of draws."""
 
 SAME_MODE = 1e-3

@@ -13,6 +13,7 @@ Source:
     419-428; Cornuet, Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), 798-812.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -99,13 +100,17 @@ def _antithetic(points: Float[np.ndarray, "half size"]) -> Float[np.ndarray, "co
 def random_rotations(keys: np.ndarray, size: int) -> Float[np.ndarray, "pixel size size"]:
     """A random rotation or reflection for each pixel (Mezzadri 2007, Notices of the AMS 54(5))."""
     # Otherwise the error of a few points in a quantile would be the same in all pixels.
-    draw = jax.vmap(
-        lambda key: jax.random.bits(jax.random.wrap_key_data(key), (size, size), np.uint32)
-    )
     # Integers are the same however a program was compiled, and for however many pixels.
-    share = (np.asarray(draw(keys)) + 0.5) / 2.0**32
+    share = (np.asarray(_random_integers(keys, size)) + 0.5) / 2.0**32
     q, r = np.linalg.qr(scipy.special.ndtri(share))
     return q * np.sign(np.einsum("pii->pi", r))[:, None, :]
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _random_integers(keys: Array, size: int) -> Array:
+    return jax.vmap(lambda key: jax.random.bits(key, (size, size), np.uint32))(
+        jax.random.wrap_key_data(keys)
+    )
 
 
 def fit_t(

@@ -46,7 +46,7 @@ def smooth(log_ratios: Float[np.ndarray, "pixel draw"]) -> Smoothed:
     usable = known.any(axis=-1)
     largest = np.max(log_ratios, axis=-1, where=known, initial=-np.inf, keepdims=True)
     ratios = np.where(known, log_ratios - np.where(np.isfinite(largest), largest, 0.0), -np.inf)
-    order = np.argsort(ratios, axis=-1, kind="stable")
+    order = np.argsort(ratios, axis=-1)
     ranked = np.exp(np.take_along_axis(ratios, order, axis=-1).astype(float))
     cutoff = ranked[:, -tail - 1, None]
     excess = ranked[:, -tail:] - cutoff
@@ -103,7 +103,7 @@ def summarize(
     """Mean, standard deviation and quantiles of weighted draws; quasi-random unless `random`."""
     mean = np.sum(weights * draws, axis=-1)
     sd = np.sqrt(np.sum(weights * (draws - mean[:, None]) ** 2, axis=-1))
-    order = np.argsort(draws, axis=-1, kind="stable")
+    order = np.argsort(draws, axis=-1)
     ranked = np.take_along_axis(draws, order, axis=-1)
     share = np.take_along_axis(weights, order, axis=-1)
     below = np.cumsum(share, axis=-1) - 0.5 * share
