@@ -33,7 +33,8 @@ from polar_bayes.inference.levenberg_marquardt import (
     RESTARTS,
     ModeSearch,
     NormalApproximation,
-    find_modes,
+    find_modes_from,
+    find_starts,
 )
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.proposals import (
@@ -197,15 +198,16 @@ class _Run:
         """Fit from the best candidate; untrusted pixels start again and keep the lower mode."""
         candidates, weighted = self.settings.candidates, self.settings.weighted
         starts = self.settings.starts or (PixelLaplace.most_starts if weighted else 1)
-        search = find_modes(self.engine, self.pixels, candidates=candidates)
+        ranked = find_starts(self.engine, self.pixels, candidates)
+        search = find_modes_from(self.engine, self.pixels, ranked[:, 0])
         found = jax.tree.map(np.array, self._weigh(np.arange(self.at.size), search))
         for start, rank in enumerate(RESTARTS, 2):
             everywhere = start <= starts
             untrusted = np.flatnonzero(everywhere | ~found.is_trusted)
             if not untrusted.size:
                 break
-            old = take_rows(found.search, untrusted)
-            new = find_modes(self.engine, self.pixels.subset(untrusted), rank, candidates)
+            old, begin = take_rows(found.search, untrusted), ranked[untrusted, rank]
+            new = find_modes_from(self.engine, self.pixels.subset(untrusted), begin, old)
             is_lower = new.mode.value < old.mode.value - SAME_MODE
             is_better = new.converged & (~old.converged | is_lower)
             is_other = old.mode.distance(new.mode) > LEAST_DISTANCE  # False where one is NaN

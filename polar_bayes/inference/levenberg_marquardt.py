@@ -388,8 +388,9 @@ PRIOR_DRAWS = 32
 RESTARTS = tuple(range(1, 8))
 """Ranks of the prior draws from which pixels without a good mode start again."""
 
-ALL_RANKS, SAME_MODE = range(16), 0.1
-"""Ranks of a search for all modes; posterior sds within which two ends are the same mode."""
+RANKS, SAME_MODE = 16, 0.1
+"""Prior draws that are kept, from all of which a search for all modes starts; posterior sds within
+which two ends are the same mode."""
 
 SINGLE_PASSES, EXACT_PASSES = (5, 4, 8, 16, 32), (1, 1, 1, 2, 4, 8, 16)
 """Steps of each pass; pixels that have converged leave between passes. The first exact pass only
@@ -412,55 +413,91 @@ class ModeSearch(NamedTuple):
     converged: np.ndarray
 
 
-def find_modes(
-    engine: BatchEngine, pixels: ObservationBatch, rank: int = 0, candidates: int = PRIOR_DRAWS
-) -> ModeSearch:
-    """The mode of every pixel, from the prior draw with the `rank`-th highest density."""
+def find_starts(
+    engine: BatchEngine, pixels: ObservationBatch, candidates: int = PRIOR_DRAWS
+) -> Float[np.ndarray, "pixel rank size"]:
+    """Draws from the prior at which each pixel starts, the one of highest density first."""
     # The largest program compiles while the others are traced and run.
     unknown = init(np.zeros((1, engine.program.size), engine.dtype))
     engine.begin(_stepping, False, pixels, unknown, given=(np.int32(1),))
-    start = engine.run(_starts, candidates, pixels, given=(np.int32(rank),), single=True)
-    return find_modes_from(engine, pixels, start)
+    return engine.run(_starts, candidates, pixels, single=True)
+
+
+def find_modes(
+    engine: BatchEngine, pixels: ObservationBatch, candidates: int = PRIOR_DRAWS
+) -> ModeSearch:
+    """The mode of every pixel, from the best of so many prior draws."""
+    return find_modes_from(engine, pixels, find_starts(engine, pixels, candidates)[:, 0])
 
 
 def find_modes_from(
-    engine: BatchEngine, pixels: ObservationBatch, start: Float[np.ndarray, "pixel size"]
+    engine: BatchEngine,
+    pixels: ObservationBatch,
+    start: Float[np.ndarray, "pixel size"],
+    known: ModeSearch | None = None,
 ) -> ModeSearch:
-    """The mode of every pixel, from a vector of its own."""
-
-    def advance(state: LMState, which: np.ndarray, count: int, *, single: bool) -> LMState:
-        some = pixels.subset(which), take_rows(state, which)
-        return engine.run(_stepping, single, *some, given=(np.int32(count),), single=single)
-
+    """The mode of every pixel, from a vector of its own; a search that ends at `known` is that."""
     fast = jax.tree.map(np.array, init(start))
     for count in SINGLE_PASSES:
         left = np.flatnonzero(~fast.settled)
         if left.size:
-            put_rows(fast, left, advance(fast, left, count, single=True))
+            steps = _advance(engine, pixels, fast, left, count, single=True)
+            put_rows(fast, left, steps)
+    if known is None:
+        return _refine(engine, pixels, start, fast)
+    # One that did not converge has no distance to anything.
+    is_known = known.mode.distance(known.mode._replace(z=fast.z.astype(float))) < SAME_MODE
+    new = np.flatnonzero(~is_known)
+    found = jax.tree.map(np.array, known)
+    if new.size:
+        put_rows(found, new, _refine(engine, pixels.subset(new), start[new], take_rows(fast, new)))
+    return found
+
+
+def _refine(
+    engine: BatchEngine, pixels: ObservationBatch, start: np.ndarray, fast: LMState
+) -> ModeSearch:
+    """The modes near where searches in single precision have ended."""
     is_finite = np.isfinite(fast.z).all(axis=-1, keepdims=True)
     state = init(np.where(is_finite, fast.z, start).astype(engine.dtype))
     first, *further = EXACT_PASSES
-    state = jax.tree.map(np.array, advance(state, np.arange(len(pixels)), first, single=False))
+    everywhere = np.arange(len(pixels))
+    moved = _advance(engine, pixels, state, everywhere, first, single=False)
+    state = jax.tree.map(np.array, moved)
     found = jax.tree.map(np.array, _finalized(engine, state))
     goal = GOALS[engine.precision]
     for count in further:
         left = np.flatnonzero(~(found.decrement < goal))
         if not left.size:
             break
-        moved = advance(state, left, count, single=False)
+        moved = _advance(engine, pixels, state, left, count, single=False)
         put_rows((state, found), left, (moved, _finalized(engine, moved)))
     converged = (found.decrement < goal) & np.isfinite(found.root).all(axis=(1, 2))
     return ModeSearch(found, fast.steps + state.steps, converged)
 
 
+def _advance(
+    engine: BatchEngine,
+    pixels: ObservationBatch,
+    state: LMState,
+    which: np.ndarray,
+    count: int,
+    *,
+    single: bool,
+) -> LMState:
+    some = pixels.subset(which), take_rows(state, which)
+    return engine.run(_stepping, single, *some, given=(np.int32(count),), single=single)
+
+
 def find_modes_again(engine: BatchEngine, pixels: ObservationBatch) -> ModeSearch:
     """The mode of every pixel; those that did not converge start again elsewhere."""
-    found = jax.tree.map(np.array, find_modes(engine, pixels))
+    starts = find_starts(engine, pixels)
+    found = jax.tree.map(np.array, find_modes_from(engine, pixels, starts[:, 0]))
     for rank in RESTARTS:
         left = np.flatnonzero(~found.converged)
         if not left.size:
             break
-        again = find_modes(engine, pixels.subset(left), rank)
+        again = find_modes_from(engine, pixels.subset(left), starts[left, rank])
         put_rows(found, left[again.converged], take_rows(again, again.converged))
     return found
 
@@ -469,8 +506,9 @@ def find_all_modes(engine: BatchEngine, pixels: ObservationBatch) -> list[np.nda
     """Distinct modes of every pixel, (mode, size), the heaviest first; None where there is none."""
     ends: list[NormalApproximation] = []
     is_new: list[np.ndarray] = []
-    for rank in ALL_RANKS:
-        mode, _, converged = find_modes(engine, pixels, rank)
+    starts = find_starts(engine, pixels)
+    for rank in range(starts.shape[1]):
+        mode, _, converged = find_modes_from(engine, pixels, starts[:, rank])
         for other, kept in zip(ends, is_new, strict=True):
             converged = converged & ~(kept & (other.distance(mode) < SAME_MODE))
         ends.append(mode)
@@ -485,20 +523,20 @@ def find_all_modes(engine: BatchEngine, pixels: ObservationBatch) -> list[np.nda
 
 
 def _starts(engine: BatchEngine, candidates: int) -> JitOnce:
-    """A program that chooses the prior draw of some rank."""
+    """A program that ranks draws from the prior, and keeps the first `RANKS`."""
     draws = engine.prior_draws(candidates).astype(np.float32)
 
     program = engine.single_program
 
-    def start(rank: Array, data: Observations) -> Array:
+    def start(data: Observations) -> Array:
         # Parameters whose priors come from other pixels start at those.
         known = {name: mean for name, (mean, _) in data.shared.items()}
         starts = jax.vmap(lambda z: ravel_pytree({**program.unravel(z), **known})[0])(draws)
         values = jax.vmap(lambda z: program.potential(z, data))(starts)
         order = jnp.argsort(jnp.where(jnp.isnan(values), jnp.inf, values))
-        return starts[order[rank]]
+        return starts[order[:RANKS]]
 
-    return batched(start, given=1)
+    return batched(start)
 
 
 def _stepping(engine: BatchEngine, single: bool) -> JitOnce:
