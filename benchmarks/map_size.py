@@ -24,6 +24,7 @@ import dask.array as da
 import distributed
 
 import polar_bayes as pb
+from polar_bayes.cli.entry import limit_arenas
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from plate_images import ASKED, plate_image
@@ -49,6 +50,7 @@ def image(count: int, path: Path) -> Path:
 
 def timed(count: int, workers: int) -> tuple[float, float]:
     """Pixels per second of a warm map, and the largest memory of this process in GB."""
+    limit_arenas()  # as the command does
     with tempfile.TemporaryDirectory() as folder:
         here = Path(folder)
         small, large = image(4 * TILE**2, here / "small.zarr"), image(count, here / "large.zarr")

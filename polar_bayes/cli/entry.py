@@ -14,6 +14,7 @@ A compiled program is native code that the next run loads, so whoever can write 
 
 import contextlib
 import contextvars
+import ctypes
 import functools
 import logging
 import os
@@ -172,6 +173,19 @@ def keep_compiled_programs() -> None:
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 
+# --- Memory ---------------------------------------------------------------------------------------
+
+
+M_ARENA_MAX = -8
+"""The number of this setting in the C library of GNU."""
+
+
+def limit_arenas() -> None:
+    """Have threads share two pools of memory, so that a map takes as much whatever its size."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
+        ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
+
+
 # --- Running a command ----------------------------------------------------------------------------
 
 
@@ -193,6 +207,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _own_process() -> int:
     """The command of the process itself; its output is flushed while an error still has a line."""
+    limit_arenas()
     quiet_libraries()
     keep_compiled_programs()
     write_lines(functools.partial(click.echo, err=True))
