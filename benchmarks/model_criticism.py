@@ -7,7 +7,8 @@
 
 A fit is flagged where its verdict has a caution or a problem. It is silent and wrong where it is
 not flagged although the 95% interval of a material parameter misses the truth by more than 2 sds.
-`right` draws the truth from the priors; `chosen` draws the scene as well, of ten, and fits with
+`right` draws the truth from the priors of the set-up, except for the exposure, which is set as a
+camera sets it; `chosen` draws the scene as well, of ten, and fits with
 `scene="auto"`. Results are appended to a file of JSON lines, so that a run that was stopped goes on
 where it was.
 """
@@ -293,11 +294,11 @@ def drawn_from_priors(
     setup: str, scene: pb.Scene, layout: Protocol, seed: int
 ) -> tuple[xr.Dataset, dict[str, float]]:
     """A capture whose parameters are drawn from their priors, and those of its material."""
-    links = SETUPS[setup].links
+    links, priors = SETUPS[setup].links, {**pb.PRIORS, **SETUPS[setup].priors}
     keys = iter(jax.random.split(jax.random.key(seed), 64))
 
     def drawn(names: Any) -> dict[str, Any]:
-        return {name: np.asarray(pb.PRIORS[name].sample(next(keys)), float) for name in names}
+        return {name: np.asarray(priors[name].sample(next(keys)), float) for name in names}
 
     noise = {n: float(v) for n, v in drawn(noise_parameters(links)).items() if n != "exposure"}
     parameters = drawn(scene.parameters)
