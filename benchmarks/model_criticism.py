@@ -2,6 +2,7 @@
 
     python benchmarks/model_criticism.py right --fits 1000   share of right models flagged
     python benchmarks/model_criticism.py wrong --fits 5      wrong worlds at 16, 40, 120 readings
+    python benchmarks/model_criticism.py wrong --chosen      the same where the fit chooses a scene
     python benchmarks/model_criticism.py chosen --fits 100   coverage where the scene is chosen, too
     python benchmarks/model_criticism.py cost                seconds beside those of a warm fit
 
@@ -15,6 +16,7 @@ where it was.
 
 import argparse
 import dataclasses
+import functools
 import json
 import platform
 import time
@@ -259,19 +261,20 @@ def judge(capture: xr.Dataset, truth: Mapping[str, float], **settings: Any) -> d
     }
 
 
-def wrong(fits: int) -> Any:
-    """Every wrong world at every number of readings."""
+def wrong(fits: int, *, chosen: bool = False) -> Any:
+    """Every wrong world at every number of readings, fitted by its set-up or by a chosen scene."""
     for readings in READINGS:
         for name, world in WRONG.items():
             for seed in range(fits):
-                key = f"{name}|{readings}|{seed}"
-                yield key, lambda w=world, r=readings, s=seed: _wrong(w, r, s)
+                key = f"{name}{', scene chosen' * chosen}|{readings}|{seed}"
+                yield key, lambda w=world, r=readings, s=seed: _wrong(w, r, s, chosen=chosen)
 
 
-def _wrong(world: World, readings: int, seed: int) -> dict[str, Any]:
-    capture = world.capture(readings, seed)
+def _wrong(world: World, readings: int, seed: int, *, chosen: bool) -> dict[str, Any]:
+    capture = world.capture(readings, seed).assign_attrs(setup=world.setup)
     truth = {n: float(capture[f"true_{n}"]) for n in MATERIAL if f"true_{n}" in capture}
-    return judge(capture, truth, scene=world.setup, method=world.method, seed=seed)
+    scene = "auto" if chosen else world.setup
+    return judge(capture, truth, scene=scene, method=world.method, seed=seed)
 
 
 def right(fits: int) -> Any:
@@ -416,6 +419,7 @@ def main() -> None:
     )
     parser.add_argument("part", choices=("right", "wrong", "chosen", "cost"))
     parser.add_argument("--fits", type=int, default=5)
+    parser.add_argument("--chosen", action="store_true", help="wrong: the fit chooses its scene")
     parser.add_argument("--only", default="", help="worlds whose name holds this text")
     parser.add_argument("--keep", type=Path, help="file of JSON lines", default="criticism.jsonl")
     asked = parser.parse_args()
@@ -428,7 +432,8 @@ def main() -> None:
         else []
     )
     done = {line["key"] for line in lines}
-    for key, run in {"right": right, "wrong": wrong, "chosen": chosen}[asked.part](asked.fits):
+    worlds = {"right": right, "wrong": functools.partial(wrong, chosen=asked.chosen)}
+    for key, run in {**worlds, "chosen": chosen}[asked.part](asked.fits):
         if key in done or asked.only not in key:
             continue
         try:
