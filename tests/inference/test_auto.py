@@ -226,14 +226,14 @@ def test_what_is_stuck_is_abandoned_and_the_best_answer_so_far_is_returned():
 
 @pytest.mark.thorough
 def test_the_time_is_counted_from_when_the_fit_was_asked_for(monkeypatch: pytest.MonkeyPatch):
-    at_once = fitting.resolve
+    at_once = fitting.make_problem
 
     def slowly(*asked: object):
         time.sleep(0.6)
         return at_once(*asked)
 
     fitted(Made())
-    monkeypatch.setattr(fitting, "resolve", slowly)
+    monkeypatch.setattr(fitting, "make_problem", slowly)
     _, said = fitted(Made(k_hat=0.9), Made(), seconds=0.5)
     assert [step["why"] for step in said["auto"]["steps"]][1] == "the time was up"
 
@@ -245,7 +245,7 @@ def test_the_time_is_kept_on_a_busy_machine():
     links = {"q": pb.links.StokesLink(stated_errors=True)}
     hard = plate_capture(np.array([55.0, 57.0]), 0.01, 0)
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
-    seconds, begin = 20.0, time.perf_counter()
+    seconds, begin = 5.0, time.perf_counter()
     try:
         result = pb.fit(hard, scene=scene, links=links, method="auto", seconds=seconds)
     finally:
