@@ -9,9 +9,8 @@
 A fit is flagged where its verdict has a caution or a problem. It is silent and wrong where it is
 not flagged although the 95% interval of a material parameter misses the truth by more than 2 sds.
 `right` draws the truth from the priors of the set-up, except for the exposure, which is set as a
-camera sets it; `chosen` draws the scene as well, of ten, and fits with
-`scene="auto"`. Results are appended to a file of JSON lines, so that a run that was stopped goes on
-where it was.
+camera sets it; `chosen` draws the scene as well, of ten, and fits with `scene="auto"`. Results are
+appended to a file of JSON lines, so that a run that was stopped goes on where it was.
 """
 
 import argparse

@@ -190,12 +190,11 @@ class Beta(dist.Beta):
     @property
     @override
     def support(self) -> constraints.Constraint:
-        for power, other, falls in (
-            (self.concentration0, self.concentration1, True),
-            (self.concentration1, self.concentration0, False),
-        ):
-            if isinstance(power, float | int) and isinstance(other, float | int) and other == 1.0:
-                return ByNormalScore(NormalScoreToPower(float(power), falls))
+        rising, falling = self.concentration1, self.concentration0
+        if _is_one(rising) and isinstance(falling, float | int):
+            return ByNormalScore(NormalScoreToPower(float(falling), falls=True))
+        if _is_one(falling) and isinstance(rising, float | int):
+            return ByNormalScore(NormalScoreToPower(float(rising), falls=False))
         return constraints.unit_interval
 
     @override
@@ -207,13 +206,14 @@ class Beta(dist.Beta):
         shapes = self.concentration1, self.concentration0
         # A shape of 1 adds nothing, not even a derivative of zero times infinity at its bound.
         logs = zip(shapes, (jnp.log, lambda x: jnp.log1p(-x)), strict=True)
-        terms = (
-            (shape - 1.0) * log(value)
-            for shape, log in logs
-            if not (isinstance(shape, float | int) and shape == 1.0)
-        )
+        terms = ((shape - 1.0) * log(value) for shape, log in logs if not _is_one(shape))
         total = gammaln(shapes[0] + shapes[1])
         return sum(terms, total - gammaln(shapes[0]) - gammaln(shapes[1]))
+
+
+def _is_one(shape: object) -> bool:
+    """Whether a shape is the Python number 1: one that is traced is not known."""
+    return isinstance(shape, float | int) and shape == 1.0
 
 
 class NormalScoreToPower(transforms.Transform):

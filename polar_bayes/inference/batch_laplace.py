@@ -210,7 +210,7 @@ class _Run:
             new = find_modes_from(self.engine, self.pixels.subset(untrusted), begin, old)
             is_lower = new.mode.value < old.mode.value - SAME_MODE
             is_better = new.converged & (~old.converged | is_lower)
-            is_other = old.mode.distance(new.mode) > LEAST_DISTANCE  # False where one is NaN
+            is_other = old.mode.distance(new.mode.z) > LEAST_DISTANCE  # False where one is NaN
             left_out = np.where(is_better, old.mode.log_evidence, new.mode.log_evidence)
             both = new.converged & old.converged & is_other
             rival = np.fmax(found.rival[untrusted], np.where(both, left_out, -np.inf))

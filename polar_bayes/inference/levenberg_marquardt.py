@@ -305,12 +305,12 @@ class NormalApproximation(NamedTuple):
         with np.errstate(invalid="ignore"):  # of pixels without a mode
             return np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum(axis=1) - self.value
 
-    def distance(self, other: "NormalApproximation") -> np.ndarray:
-        """Of many pixels: from one mode to another, in posterior sds of the first, (pixel,)."""
+    def distance(self, z: Float[AnyArray, "pixel size"]) -> np.ndarray:
+        """Of many pixels: from the mode to a vector, in posterior sds, (pixel,); NaN if unknown."""
         root, known = np.swapaxes(self.root, 1, 2), np.isfinite(self.root).all(axis=(1, 2))
         known &= (np.diagonal(root, axis1=1, axis2=2) > 0.0).all(axis=1)
         away = np.full(known.size, np.nan)
-        moved = np.linalg.solve(root[known], (other.z - self.z)[known, :, None])
+        moved = np.linalg.solve(root[known], (z - self.z)[known, :, None])
         away[known] = np.linalg.norm(moved[..., 0], axis=1)
         return away
 
@@ -423,11 +423,9 @@ def find_starts(
     return engine.run(_starts, candidates, pixels, single=True)
 
 
-def find_modes(
-    engine: BatchEngine, pixels: ObservationBatch, candidates: int = PRIOR_DRAWS
-) -> ModeSearch:
-    """The mode of every pixel, from the best of so many prior draws."""
-    return find_modes_from(engine, pixels, find_starts(engine, pixels, candidates)[:, 0])
+def find_modes(engine: BatchEngine, pixels: ObservationBatch) -> ModeSearch:
+    """The mode of every pixel, from the best of its starts."""
+    return find_modes_from(engine, pixels, find_starts(engine, pixels)[:, 0])
 
 
 def find_modes_from(
@@ -441,12 +439,10 @@ def find_modes_from(
     for count in SINGLE_PASSES:
         left = np.flatnonzero(~fast.settled)
         if left.size:
-            steps = _advance(engine, pixels, fast, left, count, single=True)
-            put_rows(fast, left, steps)
+            put_rows(fast, left, _advance(engine, pixels, fast, left, count, single=True))
     if known is None:
         return _refine(engine, pixels, start, fast)
-    # One that did not converge has no distance to anything.
-    is_known = known.mode.distance(known.mode._replace(z=fast.z.astype(float))) < SAME_MODE
+    is_known = known.mode.distance(fast.z) < SAME_MODE
     new = np.flatnonzero(~is_known)
     found = jax.tree.map(np.array, known)
     if new.size:
@@ -462,8 +458,8 @@ def _refine(
     state = init(np.where(is_finite, fast.z, start).astype(engine.dtype))
     first, *further = EXACT_PASSES
     everywhere = np.arange(len(pixels))
-    moved = _advance(engine, pixels, state, everywhere, first, single=False)
-    state = jax.tree.map(np.array, moved)
+    state = _advance(engine, pixels, state, everywhere, first, single=False)
+    state = jax.tree.map(np.array, state)
     found = jax.tree.map(np.array, _finalized(engine, state))
     goal = GOALS[engine.precision]
     for count in further:
@@ -510,7 +506,7 @@ def find_all_modes(engine: BatchEngine, pixels: ObservationBatch) -> list[np.nda
     for rank in range(starts.shape[1]):
         mode, _, converged = find_modes_from(engine, pixels, starts[:, rank])
         for other, kept in zip(ends, is_new, strict=True):
-            converged = converged & ~(kept & (other.distance(mode) < SAME_MODE))
+            converged = converged & ~(kept & (other.distance(mode.z) < SAME_MODE))
         ends.append(mode)
         is_new.append(converged)
     evidence = np.where(is_new, [mode.log_evidence for mode in ends], -np.inf)
