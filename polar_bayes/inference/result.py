@@ -71,7 +71,12 @@ def capture_of(result: xr.DataTree) -> xr.Dataset:
     """The capture of a fit, with the variables that were fitted."""
     parts = (result[name].to_dataset() for name in ("observed_data", "constant_data"))
     capture = xr.merge(parts, join="exact", compat="equals")
-    found = capture.drop_vars([dim for dim in ("view", "x", "y") if dim in capture.coords])
+    of_others = [  # errors of readings that were not fitted
+        name
+        for name in capture
+        if str(name).endswith("_error") and str(name).removesuffix("_error") not in capture
+    ]
+    found = capture.drop_vars([d for d in ("view", "x", "y") if d in capture.coords] + of_others)
     flags = {name: found[name].astype(bool) for name in ("valid", "saturated")}
     return found.assign(flags).assign_attrs(provenance_of(result).get("capture", {}))
 

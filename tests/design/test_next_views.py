@@ -105,7 +105,9 @@ def test_light_and_viewer_keep_apart() -> None:
 
 
 def test_a_fit_tells_its_capture_scene_and_priors() -> None:
+    """A goniometer's capture holds the degree of polarization, too, which is not fitted."""
     plate = plate_capture(np.linspace(20.0, 60.0, 6), 0.01, seed=2)
+    plate = plate.assign(dop=abs(plate["q"]), dop_error=plate["q_error"])
     asked = {"scene": PLATE, "links": LINKS}
     asked["priors"] = {"refractive_index": dist.Uniform(1.3, 1.8)}
     fit = pb.fit(plate, method=pb.methods.Laplace(draws=50), **asked)
