@@ -267,6 +267,7 @@ def _provenance(method, variables, limit, name, seed):
         "machine": {"processor": "x86_64", "python": "3.12"},
         "timings": {"modes": 1.5, "draws": 2.25},
         "problems": [],
+        "alternatives": [],
         "capture": {"name": name, "setup": "paper"},
     }
     if method != "point":

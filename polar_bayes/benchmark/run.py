@@ -25,7 +25,6 @@ from jaxtyping import Array, Float
 
 from polar_bayes.diagnostics.parameters import scalars
 from polar_bayes.effects.choose import choose_effects
-from polar_bayes.effects.variants import Effect, parts_of, simplify
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.compile import LRUCache, cache_key
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
@@ -37,6 +36,7 @@ from polar_bayes.interrupts import on_interrupt
 from polar_bayes.paths import temporary_folder
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.variants import Effect, parts_of, simplify
 from polar_bayes.progress import no_progress
 
 try:

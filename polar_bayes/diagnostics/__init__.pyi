@@ -1,3 +1,4 @@
+from .alternatives import alternatives as alternatives
 from .compare import (
     compare_fits as compare_fits,
     FitComparison as FitComparison,

@@ -1,4 +1,4 @@
-r"""Model criticism of one fit: priors, bounds, noise, residuals, influence and repeated readings.
+r"""Model criticism of one fit: priors, bounds, residuals, influence, repeats and alternatives.
 
 The residuals of the readings are compared with residuals of replicated readings. A replicate is
 drawn from the posterior predictive distribution, and refitted in the linear-Gaussian approximation:
@@ -12,7 +12,8 @@ the parameters have absorbed in part, would look too small beside those of the r
 Source: Gelman, Meng & Stern (1996), Statistica Sinica 6, 733 (posterior predictive assessment);
 Evans & Moshonov (2006), Bayesian Analysis 1, 893 (prior-data conflict by tail probability); Moran
 (1950), Biometrika 37, 17 (spatial autocorrelation); Saeilynoja et al. (2022), Stat. Comput. 32, 32
-(uniformity of leave-one-out PIT values).
+(uniformity of leave-one-out PIT values); Kass & Raftery (1995), J. Am. Stat. Assoc. 90, 773 (Bayes
+factors of alternative parts); Vovk & Wang (2021), Ann. Statist. 49, 1736 (their mean as a p-value).
 """
 
 import dataclasses
@@ -25,7 +26,9 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 from scipy import stats
+from scipy.special import logsumexp
 
+from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.parameters import (
     Scalar,
     method_of,
@@ -39,6 +42,7 @@ from polar_bayes.diagnostics.predictive import (
     flat_variables,
     predictive_checks,
 )
+from polar_bayes.errors import FitError
 from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
 from polar_bayes.observation.data import ANGLES
 
@@ -61,6 +65,10 @@ MASS_AT_BOUND = 0.03
 """Share of the draws in that strip that counts: a uniform density over the interval has 0.0475."""
 LARGE_SHIFT = 1.0
 """Change of a posterior mean without one reading that counts, in posterior sds."""
+REFUTED = -math.log(20.0)
+"""Log Bayes factor below which the readings speak strongly against an alternative."""
+OUTSIDE = 1.96
+"""Shift by an alternative, in posterior sds, that leaves the 95% interval."""
 NOISE_FACTOR = "stokes_error_factor"
 LARGE_FACTOR = 3.0
 """Stated errors that are exceeded by this factor, with probability 97.5%, give a caution."""
@@ -77,6 +85,7 @@ QUESTIONS = {
     "leave-one-out": "are leave-one-out PIT values uniform?",
     "influence": "does a single reading decide the answer?",
     "repeats": "was a view entered more than once?",
+    "alternatives": "would another part do as well, or better?",
 }
 """The checks in the order of the table, and what each asks."""
 CHECKS = tuple(QUESTIONS)
@@ -107,9 +116,9 @@ def criticize(
 
     Returns:
         A row for each check: "priors", "noise", "bounds", "angle", "wavelength", "outliers",
-        "leave-one-out", "influence" and "repeats". Columns: level ("passed", "caution", "problem"
-        or "not computed"), p_value and statistic (NaN where a check has none), sentence (empty
-        where it passed).
+        "leave-one-out", "influence", "repeats" and "alternatives". Columns: level ("passed",
+        "caution", "problem" or "not computed"), p_value and statistic (NaN where a check has none),
+        sentence (empty where it passed).
 
     Raises:
         FitError: The tree holds no posterior, or its parts do not fit together.
@@ -138,6 +147,7 @@ def criticize(
             "leave-one-out": _leave_one_out(checks),
             "influence": _influence(result, found, checks),
             "repeats": _repeats(result),
+            "alternatives": _alternatives(result),
         }
     )
 
@@ -521,3 +531,50 @@ def _repeats(result: xr.DataTree) -> Finding:
         "every reading once."
     )
     return Finding("problem" if repeated > 1 else "caution", statistic=repeated, sentence=sentence)
+
+
+# --- Alternatives ---------------------------------------------------------------------------------
+
+
+def _alternatives(result: xr.DataTree) -> Finding:
+    """Parts that explain the readings better, or as well with another answer."""
+    try:
+        table = alternatives(result)
+    except FitError as error:
+        return Finding("not computed", sentence=f"{error.what[:1].upper()}{error.what[1:]}.")
+    if table.empty:
+        return Finding("passed")
+    factors = table.groupby(["part", "alternative", "path"])["log_bayes_factor"].first()
+    part, alternative, path = factors.idxmax()
+    highest = float(factors.max())
+    # The mean of Bayes factors is above 1/p with probability p at most, where the fitted scene is
+    # right and its truth is drawn from its priors.
+    p_value = math.exp(min(0.0, math.log(factors.size) - float(logsumexp(factors))))
+    if _level(p_value) != "passed":
+        sentence = (
+            f"Another part explains the readings better: {alternative} in the place of {part} "
+            f"({path}), by a Bayes factor of {_factor_text(highest)}; fit the scene that has it."
+        )
+        return _finding(p_value, highest, sentence)
+    undecided = table[
+        (table["log_bayes_factor"] > REFUTED)
+        & (table["shift"].abs() > OUTSIDE)
+        & ~table["redefined"]
+    ]
+    if undecided.empty:
+        return Finding("passed", p_value, highest)
+    answers = [
+        f"{label} is {row['other']:.3g}, {abs(row['shift']):.1f} sd away, with "
+        f"{row['alternative']} in the place of {row['part']}"
+        for label, row in undecided.iterrows()
+    ]
+    sentence = (
+        f"The answer rests on a part that the readings do not decide: {listed(answers)}; unless "
+        "you know the part, report both answers, as polar_bayes.compare_scenes gives them."
+    )
+    return Finding("caution", p_value, highest, sentence)
+
+
+def _factor_text(log_factor: float) -> str:
+    large = log_factor > math.log(1e4)
+    return f"10^{log_factor / math.log(10.0):.0f}" if large else f"{math.exp(log_factor):.3g}"

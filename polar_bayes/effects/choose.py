@@ -18,7 +18,11 @@ import xarray as xr
 from numpyro import distributions as dist
 
 from polar_bayes.effects.posterior_change import Baseline, PosteriorChange, SceneDensities
-from polar_bayes.effects.variants import (
+from polar_bayes.errors import FitError, SceneError
+from polar_bayes.inference.request import resolve
+from polar_bayes.observation.links import AbstractLink
+from polar_bayes.physics.scene import FULL_SCENES, Scene
+from polar_bayes.physics.variants import (
     Effect,
     KeyPath,
     effects_of,
@@ -26,10 +30,6 @@ from polar_bayes.effects.variants import (
     parts_of,
     simplify,
 )
-from polar_bayes.errors import FitError, SceneError
-from polar_bayes.inference.request import resolve
-from polar_bayes.observation.links import AbstractLink
-from polar_bayes.physics.scene import FULL_SCENES, Scene
 from polar_bayes.priors import resolve_priors
 from polar_bayes.progress import Progress, no_progress, with_progress
 

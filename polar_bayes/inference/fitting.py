@@ -6,7 +6,7 @@ import json
 import math
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from importlib.metadata import version
 from types import FunctionType
 from typing import Any
@@ -22,6 +22,7 @@ from polar_bayes.capture.plausibility import cautions
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference import methods
+from polar_bayes.inference.alternatives import compare_alternatives
 from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_until
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import from_prior
@@ -30,6 +31,7 @@ from polar_bayes.inference.program import BLOCK, THREADS
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.physics.instrument import Discrepancy
+from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import support_bounds
 from polar_bayes.progress import Progress
 
@@ -89,6 +91,15 @@ def fit_request(
     if isinstance(request.scene.ledger, xr.Dataset):
         comparisons["effects"] = request.scene.ledger  # how the scene was chosen
     timings.record("comparisons")
+    is_point = draws.covariance is not None  # it has no intervals to compare
+    compared = (
+        {}
+        if is_point or not with_comparisons
+        else try_alternatives(
+            request, problem, posterior.parameters, key_check, progress, deadline=draws.deadline
+        )
+    )
+    timings.record("alternatives")
 
     stated = {name: getattr(draws, name) for name in DIAGNOSTICS}
     provenance = {
@@ -100,6 +111,7 @@ def fit_request(
         **{name: value if math.isfinite(value) else None for name, value in stated.items()},
         **draws.metadata,
         **checked,
+        **compared,
         **({"comparisons_failed": failed} if failed else {}),
     }
     return assemble(
@@ -137,6 +149,27 @@ def find_method(
             hint=f"give one of {', '.join(METHODS)}, or settings such as Nuts(draws=2000)",
         )
     return METHODS[method]()
+
+
+def try_alternatives(
+    request: Request,
+    problem: Problem,
+    posterior: Mapping[str, Any],
+    key: Array,
+    progress: Progress,
+    *,
+    deadline: float = math.inf,
+    compared: Collection[Scene] = (),
+) -> dict[str, Any]:
+    """Entries of the provenance: the comparison with alternative parts, or why there is none."""
+
+    def compare(progress: Progress) -> list[dict[str, Any]]:
+        return compare_alternatives(request, problem, posterior, key, progress, compared)
+
+    try:
+        return {"alternatives": run_until(deadline, progress, compare)}
+    except (FitError, OutOfTimeError) as error:
+        return {"alternatives_failed": str(error)}
 
 
 class _Timings:

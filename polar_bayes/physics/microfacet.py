@@ -33,6 +33,8 @@ TAIL = 6.0
 class AbstractMicrofacet(Part):
     """A distribution of facet slopes, isotropic around the surface normal."""
 
+    defines: ClassVar[tuple[str, ...]] = ("roughness", "roughness_across")
+
     @abc.abstractmethod
     def density(self, tan_squared: Array, roughness: Array) -> Array:
         """Facet area per steradian around a tilt, D.
@@ -123,6 +125,10 @@ class Beckmann(AbstractMicrofacet):
     """
 
     @override
+    def alternatives(self) -> tuple[Part, ...]:
+        return (GGX(),)
+
+    @override
     def density(self, tan_squared: Array, roughness: Array) -> Array:
         alpha = at_least(roughness, SMOOTHEST)
         # Far from the mirror direction the exponential would underflow and take the derivatives
@@ -171,6 +177,10 @@ class GGX(AbstractMicrofacet):
     Source:
         Walter et al. 2007, Microfacet models for refraction through rough surfaces.
     """
+
+    @override
+    def alternatives(self) -> tuple[Part, ...]:
+        return (Beckmann(),)
 
     @override
     def density(self, tan_squared: Array, roughness: Array) -> Array:

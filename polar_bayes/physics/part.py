@@ -1,13 +1,14 @@
 """What all parts of a scene share: the parameters they read, and what to put in their place.
 
 A part is a frozen value. A part that can be replaced by something cheaper says so in `simpler`;
-that is all the ledger of effects needs to weigh it (`polar_bayes.choose_effects`).
+that is all the ledger of effects needs to weigh it (`polar_bayes.choose_effects`). A part that
+another could replace as well says so in `alternatives`: every fit tells what it would change.
 """
 
 import abc
 import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,9 @@ class Range(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Part(HTMLRepr, abc.ABC):
     """One effect of a scene."""
+
+    defines: ClassVar[tuple[str, ...]] = ()
+    """Parameters whose values mean something else where another part stands in its place."""
 
     def __post_init__(self) -> None:
         for name, allowed, value in self._values():
@@ -69,6 +73,14 @@ class Part(HTMLRepr, abc.ABC):
 
         Returns:
             Replacements to be weighed, each alone; empty where there is nothing simpler.
+        """
+        return ()
+
+    def alternatives(self) -> "tuple[Part, ...]":
+        """What could be there as well: parts that the readings may not tell from this one.
+
+        Returns:
+            Parts that every fit compares with this one, each alone; empty where there are none.
         """
         return ()
 

@@ -108,6 +108,10 @@ class Lambertian(DiffuseBody):
         return (Unpolarized(self.albedo, self.internal_reflection),)
 
     @override
+    def alternatives(self) -> tuple[Part, ...]:
+        return (Depolarizer(),)
+
+    @override
     def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         brightness, leaving = self.diffuse(parameters, geometry, interface)
         return leaving._replace(intensity=brightness * leaving.intensity)

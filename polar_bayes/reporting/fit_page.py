@@ -11,6 +11,7 @@ import xarray as xr
 
 from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
 from polar_bayes.diagnostics import convergence
+from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
 from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, Verdict
 from polar_bayes.diagnostics.criticism import CAUTION, PROBLEM, QUESTIONS, criticize
@@ -31,7 +32,7 @@ from polar_bayes.diagnostics.population import (
 )
 from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck, predictive_checks
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, sensitivity
-from polar_bayes.errors import one_line
+from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import auto_sentences
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.priors import short_numbers
@@ -305,6 +306,26 @@ def _criticism(fit: Fit) -> Iterator[page.Block]:
         descriptions=QUESTIONS,
         prose=["what it says"],
     )
+    yield from _alternatives(fit)
+
+
+def _alternatives(fit: Fit) -> Iterator[page.Block]:
+    """What the answer assumes, where a part of the scene has an alternative."""
+    try:
+        table = alternatives(fit.result)
+    except FitError:  # the check says why
+        return
+    if table.empty:
+        return
+    cells: page.Cells = {
+        "in the place of": operator.itemgetter("part"),
+        "stands": operator.itemgetter("alternative"),
+        "log Bayes factor": column("log_bayes_factor", ".1f"),
+        "mean": column("mean", ".4g"),
+        "would be": column("other", ".4g"),
+        "shift (sd)": lambda row: "redefined" if row["redefined"] else f"{row['shift']:+.1f}",
+    }
+    yield page.make_table("alternative", page.caption("fit.alternative"), cells, table)
 
 
 # --- Populations and spectra ----------------------------------------------------------------------

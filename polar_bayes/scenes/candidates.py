@@ -17,7 +17,7 @@ from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, St
 from polar_bayes.physics.coat import ThinFilm
 from polar_bayes.physics.illumination import PointSource, UniformSky
 from polar_bayes.physics.instrument import AngleZero, Discrepancy, Instrument, TiltedNormal
-from polar_bayes.physics.microfacet import Beckmann
+from polar_bayes.physics.microfacet import GGX, Beckmann
 from polar_bayes.physics.mixing import AbstractMixing, StokesMixing
 from polar_bayes.physics.scene import WAY_OUT, Scene
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
@@ -35,8 +35,13 @@ SURFACES: Mapping[str, Any] = MappingProxyType(
         "mirror": SmoothSurface(),
         "rough surface": RoughSurface(Beckmann(), PointSource(), WAY_OUT),
         "sky": RoughSurface(Beckmann(), UniformSky(), WAY_OUT),
+        "rough GGX surface": RoughSurface(GGX(), PointSource(), WAY_OUT),
     }
 )
+SAME_LIGHT = MappingProxyType(
+    {"rough surface": "rough GGX surface", "rough GGX surface": "rough surface"}
+)
+"""Surfaces that differ in their slopes alone."""
 BODIES: Mapping[str, Any] = MappingProxyType(
     {
         "unpolarized body": Unpolarized(),
@@ -109,14 +114,14 @@ class SceneLibrary:
             Other choices.
         """
         for surface in self.surfaces:
-            if surface != choice[0]:
+            if surface != choice[0] and surface != "rough GGX surface":
                 yield (surface, *choice[1:])
         for slot, options in enumerate((self.bodies, *self.others.values()), start=1):
             if not choice[slot]:
                 yield (*choice[:slot], next(iter(options)), *choice[slot + 1 :])
 
     def alternatives(self, choice: Choice) -> Iterator[Choice]:
-        """Choices with another body, and those with one part less.
+        """Choices with other slopes or another body, and those with one part less.
 
         Args:
             choice: The option of each slot.
@@ -124,6 +129,8 @@ class SceneLibrary:
         Yields:
             Other choices.
         """
+        if SAME_LIGHT.get(choice[0]) in self.surfaces:
+            yield (SAME_LIGHT[choice[0]], *choice[1:])
         if choice[1]:
             yield from ((choice[0], body, *choice[2:]) for body in self.bodies if body != choice[1])
         for slot in range(1, len(choice)):
@@ -155,6 +162,7 @@ def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None)
         *(["rough surface"] if "intensity" in fitted or not mirrored else []),
         "sky",
     ]
+    surfaces += [SAME_LIGHT[name] for name in surfaces if name in SAME_LIGHT]
     several_colors = capture.sizes.get("wavelength", 1) > 2
     mixing = setup.scene.mixing if setup else None
     return SceneLibrary(

@@ -16,11 +16,12 @@ import xarray as xr
 from polar_bayes.diagnostics.convergence import verdict
 from polar_bayes.diagnostics.parameters import SAMPLE_DIMS
 from polar_bayes.errors import FitError
-from polar_bayes.inference.fitting import fit_request
+from polar_bayes.inference.fitting import fit_request, try_alternatives
 from polar_bayes.inference.laplace import Importance
 from polar_bayes.inference.least_squares import Point
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.psis import FINITE_VARIANCE
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.progress import Progress
@@ -69,9 +70,19 @@ def fit_best_scenes(
             )
             for name in weights
         }
-    result = next(iter(fits.values())) if alone else stack_fits(fits, weights)
+        result = next(iter(fits.values())) if alone else stack_fits(fits, weights)
+        request = comparison.requests[max(weights, key=lambda name: weights[name])]
+        key = jax.random.key(arguments.seed)
+        alternatives = try_alternatives(
+            request,
+            make_problem(request, key),
+            {str(name): draws for name, draws in result["posterior"].data_vars.items()},
+            key,
+            progress,
+            compared=list(comparison.scenes.values()),
+        )
     result["scenes"] = xr.DataTree(comparison.to_dataset())
-    provenance = json.loads(result.attrs[PROVENANCE]) | {"scene": "auto"}
+    provenance = json.loads(result.attrs[PROVENANCE]) | {"scene": "auto", **alternatives}
     result.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
     return result
 

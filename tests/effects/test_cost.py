@@ -10,7 +10,6 @@ from cases import each
 
 import polar_bayes as pb
 from polar_bayes.effects.posterior_change import compile_and_count, run_seconds
-from polar_bayes.effects.variants import effects_of, simplify
 from polar_bayes.physics.boundary import (
     Medium,
     medium,
@@ -20,6 +19,7 @@ from polar_bayes.physics.boundary import (
 )
 from polar_bayes.physics.geometry import cos_degrees, mirror_facet, sin_degrees
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization
+from polar_bayes.physics.variants import effects_of, simplify
 
 GEOMETRY = pb.Geometry.from_degrees(
     view_zenith=np.linspace(5.0, 80.0, 16),

@@ -12,7 +12,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from polar_bayes.effects.variants import effects_of
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
@@ -31,6 +30,7 @@ from polar_bayes.physics.scene import MATERIAL_PARAMETERS, SCENES, Scene
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Lambertian, TurbidMedium
 from polar_bayes.physics.surface import RoughSurface, SmoothExit, SmoothSurface
+from polar_bayes.physics.variants import effects_of
 
 RUN = settings(deadline=None, max_examples=60, derandomize=True)
 direction = st.tuples(st.floats(0.0, 75.0), st.floats(-360.0, 360.0))

@@ -21,7 +21,11 @@ def off_mirror(capture: xr.Dataset) -> xr.Dataset:
 
 def test_a_mirror_needs_views_in_the_mirror_direction(plate: xr.Dataset) -> None:
     assert list(scene_library(plate).surfaces) == ["mirror", "sky"]
-    assert list(scene_library(off_mirror(plate)).surfaces) == ["rough surface", "sky"]
+    library = scene_library(off_mirror(plate))
+    assert list(library.surfaces) == ["rough surface", "sky", "rough GGX surface"]
+    # Other slopes do not make a scene grow; they stand in the place of what was selected.
+    assert all(choice[0] != "rough GGX surface" for choice in library.extensions(library.simplest))
+    assert next(library.alternatives(library.simplest)) == ("rough GGX surface", "", "")
 
 
 def test_the_setup_gives_its_body_and_its_systematic_errors(plate: xr.Dataset) -> None:

@@ -1,11 +1,12 @@
-"""The effects of a scene: every part with a simpler replacement, and scenes without some of them.
+"""Variants of a scene: without some of its effects, or with another part in the place of one.
 
-There is no list of effects: every part whose `simpler` gives replacements is one, wherever it is in
-a scene and whoever wrote it.
+There is no list of effects or of alternatives: every part whose `simpler` or `alternatives` gives
+replacements has them, wherever it is in a scene and whoever wrote it.
 """
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping
+import operator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from polar_bayes.errors import SceneError
@@ -18,7 +19,7 @@ KeyPath = tuple[str | int, ...]
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """One part of a scene, and one simpler replacement."""
+    """One part of a scene, and one replacement, simpler or alternative."""
 
     name: str
     key_path: KeyPath
@@ -37,9 +38,21 @@ class Effect:
 
 def effects_of(scene: Scene) -> tuple[Effect, ...]:
     """Every effect of a scene, in the order of its fields."""
+    return _replacements(scene, operator.methodcaller("simpler"))
+
+
+def alternatives_of(scene: Scene) -> tuple[Effect, ...]:
+    """Every part of a scene with one that could be there as well, in the order of its fields."""
+    return _replacements(scene, operator.methodcaller("alternatives"))
+
+
+def _replacements(
+    scene: Scene, offered: Callable[[Part], Iterable[Part | None]]
+) -> tuple[Effect, ...]:
+    """Every replacement that the parts of a scene offer, in the order of its fields."""
     found: dict[Scene, tuple[KeyPath, Part, Part | None]] = {}
     for key_path, part in parts_of(scene):
-        for replacement in part.simpler():
+        for replacement in offered(part):
             simpler = simplify(scene, [Effect("", key_path, part, replacement)])
             if simpler != scene and len(key_path) >= len(found.get(simpler, ((),))[0]):
                 found[simpler] = key_path, part, replacement

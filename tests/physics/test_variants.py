@@ -7,10 +7,10 @@ import pytest
 from cases import each
 
 import polar_bayes as pb
-from polar_bayes.effects.variants import effects_of, find_effects, parts_of, simplify
 from polar_bayes.physics.instrument import AbstractInstrumentTerm
 from polar_bayes.physics.part import Part
 from polar_bayes.physics.scene import FULL_SCENES
+from polar_bayes.physics.variants import effects_of, find_effects, parts_of, simplify
 from polar_bayes.setups import SETUPS
 
 ROUGH = pb.Scene(

@@ -1,0 +1,54 @@
+"""What a fit assumes: alternatives to parts of its scene, and the answers that they give."""
+
+import pandas as pd
+import xarray as xr
+
+from polar_bayes.diagnostics.parameters import posterior_scalars, with_entries
+from polar_bayes.errors import FitError
+from polar_bayes.frames import PrintedFrame
+from polar_bayes.inference.result import provenance_of
+
+COLUMNS = ("part", "alternative", "path", "log_bayes_factor", "mean", "other", "shift", "redefined")
+
+
+def alternatives(result: xr.DataTree) -> pd.DataFrame:
+    """Answers of the scenes that have another part in the place of one, as the fit has found them.
+
+    Args:
+        result: A tree that `polar_bayes.fit` returned, or one read back from a file.
+
+    Returns:
+        A row for each alternative and material parameter: part and alternative (class names), path
+        (of the part in the scene), log_bayes_factor (of the alternative over the scene of the fit,
+        natural logarithm), mean (posterior mean, unit of the parameter), other (value by the
+        alternative: the mean moved by the difference of both modes), shift (that difference in
+        posterior sds), and redefined (True where the parameter means something else with the
+        alternative). The index holds the names of the parameters. Empty where the scene has no part
+        with an alternative.
+
+    Raises:
+        FitError: The tree holds no posterior, or its alternatives were not compared.
+
+    Source:
+        Kass and Raftery (1995), J. Am. Stat. Assoc. 90, 773 (Bayes factors).
+    """
+    provenance = provenance_of(result)
+    tried = provenance.get("alternatives")
+    failed = [each["failed"] for each in tried or () if "failed" in each]
+    if tried is None or failed:
+        reason = provenance.get("alternatives_failed", "the result does not hold them")
+        raise FitError(
+            f"alternatives to the parts of its scene were not compared: {[*failed, reason][0]}",
+            where="result",
+            hint="fit one material, by a method that gives draws",
+        )
+    material = [scalar for scalar in posterior_scalars(result) if scalar.is_material]
+    rows, labels = [], []
+    for each in tried:
+        for scalar, shift in with_entries(material, each["shift"]):
+            mean, sd = float(scalar.draws.mean()), float(scalar.draws.std())
+            redefined = scalar.name in each["defines"]
+            given = [each[name] for name in COLUMNS[:4]]
+            rows.append([*given, mean, mean + shift * sd, shift, redefined])
+            labels.append(scalar.label)
+    return PrintedFrame(rows, columns=list(COLUMNS), index=pd.Index(labels, name="parameter"))

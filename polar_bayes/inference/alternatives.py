@@ -1,0 +1,118 @@
+r"""Alternatives to the parts of a scene: does another one explain the readings, and what changes?
+
+A fit rests on parts that nobody has measured, such as a distribution of slopes. For each part that
+names an alternative (`Part.alternatives`) the posterior of the scene with that one is found near
+the modes of the fit, and both are compared by Laplace's approximation of the evidence,
+
+$$ \log p(y \mid M) = \log \sum_k p(y, \hat z_k \mid M) \, (2\pi)^{d/2} \, |H_k|^{-1/2} $$
+
+over the modes $\hat z_k$, with $H_k$ the Hessian of the potential and d the number of coordinates.
+
+Source: Tierney & Kadane (1986), J. Am. Stat. Assoc. 81, 82; Kass & Raftery (1995), J. Am. Stat.
+Assoc. 90, 773 (Bayes factors).
+"""
+
+import dataclasses
+import math
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
+from polar_bayes.inference.optimize import Modes, NumpyPotential
+from polar_bayes.inference.problem import Problem, compile_model
+from polar_bayes.inference.request import Request
+from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.variants import alternatives_of
+from polar_bayes.priors import resolve_priors
+from polar_bayes.progress import Progress
+
+PRIOR_DRAWS = 101
+"""Draws whose median is the start of a parameter that only the alternative has."""
+
+
+def compare_alternatives(
+    request: Request,
+    problem: Problem,
+    posterior: Mapping[str, Any],
+    key: Array,
+    progress: Progress,
+    compared: Collection[Scene] = (),
+) -> list[dict[str, Any]]:
+    """For each alternative its log Bayes factor and the answer that it gives, as JSON holds it.
+
+    `shift` is the difference of the modes in posterior sds, by parameter. Scenes that were compared
+    already are left out. A `FitError` where all coordinates together have no modes, as those of
+    many patches.
+    """
+    scenes = {each: each.apply(request.scene) for each in alternatives_of(request.scene)}
+    alternatives = [each for each, scene in scenes.items() if scene not in compared]
+    if not alternatives:
+        return []
+    found = problem.initialize(progress)
+    if not isinstance(found, JointInit):
+        raise FitError(
+            "patches have modes of their own, which give no evidence of the whole",
+            where="alternatives",
+            hint="fit one patch alone",
+        )
+    evidence, values = _log_evidence(problem, found.modes), _at_mode(problem, found.modes)
+    names = values.keys() & posterior.keys()
+    sd = {name: np.std(np.asarray(posterior[name]), axis=(0, 1)) for name in names}
+    rows = []
+    for number, alternative in enumerate(alternatives):
+        progress("comparing alternatives", number / len(alternatives))
+        row: dict[str, Any] = {
+            "part": type(alternative.part).__name__,
+            "alternative": type(alternative.replacement).__name__,
+            "path": alternative.path,
+            "defines": list(alternative.part.defines),
+        }
+        try:
+            other = _with_scene(request, problem, scenes[alternative], key)
+            modes = other.initialize(progress).joint_modes("alternatives")
+        except FitError as error:
+            rows.append(row | {"failed": str(error)})
+            continue
+        moved = {
+            name: (value - values[name]) / np.where(sd[name] > 0.0, sd[name], 1.0)
+            for name, value in _at_mode(other, modes).items()
+            if name in sd
+        }
+        row["log_bayes_factor"] = _log_evidence(other, modes) - evidence
+        rows.append(row | {"shift": {name: np.ravel(x).tolist() for name, x in moved.items()}})
+    progress("comparing alternatives", 1.0)
+    return rows
+
+
+def _with_scene(request: Request, problem: Problem, scene: Scene, key: Array) -> Problem:
+    """The same capture by another scene, whose search starts at the modes of this one."""
+    new = [name for name in scene.parameters if name not in request.scene.parameters]
+    priors = {**resolve_priors(new), **request.priors}
+    model = compile_model(dataclasses.replace(request, scene=scene, priors=priors), problem.data)
+    program, modes = model.program, problem.initialize().joint_modes("alternatives")
+    # What only the other scene has starts at the median of its prior.
+    middle = program.constrain(jnp.zeros(program.size, problem.dtype))
+    for name in middle.keys() - problem.program.supports.keys():
+        median = jnp.median(priors[name].sample(key, (PRIOR_DRAWS,)), axis=0)
+        middle[name] = jnp.broadcast_to(median, middle[name].shape)
+    sites = [problem.program.constrain(z) for z in modes.z[modes.weight >= HEAVY_MODE]]
+    starts = [program.unconstrain({n: own.get(n, x) for n, x in middle.items()}) for own in sites]
+    return Problem(model, problem.data, key, starts=np.stack(starts))
+
+
+def _log_evidence(problem: Problem, modes: Modes) -> float:
+    """Laplace's approximation of the log evidence, summed over the modes."""
+    potential = NumpyPotential(problem.program.value_and_gradient, problem.data, problem.dtype)
+    volume = 0.5 * np.linalg.slogdet(2.0 * math.pi * modes.covariance[0])[1]
+    return float(volume - potential(modes.z[0])[0] - math.log(modes.weight[0]))
+
+
+def _at_mode(problem: Problem, modes: Modes) -> dict[str, np.ndarray]:
+    """Parameters at the mode of largest weight."""
+    found = problem.constrain(modes.z[None, :1])
+    return {name: np.asarray(value)[0, 0] for name, value in found.items()}

@@ -1,0 +1,129 @@
+"""Alternative parts: Bayes factors and answers in closed form, and worlds with another part."""
+
+import dataclasses
+
+import linear
+import numpy as np
+import numpyro
+import pytest
+import toy_models
+import xarray as xr
+from numpyro import distributions as dist
+from scipy import stats
+
+import polar_bayes as pb
+from polar_bayes.diagnostics import alternatives, criticize
+from polar_bayes.errors import FitError
+from polar_bayes.simulation import Protocol
+
+ROUGH = pb.Scene(pb.RoughSurface(pb.Beckmann(), pb.PointSource()))
+SLOPE = {pb.Beckmann: 1.0, pb.GGX: 1.3}
+DRAWS = 4000
+
+
+def _line(data, scene, priors, links):
+    """Readings on a line through the origin, whose steepness depends on the distribution."""
+    del priors, links
+    x = np.linspace(-1.0, 1.0, data.shape[-1])
+    tilt = numpyro.sample("normal_tilt_x", dist.Normal(0.0, 1.0))
+    with numpyro.plate("view", x.size):
+        mean = SLOPE[type(scene.surface.distribution)] * tilt * x
+        numpyro.sample("q", dist.Normal(mean, linear.NOISE), obs=data.readings["q"])
+
+
+def _exact(q: np.ndarray, slope: float) -> tuple[float, float, float]:
+    """Log evidence, posterior mean and sd of the tilt."""
+    x = slope * np.linspace(-1.0, 1.0, q.size)
+    variance = 1.0 / (1.0 + x @ x / linear.NOISE**2)
+    covariance = linear.NOISE**2 * np.eye(q.size) + np.outer(x, x)
+    evidence = float(stats.multivariate_normal(cov=covariance).logpdf(q))
+    return evidence, variance * (x @ q) / linear.NOISE**2, variance**0.5
+
+
+@pytest.fixture(scope="module")
+def fitted_line() -> xr.DataTree:
+    return pb.fit(
+        toy_models.capture(),
+        model=_line,
+        scene=ROUGH,
+        links=linear.LINKS,
+        method=pb.methods.Laplace(draws=DRAWS),
+    )
+
+
+def test_bayes_factor_and_answer_are_those_in_closed_form(fitted_line) -> None:
+    q = fitted_line["observed_data"]["q"].to_numpy()
+    (evidence, mean, sd), (other_evidence, other, _) = (_exact(q, s) for s in SLOPE.values())
+    table = alternatives(fitted_line)
+    row = table.loc["normal_tilt_x"]
+    assert (row["part"], row["alternative"]) == ("Beckmann", "GGX")
+    assert row["path"] == "surface.distribution"
+    # The posterior is normal, so Laplace's approximation is exact but for differences and rounding.
+    assert row["log_bayes_factor"] == pytest.approx(other_evidence - evidence, abs=1e-6)
+    # The standard error of an sd from independent draws, five times: one run in 2 million.
+    error = 5.0 / np.sqrt(2 * DRAWS)
+    assert row["shift"] == pytest.approx((other - mean) / sd, rel=error)
+    assert row["other"] - row["mean"] == pytest.approx(other - mean, rel=1e-4)
+
+
+def test_the_same_is_read_back_from_a_file(fitted_line, tmp_path) -> None:
+    pb.save(fitted_line, tmp_path / "fit.nc")
+    again = alternatives(pb.load(tmp_path / "fit.nc"))
+    assert again.equals(alternatives(fitted_line))
+
+
+def test_a_scene_without_alternatives_has_an_empty_table() -> None:
+    fit = pb.fit(toy_models.capture(), model=toy_models.line, links=linear.LINKS, method="laplace")
+    assert alternatives(fit).empty
+    assert criticize(fit).loc["alternatives", "level"] == "passed"
+
+
+def test_a_point_fit_has_nothing_to_compare() -> None:
+    fit = pb.fit(toy_models.capture(), model=toy_models.line, links=linear.LINKS, method="point")
+    with pytest.raises(FitError, match=r"not compared.*by a method that gives draws"):
+        alternatives(fit)
+
+
+def _fit(preset: str, setup: str, **parts) -> xr.DataTree:
+    """A fit by a set-up of forty readings of a world with other parts."""
+    own = pb.setups.SETUPS[setup]
+    if "distribution" in parts:
+        parts = {"surface": dataclasses.replace(own.scene.surface, **parts)}
+    capture = pb.simulate(
+        preset,
+        scene=dataclasses.replace(own.scene, **parts),
+        links=own.links,
+        protocol=Protocol(views=40, wavelengths=()),
+        seed=0,
+    )
+    return pb.fit(capture, scene=setup, method="laplace", seed=0)
+
+
+def test_a_distribution_that_explains_the_readings_better_is_a_problem() -> None:
+    fit = _fit("plastic", "paper", distribution=pb.physics.GGX())
+    row = criticize(fit).loc["alternatives"]
+    assert row["level"] == "problem"
+    assert "GGX in the place of Beckmann (surface.distribution)" in row["sentence"]
+    assert any("GGX" in problem for problem in pb.verdict(fit).problems)
+
+
+@pytest.fixture(scope="module")
+def absorbing_body() -> xr.DataTree:
+    return _fit("leaf", "camera", subsurface=pb.physics.Depolarizer())
+
+
+def test_a_body_that_may_absorb_is_told_with_the_answer_it_gives(absorbing_body) -> None:
+    """The readings do not tell it from a white one, whose fraction is tens of sds off."""
+    row = criticize(absorbing_body).loc["alternatives"]
+    assert row["level"] == "caution"
+    assert "Depolarizer in the place of Lambertian" in row["sentence"]
+    table = alternatives(absorbing_body)
+    told = table[table["alternative"] == "Depolarizer"].loc["subsurface_fraction"]
+    truth = float(absorbing_body["constant_data"]["true_subsurface_fraction"])
+    assert abs(told["other"] - truth) < 0.2 * abs(told["mean"] - truth)
+
+
+def test_roughness_of_another_distribution_is_not_the_same_quantity(absorbing_body) -> None:
+    table = alternatives(absorbing_body)
+    slopes = table[table["alternative"] == "GGX"]
+    assert slopes.index[slopes["redefined"]].tolist() == ["roughness"]
