@@ -307,3 +307,51 @@ def _after_returns(turned: _Turned, source: Array, cos_view: Array) -> Array:
     """Light that leaves towards the viewer after it has entered again: (pair, 2, ...)."""
     total = jnp.einsum("gaibj...,gbj...->gai...", turned.returns, source, precision="highest")
     return jnp.sum(total / (turned.cosine + cos_view), axis=2)
+
+
+# --- Isotropic scattering, in closed form ---------------------------------------------------------
+
+
+# Mean cosine of light turned back by total reflection, over that of the critical angle.
+MEAN_TRAPPED = 2.0 / 3.0
+
+
+def _isotropic_h(cosine: Array, g: Array) -> tuple[Array, Array]:
+    """Numerator and denominator of H: the one quotient of the caller compiles to fewer loops."""
+    # A fit to H by iteration on 200 nodes, within .25 % of H and of the plane albedo 1 - g H, for g
+    # up to .99 and cosines from .003. Exact for a black body (g = 1) and at grazing: H = 1.
+    level, rise = 1.9613 + g * (0.4670 - 0.1275 * g), -0.1313 - 0.0334 * g
+    bend, off = 0.0743 + 0.0473 * g, cosine + 0.04
+    q = cosine * (off * (level + rise * cosine) + bend)
+    return off + q, off + g * q
+
+
+def isotropic_reflectance(
+    cos_light: Array, cos_view: Array, absorption: Array, escape: Array, refractive_index: Array
+) -> Array:
+    r"""Radiance inside, over that of a white diffuser, of a half space that scatters evenly.
+
+    $$ r(l, v) + \frac{F_i\, r(l, t)\, r(t, v)}{1 - F_i\, r(t, t)}, \qquad
+       r(l, v) = \frac{w}{4} \frac{H_l H_v}{\mu_l + \mu_v}, \qquad
+       H = \frac{1 + q}{1 + g q}, \qquad
+       \frac{q}{\mu} = c_0(g) + c_1(g) \mu + \frac{c_2(g)}{\mu + 0.04} $$
+
+    The interface turns back F_i = 1 - escape of diffuse light. It enters again at one cosine, the
+    mean of those beyond the critical angle, $\mu_t = \frac{2}{3} \sqrt{1 - 1/n^2}$.
+
+    Source:
+        Chandrasekhar 1960, Radiative transfer, section 47.
+    """
+    absorption = at_least(absorption, CLEAREST)
+    w, g = 1.0 / (1.0 + absorption), jnp.sqrt(absorption / (1.0 + absorption))
+    step = (refractive_index - 1.0) * (refractive_index + 1.0) + STEP_FLOOR
+    turned = MEAN_TRAPPED * jnp.sqrt(step) / refractive_index
+    light, view = (jnp.maximum(cosine, GRAZING) for cosine in (cos_light, cos_view))
+    (above_l, below_l), (above_v, below_v), (above_t, below_t) = (
+        _isotropic_h(cosine, g) for cosine in (light, view, turned)
+    )
+    again = 0.25 * w * (above_t / below_t) ** 2 * (1.0 - escape)
+    again = again / (1.0 - 0.5 * again / turned)
+    three = (light + turned) * (turned + view)
+    above = 0.25 * w * above_l * above_v * (three + again * (light + view))
+    return above / (below_l * below_v * three * (light + view))

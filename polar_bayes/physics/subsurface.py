@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.half_space import CLEAREST, refract, scatter
+from polar_bayes.physics.half_space import CLEAREST, isotropic_reflectance, refract, scatter
 from polar_bayes.physics.part import (
     Parameters,
     Part,
@@ -122,9 +122,11 @@ class Depolarizer(AbstractSubsurface):
     r"""A body that depolarizes the more, the brighter it is (Umov's effect).
 
     $$ \rho = (1 - R_b(a, n)) \rho_\text{exit}(v; n, r), \qquad
-       S_0 = \text{entering} \frac{R_d(a)}{\pi n^2 (1 - F_i R_d)} T_\text{exit}(v) $$
+       S_0 = \text{entering} \frac{R(l, v; a, n)}{\pi n^2} T_\text{exit}(v) $$
 
-    An absorbing body scatters light few times, so that more of its polarization is kept.
+    An absorbing body scatters light few times, so that more of its polarization is kept. R is that
+    of isotropic scattering (`polar_bayes.physics.half_space.isotropic_reflectance`), for light
+    that enters and leaves as through a plane.
 
     Args:
         internal_reflection: InternalReflection(), or None for an interface that turns nothing
@@ -139,18 +141,23 @@ class Depolarizer(AbstractSubsurface):
 
     @override
     def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
-        lost = half_space_loss(parameters["absorption"])
-        if self.internal_reflection is None:
-            not_trapped, kept = jnp.ones_like(lost), lost
-        else:
+        absorption, n = parameters["absorption"], parameters["refractive_index"]
+        escape = jnp.ones_like(n)
+        if self.internal_reflection is not None:
             escape = interface.escape(parameters, geometry)
-            # 1 - Fi Rd, as a sum of two positive terms.
-            not_trapped = lost + (1.0 - lost) * escape
-            kept = body_loss(parameters["absorption"], escape)
-        returned = (1.0 - lost) / (jnp.pi * parameters["refractive_index"] ** 2 * not_trapped)
-        entering = interface.entering(parameters, geometry).intensity
-        leaving = interface.exit(parameters, geometry)
-        return Light(entering * returned * leaving.intensity, kept * leaving.q, kept * leaving.u)
+        rays, entering = interface.beams(parameters, geometry)
+        view = refract(sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith), n)
+        light = refract(
+            sin_degrees(rays.light_zenith), cos_degrees(rays.light_zenith), n[..., None]
+        )
+        reflectance = isotropic_reflectance(
+            light.cosine,
+            view.cosine[..., None],
+            *(array[..., None] for array in (absorption, escape, n)),
+        )
+        returned = jnp.sum(entering.intensity * reflectance, axis=-1) / (jnp.pi * n**2)
+        leaving, kept = interface.exit(parameters, geometry), body_loss(absorption, escape)
+        return Light(returned * leaving.intensity, kept * leaving.q, kept * leaving.u)
 
 
 def half_space_loss(absorption: Array) -> Array:

@@ -72,11 +72,11 @@ def test_unpolarized_is_as_bright_as_lambertian() -> None:
 
 
 def test_a_white_depolarizer_returns_what_enters() -> None:
-    """Without absorption all that enters leaves: Saunderson's sum is 1 then, and rho is 0."""
+    """Without absorption all that enters leaves, nearly as from a diffuser, and rho is 0."""
     white = {**MATERIAL, "absorption": jnp.array([0.0])}
     found = Depolarizer().light(white, GEOMETRY, under(SmoothSurface()))
     lambertian = Lambertian(albedo=1.0).light(white, GEOMETRY, under(SmoothSurface()))
-    # What absorption at its floor, 1e-4, still takes away.
+    # What absorption at its floor, 1e-4, still takes away, and where the light goes.
     np.testing.assert_allclose(found.intensity, lambertian.intensity, rtol=0.06)
     assert np.all(np.abs(found.q) < 0.06 * np.abs(lambertian.q) + 1e-12)
 
