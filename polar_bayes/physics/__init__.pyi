@@ -37,6 +37,7 @@ from .mixing import (
 )
 from .part import Part as Part
 from .scene import Scene as Scene
+from .second_bounce import TwoBounceSurface as TwoBounceSurface
 from .stokes import LinearPolarization as LinearPolarization
 from .subsurface import (
     AbstractSubsurface as AbstractSubsurface,

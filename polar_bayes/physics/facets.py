@@ -288,13 +288,18 @@ class Microsurface:
         """Facet area per steradian around the facet that mirrors the light to the viewer."""
         if ellipse.shear is None:
             return self.distribution.density(tan_squared, ellipse.across)
+        return self.density_of(ellipse, *mirror_slopes(geometry))
+
+    def density_of(self, ellipse: SlopeEllipse, x: Array, y: Array) -> Array:
+        """Facet area per steradian around slopes towards the viewer and across."""
+        if ellipse.shear is None:
+            return self.distribution.density(x**2 + y**2, ellipse.across)
         # The slopes of an isotropic surface with the same peak that are met as often as these.
-        in_plane, out_of_plane = mirror_slopes(geometry)
-        w = out_of_plane / ellipse.across
-        u = (in_plane - ellipse.shear * w) / ellipse.along
+        w = y / ellipse.across
+        u = (x - ellipse.shear * w) / ellipse.along
         peak = ellipse.across * ellipse.along
         alike = peak * (u**2 + w**2)
-        stretch = (1.0 + tan_squared) / (1.0 + alike)
+        stretch = (1.0 + x**2 + y**2) / (1.0 + alike)
         return self.distribution.density(alike, jnp.sqrt(peak)) * stretch**2
 
     def visible(self, ellipse: SlopeEllipse, x: Array, y: Array) -> Array:

@@ -37,7 +37,7 @@ from jaxtyping import Array
 
 from polar_bayes.physics.boundary import medium
 from polar_bayes.physics.geometry import cos_degrees, double_angle, sin_degrees
-from polar_bayes.physics.part import at_least, squared_rule, unit_rule
+from polar_bayes.physics.part import at_least, quotient, squared_rule, unit_rule
 from polar_bayes.physics.stack import Stack
 
 # Scattered light changes with the square root of absorption, whose slope at zero is infinite: less
@@ -312,8 +312,8 @@ def _after_returns(turned: _Turned, source: Array, cos_view: Array) -> Array:
 # --- Isotropic scattering, in closed form ---------------------------------------------------------
 
 
-# Mean cosine of light turned back by total reflection, over that of the critical angle.
-MEAN_TRAPPED = 2.0 / 3.0
+# Mean cosine of diffuse light.
+MEAN_COSINE = 2.0 / 3.0
 
 
 def _isotropic_h(cosine: Array, g: Array) -> tuple[Array, Array]:
@@ -336,8 +336,10 @@ def isotropic_reflectance(
        H = \frac{1 + q}{1 + g q}, \qquad
        \frac{q}{\mu} = c_0(g) + c_1(g) \mu + \frac{c_2(g)}{\mu + 0.04} $$
 
-    The interface turns back F_i = 1 - escape of diffuse light. It enters again at one cosine, the
-    mean of those beyond the critical angle, $\mu_t = \frac{2}{3} \sqrt{1 - 1/n^2}$.
+    The interface turns back F_i = 1 - escape of diffuse light: all beyond the critical angle, whose
+    cosine is $\mu_c$, and some of the rest. It enters again at one cosine, its mean,
+
+    $$ \mu_t = \frac{2}{3} [1 - (1 - \mu_c) \mu_c^2 / F_i], \qquad \mu_c^2 = 1 - 1/n^2 $$
 
     Source:
         Chandrasekhar 1960, Radiative transfer, section 47.
@@ -345,13 +347,15 @@ def isotropic_reflectance(
     absorption = at_least(absorption, CLEAREST)
     w, g = 1.0 / (1.0 + absorption), jnp.sqrt(absorption / (1.0 + absorption))
     step = (refractive_index - 1.0) * (refractive_index + 1.0) + STEP_FLOOR
-    turned = MEAN_TRAPPED * jnp.sqrt(step) / refractive_index
+    critical, trapped = step / refractive_index**2, 1.0 - escape
+    beyond = critical / jnp.maximum(trapped, critical)
+    turned = MEAN_COSINE * (1.0 - (1.0 - jnp.sqrt(critical)) * beyond)
     light, view = (jnp.maximum(cosine, GRAZING) for cosine in (cos_light, cos_view))
     (above_l, below_l), (above_v, below_v), (above_t, below_t) = (
         _isotropic_h(cosine, g) for cosine in (light, view, turned)
     )
-    again = 0.25 * w * (above_t / below_t) ** 2 * (1.0 - escape)
+    again = 0.25 * w * (above_t / below_t) ** 2 * trapped
     again = again / (1.0 - 0.5 * again / turned)
     three = (light + turned) * (turned + view)
     above = 0.25 * w * above_l * above_v * (three + again * (light + view))
-    return above / (below_l * below_v * three * (light + view))
+    return quotient(above, below_l * below_v * three * (light + view))

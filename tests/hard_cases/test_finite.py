@@ -43,6 +43,7 @@ from polar_bayes.physics.microfacet import (
 )
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.scene import SCENES, Scene
+from polar_bayes.physics.second_bounce import TwoBounceSurface
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, TurbidMedium, Unpolarized
 from polar_bayes.physics.surface import (
@@ -93,6 +94,11 @@ EFFECT_SCENES = {
         Cauchy(),
         TiltedNormal(),
     ),
+    "grooves that light each other": Scene(
+        TwoBounceSurface(Beckmann(), quadrature=FacetQuadrature(along=3, across=2), slopes=GROOVED),
+        Lambertian(),
+        StokesMixing(),
+    ),
     "a turbid body": Scene(SmoothSurface(BEAM), TurbidMedium("polarized_fraction"), StokesMixing()),
 }
 
@@ -103,6 +109,14 @@ ALL_SCENES = (
         "GGX, point": Scene(RoughSurface(GGX()), Depolarizer(), StokesMixing()),
         "facets both ways": Scene(
             RoughSurface(quadrature=FEW, way_out=RoughPassage()), Depolarizer(), StokesMixing()
+        ),
+        "two bounces": Scene(
+            TwoBounceSurface(quadrature=FEW), Depolarizer(), DopMixing(signed=True)
+        ),
+        "two bounces, sky": Scene(
+            TwoBounceSurface(GGX(), UniformSky(), FacetQuadrature(along=3, across=2)),
+            Lambertian(),
+            StokesMixing(),
         ),
         "GGX, sky": Scene(RoughSurface(GGX(), UniformSky()), Lambertian(), StokesMixing()),
         "Beckmann, sky": Scene(
