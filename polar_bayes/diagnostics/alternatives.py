@@ -18,7 +18,8 @@ def alternatives(result: xr.DataTree) -> pd.DataFrame:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
 
     Returns:
-        A row for each alternative and material parameter: part and alternative (class names), path
+        A row for each alternative and material parameter (every parameter of a model that declares
+        none of the material's): part and alternative (class names), path
         (of the part in the scene), log_bayes_factor (of the alternative over the scene of the fit,
         natural logarithm), mean (posterior mean, unit of the parameter), other (value by the
         alternative: the mean moved by the difference of both modes), shift (that difference in
@@ -42,10 +43,11 @@ def alternatives(result: xr.DataTree) -> pd.DataFrame:
             where="result",
             hint="fit one material, by a method that gives draws",
         )
-    material = [scalar for scalar in posterior_scalars(result) if scalar.is_material]
+    found = posterior_scalars(result)
+    material = [scalar for scalar in found if scalar.is_material]
     rows, labels = [], []
     for each in tried:
-        for scalar, shift in with_entries(material, each["shift"]):
+        for scalar, shift in with_entries(material or found, each["shift"]):
             mean, sd = float(scalar.draws.mean()), float(scalar.draws.std())
             redefined = scalar.name in each["defines"]
             given = [each[name] for name in COLUMNS[:4]]

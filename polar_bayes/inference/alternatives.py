@@ -83,8 +83,12 @@ def compare_alternatives(
             for name, value in _at_mode(other, modes).items()
             if name in sd
         }
-        row["log_bayes_factor"] = _log_evidence(other, modes) - evidence
-        rows.append(row | {"shift": {name: np.ravel(x).tolist() for name, x in moved.items()}})
+        factor = _log_evidence(other, modes) - evidence
+        if not math.isfinite(factor):
+            rows.append(row | {"failed": "its evidence is not finite"})
+            continue
+        shift = {name: np.ravel(change).tolist() for name, change in moved.items()}
+        rows.append(row | {"log_bayes_factor": factor, "shift": shift})
     progress("comparing alternatives", 1.0)
     return rows
 

@@ -318,8 +318,8 @@ def _alternatives(fit: Fit) -> Iterator[page.Block]:
     if table.empty:
         return
     cells: page.Cells = {
-        "in the place of": operator.itemgetter("part"),
-        "stands": operator.itemgetter("alternative"),
+        "part": operator.itemgetter("part"),
+        "instead": operator.itemgetter("alternative"),
         "log Bayes factor": column("log_bayes_factor", ".1f"),
         "mean": column("mean", ".4g"),
         "would be": column("other", ".4g"),

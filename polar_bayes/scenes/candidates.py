@@ -38,10 +38,8 @@ SURFACES: Mapping[str, Any] = MappingProxyType(
         "rough GGX surface": RoughSurface(GGX(), PointSource(), WAY_OUT),
     }
 )
-SAME_LIGHT = MappingProxyType(
-    {"rough surface": "rough GGX surface", "rough GGX surface": "rough surface"}
-)
-"""Surfaces that differ in their slopes alone."""
+OTHER_SLOPES = MappingProxyType({"rough surface": "rough GGX surface"})
+"""Surfaces that differ in their slopes alone; the second is an alternative, never an extension."""
 BODIES: Mapping[str, Any] = MappingProxyType(
     {
         "unpolarized body": Unpolarized(),
@@ -114,7 +112,7 @@ class SceneLibrary:
             Other choices.
         """
         for surface in self.surfaces:
-            if surface != choice[0] and surface != "rough GGX surface":
+            if surface != choice[0] and surface not in OTHER_SLOPES.values():
                 yield (surface, *choice[1:])
         for slot, options in enumerate((self.bodies, *self.others.values()), start=1):
             if not choice[slot]:
@@ -129,8 +127,9 @@ class SceneLibrary:
         Yields:
             Other choices.
         """
-        if SAME_LIGHT.get(choice[0]) in self.surfaces:
-            yield (SAME_LIGHT[choice[0]], *choice[1:])
+        for pair in OTHER_SLOPES.items():
+            if choice[0] in pair and set(pair) <= set(self.surfaces):
+                yield (pair[1 - pair.index(choice[0])], *choice[1:])
         if choice[1]:
             yield from ((choice[0], body, *choice[2:]) for body in self.bodies if body != choice[1])
         for slot in range(1, len(choice)):
@@ -162,7 +161,7 @@ def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None)
         *(["rough surface"] if "intensity" in fitted or not mirrored else []),
         "sky",
     ]
-    surfaces += [SAME_LIGHT[name] for name in surfaces if name in SAME_LIGHT]
+    surfaces += [OTHER_SLOPES[name] for name in surfaces if name in OTHER_SLOPES]
     several_colors = capture.sizes.get("wavelength", 1) > 2
     mixing = setup.scene.mixing if setup else None
     return SceneLibrary(

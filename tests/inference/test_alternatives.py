@@ -73,7 +73,14 @@ def test_the_same_is_read_back_from_a_file(fitted_line, tmp_path) -> None:
 
 
 def test_a_scene_without_alternatives_has_an_empty_table() -> None:
-    fit = pb.fit(toy_models.capture(), model=toy_models.line, links=linear.LINKS, method="laplace")
+    smooth = pb.Scene(pb.SmoothSurface())
+    fit = pb.fit(
+        toy_models.capture(),
+        model=toy_models.line,
+        scene=smooth,
+        links=linear.LINKS,
+        method="laplace",
+    )
     assert alternatives(fit).empty
     assert criticize(fit).loc["alternatives", "level"] == "passed"
 
