@@ -295,7 +295,7 @@ def _residuals(result: xr.DataTree) -> _Residuals | None:
     random = np.random.default_rng(0)
     pick = random.permutation(len(noise))[:REPLICATES]
     centered = noise_free - noise_free.mean(axis=0)
-    absorbed = (noise[pick] @ centered.T) @ centered / (len(centered) - 1)
+    absorbed = noise[pick] @ (centered.T @ centered / (len(centered) - 1))
     group = [name for each in where for name in each.group]
     labels = [label for each in where for label in each.labels]
     groups = {name: number for number, name in enumerate(dict.fromkeys(group))}

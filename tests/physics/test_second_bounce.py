@@ -1,5 +1,6 @@
 """A second bounce between facets: height fields, energy, sky and point, and explicit vectors."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,11 +19,13 @@ from polar_bayes.physics.surface import RoughSurface
 
 MANY = FacetQuadrature(10, 8)
 
+stokes_of = jax.jit(Scene.stokes, static_argnums=0)
+
 
 def second_bounce(parameters, geometry, **parts) -> np.ndarray:
     """Stokes vectors of the second bounce alone."""
     twice, once = (
-        Scene(kind(**{"quadrature": MANY, **parts})).stokes(parameters, geometry)
+        stokes_of(Scene(kind(**{"quadrature": MANY, **parts})), parameters, geometry)
         for kind in (TwoBounceSurface, RoughSurface)
     )
     return np.asarray(twice - once)
@@ -64,16 +67,17 @@ def test_the_second_bounce_is_that_of_a_height_field(height_field_sky: np.ndarra
 def test_no_light_is_made(distribution, roughness) -> None:
     """Facets that reflect everything give back what comes, to 1% of quadrature, never more."""
     mirror = {"roughness": roughness, "refractive_index": 1e5}
-    surface = TwoBounceSurface(distribution, UniformSky(), MANY)
-    found = Scene(surface).stokes(mirror, seen_from(0.0, 45.0, 75.0, 85.0))[:, 0]
-    once = Scene(RoughSurface(distribution, UniformSky(), MANY)).stokes(
-        mirror, seen_from(0.0, 45.0, 75.0, 85.0)
-    )[:, 0]
+    views = seen_from(0.0, 45.0, 75.0, 85.0)
+    found, once = (
+        stokes_of(Scene(kind(distribution, UniformSky(), MANY)), mirror, views)[:, 0]
+        for kind in (TwoBounceSurface, RoughSurface)
+    )
     assert np.all(found <= 1.01)
     assert np.all(found >= once)
     assert np.all(1.0 - found < 0.35 * (1.0 - once) + 0.01)
 
 
+@pytest.mark.thorough
 @each("view", [30.0, 75.0])
 def test_a_sky_is_many_points(view: float) -> None:
     node, weight = np.polynomial.legendre.leggauss(24)
@@ -145,6 +149,7 @@ def test_point_source_agrees_with_vectors(azimuth: float) -> None:
     np.testing.assert_allclose(found, total, rtol=0.04)
 
 
+@pytest.mark.thorough
 def test_equal_slopes_of_grooves_are_isotropic() -> None:
     geometry = Geometry.from_degrees(
         view_zenith=[50.0, 75.0], view_azimuth=20.0, light_zenith=60.0, light_azimuth=190.0
