@@ -73,7 +73,7 @@ def compare_alternatives(
             "defines": list(alternative.part.defines),
         }
         try:
-            other = _with_scene(request, problem, scenes[alternative], key)
+            other = _with_scene(request, problem, found.modes, scenes[alternative], key)
             modes = other.initialize(progress).joint_modes("alternatives")
         except FitError as error:
             rows.append(row | {"failed": str(error)})
@@ -93,12 +93,14 @@ def compare_alternatives(
     return rows
 
 
-def _with_scene(request: Request, problem: Problem, scene: Scene, key: Array) -> Problem:
+def _with_scene(
+    request: Request, problem: Problem, modes: Modes, scene: Scene, key: Array
+) -> Problem:
     """The same capture by another scene, whose search starts at the modes of this one."""
     new = [name for name in scene.parameters if name not in request.scene.parameters]
     priors = {**resolve_priors(new), **request.priors}
     model = compile_model(dataclasses.replace(request, scene=scene, priors=priors), problem.data)
-    program, modes = model.program, problem.initialize().joint_modes("alternatives")
+    program = model.program
     # What only the other scene has starts at the median of its prior.
     middle = program.constrain(jnp.zeros(program.size, problem.dtype))
     for name in middle.keys() - problem.program.supports.keys():

@@ -83,22 +83,19 @@ def fit_request(
     checked = method.cross_check(problem, posterior.parameters, key_check)
     timings.record("cross-check")
 
-    comparisons, failed = (
-        _fit_comparisons(request, method, draws, key_comparisons, progress)
-        if with_comparisons
-        else ({}, {})
-    )
+    comparisons: dict[str, xr.Dataset] = {}
+    failed: dict[str, str] = {}
+    alternatives: dict[str, Any] = {}
+    compares = with_comparisons and draws.covariance is None  # a point has no intervals to compare
+    if compares:
+        comparisons, failed = _fit_comparisons(request, method, draws, key_comparisons, progress)
     if isinstance(request.scene.ledger, xr.Dataset):
         comparisons["effects"] = request.scene.ledger  # how the scene was chosen
     timings.record("comparisons")
-    is_point = draws.covariance is not None  # it has no intervals to compare
-    compared = (
-        {}
-        if is_point or not with_comparisons
-        else try_alternatives(
+    if compares:
+        alternatives = try_alternatives(
             request, problem, posterior.parameters, key_check, progress, deadline=draws.deadline
         )
-    )
     timings.record("alternatives")
 
     stated = {name: getattr(draws, name) for name in DIAGNOSTICS}
@@ -111,7 +108,7 @@ def fit_request(
         **{name: value if math.isfinite(value) else None for name, value in stated.items()},
         **draws.metadata,
         **checked,
-        **compared,
+        **alternatives,
         **({"comparisons_failed": failed} if failed else {}),
     }
     return assemble(
@@ -202,8 +199,7 @@ def _fit_comparisons(
     request: Request, method: AbstractMethod, draws: PosteriorDraws, key: Array, progress: Progress
 ) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
     """Posteriors of the same capture under simpler scenes, by name, and why others failed."""
-    is_point = draws.covariance is not None  # it has no intervals to compare
-    if is_point or not request.scene.has(Discrepancy):
+    if not request.scene.has(Discrepancy):
         return {}, {}
     method = draws.comparison_method or method
     scenes = {

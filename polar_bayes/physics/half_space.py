@@ -259,11 +259,15 @@ def _at_nodes(moments: _Moments) -> _Moments:
     return _Moments(moments.constant[:, :, :, None], moments.term[:, :, :, :, None])
 
 
+def _critical(n: Array) -> Array:
+    """Squared cosine of the critical angle, with a finite slope of its root at n = 1."""
+    return ((n - 1.0) * (n + 1.0) + STEP_FLOOR) / n**2
+
+
 def _interface(n: Array) -> _Interface:
     """Nodes in the cosine beyond the critical angle; within it, in that of the light outside."""
-    step = (n - 1.0) * (n + 1.0)
     node, weight = (_column(x, n) for x in unit_rule(BEYOND))
-    critical = (step + STEP_FLOOR) / n**2
+    critical = _critical(n)
     cosine = jnp.sqrt(critical) * node
     # Squared tangent of half the phase between s and p in total reflection.
     tangent = (critical * node / (1.0 - cosine**2)) ** 2 * (1.0 - node**2)
@@ -346,8 +350,7 @@ def isotropic_reflectance(
     """
     absorption = at_least(absorption, CLEAREST)
     w, g = 1.0 / (1.0 + absorption), jnp.sqrt(absorption / (1.0 + absorption))
-    step = (refractive_index - 1.0) * (refractive_index + 1.0) + STEP_FLOOR
-    critical, trapped = step / refractive_index**2, 1.0 - escape
+    critical, trapped = _critical(refractive_index), 1.0 - escape
     beyond = critical / jnp.maximum(trapped, critical)
     turned = MEAN_COSINE * (1.0 - (1.0 - jnp.sqrt(critical)) * beyond)
     light, view = (jnp.maximum(cosine, GRAZING) for cosine in (cos_light, cos_view))

@@ -55,13 +55,18 @@ class Vector(NamedTuple):
         """Scalar product."""
         return self.x * other.x + self.y * other.y + self.z * other.z
 
+    def cross(self, other: "Vector") -> "Vector":
+        """Vector product."""
+        return Vector(
+            self.y * other.z - self.z * other.y,
+            self.z * other.x - self.x * other.z,
+            self.x * other.y - self.y * other.x,
+        )
+
     def across(self, other: "Vector") -> "Vector":
         """Unit vector across both; any one where both are the same direction."""
-        x = self.y * other.z - self.z * other.y
-        y = self.z * other.x - self.x * other.z
-        z = self.x * other.y - self.y * other.x
-        scale = 1.0 / jnp.sqrt(x**2 + y**2 + z**2 + LEAST**2)
-        return Vector(x * scale, y * scale, z * scale)
+        product = self.cross(other)
+        return product.times(1.0 / jnp.sqrt(product.dot(product) + LEAST**2))
 
     def times(self, factor: Array) -> "Vector":
         """A multiple."""
@@ -115,7 +120,7 @@ class TwoBounceSurface(RoughSurface):
         hidden = first.weight * self._open(per_facet(ellipse), ray)
         share = hidden * self._open(ellipse, Vector(sin_view, zero, cos_view))[..., None, :]
 
-        back = ray.times(-jnp.ones_like(ray.x))
+        back = jax.tree.map(jnp.negative, ray)
         view = Vector(*(x[..., None, :] for x in (sin_view, zero, cos_view)))
         axis = view.across(back)
         if isinstance(self.illumination, PointSource):
@@ -150,7 +155,7 @@ class TwoBounceSurface(RoughSurface):
         turn = (geometry.light_azimuth - geometry.view_azimuth)[..., None, :]
         sin, cos = (f(geometry.light_zenith)[..., None, :] for f in (sin_degrees, cos_degrees))
         light = Vector(sin * cos_degrees(turn), sin * sin_degrees(turn), cos)
-        middle = Vector(back.x + light.x, back.y + light.y, back.z + light.z)
+        middle = jax.tree.map(jnp.add, back, light)
         length = jnp.sqrt(jnp.maximum(middle.dot(middle), LEAST))
         normal = middle.times(1.0 / length)
         upright = jnp.maximum(normal.z, LEAST)
@@ -188,13 +193,7 @@ def _mirrored(
     cosine = jnp.clip(cosine, GRAZING, 1.0)
     power = stack.reflection(cosine, (1.0 - cosine) * (1.0 + cosine))
     own = back.across(light)
-    # The second direction of the frame is across the axis and the ray.
-    side = Vector(
-        back.y * axis.z - back.z * axis.y,
-        back.z * axis.x - back.x * axis.z,
-        back.x * axis.y - back.y * axis.x,
-    )
-    cos, sin = double(own.dot(axis), own.dot(side))
+    cos, sin = double(own.dot(axis), own.dot(back.cross(axis)))
     polarized = lit * power.contrast * power.sin_squared
     return Vector(lit * power.mean, polarized * cos, polarized * sin)
 
@@ -209,14 +208,9 @@ def both_sides(sample: Facets) -> Facets:
     if sample.across_s is not None:
         return sample
 
-    def twice(values: Array, sign: float = 1.0) -> Array:
-        return jnp.concatenate([values, sign * values], axis=-2)
-
-    return sample._replace(
-        weight=twice(0.5 * sample.weight),
-        cos_incidence=twice(sample.cos_incidence),
-        sin_squared=twice(sample.sin_squared),
-        cos_light=twice(sample.cos_light),
-        light_in_plane=twice(sample.light_in_plane),
-        light_out_of_plane=twice(sample.light_out_of_plane, -1.0),
+    both = jax.tree.map(lambda values: jnp.concatenate([values, values], axis=-2), sample)
+    out_of_plane = sample.light_out_of_plane
+    return both._replace(
+        weight=0.5 * both.weight,
+        light_out_of_plane=jnp.concatenate([out_of_plane, -out_of_plane], axis=-2),
     )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.half_space import CLEAREST, isotropic_reflectance, refract, scatter
+from polar_bayes.physics.half_space import CLEAREST, Ray, isotropic_reflectance, refract, scatter
 from polar_bayes.physics.part import (
     Parameters,
     Part,
@@ -146,10 +146,8 @@ class Depolarizer(AbstractSubsurface):
         if self.internal_reflection is not None:
             escape = interface.escape(parameters, geometry)
         rays, entering = interface.beams(parameters, geometry)
-        view = refract(sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith), n)
-        light = refract(
-            sin_degrees(rays.light_zenith), cos_degrees(rays.light_zenith), n[..., None]
-        )
+        view = _inside(geometry.view_zenith, n)
+        light = _inside(rays.light_zenith, n[..., None])
         reflectance = isotropic_reflectance(
             light.cosine,
             view.cosine[..., None],
@@ -158,6 +156,11 @@ class Depolarizer(AbstractSubsurface):
         returned = jnp.sum(entering.intensity * reflectance, axis=-1) / (jnp.pi * n**2)
         leaving, kept = interface.exit(parameters, geometry), body_loss(absorption, escape)
         return Light(returned * leaving.intensity, kept * leaving.q, kept * leaving.u)
+
+
+def _inside(zenith: Array, refractive_index: Array) -> Ray:
+    """Direction in the body of light that meets a plane surface at a zenith, degree."""
+    return refract(sin_degrees(zenith), cos_degrees(zenith), refractive_index)
 
 
 def half_space_loss(absorption: Array) -> Array:
@@ -227,10 +230,8 @@ class TurbidMedium(AbstractSubsurface):
     def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
         n = parameters["refractive_index"]
         rays, entering = interface.beams(parameters, geometry)
-        view = refract(sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith), n)
-        light = refract(
-            sin_degrees(rays.light_zenith), cos_degrees(rays.light_zenith), n[..., None]
-        )
+        view = _inside(geometry.view_zenith, n)
+        light = _inside(rays.light_zenith, n[..., None])
         # The half space counts u from e_s towards e_s x l, the other way round.
         incident = (
             entering.intensity,

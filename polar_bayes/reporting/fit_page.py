@@ -14,7 +14,7 @@ from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
 from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, Verdict
-from polar_bayes.diagnostics.criticism import CAUTION, PROBLEM, QUESTIONS, criticize
+from polar_bayes.diagnostics.criticism import CAUTION, PROBLEM, QUESTIONS, REFUTED, criticize
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
     Scalar,
@@ -325,7 +325,8 @@ def _alternatives(fit: Fit) -> Iterator[page.Block]:
         "would be": column("other", ".4g"),
         "shift (sd)": lambda row: "redefined" if row["redefined"] else f"{row['shift']:+.1f}",
     }
-    yield page.make_table("alternative", page.caption("fit.alternative"), cells, table)
+    caption = page.caption("fit.alternative", better=-math.log(CAUTION), refuted=REFUTED)
+    yield page.make_table("alternative", caption, cells, table)
 
 
 # --- Populations and spectra ----------------------------------------------------------------------

@@ -242,6 +242,26 @@ def test_isotropic_scattering_in_closed_form_agrees_with_adding_doubling() -> No
     np.testing.assert_allclose(found + reflected, diffuse, rtol=0.01)
 
 
+@pytest.mark.thorough
+def test_similarity_holds_for_bright_bodies() -> None:
+    """Forward scattering by reduced scattering: the figures of docs/equations.md, n = 1 and 1.5."""
+    table = read("iad_semiinfinite_albedo.csv")
+    for anisotropy, albedo, excess in (
+        (0.5, 0.97, 0.03),
+        (0.8, 0.97, 0.10),
+        (0.5, 0.9, 0.09),
+        (0.8, 0.9, 0.30),
+        (0.5, 0.1, 0.96),
+        (0.8, 0.1, 1.79),
+    ):
+        n, _, _, normal = table[:4, (table[1] == anisotropy) & (table[2] == albedo)]
+        reduced = albedo * (1.0 - anisotropy) / (1.0 - albedo * anisotropy)
+        (view, ns), integral = hemisphere(n)
+        found = np.pi * integral(isotropic_under_beam(ns, reduced + 0.0 * ns, 0.0 * view, view))
+        exact = normal - ((n - 1.0) / (n + 1.0)) ** 2
+        assert np.max(found / exact) - 1.0 == pytest.approx(excess, abs=0.005)
+
+
 def test_isotropic_scattering_in_closed_form_agrees_with_all_orders() -> None:
     """Direction by direction, beside `scatter` without polarized scattering.
 

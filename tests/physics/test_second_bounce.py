@@ -53,6 +53,8 @@ def test_the_second_bounce_is_that_of_a_height_field(height_field_sky: np.ndarra
     once, twice = np.array(once), np.array(twice)
     assert np.abs(once[:, 0] / rows[:, 4] - 1.0).max() > 0.09
     np.testing.assert_allclose(twice[:, 0], rows[:, 4], rtol=0.045)
+    degree = twice[:, 1] / twice[:, 0] - once[:, 1] / once[:, 0]
+    assert np.abs(degree).max() < 0.02  # as docs/scenes.md says
     # What the second bounce adds, polarization included, where it adds most: within 10% and three
     # standard errors of the table.
     added = rows[:, 4:6] - height_field_sky[height_field_sky[:, 3] == 1.0][:, 4:6]
