@@ -6,7 +6,7 @@ blocks R-hat and effective sample sizes are computed: sampling continues until e
 reached the goals, within the limits of the settings. The draws do not depend on the threads.
 
 Where a draw diverged, the steps were too long for a part of the posterior, which the chains may
-have left out: they are sampled again with half the step size, which is what a higher target
+have left out: they are sampled again at once with half the step size, which is what a higher target
 acceptance leads to (Betancourt 2016, arXiv:1604.00695), and needs no new compilation.
 """
 
@@ -243,7 +243,8 @@ def sample(
             if halvings:
                 warmup_steps += _stacked(rounds).n_steps.sum(axis=1)  # they are paid for, too
                 states, rounds = [_with_half_the_step(state) for state in states], []
-            states = _until_converged(states, rounds, advance_all, settings)
+            last = halvings == MOST_HALVINGS
+            states = _until_converged(states, rounds, advance_all, settings, despite=last)
             if not _stacked(rounds).diverging.any():
                 break
     stats = jax.tree.map(lambda x: x[:, : settings.most_draws], _stacked(rounds))._asdict()
@@ -260,12 +261,19 @@ def _until_converged(
     rounds: list[Step],
     advance_all: Callable[[list[infer.hmc.HMCState]], tuple[list[infer.hmc.HMCState], Step]],
     settings: Nuts,
+    *,
+    despite: bool,
 ) -> list[infer.hmc.HMCState]:
-    """Add blocks of draws to `rounds` until the goals or the limit of the settings are reached."""
+    """Add blocks of draws to `rounds` until the goals or the limit of the settings are reached.
+
+    A divergence ends it at once, unless sampling is to go on despite of it: such draws are redone.
+    """
     least, most = (-(-count // settings.block) for count in (settings.draws, settings.most_draws))
     for done in range(1, most + 1):
         states, steps = advance_all(states)
         rounds.append(steps)
+        if steps.diverging.any() and not despite:
+            break
         if done >= least and _converged(rounds, settings):
             break
     return states
