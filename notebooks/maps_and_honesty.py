@@ -127,6 +127,19 @@ pb.diagnostics.map_coverage(overconfident, image)[held].round(3)
 # single pixel sees that. The readings of all of them would: fit the noise on a patch first, or
 # leave it unknown (slower, and wider).
 #
-# A map has no joint posterior of its pixels: the mean of a region and its uncertainty are not in
-# it. Fit the region as one capture, or as [patches of one population](pooling_and_spectra.md). How
-# maps are made, and how fast: [maps](../maps.md).
+# ## The mean of a region
+#
+# Pixels are independent given what they share, and here they share nothing:
+
+# %%
+means = pb.maps.region_means(maps, shadow)
+pb.maps.region_table(means).round(4)
+
+# %%
+means.attrs["cautions"]
+
+# %% [markdown]
+# The interval is that of the map's own model, in which each pixel has a prior of its own. Where the
+# pixels of a region are alike, all those priors pull the same way, and the caution says by how
+# much: fit such a region as one capture, or as [patches of one population](pooling_and_spectra.md).
+# How maps are made, and how fast: [maps](../maps.md).

@@ -1,6 +1,7 @@
 """Commands that fit a capture, compare scenes, and show results."""
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -201,6 +202,27 @@ def map_(
 
 
 @command()
+@click.argument("maps", type=INPUT)
+@click.argument("labels", type=INPUT)
+@option("--against", help="Region from which the others are subtracted.")
+@json_option
+def regions(maps: Path, labels: Path, against: str | None, as_json: bool) -> None:
+    """Means of a map over the regions of a label image, and how they differ."""
+    picture = pb.maps.load_labels(labels)
+    reference: Any = against
+    if against is not None and picture.dtype.kind in "iu" and against.isdecimal():
+        reference = int(against)
+    found = pb.maps.region_means(pb.maps.open_map(maps), picture, against=reference)
+    table, cautions = pb.maps.region_table(found), found.attrs["cautions"]
+    if as_json:
+        print_json({"regions": json.loads(table.to_json(orient="records")), "cautions": cautions})
+        return
+    print_frame(table.set_index("region"))
+    for sentence in cautions:
+        click.echo(f"caution: {sentence}", err=True)
+
+
+@command()
 @capture_argument
 @scene_options
 @option("--tolerance", type=float, default=0.1, help="Posterior sd.")
@@ -343,4 +365,4 @@ def _load_all(paths: tuple[Path, ...], kind: str) -> dict[str, Any]:
     return {path.stem: pb.load(path, kind) for path in paths}
 
 
-COMMANDS = (demo, fit, map_, effects, scene, scenes, report, compare)
+COMMANDS = (demo, fit, map_, regions, effects, scene, scenes, report, compare)

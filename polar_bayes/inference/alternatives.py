@@ -17,19 +17,31 @@ import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
-from polar_bayes.inference.optimize import Modes, NumpyPotential
+from polar_bayes.inference.optimize import (
+    DifferencedPotential,
+    Modes,
+    NumpyPotential,
+    ValueAndGradient,
+    find_modes,
+    symmetrize,
+)
 from polar_bayes.inference.problem import Problem, compile_model
 from polar_bayes.inference.request import Request
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.variants import alternatives_of
 from polar_bayes.priors import resolve_priors
 from polar_bayes.progress import Progress
+
+JITTER = 1e-9
+"""Share by which variances are widened, so that rounding leaves a covariance positive definite."""
 
 PRIOR_DRAWS = 101
 """Draws whose median is the start of a parameter that only the alternative has."""
@@ -60,7 +72,8 @@ def compare_alternatives(
             where="alternatives",
             hint="fit one patch alone",
         )
-    evidence, values = _log_evidence(problem, found.modes), _at_mode(problem, found.modes)
+    potential = NumpyPotential(problem.program.value_and_gradient, problem.data, problem.dtype)
+    evidence, values = _log_evidence(potential, found.modes), _at_mode(problem, found.modes)
     names = values.keys() & posterior.keys()
     sd = {name: np.std(np.asarray(posterior[name]), axis=(0, 1)) for name in names}
     rows = []
@@ -73,21 +86,23 @@ def compare_alternatives(
             "defines": list(alternative.part.defines),
         }
         try:
-            other = _with_scene(request, problem, found.modes, scenes[alternative], key)
-            modes = other.initialize(progress).joint_modes("alternatives")
+            with jax.enable_x64(True):  # single precision leaves nothing of a difference
+                given = request, problem, found.modes, scenes[alternative], key
+                other, starts, covariance = _with_scene(*given)
+                modes = find_modes(other, starts, progress, covariance)
+                factor = _log_evidence(other, modes) - evidence
+                at_mode = other.parameters(modes.z[0])
         except FitError as error:
             rows.append(row | {"failed": str(error)})
             continue
-        moved = {
-            name: (value - values[name]) / np.where(sd[name] > 0.0, sd[name], 1.0)
-            for name, value in _at_mode(other, modes).items()
-            if name in sd
-        }
-        factor = _log_evidence(other, modes) - evidence
         if not math.isfinite(factor):
             rows.append(row | {"failed": "its evidence is not finite"})
             continue
-        shift = {name: np.ravel(change).tolist() for name, change in moved.items()}
+        shift = {
+            name: np.ravel((at_mode[name] - values[name]) / np.where(own > 0.0, own, 1.0)).tolist()
+            for name, own in sd.items()
+            if name in at_mode
+        }
         rows.append(row | {"log_bayes_factor": factor, "shift": shift})
     progress("comparing alternatives", 1.0)
     return rows
@@ -95,25 +110,34 @@ def compare_alternatives(
 
 def _with_scene(
     request: Request, problem: Problem, modes: Modes, scene: Scene, key: Array
-) -> Problem:
-    """The same capture by another scene, whose search starts at the modes of this one."""
+) -> tuple[DifferencedPotential, np.ndarray, np.ndarray]:
+    """The potential of another scene, and the modes and the covariance of this one as a guess."""
     new = [name for name in scene.parameters if name not in request.scene.parameters]
     priors = {**resolve_priors(new), **request.priors}
-    model = compile_model(dataclasses.replace(request, scene=scene, priors=priors), problem.data)
-    program = model.program
+    data = jax.tree.map(_as_double, problem.data)
+    program = compile_model(dataclasses.replace(request, scene=scene, priors=priors), data).program
+    known = problem.program.positions
+    both = [name for name in program.positions if name in known]
+    here, there = (np.hstack([of[n].ravel() for n in both]) for of in (program.positions, known))
+    heavy = modes.z[modes.weight >= HEAVY_MODE]
+    starts, covariance = np.zeros((len(heavy), program.size)), np.eye(program.size)
+    starts[:, here] = heavy[:, there]
+    covariance[np.ix_(here, here)] = symmetrize(modes.covariance[0])[np.ix_(there, there)]
+    covariance[np.diag_indices_from(covariance)] *= 1.0 + JITTER
     # What only the other scene has starts at the median of its prior.
-    middle = program.constrain(jnp.zeros(program.size, problem.dtype))
-    for name in middle.keys() - problem.program.supports.keys():
+    for name in program.positions.keys() - known.keys():
         median = jnp.median(priors[name].sample(key, (PRIOR_DRAWS,)), axis=0)
-        middle[name] = jnp.broadcast_to(median, middle[name].shape)
-    sites = [problem.program.constrain(z) for z in modes.z[modes.weight >= HEAVY_MODE]]
-    starts = [program.unconstrain({n: own.get(n, x) for n, x in middle.items()}) for own in sites]
-    return Problem(model, problem.data, key, starts=np.stack(starts))
+        starts[:, program.positions[name]] = dist.biject_to(program.supports[name]).inv(median)
+    potential = DifferencedPotential(program, data, np.sqrt(np.diagonal(covariance)))
+    return potential, starts, covariance
 
 
-def _log_evidence(problem: Problem, modes: Modes) -> float:
+def _as_double(x: Array) -> Array:
+    return x.astype(np.float64) if jnp.issubdtype(x.dtype, jnp.floating) else x
+
+
+def _log_evidence(potential: ValueAndGradient, modes: Modes) -> float:
     """Laplace's approximation of the log evidence, summed over the modes."""
-    potential = NumpyPotential(problem.program.value_and_gradient, problem.data, problem.dtype)
     volume = 0.5 * np.linalg.slogdet(2.0 * math.pi * modes.covariance[0])[1]
     return float(volume - potential(modes.z[0])[0] - math.log(modes.weight[0]))
 

@@ -34,6 +34,10 @@ ValueAndGradient = Callable[[np.ndarray], tuple[float, np.ndarray]]
 SAME_MODE = 0.1
 """Two searches that end within so many posterior standard deviations found the same mode."""
 
+STEP = 1e-3
+"""Step of central differences of a potential, in posterior standard deviations: the error of a
+gradient is 1e-10 by rounding, and a third derivative by 2e-7."""
+
 SETTLED = 1e-2
 """Largest Newton decrement, in posterior standard deviations, of a search that has converged."""
 
@@ -98,6 +102,31 @@ class NumpyPotential:
         return float(value), np.asarray(gradient, float)
 
 
+class DifferencedPotential:
+    """The same in double precision, of which only values are compiled: gradients are differences.
+
+    That compiles three times as fast as the gradient, and runs half as fast: for a few searches.
+    """
+
+    def __init__(self, program: Program, given: Observations, sd: np.ndarray) -> None:
+        self._program, self._given, self._step = program, given, STEP * np.clip(sd, 1e-6, 1.0)
+
+    def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        value, *shifted = self._evaluate(z)[0]
+        above, below = np.split(np.array(shifted), 2)
+        return float(value), (above - below) / (2.0 * self._step)
+
+    def parameters(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """The parameters of a vector."""
+        return {name: np.asarray(rows)[0] for name, rows in self._evaluate(z)[1].items()}
+
+    def _evaluate(self, z: np.ndarray) -> tuple[np.ndarray, dict[str, Array]]:
+        shift = np.diag(self._step)
+        rows = jnp.asarray(np.vstack([z, z + shift, z - shift]))
+        potentials, parameters = self._program.evaluated(rows, self._given)
+        return np.asarray(potentials, float), parameters
+
+
 def finite_potential(potential: ValueAndGradient) -> ValueAndGradient:
     """The potential with a flat wall where it, or its gradient, is not finite."""
 
@@ -136,12 +165,16 @@ def symmetrize(matrix: np.ndarray) -> np.ndarray:
 # --- The search from one start, and from many -----------------------------------------------------
 
 
-def find_mode(potential: ValueAndGradient, start: np.ndarray) -> Optimum:
-    """Minimize the potential by BFGS, then by at most six Newton steps."""
+def find_mode(
+    potential: ValueAndGradient, start: np.ndarray, guess: np.ndarray | None = None
+) -> Optimum:
+    """Minimize the potential by BFGS, then by at most six Newton steps.
+
+    A guess of the covariance near the mode saves most of the steps; a poor one costs more.
+    """
     guarded = finite_potential(potential)
-    found = scipy.optimize.minimize(
-        guarded, start, jac=True, method="BFGS", options={"gtol": 1e-3, "maxiter": 500}
-    )
+    options = {"gtol": 1e-3, "maxiter": 500, "hess_inv0": guess}
+    found = scipy.optimize.minimize(guarded, start, jac=True, method="BFGS", options=options)
     z, sd = found.x, np.sqrt(np.abs(np.diagonal(found.hess_inv)))
     for _ in range(6):
         value, gradient = guarded(z)
@@ -183,12 +216,17 @@ def distinct_modes(ends: list[Optimum]) -> Modes | None:
     )
 
 
-def find_modes(potential: ValueAndGradient, starts: np.ndarray, progress: Progress) -> Modes:
-    """The distinct modes that searches from all starts reach."""
+def find_modes(
+    potential: ValueAndGradient,
+    starts: np.ndarray,
+    progress: Progress,
+    guess: np.ndarray | None = None,
+) -> Modes:
+    """The distinct modes that searches from all starts reach, with a guess of the covariance."""
     ends = []
     with ignore_line_search_warnings():
         for number, start in enumerate(starts):
-            ends.append(find_mode(potential, start))
+            ends.append(find_mode(potential, start, guess))
             progress("searching for modes", (number + 1) / len(starts))
     modes = distinct_modes(ends)
     if modes is None:

@@ -203,6 +203,15 @@ class Program:
         return np.where(np.isnan(found.log_density), -np.inf, found.log_density)
 
     @functools.cached_property
+    def evaluated(self) -> JitOnce:
+        """Potentials and parameters of some vectors, (row, size), compiled."""
+
+        def evaluate(z: Array, data: Observations) -> tuple[Array, dict[str, Array]]:
+            return jax.lax.map(lambda z: (self.potential(z, data), self.parameters(z, data)), z)
+
+        return JitOnce(evaluate)
+
+    @functools.cached_property
     def parameters_of_chains(self) -> Callable[[Array, Observations], dict[str, Array]]:
         """`parameters` of chains of draws, (chain, draw, size), compiled."""
         over_draws = jax.vmap(self.parameters, in_axes=(0, None))

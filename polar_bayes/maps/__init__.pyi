@@ -7,6 +7,10 @@ from .lazy import (
     shared_parameters as shared_parameters,
     start_sentences as start_sentences,
 )
-from .regions import region_means as region_means
+from .regions import (
+    load_labels as load_labels,
+    region_means as region_means,
+    region_table as region_table,
+)
 from .smoothing import smooth as smooth
 from .store import map_file as map_file

@@ -6,16 +6,22 @@ parameter k and $b_{ik} = dE[x_i]/du_k$, the mean of a region of N pixels has th
 $$ \frac{1}{N^2} \sum_i \left(\sigma_i^2 - \sum_k b_{ik}^2\right) + \sum_k \bar b_k^2 . $$
 """
 
+import os
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import xarray as xr
+from arviz_base import xarray_sel_iter
+from arviz_base.labels import BaseLabeller
+from PIL import Image
 from scipy.special import ndtri
 
-from polar_bayes.errors import FitError
+from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.maps.lazy import CHUNK, checked_status, map_parameters
+from polar_bayes.paths import existing_file
 
 BOUNDS = (0.025, 0.975)
 """Levels of the ends of an interval."""
@@ -111,6 +117,65 @@ def region_means(
     return answer.isel(region=shown).assign_attrs(cautions=cautions)
 
 
+def region_table(found: xr.Dataset) -> pd.DataFrame:
+    """What `region_means` found as a table.
+
+    Args:
+        found: Of `region_means`.
+
+    Returns:
+        A row for each region and parameter, with the columns `region`, `parameter`, `pixels`,
+        `unanswered`, `mean`, `sd`, `q2.5`, `q97.5` and `prior_pull`. A parameter of several values
+        has a row for each, named as in ArviZ: `absorption[550.0]`.
+    """
+    names = [str(name) for name in found.data_vars if f"{name}_interval" in found]
+    tables = []
+    for name, at, _ in xarray_sel_iter(found[names], skip_dims={"region"}):
+        low, high = found[f"{name}_interval"].sel(at).transpose("bound", "region").to_numpy()
+        columns = {
+            "region": found["region"],
+            "parameter": BaseLabeller().make_label_flat(name, at, at),
+            "pixels": found["pixels"],
+            "unanswered": found["unanswered"],
+            "mean": found[name].sel(at),
+            "sd": found[f"{name}_sd"].sel(at),
+            "q2.5": low,
+            "q97.5": high,
+            "prior_pull": found[f"{name}_prior_pull"].sel(at),
+        }
+        tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True).sort_values("region", kind="stable")
+
+
+def load_labels(path: str | os.PathLike[str]) -> np.ndarray:
+    """The labels of regions from an image file, as a program for drawing masks writes it.
+
+    Args:
+        path: A picture with one channel, such as PNG or TIFF: gray values, numbers of a palette,
+            or black and white.
+
+    Returns:
+        Integers, or truth values of a black and white picture, (y, x).
+
+    Raises:
+        CaptureError: It is no picture, or has colors, which are no labels.
+    """
+    file = existing_file(path, "labels")
+    try:
+        with Image.open(file) as picture:
+            values = np.asarray(picture)
+    except (OSError, ValueError) as error:
+        hint = "give a label image, such as a PNG with one gray value for each region"
+        raise CaptureError("it cannot be read as a picture", where=str(file), hint=hint) from error
+    if values.ndim != len(IMAGE) or values.dtype.kind not in "biu":
+        raise CaptureError(
+            f"it has values of shape {values.shape} and type {values.dtype}",
+            where=str(file),
+            hint="save it with one channel of whole numbers: one gray value for each region",
+        )
+    return values
+
+
 def _numbered(maps: xr.Dataset, labels: xr.DataArray | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Number of each pixel's region, -1 for none, (y, x); and the labels of regions."""
     if isinstance(labels, xr.DataArray) and set(labels.dims) == set(IMAGE):
@@ -160,7 +225,7 @@ def _sums_of(
     shares = f"{name}_slope" in block
     slope = values(f"{name}_slope") if shares else np.zeros((0, *mean.shape))
     prior_mean, prior_sd = (
-        np.reshape(block[name].attrs.get(f"prior_{part}", np.nan), mean.shape[1:] or -1)
+        np.broadcast_to(block[name].attrs.get(f"prior_{part}", np.nan), mean.shape[1:] or (1,))
         for part in ("mean", "sd")
     )
     # A pixel that says nothing has the variance of the prior: its pull can be anything.

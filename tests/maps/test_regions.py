@@ -1,5 +1,6 @@
 """Means and contrasts of regions, with what all pixels share counted once."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,12 @@ import pytest
 import xarray as xr
 from numpyro import distributions as dist
 from numpyro import handlers
+from PIL import Image
 from plate_images import ASKED, plate_image
+from synthetic_maps import make_maps
 
 import polar_bayes as pb
+from polar_bayes.cli import main
 from polar_bayes.inference.batching import Status
 
 SIDE, NOISE, SPREAD, ZERO = 16, 0.05, 0.1, 0.07
@@ -132,6 +136,48 @@ def test_labels_that_do_not_fit_are_refused(
 ) -> None:
     with pytest.raises(pb.FitError, match=what):
         pb.maps.region_means(maps, labels, against=against)
+
+
+def test_the_command_reads_labels_from_a_picture(
+    maps: xr.Dataset, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    store, picture = tmp_path / "map.zarr", tmp_path / "labels.png"
+    maps.to_zarr(store, consolidated=False)
+    Image.fromarray(np.uint8(quarters())).save(picture)
+    np.testing.assert_array_equal(pb.maps.load_labels(picture), quarters())
+    words = ["regions", str(store), str(picture), "--against", "4"]
+    assert main([*words, "--json"]) == 0
+    found = pb.maps.region_means(maps, quarters(), against=4)
+    rows = json.loads(capsys.readouterr().out)["regions"]
+    row, *_ = (row for row in rows if row["parameter"] == "level")
+    assert (row["region"], row["pixels"]) == (1, 63)
+    assert row["mean"] == pytest.approx(float(found["level"][0]), rel=1e-6)
+    assert [row["q2.5"], row["q97.5"]] == pytest.approx(found["level_interval"][:, 0], rel=1e-6)
+    assert main(words) == 0
+    assert "level" in capsys.readouterr().out
+
+
+def test_a_parameter_of_several_values_has_a_row_for_each() -> None:
+    found = make_maps({"absorption": np.ones((3, 4, 2))}, wavelengths=(450.0, 550.0))
+    table = pb.maps.region_table(pb.maps.region_means(found, np.ones((3, 4), int)))
+    assert table["parameter"].tolist() == ["absorption[450.0]", "absorption[550.0]"]
+    assert table["pixels"].tolist() == [12, 12]
+
+
+@pytest.mark.parametrize(
+    ("mode", "what"),
+    [("RGB", "it has values of shape"), ("F", "and type float32"), (None, "cannot be read")],
+)
+def test_pictures_that_are_no_labels_are_refused(
+    tmp_path: Path, mode: str | None, what: str
+) -> None:
+    file = tmp_path / "labels.tiff"
+    if mode is None:
+        file.write_text("no picture")
+    else:
+        Image.new(mode, (4, 3)).save(file)
+    with pytest.raises(pb.CaptureError, match=what):
+        pb.maps.load_labels(file)
 
 
 def test_what_is_no_map_has_no_regions(image: xr.Dataset) -> None:
