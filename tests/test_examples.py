@@ -107,11 +107,9 @@ def fits() -> Fits:
 
 @pytest.fixture
 def settings_of_jax() -> Iterator[None]:
-    """Compile fast rather than fast code, and take back what a page changes."""
+    """Take back what a page changes."""
     saved = {name: getattr(jax.config, name) for name in CHANGED}
-    jax.config.update("jax_disable_most_optimizations", True)
     yield
-    jax.config.update("jax_disable_most_optimizations", False)
     for name, value in saved.items():
         jax.config.update(name, value)
 
