@@ -56,7 +56,12 @@ HOMES = {
     "polanalyser": ("polar_bayes.importers",),
     "optimistix": ("polar_bayes.inference", "polar_bayes.design"),
     "tinygp": ("polar_bayes.models",),
-    "arviz_base": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.reporting"),
+    "arviz_base": (
+        "polar_bayes.inference",
+        "polar_bayes.maps",
+        "polar_bayes.diagnostics",
+        "polar_bayes.reporting",
+    ),
     "arviz_stats": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.reporting"),
     "zarr": ("polar_bayes.maps",),
     "portalocker": ("polar_bayes.maps",),

@@ -41,7 +41,7 @@ LARGEST_COUNT = 1e9
 
 def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
     """One frame of gray values, and the count of a full pixel where the format states it."""
-    values = _array(frame, where)
+    values = read_image(frame, where)
     where = str(frame) if isinstance(frame, str | os.PathLike) else where
     if values.dtype.kind not in "uif" or values.ndim != 2 or values.size == 0:
         what = f"it holds {values.dtype.name} of shape {values.shape}, not one frame of gray values"
@@ -76,7 +76,8 @@ def read_array(path: str | os.PathLike[str], where: str) -> np.ndarray:
     return np.array(mapped)
 
 
-def _array(frame: Any, where: str) -> np.ndarray:
+def read_image(frame: Any, where: str) -> np.ndarray:
+    """The values of one channel of an image file, or of an array as it is."""
     if not isinstance(frame, str | os.PathLike):
         return np.asarray(frame)
     file = existing_file(frame, where)

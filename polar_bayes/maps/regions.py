@@ -15,13 +15,12 @@ import pandas as pd
 import xarray as xr
 from arviz_base import xarray_sel_iter
 from arviz_base.labels import BaseLabeller
-from PIL import Image
 from scipy.special import ndtri
 
 from polar_bayes.errors import CaptureError, FitError
+from polar_bayes.importers.detector import read_image
 from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.maps.lazy import CHUNK, checked_status, map_parameters
-from polar_bayes.paths import existing_file
 
 BOUNDS = (0.025, 0.975)
 """Levels of the ends of an interval."""
@@ -151,26 +150,19 @@ def load_labels(path: str | os.PathLike[str]) -> np.ndarray:
     """The labels of regions from an image file, as a program for drawing masks writes it.
 
     Args:
-        path: A picture with one channel, such as PNG or TIFF: gray values, numbers of a palette,
-            or black and white.
+        path: An image with one channel of gray values, PNG or TIFF, or an array in a .npy file.
 
     Returns:
-        Integers, or truth values of a black and white picture, (y, x).
+        Integers or truth values, (y, x).
 
     Raises:
-        CaptureError: It is no picture, or has colors, which are no labels.
+        CaptureError: It cannot be read, has colors, or does not hold labels.
     """
-    file = existing_file(path, "labels")
-    try:
-        with Image.open(file) as picture:
-            values = np.asarray(picture)
-    except (OSError, ValueError) as error:
-        hint = "give a label image, such as a PNG with one gray value for each region"
-        raise CaptureError("it cannot be read as a picture", where=str(file), hint=hint) from error
+    values = read_image(path, "labels")
     if values.ndim != len(IMAGE) or values.dtype.kind not in "biu":
         raise CaptureError(
             f"it has values of shape {values.shape} and type {values.dtype}",
-            where=str(file),
+            where=f"labels {path}",
             hint="save it with one channel of whole numbers: one gray value for each region",
         )
     return values

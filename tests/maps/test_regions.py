@@ -166,7 +166,7 @@ def test_a_parameter_of_several_values_has_a_row_for_each() -> None:
 
 @pytest.mark.parametrize(
     ("mode", "what"),
-    [("RGB", "it has values of shape"), ("F", "and type float32"), (None, "cannot be read")],
+    [("RGB", "not gray values"), ("F", "and type float32"), (None, "cannot be read")],
 )
 def test_pictures_that_are_no_labels_are_refused(
     tmp_path: Path, mode: str | None, what: str
@@ -178,6 +178,12 @@ def test_pictures_that_are_no_labels_are_refused(
         Image.new(mode, (4, 3)).save(file)
     with pytest.raises(pb.CaptureError, match=what):
         pb.maps.load_labels(file)
+
+
+def test_an_array_of_no_labels_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "labels.npy", np.ones((3, 4)))
+    with pytest.raises(pb.CaptureError, match="and type float64"):
+        pb.maps.load_labels(tmp_path / "labels.npy")
 
 
 def test_what_is_no_map_has_no_regions(image: xr.Dataset) -> None:
