@@ -20,6 +20,7 @@ from polar_bayes.cli.options import (
     link_option,
     option,
     out_option,
+    print_cautions,
     read_scene_options,
     seed_option,
 )
@@ -56,8 +57,7 @@ def _save_import(capture: Any, out: Path) -> None:
     _save(capture, out)
     for sentence in pb.capture.inferred(capture) + pb.capture.stated(capture):
         click.echo(sentence)
-    for sentence in pb.capture.cautions(capture):
-        click.echo(f"caution: {sentence}", err=True)
+    print_cautions(pb.capture.cautions(capture))
 
 
 OF_PROTOCOL = ("views", "largest_view_zenith", "wavelengths")

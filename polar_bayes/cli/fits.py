@@ -1,7 +1,6 @@
 """Commands that fit a capture, compare scenes, and show results."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from polar_bayes.cli.options import (
     nuts_options,
     option,
     out_option,
+    print_cautions,
     print_fit,
     print_frame,
     print_json,
@@ -197,29 +197,24 @@ def map_(
         click.echo(f"{name}: {interval} in all pixels, from {row['pixels']:.0f} of them")
     for sentence in pb.maps.start_sentences(maps):
         click.echo(sentence)
-    for sentence in pb.maps.shared_cautions(maps):
-        click.echo(f"caution: {sentence}", err=True)
+    print_cautions(pb.maps.shared_cautions(maps))
 
 
 @command()
 @click.argument("maps", type=INPUT)
 @click.argument("labels", type=INPUT)
-@option("--against", help="Region from which the others are subtracted.")
+@option("--against", type=int, help="Region from which the others are subtracted.")
 @json_option
-def regions(maps: Path, labels: Path, against: str | None, as_json: bool) -> None:
+def regions(maps: Path, labels: Path, against: int | None, as_json: bool) -> None:
     """Means of a map over the regions of a label image, and how they differ."""
     picture = pb.maps.load_labels(labels)
-    reference: Any = against
-    if against is not None and picture.dtype.kind in "iu" and against.isdecimal():
-        reference = int(against)
-    found = pb.maps.region_means(pb.maps.open_map(maps), picture, against=reference)
+    found = pb.maps.region_means(pb.maps.open_map(maps), picture, against=against)
     table, cautions = pb.maps.region_table(found), found.attrs["cautions"]
     if as_json:
-        print_json({"regions": json.loads(table.to_json(orient="records")), "cautions": cautions})
+        print_json({"regions": json_rows(table, "records"), "cautions": cautions})
         return
     print_frame(table.set_index("region"))
-    for sentence in cautions:
-        click.echo(f"caution: {sentence}", err=True)
+    print_cautions(cautions)
 
 
 @command()

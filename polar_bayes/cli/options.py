@@ -292,9 +292,9 @@ def print_json(value: object) -> None:
     click.echo(json.dumps(value, indent=2, allow_nan=False))
 
 
-def json_rows(table: Any) -> dict[str, Any]:
-    """A row of a data frame by its label, as JSON has it."""
-    return json.loads(table.to_json(orient="index"))
+def json_rows(table: Any, orient: str = "index") -> Any:
+    """The rows of a data frame by label, or in a list (`"records"`), as JSON has them."""
+    return json.loads(table.to_json(orient=orient))
 
 
 def print_frame(frame: Any, sentences: Iterable[str] = ()) -> None:
@@ -331,11 +331,16 @@ def _explanations(posterior: Any) -> Iterator[str]:
             yield f"{name}: {meaning}{'' if unit == '1' else f' [{unit}]'}"
 
 
+def print_cautions(sentences: Iterable[str]) -> None:
+    """Print cautions on the error stream."""
+    for sentence in sentences:
+        click.echo(f"caution: {sentence}", err=True)
+
+
 def print_verdict(result: Any) -> int:
     """Print problems and cautions of a fit on the error stream; returns the exit status."""
     verdict = pb.verdict(result)
     for problem in verdict.problems:
         click.echo(f"problem: {problem}", err=True)
-    for caution in verdict.cautions:
-        click.echo(f"caution: {caution}", err=True)
+    print_cautions(verdict.cautions)
     return 0 if verdict.passed else NOT_CONVERGED

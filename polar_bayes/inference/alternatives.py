@@ -28,12 +28,11 @@ from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
 from polar_bayes.inference.optimize import (
     DifferencedPotential,
     Modes,
-    NumpyPotential,
     ValueAndGradient,
     find_modes,
     symmetrize,
 )
-from polar_bayes.inference.problem import Problem, compile_model
+from polar_bayes.inference.problem import Problem, compile_model, observe_request
 from polar_bayes.inference.request import Request
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.variants import alternatives_of
@@ -72,8 +71,7 @@ def compare_alternatives(
             where="alternatives",
             hint="fit one patch alone",
         )
-    potential = NumpyPotential(problem.program.value_and_gradient, problem.data, problem.dtype)
-    evidence, values = _log_evidence(potential, found.modes), _at_mode(problem, found.modes)
+    evidence, values = _log_evidence(found.potential, found.modes), _at_mode(problem, found.modes)
     names = values.keys() & posterior.keys()
     sd = {name: np.std(np.asarray(posterior[name]), axis=(0, 1)) for name in names}
     rows = []
@@ -114,8 +112,9 @@ def _with_scene(
     """The potential of another scene, and the modes and the covariance of this one as a guess."""
     new = [name for name in scene.parameters if name not in request.scene.parameters]
     priors = {**resolve_priors(new), **request.priors}
-    data = jax.tree.map(_as_double, problem.data)
-    program = compile_model(dataclasses.replace(request, scene=scene, priors=priors), data).program
+    other = dataclasses.replace(request, scene=scene, priors=priors, precision="double")
+    data = observe_request(other)
+    program = compile_model(other, data).program
     known = problem.program.positions
     both = [name for name in program.positions if name in known]
     here, there = (np.hstack([of[n].ravel() for n in both]) for of in (program.positions, known))
@@ -130,10 +129,6 @@ def _with_scene(
         starts[:, program.positions[name]] = dist.biject_to(program.supports[name]).inv(median)
     potential = DifferencedPotential(program, data, np.sqrt(np.diagonal(covariance)))
     return potential, starts, covariance
-
-
-def _as_double(x: Array) -> Array:
-    return x.astype(np.float64) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
 
 def _log_evidence(potential: ValueAndGradient, modes: Modes) -> float:

@@ -243,8 +243,8 @@ def sample(
             if halvings:
                 warmup_steps += _stacked(rounds).n_steps.sum(axis=1)  # they are paid for, too
                 states, rounds = [_with_half_the_step(state) for state in states], []
-            last = halvings == MOST_HALVINGS
-            states = _until_converged(states, rounds, advance_all, settings, despite=last)
+            redoes = halvings < MOST_HALVINGS
+            states = _until_converged(states, rounds, advance_all, settings, redoes=redoes)
             if not _stacked(rounds).diverging.any():
                 break
     stats = jax.tree.map(lambda x: x[:, : settings.most_draws], _stacked(rounds))._asdict()
@@ -262,17 +262,17 @@ def _until_converged(
     advance_all: Callable[[list[infer.hmc.HMCState]], tuple[list[infer.hmc.HMCState], Step]],
     settings: Nuts,
     *,
-    despite: bool,
+    redoes: bool,
 ) -> list[infer.hmc.HMCState]:
     """Add blocks of draws to `rounds` until the goals or the limit of the settings are reached.
 
-    A divergence ends it at once, unless sampling is to go on despite of it: such draws are redone.
+    Where draws that diverged are to be made again, the first divergence ends it.
     """
     least, most = (-(-count // settings.block) for count in (settings.draws, settings.most_draws))
     for done in range(1, most + 1):
         states, steps = advance_all(states)
         rounds.append(steps)
-        if steps.diverging.any() and not despite:
+        if redoes and steps.diverging.any():
             break
         if done >= least and _converged(rounds, settings):
             break

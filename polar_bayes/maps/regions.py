@@ -143,7 +143,7 @@ def region_table(found: xr.Dataset) -> pd.DataFrame:
             "prior_pull": found[f"{name}_prior_pull"].sel(at),
         }
         tables.append(pd.DataFrame(columns))
-    return pd.concat(tables, ignore_index=True).sort_values("region", kind="stable")
+    return pd.concat(tables).sort_values("region", kind="stable", ignore_index=True)
 
 
 def load_labels(path: str | os.PathLike[str]) -> np.ndarray:
