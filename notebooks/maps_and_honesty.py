@@ -140,6 +140,7 @@ means.attrs["cautions"]
 
 # %% [markdown]
 # The interval is that of the map's own model, in which each pixel has a prior of its own. Where the
-# pixels of a region are alike, all those priors pull the same way, and the caution says by how
-# much: fit such a region as one capture, or as [patches of one population](pooling_and_spectra.md).
-# How maps are made, and how fast: [maps](../maps.md).
+# pixels of a region are alike, all those priors pull the same way. In the dark pixels of the shadow
+# they say more of the index than the readings do, and the caution says so: fit such a region as one
+# capture, or as [patches of one population](pooling_and_spectra.md). How maps are made, and how
+# fast: [maps](../maps.md).
