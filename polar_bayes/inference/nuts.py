@@ -6,7 +6,7 @@ blocks R-hat and effective sample sizes are computed: sampling continues until e
 reached the goals, within the limits of the settings. The draws do not depend on the threads.
 
 Where a draw diverged, the steps were too long for a part of the posterior, which the chains may
-have left out: they are sampled again at once with half the step size, which is what a higher target
+have left out: they are sampled again with half the step size, which is what a higher target
 acceptance leads to (Betancourt 2016, arXiv:1604.00695), and needs no new compilation.
 """
 
@@ -266,13 +266,14 @@ def _until_converged(
 ) -> list[infer.hmc.HMCState]:
     """Add blocks of draws to `rounds` until the goals or the limit of the settings are reached.
 
-    Where draws that diverged are to be made again, the first divergence ends it.
+    Where draws that diverged are to be made again, a divergence ends it, too, after as many draws
+    as are asked for at least or a multiple of them: what is drawn does not depend on the block.
     """
     least, most = (-(-count // settings.block) for count in (settings.draws, settings.most_draws))
     for done in range(1, most + 1):
         states, steps = advance_all(states)
         rounds.append(steps)
-        if redoes and steps.diverging.any():
+        if redoes and done % least == 0 and _stacked(rounds).diverging.any():
             break
         if done >= least and _converged(rounds, settings):
             break

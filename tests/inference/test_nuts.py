@@ -39,3 +39,29 @@ def test_how_draws_are_cut_into_blocks_changes_nothing() -> None:
     for name in ("n_steps", "warmup_steps", "energy"):
         assert np.array_equal(stats[name], others[name]), name
     assert np.all(stats["warmup_steps"] >= 60)  # a draw takes one step at least
+
+
+def funnel(z: jax.Array, scale: jax.Array) -> jax.Array:
+    """Neal (2003), Ann. Statist. 31, 705: at its neck every step is too long."""
+    return 0.5 * (z[0] / scale) ** 2 + 0.5 * jnp.sum(z[1:] ** 2) * jnp.exp(-z[0]) + z[0]
+
+
+def test_where_draws_diverge_it_changes_nothing_either() -> None:
+    """Chains are redone after the same draws, whether a block holds one or all of them."""
+    told = []
+    with jax.enable_x64(True):
+        for block in (20, 50, 100):
+            settings = pb.methods.Nuts(
+                chains=2, warmup=100, draws=100, most_draws=400, effective_draws=1e6, block=block
+            )
+            here = target(3, 2)._replace(density=funnel, given=jnp.asarray(3.0))
+            here = here._replace(potential=jax.value_and_grad(lambda z: funnel(z, 3.0)))
+            sampler = nuts.Sampler(funnel, settings.static(here))
+            told.append(nuts.sample(sampler, here, jax.random.key(1), settings))
+    z, stats, reached, halvings = told[0]
+    assert halvings > 0
+    assert not reached
+    for again, others, *_, as_often in told[1:]:
+        assert as_often == halvings
+        assert np.array_equal(z, again)
+        assert np.array_equal(stats["warmup_steps"], others["warmup_steps"])
