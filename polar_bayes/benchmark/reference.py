@@ -10,8 +10,8 @@ import scipy.stats
 from jaxtyping import Array, Float
 
 from polar_bayes.benchmark.run import labeled
-from polar_bayes.diagnostics.convergence import LARGEST_R_HAT
 from polar_bayes.errors import FitError
+from polar_bayes.inference.mcse import LARGEST_R_HAT
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.problem import Problem

@@ -17,10 +17,11 @@ from polar_bayes.diagnostics.parameters import (
     posterior_scalars,
     scalars,
 )
-from polar_bayes.diagnostics.predictive import MAX_PARETO_K, Loo, predictive_checks, usable_readings
+from polar_bayes.diagnostics.predictive import Loo, predictive_checks, usable_readings
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import check_fit
+from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.observation.data import ANGLES
 

@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
-from scipy.special import logsumexp
 
 from polar_bayes.diagnostics.criticism import criticize, listed
 from polar_bayes.diagnostics.parameters import (
@@ -24,15 +23,13 @@ from polar_bayes.diagnostics.parameters import (
     stats_of,
     with_entries,
 )
-from polar_bayes.diagnostics.predictive import pareto_smoothed
+from polar_bayes.inference.mcse import LARGEST_R_HAT, SMALLEST_ESS
+from polar_bayes.inference.psis import MAX_PARETO_K, smooth
 from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
 from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
 TAILS = (0.05, 0.95)
-LARGEST_R_HAT = 1.01
-SMALLEST_ESS = 400
-LARGEST_K_HAT = 0.7
 LARGE_CORRECTION = 0.1
 """Error of an approximate mean in sds, or of an sd in its log, that is told."""
 WEIGHTED = ("importance", "tempered")
@@ -169,13 +166,10 @@ def _smoothed_weights(result: xr.DataTree) -> tuple[np.ndarray, float]:
     log_weight = stats["log_weight"].to_numpy().astype(float).ravel()
     if np.any(np.isnan(log_weight) | np.isposinf(log_weight)) or np.all(np.isneginf(log_weight)):
         return np.empty(0), math.nan
-    lowest = np.min(log_weight[np.isfinite(log_weight)])
-    log_weight = np.where(np.isneginf(log_weight), lowest - 700.0, log_weight) - log_weight.max()
     if np.ptp(log_weight) < 1e-12:
         return np.full(log_weight.size, 1.0 / log_weight.size), -math.inf
-    with np.errstate(all="ignore"):  # smoothing an extreme tail overflows inside ArviZ
-        smoothed, k_hat = pareto_smoothed(log_weight)
-        return np.exp(smoothed - logsumexp(smoothed)), k_hat
+    weights, k_hat = smooth(log_weight[None])
+    return weights[0], float(k_hat[0])
 
 
 def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
@@ -305,14 +299,14 @@ def _approximation_cautions(
     if method not in APPROXIMATIONS or "log_weight" not in stats_of(result):
         return
     weights, k_hat = _smoothed_weights(result)
-    if k_hat <= LARGEST_K_HAT:
+    if k_hat <= MAX_PARETO_K:
         yield from _corrections(weights, found)
     else:
         draws, shape = ("the guide's draws", "the guide")
         if method == "laplace":
             draws, shape = ("the Laplace draws", "a normal distribution")
         yield (
-            f"Pareto k-hat of {draws} is {k_hat:.2f} (at most {LARGEST_K_HAT}): the posterior is "
+            f"Pareto k-hat of {draws} is {k_hat:.2f} (at most {MAX_PARETO_K}): the posterior is "
             f"not close to {shape}; use method='nuts' for intervals."
         )
 
@@ -353,7 +347,7 @@ def _tail_cautions(
 ) -> Iterator[str]:
     """Tails of chains that are too light by weighted draws, which reach what chains may miss."""
     tails = provenance.get("tails") or {}
-    if not tails or not tails["k_hat"] <= LARGEST_K_HAT:
+    if not tails or not tails["k_hat"] <= MAX_PARETO_K:
         return
     nominal, missed = CENTRAL_95[0], []
     variance = nominal * (1.0 - nominal)

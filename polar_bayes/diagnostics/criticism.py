@@ -136,7 +136,8 @@ def criticize(
         if method_of(result) == "point":
             why = "A point fit has no draws to criticize."
         return _table(dict.fromkeys(CHECKS, Finding("not computed", sentence=why)))
-    residuals = _residuals(result)
+    variables = flat_variables(result)
+    residuals = _residuals(result, variables)
     checks = predictive_checks(result) if checks is None else checks
     return _table(
         {
@@ -145,7 +146,7 @@ def criticize(
             "bounds": _bounds(result, found),
             **_residual_findings(residuals),
             "leave-one-out": _leave_one_out(checks),
-            "influence": _influence(result, found, checks),
+            "influence": _influence(result, variables, found, checks),
             "repeats": _repeats(result),
             "alternatives": _alternatives(result),
         }
@@ -273,9 +274,8 @@ class _Residuals:
     labels: tuple[str, ...]
 
 
-def _residuals(result: xr.DataTree) -> _Residuals | None:
+def _residuals(result: xr.DataTree, variables: Sequence[FlatVariable]) -> _Residuals | None:
     """Residuals of all variables together, since they share the parameters that absorb them."""
-    variables = flat_variables(result)
     if not variables or not all(
         np.isfinite(v.predicted).all() and np.isfinite(v.noise_free).all() for v in variables
     ):
@@ -324,8 +324,7 @@ def _positions(result: xr.DataTree, variable: FlatVariable) -> _Positions:
     constants = result["constant_data"].to_dataset()
 
     def along(values: xr.DataArray) -> np.ndarray:
-        whole = values.broadcast_like(reading).transpose(*reading.dims)
-        return np.asarray(whole)[variable.usable]
+        return values.variable.set_dims(reading.sizes).to_numpy()[variable.usable]
 
     angles = [along(constants[name]) for name in ANGLES]
     wavelength = np.zeros(variable.observed.size)
@@ -480,21 +479,25 @@ def _uniformity(pit: np.ndarray) -> float:
 
 
 def _influence(
-    result: xr.DataTree, found: Sequence[Scalar], checks: Mapping[str, PredictiveCheck]
+    result: xr.DataTree,
+    variables: Sequence[FlatVariable],
+    found: Sequence[Scalar],
+    checks: Mapping[str, PredictiveCheck],
 ) -> Finding:
     """Readings without which a material parameter's mean would move by more than its sd."""
     material = [s.draws.ravel() for s in found if s.is_material and np.isfinite(s.draws).all()]
     draws = np.stack([d for d in material if np.ptp(d) > 0.0]) if material else np.empty((0, 0))
     named: list[tuple[float, str]] = []
-    for variable in flat_variables(result):
+    for variable in variables:
         check = checks.get(variable.name)
         if check is None or check.loo is None or variable.log_likelihood is None or not len(draws):
             continue
         scores = (draws - draws.mean(axis=1, keepdims=True)) / draws.std(axis=1, keepdims=True)
         weights = check.loo.weights
         shift = np.abs(scores @ weights).max(axis=0)  # (reading,)
-        labels = _positions(result, variable).labels
-        named += [(float(shift[i]), labels[i]) for i in np.flatnonzero(shift > LARGE_SHIFT)]
+        large = np.flatnonzero(shift > LARGE_SHIFT)
+        labels = _positions(result, variable).labels if large.size else []
+        named += [(float(shift[i]), labels[i]) for i in large]
     if not named:
         return Finding("passed")
     named.sort(reverse=True)

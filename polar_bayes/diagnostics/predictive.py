@@ -28,12 +28,12 @@ from polar_bayes.diagnostics.parameters import (
     stats_of,
 )
 from polar_bayes.inference.files import check_fit
+from polar_bayes.inference.psis import MAX_PARETO_K, smooth
 
 PROBABILITIES = (0.5, 0.8, 0.95)
 BAND_PROBABILITY = 0.95
 BAND_SIMULATIONS = 1000
 MAX_BAND_POINTS = 500
-MAX_PARETO_K = 0.7
 MIN_DRAWS = 100
 COMPARABLE = MappingProxyType({"valid": True, "saturated": False})
 """Flags of readings that can be compared with a prediction."""
@@ -122,7 +122,7 @@ def usable_readings(
     usable = np.isfinite(observed.to_numpy())
     constants = result["constant_data"].to_dataset() if "constant_data" in result.children else {}
     for flag in flags.keys() & constants.keys():
-        mask = constants[flag].broadcast_like(observed).transpose(*observed.dims).to_numpy()
+        mask = constants[flag].variable.set_dims(observed.sizes).to_numpy()
         usable = usable & (mask.astype(bool) == flags[flag])
     return usable
 
@@ -195,14 +195,11 @@ def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | N
     if log_likelihood is None or not np.isfinite(log_likelihood).all():
         return None
     base = np.zeros((len(log_likelihood), 1)) if correction is None else correction[:, None]
-    ratios = base - log_likelihood
-    count = variable.observed.size
-    log_weights, pareto_k = np.zeros_like(ratios), np.full(count, -np.inf)
+    ratios, count = base - log_likelihood, variable.observed.size
+    weights, pareto_k = (x.T for x in smooth(ratios.T, relative_ess))
+    pareto_k = np.where(np.ptp(ratios, axis=0) > 1e-12, pareto_k, -np.inf)
     with np.errstate(all="ignore"):  # an extreme tail overflows: what is not known is NaN
-        for i in np.flatnonzero(np.ptp(ratios, axis=0) > 1e-12):
-            log_weights[:, i], pareto_k[i] = pareto_smoothed(ratios[:, i], relative_ess)
-        log_weights = log_weights - logsumexp(log_weights, axis=0)
-        elpd = logsumexp(log_weights + log_likelihood, axis=0)
+        elpd = logsumexp(log_likelihood, b=weights, axis=0)
         p_loo = logsumexp(log_likelihood + base, axis=0) - logsumexp(base) - elpd
     error = np.sqrt(count * np.var(elpd, ddof=1)) if count > 1 else math.nan
     return Loo(
@@ -210,20 +207,10 @@ def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | N
         standard_error=float(error),
         p_loo=float(np.sum(p_loo)),
         pareto_k=pareto_k,
-        pit=_pit(variable, np.exp(log_weights)),
+        pit=_pit(variable, weights),
         pointwise=elpd,
-        weights=np.exp(log_weights),
+        weights=weights,
     )
-
-
-def pareto_smoothed(log_ratios: np.ndarray, relative_ess: float = 1.0) -> tuple[np.ndarray, float]:
-    """Pareto-smoothed log weights of draws and k-hat; as they are and infinity without a tail."""
-    try:
-        # psislw expects log likelihoods, which are minus the log ratios: hence the sign.
-        smoothed, k_hat = array_stats.psislw(-log_ratios, r_eff=relative_ess)
-    except ValueError:  # chains that stand still have some values only, and the largest fills it
-        return log_ratios, math.inf
-    return smoothed, float(k_hat)
 
 
 def _relative_ess(result: xr.DataTree) -> float:

@@ -11,7 +11,7 @@ import scipy.stats
 from arviz_stats.base import array_stats
 from jaxtyping import Float
 
-LARGEST_R_HAT, SMALLEST_ESS = 1.01, 400.0
+LARGEST_R_HAT, SMALLEST_ESS = 1.01, 400
 """Limits beyond which chains have not converged."""
 
 TAILS = (0.05, 0.95)

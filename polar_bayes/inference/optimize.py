@@ -157,6 +157,14 @@ def central_difference_hessian(
     return np.stack(found)
 
 
+def forward_difference_hessian(
+    potential: ValueAndGradient, z: np.ndarray, sd: np.ndarray, dtype: DTypeLike
+) -> np.ndarray:
+    """The Hessian for half the gradients, to 1e-4 of it: enough for a proposal, not for a mode."""
+    steps, at_z = np.clip(sd, 1e-6, 1.0) * np.finfo(dtype).eps ** 0.25, potential(z)[1]
+    return np.stack([(potential(z + s)[1] - at_z) / s.max() for s in np.diag(steps)])
+
+
 def symmetrize(matrix: np.ndarray) -> np.ndarray:
     """The symmetric part of a square matrix."""
     return 0.5 * (matrix + matrix.T)

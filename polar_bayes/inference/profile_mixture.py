@@ -21,8 +21,8 @@ import scipy.optimize
 from polar_bayes.inference.initialization import Coordinates
 from polar_bayes.inference.optimize import (
     ValueAndGradient,
-    central_difference_hessian,
     finite_potential,
+    forward_difference_hessian,
     ignore_line_search_warnings,
     symmetrize,
 )
@@ -97,7 +97,7 @@ def _along_profiles(
                 x, value = _conditional_mode(potential, x, others, half)
                 if not value - lowest <= LARGEST_DROP:
                     break
-                hessian = central_difference_hessian(potential, x, 0.3 * sd, mode.dtype)
+                hessian = forward_difference_hessian(potential, x, 0.3 * sd, mode.dtype)
                 curvature = factor.T @ symmetrize(hessian) @ factor
                 if not np.isfinite(curvature).all():
                     break

@@ -37,11 +37,15 @@ class Smoothed(NamedTuple):
     pareto_k: Float[np.ndarray, " pixel"]
 
 
-def smooth(log_ratios: Float[np.ndarray, "pixel draw"]) -> Smoothed:
-    """Pareto-smoothed importance weights of many pixels at once."""
+def smooth(log_ratios: Float[np.ndarray, "pixel draw"], relative_ess: float = 1.0) -> Smoothed:
+    """Pareto-smoothed importance weights of many pixels at once.
+
+    `relative_ess` is the effective over the actual number of draws: that of chains is not one.
+    """
     # Source: Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72).
     count = log_ratios.shape[-1]
-    tail = int(3.0 * count**0.5) if count > 225 else count // 5
+    is_large = count * relative_ess > 225
+    tail = int(3.0 * (count / relative_ess) ** 0.5) if is_large else count // 5
     known = np.isfinite(log_ratios)
     usable = known.any(axis=-1)
     largest = np.max(log_ratios, axis=-1, where=known, initial=-np.inf, keepdims=True)
@@ -75,7 +79,8 @@ def _fit_tail(excess: Float[np.ndarray, "pixel tail"]) -> tuple[np.ndarray, np.n
     with np.errstate(all="ignore"):
         b = 1.0 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))
         b = b / (3.0 * quartile) + 1.0 / excess[:, -1:]
-        k = np.mean(np.log1p(-b[:, :, None] * excess[:, None, :]), axis=-1)
+        # One point of the grid at a time: an array of (pixel, grid, tail) would not fit the cache.
+        k = np.stack([np.mean(np.log1p(-at[:, None] * excess), axis=-1) for at in b.T], axis=-1)
         fit = count * (np.log(-b / k) - k - 1.0)
         weights = scipy.special.softmax(fit, axis=-1)
         weights = np.where(weights >= 10.0 * np.finfo(float).eps, weights, 0.0)

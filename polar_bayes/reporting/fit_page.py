@@ -13,7 +13,7 @@ from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
-from polar_bayes.diagnostics.convergence import LARGEST_K_HAT, Verdict
+from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.criticism import CAUTION, PROBLEM, QUESTIONS, REFUTED, criticize
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
@@ -34,6 +34,7 @@ from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck, p
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, sensitivity
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import auto_sentences
+from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
@@ -563,7 +564,7 @@ def _sampler_facts(fit: Fit) -> dict[str, object]:
     if fit.method in APPROXIMATIONS and "log_weight" in stats:
         k_hat = convergence.laplace_k_hat(fit.result)
     if k_hat is not None:
-        facts[f"Pareto k-hat (at most {LARGEST_K_HAT})"] = or_dash(k_hat, ".2f")
+        facts[f"Pareto k-hat (at most {MAX_PARETO_K})"] = or_dash(k_hat, ".2f")
     if (effective := fit.provenance.get("effective_draws")) is not None:
         facts["effective sample size of the draws"] = f"{effective:.0f}"
     if modes.get("weights"):
