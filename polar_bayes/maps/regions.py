@@ -63,7 +63,7 @@ def region_means(
         Over the axis `region`: each parameter (its mean over the pixels with an answer; with
         `against` the difference), `<name>_sd`, `<name>_interval` (its normal 95% interval, axis
         `bound`), `<name>_prior_pull` (by how much the priors of the pixels move that mean, if
-        pixels are alike; NaN without a known prior), and the numbers `pixels` and `unanswered`.
+        pixels are alike; NaN without a known prior, and where pixels are as wide as theirs), and the numbers `pixels` and `unanswered`.
         The attribute `cautions` lists sentences.
 
     Raises:
@@ -246,7 +246,8 @@ def _of_regions(sums: _Sums, count: np.ndarray, reference: int | None) -> _Sums:
         mean, pull = mean - mean[reference], pull - pull[reference]
         slope = slope - slope[:, reference, None]
         variance, spread = variance + variance[reference], spread + spread[reference]
-    return _Sums(mean, variance, slope, pull, spread)
+    sd = np.sqrt(variance + np.sum(slope**2, axis=0))
+    return _Sums(mean, variance, slope, np.where(np.sqrt(spread) > sd, np.nan, pull), spread)
 
 
 def _cautions(
@@ -256,8 +257,8 @@ def _cautions(
     pull, chance = np.abs(found.pull), np.sqrt(found.pull_variance)
     is_moved = (pull > LARGEST_PULL * sd) & (pull > SIGNIFICANT * chance)
     for at in shown:
-        if np.any(chance[at] > sd[at]):  # then the pull is not known
-            why = "its pixels say less than their priors, which count once for each pixel"
+        if np.any(np.isnan(found.pull[at]) & np.isfinite(sd[at])):
+            why = "its pixels are as wide as their priors, whose pull on the mean is not known"
         elif np.any(is_moved[at]):
             sds = np.max(pull[at] / sd[at])
             why = f"if its pixels are alike, their priors move the mean by {sds:.1f} sds"

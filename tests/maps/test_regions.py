@@ -199,4 +199,5 @@ def test_pixels_that_say_nothing_are_told(maps: xr.Dataset) -> None:
     found = pb.maps.region_means(ignorant, quarters() == 1)
     assert found["level_sd"].item() == pytest.approx(SPREAD / np.sqrt(63), rel=1e-6)
     (sentence,) = found.attrs["cautions"]
-    assert "level of region True: its pixels say less than their priors, which" in sentence
+    assert "level of region True: its pixels are as wide as their priors, whose pull" in sentence
+    assert np.isnan(found["level_prior_pull"].item())
