@@ -6,6 +6,8 @@ Every effect of three scenes is switched on alone in the plain scene that is lef
 Prints a Markdown table.
 """
 
+import dataclasses
+
 import jax
 import numpy as np
 import xarray as xr
@@ -60,6 +62,9 @@ TURBID = pb.Scene(
     subsurface=pb.TurbidMedium(internal_reflection=None),
     mixing=pb.StokesMixing(),
 )
+FORWARD = dataclasses.replace(
+    TURBID, subsurface=pb.Depolarizer(None, pb.physics.HenyeyGreenstein())
+)
 
 
 def capture() -> xr.Dataset:
@@ -112,7 +117,7 @@ def main() -> None:
     data = capture()
     print("| effect on | operations | ratio | compilation | one gradient | ratio |")
     print("|---|---|---|---|---|---|")
-    for scene in (ROUGH, POLARIZED, TURBID):
+    for scene in (ROUGH, POLARIZED, TURBID, FORWARD):
         print("\n".join(table(scene, data)), flush=True)
 
 

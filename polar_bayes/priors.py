@@ -511,6 +511,7 @@ _ROWS: dict[str, dist.Distribution] = {
     "roughness_across": dist.HalfNormal(0.2),
     "roughness_azimuth": dist.Normal(0.0, 45.0),
     "albedo": Beta(2.0, 2.0),
+    "anisotropy": dist.Uniform(0.0, 0.9),
     "polarized_fraction": Beta(2.0, 2.0),
     "cauchy_a": dist.TruncatedNormal(1.44, 0.15, low=1.2, high=2.0),
     "cauchy_b": dist.LogNormal(math.log(0.005), 0.5),
@@ -598,6 +599,7 @@ RANGES: dict[str, tuple[float, float]] = {
         if isinstance(prior, dist.HalfNormal | dist.LogNormal | dist.Beta)
     },
     **dict.fromkeys(_INDICES, (1.0, math.inf)),
+    "anisotropy": (0.0, 0.9),
     "sellmeier_strength": (0.0, math.inf),
     "sellmeier_resonance": (0.0, 0.1),
     "beam_overlap_zenith": (0.0, 90.0),

@@ -63,8 +63,8 @@ def region_means(
         Over the axis `region`: each parameter (its mean over the pixels with an answer; with
         `against` the difference), `<name>_sd`, `<name>_interval` (its normal 95% interval, axis
         `bound`), `<name>_prior_pull` (by how much the priors of the pixels move that mean, if
-        pixels are alike; NaN without a known prior, and where pixels are as wide as theirs), and the numbers `pixels` and `unanswered`.
-        The attribute `cautions` lists sentences.
+        pixels are alike; NaN without a known prior, and where pixels are as wide as theirs), and
+        the numbers `pixels` and `unanswered`. The attribute `cautions` lists sentences.
 
     Raises:
         FitError: It holds no maps, the labels do not fit, or no region has an answer.

@@ -36,6 +36,11 @@ from .mixing import (
     StokesMixing as StokesMixing,
 )
 from .part import Part as Part
+from .phase_function import (
+    AbstractPhaseFunction as AbstractPhaseFunction,
+    HenyeyGreenstein as HenyeyGreenstein,
+    Isotropic as Isotropic,
+)
 from .scene import Scene as Scene
 from .second_bounce import TwoBounceSurface as TwoBounceSurface
 from .stokes import LinearPolarization as LinearPolarization

@@ -37,7 +37,7 @@ from jaxtyping import Array
 
 from polar_bayes.physics.boundary import medium
 from polar_bayes.physics.geometry import cos_degrees, double_angle, sin_degrees
-from polar_bayes.physics.part import at_least, quotient, squared_rule, unit_rule
+from polar_bayes.physics.part import at_least, squared_rule, unit_rule
 from polar_bayes.physics.stack import Stack
 
 # Scattered light changes with the square root of absorption, whose slope at zero is infinite: less
@@ -259,7 +259,7 @@ def _at_nodes(moments: _Moments) -> _Moments:
     return _Moments(moments.constant[:, :, :, None], moments.term[:, :, :, :, None])
 
 
-def _critical(n: Array) -> Array:
+def critical_cosine_squared(n: Array) -> Array:
     """Squared cosine of the critical angle, with a finite slope of its root at n = 1."""
     return ((n - 1.0) * (n + 1.0) + STEP_FLOOR) / n**2
 
@@ -267,7 +267,7 @@ def _critical(n: Array) -> Array:
 def _interface(n: Array) -> _Interface:
     """Nodes in the cosine beyond the critical angle; within it, in that of the light outside."""
     node, weight = (_column(x, n) for x in unit_rule(BEYOND))
-    critical = _critical(n)
+    critical = critical_cosine_squared(n)
     cosine = jnp.sqrt(critical) * node
     # Squared tangent of half the phase between s and p in total reflection.
     tangent = (critical * node / (1.0 - cosine**2)) ** 2 * (1.0 - node**2)
@@ -311,54 +311,3 @@ def _after_returns(turned: _Turned, source: Array, cos_view: Array) -> Array:
     """Light that leaves towards the viewer after it has entered again: (pair, 2, ...)."""
     total = jnp.einsum("gaibj...,gbj...->gai...", turned.returns, source, precision="highest")
     return jnp.sum(total / (turned.cosine + cos_view), axis=2)
-
-
-# --- Isotropic scattering, in closed form ---------------------------------------------------------
-
-
-# Mean cosine of diffuse light.
-MEAN_COSINE = 2.0 / 3.0
-
-
-def _isotropic_h(cosine: Array, g: Array) -> tuple[Array, Array]:
-    """Numerator and denominator of H: the one quotient of the caller compiles to fewer loops."""
-    # A fit to H by iteration on 200 nodes, within .25 % of H and of the plane albedo 1 - g H, for g
-    # up to .99 and cosines from .003. Exact for a black body (g = 1) and at grazing: H = 1.
-    level, rise = 1.9613 + g * (0.4670 - 0.1275 * g), -0.1313 - 0.0334 * g
-    bend, off = 0.0743 + 0.0473 * g, cosine + 0.04
-    q = cosine * (off * (level + rise * cosine) + bend)
-    return off + q, off + g * q
-
-
-def isotropic_reflectance(
-    cos_light: Array, cos_view: Array, absorption: Array, escape: Array, refractive_index: Array
-) -> Array:
-    r"""Radiance inside, over that of a white diffuser, of a half space that scatters evenly.
-
-    $$ r(l, v) + \frac{F_i\, r(l, t)\, r(t, v)}{1 - F_i\, r(t, t)}, \qquad
-       r(l, v) = \frac{w}{4} \frac{H_l H_v}{\mu_l + \mu_v}, \qquad
-       H = \frac{1 + q}{1 + g q}, \qquad
-       \frac{q}{\mu} = c_0(g) + c_1(g) \mu + \frac{c_2(g)}{\mu + 0.04} $$
-
-    The interface turns back F_i = 1 - escape of diffuse light: all beyond the critical angle, whose
-    cosine is $\mu_c$, and some of the rest. It enters again at one cosine, its mean,
-
-    $$ \mu_t = \frac{2}{3} [1 - (1 - \mu_c) \mu_c^2 / F_i], \qquad \mu_c^2 = 1 - 1/n^2 $$
-
-    Source:
-        Chandrasekhar 1960, Radiative transfer, section 47.
-    """
-    absorption = at_least(absorption, CLEAREST)
-    w, g = 1.0 / (1.0 + absorption), jnp.sqrt(absorption / (1.0 + absorption))
-    critical, trapped = _critical(refractive_index), 1.0 - escape
-    beyond = critical / jnp.maximum(trapped, critical)
-    turned = MEAN_COSINE * (1.0 - (1.0 - jnp.sqrt(critical)) * beyond)
-    light, view = (jnp.maximum(cosine, GRAZING) for cosine in (cos_light, cos_view))
-    (above_l, below_l), (above_v, below_v), (above_t, below_t) = (
-        _isotropic_h(cosine, g) for cosine in (light, view, turned)
-    )
-    again = 0.25 * w * (above_t / below_t) ** 2 * trapped
-    again = again / (1.0 - 0.5 * again / turned)
-    three = (light + turned) * (turned + view)
-    above = 0.25 * w * above_l * above_v * (three + again * (light + view))
-    return quotient(above, below_l * below_v * three * (light + view))

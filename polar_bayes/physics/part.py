@@ -173,6 +173,7 @@ NOTATION: dict[str, Quantity] = {
     "roughness_across": Quantity("", "roughness across the direction of `roughness`"),
     "roughness_azimuth": Quantity("", "azimuth along which `roughness` is meant", "degree"),
     "albedo": Quantity("A", "albedo of the body"),
+    "anisotropy": Quantity("g", "mean cosine of scattering"),
     "polarized_fraction": Quantity("", "share of scattering that polarizes"),
     "cauchy_a": Quantity("A", "Cauchy's A"),
     "cauchy_b": Quantity("B", "Cauchy's B", "micrometer^2"),

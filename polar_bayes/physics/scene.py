@@ -50,6 +50,7 @@ MATERIAL_PARAMETERS = (
     "roughness_across",
     "roughness_azimuth",
     "albedo",
+    "anisotropy",
     "polarized_fraction",
     "cauchy_a",
     "cauchy_b",

@@ -2,14 +2,14 @@
 
 import abc
 import dataclasses
-from typing import Annotated, ClassVar, override
+from typing import Annotated, override
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
-from polar_bayes.physics.half_space import CLEAREST, Ray, isotropic_reflectance, refract, scatter
+from polar_bayes.physics.half_space import CLEAREST, Ray, refract, scatter
 from polar_bayes.physics.part import (
     Parameters,
     Part,
@@ -19,6 +19,7 @@ from polar_bayes.physics.part import (
     quotient,
     value_of,
 )
+from polar_bayes.physics.phase_function import AbstractPhaseFunction, Isotropic
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import Interface, InternalReflection
 
@@ -125,19 +126,24 @@ class Depolarizer(AbstractSubsurface):
        S_0 = \text{entering} \frac{R(l, v; a, n)}{\pi n^2} T_\text{exit}(v) $$
 
     An absorbing body scatters light few times, so that more of its polarization is kept. R is that
-    of isotropic scattering (`polar_bayes.physics.half_space.isotropic_reflectance`), for light
-    that enters and leaves as through a plane.
+    of the phase function (`polar_bayes.physics.phase_function`), for light that enters and leaves
+    as through a plane; the absorption is relative to reduced scattering.
 
     Args:
         internal_reflection: InternalReflection(), or None for an interface that turns nothing
             back: then R_b = R_d.
+        phase_function: Isotropic() or HenyeyGreenstein().
     """
 
     internal_reflection: InternalReflection | None = dataclasses.field(
         default_factory=InternalReflection
     )
+    phase_function: AbstractPhaseFunction = dataclasses.field(default_factory=Isotropic)
 
-    parameters: ClassVar[tuple[str, ...]] = ("absorption",)
+    @property
+    @override
+    def parameters(self) -> tuple[str, ...]:
+        return ("absorption", *super().parameters)
 
     @override
     def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
@@ -148,10 +154,13 @@ class Depolarizer(AbstractSubsurface):
         rays, entering = interface.beams(parameters, geometry)
         view = _inside(geometry.view_zenith, n)
         light = _inside(rays.light_zenith, n[..., None])
-        reflectance = isotropic_reflectance(
-            light.cosine,
-            view.cosine[..., None],
-            *(array[..., None] for array in (absorption, escape, n)),
+        names = "refractive_index", *self.parameters
+        reflectance = self.phase_function.reflectance(
+            {name: parameters[name][..., None] for name in names},
+            light,
+            jax.tree.map(lambda array: array[..., None], view),
+            rays.light_azimuth - rays.view_azimuth,
+            escape[..., None],
         )
         returned = jnp.sum(entering.intensity * reflectance, axis=-1) / (jnp.pi * n**2)
         leaving, kept = interface.exit(parameters, geometry), body_loss(absorption, escape)

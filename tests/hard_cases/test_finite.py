@@ -42,6 +42,7 @@ from polar_bayes.physics.microfacet import (
     HeightCorrelatedShadowing,
 )
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
+from polar_bayes.physics.phase_function import HenyeyGreenstein
 from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.physics.second_bounce import TwoBounceSurface
 from polar_bayes.physics.stokes import LinearPolarization
@@ -106,7 +107,9 @@ ALL_SCENES = (
     SCENES
     | EFFECT_SCENES
     | {
-        "GGX, point": Scene(RoughSurface(GGX()), Depolarizer(), StokesMixing()),
+        "GGX, point": Scene(
+            RoughSurface(GGX()), Depolarizer(phase_function=HenyeyGreenstein()), StokesMixing()
+        ),
         "facets both ways": Scene(
             RoughSurface(quadrature=FEW, way_out=RoughPassage()), Depolarizer(), StokesMixing()
         ),

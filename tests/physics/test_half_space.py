@@ -16,11 +16,9 @@ from polar_bayes.physics.geometry import cos_degrees, sin_degrees
 from polar_bayes.physics.half_space import (
     CLEAREST,
     Ray,
-    isotropic_reflectance,
     refract,
     scatter,
 )
-from polar_bayes.physics.stack import Stack
 
 REFERENCE = Path(__file__).parents[1] / "reference"
 BATCH = 512
@@ -195,95 +193,6 @@ def test_albedo_agrees_with_adding_doubling() -> None:
     reflected = integral(1.0 - transmittance(view, ns)[0])
     # A black body behind the interface reflects .0009 more than the table's.
     np.testing.assert_allclose(found + reflected, diffuse, rtol=0.01)
-
-
-def test_h_in_closed_form_is_that_of_chandrasekhars_equation() -> None:
-    """Beside its iteration on many nodes: within .25 %, so is the plane albedo."""
-    node, weight = np.polynomial.legendre.leggauss(100)
-    mu, measure = (0.5 * (node + 1.0)) ** 2, 0.5 * weight * (node + 1.0)
-    at = np.geomspace(0.003, 1.0, 40)
-    for g in (0.01, 0.1, 0.3, 0.6, 0.9, 0.99):
-        half = 0.5 * (1.0 - g**2)
-
-        def renewed(h: np.ndarray, cosine: np.ndarray, g: float = g, half: float = half):
-            return 1.0 / (g + half * (measure * mu * h / (cosine[:, None] + mu)).sum(axis=1))
-
-        h = (1.0 + 2.0 * mu) / (1.0 + 2.0 * g * mu)
-        for _ in range(200):
-            h = 0.5 * (h + renewed(h, mu))
-        exact = renewed(h, at)
-        # Without an interface, light at grazing has H = 1: the reflectance then is w/4 H/mu.
-        grazing, one, absorption = np.full_like(at, 1e-5), np.ones_like(at), g**2 / (1.0 - g**2)
-        reflectance = isotropic_reflectance(at, grazing, absorption, one, one)
-        found = np.asarray(reflectance) * (at + grazing) * 4.0 * (1.0 + absorption)
-        np.testing.assert_allclose(found, exact, rtol=0.0025)
-        np.testing.assert_allclose(1.0 - g * found, 1.0 - g * exact, rtol=0.0025)
-
-
-def isotropic_under_beam(n, albedo, light, view) -> np.ndarray:
-    """Radiance outside for unit irradiance on the interface, by the closed form."""
-    escape = Stack(jnp.asarray(n)).escape()
-    cosines = (refracted(angle, n).cosine for angle in (light, view))
-    inside = isotropic_reflectance(*cosines, 1.0 / albedo - 1.0, escape, n)
-    return transmittance(light, n)[0] * inside * transmittance(view, n)[0] / (np.pi * n**2)
-
-
-def test_isotropic_scattering_in_closed_form_agrees_with_adding_doubling() -> None:
-    """Albedos of a beam along the normal, and of a sky by its beams, without the mirror's share."""
-    table = read("iad_semiinfinite_albedo.csv")
-    n, _, albedo, normal, diffuse = table[:5, table[1] == 0.0]
-    (view, ns, albedos), integral = hemisphere(n, albedo)
-    found = np.pi * integral(isotropic_under_beam(ns, albedos, 0.0 * view, view))
-    np.testing.assert_allclose(found, normal - ((n - 1.0) / (n + 1.0)) ** 2, rtol=0.01)
-    (light, views, *both), of_sky = hemisphere(view, ns, albedos)
-    found = np.pi * integral(of_sky(isotropic_under_beam(*both, light, views)))
-    reflected = integral(1.0 - transmittance(view, ns)[0])
-    # A black body behind the interface reflects .0009 more than the table's.
-    np.testing.assert_allclose(found + reflected, diffuse, rtol=0.01)
-
-
-@pytest.mark.thorough
-def test_similarity_holds_for_bright_bodies() -> None:
-    """Forward scattering by reduced scattering: the figures of docs/equations.md, n = 1 and 1.5."""
-    table = read("iad_semiinfinite_albedo.csv")
-    for anisotropy, albedo, excess in (
-        (0.5, 0.97, 0.03),
-        (0.8, 0.97, 0.10),
-        (0.5, 0.9, 0.09),
-        (0.8, 0.9, 0.30),
-        (0.5, 0.1, 0.96),
-        (0.8, 0.1, 1.79),
-    ):
-        n, _, _, normal = table[:4, (table[1] == anisotropy) & (table[2] == albedo)]
-        reduced = albedo * (1.0 - anisotropy) / (1.0 - albedo * anisotropy)
-        (view, ns), integral = hemisphere(n)
-        found = np.pi * integral(isotropic_under_beam(ns, reduced + 0.0 * ns, 0.0 * view, view))
-        exact = normal - ((n - 1.0) / (n + 1.0)) ** 2
-        assert np.max(found / exact) - 1.0 == pytest.approx(excess, abs=0.005)
-
-
-def test_isotropic_scattering_in_closed_form_agrees_with_all_orders() -> None:
-    """Direction by direction, beside `scatter` without polarized scattering.
-
-    Light that the interface turns back enters again at one cosine, which costs most where light
-    stays longest: in a clear body of index 2.
-    """
-    n, albedo, light, view = (
-        np.array(column)
-        for column in zip(
-            *itertools.product(
-                [1.0, 1.33, 1.5, 2.0],
-                [0.05, 0.5, 0.9, 0.99, 1.0 / (1.0 + CLEAREST)],
-                [0.0, 40.0, 80.0, 89.0],
-                [0.0, 30.0, 60.0, 85.0],
-            ),
-            strict=True,
-        )
-    )
-    exact = under_beam(n, albedo, 0.0 * n, light, view, 0.0)[0]
-    np.testing.assert_allclose(isotropic_under_beam(n, albedo, light, view), exact, rtol=0.03)
-    swapped = isotropic_under_beam(n, albedo, view, light)
-    np.testing.assert_allclose(isotropic_under_beam(n, albedo, light, view), swapped, rtol=1e-12)
 
 
 def test_light_is_neither_made_nor_lost() -> None:

@@ -36,6 +36,7 @@ from polar_bayes.physics.microfacet import (
     SeparableShadowing,
 )
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
+from polar_bayes.physics.phase_function import HenyeyGreenstein
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
@@ -68,7 +69,7 @@ SCENES = {
     ),
     "a disc on a body of its own color": Scene(
         RoughSurface(Beckmann(), Disc(10.0), shadowing=HeightCorrelatedShadowing()),
-        Depolarizer(internal_reflection=None),
+        Depolarizer(None, HenyeyGreenstein("anisotropy")),
         DopMixing(),
         dispersion=Cauchy(),
     ),
@@ -95,6 +96,7 @@ VALUES = {
     "absorption": st.floats(0.0, 10.0),
     "refractive_index": st.floats(1.0, 2.5),
     "albedo": st.floats(0.0, 1.0),
+    "anisotropy": st.floats(0.0, 0.9),
     "coat_refractive_index": st.floats(1.0, 2.0),
     "coat_absorbance": st.floats(0.0, 5.0),
     "second_index": st.floats(1.0, 2.0),

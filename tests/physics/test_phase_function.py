@@ -1,0 +1,223 @@
+"""Phase functions: a half space's brightness against adding-doubling and invariant embedding."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from physics.test_half_space import hemisphere, read, refracted, transmittance, under_beam
+
+import polar_bayes as pb
+from polar_bayes.physics.half_space import CLEAREST, Ray
+from polar_bayes.physics.phase_function import HenyeyGreenstein, Isotropic
+from polar_bayes.physics.stack import Stack
+
+
+def test_h_in_closed_form_is_that_of_chandrasekhars_equation() -> None:
+    """Beside its iteration on many nodes: within .25 %, so is the plane albedo."""
+    node, weight = np.polynomial.legendre.leggauss(100)
+    mu, measure = (0.5 * (node + 1.0)) ** 2, 0.5 * weight * (node + 1.0)
+    at = np.geomspace(0.003, 1.0, 40)
+    for g in (0.01, 0.1, 0.3, 0.6, 0.9, 0.99):
+        half = 0.5 * (1.0 - g**2)
+
+        def renewed(h: np.ndarray, cosine: np.ndarray, g: float = g, half: float = half):
+            return 1.0 / (g + half * (measure * mu * h / (cosine[:, None] + mu)).sum(axis=1))
+
+        h = (1.0 + 2.0 * mu) / (1.0 + 2.0 * g * mu)
+        for _ in range(200):
+            h = 0.5 * (h + renewed(h, mu))
+        exact = renewed(h, at)
+        # Without an interface, light at grazing has H = 1: the reflectance then is w/4 H/mu.
+        grazing, one, absorption = np.full_like(at, 1e-5), np.ones_like(at), g**2 / (1.0 - g**2)
+        material = {"absorption": absorption, "refractive_index": one}
+        rays = Ray(at, one), Ray(grazing, one)
+        reflectance = Isotropic().reflectance(material, *rays, 0.0 * at, one)
+        found = np.asarray(reflectance) * (at + grazing) * 4.0 * (1.0 + absorption)
+        np.testing.assert_allclose(found, exact, rtol=0.0025)
+        np.testing.assert_allclose(1.0 - g * found, 1.0 - g * exact, rtol=0.0025)
+
+
+def through_a_plane(phase_function, n, absorption, light, view, azimuth=90.0) -> np.ndarray:
+    """Radiance outside for unit irradiance on a plane interface."""
+    escape, beam, seen = Stack(jnp.asarray(n)).escape(), refracted(light, n), refracted(view, n)
+    material = {"absorption": absorption, "refractive_index": n}
+    inside = phase_function.reflectance(material, beam, seen, azimuth, escape)
+    return transmittance(light, n)[0] * inside * transmittance(view, n)[0] / (np.pi * n**2)
+
+
+def test_isotropic_scattering_in_closed_form_agrees_with_adding_doubling() -> None:
+    """Albedos of a beam along the normal, and of a sky by its beams, without the mirror's share."""
+    table = read("iad_semiinfinite_albedo.csv")
+    n, _, albedo, normal, diffuse = table[:5, table[1] == 0.0]
+    (view, ns, albedos), integral = hemisphere(n, albedo)
+    found = np.pi * integral(
+        through_a_plane(Isotropic(), ns, 1.0 / albedos - 1.0, 0.0 * view, view)
+    )
+    np.testing.assert_allclose(found, normal - ((n - 1.0) / (n + 1.0)) ** 2, rtol=0.01)
+    (light, views, index, share), of_sky = hemisphere(view, ns, albedos)
+    beams = through_a_plane(Isotropic(), index, 1.0 / share - 1.0, light, views)
+    found = np.pi * integral(of_sky(beams))
+    reflected = integral(1.0 - transmittance(view, ns)[0])
+    # A black body behind the interface reflects .0009 more than the table's.
+    np.testing.assert_allclose(found + reflected, diffuse, rtol=0.01)
+
+
+def test_isotropic_scattering_in_closed_form_agrees_with_all_orders() -> None:
+    """Direction by direction, beside `scatter` without polarized scattering.
+
+    Light that the interface turns back enters again at one cosine, which costs most where light
+    stays longest: in a clear body of index 2.
+    """
+    n, albedo, light, view = (
+        np.array(column)
+        for column in zip(
+            *itertools.product(
+                [1.0, 1.33, 1.5, 2.0],
+                [0.05, 0.5, 0.9, 0.99, 1.0 / (1.0 + CLEAREST)],
+                [0.0, 40.0, 80.0, 89.0],
+                [0.0, 30.0, 60.0, 85.0],
+            ),
+            strict=True,
+        )
+    )
+    exact = under_beam(n, albedo, 0.0 * n, light, view, 0.0)[0]
+    found = through_a_plane(Isotropic(), n, 1.0 / albedo - 1.0, light, view)
+    np.testing.assert_allclose(found, exact, rtol=0.03)
+
+
+# --- Forward scattering ---------------------------------------------------------------------------
+
+
+NODE, WEIGHT = np.polynomial.legendre.leggauss(40)
+COSINES, MEASURE = (0.5 * (NODE + 1.0)) ** 2, 0.5 * WEIGHT * (NODE + 1.0)
+SINES = np.sqrt(1.0 - COSINES**2)
+ORDERS = 24
+
+
+def henyey_greenstein(cosine: np.ndarray, g: float) -> np.ndarray:
+    return (1.0 - g**2) / (1.0 + g**2 - 2.0 * g * cosine) ** 1.5
+
+
+def invariant_embedding(g: float, albedo: float) -> np.ndarray:
+    """Orders in azimuth of r of a half space without an interface, (order, view, light).
+
+    Ambartsumian's equation by iteration: a layer on top of a half space changes nothing.
+    Source: Chandrasekhar 1960, Radiative transfer, section 29, equation 28.
+    """
+    turn = (np.arange(400) + 0.5) * np.pi / 400
+    around = np.cos(np.arange(ORDERS)[:, None] * turn) / turn.size
+    across = np.multiply.outer(np.outer(SINES, SINES), np.cos(turn))
+    forth, back = (
+        np.einsum("vlt,mt->mvl", henyey_greenstein(along[..., None] + across, g), around)
+        for along in (np.outer(COSINES, COSINES), -np.outer(COSINES, COSINES))
+    )
+    norm = np.sqrt(0.5 * (forth[0] + back[0]) @ MEASURE)  # no light is lost to the nodes
+    forth, back = (each / np.outer(norm, norm) for each in (forth, back))
+    view, light = COSINES[:, None], COSINES
+    r = np.zeros_like(back)
+    for _ in range(2000):
+        inner = MEASURE[:, None] * r
+        after = back + 2.0 * light * (forth @ inner)
+        after += 2.0 * view * ((r * MEASURE) @ (forth + 2.0 * light * (back @ inner)))
+        renewed = 0.25 * albedo * after / (view + light)
+        if np.max(np.abs(renewed - r)) < 1e-9:
+            break
+        r = renewed
+    return renewed
+
+
+def reflectance_at_nodes(g: float, albedo: float, turn: np.ndarray) -> np.ndarray:
+    """The closed form without an interface, (view, light, turn); a turn of 0 is the mirror side."""
+    material = {
+        "absorption": jnp.asarray((1.0 - albedo) / albedo / (1.0 - g)),
+        "refractive_index": jnp.asarray(1.0),
+    }
+    view = Ray(COSINES[:, None, None], SINES[:, None, None])
+    light = Ray(COSINES[:, None], SINES[:, None])
+    azimuth = 180.0 - np.rad2deg(turn)
+    phase_function = HenyeyGreenstein(g)
+    return np.asarray(phase_function.reflectance(material, light, view, azimuth, jnp.asarray(1.0)))
+
+
+@pytest.mark.parametrize(
+    ("g", "diffuse", "rms"), [(0.2, 0.002, 0.0035), (0.5, 0.004, 0.03), (0.8, 0.006, 0.09)]
+)
+def test_forward_scattering_agrees_with_invariant_embedding(
+    g: float, diffuse: float, rms: float
+) -> None:
+    """The diffuse albedo, and direction by direction: the figures of docs/equations.md."""
+    turn = np.linspace(0.0, np.pi, 7)
+    many = (np.arange(64) + 0.5) * np.pi / 64
+    share = np.outer(MEASURE * COSINES, MEASURE * COSINES)
+    for albedo in (0.1, 0.5, 0.9, 0.99):
+        orders = invariant_embedding(g, albedo)
+        factor = np.where(np.arange(ORDERS) > 0, 2.0, 1.0)[:, None] * np.cos(
+            np.arange(ORDERS)[:, None] * turn
+        )
+        exact = np.tensordot(orders, factor, axes=(0, 0))
+        error = reflectance_at_nodes(g, albedo, turn) / exact - 1.0
+        of_all = np.sum(share[..., None] * error**2) / (share.sum() * turn.size)
+        assert np.sqrt(of_all) < rms, albedo
+        mean = reflectance_at_nodes(g, albedo, many).mean(axis=-1)
+        assert np.sum(share * mean) == pytest.approx(np.sum(share * orders[0]), rel=diffuse)
+
+
+def test_forward_scattering_agrees_with_adding_doubling() -> None:
+    """The albedo along the normal, without an interface and behind one of index 1.5."""
+    table = read("iad_semiinfinite_albedo.csv")
+    for g, bound in ((0.5, 0.035), (0.8, 0.095)):
+        n, _, albedo, normal = table[:4, table[1] == g]
+        (view, ns, share), integral = hemisphere(n, albedo)
+        given = ns, (1.0 / share - 1.0) / (1.0 - g), 0.0 * view, view
+        found = np.pi * integral(through_a_plane(HenyeyGreenstein(g), *given))
+        np.testing.assert_allclose(found, normal - ((n - 1.0) / (n + 1.0)) ** 2, rtol=bound)
+
+
+zenith, turn = st.floats(0.0, 89.9), st.floats(-180.0, 180.0)
+a, g, index = st.floats(0.0, 20.0), st.floats(0.0, 0.9), st.floats(1.0, 2.5)
+
+
+@given(light=zenith, view=zenith, azimuth=turn, a=a, g=g, n=index)
+@settings(deadline=None, max_examples=50, derandomize=True)
+def test_viewer_and_light_may_change_places(
+    light: float, view: float, azimuth: float, a: float, g: float, n: float
+) -> None:
+    there = through_a_plane(HenyeyGreenstein(g), n, a, light, view, azimuth)
+    back = through_a_plane(HenyeyGreenstein(g), n, a, view, light, -azimuth)
+    assert there > 0.0
+    np.testing.assert_allclose(there, back, rtol=1e-10)
+
+
+@given(light=zenith, view=zenith, azimuth=turn, a=a, n=index)
+@settings(deadline=None, max_examples=50, derandomize=True)
+def test_without_anisotropy_scattering_is_isotropic(
+    light: float, view: float, azimuth: float, a: float, n: float
+) -> None:
+    found, expected = (
+        through_a_plane(each, n, a, light, view, azimuth)
+        for each in (HenyeyGreenstein(0.0), Isotropic())
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+@given(light=zenith, view=zenith, azimuth=turn, g=g)
+@settings(deadline=None, max_examples=50, derandomize=True)
+def test_a_black_body_scatters_once(light: float, view: float, azimuth: float, g: float) -> None:
+    """w p/[4 (mu_l + mu_v)] with the albedo w of single scattering, 1e-9 here."""
+    beam, seen = refracted(light, 1.5), refracted(view, 1.5)
+    cosine = -beam.cosine * seen.cosine
+    cosine -= beam.sine * seen.sine * np.cos(np.deg2rad(azimuth))
+    once = 1e-9 * henyey_greenstein(cosine, g) / (4.0 * (beam.cosine + seen.cosine))
+    material = {"absorption": jnp.asarray(1e9 / (1.0 - g)), "refractive_index": jnp.asarray(1.5)}
+    found = HenyeyGreenstein(g).reflectance(material, beam, seen, azimuth, jnp.asarray(0.5))
+    np.testing.assert_allclose(found, once, rtol=1e-6)
+
+
+def test_an_anisotropy_is_a_number_below_nine_tenths_or_a_name() -> None:
+    with pytest.raises(pb.SceneError, match=r"HenyeyGreenstein: anisotropy: 0.95 is neither"):
+        HenyeyGreenstein(0.95)
+    body = pb.Depolarizer(phase_function=HenyeyGreenstein("anisotropy"))
+    assert body.parameters == ("absorption", "anisotropy")
