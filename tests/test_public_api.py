@@ -123,6 +123,7 @@ print(jax.config.jax_compilation_cache_dir)
 """
 
 
+@pytest.mark.thorough
 def test_programs_are_kept_on_the_disk_from_the_first_that_is_compiled(tmp_path, monkeypatch):
     """What JAX compiled before does not keep them from it; the environment stays what it was."""
     for name in [name for name in os.environ if "COMPILATION_CACHE" in name or "TF_CPP" in name]:

@@ -94,6 +94,7 @@ def test_a_table_prints_every_column_within_80_characters():
     assert max(map(len, text.splitlines())) <= 80
 
 
+@pytest.mark.thorough
 def test_a_discrepancy_of_more_functions_has_as_many_weights():
     layout = pb.simulation.Protocol(views=24, wavelengths=(), azimuths=(180.0,))
     plate = pb.simulate("glass", scene="goniometer", protocol=layout)

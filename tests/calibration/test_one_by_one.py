@@ -223,6 +223,7 @@ class Mine(AbstractMethod):
         return PosteriorDraws("my own", np.repeat(z, 10, axis=1), stats)
 
 
+@pytest.mark.thorough
 def test_a_method_of_a_user_is_calibrated_and_judged_by_its_own_draws() -> None:
     one = plate_capture(np.linspace(35.0, 75.0, VIEWS), 0.03, 0)
     given: dict[str, Any] = {"model": line, "method": Mine(), "links": LINKS, "readings": False}

@@ -241,6 +241,7 @@ print(json.dumps(fingerprint_of(make_plan(request, None, METHODS["tempered"], Tr
 """
 
 
+@pytest.mark.thorough
 def test_the_question_is_the_same_in_every_process() -> None:
     """However the process orders its sets."""
     paths = os.pathsep.join([str(Path(__file__).parents[1]), str(Path(__file__).parent)])

@@ -66,6 +66,7 @@ def test_a_table_of_readings_becomes_a_capture(
     assert pb.load_capture(out).attrs["setup"] == "camera"
 
 
+@pytest.mark.thorough
 def test_the_command_line_says_what_python_can(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

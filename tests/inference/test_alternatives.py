@@ -106,6 +106,7 @@ def _fit(preset: str, setup: str, **parts) -> xr.DataTree:
     return pb.fit(capture, scene=setup, method="laplace", seed=0)
 
 
+@pytest.mark.thorough
 def test_a_distribution_that_explains_the_readings_better_is_a_problem() -> None:
     fit = _fit("plastic", "paper", distribution=pb.physics.GGX())
     row = criticize(fit).loc["alternatives"]

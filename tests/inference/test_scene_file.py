@@ -36,6 +36,7 @@ def test_a_fit_by_the_file_of_a_fit_has_the_same_draws(fitted, tmp_path: Path):
         assert own[key] == other[key]
 
 
+@pytest.mark.thorough
 def test_what_a_file_states_as_it_is_shipped_is_not_swapped(tmp_path: Path):
     file = tmp_path / "plate.toml"
     pb.save_scene("goniometer", file)

@@ -54,6 +54,7 @@ def test_what_is_shared_has_no_map_and_pixels_keep_theirs(maps: xr.Dataset) -> N
     assert (maps["status"] == Status.GOOD).all()
 
 
+@pytest.mark.thorough
 def test_pixels_know_as_much_as_if_the_noise_were_given(
     image: xr.Dataset, maps: xr.Dataset
 ) -> None:
@@ -73,6 +74,7 @@ def test_pixels_that_disagree_are_told() -> None:
     assert "stokes_error_factor is shared by all pixels, and they do not agree" in sentence
 
 
+@pytest.mark.thorough
 def test_it_does_not_matter_how_the_image_is_cut(
     image: xr.Dataset, maps: xr.Dataset, tmp_path: Path
 ) -> None:
@@ -115,6 +117,7 @@ def test_too_few_pixels_are_an_error(image: xr.Dataset) -> None:
         pb.fit_pixels(image.isel(y=slice(4), x=slice(5)), scene=PLATE, links=LINKS, shared=SHARED)
 
 
+@pytest.mark.thorough
 def test_nothing_is_shared_unless_it_is_asked_for(image: xr.Dataset) -> None:
     maps = pb.fit_pixels(image.isel(y=[0], x=[0]), **ASKED)
     assert pb.maps.shared_parameters(maps).empty

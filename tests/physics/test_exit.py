@@ -157,6 +157,7 @@ def swapped(way_out: AbstractExit, roughness: float, zenith: float, **parts: obj
     return float((forth / back)[0] / np.cos(np.deg2rad(zenith)))
 
 
+@pytest.mark.thorough
 def test_viewer_and_light_may_change_places_where_light_passes_facets_both_ways() -> None:
     for parts in ({}, {"slopes": AnisotropicSlopes(30.0)}, {"distribution": GGX()}):
         for roughness, zenith in ((0.1, 60.0), (0.3, 85.0)):
