@@ -96,9 +96,8 @@ class HenyeyGreenstein(AbstractPhaseFunction):
 
     $$ p = \frac{1 - g^2}{(1 + g^2 - 2 g \cos\Theta)^{3/2}} $$
 
-    The first order of scattering is exact. Higher orders are those of the phase function
-    $w (1 + x \cos\Theta)$ with the same mean cosine and the same share g^2 of a forward peak, for
-    which H functions are known:
+    The first order of scattering is exact. For higher ones a share g^2, the forward peak, counts as
+    not scattered, and the rest follows $1 + x \cos\Theta$, whose H functions are known:
 
     $$ r = \frac{w}{4 (\mu_l + \mu_v)} \{H_l H_v [1 - c (\mu_l + \mu_v) - y \mu_l \mu_v] - 1
        + x [(\cos\Theta + \mu_l \mu_v) K_l K_v - \cos\Theta]
@@ -212,7 +211,7 @@ def _linear_h(cosine: Array, g: Array, y: Array) -> Array:
 
 
 # Of alpha_1 and alpha_2, the integrals of mu H and mu^2 H: value at gamma = 0, and the coefficients
-# of its powers over that; fitted within 1 % for y up to 1.5.
+# of its powers over that; fitted within 2 % for y up to 1.5.
 MOMENTS = ((1.14, -1.16, 0.91, -0.32), (0.81, -1.23, 0.99, -0.35))
 
 
