@@ -1,6 +1,6 @@
 """What each effect costs: compilation, operations and time of one gradient, on against off.
 
-    python -m tests.benchmarks.effect_costs
+    python benchmarks/effect_costs.py
 
 Every effect of three scenes is switched on alone in the plain scene that is left when all are off.
 Prints a Markdown table.

@@ -1,6 +1,6 @@
 """The chosen effects against everything: the same posterior, and how much faster.
 
-    python -m tests.benchmarks.effects [glass plastic leaf paint]
+    python benchmarks/effects.py [glass plastic leaf paint]
 
 Four scenes, each simulated with everything on and fitted by NUTS twice. Prints Markdown tables;
 takes some tens of minutes.
@@ -14,7 +14,7 @@ from typing import Any, override
 import jax
 import numpy as np
 import xarray as xr
-from tests.benchmarks.effect_costs import gradients
+from effect_costs import gradients
 
 import polar_bayes as pb
 from polar_bayes.effects.choose import ledger_table

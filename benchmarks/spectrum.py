@@ -1,6 +1,6 @@
 """Real materials at colors that were not measured, and what many colors cost.
 
-    python -m tests.benchmarks.spectrum [bands] [coverage] [colors]
+    python benchmarks/spectrum.py [bands] [coverage] [colors]
 
 Needs `tests` on the path (PYTHONPATH=tests). Prints Markdown tables; takes some ten minutes.
 """
@@ -8,14 +8,17 @@ Needs `tests` on the path (PYTHONPATH=tests). Prints Markdown tables; takes some
 import sys
 import time
 from collections.abc import Mapping
+from pathlib import Path
 
 import jax
 import numpy as np
 import xarray as xr
-from spectral_plates import LINKS, PLATE, spectral_plate, tabulated
 
 import polar_bayes as pb
 from polar_bayes.inference.result import provenance_of
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from spectral_plates import LINKS, PLATE, spectral_plate, tabulated
 
 MODEL = pb.models.GpSpectral(coupled=("refractive_index",))
 VIEWS = np.linspace(30.0, 78.0, 24)
