@@ -96,18 +96,22 @@ class HenyeyGreenstein(AbstractPhaseFunction):
 
     $$ p = \frac{1 - g^2}{(1 + g^2 - 2 g \cos\Theta)^{3/2}} $$
 
-    The first order of scattering is exact. For higher ones a share g^2, the forward peak, counts as
-    not scattered, and the rest follows $1 + x \cos\Theta$, whose H functions are known:
+    The first order of scattering is exact. For higher ones a share $g^2$, the forward peak, counts
+    as not scattered, and the rest follows $1 + x \cos\Theta$, whose H functions are known:
 
-    $$ r = \frac{w}{4 (\mu_l + \mu_v)} \{H_l H_v [1 - c (\mu_l + \mu_v) - y \mu_l \mu_v] - 1
-       + x [(\cos\Theta + \mu_l \mu_v) K_l K_v - \cos\Theta]
-       + (1 + g^2 - 2 g \cos\Theta)^{-3/2}\}, $$
-    $$ w = \frac{1 + g}{1 + g + a}, \quad x = \frac{3 g}{1 + g}, \quad y = x (1 - w), \quad
-       c = \frac{w y \alpha_1}{2 \gamma + w y \alpha_2}, \quad
+    $$ r = \frac{w}{4 (\mu_l + \mu_v)} (A + B + C), \qquad w = \frac{1 + g}{1 + g + a} $$
+
+    $$ A = H_l H_v [1 - c (\mu_l + \mu_v) - y \mu_l \mu_v] - 1, \qquad
+       B = x [(\cos\Theta + \mu_l \mu_v) K_l K_v - \cos\Theta] $$
+
+    $$ C = (1 + g^2 - 2 g \cos\Theta)^{-3/2}, \qquad
+       c = \frac{w y \alpha_1}{2 \gamma + w y \alpha_2} $$
+
+    $$ x = \frac{3 g}{1 + g}, \qquad y = x (1 - w), \qquad
        \gamma = \frac{\sqrt{a (1 + a)}}{1 + g + a} $$
 
     H and its moments $\alpha_1, \alpha_2$ belong to the characteristic function
-    $(w/2) (1 + y \mu^2)$, K to $(w x/4) (1 - \mu^2)$; r_0 is the mean of r over azimuth.
+    $(w/2) (1 + y \mu^2)$, K to $(w x/4) (1 - \mu^2)$; $r_0$ is the mean of r over azimuth.
 
     Args:
         anisotropy: g, the mean cosine of the angle by which light turns, 1, 0 to 0.9; a name fits
