@@ -80,11 +80,14 @@ class Isotropic(AbstractPhaseFunction):
         w, g = 1.0 / (1.0 + absorption), jnp.sqrt(absorption / (1.0 + absorption))
         cos_light, cos_view = (jnp.maximum(ray.cosine, GRAZING) for ray in (light, view))
         trapped, turned = 1.0 - escape, _mean_cosine(parameters["refractive_index"], escape)
-        (above_l, below_l), (above_v, below_v), (above_t, below_t) = (
-            _isotropic_h(cosine, g) for cosine in (cos_light, cos_view, turned)
-        )
+        above_t, below_t = _isotropic_h(turned, g)
         again = 0.25 * w * (above_t / below_t) ** 2 * trapped
         again = again / (1.0 - 0.5 * again / turned)
+        # Spread over the views once, so that their uses sum derivatives over the views in one loop.
+        cos_light, cos_view, w, g, turned, again = jnp.broadcast_arrays(
+            cos_light, cos_view, w, g, turned, again
+        )
+        (above_l, below_l), (above_v, below_v) = (_isotropic_h(x, g) for x in (cos_light, cos_view))
         three = (cos_light + turned) * (turned + cos_view)
         above = 0.25 * w * above_l * above_v * (three + again * (cos_light + cos_view))
         return quotient(above, below_l * below_v * three * (cos_light + cos_view))
