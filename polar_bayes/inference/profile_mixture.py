@@ -17,6 +17,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
+from jaxtyping import DTypeLike
 
 from polar_bayes.inference.initialization import Coordinates
 from polar_bayes.inference.optimize import (
@@ -55,7 +56,8 @@ class _Component(NamedTuple):
 
 def profile_mixture(coordinates: Coordinates) -> Mixture:
     """Normal components at every heavy mode, and along its profiles."""
-    modes, dtype = coordinates.modes, coordinates.modes.z.dtype
+    modes = coordinates.modes
+    dtype = jnp.asarray(modes.z).dtype  # of the fit: modes are searched in double precision
     components: list[_Component] = []
     with ignore_line_search_warnings():
         for mode in np.flatnonzero(modes.weight >= LEAST_WEIGHT):
@@ -63,7 +65,7 @@ def profile_mixture(coordinates: Coordinates) -> Mixture:
             evidence = -coordinates.potential(z)[0] + 0.5 * np.linalg.slogdet(covariance)[1]
             components.append(_Component(z, covariance, evidence))
             if z.size <= MOST_COORDINATES:
-                components += _along_profiles(coordinates, z, covariance)
+                components += _along_profiles(coordinates, z, covariance, dtype)
     evidence = np.array([each.log_evidence for each in components])
     # The square root: tails need more draws than they weigh.
     share = np.exp(0.5 * (evidence - evidence.max()))
@@ -81,7 +83,7 @@ def profile_mixture(coordinates: Coordinates) -> Mixture:
 
 
 def _along_profiles(
-    coordinates: Coordinates, mode: np.ndarray, covariance: np.ndarray
+    coordinates: Coordinates, mode: np.ndarray, covariance: np.ndarray, dtype: DTypeLike
 ) -> Iterator[_Component]:
     potential = finite_potential(coordinates.potential)
     sd, factor = np.sqrt(np.diagonal(covariance)), np.linalg.cholesky(covariance)
@@ -97,7 +99,7 @@ def _along_profiles(
                 x, value = _conditional_mode(potential, x, others, half)
                 if not value - lowest <= LARGEST_DROP:
                     break
-                hessian = forward_difference_hessian(potential, x, 0.3 * sd, mode.dtype)
+                hessian = forward_difference_hessian(potential, x, 0.3 * sd, dtype)
                 curvature = factor.T @ symmetrize(hessian) @ factor
                 if not np.isfinite(curvature).all():
                     break
@@ -112,6 +114,8 @@ def _conditional_mode(
     potential: ValueAndGradient, start: np.ndarray, others: np.ndarray, half: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Where the potential is least over the other coordinates, in units of their covariance."""
+    if not others.size:
+        return start, potential(start)[0]
 
     def along(y: np.ndarray) -> np.ndarray:
         x = start.copy()

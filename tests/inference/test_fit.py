@@ -160,7 +160,6 @@ def conjugate(data, scene, priors, links) -> None:
         numpyro.sample("q", dist.Normal(mean, 0.5), obs=data.readings["q"])
 
 
-@pytest.mark.thorough
 def test_a_model_of_ones_own_with_a_known_posterior(capture: xr.Dataset) -> None:
     result = pb.fit(capture, model=conjugate, scene=PLATE, links=LINKS, seed=1)
     q = capture["q"].to_numpy()
