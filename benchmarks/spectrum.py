@@ -2,7 +2,7 @@
 
     python benchmarks/spectrum.py [bands] [coverage] [colors]
 
-Needs `tests` on the path (PYTHONPATH=tests). Prints Markdown tables; takes some ten minutes.
+Prints Markdown tables; takes some ten minutes.
 """
 
 import sys

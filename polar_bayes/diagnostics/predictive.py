@@ -197,6 +197,8 @@ def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | N
     base = np.zeros((len(log_likelihood), 1)) if correction is None else correction[:, None]
     ratios, count = base - log_likelihood, variable.observed.size
     weights, pareto_k = (x.T for x in smooth(ratios.T, relative_ess))
+    # Weights that differ but have a flat tail, k = 0, are those of chains that stand still.
+    pareto_k = np.where(pareto_k == 0.0, np.inf, pareto_k)
     pareto_k = np.where(np.ptp(ratios, axis=0) > 1e-12, pareto_k, -np.inf)
     with np.errstate(all="ignore"):  # an extreme tail overflows: what is not known is NaN
         elpd = logsumexp(log_likelihood, b=weights, axis=0)

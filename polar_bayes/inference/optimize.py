@@ -146,10 +146,9 @@ def central_difference_hessian(
     rows: Sequence[int] | np.ndarray | None = None,
 ) -> np.ndarray:
     """Rows of the Hessian, all by default, by central differences of the gradient."""
-    # With a step of the fourth root of the rounding error, in units of the posterior's own sd,
-    # truncation and rounding both stay below 1e-7 of the Hessian (double precision).
-    steps = np.clip(sd, 1e-6, 1.0) * np.finfo(dtype).eps ** 0.25
-    found = []
+    # With these steps truncation and rounding both stay below 1e-7 of the Hessian (double
+    # precision).
+    found, steps = [], _steps(sd, dtype)
     for index, step in zip(range(z.size) if rows is None else rows, steps, strict=True):
         shift = np.zeros_like(z)
         shift[index] = step
@@ -161,8 +160,13 @@ def forward_difference_hessian(
     potential: ValueAndGradient, z: np.ndarray, sd: np.ndarray, dtype: DTypeLike
 ) -> np.ndarray:
     """The Hessian for half the gradients, to 1e-4 of it: enough for a proposal, not for a mode."""
-    steps, at_z = np.clip(sd, 1e-6, 1.0) * np.finfo(dtype).eps ** 0.25, potential(z)[1]
+    steps, at_z = _steps(sd, dtype), potential(z)[1]
     return np.stack([(potential(z + s)[1] - at_z) / s.max() for s in np.diag(steps)])
+
+
+def _steps(sd: np.ndarray, dtype: DTypeLike) -> np.ndarray:
+    """The fourth root of the rounding error, in units of the posterior's own sds."""
+    return np.clip(sd, 1e-6, 1.0) * np.finfo(dtype).eps ** 0.25
 
 
 def symmetrize(matrix: np.ndarray) -> np.ndarray:

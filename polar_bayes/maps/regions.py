@@ -42,6 +42,16 @@ class _Sums(NamedTuple):
     pull: np.ndarray
     pull_variance: np.ndarray
 
+    @property
+    def sd(self) -> np.ndarray:
+        """Of the mean, with what is shared counted once: (region, ...)."""
+        return np.sqrt(self.own_variance + np.sum(self.slope**2, axis=0))
+
+    @property
+    def is_pull_known(self) -> np.ndarray:
+        """Where pixels say more than their priors: (region, ...)."""
+        return ~(np.sqrt(self.pull_variance) > self.sd)
+
 
 def region_means(
     maps: xr.Dataset, labels: xr.DataArray | np.ndarray, *, against: object = None
@@ -102,15 +112,16 @@ def region_means(
     cautions: list[str] = []
     for name, total in sums.items():
         means = _of_regions(total, counts[0], reference)
-        sd = np.sqrt(means.own_variance + np.sum(means.slope**2, axis=0))
-        cautions += _cautions(name, found, means, sd, shown)
+        sd = means.sd
+        cautions += _cautions(name, found, means, shown)
         interval = means.mean + ndtri(BOUNDS).reshape(-1, *[1] * sd.ndim) * sd
         attrs = {key: maps[name].attrs.get(key, "") for key in ("units", "symbol")}
         axes = ("region", *_own_dims(maps, name))
         variables[name] = (axes, means.mean, attrs)
         variables[f"{name}_sd"] = (axes, sd, attrs)
         variables[f"{name}_interval"] = (("bound", *axes), interval, attrs)
-        variables[f"{name}_prior_pull"] = (axes, means.pull, attrs)
+        pull = np.where(means.is_pull_known, means.pull, np.nan)
+        variables[f"{name}_prior_pull"] = (axes, pull, attrs)
     own = {dim: x for dim, x in maps.coords.items() if any(dim in v[0] for v in variables.values())}
     answer = xr.Dataset(variables, {**own, "region": found, "bound": list(BOUNDS)})
     return answer.isel(region=shown).assign_attrs(cautions=cautions)
@@ -246,18 +257,16 @@ def _of_regions(sums: _Sums, count: np.ndarray, reference: int | None) -> _Sums:
         mean, pull = mean - mean[reference], pull - pull[reference]
         slope = slope - slope[:, reference, None]
         variance, spread = variance + variance[reference], spread + spread[reference]
-    sd = np.sqrt(variance + np.sum(slope**2, axis=0))
-    return _Sums(mean, variance, slope, np.where(np.sqrt(spread) > sd, np.nan, pull), spread)
+    return _Sums(mean, variance, slope, pull, spread)
 
 
-def _cautions(
-    name: str, labels: np.ndarray, found: _Sums, sd: np.ndarray, shown: np.ndarray
-) -> Iterator[str]:
+def _cautions(name: str, labels: np.ndarray, found: _Sums, shown: np.ndarray) -> Iterator[str]:
     """Where an interval would not hold if all pixels of a region were alike."""
-    pull, chance = np.abs(found.pull), np.sqrt(found.pull_variance)
+    pull, chance, sd = np.abs(found.pull), np.sqrt(found.pull_variance), found.sd
     is_moved = (pull > LARGEST_PULL * sd) & (pull > SIGNIFICANT * chance)
+    is_known = found.is_pull_known
     for at in shown:
-        if np.any(np.isnan(found.pull[at]) & np.isfinite(sd[at])):
+        if not np.all(is_known[at]):
             why = "its pixels are as wide as their priors, whose pull on the mean is not known"
         elif np.any(is_moved[at]):
             sds = np.max(pull[at] / sd[at])

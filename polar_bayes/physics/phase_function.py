@@ -201,18 +201,23 @@ def _isotropic_h(cosine: Array, g: Array) -> tuple[Array, Array]:
     """Numerator and denominator of H."""
     # A fit to H by iteration on 200 nodes, within .25 % of H and of the plane albedo 1 - g H, for g
     # up to .99 and cosines from .003. Exact for a black body (g = 1) and at grazing: H = 1.
-    level, rise = 1.9613 + g * (0.4670 - 0.1275 * g), -0.1313 - 0.0334 * g
-    bend, off = 0.0743 + 0.0473 * g, cosine + 0.04
+    (level, rise, bend), off = _coefficients(g), cosine + 0.04
     q = cosine * (off * (level + rise * cosine) + bend)
     return off + q, off + g * q
+
+
+def _coefficients(g: Array) -> tuple[Array, Array, Array]:
+    """Of q/mu = level + rise mu + bend/(mu + .04)."""
+    return 1.9613 + g * (0.4670 - 0.1275 * g), -0.1313 - 0.0334 * g, 0.0743 + 0.0473 * g
 
 
 def _linear_h(cosine: Array, g: Array, y: Array) -> Array:
     """H of the characteristic function (w/2) (1 + y mu^2); for y = 0 that of `_isotropic_h`."""
     # Fitted likewise, within .4 %, with g = (1 - 2 int of it)^(1/2), for y up to 1.5.
-    level = 1.9613 + g * (0.4670 - 0.1275 * g) + y * (-0.2773 - 0.0780 * g + 0.0775 * y)
-    rise = -0.1313 - 0.0334 * g + y * (-0.0032 + 0.0171 * g + 0.0087 * y)
-    bend = 0.0743 + 0.0473 * g + y * (-0.0209 - 0.0148 * g + 0.0074 * y)
+    level, rise, bend = _coefficients(g)
+    level = level + y * (-0.2773 - 0.0780 * g + 0.0775 * y)
+    rise = rise + y * (-0.0032 + 0.0171 * g + 0.0087 * y)
+    bend = bend + y * (-0.0209 - 0.0148 * g + 0.0074 * y)
     q = cosine * (level + rise * cosine + bend / (cosine + 0.04))
     return (1.0 + q) / (1.0 + g * q)
 

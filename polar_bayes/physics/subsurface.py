@@ -4,11 +4,10 @@ import abc
 import dataclasses
 from typing import Annotated, override
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
+from polar_bayes.physics.geometry import Geometry, cos_degrees, per_ray, sin_degrees
 from polar_bayes.physics.half_space import CLEAREST, Ray, refract, scatter
 from polar_bayes.physics.part import (
     Parameters,
@@ -156,11 +155,11 @@ class Depolarizer(AbstractSubsurface):
         light = _inside(rays.light_zenith, n[..., None])
         names = "refractive_index", *self.parameters
         reflectance = self.phase_function.reflectance(
-            {name: parameters[name][..., None] for name in names},
+            per_ray({name: parameters[name] for name in names}),
             light,
-            jax.tree.map(lambda array: array[..., None], view),
+            per_ray(view),
             rays.light_azimuth - rays.view_azimuth,
-            escape[..., None],
+            per_ray(escape),
         )
         returned = jnp.sum(entering.intensity * reflectance, axis=-1) / (jnp.pi * n**2)
         leaving, kept = interface.exit(parameters, geometry), body_loss(absorption, escape)
@@ -249,7 +248,7 @@ class TurbidMedium(AbstractSubsurface):
         )
         scattered = scatter(
             light,
-            jax.tree.map(lambda array: array[..., None], view),
+            per_ray(view),
             rays.light_azimuth - rays.view_azimuth,
             incident,
             parameters["absorption"][..., None],

@@ -61,6 +61,18 @@ def test_leave_one_out_agrees_with_arviz() -> None:
     np.testing.assert_allclose(loo.pit, pit, atol=1e-8)
 
 
+def test_chains_that_stand_still_are_not_relied_upon() -> None:
+    """Two values in 600 draws; where all draws are alike, each is as good as any other."""
+    tree = make_result(**SMALL, variables=("dop",))
+    still = np.zeros(tree["log_likelihood"]["dop"].shape)
+    alike = predictive_checks(replace(tree, "log_likelihood", "dop", still))["dop"].loo
+    assert alike.unreliable == 0
+    still[:2] = 1.0
+    assert (
+        predictive_checks(replace(tree, "log_likelihood", "dop", still))["dop"].loo.unreliable == 20
+    )
+
+
 @pytest.mark.thorough
 def test_laplace_weights_correct_the_leave_one_out() -> None:
     """Draws from a wrong normal with their weights say what draws from the posterior say."""

@@ -201,3 +201,12 @@ def test_pixels_that_say_nothing_are_told(maps: xr.Dataset) -> None:
     (sentence,) = found.attrs["cautions"]
     assert "level of region True: its pixels are as wide as their priors, whose pull" in sentence
     assert np.isnan(found["level_prior_pull"].item())
+
+
+def test_without_a_known_prior_nothing_is_said_of_its_pull(maps: xr.Dataset) -> None:
+    unknown = maps.copy()
+    for key in ("prior_mean", "prior_sd"):
+        del unknown["level"].attrs[key]
+    found = pb.maps.region_means(unknown, quarters())
+    assert np.isnan(found["level_prior_pull"]).all()
+    assert not [told for told in found.attrs["cautions"] if told.startswith("level ")]

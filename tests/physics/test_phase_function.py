@@ -86,9 +86,32 @@ def test_isotropic_scattering_in_closed_form_agrees_with_all_orders() -> None:
     exact = under_beam(n, albedo, 0.0 * n, light, view, 0.0)[0]
     found = through_a_plane(Isotropic(), n, 1.0 / albedo - 1.0, light, view)
     np.testing.assert_allclose(found, exact, rtol=0.03)
+    swapped = through_a_plane(Isotropic(), n, 1.0 / albedo - 1.0, view, light)
+    np.testing.assert_allclose(found, swapped, rtol=1e-12)
 
 
 # --- Forward scattering ---------------------------------------------------------------------------
+
+
+@pytest.mark.thorough
+def test_similarity_holds_for_bright_bodies() -> None:
+    """Forward scattering by reduced scattering alone: the figures of docs/equations.md."""
+    table = read("iad_semiinfinite_albedo.csv")
+    for anisotropy, albedo, excess in (
+        (0.5, 0.97, 0.03),
+        (0.8, 0.97, 0.10),
+        (0.5, 0.9, 0.09),
+        (0.8, 0.9, 0.30),
+        (0.5, 0.1, 0.96),
+        (0.8, 0.1, 1.79),
+    ):
+        n, _, _, normal = table[:4, (table[1] == anisotropy) & (table[2] == albedo)]
+        reduced = albedo * (1.0 - anisotropy) / (1.0 - albedo * anisotropy)
+        (view, ns), integral = hemisphere(n)
+        given = ns, 1.0 / reduced - 1.0 + 0.0 * ns, 0.0 * view, view
+        found = np.pi * integral(through_a_plane(Isotropic(), *given))
+        exact = normal - ((n - 1.0) / (n + 1.0)) ** 2
+        assert np.max(found / exact) - 1.0 == pytest.approx(excess, abs=0.005)
 
 
 NODE, WEIGHT = np.polynomial.legendre.leggauss(40)
