@@ -35,9 +35,10 @@ def alternatives(result: xr.DataTree) -> pd.DataFrame:
     """
     provenance = provenance_of(result)
     tried = provenance.get("alternatives")
-    failed = [each["failed"] for each in tried or () if "failed" in each]
-    if tried is None or failed:
-        reason = provenance.get("alternatives_failed", "the result does not hold them")
+    reason = provenance.get("alternatives_failed") or "the result does not hold them"
+    compared = [each for each in tried or () if each.get("log_bayes_factor") is not None]
+    if tried is None or len(compared) < len(tried):
+        failed = [each["failed"] for each in tried or () if each.get("failed")]
         raise FitError(
             f"alternatives to the parts of its scene were not compared: {[*failed, reason][0]}",
             where="result",
@@ -46,8 +47,8 @@ def alternatives(result: xr.DataTree) -> pd.DataFrame:
     found = posterior_scalars(result)
     material = [scalar for scalar in found if scalar.is_material]
     rows, labels = [], []
-    for each in tried:
-        for scalar, shift in with_entries(material or found, each["shift"]):
+    for each in compared:
+        for scalar, shift in with_entries(material or found, each.get("shift") or {}):
             mean, sd = float(scalar.draws.mean()), float(scalar.draws.std())
             redefined = scalar.name in each["defines"]
             given = [each[name] for name in COLUMNS[:4]]

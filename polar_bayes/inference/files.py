@@ -56,12 +56,18 @@ def _are_bounds(value: Any) -> bool:
     return is_pair and all(bound is None or _is_finite(bound) for bound in value)
 
 
+def _are_shares(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_finite, value))
+
+
 ANY = Leaf("anything", lambda _: True)
 TEXT = Leaf("text", lambda value: isinstance(value, str))
 FLAG = Leaf("true or false", lambda value: isinstance(value, bool))
 FINITE = Leaf("a finite number", _is_finite)
 COUNT = Leaf("a count", lambda value: _is_finite(value) and value >= 0 and value % 1 == 0)
+NUMBER = Leaf("a number", _is_number)
 BOUNDS = Leaf("a least and a largest value", _are_bounds)
+SHARES = Leaf("a share below and a share above", _are_shares)
 OPTIONAL = Leaf("a number or null", lambda value: value is None or _is_number(value))
 
 type Spec = Leaf | Mapping[str, Spec] | list[Spec]
@@ -292,6 +298,10 @@ COMMON_PROVENANCE: Mapping[str, Spec] = {
 }
 """Provenance that every kind of result may have."""
 
+_ALTERNATIVE = {
+    **dict.fromkeys(("part", "alternative", "path", "failed?"), TEXT),
+    **{"defines": [TEXT], "log_bayes_factor?": FINITE, "shift?": {EACH: [FINITE]}},
+}
 _STEP = {"name": TEXT, "taken": FLAG, "why": TEXT, "seconds": FINITE, "monte_carlo?": FINITE}
 _FIT_PROVENANCE: Mapping[str, Spec] = {
     **COMMON_PROVENANCE,
@@ -311,6 +321,10 @@ _FIT_PROVENANCE: Mapping[str, Spec] = {
     "problems?": [TEXT],
     "capture?": {EACH: ANY},
     "comparisons_failed?": {EACH: TEXT},
+    "prior_probability?": {EACH: [NUMBER]},
+    "tails?": {"k_hat": NUMBER, "effective_draws": NUMBER, "shares": {EACH: [SHARES]}},
+    "alternatives?": [_ALTERNATIVE],
+    "alternatives_failed?": TEXT,
     "standard_errors?": {EACH: [OPTIONAL]},
     "modes?": {"weights?": [FINITE]},
     "k_hat?": FINITE,

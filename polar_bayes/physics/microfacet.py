@@ -307,7 +307,9 @@ class IsotropicSlopes(AbstractSlopes):
 
     @override
     def ellipse(self, parameters: Parameters, geometry: Geometry) -> SlopeEllipse:
-        return SlopeEllipse(parameters["roughness"], parameters["roughness"], None)
+        # Of every view, so that its many uses sum their derivatives over the views in one loop.
+        roughness, _ = jnp.broadcast_arrays(parameters["roughness"], geometry.view_zenith)
+        return SlopeEllipse(roughness, roughness, None)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -108,6 +108,7 @@ def by_hand(parameters, geometry):
         jnp.asarray(parameters[name])[..., None]
         for name in ("roughness", "subsurface_fraction", "refractive_index")
     )
+    roughness, _ = jnp.broadcast_arrays(roughness, geometry.view_zenith)
     facets = pb.Beckmann()
     facet = mirror_facet(geometry)
     views, lights = (

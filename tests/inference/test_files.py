@@ -35,11 +35,18 @@ AUTO = {
         {"name": "nuts", "taken": True, "why": "", "seconds": 2.0, "monte_carlo": 0.02},
     ],
 }
+OTHER = {
+    **{"part": "Beckmann", "alternative": "GGX", "path": "surface.distribution", "defines": []},
+    **{"log_bayes_factor": -1.0, "shift": {"roughness": [0.5]}},
+}
+TAILS = {"k_hat": 0.3, "effective_draws": 500.0, "shares": {"roughness": [[0.02, 0.03]]}}
 MANY = pool(
     edit_provenance(
         make_result(**SMALL, wavelengths=(450.0, 550.0), materials=("a", "b")),
         auto=AUTO,
         bounds={"roughness": [0.0, None]},
+        alternatives=[OTHER],
+        tails=TAILS,
         comparisons_failed={"without_discrepancy": "why"},
     ),
     "roughness",
@@ -174,6 +181,19 @@ def test_provenance_that_is_no_mapping_is_refused(odd):
         ({"modes": {"weights": [1.0, "x"]}}, r"modes.weights\[1\]: it is 'x', not a finite number"),
         ({"bounds": {"roughness": [0.0]}}, r"bounds.roughness: it is \[0.0\], not a least"),
         ({"auto": {**AUTO, "steps": [{}]}}, r"auto.steps\[0\].name: it is missing"),
+        ({"alternatives": ["x"]}, r"alternatives\[0\]: it is 'x', not a mapping"),
+        (
+            {"alternatives": [{**OTHER, "shift": "x"}]},
+            r"alternatives\[0\].shift: it is 'x', not a mapping",
+        ),
+        (
+            {"prior_probability": {"roughness": ["x"]}},
+            r"prior_probability.roughness\[0\]: it is 'x', not a number",
+        ),
+        (
+            {"tails": {**TAILS, "shares": {"a": [[0.1]]}}},
+            r"tails.shares.a\[0\]: .*, not a share below",
+        ),
         ({"method": 3}, "polar_bayes.method: it is 3, not text"),
         ({"largest_view_zenith": math.inf}, "largest_view_zenith: it is inf, not a finite"),
     ],
