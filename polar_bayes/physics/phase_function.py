@@ -1,4 +1,4 @@
-r"""How a body scatters, and how bright a half space of it is: closed forms, without polarization.
+r"""How a body scatters, and how bright a half space of it is, without polarization.
 
 The brightness is the radiance inside over that of a white diffuser,
 
@@ -20,10 +20,14 @@ Source:
 
 import abc
 import dataclasses
-import math
+import functools
+import importlib.resources
+import io
+from collections.abc import Sequence
 from typing import Annotated, NamedTuple, override
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.physics.geometry import cos_degrees
@@ -34,6 +38,7 @@ from polar_bayes.physics.part import (
     Range,
     Setting,
     at_least,
+    like,
     quotient,
     value_of,
 )
@@ -41,8 +46,13 @@ from polar_bayes.physics.part import (
 # Mean cosine of diffuse light.
 MEAN_COSINE = 2.0 / 3.0
 
-# Cosines of azimuths whose mean is that of a phase function at steep directions.
-AZIMUTHS = tuple(math.cos(math.pi * (k + 0.5) / 4) for k in range(4))
+MOST_ANISOTROPY = 0.9
+
+# Of the table of multiple scattering: orders in azimuth, and polynomials of each variable.
+ORDERS, DEGREES = 3, 5
+
+# Azimuths whose mean is that of all, at the directions of light that is turned back. Unit degree.
+AZIMUTHS = (22.5, 67.5, 112.5, 157.5)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,22 +109,16 @@ class HenyeyGreenstein(AbstractPhaseFunction):
 
     $$ p = \frac{1 - g^2}{(1 + g^2 - 2 g \cos\Theta)^{3/2}} $$
 
-    The first order of scattering is exact. For higher ones a share $g^2$, the forward peak, counts
-    as not scattered, and the rest follows $1 + x \cos\Theta$, whose H functions are known:
+    The first order of scattering is exact. Higher ones follow those of isotropic scattering with
+    the same a,
 
-    $$ r = \frac{w}{4 (\mu_l + \mu_v)} (A + B + C), \qquad w = \frac{1 + g}{1 + g + a} $$
+    $$ r = \frac{w}{4 (\mu_l + \mu_v)} \Bigl\{ p + (H_l H_v - 1) \exp \sum_{m=0}^{2}
+       (g^2 \sin\theta_l \sin\theta_v)^m P_m \cos m\varphi \Bigr\},
+       \qquad w = \frac{1}{1 + (1 - g)\, a} $$
 
-    $$ A = H_l H_v [1 - c (\mu_l + \mu_v) - y \mu_l \mu_v] - 1, \qquad
-       B = x [(\cos\Theta + \mu_l \mu_v) K_l K_v - \cos\Theta] $$
-
-    $$ C = (1 + g^2 - 2 g \cos\Theta)^{-3/2}, \qquad
-       c = \frac{w y \alpha_1}{2 \gamma + w y \alpha_2} $$
-
-    $$ x = \frac{3 g}{1 + g}, \qquad y = x (1 - w), \qquad
-       \gamma = \frac{\sqrt{a (1 + a)}}{1 + g + a} $$
-
-    H and its moments $\alpha_1, \alpha_2$ belong to the characteristic function
-    $(w/2) (1 + y \mu^2)$, K to $(w x/4) (1 - \mu^2)$; $r_0$ is the mean of r over azimuth.
+    with $\varphi$ from the plane of the mirror side. The $P_m$ are sums of Chebyshev
+    polynomials of g, of $\sqrt{a/(1 + a)}$ and of the roots of both cosines, fitted to the solution
+    of the half space (`benchmarks/henyey_greenstein.py`). $r_0$ is the mean of r over azimuth.
 
     Args:
         anisotropy: g, the mean cosine of the angle by which light turns, 1, 0 to 0.9; a name fits
@@ -124,12 +128,11 @@ class HenyeyGreenstein(AbstractPhaseFunction):
         SceneError: It is neither such a number nor a name.
 
     Source:
-        Henyey & Greenstein 1941, Astrophys. J. 93, 70; Joseph, Wiscombe & Weinman 1976, J. Atmos.
-        Sci. 33, 2452 (the forward peak); Nakajima & Tanaka 1988, J. Quant. Spectrosc. Radiat.
-        Transfer 40, 51 (the first order).
+        Henyey & Greenstein 1941, Astrophys. J. 93, 70; Chandrasekhar 1960, Radiative transfer,
+        section 29 (the equation of the half space).
     """
 
-    anisotropy: Annotated[Setting, Range(0.0, 0.9)] = 0.8
+    anisotropy: Annotated[Setting, Range(0.0, MOST_ANISOTROPY)] = 0.8
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
@@ -141,53 +144,89 @@ class HenyeyGreenstein(AbstractPhaseFunction):
     ) -> Array:
         a = at_least(parameters["absorption"], CLEAREST)
         g = value_of(self.anisotropy, parameters)
-        w, x = (1.0 + g) / (1.0 + g + a), 3.0 * g / (1.0 + g)
-        y, gamma = x * a / (1.0 + g + a), jnp.sqrt(a * (1.0 + a)) / (1.0 + g + a)
-        first, second = (
-            level * (1.0 + gamma * (b + gamma * (c + gamma * d))) for level, b, c, d in MOMENTS
-        )
-        c = w * y * first / (2.0 * gamma + w * y * second)
+        w, gamma = 1.0 / (1.0 + (1.0 - g) * a), jnp.sqrt(a / (1.0 + a))
+        of_orders = _of_orders(g, gamma)
         trapped, turned = 1.0 - escape, _mean_cosine(parameters["refractive_index"], escape)
-        cos_light, cos_view = (jnp.maximum(ray.cosine, GRAZING) for ray in (light, view))
         incident, leaving, back = (
-            _Direction(cosine, sine, _linear_h(cosine, gamma, y))
+            _direction(jnp.maximum(cosine, GRAZING), sine, gamma)
             for cosine, sine in (
-                (cos_light, light.sine),
-                (cos_view, view.sine),
+                (light.cosine, light.sine),
+                (view.cosine, view.sine),
                 (turned, jnp.sqrt(1.0 - turned**2)),
             )
         )
 
-        def peak(one: _Direction, other: _Direction, around: Array | float) -> Array:
-            cosine = one.cosine * other.cosine + one.sine * other.sine * around  # -cos(Theta)
-            return (1.0 + g * (g + 2.0 * cosine)) ** -1.5
+        def reflectance(one: _Direction, other: _Direction, azimuths: Sequence[Array]) -> Array:
+            """The mean over azimuths from the mirror side."""
+            sines = one.sine * other.sine
+            orders = [
+                jnp.einsum(
+                    "...ij,...i,...j->...", each, one.basis, other.basis, precision="highest"
+                )
+                * (g**2 * sines) ** order
+                for order, each in enumerate(of_orders)
+            ]
+            scattered = []
+            for azimuth in azimuths:
+                around = [cos_degrees(order * azimuth) for order in range(ORDERS)]
+                turn = sines * around[1] - one.cosine * other.cosine  # cos(Theta)
+                once = (1.0 - g**2) * (1.0 + g * (g - 2.0 * turn)) ** -1.5
+                exponent = sum(p * cosine for p, cosine in zip(orders, around, strict=True))
+                scattered.append(once + (one.h * other.h - 1.0) * jnp.exp(exponent))
+            mean = sum(scattered) / len(scattered)
+            return quotient(0.25 * w * mean, one.cosine + other.cosine)
 
-        def reflectance(one: _Direction, other: _Direction, of_azimuth: Array) -> Array:
-            product, total = one.cosine * other.cosine, one.cosine + other.cosine
-            of_both = one.h * other.h * (1.0 - c * total - y * product) - 1.0 + x * product
-            return quotient(0.25 * w * (of_both + of_azimuth), total)
-
-        def mean(one: _Direction, other: _Direction) -> Array:
-            peaks = jnp.stack([peak(one, other, node) for node in AZIMUTHS])
-            return reflectance(one, other, jnp.mean(peaks, axis=0))
-
-        around = cos_degrees(azimuth)
-        k = _once_around(cos_light, 0.25 * w * x) * _once_around(cos_view, 0.25 * w * x)
-        once_around = x * light.sine * view.sine * around * (1.0 - k)
-        direct = reflectance(incident, leaving, once_around + peak(incident, leaving, around))
-        again = trapped * mean(incident, back) * mean(back, leaving)
-        return direct + again / (1.0 - trapped * mean(back, back))
+        again = (
+            trapped * reflectance(incident, back, AZIMUTHS) * reflectance(back, leaving, AZIMUTHS)
+        )
+        again = again / (1.0 - trapped * reflectance(back, back, AZIMUTHS))
+        return reflectance(incident, leaving, [180.0 - azimuth]) + again
 
 
 # --- H functions and what follows from them -------------------------------------------------------
 
 
 class _Direction(NamedTuple):
-    """A direction inside the body, and H there."""
+    """A direction inside the body, with H and the polynomials of its cosine, on a last axis."""
 
     cosine: Array
     sine: Array
     h: Array
+    basis: Array
+
+
+def _direction(cosine: Array, sine: Array, gamma: Array) -> _Direction:
+    above, below = _isotropic_h(cosine, gamma)
+    return _Direction(cosine, sine, above / below, _chebyshev(jnp.sqrt(cosine)))
+
+
+@functools.cache
+def _table() -> np.ndarray:
+    """Coefficients of P_m, (order, g, gamma, cosine, cosine)."""
+    file = importlib.resources.files("polar_bayes.physics") / "henyey_greenstein.csv"
+    values = np.loadtxt(io.StringIO(file.read_text()), delimiter=",")
+    return values.reshape(ORDERS, *(4 * (DEGREES,)))
+
+
+def _of_orders(g: Array, gamma: Array) -> list[Array]:
+    """Of each P_m, coefficients of the polynomials of both cosines, on two last axes."""
+    share = g / MOST_ANISOTROPY
+    of_g, of_gamma = _chebyshev(share), _chebyshev(gamma)
+    # That of order 0 vanishes with g, where scattering is isotropic.
+    of_order = (of_g * share[..., None], *((ORDERS - 1) * (of_g,)))
+    return [
+        jnp.einsum("...g,...s,gsij->...ij", each, of_gamma, like(table, g), precision="highest")
+        for each, table in zip(of_order, _table(), strict=True)
+    ]
+
+
+def _chebyshev(share: Array) -> Array:
+    """Chebyshev polynomials of a number from 0 to 1, on a last axis."""
+    x = 2.0 * share - 1.0
+    terms = [jnp.ones_like(x), x]
+    while len(terms) < DEGREES:
+        terms.append(2.0 * x * terms[-1] - terms[-2])
+    return jnp.stack(terms, axis=-1)
 
 
 def _mean_cosine(refractive_index: Array, escape: Array) -> Array:
@@ -209,25 +248,3 @@ def _isotropic_h(cosine: Array, g: Array) -> tuple[Array, Array]:
 def _coefficients(g: Array) -> tuple[Array, Array, Array]:
     """Of q/mu = level + rise mu + bend/(mu + .04)."""
     return 1.9613 + g * (0.4670 - 0.1275 * g), -0.1313 - 0.0334 * g, 0.0743 + 0.0473 * g
-
-
-def _linear_h(cosine: Array, g: Array, y: Array) -> Array:
-    """H of the characteristic function (w/2) (1 + y mu^2); for y = 0 that of `_isotropic_h`."""
-    # Fitted likewise, within .4 %, with g = (1 - 2 int of it)^(1/2), for y up to 1.5.
-    level, rise, bend = _coefficients(g)
-    level = level + y * (-0.2773 - 0.0780 * g + 0.0775 * y)
-    rise = rise + y * (-0.0032 + 0.0171 * g + 0.0087 * y)
-    bend = bend + y * (-0.0209 - 0.0148 * g + 0.0074 * y)
-    q = cosine * (level + rise * cosine + bend / (cosine + 0.04))
-    return (1.0 + q) / (1.0 + g * q)
-
-
-# Of alpha_1 and alpha_2, the integrals of mu H and mu^2 H: value at gamma = 0, and the coefficients
-# of its powers over that; fitted within 2 % for y up to 1.5.
-MOMENTS = ((1.14, -1.16, 0.91, -0.32), (0.81, -1.23, 0.99, -0.35))
-
-
-def _once_around(cosine: Array, strength: Array) -> Array:
-    """H of the characteristic function strength (1 - mu^2), within .4 % up to 3/8."""
-    level = 0.4457 + 0.1121 * cosine + strength * (0.1750 + 0.1092 * cosine)
-    return 1.0 / (1.0 - strength * cosine * level / (cosine + 0.1299))
