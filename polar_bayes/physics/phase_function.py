@@ -159,11 +159,9 @@ class HenyeyGreenstein(AbstractPhaseFunction):
         def reflectance(one: _Direction, other: _Direction, azimuths: Sequence[Array]) -> Array:
             """The mean over azimuths from the mirror side."""
             sines = one.sine * other.sine
+            pair = one.basis[..., :, None] * other.basis[..., None, :]
             orders = [
-                jnp.einsum(
-                    "...ij,...i,...j->...", each, one.basis, other.basis, precision="highest"
-                )
-                * (g**2 * sines) ** order
+                jnp.sum(each * pair, axis=(-2, -1)) * (g**2 * sines) ** order
                 for order, each in enumerate(of_orders)
             ]
             scattered = []
