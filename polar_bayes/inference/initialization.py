@@ -35,6 +35,7 @@ from polar_bayes.inference.optimize import (
     Modes,
     NumpyPotential,
     ValueAndGradient,
+    begin_from_prior,
     distinct_modes,
     find_mode,
     find_modes,
@@ -312,6 +313,10 @@ class AbstractInitializer(abc.ABC):
     ) -> AbstractInit:
         """The modes of one capture, by default from prior draws; a `FitError` where it has none."""
 
+    def prepare(self, data: Observations) -> None:
+        """Begin to compile what `find` needs; nothing by default."""
+        del data
+
     @abc.abstractmethod
     def prepare_target(self, data: Observations) -> Target | None:
         """A target of the shapes that the search will give, whose programs begin to compile.
@@ -348,6 +353,12 @@ class JointInitializer(AbstractInitializer):
             "gradients": potential.calls,
         }
         return JointInit(self, data, potential, modes, metadata)
+
+    @override
+    def prepare(self, data: Observations) -> None:
+        begin_from_prior(self.program, data)
+        z = jax.ShapeDtypeStruct((self.program.size,), data.brightness.dtype)
+        self.program.value_and_gradient.begin(z, data)
 
     @override
     def prepare_target(self, data: Observations) -> Target:

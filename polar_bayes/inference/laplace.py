@@ -119,6 +119,10 @@ class Importance(AbstractMethod):
             raise FitError(f"rounds is {self.rounds}", where="Importance", hint="give at least 1")
 
     @override
+    def prepare(self, problem: Problem) -> None:
+        problem.prepare_search()
+
+    @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
         initialization = problem.initialize(progress)
         key_draw, key_resample = jax.random.split(key)

@@ -284,6 +284,12 @@ KEYS = 500
 """Prior draws that one call of a compiled program makes at most."""
 
 
+def begin_from_prior(program: Program, data: Observations) -> None:
+    """Begin to compile what `from_prior` needs."""
+    keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), KEYS)))
+    program.drawn_from_prior.begin(keys, KEYS, data)
+
+
 def from_prior(program: Program, key: Array, draws: int, data: Observations) -> np.ndarray:
     """Unconstrained vectors drawn from the prior; one compiled program serves any number."""
     # The key of a draw depends on its index alone, so a multiple of `KEYS` serves any number.

@@ -38,8 +38,8 @@ from polar_bayes.observation.data import Observations, observe
 from polar_bayes.priors import RANGES, describe_prior, support_bounds
 from polar_bayes.progress import Progress, no_progress
 
-MAX_LAYOUTS = 8
-"""Models by layout that stay compiled."""
+MAX_LAYOUTS = 16
+"""Models by layout that stay compiled: all candidates of a comparison of scenes, and some more."""
 
 MAX_PROGRAMS = 16
 """Further programs that methods have made of one of them, by settings, that stay compiled."""
@@ -223,6 +223,10 @@ class Problem:
             name: np.concatenate([piece[name] for piece in pieces], axis=1)[:, :count]
             for name in pieces[0]
         }
+
+    def prepare_search(self) -> None:
+        """Begin to compile what `initialize` needs, in parallel with whatever follows."""
+        self.compiled_model.initializer.prepare(self.data)
 
     def prepare_predictions(self) -> None:
         """Begin to compile what `predict` needs, in parallel with whatever follows."""

@@ -173,7 +173,7 @@ class Program:
         return JitOnce(jax.value_and_grad(self.potential_jit))
 
     @functools.cached_property
-    def drawn_from_prior(self) -> Callable[[np.ndarray, int, Observations], Array]:
+    def drawn_from_prior(self) -> JitOnce:
         """Vectors drawn from the prior, compiled: one for each of the first `count` keys."""
         # The others are zero, so that one program serves any count.
 

@@ -118,6 +118,18 @@ class SceneLibrary:
             if not choice[slot]:
                 yield (*choice[:slot], next(iter(options)), *choice[slot + 1 :])
 
+    def other_bodies(self, choice: Choice) -> Iterator[Choice]:
+        """Choices with another body in the place of the one that there is.
+
+        Args:
+            choice: The option of each slot.
+
+        Yields:
+            Other choices.
+        """
+        if choice[1]:
+            yield from ((choice[0], body, *choice[2:]) for body in self.bodies if body != choice[1])
+
     def alternatives(self, choice: Choice) -> Iterator[Choice]:
         """Choices with other slopes or another body, and those with one part less.
 
@@ -130,8 +142,7 @@ class SceneLibrary:
         for pair in OTHER_SLOPES.items():
             if choice[0] in pair and set(pair) <= set(self.surfaces):
                 yield (pair[1 - pair.index(choice[0])], *choice[1:])
-        if choice[1]:
-            yield from ((choice[0], body, *choice[2:]) for body in self.bodies if body != choice[1])
+        yield from self.other_bodies(choice)
         for slot in range(1, len(choice)):
             if choice[slot]:
                 yield (*choice[:slot], "", *choice[slot + 1 :])

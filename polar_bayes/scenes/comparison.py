@@ -11,7 +11,9 @@ Source:
     Yao, Vehtari, Simpson & Gelman (2018), Bayesian Analysis 13, 917 (stacking; Bayesian bootstrap).
 """
 
+import contextlib
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -30,6 +32,7 @@ from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.errors import FitError, SceneError, one_line
 from polar_bayes.inference.fitting import fit_request
 from polar_bayes.inference.laplace import Importance
+from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.observation.links import AbstractLink
@@ -137,8 +140,7 @@ def compare_scenes(
         return compare_candidates(arguments, progress or no_progress)
     fits = _Fits(arguments.among(_checked(scenes).values()), progress or no_progress)
     with jax.enable_x64(precision == "double"):
-        for name, scene in scenes.items():
-            fits.add(one_line(str(name)), scene, len(scenes))
+        fits.add_all({one_line(str(name)): scene for name, scene in scenes.items()}, len(scenes))
     return _comparison(fits)
 
 
@@ -213,11 +215,20 @@ class _Fits:
         """Candidates that were tried."""
         return len(self.done) + len(self.failed)
 
-    def add(self, name: str, scene: Scene, most: int) -> None:
-        """Fit one candidate."""
-        self.progress(f"comparing scenes: {name}", self.count / most)
+    def add_all(self, scenes: Mapping[str, Scene], most: int) -> None:
+        """Fit candidates, of which at most so many are tried in all."""
+        requests = {name: self.arguments.request(scene) for name, scene in scenes.items()}
+        waiting = iter(requests.values())
+        for each in itertools.islice(waiting, 1):
+            _begin_to_compile(each)
+        for name, request in requests.items():
+            self.progress(f"comparing scenes: {name}", self.count / most)
+            for following in itertools.islice(waiting, 1):
+                _begin_to_compile(following)  # while this one runs
+            self._add(name, request)
+
+    def _add(self, name: str, request: Request) -> None:
         begun = time.perf_counter()
-        request = self.arguments.request(scene)
         try:
             tree = fit_request(request, METHOD, no_progress, begun, with_comparisons=False)
             checks = predictive_checks(tree)
@@ -238,6 +249,14 @@ class _Fits:
             pointwise=np.concatenate([each.pointwise for each in loo]),
             unreliable=sum(each.unreliable for each in loo),
         )
+
+
+def _begin_to_compile(request: Request) -> None:
+    """Trace the programs of a fit now, and compile them on another thread."""
+    with contextlib.suppress(FitError):  # told when the fit is done
+        problem = make_problem(request, jax.random.key(request.seed))
+        METHOD.prepare(problem)
+        problem.prepare_predictions()
 
 
 def _checked(scenes: Mapping[str, Scene]) -> Mapping[str, Scene]:
@@ -262,6 +281,11 @@ def _select(fits: _Fits, library: SceneLibrary) -> None:
         extensions = list(library.extensions(best))
         _fit_choices(fits, library, extensions)
         better = _better(fits, best, extensions)
+        if better is not None and better[1] != best[1]:
+            # Which body it is comes first: systematic errors explain what a wrong body lacks.
+            bodies = list(library.other_bodies(better))
+            _fit_choices(fits, library, bodies)
+            better = _better(fits, better, bodies) or better
         if better is None and not looked_at_alternatives:
             looked_at_alternatives = True
             alternatives = list(library.alternatives(best))
@@ -273,10 +297,10 @@ def _select(fits: _Fits, library: SceneLibrary) -> None:
 
 
 def _fit_choices(fits: _Fits, library: SceneLibrary, choices: Iterable[Choice]) -> None:
-    for choice in choices:
-        name = name_of(choice)
-        if name not in fits.done and name not in fits.failed and fits.count < MAX_FITS:
-            fits.add(name, library.scene(choice), MAX_FITS)
+    tried = {*fits.done, *fits.failed}
+    new = {name: choice for choice in choices if (name := name_of(choice)) not in tried}
+    scenes = {name: library.scene(new[name]) for name in list(new)[: MAX_FITS - fits.count]}
+    fits.add_all(scenes, MAX_FITS)
 
 
 def _better(fits: _Fits, best: Choice, choices: Iterable[Choice]) -> Choice | None:
