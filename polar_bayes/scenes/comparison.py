@@ -2,8 +2,9 @@
 
 The simplest candidate is fitted first. Then every extension by one part is; the one that predicts
 best is taken if it gains more than the standard error of the gain, or if it gains at all and the
-criticism of the present scene finds that something is left to explain. When no extension is taken,
-the alternatives to the present scene are fitted, so that what cannot be told apart is compared.
+criticism of the present scene finds that something is left to explain. Where a body is added, the
+other bodies are compared with it before anything else is. When no extension is taken, the
+alternatives to the present scene are fitted, so that what cannot be told apart is compared.
 
 Source:
     Vehtari, Gelman & Gabry (2017), Stat. Comput. 27, 1413 (PSIS-LOO and the error of differences);

@@ -70,5 +70,7 @@ def test_extensions_add_one_part_and_alternatives_exchange_or_remove_one(
         ("sky", "", "systematic errors"),
         ("sky", "Lambertian body", ""),
     ]
+    assert list(library.other_bodies(whole)) == [("sky", "unpolarized body", "systematic errors")]
+    assert not list(library.other_bodies(library.simplest))
     assert {type(scene) for scene in library.single_parts()} == {pb.Scene}
     assert library.scene(whole).has(Discrepancy)

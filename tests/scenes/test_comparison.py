@@ -10,9 +10,12 @@ from numpyro import distributions as dist
 from plates import LINKS, PLATE, plate_capture
 
 import polar_bayes as pb
+from polar_bayes.scenes.candidates import scene_library
 from polar_bayes.scenes.comparison import FitArguments, between_scenes, stacking_weights
 from polar_bayes.scenes.sentences import SceneComparison
 from polar_bayes.scenes.stacking import stack_fits
+from polar_bayes.setups import SETUPS
+from polar_bayes.simulation import Protocol
 
 MIRROR = pb.Scene(pb.SmoothSurface())
 SCENES = {"mirror": MIRROR, "with body": PLATE}
@@ -103,3 +106,28 @@ def test_what_is_no_scene_is_refused(capture: xr.Dataset) -> None:
         pb.fit(capture, scene="auto", method="none")
     with pytest.raises(pb.FitError, match="no width to compare"):
         pb.fit(capture, scene="auto", method="point")
+
+
+@pytest.mark.thorough
+def test_systematic_errors_do_not_stand_in_for_another_body() -> None:
+    """A sample that leans by a degree, whose body is not that of its set-up.
+
+    Beside the body of the set-up, systematic errors predicted better than the leaning normal, and
+    the roughness was twelve sds off.
+    """
+    layout = Protocol(views=24, largest_view_zenith=80.0, wavelengths=())
+    parts = ("rough surface", "unpolarized body", "", "leaning normal")
+    capture = pb.simulate(
+        "plastic",
+        scene=scene_library(pb.simulate(scene="camera", protocol=layout)).scene(parts),
+        links=SETUPS["camera"].links,
+        protocol=layout,
+        parameters={"roughness": 0.08, "subsurface_fraction": 0.72, "refractive_index": 1.5}
+        | {"normal_tilt_x": -0.85, "normal_tilt_y": 0.45},
+        seed=19,
+    )
+    comparison = pb.compare_scenes(capture.assign_attrs(setup="camera"))
+    assert all("unpolarized body" in name for name in comparison.weights)
+    assert all("leaning normal" in name for name in comparison.weights)
+    best = comparison.intervals.xs(comparison.table.index[0], level="scene")
+    assert best.loc["roughness", "q2.5"] < 0.08 < best.loc["roughness", "q97.5"]
