@@ -103,7 +103,7 @@ def fitted() -> np.ndarray:
     nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
     anisotropies = MOST_ANISOTROPY * nodes
     gammas = math.sqrt(CLEAREST) + (1.0 - math.sqrt(CLEAREST)) * nodes
-    floored = 4.0 * np.add.outer(*(2 * [np.maximum(COSINES, GRAZING)]))
+    least = np.maximum(COSINES, GRAZING)  # as the package does
     turns = (np.arange(TURNS_FITTED) + 0.5) * np.pi / TURNS_FITTED
     orders = np.arange(ORDERS)
     transform = np.where(orders > 0, 2.0, 1.0) * np.cos(np.outer(turns, orders)) / turns.size
@@ -114,9 +114,9 @@ def fitted() -> np.ndarray:
         material = {"absorption": jnp.asarray(absorption), "refractive_index": jnp.ones(())}
         light, view = rays(COSINES[None]), rays(COSINES[:, None])
         isotropic = Isotropic().reflectance(material, light, view, jnp.zeros(()), jnp.ones(()))
-        isotropic = floored * np.asarray(isotropic) * (1.0 + absorption) - 1.0
+        h_squared = 4.0 * np.add.outer(least, least) * np.asarray(isotropic) * (1.0 + absorption)
         # What few orders leave of a peak at grazing may be negative there.
-        logs[i, j] = np.log(np.maximum(often / isotropic[..., None], LEAST)) @ transform
+        logs[i, j] = np.log(np.maximum(often / (h_squared - 1.0)[..., None], LEAST)) @ transform
     # Least squares in each variable; a direction counts as much as diffuse light has of it.
     of_g, of_gamma, of_cosine = map(chebyshev, (nodes, gammas, np.sqrt(COSINES)))
     weight, found = np.sqrt(COSINES * MEASURE)[:, None], []

@@ -1,7 +1,6 @@
 """Comparison of several fits of one capture: parameters, prior sensitivity and predictions."""
 
 import dataclasses
-import warnings
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -148,11 +147,7 @@ def compare_predictions(fits: Mapping[str, xr.DataTree]) -> tuple[pd.DataFrame, 
         if any(not np.array_equal(own[n], expected[n]) for n in own):
             names = f"{first} and {name} have set aside different views"
             return pd.DataFrame(), {"": f"They were fitted to different readings: {names}."}
-    elpds = {name: _combined(parts) for name, parts in found.items()}
-    with warnings.catch_warnings():
-        # Of more than eleven fits: the differences and their errors, which the table has, tell it.
-        warnings.filterwarnings("ignore", "Difference in performance potentially due to chance")
-        table = compare(elpds, round_to="none")
+    table = compare({name: _combined(parts) for name, parts in found.items()}, round_to="none")
     unreliable = {name: sum(part.unreliable for part in parts) for name, parts in found.items()}
     columns = ["elpd", "se", "p", "elpd_diff", "dse", "weight"]
     return table[columns].assign(unreliable=pd.Series(unreliable)), left_out

@@ -13,6 +13,7 @@ Assoc. 90, 773 (Bayes factors).
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -93,14 +94,14 @@ def compare_alternatives(
         except FitError as error:
             rows.append(row | {"failed": str(error)})
             continue
-        if not math.isfinite(factor):
-            rows.append(row | {"failed": "its evidence is not finite"})
-            continue
         shift = {
             name: np.ravel((at_mode[name] - values[name]) / np.where(own > 0.0, own, 1.0)).tolist()
             for name, own in sd.items()
             if name in at_mode
         }
+        if not np.isfinite([factor, *itertools.chain(*shift.values())]).all():
+            rows.append(row | {"failed": "its evidence or its mode is not finite"})
+            continue
         rows.append(row | {"log_bayes_factor": factor, "shift": shift})
     progress("comparing alternatives", 1.0)
     return rows

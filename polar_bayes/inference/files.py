@@ -44,7 +44,8 @@ CHOSEN_BY = {
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    is_real = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return is_real and not (isinstance(value, int) and abs(value) >= 2**64)
 
 
 def _is_finite(value: Any) -> bool:
@@ -66,6 +67,7 @@ FLAG = Leaf("true or false", lambda value: isinstance(value, bool))
 FINITE = Leaf("a finite number", _is_finite)
 COUNT = Leaf("a count", lambda value: _is_finite(value) and value >= 0 and value % 1 == 0)
 NUMBER = Leaf("a number", _is_number)
+POSITIVE = Leaf("a number above 0", lambda value: _is_finite(value) and value > 0)
 BOUNDS = Leaf("a least and a largest value", _are_bounds)
 SHARES = Leaf("a share below and a share above", _are_shares)
 OPTIONAL = Leaf("a number or null", lambda value: value is None or _is_number(value))
@@ -322,7 +324,7 @@ _FIT_PROVENANCE: Mapping[str, Spec] = {
     "capture?": {EACH: ANY},
     "comparisons_failed?": {EACH: TEXT},
     "prior_probability?": {EACH: [NUMBER]},
-    "tails?": {"k_hat": NUMBER, "effective_draws": NUMBER, "shares": {EACH: [SHARES]}},
+    "tails?": {"k_hat": NUMBER, "effective_draws": POSITIVE, "shares": {EACH: [SHARES]}},
     "alternatives?": [_ALTERNATIVE],
     "alternatives_failed?": TEXT,
     "standard_errors?": {EACH: [OPTIONAL]},

@@ -111,12 +111,15 @@ class SceneLibrary:
         Yields:
             Other choices.
         """
-        for surface in self.surfaces:
-            if surface != choice[0] and surface not in OTHER_SLOPES.values():
-                yield (surface, *choice[1:])
+        yield from self._other_surfaces(choice)
         for slot, options in enumerate((self.bodies, *self.others.values()), start=1):
             if not choice[slot]:
                 yield (*choice[:slot], next(iter(options)), *choice[slot + 1 :])
+
+    def _other_surfaces(self, choice: Choice) -> Iterator[Choice]:
+        for surface in self.surfaces:
+            if surface != choice[0] and surface not in OTHER_SLOPES.values():
+                yield (surface, *choice[1:])
 
     def other_bodies(self, choice: Choice) -> Iterator[Choice]:
         """Choices with another body in the place of the one that there is.
@@ -131,7 +134,7 @@ class SceneLibrary:
             yield from ((choice[0], body, *choice[2:]) for body in self.bodies if body != choice[1])
 
     def alternatives(self, choice: Choice) -> Iterator[Choice]:
-        """Choices with other slopes or another body, and those with one part less.
+        """Choices with other slopes or another body, with one part less, or with another surface.
 
         Args:
             choice: The option of each slot.
@@ -146,6 +149,7 @@ class SceneLibrary:
         for slot in range(1, len(choice)):
             if choice[slot]:
                 yield (*choice[:slot], "", *choice[slot + 1 :])
+        yield from self._other_surfaces(choice)
 
 
 def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None) -> SceneLibrary:

@@ -4,7 +4,8 @@ The simplest candidate is fitted first. Then every extension by one part is; the
 best is taken if it gains more than the standard error of the gain, or if it gains at all and the
 criticism of the present scene finds that something is left to explain. Where a body is added, the
 other bodies are compared with it before anything else is. When no extension is taken, the
-alternatives to the present scene are fitted, so that what cannot be told apart is compared.
+alternatives to the present scene are fitted, so that what cannot be told apart is compared, as far
+as the number of fits allows.
 
 Source:
     Vehtari, Gelman & Gabry (2017), Stat. Comput. 27, 1413 (PSIS-LOO and the error of differences);
@@ -14,8 +15,8 @@ Source:
 
 import contextlib
 import dataclasses
-import itertools
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -219,13 +220,11 @@ class _Fits:
     def add_all(self, scenes: Mapping[str, Scene], most: int) -> None:
         """Fit candidates, of which at most so many are tried in all."""
         requests = {name: self.arguments.request(scene) for name, scene in scenes.items()}
-        waiting = iter(requests.values())
-        for each in itertools.islice(waiting, 1):
-            _begin_to_compile(each)
-        for name, request in requests.items():
+        waiting = list(requests.values())
+        for number, (name, request) in enumerate(requests.items()):
             self.progress(f"comparing scenes: {name}", self.count / most)
-            for following in itertools.islice(waiting, 1):
-                _begin_to_compile(following)  # while this one runs
+            for each in waiting[number : number + 2]:
+                _begin_to_compile(each)  # the next one while this one runs
             self._add(name, request)
 
     def _add(self, name: str, request: Request) -> None:
@@ -278,9 +277,11 @@ def _select(fits: _Fits, library: SceneLibrary) -> None:
     best = library.simplest
     _fit_choices(fits, library, [best])
     looked_at_alternatives = False
+    refuted: set[str] = set()  # surfaces that are not tried again before the alternatives
     while fits.count < MAX_FITS:
-        extensions = list(library.extensions(best))
+        extensions = [each for each in library.extensions(best) if each[0] not in refuted]
         _fit_choices(fits, library, extensions)
+        refuted |= {each[0] for each in extensions if _is_worse(fits, best, each)} - {best[0]}
         better = _better(fits, best, extensions)
         if better is not None and better[1] != best[1]:
             # Which body it is comes first: systematic errors explain what a wrong body lacks.
@@ -313,10 +314,23 @@ def _better(fits: _Fits, best: Choice, choices: Iterable[Choice]) -> Choice | No
     found = max(fitted, key=lambda choice: fits.done[name_of(choice)].elpd)
     if present is None:
         return found
-    gain = fits.done[name_of(found)].pointwise - present.pointwise
-    error = float(np.sqrt(gain.size * gain.var()))
-    enough = gain.sum() > error or (present.unexplained and gain.sum() > 0.0)
+    gain, error = _gain(fits.done[name_of(found)], present)
+    enough = gain > error or (present.unexplained and gain > 0.0)
     return found if enough else None
+
+
+def _is_worse(fits: _Fits, best: Choice, choice: Choice) -> bool:
+    """Whether a choice is told apart from the best so far, and predicts worse."""
+    if not {name_of(best), name_of(choice)} <= fits.done.keys():
+        return False
+    gain, error = _gain(fits.done[name_of(choice)], fits.done[name_of(best)])
+    return gain < -max(SMALL_DIFFERENCE, ERRORS_APART * error)
+
+
+def _gain(one: _Fit, other: _Fit) -> tuple[float, float]:
+    """By how much one fit predicts better than another, and the error of that. Unit nat."""
+    gain = one.pointwise - other.pointwise
+    return float(gain.sum()), float(np.sqrt(gain.size * gain.var()))
 
 
 def name_of(choice: Choice) -> str:
@@ -367,7 +381,10 @@ def _predictions(fits: Mapping[str, _Fit]) -> pd.DataFrame:
         error = float(np.sqrt(fit.pointwise.size * fit.pointwise.var()))
         row = [fit.elpd, error, 0.0, 0.0, 1.0, fit.unreliable]
         return pd.DataFrame([row], columns=columns, index=pd.Index([name]))
-    table, left_out = compare_predictions({name: fit.tree for name, fit in fits.items()})
+    with warnings.catch_warnings():
+        # None is declared the best one: scenes that are not told apart are stacked.
+        warnings.filterwarnings("ignore", "Difference in performance potentially due to chance")
+        table, left_out = compare_predictions({name: fit.tree for name, fit in fits.items()})
     if table.empty:
         raise FitError(
             " ".join(left_out.values()), where="compare_scenes", hint="give scenes of one capture"

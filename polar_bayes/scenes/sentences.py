@@ -28,7 +28,8 @@ class SceneComparison:
     Args:
         table: A row for each scene, best first: elpd and se (nat), elpd_diff and dse (to the best),
             weight (stacking; 0 for a scene that does not remain), unreliable (readings whose Pareto
-            k is above 0.7), seconds, criticism (checks that found a caution or problem).
+            k is above 0.7), seconds (of the fit, which is compiled while the one before runs),
+            criticism (checks that found a caution or problem).
         intervals: A row for each material parameter and scene that has it, in the order of the
             table: mean, sd, q2.5, q97.5 (unit of the parameter).
         between: For each material parameter of all remaining scenes, the share of its stacked

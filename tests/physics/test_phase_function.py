@@ -167,6 +167,49 @@ def test_forward_scattering_agrees_with_adding_doubling() -> None:
         np.testing.assert_allclose(found, normal - ((n - 1.0) / (n + 1.0)) ** 2, rtol=bound)
 
 
+def test_forward_scattering_agrees_with_photons() -> None:
+    """Off the plane of the light, too: every collision sends what the viewer sees of it.
+
+    Without an interface, at a single-scattering albedo of .7 and g = .8. Within four Monte Carlo
+    errors and the 1.2 % of the docs.
+    """
+    random, g, albedo, count = np.random.default_rng(3), 0.8, 0.7, 60_000
+    cosines, azimuths = np.array([0.6, 0.9]), np.array([0.0, 60.0, 120.0, 180.0])
+    mu, phi = (x.ravel() for x in np.meshgrid(cosines, np.deg2rad(azimuths), indexing="ij"))
+    seen = np.stack([np.sqrt(1 - mu**2) * np.cos(phi), np.sqrt(1 - mu**2) * np.sin(phi), -mu])
+    way = np.tile([0.8, 0.0, 0.6], (count, 1))  # down, towards the mirror side
+    depth, radiance = np.zeros(count), np.zeros((count, mu.size))
+    for order in range(40):
+        depth = depth + way[:, 2] * random.exponential(size=count)
+        inside = depth > 0.0
+        once = henyey_greenstein.henyey_greenstein(way @ seen, g) * np.exp(-depth[:, None] / mu)
+        radiance += np.where(inside[:, None], albedo ** (order + 1) * once / (4.0 * mu), 0.0)
+        depth = np.where(inside, depth, -np.inf)
+        way = turned(way, g, random)
+    exact, error = radiance.mean(axis=0), radiance.std(axis=0) / np.sqrt(count)
+    material = {
+        "absorption": jnp.asarray((1.0 - albedo) / albedo / (1.0 - g)),
+        "refractive_index": jnp.asarray(1.0),
+    }
+    rays = Ray(jnp.asarray(0.6), jnp.asarray(0.8)), Ray(mu, np.sqrt(1 - mu**2))
+    azimuth = 180.0 - np.rad2deg(phi)
+    found = HenyeyGreenstein(g).reflectance(material, *rays, azimuth, jnp.asarray(1.0))
+    assert np.all(error < 0.02 * exact)
+    assert np.all(np.abs(found - exact) < 4.0 * error + 0.012 * exact)
+
+
+def turned(way: np.ndarray, g: float, random: np.random.Generator) -> np.ndarray:
+    """Directions (photon, 3) after one more scattering."""
+    share, around = random.random(len(way)), 2.0 * np.pi * random.random(len(way))
+    cosine = (1 + g**2 - ((1 - g**2) / (1 - g + 2 * g * share)) ** 2) / (2 * g)
+    sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
+    other = np.where(np.abs(way[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    across = np.cross(way, other)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    aside = np.cos(around)[:, None] * across + np.sin(around)[:, None] * np.cross(way, across)
+    return cosine[:, None] * way + sine[:, None] * aside
+
+
 zenith, turn = st.floats(0.0, 89.9), st.floats(-180.0, 180.0)
 a, g, index = st.floats(0.0, 20.0), st.floats(0.0, 0.9), st.floats(1.0, 2.5)
 

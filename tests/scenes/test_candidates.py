@@ -69,6 +69,7 @@ def test_extensions_add_one_part_and_alternatives_exchange_or_remove_one(
         ("sky", "unpolarized body", "systematic errors"),
         ("sky", "", "systematic errors"),
         ("sky", "Lambertian body", ""),
+        ("mirror", "Lambertian body", "systematic errors"),
     ]
     assert list(library.other_bodies(whole)) == [("sky", "unpolarized body", "systematic errors")]
     assert not list(library.other_bodies(library.simplest))
