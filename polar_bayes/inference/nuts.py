@@ -243,8 +243,7 @@ def sample(
             if halvings:
                 warmup_steps += _stacked(rounds).n_steps.sum(axis=1)  # they are paid for, too
                 states, rounds = [_with_half_the_step(state) for state in states], []
-            redoes = halvings < MOST_HALVINGS
-            states = _until_converged(states, rounds, advance_all, settings, redoes=redoes)
+            states = _until_converged(states, rounds, advance_all, settings)
             if not _stacked(rounds).diverging.any():
                 break
     stats = jax.tree.map(lambda x: x[:, : settings.most_draws], _stacked(rounds))._asdict()
@@ -261,19 +260,17 @@ def _until_converged(
     rounds: list[Step],
     advance_all: Callable[[list[infer.hmc.HMCState]], tuple[list[infer.hmc.HMCState], Step]],
     settings: Nuts,
-    *,
-    redoes: bool,
 ) -> list[infer.hmc.HMCState]:
     """Add blocks of draws to `rounds` until the goals or the limit of the settings are reached.
 
-    Where draws that diverged are to be made again, a divergence ends it, too, after as many draws
-    as are asked for at least or a multiple of them: what is drawn does not depend on the block.
+    A divergence ends it, too, since no further draws make up for it, after as many draws as are
+    asked for at least or a multiple of them: what is drawn does not depend on the block.
     """
     least, most = (-(-count // settings.block) for count in (settings.draws, settings.most_draws))
     for done in range(1, most + 1):
         states, steps = advance_all(states)
         rounds.append(steps)
-        if redoes and done % least == 0 and _stacked(rounds).diverging.any():
+        if done % least == 0 and _stacked(rounds).diverging.any():
             break
         if done >= least and _converged(rounds, settings):
             break
