@@ -300,7 +300,7 @@ COMMON_PROVENANCE: Mapping[str, Spec] = {
 }
 """Provenance that every kind of result may have."""
 
-_ALTERNATIVE = {
+_ALTERNATIVE: Mapping[str, Spec] = {
     **dict.fromkeys(("part", "alternative", "path", "failed?"), TEXT),
     **{"defines": [TEXT], "log_bayes_factor?": FINITE, "shift?": {EACH: [FINITE]}},
 }

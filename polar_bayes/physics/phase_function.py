@@ -28,7 +28,7 @@ from typing import Annotated, NamedTuple, override
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from polar_bayes.physics.geometry import cos_degrees
 from polar_bayes.physics.half_space import CLEAREST, GRAZING, Ray, critical_cosine_squared
@@ -156,7 +156,7 @@ class HenyeyGreenstein(AbstractPhaseFunction):
             )
         )
 
-        def reflectance(one: _Direction, other: _Direction, azimuths: Sequence[Array]) -> Array:
+        def reflectance(one: _Direction, other: _Direction, azimuths: Sequence[ArrayLike]) -> Array:
             """The mean over azimuths from the mirror side."""
             sines = one.sine * other.sine
             pair = one.basis[..., :, None] * other.basis[..., None, :]
@@ -166,7 +166,7 @@ class HenyeyGreenstein(AbstractPhaseFunction):
             ]
             scattered = []
             for azimuth in azimuths:
-                around = [cos_degrees(order * azimuth) for order in range(ORDERS)]
+                around = [cos_degrees(like(azimuth, g) * order) for order in range(ORDERS)]
                 turn = sines * around[1] - one.cosine * other.cosine  # cos(Theta)
                 once = (1.0 - g**2) * (1.0 + g * (g - 2.0 * turn)) ** -1.5
                 exponent = sum(p * cosine for p, cosine in zip(orders, around, strict=True))
