@@ -112,8 +112,8 @@ class HenyeyGreenstein(AbstractPhaseFunction):
     The first order of scattering is exact. Higher ones follow those of isotropic scattering with
     the same a,
 
-    $$ r = \frac{w}{4 (\mu_l + \mu_v)} \Bigl\{ p + (H_l H_v - 1) \exp \sum_{m=0}^{2}
-       (g^2 \sin\theta_l \sin\theta_v)^m P_m \cos m\varphi \Bigr\},
+    $$ r = \frac{w}{4 (\mu_l + \mu_v)} [p + (H_l H_v - 1) \exp \sum_{m=0}^{2}
+       (g^2 \sin\theta_l \sin\theta_v)^m P_m \cos m\varphi],
        \qquad w = \frac{1}{1 + (1 - g)\, a} $$
 
     with $\varphi$ from the plane of the mirror side. The $P_m$ are sums of Chebyshev
