@@ -52,13 +52,8 @@ def _is_finite(value: Any) -> bool:
     return _is_number(value) and abs(value) < 2**64 and math.isfinite(value)
 
 
-def _are_bounds(value: Any) -> bool:
-    is_pair = isinstance(value, list) and len(value) == 2
-    return is_pair and all(bound is None or _is_finite(bound) for bound in value)
-
-
-def _are_shares(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(map(_is_finite, value))
+def _is_pair(value: Any, holds: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(holds, value))
 
 
 ANY = Leaf("anything", lambda _: True)
@@ -68,8 +63,11 @@ FINITE = Leaf("a finite number", _is_finite)
 COUNT = Leaf("a count", lambda value: _is_finite(value) and value >= 0 and value % 1 == 0)
 NUMBER = Leaf("a number", _is_number)
 POSITIVE = Leaf("a number above 0", lambda value: _is_finite(value) and value > 0)
-BOUNDS = Leaf("a least and a largest value", _are_bounds)
-SHARES = Leaf("a share below and a share above", _are_shares)
+BOUNDS = Leaf(
+    "a least and a largest value",
+    lambda value: _is_pair(value, lambda bound: bound is None or _is_finite(bound)),
+)
+SHARES = Leaf("a share below and a share above", lambda value: _is_pair(value, _is_finite))
 OPTIONAL = Leaf("a number or null", lambda value: value is None or _is_number(value))
 
 type Spec = Leaf | Mapping[str, Spec] | list[Spec]

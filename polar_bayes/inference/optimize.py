@@ -286,8 +286,8 @@ KEYS = 500
 
 def begin_from_prior(program: Program, data: Observations) -> None:
     """Begin to compile what `from_prior` needs."""
-    keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), KEYS)))
-    program.drawn_from_prior.begin(keys, KEYS, data)
+    key = jax.random.key_data(jax.random.key(0))
+    program.drawn_from_prior.begin(jax.ShapeDtypeStruct((KEYS, *key.shape), key.dtype), KEYS, data)
 
 
 def from_prior(program: Program, key: Array, draws: int, data: Observations) -> np.ndarray:

@@ -156,8 +156,8 @@ class HenyeyGreenstein(AbstractPhaseFunction):
             )
         )
 
-        def reflectance(one: _Direction, other: _Direction, azimuths: Sequence[ArrayLike]) -> Array:
-            """The mean over azimuths from the mirror side."""
+        def mean(one: _Direction, other: _Direction, azimuths: Sequence[ArrayLike]) -> Array:
+            """Of r over azimuths from the mirror side."""
             sines = one.sine * other.sine
             pair = one.basis[..., :, None] * other.basis[..., None, :]
             orders = [
@@ -171,14 +171,12 @@ class HenyeyGreenstein(AbstractPhaseFunction):
                 once = (1.0 - g**2) * (1.0 + g * (g - 2.0 * turn)) ** -1.5
                 exponent = sum(p * cosine for p, cosine in zip(orders, around, strict=True))
                 scattered.append(once + (one.h * other.h - 1.0) * jnp.exp(exponent))
-            mean = sum(scattered) / len(scattered)
-            return quotient(0.25 * w * mean, one.cosine + other.cosine)
+            radiance = 0.25 * w * sum(scattered) / len(scattered)
+            return quotient(radiance, one.cosine + other.cosine)
 
-        again = (
-            trapped * reflectance(incident, back, AZIMUTHS) * reflectance(back, leaving, AZIMUTHS)
-        )
-        again = again / (1.0 - trapped * reflectance(back, back, AZIMUTHS))
-        return reflectance(incident, leaving, [180.0 - azimuth]) + again
+        again = trapped * mean(incident, back, AZIMUTHS) * mean(back, leaving, AZIMUTHS)
+        again = again / (1.0 - trapped * mean(back, back, AZIMUTHS))
+        return mean(incident, leaving, [180.0 - azimuth]) + again
 
 
 # --- H functions and what follows from them -------------------------------------------------------
@@ -238,11 +236,7 @@ def _isotropic_h(cosine: Array, g: Array) -> tuple[Array, Array]:
     """Numerator and denominator of H."""
     # A fit to H by iteration on 200 nodes, within .25 % of H and of the plane albedo 1 - g H, for g
     # up to .99 and cosines from .003. Exact for a black body (g = 1) and at grazing: H = 1.
-    (level, rise, bend), off = _coefficients(g), cosine + 0.04
+    level = 1.9613 + g * (0.4670 - 0.1275 * g)
+    rise, bend, off = -0.1313 - 0.0334 * g, 0.0743 + 0.0473 * g, cosine + 0.04
     q = cosine * (off * (level + rise * cosine) + bend)
     return off + q, off + g * q
-
-
-def _coefficients(g: Array) -> tuple[Array, Array, Array]:
-    """Of q/mu = level + rise mu + bend/(mu + .04)."""
-    return 1.9613 + g * (0.4670 - 0.1275 * g), -0.1313 - 0.0334 * g, 0.0743 + 0.0473 * g

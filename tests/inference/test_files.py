@@ -133,7 +133,7 @@ def test_a_damaged_study_is_refused_in_one_line_or_works():
 # Matplotlib says that an axis from 1e-300 to 1e300 overflows; the figure is drawn all the same.
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning:matplotlib")
 @pytest.mark.thorough
-@each("seed", range(2))  # of some minutes each; benchmarks/fuzz.py goes on for as long as one likes
+@each("seed", range(8))
 def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
     random = np.random.default_rng([14, seed])
     figures = (
