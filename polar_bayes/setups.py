@@ -45,12 +45,14 @@ class Setup(HTMLRepr):
         links: Likelihood link of each variable that such a capture may hold.
         largest_view_zenith: Views beyond it are set aside and counted. Unit degree.
         priors: Distributions that replace those of `polar_bayes.PRIORS` in this set-up.
+        shared: Instrument parameters that the pixels of an image share by default.
     """
 
     scene: Scene
     links: Mapping[str, AbstractLink]
     largest_view_zenith: float = 90.0
     priors: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
+    shared: tuple[str, ...] = ()
 
 
 SETUPS: Mapping[str, Setup] = MappingProxyType(
@@ -59,6 +61,7 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
         "camera": Setup(
             SCENES["camera"],
             {"q": StokesLink(), "u": StokesLink(), "intensity": StudentTLink()},
+            shared=("dolp_gain",),  # one polarizer took the image
         ),
         # The irradiance of a pixel is unknown, so brightness carries no information; the noise of
         # every pixel is known.

@@ -14,6 +14,7 @@ from polar_bayes.inference.batching import ObservationBatch, cut
 from polar_bayes.maps.fit_map import (
     MapPlan,
     blank,
+    estimate_plan,
     fit_block,
     mask_missing,
     plan_map,
@@ -92,9 +93,9 @@ def planned(
 ) -> MapPlan:
     """The plan of a map; with one plan, the same programs serve many tests."""
     given = {**ASKED, **asked}
-    return plan_map(
-        capture, given["model"], method, given["scene"], None, given["links"], None, seed, precision
-    )
+    scene, links = given["scene"], given["links"]
+    asked_for = plan_map(capture, given["model"], method, scene, None, links, None, seed, precision)
+    return estimate_plan(asked_for, capture)
 
 
 def stacked(capture: xr.Dataset, plan: MapPlan) -> ObservationBatch:

@@ -164,7 +164,11 @@ def _in_setup(chosen: Any, scene: Any) -> Any:
     help="One mode of each pixel, corrected; or all modes, many times slower.",
 )  # fmt: skip
 @option("--draws", type=int, help="Of laplace, weighted, in each pixel.  [default: 256]")
-@option("--share", "shared", multiple=True, help="Noise or instrument parameter; repeatable.")
+@option(
+    "--share", "shared", multiple=True,
+    help="Noise or instrument parameter of the whole image; repeatable; none for none.  "
+    "[default: those of the set-up]",
+)  # fmt: skip
 @seed_option
 @option("--precision", default="double", help="double or single.")
 @scheduler_option
@@ -181,13 +185,14 @@ def map_(
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
     settings = read_scene_options(settings)
+    settings["shared"] = tuple(name for name in shared if name != "none") if shared else None
     given: dict[str, Any] = {} if draws is None else {"draws": draws}
     methods: dict[str, Any] = {
         "laplace": pb.methods.PixelLaplace(**given),
         "importance": pb.methods.PixelByPixel(),
         "tempered": pb.methods.PixelSMC(),
     }
-    maps = pb.maps.map_file(capture, out, method=methods[method], shared=shared, **settings)
+    maps = pb.maps.map_file(capture, out, method=methods[method], **settings)
     counts = ", ".join(
         f"{count} {what}" for what, count in pb.maps.count_pixels(maps).items() if count
     )

@@ -58,6 +58,8 @@ class Request:
     largest_view_zenith: float
     seed: int
     precision: str
+    shared: tuple[str, ...]
+    """Parameters of the set-up that the pixels of an image share by default."""
 
     def bind(self, scene: Scene) -> Callable[[Observations], None]:
         """The model with everything but its data in place."""
@@ -172,6 +174,7 @@ def resolve(
         largest_view_zenith=limit,
         seed=int(seed),
         precision=precision,
+        shared=tuple(name for name in setup.shared if name in found.priors),
     )
 
 

@@ -48,6 +48,9 @@ so that many more would call for more draws of each."""
 
 LEAST_PIXELS = 32
 
+DISAGREEMENT = 3.1
+"""Of the information matrix test, a standard normal number: once in a thousand right models."""
+
 DRAWS = 64
 """Resampled draws of each pixel at which derivatives are taken."""
 

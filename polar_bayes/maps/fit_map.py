@@ -32,13 +32,14 @@ from polar_bayes.inference.batching import (
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE
-from polar_bayes.inference.shared import PIXELS as SHARED_PIXELS
 from polar_bayes.inference.shared import (
+    DISAGREEMENT,
     SharedParameter,
     as_priors,
     estimate_shared,
     of_priors,
 )
+from polar_bayes.inference.shared import PIXELS as SHARED_PIXELS
 from polar_bayes.maps.blocks import as_completed, workers
 from polar_bayes.observation.data import ANGLES, READINGS, Observations, observe
 from polar_bayes.observation.links import AbstractLink
@@ -77,7 +78,7 @@ def fit_pixels(
     largest_view_zenith: float | None = None,
     seed: int = 0,
     precision: str = "double",
-    shared: str | Sequence[str] = (),
+    shared: str | Sequence[str] | None = None,
     progress: Counter | None = None,
 ) -> xr.Dataset:
     """Fit every pixel of an image by itself.
@@ -102,7 +103,9 @@ def fit_pixels(
         seed: The same seed gives the same maps, however the image is cut.
         precision: "double" or "single".
         shared: Parameters of the noise or instrument, such as `("stokes_scale", "dolp_gain")`,
-            that have one value in all of the image.
+            that have one value in all of the image; `()` for none. By default those of the set-up
+            (`Setup.shared`) in images of at least 512 pixels, as long as pixels agree about them;
+            `maps.shared_cautions` tells where they do not.
         progress: Called with the pixels that are done, and all.
 
     Returns:
@@ -118,9 +121,10 @@ def fit_pixels(
         SceneError: No such scene.
         FitError: A model, prior, link or setting cannot be used.
     """
-    plan = plan_map(
+    asked = plan_map(
         capture, model, method, scene, priors, links, largest_view_zenith, seed, precision, shared
     )
+    plan = estimate_plan(asked, capture)
     if capture.chunks:
         numbered = with_pixel_numbers(capture)
         maps = xr.map_blocks(fit_block, numbered, args=[plan], template=blank(capture, plan))
@@ -140,7 +144,15 @@ class MapPlan:
     intensity_unit: float | None = dataclasses.field(compare=False)
     own_directions: frozenset[str] = dataclasses.field(compare=False)
     shared: tuple[SharedParameter, ...] = ()
+    shares_by_default: bool = dataclasses.field(default=False, compare=False)
     found: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)
+
+    def sharing(self, names: Sequence[str]) -> "MapPlan":
+        """The same request, where pixels share these parameters."""
+        own, no_unit = sorted(self.own_directions), self.intensity_unit is None
+        key = engine_key(self.request, own, no_unit, tuple(names))
+        shared = tuple(of_priors(names, self.request.priors))
+        return dataclasses.replace(self, key=key, shared=shared)
 
     def observe(self, capture: xr.Dataset) -> Observations:
         """A block, or one pixel, as arrays."""
@@ -196,10 +208,9 @@ def plan_map(
     largest_view_zenith: float | None,
     seed: int,
     precision: str,
-    shared: str | Sequence[str] = (),
+    shared: str | Sequence[str] | None = None,
 ) -> MapPlan:
-    """Check the request of a map on one of its pixels, and estimate what all of them share."""
-    shared = (shared,) if isinstance(shared, str) else tuple(shared)
+    """Check the request of a map on one of its pixels."""
     settings = PixelLaplace() if method is None else method
     if not isinstance(settings, AbstractPixelMethod):
         hint = "give settings such as PixelLaplace(draws=512) or PixelSMC()"
@@ -217,11 +228,21 @@ def plan_map(
         if name in capture and set(IMAGE) & set(capture[name].dims)
     )
     unit = _intensity_unit(capture)
-    _check_shared(shared, request)
-    key = engine_key(request, sorted(own), unit is None, shared)
-    begin = tuple(of_priors(shared, request.priors))
-    plan = MapPlan(key, request, settings, unit, own, begin)
-    return _with_settings(_with_shared(plan, capture) if shared else plan, capture)
+    plan = MapPlan("", request, settings, unit, own, shares_by_default=shared is None)
+    if shared is None:
+        is_large = capture.sizes["y"] * capture.sizes["x"] >= SHARED_PIXELS
+        return plan.sharing(request.shared if is_large else ())
+    names = (shared,) if isinstance(shared, str) else tuple(shared)
+    _check_shared(names, request)
+    return plan.sharing(names)
+
+
+def estimate_plan(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
+    """The plan with what some pixels tell of all: what these share, and the starts they call for.
+
+    It takes as long as hundreds of fits, and must be done once for one image.
+    """
+    return _with_settings(_with_shared(plan, capture) if plan.shared else plan, capture)
 
 
 def _check_shared(names: Sequence[str], request: Request) -> None:
@@ -244,8 +265,25 @@ def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     if isinstance(settings, PixelLaplace) and settings.weighted:
         method = settings
     method = dataclasses.replace(method, sampler=None, starts=PixelLaplace.most_starts)
-    found = estimate_shared(plan.engine, pixels, method, request.priors, plan.shared, request.seed)
+    given = plan.engine, pixels, method, request.priors, plan.shared, request.seed
+    try:
+        found = estimate_shared(*given)
+    except FitError as error:
+        if not plan.shares_by_default:
+            raise
+        return _sharing_nothing(plan, error.what)
+    most = max(each.disagreement for each in found)
+    if plan.shares_by_default and most > DISAGREEMENT:
+        return _sharing_nothing(plan, f"pixels do not agree (information matrix test {most:.1f})")
     return dataclasses.replace(plan, shared=tuple(found))
+
+
+def _sharing_nothing(plan: MapPlan, reason: str) -> MapPlan:
+    """The plan in which each pixel has parameters of its own, and why."""
+    names = [each.name for each in plan.shared]
+    return dataclasses.replace(
+        plan.sharing(()), found={"not_shared": {"names": names, "reason": reason}}
+    )
 
 
 def _with_settings(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
@@ -258,7 +296,7 @@ def _with_settings(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
 
     size = capture.sizes["y"] * capture.sizes["x"]
     settings, found = plan.settings.for_image(size, sample, is_shared=bool(plan.shared))
-    return dataclasses.replace(plan, settings=settings, found=found)
+    return dataclasses.replace(plan, settings=settings, found={**plan.found, **found})
 
 
 def _random_pixels(capture: xr.Dataset, seed: int, count: int) -> xr.Dataset:
@@ -328,6 +366,7 @@ def provenance_json(plan: MapPlan) -> str:
         "precision": request.precision,
         "intensity_unit": plan.intensity_unit,
         "shared": {each.name: _described(each, request) for each in plan.shared},
+        "shared_by_default": plan.shares_by_default,
         **plan.found,
     }
     return json.dumps(provenance, sort_keys=True)

@@ -17,6 +17,7 @@ from polar_bayes.errors import CaptureError, FitError, PolarBayesError
 from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.inference.psis import LEVELS
 from polar_bayes.inference.result import PROVENANCE, provenance_of
+from polar_bayes.inference.shared import DISAGREEMENT
 from polar_bayes.observation.data import READINGS
 from polar_bayes.paths import as_path
 
@@ -247,10 +248,6 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
     return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
 
 
-DISAGREEMENT = 3.1
-"""Of a standard normal number, which is larger once in a thousand cases."""
-
-
 def shared_parameters(maps: xr.Dataset) -> pd.DataFrame:
     """The posterior of what all pixels of a map share.
 
@@ -290,9 +287,16 @@ def start_sentences(maps: xr.Dataset) -> list[str]:
 
 
 def shared_cautions(maps: xr.Dataset) -> list[str]:
-    """A sentence for each shared parameter in which pixels do not agree."""
-    found = shared_parameters(maps)
-    return [
+    """A sentence for each parameter of which the pixels share no one value, though they should."""
+    found, own = shared_parameters(maps), provenance_of(maps).get("not_shared")
+    cautions = []
+    if own:
+        names = ", ".join(own["names"])
+        cautions.append(
+            f"{names}: one value should serve the whole image, but {own['reason']}, so that each "
+            "pixel has its own. The scene may lack a part that the image shows."
+        )
+    return cautions + [
         f"{name} is shared by all pixels, and they do not agree about it (information matrix test "
         f"{row['disagreement']:.1f}, above {DISAGREEMENT:g} once in a thousand right models): "
         "intervals may be too narrow. Let each pixel have its own."

@@ -40,6 +40,7 @@ from polar_bayes.maps.blocks import (
 from polar_bayes.maps.fit_map import (
     MapPlan,
     blank,
+    estimate_plan,
     fit_block,
     fit_pixels,
     plan_map,
@@ -128,6 +129,8 @@ def map_file(
             target.check_finished()
         else:
             target.check_readings(ledger)
+            with _in_capture(source):
+                target.estimate()
             target.begin(ledger)
             with on_interrupt(lambda: resume_hint(store)):
                 target.run(ledger, source, scheduler, progress or no_progress)
@@ -214,6 +217,11 @@ class _MapStore:
             raise FitError(begun_with_another([TOPIC]), where=where, hint=REPEAT)
         return FINISHED in attributes
 
+    def estimate(self) -> None:
+        """Complete the plan, which is not part of the request: the same image gives the same."""
+        self._plan = estimate_plan(self._plan, self._image)
+        self._maps = blank(self._image, self._plan)
+
     def check_finished(self) -> None:
         """Refuse a finished map of readings that have changed, or with missing chunks."""
         where = str(self._store)
@@ -244,7 +252,8 @@ class _MapStore:
                 for file in files:
                     found, expected = self._store / file, (empty / file).read_bytes()
                     if not found.is_file() or found.read_bytes() != expected:
-                        what, where = "it is missing, or not as it was written", self._store
+                        what = "it is missing or not as written, or the capture has changed since"
+                        where = self._store
                         raise OutputError(what, where=f"{where}: {file}", hint=OTHER_OUT)
                 ledger.begin()
                 return

@@ -3,9 +3,9 @@
 The simplest candidate is fitted first. Then every extension by one part is; the one that predicts
 best is taken if it gains more than the standard error of the gain, or if it gains at all and the
 criticism of the present scene finds that something is left to explain. Where a body is added, the
-other bodies are compared with it before anything else is. When no extension is taken, the
-alternatives to the present scene are fitted, so that what cannot be told apart is compared, as far
-as the number of fits allows.
+other bodies are compared with it before anything else is. When no extension is taken, or so many
+fits were made, alternatives to the present scene are fitted, so that what cannot be told apart is
+compared.
 
 Source:
     Vehtari, Gelman & Gabry (2017), Stat. Comput. 27, 1413 (PSIS-LOO and the error of differences);
@@ -49,11 +49,15 @@ from polar_bayes.scenes.candidates import (
 )
 from polar_bayes.scenes.sentences import ERRORS_APART, SMALL_DIFFERENCE, SceneComparison
 
-METHOD = Importance(draws=2048, rounds=6)
-"""Of the fits that are compared."""
+METHOD = Importance(draws=2048, rounds=12)
+"""Of the fits that are compared. Most need few rounds; curved posteriors of many parameters need all,
+where chains would take minutes."""
 
 MAX_FITS = 12
-"""Candidates that are fitted at most."""
+"""Candidates that forward selection fits at most."""
+
+MAX_ALTERNATIVES = 4
+"""Alternatives that are fitted besides at most: those with other slopes or bodies come first."""
 
 LEAST_WEIGHT = 0.05
 """Stacking weight below which a scene does not remain."""
@@ -278,7 +282,7 @@ def _select(fits: _Fits, library: SceneLibrary) -> None:
     _fit_choices(fits, library, [best])
     looked_at_alternatives = False
     refuted: set[str] = set()  # surfaces that are not tried again before the alternatives
-    while fits.count < MAX_FITS:
+    while True:
         extensions = [each for each in library.extensions(best) if each[0] not in refuted]
         _fit_choices(fits, library, extensions)
         refuted |= {each[0] for each in extensions if _is_worse(fits, best, each)} - {best[0]}
@@ -291,18 +295,22 @@ def _select(fits: _Fits, library: SceneLibrary) -> None:
         if better is None and not looked_at_alternatives:
             looked_at_alternatives = True
             alternatives = list(library.alternatives(best))
-            _fit_choices(fits, library, alternatives)
+            _fit_choices(fits, library, alternatives, fits.count + MAX_ALTERNATIVES)
             better = _better(fits, best, alternatives)
         if better is None:
             break
         best = better
 
 
-def _fit_choices(fits: _Fits, library: SceneLibrary, choices: Iterable[Choice]) -> None:
+def _fit_choices(
+    fits: _Fits, library: SceneLibrary, choices: Iterable[Choice], most: int | None = None
+) -> None:
+    """Fit what was not tried yet, until so many candidates were tried in all."""
+    most = MAX_FITS if most is None else most
     tried = {*fits.done, *fits.failed}
     new = {name: choice for choice in choices if (name := name_of(choice)) not in tried}
-    scenes = {name: library.scene(new[name]) for name in list(new)[: MAX_FITS - fits.count]}
-    fits.add_all(scenes, MAX_FITS)
+    scenes = {name: library.scene(new[name]) for name in list(new)[: max(most - fits.count, 0)]}
+    fits.add_all(scenes, MAX_FITS + MAX_ALTERNATIVES)
 
 
 def _better(fits: _Fits, best: Choice, choices: Iterable[Choice]) -> Choice | None:

@@ -14,6 +14,7 @@ from polar_bayes.scenes import comparison
 def one_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     """The simplest scene alone: what the command does, not what it finds."""
     monkeypatch.setattr(comparison, "MAX_FITS", 1)
+    monkeypatch.setattr(comparison, "MAX_ALTERNATIVES", 0)
 
 
 def test_scenes_are_compared_and_what_remains_is_written(

@@ -101,15 +101,15 @@ def test_chunks_on_threads_give_the_same_bits(image: xr.Dataset, whole: xr.Datas
 def compiled_already(plan: MapPlan, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of twenty pixels, fitted by the programs of the whole image."""
 
-    def plan_map(capture: xr.Dataset, *asked) -> MapPlan:
-        own = verb_plan(capture, *asked)
+    def estimate_plan(asked: MapPlan, capture: xr.Dataset) -> MapPlan:
+        own = estimate(asked, capture)
         assert own.settings == plan.settings
         assert own.request.priors.keys() == plan.request.priors.keys()
         assert own.request.capture["valid"].all()
         return plan
 
-    verb_plan = verb.plan_map
-    monkeypatch.setattr(verb, "plan_map", plan_map)
+    estimate = verb.estimate_plan
+    monkeypatch.setattr(verb, "estimate_plan", estimate_plan)
     monkeypatch.setattr(verb.cut, "__defaults__", (20,))
 
 

@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 import xarray as xr
 from numpyro import handlers
-from plate_images import ASKED, plate_image
+from plate_images import plate_image
 from plates import PLATE
 from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
 from polar_bayes.inference.batching import Status
+from polar_bayes.maps import fit_map
 
 SHARED = ("stokes_error_factor",)
 FACTOR = 1.6
 SIDE = 15
 LINKS = {"q": pb.links.StokesLink(stated_errors=True)}
+HALVES = np.where(np.arange(SIDE) < SIDE // 2, 0.8, 2.4) * np.ones((SIDE, 1))
+"""The noise of the right half is three times that of the left one."""
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
 
@@ -67,9 +70,7 @@ def test_pixels_know_as_much_as_if_the_noise_were_given(
 
 
 def test_pixels_that_disagree_are_told() -> None:
-    """The noise of the right half is three times that of the left one."""
-    halves = np.where(np.arange(SIDE) < SIDE // 2, 0.8, 2.4) * np.ones((SIDE, 1))
-    maps = pb.fit_pixels(noisy(halves), scene=PLATE, links=LINKS, shared=SHARED)
+    maps = pb.fit_pixels(noisy(HALVES), scene=PLATE, links=LINKS, shared=SHARED)
     (sentence,) = pb.maps.shared_cautions(maps)
     assert "stokes_error_factor is shared by all pixels, and they do not agree" in sentence
 
@@ -117,7 +118,42 @@ def test_too_few_pixels_are_an_error(image: xr.Dataset) -> None:
         pb.fit_pixels(image.isel(y=slice(4), x=slice(5)), scene=PLATE, links=LINKS, shared=SHARED)
 
 
-@pytest.mark.thorough
-def test_nothing_is_shared_unless_it_is_asked_for(image: xr.Dataset) -> None:
-    maps = pb.fit_pixels(image.isel(y=[0], x=[0]), **ASKED)
+SETUP = pb.setups.Setup(PLATE, LINKS, shared=SHARED)
+
+
+def test_a_setup_says_what_its_images_share(
+    image: xr.Dataset, maps: xr.Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fit_map, "SHARED_PIXELS", SIDE**2)
+    found = pb.fit_pixels(image, scene=SETUP)
+    xr.testing.assert_equal(found, maps)
+    assert not pb.maps.shared_cautions(found)
+
+
+@pytest.mark.parametrize("case", ["asked", "small", "disagreeing"])
+def test_pixels_keep_their_own_where_nothing_should_be_shared(
+    image: xr.Dataset, monkeypatch: pytest.MonkeyPatch, case: str
+) -> None:
+    asked: dict = {"shared": ()} if case == "asked" else {}
+    if case != "small":
+        monkeypatch.setattr(fit_map, "SHARED_PIXELS", 4 if case == "asked" else SIDE**2)
+    corner = image.isel(y=slice(2), x=slice(2))
+    image = noisy(HALVES) if case == "disagreeing" else corner
+    maps = pb.fit_pixels(image, scene=SETUP, **asked)
     assert pb.maps.shared_parameters(maps).empty
+    assert "stokes_error_factor" in maps
+    cautions = pb.maps.shared_cautions(maps)
+    assert len(cautions) == (case == "disagreeing")
+    assert all("one value should serve the whole image, but pixels do" in x for x in cautions)
+
+
+@pytest.mark.thorough
+def test_an_image_of_a_camera_shares_its_polarizer() -> None:
+    assert pb.setups.SETUPS["camera"].shared == ("dolp_gain",)
+    truth = {"dolp_gain": np.asarray(0.93), "roughness": np.full((24, 24), 0.2)}
+    protocol = pb.simulation.Protocol(views=12, wavelengths=(), largest_view_zenith=75.0)
+    image = pb.simulate("plastic", scene="camera", protocol=protocol, parameters=truth, seed=1)
+    row = pb.maps.shared_parameters(pb.fit_pixels(image, scene="camera")).loc["dolp_gain"]
+    width = 4.0 / 1.96  # four sds: once in 16,000 right models
+    assert row["q50"] - width * (row["q50"] - row["q2.5"]) < 0.93
+    assert row["q50"] + width * (row["q97.5"] - row["q50"]) > 0.93

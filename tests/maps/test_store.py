@@ -131,6 +131,14 @@ def test_the_maps_are_those_that_are_made_in_memory(
     xr.testing.assert_equal(found, pb.fit_pixels(image, method=METHOD, **ASKED))
 
 
+def test_a_finished_map_comes_back_without_an_estimate(
+    capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(module, "estimate_plan")
+    found = mapped(capture, finished, resume=True)
+    xr.testing.assert_identical(found.load(), pb.maps.open_map(finished).load())
+
+
 @pytest.mark.thorough
 def test_whoever_is_stopped_before_the_store_is_whole_can_go_on(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

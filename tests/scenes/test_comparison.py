@@ -135,5 +135,10 @@ def test_bodies_are_compared_at_once_and_a_worse_surface_not_again(
     bodies = [" + unpolarized body", " + depolarizing body"]
     assert tried[:8] == ["rough surface", "sky", *(f"rough surface{x}" for x in first[1:] + bodies)]
     assert sum("sky" in name for name in tried) == 1
-    assert tried[-1].startswith("rough surface + unpolarized body + systematic errors + ")
-    assert len(tried) == selection.MAX_FITS
+    forward, alternatives = tried[: selection.MAX_FITS], tried[selection.MAX_FITS :]
+    assert forward[-1].startswith("rough surface + unpolarized body + systematic errors + ")
+    assert len(alternatives) == selection.MAX_ALTERNATIVES
+    assert alternatives[0].startswith("rough GGX surface + unpolarized body + systematic errors")
+    assert [name.split(" + ")[1] for name in alternatives[1:3]] == [
+        b[3:] for b in (first[1], bodies[1])
+    ]
