@@ -50,8 +50,8 @@ from polar_bayes.scenes.candidates import (
 from polar_bayes.scenes.sentences import ERRORS_APART, SMALL_DIFFERENCE, SceneComparison
 
 METHOD = Importance(draws=2048, rounds=12)
-"""Of the fits that are compared. Most take few rounds; posteriors that are curved in many parameters
-take all, where chains would take minutes."""
+"""Of the fits that are compared. Most take few rounds; posteriors that are curved in many
+parameters take all, where chains would take minutes."""
 
 MAX_FITS = 12
 """Candidates that forward selection fits at most."""
