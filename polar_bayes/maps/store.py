@@ -192,7 +192,6 @@ class _MapStore:
 
     def __init__(self, store: Path, image: xr.Dataset, plan: MapPlan) -> None:
         self._store, self._image, self._plan = store, image, plan
-        self._maps = blank(image, plan)
         # The size of blocks depends on the image alone, so resumed maps have the same blocks.
         size = min(BLOCK, max(LEAST, image.sizes["y"] * image.sizes["x"] // PARTS))
         self._regions = list(cut(image, size))
@@ -229,6 +228,7 @@ class _MapStore:
         if _metadata(self._store)["attributes"][FINISHED] != self._digest_all(readings):
             what = "the capture has changed since it was made"
             raise FitError(what, where=where, hint=OTHER_OUT)
+        self._maps = open_map(self._store)  # what pixels share was estimated, and has no map
         files = [file for region in self._regions for file in self._files(region)]
         if missing := sum(not file.is_file() for file in files):
             what = f"{missing} of {len(files)} chunks are missing"

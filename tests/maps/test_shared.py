@@ -147,6 +147,18 @@ def test_pixels_keep_their_own_where_nothing_should_be_shared(
     assert all("one value should serve the whole image, but pixels do" in x for x in cautions)
 
 
+def test_a_finished_map_whose_pixels_disagree_is_returned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fit_map, "SHARED_PIXELS", SIDE**2)
+    noisy(HALVES).to_zarr(tmp_path / "image.zarr", consolidated=False)
+    paths = tmp_path / "image.zarr", tmp_path / "map.zarr"
+    first = pb.maps.map_file(*paths, scene=SETUP).load()
+    assert pb.maps.shared_cautions(first)
+    again = pb.maps.map_file(*paths, scene=SETUP, resume=True)
+    xr.testing.assert_identical(again.load(), first)
+
+
 @pytest.mark.thorough
 def test_an_image_of_a_camera_shares_its_polarizer() -> None:
     assert pb.setups.SETUPS["camera"].shared == ("dolp_gain",)
