@@ -184,8 +184,10 @@ def map_(
     """Fit every pixel of an image."""
     if draws is not None and method != "laplace":
         raise click.UsageError("--draws needs --method laplace")
+    if "none" in shared and len(shared) > 1:
+        raise click.UsageError("--share none excludes every other --share")
     settings = read_scene_options(settings)
-    settings["shared"] = tuple(name for name in shared if name != "none") if shared else None
+    settings["shared"] = () if shared == ("none",) else shared or None
     given: dict[str, Any] = {} if draws is None else {"draws": draws}
     methods: dict[str, Any] = {
         "laplace": pb.methods.PixelLaplace(**given),

@@ -83,6 +83,8 @@ def test_what_an_image_shares_is_told_with_its_interval(
     told = capsys.readouterr().err
     assert "shared='roughness': an image cannot share it; give names among" in told
     assert "stokes_error_factor" in told
+    assert main([*words, "--share", "none", "--share", "dolp_gain"]) == 1
+    assert "--share none excludes every other --share" in capsys.readouterr().err
     assert not (tmp_path / "map.zarr").exists()
     shared = {
         "stokes_error_factor": {
