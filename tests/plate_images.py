@@ -106,7 +106,7 @@ def stacked(capture: xr.Dataset, plan: MapPlan) -> ObservationBatch:
 def mapped(capture: xr.Dataset, plan: MapPlan, block: int = 4096) -> xr.Dataset:
     """Maps made block by block."""
     numbered = with_pixel_numbers(capture)
-    maps = blank(numbered, plan).copy(deep=True)
+    maps = blank(numbered, plan).compute().copy(deep=True)
     for place in cut(numbered, block):
         for name, values in fit_block(numbered.isel(place), plan).items():
             maps[name][place] = values

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import lazy_loader
 import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
@@ -46,6 +47,8 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.progress import Counter, no_progress, with_counter
+
+da = lazy_loader.load("dask.array")
 
 BLOCK = 4096
 """Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
@@ -397,17 +400,18 @@ def with_pixel_numbers(image: xr.Dataset, region: Mapping[str, slice] | None = N
 
 
 def blank(capture: xr.Dataset, plan: MapPlan) -> xr.Dataset:
-    """Maps of the image without values: names, axes, types and attributes."""
+    """Maps of the image without values: names, axes, types and attributes; lazy (Dask)."""
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
     nothing = empty_outcome(1, Status.NOT_FITTED)
-    tiny = maps_of(plan.marginals(1), nothing, corner, plan)
-    one = tiny.isel({dim: 0 for dim in IMAGE}, drop=True)
-    whole = one.expand_dims({dim: capture.sizes[dim] for dim in IMAGE})
-    whole = whole.assign_coords({dim: capture[dim] for dim in IMAGE if dim in capture.coords})
-    whole = xr.Dataset(
-        {n: v.transpose(*tiny[n].dims) for n, v in whole.items()},
-        attrs={PROVENANCE: provenance_json(plan)},
-    )
+    tiny = maps_of(plan.marginals(1), nothing, corner, plan).drop_vars(IMAGE, errors="ignore")
+    sizes = {**tiny.sizes, **{dim: capture.sizes[dim] for dim in IMAGE}}
+    coords = {dim: capture[dim] for dim in IMAGE if dim in capture.coords}
+    whole = tiny.coords.to_dataset().assign_coords(coords)
+    for name, variable in tiny.items():
+        shape = [sizes[dim] for dim in variable.dims]
+        values = da.broadcast_to(da.from_array(variable.to_numpy()), shape)
+        whole[name] = (variable.dims, values, variable.attrs)
+    whole.attrs[PROVENANCE] = provenance_json(plan)
     for name, (mean, sd) in plan.engine.prior_moments.items():
         if name in plan.axes:
             whole[name].attrs |= {"prior_mean": mean.tolist(), "prior_sd": sd.tolist()}
@@ -417,7 +421,7 @@ def blank(capture: xr.Dataset, plan: MapPlan) -> xr.Dataset:
 
 def _in_memory(capture: xr.Dataset, plan: MapPlan, progress: Counter) -> xr.Dataset:
     """Blocks on threads, put together in memory."""
-    maps = blank(capture, plan).copy(deep=True)
+    maps = blank(capture, plan).compute().copy(deep=True)
     every, done = capture.sizes["y"] * capture.sizes["x"], 0
     with workers(None) as (pool, count):
         tasks = ((region,) for region in cut(capture, BLOCK))

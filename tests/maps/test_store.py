@@ -7,13 +7,15 @@ import os
 import re
 import shutil
 import time
+import tracemalloc
 from pathlib import Path
 
+import dask.array as da
 import numpy as np
 import pytest
 import xarray as xr
 from cases import each
-from plate_images import ASKED, plate_image
+from plate_images import ASKED, NAMES, plate_image
 
 import polar_bayes as pb
 from polar_bayes.inference import batch_engine
@@ -21,6 +23,7 @@ from polar_bayes.interrupts import clean_up
 from polar_bayes.maps import lazy
 from polar_bayes.maps import store as module
 from polar_bayes.maps.blocks import workers
+from polar_bayes.maps.fit_map import MapPlan
 from polar_bayes.reporting.report import render
 
 METHOD = pb.methods.PixelLaplace(draws=64, sampler=None)
@@ -71,6 +74,32 @@ def break_off(capture: Path, out: Path) -> None:
 
     with pytest.raises(BrokenOff):
         mapped(capture, out, progress=progress)
+
+
+def test_a_store_is_begun_without_holding_the_maps_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tile, side = plate_image(1, 20), 2000
+    image = tile[[name for name in tile if "y" not in tile[name].dims]]
+    for name in ("q", "q_error"):
+        whole = da.broadcast_to(tile[name].to_numpy()[:, :1], (side, side, 6), chunks=(50, 250, -1))
+        image[name] = (("y", "x", "view"), whole)
+    image.to_zarr(tmp_path / "large.zarr", consolidated=False)
+    written: list[int] = []
+
+    def at_the_first_block(block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
+        written.append(tracemalloc.get_traced_memory()[1])
+        raise BrokenOff
+
+    monkeypatch.setattr(module, "BLOCK", 65536)
+    monkeypatch.setattr(module, "fit_block", at_the_first_block)
+    monkeypatch.setattr(module, "estimate_plan", lambda plan, image: plan)  # reads 512 pixels
+    tracemalloc.start()
+    with pytest.raises(BrokenOff):
+        mapped(tmp_path / "large.zarr", tmp_path / "map.zarr")
+    tracemalloc.stop()
+    values = side**2 * len(NAMES) * 9 * 4  # mean, sd and seven quantiles, in single precision
+    assert written[0] < values / 4
 
 
 def copied(store: Path, to: Path, *, ledger: bool = True) -> Path:
