@@ -404,7 +404,7 @@ def blank(capture: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
     nothing = empty_outcome(1, Status.NOT_FITTED)
     tiny = maps_of(plan.marginals(1), nothing, corner, plan).drop_vars(IMAGE, errors="ignore")
-    sizes = {**tiny.sizes, **{dim: capture.sizes[dim] for dim in IMAGE}}
+    sizes = dict(tiny.sizes) | {dim: capture.sizes[dim] for dim in IMAGE}
     coords = {dim: capture[dim] for dim in IMAGE if dim in capture.coords}
     whole = tiny.coords.to_dataset().assign_coords(coords)
     for name, variable in tiny.items():
