@@ -24,7 +24,7 @@ Source:
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, override
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +36,10 @@ from numpyro import distributions as dist
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batch_laplace import PixelLaplace
+from polar_bayes.inference.batch_method import BatchFit, random_keys
 from polar_bayes.inference.batching import LANES, ObservationBatch, Status, batched
 from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.levenberg_marquardt import ModeSearch, NormalApproximation
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.inference.psis import draws_at
 from polar_bayes.observation.data import Observations
@@ -121,18 +123,26 @@ def estimate_shared(
 ) -> list[SharedParameter]:
     """The posterior of shared parameters, from the pixels that the method can be trusted in.
 
+    Modes are followed from step to step. The last step searches every pixel from all starts.
+
     Raises:
         FitError: Too few pixels have an answer, or the search does not settle.
     """
     names = tuple(each.name for each in shared)
     where = f"shared parameters {', '.join(names)}"
     mean, sd = (np.array([getattr(each, part) for each in shared]) for part in ("mean", "sd"))
+    once, everywhere = (
+        dataclasses.replace(method, sampler=None, starts=starts)
+        for starts in (1, PixelLaplace.most_starts)
+    )
+    modes, is_last = None, False
     for _ in range(MOST_STEPS):
         now = [
             dataclasses.replace(each, mean=m, sd=s)
             for each, m, s in zip(shared, mean.tolist(), sd.tolist(), strict=True)
         ]
-        found = _expectations(engine, pixels, method, now, seed)
+        searching = everywhere if is_last else once
+        found, modes = _expectations(engine, pixels, searching, now, seed, modes)
         count = len(found.slope)
         if count < LEAST_PIXELS:
             raise FitError(
@@ -152,7 +162,8 @@ def estimate_shared(
         if not np.isfinite(_precision(whole)).all():
             whole = np.diag(sd**-2.0) * count**0.5
         step, reached = np.linalg.solve(whole, total), _precision(whole) ** -0.5
-        if ratio < NARROW and np.all(np.abs(step) < SETTLED * reached):
+        is_settled = bool(ratio < NARROW and np.all(np.abs(step) < SETTLED * reached))
+        if is_settled and is_last:
             return [
                 dataclasses.replace(each, mean=m, sd=s, pixels=count, disagreement=d)
                 for each, m, s, d in zip(
@@ -163,6 +174,7 @@ def estimate_shared(
                     strict=True,
                 )
             ]
+        is_last, modes = is_settled, None if is_settled else modes
         step = step / max(1.0, np.max(np.abs(step) / sd) / LONGEST_STEP)
         mean, reached = mean + step, np.maximum(reached, 0.5 * np.abs(step))
         sd = np.clip(reached, sd / SHRINKAGE, GROWTH * sd)
@@ -222,34 +234,54 @@ def _prior_derivatives(
     return np.array(first), -np.diag(second)
 
 
+class _Batch(BatchFit):
+    """A fit that keeps its modes, and draws of equal weight as unconstrained vectors."""
+
+    modes: NormalApproximation
+
+    def __init__(self, engine: BatchEngine, pixels: ObservationBatch, seed: int) -> None:
+        every = np.arange(len(pixels))
+        super().__init__(engine, pixels, random_keys(seed, every), seed=seed)
+        self.z = np.zeros((every.size, DRAWS, engine.program.size), engine.dtype)
+
+    @override
+    def record_modes(self, at: np.ndarray, search: ModeSearch) -> None:
+        super().record_modes(at, search)
+        self.modes = search.mode
+
+    @override
+    def record(self, at: np.ndarray, draws: Values, weights: np.ndarray, *further: Any) -> None:
+        super().record(at, draws, weights, *further)
+        if at.size:
+            rows, which = np.arange(at.size)[:, None], _resampled(weights)
+            values = {n: np.asarray(draws[n])[rows, which] for n in self.engine.program.supports}
+            self.z[at] = self.engine.run(_coordinates, None, self.pixels.subset(at), values)
+
+
 def _expectations(
     engine: BatchEngine,
     pixels: ObservationBatch,
     method: PixelLaplace,
     shared: Sequence[SharedParameter],
     seed: int,
-) -> _Expectations:
+    modes: NormalApproximation | None,
+) -> tuple[_Expectations, NormalApproximation]:
     """What each pixel says about the shared parameters, at the priors that they have now."""
     static = dataclasses.replace(pixels.static, shared=as_priors(shared))
     pixels = dataclasses.replace(pixels, static=static)
-    z = np.zeros((len(pixels), DRAWS, engine.program.size))
-
-    def keep(at: np.ndarray, draws: Values, weights: np.ndarray) -> None:
-        if at.size:
-            z[at] = _coordinates(engine.program, draws, _resampled(weights))
-
-    outcome = method.run_batch(engine, pixels, np.arange(len(pixels)), seed, keep)
-    good = np.flatnonzero(outcome.status == Status.GOOD)
+    batch = _Batch(engine, pixels, seed)
+    method.fit(batch, np.arange(len(pixels)), modes)
+    good = np.flatnonzero(batch.outcome.status == Status.GOOD)
     names = tuple(each.name for each in shared)
     if not good.size:
-        return _Expectations(*(np.zeros((0, len(names))) for _ in range(5)))
-    coordinates = z[good][..., _positions(engine.program, names)]
+        return _Expectations(*(np.zeros((0, len(names))) for _ in range(5))), batch.modes
+    z = batch.z[good]
+    coordinates = z[..., _positions(engine.program, names)].astype(float)
     mean = coordinates.mean(axis=1)
     centered = coordinates - mean[:, None]
     covariance = np.einsum("pdi,pdj->pij", centered, centered) / (DRAWS - 1)
-    own = pixels.subset(good), z[good].astype(engine.dtype)
-    slope, error, information = engine.run(_slopes, names, *own)
-    return _Expectations(slope, error, information, mean, covariance)
+    slope, error, information = engine.run(_slopes, names, pixels.subset(good), z)
+    return _Expectations(slope, error, information, mean, covariance), batch.modes
 
 
 def _resampled(weights: np.ndarray) -> np.ndarray:
@@ -262,11 +294,14 @@ def _resampled(weights: np.ndarray) -> np.ndarray:
     return np.take_along_axis(order, np.stack([draws_at(levels, row) for row in rows]), axis=1)
 
 
-def _coordinates(program: Program, draws: Values, which: np.ndarray) -> np.ndarray:
-    """Unconstrained vectors of some draws, (pixel, draw, size)."""
-    rows = np.arange(len(which))[:, None]
-    values = {name: jnp.asarray(draws[name])[rows, which] for name in program.supports}
-    return np.asarray(jax.vmap(jax.vmap(program.unconstrain))(values), float)
+def _coordinates(engine: BatchEngine, _: None) -> JitOnce:
+    """The program of unconstrained vectors of the draws of one pixel."""
+
+    def of_pixel(data: Observations, draws: dict[str, Array]) -> Array:
+        del data  # a transform does not depend on readings
+        return jax.vmap(engine.program.unconstrain)(draws)
+
+    return batched(of_pixel, lanes=LANES)
 
 
 def _positions(program: Program, names: Sequence[str]) -> np.ndarray:

@@ -48,7 +48,7 @@ from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.progress import Counter, no_progress, with_counter
 
-da = lazy_loader.load("dask.array")
+da = lazy_loader.load("dask.array", suppress_warning=True)  # dask itself is loaded in any case
 
 BLOCK = 4096
 """Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
@@ -267,7 +267,6 @@ def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     method = PixelLaplace()
     if isinstance(settings, PixelLaplace) and settings.weighted:
         method = settings
-    method = dataclasses.replace(method, sampler=None, starts=PixelLaplace.most_starts)
     given = plan.engine, pixels, method, request.priors, plan.shared, request.seed
     try:
         found = estimate_shared(*given)
