@@ -141,9 +141,12 @@ def estimate_shared(
             dataclasses.replace(each, mean=m, sd=s)
             for each, m, s in zip(shared, mean.tolist(), sd.tolist(), strict=True)
         ]
-        searching = everywhere if is_last else once
+        searching, are_followed = everywhere if is_last else once, modes is not None
         found, modes = _expectations(engine, pixels, searching, now, seed, modes)
         count = len(found.slope)
+        if count < LEAST_PIXELS and are_followed:
+            modes = None
+            continue
         if count < LEAST_PIXELS:
             raise FitError(
                 f"only {count} pixels have an answer (at least {LEAST_PIXELS})",
