@@ -77,9 +77,10 @@ def test_a_region_counts_what_is_shared_once(image: xr.Dataset, maps: xr.Dataset
     assert found["region"].values.tolist() == [1, 2, 3, 4]
     assert found["pixels"].values.tolist() == [63, 64, 64, 64]
     sd = np.sqrt(own + common)
-    # The zero has an error of Monte Carlo, which its sd tells: half of the sd without it.
-    np.testing.assert_allclose(found["level_sd"], sd, rtol=0.25)
-    assert (abs(found["level"] - mean) < 4.0 * 0.5 * sd).all()
+    # The spread of the slopes of 256 pixels is known to 4.4% (one sd), and to 3.5 times that but
+    # once in 2,000 seeds. Their Monte Carlo errors move the zero by a third of its sd.
+    np.testing.assert_allclose(found["level_sd"], sd, rtol=0.155)
+    assert (abs(found["level"] - mean) < 3.5 / 3.0 * sd).all()
     low, high = found["level_interval"]
     np.testing.assert_allclose(high - low, 2.0 * 1.96 * found["level_sd"], rtol=1e-4)
     assert not found.attrs["cautions"]
