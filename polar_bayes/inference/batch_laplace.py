@@ -127,7 +127,7 @@ class PixelLaplace(AbstractPixelMethod):
         self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
     ) -> None:
         run = _Run(self, batch, at)
-        found = run.approximate(None if modes is None else np.asarray(modes.z)[:, None])
+        found = run.approximate(None if modes is None else np.asarray(modes.z))
         run.record(found)
         several = np.zeros(at.size, bool)
         if self.sampler is not None and self.weighted:
@@ -197,16 +197,17 @@ class _Run:
     def approximate(self, known: np.ndarray | None = None) -> Approximation:
         """Fit from the best candidate; untrusted pixels start again and keep the lower mode.
 
-        With known starts, (pixel, rank, size), each pixel is fitted from the first alone.
+        With known starts, (pixel, size), each pixel is fitted from its own alone.
         """
         candidates, weighted = self.settings.candidates, self.settings.weighted
         starts = self.settings.starts or (PixelLaplace.most_starts if weighted else 1)
-        ranked, ranks = known, range(0)
-        if ranked is None:
-            ranked, ranks = find_starts(self.engine, self.pixels, candidates), RESTARTS
+        if known is None:
+            ranked = find_starts(self.engine, self.pixels, candidates)
+        else:
+            ranked = known[:, None]
         search = find_modes_from(self.engine, self.pixels, ranked[:, 0])
         found = jax.tree.map(np.array, self._weigh(np.arange(self.at.size), search))
-        for start, rank in enumerate(ranks, 2):
+        for start, rank in enumerate(RESTARTS if known is None else (), 2):
             everywhere = start <= starts
             untrusted = np.flatnonzero(everywhere | ~found.is_trusted)
             if not untrusted.size:

@@ -385,7 +385,7 @@ def finalize(z: Float[Array, " size"], derivatives: Derivatives) -> NormalApprox
 PRIOR_DRAWS = 32
 """Draws from the prior among which a starting point is chosen unless settings say otherwise."""
 
-RESTARTS = range(1, 8)
+RESTARTS = tuple(range(1, 8))
 """Ranks of the prior draws from which pixels without a good mode start again."""
 
 RANKS, SAME_MODE = 16, 0.1

@@ -420,7 +420,7 @@ def blank(capture: xr.Dataset, plan: MapPlan) -> xr.Dataset:
 
 def _in_memory(capture: xr.Dataset, plan: MapPlan, progress: Counter) -> xr.Dataset:
     """Blocks on threads, put together in memory."""
-    maps = blank(capture, plan).compute().copy(deep=True)
+    maps = blank(capture, plan).compute().copy(deep=True)  # repeated values are read-only
     every, done = capture.sizes["y"] * capture.sizes["x"], 0
     with workers(None) as (pool, count):
         tasks = ((region,) for region in cut(capture, BLOCK))
