@@ -1,6 +1,7 @@
 """The layers of the package: every import points up the list, and packages stay in their homes."""
 
 import ast
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -161,6 +162,17 @@ def test_no_import_hides_inside_a_function() -> None:
         f"{module} imports {target} inside a function"
         for module, target, inside in package_imports()
         if inside and not belongs(module, "polar_bayes.cli")
+    ]
+
+
+def test_only_whole_packages_are_loaded_lazily() -> None:
+    # A lazy submodule is not an attribute of its package, where others look for it: with a lazy
+    # `dask.array` the maps of an image in chunks ended in an AttributeError of xarray.
+    assert not [
+        f"{module} loads {name} lazily"
+        for module, path in MODULES.items()
+        for name in re.findall(r'lazy_loader\.load\(\s*"([^"]+)"', path.read_text())
+        if "." in name
     ]
 
 

@@ -7,9 +7,9 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import dask.array as da
 import jax
 import jax.numpy as jnp
-import lazy_loader
 import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
@@ -47,8 +47,6 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.progress import Counter, no_progress, with_counter
-
-da = lazy_loader.load("dask.array", suppress_warning=True)  # dask itself is loaded in any case
 
 BLOCK = 4096
 """Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
