@@ -5,8 +5,8 @@ Fisher scoring in single precision first, and with exact second derivatives in d
 at the end. Functions are of one pixel and mapped over a batch, so a pixel's result does not depend
 on the other pixels of its batch.
 
-Two choices are for speed. Cholesky factors of matrices as small as 4 by 4 are written out, because
-a library factors a batch of them one call at a time. Derivatives are taken by forward mode along
+Two choices are for speed where a pixel has few coordinates. Cholesky factors of small matrices are
+written out, because a library factors a batch of them one call at a time. Jacobians are taken along
 one coordinate at a time, so that parts of the model that do not depend on a coordinate are absent
 from its program. `benchmarks/pixels.py` has the measurements.
 
@@ -19,7 +19,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,12 +42,19 @@ from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 
-# --- Cholesky factors of very small matrices, written out -----------------------------------------
+# --- Cholesky factors of small matrices -----------------------------------------------------------
+
+
+MAX_UNROLLED = 6
+"""Largest size of a matrix whose factor is written out, and most coordinates along which Jacobians
+are taken one by one. Beyond it compilation takes longer than the program saves."""
 
 
 def cholesky(matrix: Float[Array | np.ndarray, "size size"]) -> Float[Array, "size size"]:
-    """Lower factor of a symmetric matrix."""
+    """Lower factor of a symmetric matrix; NaN where it is not positive definite."""
     size = matrix.shape[0]
+    if size > MAX_UNROLLED:
+        return jnp.linalg.cholesky(matrix)
     rows: list[list[Array]] = []
     for i in range(size):
         row: list[Array] = []
@@ -61,6 +68,9 @@ def cholesky(matrix: Float[Array | np.ndarray, "size size"]) -> Float[Array, "si
 def inverse(factor: Float[Array, "size size"]) -> Float[Array, "size size"]:
     """Inverse of a lower factor, lower again."""
     size = factor.shape[0]
+    if size > MAX_UNROLLED:
+        unit = jnp.eye(size, dtype=factor.dtype)
+        return jax.scipy.linalg.solve_triangular(factor, unit, lower=True)
     rows: list[list[Array]] = []
     for i in range(size):
         above = [
@@ -80,12 +90,8 @@ def _lower(rows: list[list[Array]]) -> Array:
     return jnp.stack([jnp.stack([*row, *[zero] * (len(rows) - len(row))]) for row in rows])
 
 
-# --- Derivatives of one pixel's log posterior density, in forward mode ----------------------------
+# --- Derivatives of one pixel's log posterior density ---------------------------------------------
 
-
-MAX_UNROLLED = 6
-"""Most coordinates that are differentiated one by one. Programs grow with the square of their
-number, and beyond it compilation takes longer than the program saves."""
 
 Coordinates = tuple[Float[Array, ""], ...]
 """The unconstrained vector as numbers, so that each can be differentiated by itself."""
@@ -109,9 +115,9 @@ def scoring_derivatives(
     # Gauss-Newton matrix (Schraudolph 2002), the Fisher information under normal noise.
     coordinates = tuple(z)
     pixel = _Pixel(program, data)
-    arguments, likelihoods = pixel.arguments(coordinates), pixel.likelihoods(coordinates)
-    jacobians = _jacobian(lambda *c: pixel.arguments(c), coordinates)
-    value, gradient, curvature = _derivatives(pixel.prior, coordinates)
+    arguments, jacobians = _jacobian(lambda *c: pixel.arguments(c), coordinates)
+    likelihoods = pixel.likelihoods(coordinates)
+    value, gradient, curvature = derivatives(lambda z: program.prior_potential(z, data), z)
     for at, (own, likelihood) in enumerate(zip(arguments, likelihoods, strict=True)):
         active = pixel.active(at, coordinates)
         value = value - jnp.sum(likelihood(own))
@@ -119,15 +125,13 @@ def scoring_derivatives(
         first = gradient_of(own)
         units = {a: [jnp.full_like(x, float(k == a)) for k, x in enumerate(own)] for a in active}
         second = {a: jax.jvp(gradient_of, (own,), (unit,))[1] for a, unit in units.items()}
-        jacobian = [jacobians[k][at] for k in range(program.size)]
+        jacobian = {a: jacobians[at][a].reshape(program.size, -1) for a in active}
         # The barrier keeps the compiler from computing these again for each of the sums below.
         first, second, jacobian = jax.lax.optimization_barrier((first, second, jacobian))
-        gradient = gradient - jnp.stack(
-            [sum(jnp.sum(j[a] * first[a]) for a in active) for j in jacobian]
-        )
+        gradient = gradient - sum(jacobian[a] @ first[a].ravel() for a in active)
         for a, b in itertools.product(active, active):
-            rows = [[jnp.sum(i[a] * second[a][b] * j[b]) for j in jacobian] for i in jacobian]
-            curvature = curvature - jnp.stack([jnp.stack(row) for row in rows])
+            weighted = jacobian[a] * second[a][b].ravel()
+            curvature = curvature - weighted @ jacobian[b].T
     return Derivatives(value, gradient, curvature)
 
 
@@ -135,7 +139,7 @@ def exact_derivatives(
     program: Program, z: Float[Array, " size"], data: Observations
 ) -> Derivatives:
     """Value, gradient and exact second derivatives."""
-    return Derivatives(*_derivatives(_Pixel(program, data).potential, tuple(z)))
+    return derivatives(lambda z: program.potential(z, data), z)
 
 
 class _Pixel:
@@ -148,8 +152,6 @@ class _Pixel:
         self._program = program
         self._data = data
         self._layout = jax.eval_shape(program.unravel, jnp.zeros(program.size))
-        self.potential = jax.jit(self._potential, inline=True)
-        self.prior = jax.jit(self._prior, inline=True)
         self.arguments = jax.jit(self._arguments, inline=True)
 
     def likelihoods(self, coordinates: Coordinates) -> list[Callable]:
@@ -167,13 +169,6 @@ class _Pixel:
 
         count = len(self.arguments(coordinates)[at])
         return [a for a in range(count) if _depends(functools.partial(argument, a), coordinates)]
-
-    def _potential(self, *coordinates: Array) -> Array:
-        return self._program.potential_at(self._sites(coordinates), self._data)
-
-    def _prior(self, *coordinates: Array) -> Array:
-        """Minus the log prior density of the coordinates."""
-        return self._program.prior_potential_at(self._sites(coordinates), self._data)
 
     def _arguments(self, coordinates: Coordinates) -> list[list[Array]]:
         """For each observed site, the arguments of its distribution, a value for each reading."""
@@ -212,40 +207,32 @@ def _is_number(x: Array) -> bool:
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
-def _directional(function: Callable, k: int) -> Callable:
-    """The derivative of a function of coordinates along one of them."""
+def derivatives(function: Callable, z: Float[Array, " size"]) -> Derivatives:
+    """Value, gradient and Hessian of a function of the unconstrained vector."""
 
-    def derivative(*coordinates: Array) -> Array:
-        def of_one(x: Array) -> Array:
-            return function(*coordinates[:k], x, *coordinates[k + 1 :])
+    def first(z: Array) -> tuple[Array, tuple[Array, Array]]:
+        value, gradient = jax.value_and_grad(function)(z)
+        return gradient, (value, gradient)
 
-        return jax.jvp(of_one, (coordinates[k],), (jnp.ones_like(coordinates[k]),))[1]
-
-    return derivative
-
-
-def _jacobian(function: Callable, coordinates: Coordinates) -> list:
-    """The derivatives of a tree of arrays along every coordinate."""
-    size = len(coordinates)
-    if size <= MAX_UNROLLED:
-        return [_directional(function, k)(*coordinates) for k in range(size)]
-    whole = jax.jacfwd(lambda z: function(*z))(jnp.stack(coordinates))
-    return [jax.tree.map(lambda x, k=k: x[..., k], whole) for k in range(size)]
+    curvature, (value, gradient) = jax.jacfwd(first, has_aux=True)(z)
+    return Derivatives(value, gradient, curvature)
 
 
-def _derivatives(function: Callable, coordinates: Coordinates) -> tuple[Array, Array, Array]:
+def _jacobian(function: Callable, coordinates: Coordinates) -> tuple[Any, Any]:
+    """A tree of arrays, and its derivatives along every coordinate, (size, ...)."""
     size = len(coordinates)
     if size > MAX_UNROLLED:
-        z = jnp.stack(coordinates)
-        value, gradient = jax.value_and_grad(lambda z: function(*z))(z)
-        return value, gradient, jax.hessian(lambda z: function(*z))(z)
-    first = [_directional(function, k) for k in range(size)]
-    rows: list[list[Array]] = [[] for _ in range(size)]
-    for i in range(size):
-        rows[i] = [rows[j][i] for j in range(i)]
-        rows[i] += [_directional(first[i], j)(*coordinates) for j in range(i, size)]
-    gradient = jnp.stack([each(*coordinates) for each in first])
-    return function(*coordinates), gradient, jnp.stack([jnp.stack(row) for row in rows])
+        units = tuple(jnp.eye(size, dtype=coordinates[0].dtype))
+        push = jax.vmap(lambda unit: jax.jvp(function, coordinates, unit), out_axes=(None, 0))
+        return push(units)
+
+    def along(k: int) -> tuple[Any, Any]:
+        """The derivative along one coordinate, the others being constants."""
+        below, x, above = coordinates[:k], coordinates[k], coordinates[k + 1 :]
+        return jax.jvp(lambda x: function(*below, x, *above), (x,), (jnp.ones_like(x),))
+
+    values, rows = zip(*map(along, range(size)), strict=True)
+    return values[0], jax.tree.map(lambda *row: jnp.stack(row), *rows)
 
 
 def _depends(function: Callable, coordinates: Coordinates) -> bool:

@@ -37,9 +37,13 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_method import BatchFit, random_keys
-from polar_bayes.inference.batching import LANES, ObservationBatch, Status, batched
+from polar_bayes.inference.batching import LANES, AnyArray, ObservationBatch, Status, batched
 from polar_bayes.inference.compile import JitOnce
-from polar_bayes.inference.levenberg_marquardt import ModeSearch, NormalApproximation
+from polar_bayes.inference.levenberg_marquardt import (
+    ModeSearch,
+    NormalApproximation,
+    derivatives,
+)
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.inference.psis import draws_at
 from polar_bayes.observation.data import Observations
@@ -318,16 +322,17 @@ def _slopes(engine: BatchEngine, names: tuple[str, ...]) -> JitOnce:
     program = engine.program
     where = _positions(program, names)
 
-    def of_pixel(data: Observations, z: Array) -> tuple[Array, Array, Array]:
+    def of_pixel(data: Observations, z: Array) -> tuple[AnyArray, AnyArray, AnyArray]:
         mean, sd = (jnp.stack([data.shared[name][part] for name in names]) for part in (0, 1))
 
-        def of_draw(z: Array) -> tuple[Array, Array]:
+        def of_draw(z: Array) -> tuple[AnyArray, AnyArray]:
             def potential(x: Array) -> Array:
                 # Without the prior of the shared parameters, which counts once for all pixels.
                 own = 0.5 * jnp.sum(((x - mean) / sd) ** 2)
                 return program.potential(z.at[where].set(x), data) - own
 
-            return -jax.grad(potential)(z[where]), jax.hessian(potential)(z[where])
+            found = derivatives(potential, z[where])
+            return -found.gradient, found.curvature
 
         slope, curvature = jax.vmap(of_draw)(z)
         centered = slope - slope.mean(axis=0)
