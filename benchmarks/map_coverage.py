@@ -46,7 +46,7 @@ ONE_BY_ONE = 4
 SHARED = ("stokes_scale", "intensity_scale", "dolp_gain", "exposure")
 
 
-def camera_image(gain: float | None) -> xr.Dataset:
+def camera_image(gain: float | None, seed: int = 1) -> xr.Dataset:
     """Rough materials drawn from the priors, each with a polarizer of its own or all with one."""
     names = ("roughness", "subsurface_fraction", "refractive_index", "dolp_gain")
     keys = jax.random.split(jax.random.key(3), 4)
@@ -56,7 +56,7 @@ def camera_image(gain: float | None) -> xr.Dataset:
     }
     truth |= {} if gain is None else {"dolp_gain": np.asarray(gain)}
     protocol = pb.simulation.Protocol(views=12, wavelengths=(), largest_view_zenith=75.0)
-    return pb.simulate("plastic", scene="camera", protocol=protocol, parameters=truth, seed=1)
+    return pb.simulate("plastic", scene="camera", protocol=protocol, parameters=truth, seed=seed)
 
 
 def camera() -> None:
