@@ -96,9 +96,13 @@ class SharedParameter:
 
     def scores(self, prior: dist.Distribution, draws: Values) -> np.ndarray:
         """Standard scores of draws, in the shape of these."""
+        values = np.asarray(draws[self.name], float)
+        # Pixels that are fitted one by one have as many draws as they need. JAX compiles for each
+        # length, so that lengths are powers of two.
+        padded = np.resize(values, 1 << (values.size - 1).bit_length())
         with jax.enable_x64(True):
-            x = dist.biject_to(prior.support).inv(jnp.asarray(draws[self.name], float))
-        return (np.asarray(x) - self.mean) / self.sd
+            x = np.asarray(dist.biject_to(prior.support).inv(jnp.asarray(padded)))
+        return (x[: values.size].reshape(values.shape) - self.mean) / self.sd
 
 
 def as_priors(shared: Sequence[SharedParameter]) -> dict[str, tuple[Any, Any]]:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from compilations import compilations
 from numpyro import handlers
 from plate_images import plate_image
 from plates import PLATE
@@ -12,6 +13,7 @@ from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
 from polar_bayes.inference.batching import Status
+from polar_bayes.inference.shared import SharedParameter
 from polar_bayes.maps import fit_map
 
 SHARED = ("stokes_error_factor",)
@@ -157,6 +159,18 @@ def test_a_finished_map_whose_pixels_disagree_is_returned(
     assert pb.maps.shared_cautions(first)
     again = pb.maps.map_file(*paths, scene=SETUP, resume=True)
     xr.testing.assert_identical(again.load(), first)
+
+
+def test_another_number_of_draws_compiles_nothing() -> None:
+    # Pixels that are fitted one by one have as many draws as they need.
+    gain, prior = SharedParameter("dolp_gain", 2.0, 0.5), pb.PRIORS["dolp_gain"]
+    draws = np.random.default_rng(0).uniform(0.5, 0.99, 2000)
+    whole = gain.scores(prior, {"dolp_gain": draws})
+    with compilations() as compiled:
+        for count in (1999, 1500, 1025):
+            part = gain.scores(prior, {"dolp_gain": draws[:count].reshape(1, count)})
+            np.testing.assert_allclose(part[0], whole[:count], rtol=1e-12)
+    assert not compiled
 
 
 @pytest.mark.thorough
