@@ -143,9 +143,9 @@ def exact_derivatives(
 
 
 class _Pixel:
-    """A program and its data as functions of coordinates, one number each."""
+    """The likelihood of a program and its data in terms of coordinates, one number each."""
 
-    # Each function is traced once, however often it is differentiated: tracing a model with NumPyro
+    # `arguments` is traced once, however often it is differentiated: tracing a model with NumPyro
     # is slow.
 
     def __init__(self, program: Program, data: Observations) -> None:
