@@ -89,7 +89,7 @@ class NumpyPotential:
 
     def __init__(
         self,
-        value_and_gradient: Callable[[Array, Any], tuple[Array, Array]],
+        value_and_gradient: Callable[[np.ndarray, Any], tuple[Array, Array]],
         given: Any,
         dtype: DTypeLike,
     ) -> None:
@@ -98,7 +98,8 @@ class NumpyPotential:
 
     def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         self.calls += 1
-        value, gradient = self._compiled(jnp.asarray(z, self._dtype), self._given)
+        # A NumPy array: `jnp.asarray` would take as long as a small program.
+        value, gradient = self._compiled(np.asarray(z, self._dtype), self._given)
         return float(value), np.asarray(gradient, float)
 
 
