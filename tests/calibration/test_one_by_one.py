@@ -134,11 +134,11 @@ def test_fits_without_draws_are_counted(
         def __init__(self, initializer) -> None:
             self._grounds = initializer
 
-        def find(self, data, key, progress):
+        def find(self, data, *further):
             if float(data.readings["q"].mean()) > 0.0:
                 refused.append(None)
                 raise FitError("no start reached a peak", where="fit", hint="look at it")
-            return self._grounds.find(data, key, progress)
+            return self._grounds.find(data, *further)
 
     monkeypatch.setattr(
         problem.CompiledModel, "initializer", property(lambda self: Refusing(inner(self)))
