@@ -77,12 +77,8 @@ class Program:
 
     def prior_potential(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """The potential without the likelihood."""
-        return self.prior_potential_at(self.unravel(z), data)
-
-    def prior_potential_at(self, sites: dict[str, Array], data: Observations) -> Float[Array, ""]:
-        """The same of the unconstrained latent sites by name."""
         prior = handlers.block(self.model, hide=list(self.observed))
-        return potential_energy(prior, (data,), {}, sites)
+        return potential_energy(prior, (data,), {}, self.unravel(z))
 
     def constrain(self, z: Float[Array, " size"]) -> dict[str, Array]:
         """The latent sites in their supports."""

@@ -58,8 +58,8 @@ DISAGREEMENT = 3.1
 """Of the information matrix test, a standard normal number: once in a thousand right models."""
 
 DRAWS = 256
-"""Resampled draws of each pixel at which derivatives are taken. With 64 the information of 256
-pixels was off by up to 44%, where readings say little that priors do not (tests/maps)."""
+"""Resampled draws of each pixel at which derivatives are taken. With 64, Monte Carlo errors are a
+large part of the information of 256 pixels whose readings say little that priors do not."""
 
 LONGEST_STEP, SHRINKAGE, GROWTH, MOST_STEPS = 4.0, 30.0, 2.0, 20
 """Of Newton's method: the longest step in sds of the priors of pixels, how fast these narrow and
