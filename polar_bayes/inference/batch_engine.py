@@ -79,7 +79,7 @@ class BatchEngine:
         settings: S,
         pixels: ObservationBatch,
         state: Any,
-        given: tuple,
+        given: tuple = (),
     ) -> None:
         """Begin to compile what `run` needs, in parallel with what follows; one state is enough."""
         program = self.compiled(make, settings)

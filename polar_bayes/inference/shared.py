@@ -23,6 +23,7 @@ Source:
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, override
 
@@ -32,6 +33,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array
 from numpyro import distributions as dist
+from numpyro.distributions import transforms
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_engine import BatchEngine
@@ -92,7 +94,7 @@ class SharedParameter:
     def quantiles(self, prior: dist.Distribution, levels: Sequence[float]) -> np.ndarray:
         """Quantiles of the parameter itself."""
         scores = self.mean + self.sd * scipy.special.ndtri(np.asarray(levels))
-        return np.asarray(dist.biject_to(prior.support)(scores), float)
+        return np.asarray(_values(dist.biject_to(prior.support), scores), float)
 
     def scores(self, prior: dist.Distribution, draws: Values) -> np.ndarray:
         """Standard scores of draws, in the shape of these."""
@@ -101,8 +103,42 @@ class SharedParameter:
         # length, so that lengths are powers of two.
         padded = np.resize(values, 1 << (values.size - 1).bit_length())
         with jax.enable_x64(True):
-            x = np.asarray(dist.biject_to(prior.support).inv(jnp.asarray(padded)))
+            x = np.asarray(_coordinates_of(dist.biject_to(prior.support), padded))
         return (x[: values.size].reshape(values.shape) - self.mean) / self.sd
+
+
+# Compiled as a whole: by themselves, their operations are dozens of programs for each shape.
+
+
+@jax.jit
+def _values(transform: transforms.Transform, x: Array) -> Array:
+    """Values of unconstrained coordinates."""
+    return transform(x)
+
+
+@jax.jit
+def _coordinates_of(transform: transforms.Transform, values: Array) -> Array:
+    """Unconstrained coordinates of values."""
+    return transform.inv(values)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _drawn(prior: dist.Distribution) -> Array:
+    """Unconstrained coordinates of draws from a prior."""
+    return dist.biject_to(prior.support).inv(prior.sample(jax.random.key(0), (4000,)))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _log_density_derivatives(prior: dist.Distribution, x: Array) -> tuple[Array, Array]:
+    """First and second derivative of the log prior density of an unconstrained coordinate."""
+    transform = dist.biject_to(prior.support)
+
+    def log_density(x: Array) -> Array:
+        value = transform(x)
+        return prior.log_prob(value) + transform.log_abs_det_jacobian(x, value)
+
+    slope = jax.grad(log_density)
+    return slope(x), jax.grad(slope)(x)
 
 
 def as_priors(shared: Sequence[SharedParameter]) -> dict[str, tuple[Any, Any]]:
@@ -116,9 +152,8 @@ def of_priors(
     """The priors themselves as normal distributions, from which the search begins."""
     found = []
     for name in names:
-        draws = priors[name].sample(jax.random.key(0), (4000,))
-        scores = np.asarray(dist.biject_to(priors[name].support).inv(draws), float)
-        found.append(SharedParameter(name, float(scores.mean()), float(scores.std())))
+        x = np.asarray(_drawn(priors[name]), float)
+        found.append(SharedParameter(name, float(x.mean()), float(x.std())))
     return found
 
 
@@ -144,6 +179,8 @@ def estimate_shared(
         dataclasses.replace(method, sampler=None, starts=starts)
         for starts in (1, PixelLaplace.most_starts)
     )
+    # Compiled while the first modes are searched for.
+    engine.begin(_slopes, names, pixels, np.zeros((1, DRAWS, engine.program.size), engine.dtype))
     modes, is_last = None, False
     for _ in range(MOST_STEPS):
         now = [
@@ -233,17 +270,10 @@ def _prior_derivatives(
     names: Sequence[str], priors: Mapping[str, dist.Distribution], at: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Slope of the log prior density of the coordinates, and minus its curvature."""
-
-    def log_density(name: str, x: Array) -> Array:
-        transform = dist.biject_to(priors[name].support)
-        value = transform(x)
-        return priors[name].log_prob(value) + transform.log_abs_det_jacobian(x, value)
-
     with jax.enable_x64(True):
-        slopes = [jax.grad(lambda x, n=n: log_density(n, x)) for n in names]
-        first = [float(f(x)) for f, x in zip(slopes, at, strict=True)]
-        second = [float(jax.grad(f)(x)) for f, x in zip(slopes, at, strict=True)]
-    return np.array(first), -np.diag(second)
+        found = [_log_density_derivatives(priors[n], x) for n, x in zip(names, at, strict=True)]
+        first, second = np.array(found, float).T
+    return first, -np.diag(second)
 
 
 class _Batch(BatchFit):
