@@ -76,7 +76,7 @@ def camera() -> None:
             print(pb.diagnostics.map_coverage(maps, in_band)[["answered", "held_95"]].round(3))
     rows = camera_image(None).isel(y=slice(ONE_BY_ONE))
     begun = time.perf_counter()
-    maps = pb.fit_pixels(rows, method=pb.methods.PixelByPixel())
+    maps = pb.fit_pixels(rows, method=pb.methods.PixelImportance())
     seconds = time.perf_counter() - begun
     print(f"one by one, {ONE_BY_ONE * CAMERA_SIDE} pixels: {seconds:.0f} s with compilation")
     print(pb.diagnostics.map_coverage(maps, rows)[["answered", "held_95"]].round(3))

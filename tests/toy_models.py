@@ -50,3 +50,16 @@ def funnel(data, scene, priors, links) -> None:
     numpyro.sample("inside", dist.Normal(0.0, jnp.exp(0.5 * width)))
     with numpyro.plate("view", data.shape[-1]):
         numpyro.sample("q", dist.Normal(0.0, NOISE), obs=data.readings["q"])
+
+
+BEND = 0.02
+
+
+def bent(data, scene, priors, links) -> None:
+    """Readings that say nothing of a narrow ridge along a parabola, and of a place on it."""
+    del scene, priors, links
+    along = numpyro.sample("along", dist.Normal(0.0, 1.0))
+    numpyro.sample("across", dist.Normal(along**2, BEND))
+    numpyro.sample("place", dist.Normal(along, BEND))
+    with numpyro.plate("view", data.shape[-1]):
+        numpyro.sample("q", dist.Normal(0.0, NOISE), obs=data.readings["q"])

@@ -191,7 +191,7 @@ def map_(
     given: dict[str, Any] = {} if draws is None else {"draws": draws}
     methods: dict[str, Any] = {
         "laplace": pb.methods.PixelLaplace(**given),
-        "importance": pb.methods.PixelByPixel(),
+        "importance": pb.methods.PixelImportance(),
         "tempered": pb.methods.PixelSMC(),
     }
     maps = pb.maps.map_file(capture, out, method=methods[method], **settings)

@@ -27,6 +27,10 @@ BATCH = 128
 SMALL_BATCH = 4
 """The same where each pixel has chains or particles of its own."""
 
+DRAW_BATCH = 64
+"""Draws of one pixel that are evaluated together: more are shared among cores that then wait for
+each other."""
+
 MOST_PROGRAMS = 64
 
 MOMENTS = 4000

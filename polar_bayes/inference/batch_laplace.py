@@ -3,7 +3,7 @@
 Each pixel takes the first of these that can be trusted: quasi-random draws of the normal
 approximation at the mode, weighted by Pareto-smoothed importance sampling; draws of Student t
 proposals that are fitted to the weighted draws of the previous round (population Monte Carlo);
-draws of a sampler (`PixelByPixel`, `PixelNuts` or `PixelSMC`), which also fits pixels whose mode
+draws of a sampler (`PixelImportance`, `PixelNuts` or `PixelSMC`), which also fits pixels whose mode
 was not found.
 """
 
@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference.batch_engine import BatchEngine
+from polar_bayes.inference.batch_importance import PixelImportance
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
-from polar_bayes.inference.batch_one_by_one import PixelByPixel
 from polar_bayes.inference.batching import (
     MethodUsed,
     Status,
@@ -98,7 +98,7 @@ class PixelLaplace(AbstractPixelMethod):
             draws, is fitted to its own weighted draws, until it has neither; >= 0. Without weights
             there are none.
         sampler: The method of pixels that still have, and of those whose mode was not found, such
-            as `PixelByPixel()` or `PixelNuts()`; None marks them only, and so do maps without
+            as `PixelImportance()` or `PixelNuts()`; None marks them only, and so do maps without
             weights.
 
     Raises:
@@ -110,7 +110,7 @@ class PixelLaplace(AbstractPixelMethod):
     candidates: int = PRIOR_DRAWS
     starts: int | None = None
     rounds: int = 3
-    sampler: AbstractPixelMethod | None = dataclasses.field(default_factory=PixelByPixel)
+    sampler: AbstractPixelMethod | None = dataclasses.field(default_factory=PixelImportance)
 
     memory_limit: ClassVar[int] = 4096
     most_starts: ClassVar[int] = 1 + len(RESTARTS)

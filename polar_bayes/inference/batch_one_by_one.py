@@ -9,8 +9,7 @@ import numpy as np
 from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batching import Outcome
-from polar_bayes.inference.laplace import Importance
-from polar_bayes.inference.levenberg_marquardt import NormalApproximation, find_all_modes
+from polar_bayes.inference.levenberg_marquardt import NormalApproximation
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.problem import CompiledModel
 from polar_bayes.inference.program import THREADS, Values
@@ -21,13 +20,10 @@ class PixelByPixel(AbstractPixelMethod):
     """A method of one capture in every pixel, with its own search for modes and its own judgment.
 
     Args:
-        method: Of each pixel. By default draws at all modes and along the profiles through them,
-            whose mixture is fitted again until Pareto k is at most 0.5.
+        method: Of each pixel, such as `Importance(draws=4096)`.
     """
 
-    method: AbstractMethod = dataclasses.field(
-        default_factory=lambda: Importance(draws=2048, rounds=6)
-    )
+    method: AbstractMethod
 
     @override
     def thinning(self, count: int) -> int:
@@ -37,14 +33,9 @@ class PixelByPixel(AbstractPixelMethod):
     def fit(
         self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
     ) -> None:
-        known: list[np.ndarray | None] = [None] * at.size
-        if modes is not None:  # the search of many pixels at once is compiled, and faster
-            known = find_all_modes(batch.engine, batch.pixels.subset(at))
         compiled = batch.engine.programs.of("one by one", lambda: _compiled_model(batch.engine))
 
-        def run(
-            pixel: int, starts: np.ndarray | None
-        ) -> tuple[np.ndarray, Outcome, list[tuple[Values, np.ndarray]]]:
+        def run(pixel: int) -> tuple[np.ndarray, Outcome, list[tuple[Values, np.ndarray]]]:
             one, found = np.array([pixel]), []
             outcome = self.method.run_batch(
                 compiled,
@@ -52,12 +43,11 @@ class PixelByPixel(AbstractPixelMethod):
                 batch.keys[one, -1],  # a number of the pixel's own, on which its answer depends
                 batch.seed,
                 lambda _, draws, weights: found.append((draws, weights)),
-                [starts],
             )
             return one, outcome, found
 
         with ThreadPoolExecutor(THREADS) as pool:
-            for one, outcome, found in pool.map(run, at, known):
+            for one, outcome, found in pool.map(run, at):
                 if np.isnan(batch.outcome.pareto_k[one]):  # else it is that of another proposal
                     batch.outcome.pareto_k[one] = outcome.pareto_k
                 for draws, weights in found:

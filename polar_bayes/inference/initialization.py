@@ -55,9 +55,6 @@ LARGEST_DENSE = 60
 """Most coordinates whose covariance a warm-up of some hundred draws can estimate. The posterior of
 the common parameters can have any shape with few groups; with many it is close to normal."""
 
-Starts = np.ndarray | None
-"""Unconstrained vectors from which modes are searched, (start, size); None: draws of the prior."""
-
 Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 """Unconstrained draws (chain, draw, size), and statistics, each (chain, draw)."""
 
@@ -308,10 +305,8 @@ class AbstractInitializer(abc.ABC):
     """The search for modes in all captures of one layout."""
 
     @abc.abstractmethod
-    def find(
-        self, data: Observations, key: Array, progress: Progress, starts: Starts = None
-    ) -> AbstractInit:
-        """The modes of one capture, by default from prior draws; a `FitError` where it has none."""
+    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
+        """The modes of one capture, searched from prior draws; a `FitError` where it has none."""
 
     def prepare(self, data: Observations) -> None:
         """Begin to compile what `find` needs; nothing by default."""
@@ -338,12 +333,9 @@ class JointInitializer(AbstractInitializer):
         return JitOnce(functools.partial(_guide, self.program))
 
     @override
-    def find(
-        self, data: Observations, key: Array, progress: Progress, starts: Starts = None
-    ) -> AbstractInit:
+    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
         potential = NumpyPotential(self.program.value_and_gradient, data, data.brightness.dtype)
-        if starts is None:
-            starts = from_prior(self.program, key, STARTS, data)
+        starts = from_prior(self.program, key, STARTS, data)
         modes = find_modes(potential, starts, progress)
         metadata = {
             "starts": modes.starts,
@@ -383,10 +375,7 @@ class HierarchicalInitializer(AbstractInitializer):
     reparam: HierarchicalReparam
 
     @override
-    def find(
-        self, data: Observations, key: Array, progress: Progress, starts: Starts = None
-    ) -> AbstractInit:
-        del starts  # each group is searched from draws of its own
+    def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
         fitted = fit_reparam(self.group_model, self.reparam, data, key, progress)
         modes = fitted.modes
         metadata = {

@@ -17,10 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 import scipy.special
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.initialization import Coordinates
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import SETTLED
 from polar_bayes.inference.problem import Problem
@@ -127,12 +126,15 @@ class Importance(AbstractMethod):
         initialization = problem.initialize(progress)
         key_draw, key_resample = jax.random.split(key)
         coordinates = initialization.joint_coordinates("Importance")
-        sample = _Rounds(coordinates, self, problem.dtype)
-        sample.add(profile_mixture(coordinates), key_draw)
-        while sample.calls_for_more and len(sample.proposals) < self.rounds:
+        sample = Rounds(self.draws, self.rounds)
+        proposal = profile_mixture(coordinates)
+        while True:
+            sample.weigh(coordinates.log_density(sample.draw(proposal, key_draw)))
+            if not sample.calls_for_more:
+                break
             progress("weighting draws", len(sample.proposals) / self.rounds)
             key_draw, key_fit = jax.random.split(key_draw)
-            sample.add(sample.fit(key_fit), key_draw)
+            proposal = sample.fit(key_fit)
         weights, k_hat = sample.weights, sample.k_hat
         if not np.isfinite(weights).all():
             raise FitError(
@@ -198,28 +200,41 @@ FITTED_PER_SIZE = 10
 raised to a power below 1."""
 
 
-class _Rounds:
+class Rounds:
     """Draws of all rounds, weighted over the mean density of their proposals."""
 
-    def __init__(self, coordinates: Coordinates, settings: Importance, dtype: np.dtype) -> None:
-        self._coordinates, self._settings = coordinates, settings
+    def __init__(self, draws: int, rounds: int) -> None:
+        self._draws, self._rounds = draws, rounds
         self.proposals: list[Mixture] = []
-        size = coordinates.modes.z.shape[1]
-        self.z, self.log_posterior = np.empty((0, size), dtype), np.empty(0)
+        self._z: list[np.ndarray] = []
+        self._log_posterior: list[np.ndarray] = []
         self._log_proposals = np.empty((0, 0))  # (proposal, draw)
 
-    def add(self, proposal: Mixture, key: Array) -> None:
-        """Draw from one more proposal, and weigh all draws anew."""
-        count = self._settings.draws
-        z, log_proposal = (np.asarray(x) for x in _propose(proposal, count, key))
+    @property
+    def z(self) -> Float[np.ndarray, "draw size"]:
+        """Draws of all rounds."""
+        return np.concatenate(self._z)
+
+    @property
+    def log_posterior(self) -> Float[np.ndarray, " draw"]:
+        """Their log posterior densities."""
+        return np.concatenate(self._log_posterior)
+
+    def draw(self, proposal: Mixture, key: Array) -> np.ndarray:
+        """Draws of one more proposal, (draw, size), to be weighed next."""
+        z, log_proposal = map(np.asarray, _propose(proposal, self._draws, key))
         older = [np.asarray(_log_densities(each, z)) for each in self.proposals]
-        newer = [np.asarray(_log_densities(proposal, block)) for block in self._blocks()]
-        above = np.concatenate([self._log_proposals, np.reshape(older, (-1, count))], axis=1)
+        newer = [np.asarray(_log_densities(proposal, block)) for block in self._z]
+        above = np.concatenate([self._log_proposals, np.reshape(older, (-1, len(z)))], axis=1)
         below = np.concatenate([*newer, log_proposal])
         self._log_proposals = np.concatenate([above, below[None]])
         self.proposals.append(proposal)
-        self.z = np.concatenate([self.z, z])
-        self.log_posterior = np.concatenate([self.log_posterior, self._coordinates.log_density(z)])
+        self._z.append(z)
+        return z
+
+    def weigh(self, log_posterior: np.ndarray) -> None:
+        """Weigh the last draws by their log posterior densities, and all others anew."""
+        self._log_posterior.append(log_posterior)
         mean = scipy.special.logsumexp(self._log_proposals, axis=0) - math.log(len(self.proposals))
         self.log_ratios = self.log_posterior - mean
         weights, k_hat = smooth(self.log_ratios[None])
@@ -229,21 +244,19 @@ class _Rounds:
     @property
     def calls_for_more(self) -> bool:
         """Whether a further round is needed, and there are draws to which it can be fitted."""
-        enough = self.effective >= ENOUGH_SHARE * self._settings.draws
-        reaches = self.k_hat <= FINITE_VARIANCE
-        return bool(np.isfinite(self.weights).all()) and not (enough and reaches)
+        enough = self.effective >= ENOUGH_SHARE * self._draws and self.k_hat <= FINITE_VARIANCE
+        is_last = len(self.proposals) == self._rounds
+        return not (enough or is_last) and bool(np.isfinite(self.weights).all())
 
     def fit(self, key: Array) -> Mixture:
         """A mixture for the next round."""
-        weights = _temper(self.log_ratios, FITTED_PER_SIZE * self.z.shape[1])
+        z = self.z
+        weights = _temper(self.log_ratios, FITTED_PER_SIZE * z.shape[1])
         # One length compiles once: the draws of rounds to come have no weight.
-        missing = self._settings.rounds * self._settings.draws - len(self.z)
-        z = np.pad(self.z, ((0, missing), (0, 0)))
+        missing = self._rounds * self._draws - len(z)
+        z = np.pad(z, ((0, missing), (0, 0)))
         padded = np.pad(weights, (0, missing)).astype(z.dtype)
         return _fit_mixture(jnp.asarray(z), jnp.asarray(padded), COMPONENTS, key)
-
-    def _blocks(self) -> list[np.ndarray]:
-        return np.split(self.z, len(self.proposals)) if self.proposals else []
 
 
 _fit_mixture = functools.partial(jax.jit, static_argnums=2)(fit_mixture)

@@ -275,6 +275,8 @@ class LMState(NamedTuple):
     decrement: Float[AnyArray, ""]
     steps: Int[AnyArray, ""]
     settled: Bool[AnyArray, ""]
+    free: Float[AnyArray, " size"]
+    """One for each coordinate, zero for those that stay where they are."""
 
 
 class NormalApproximation(NamedTuple):
@@ -314,6 +316,7 @@ def init(z: Float[np.ndarray, "pixel size"]) -> LMState:
         decrement=unknown,
         steps=np.zeros(count, np.int32),
         settled=np.zeros(count, bool),
+        free=np.ones_like(z),
     )
 
 
@@ -322,6 +325,9 @@ def step(
 ) -> LMState:
     """One damped step, taken only where it decreases the potential."""
     value, gradient, curvature = state.derivatives
+    free = state.free
+    gradient = free * gradient
+    curvature = free[:, None] * curvature * free + jnp.diag(1.0 - free)
     scale = jnp.maximum(jnp.abs(jnp.diagonal(curvature)), jnp.finfo(value.dtype).tiny)
     root = inverse(cholesky(curvature + state.damping * jnp.diag(scale)))
     whitened = root @ gradient
@@ -348,6 +354,7 @@ def step(
         decrement=jnp.where(is_possible & ~is_first, decrement, jnp.inf),
         steps=state.steps + ~is_first,
         settled=accepted & ~is_first & (decrement < goal) & (state.damping <= FIRST_DAMPING),
+        free=free,
     )
     return jax.tree.map(lambda new, old: jnp.where(state.settled, old, new), moved, state)
 
@@ -384,6 +391,9 @@ SINGLE_PASSES, EXACT_PASSES = (5, 4, 8, 16, 32), (1, 1, 1, 2, 4, 8, 16)
 evaluates the derivatives, which is enough for most pixels. The expected information is positive
 definite everywhere and exact curvature is not, so that the long way is gone with the former:
 narrow lobes take up to 60 steps."""
+
+CONDITIONAL_PASSES = (4, 4, 8, 16, 32)
+"""Steps of the passes to a mode given one coordinate: bent ridges take about forty."""
 
 SINGLE_GOAL = 1e-4
 """The Newton decrement, in posterior sds, at which steps in single precision stop."""
@@ -485,24 +495,39 @@ def find_modes_again(engine: BatchEngine, pixels: ObservationBatch) -> ModeSearc
     return found
 
 
-def find_all_modes(engine: BatchEngine, pixels: ObservationBatch) -> list[np.ndarray | None]:
-    """Distinct modes of every pixel, (mode, size), the heaviest first; None where there is none."""
+def find_all_modes(
+    engine: BatchEngine, pixels: ObservationBatch
+) -> tuple[Int[np.ndarray, " mode"], NormalApproximation]:
+    """Distinct modes of all pixels, and the index of the pixel that each belongs to."""
     ends: list[NormalApproximation] = []
     is_new: list[np.ndarray] = []
-    starts = find_starts(engine, pixels)
+    starts, first = find_starts(engine, pixels), None
     for rank in range(starts.shape[1]):
-        mode, _, converged = find_modes_from(engine, pixels, starts[:, rank])
+        search = find_modes_from(engine, pixels, starts[:, rank], first)
+        first, (mode, _, converged) = first or search, search
         for other, kept in zip(ends, is_new, strict=True):
             converged = converged & ~(kept & (other.distance(mode.z) < SAME_MODE))
         ends.append(mode)
         is_new.append(converged)
-    evidence = np.where(is_new, [mode.log_evidence for mode in ends], -np.inf)
-    order = np.argsort(-evidence, axis=0, kind="stable")
-    z = np.stack([mode.z for mode in ends])
-    modes: list[np.ndarray | None] = []
-    for pixel, count in enumerate(np.sum(is_new, axis=0)):
-        modes.append(z[order[:count, pixel], pixel] if count else None)
-    return modes
+    rank, owner = np.nonzero(is_new)
+    return owner, jax.tree.map(lambda *each: np.stack(each)[rank, owner], *ends)
+
+
+def find_conditional_modes(
+    engine: BatchEngine,
+    pixels: ObservationBatch,
+    z: Float[np.ndarray, "pixel size"],
+    fixed: Int[np.ndarray, " pixel"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The mode near a vector of each pixel given one of its coordinates; potential and Hessian."""
+    free = 1.0 - np.eye(z.shape[1], dtype=engine.dtype)[fixed]
+    state = jax.tree.map(np.array, init(z.astype(engine.dtype))._replace(free=free))
+    for count in CONDITIONAL_PASSES:
+        left = np.flatnonzero(~state.settled)
+        if left.size:
+            put_rows(state, left, _advance(engine, pixels, state, left, count, single=False))
+    value, _, curvature = state.derivatives
+    return np.asarray(state.z), np.asarray(value), np.asarray(curvature)
 
 
 def _starts(engine: BatchEngine, candidates: int) -> JitOnce:

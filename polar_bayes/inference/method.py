@@ -5,7 +5,7 @@ import dataclasses
 import difflib
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Self, override
 
 import jax
@@ -259,12 +259,8 @@ class AbstractMethod(AbstractBatchMethod[CompiledModel]):
         numbers: np.ndarray,
         seed: int,
         describe: Describe,
-        starts: Sequence[np.ndarray | None] | None = None,
     ) -> Outcome:
-        """Fit one capture after another, and describe nearly independent draws of each.
-
-        `starts` are vectors from which modes are searched, (start, size); None: draws of the prior.
-        """
+        """Fit one capture after another, and describe nearly independent draws of each."""
         # Chains are thinned to every k-th draw, where k is the number of draws over the smallest
         # bulk effective sample size of all parameters, rounded up. A fit that must not be trusted
         # is described all the same.
@@ -278,8 +274,7 @@ class AbstractMethod(AbstractBatchMethod[CompiledModel]):
         for at, number in enumerate(numbers):
             with jax.enable_x64(double):  # a thread does not inherit it
                 key_search, key_draws = jax.random.split(jax.random.fold_in(base, int(number)))
-                known = None if starts is None else starts[at]
-                problem = Problem(engine, observations.pixel(at), key_search, starts=known)
+                problem = Problem(engine, observations.pixel(at), key_search)
                 try:
                     draws = self.run(problem, key_draws, no_progress)
                 except (FitError, np.linalg.LinAlgError):  # no mode, or no width around it

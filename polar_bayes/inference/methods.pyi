@@ -2,6 +2,7 @@ from .auto import (
     STUDY_METHODS as STUDY_METHODS,
     Auto as Auto,
 )
+from .batch_importance import PixelImportance as PixelImportance
 from .batch_laplace import PixelLaplace as PixelLaplace
 from .batch_nuts import PixelNuts as PixelNuts
 from .batch_one_by_one import PixelByPixel as PixelByPixel

@@ -11,7 +11,7 @@ acceptance leads to (Betancourt 2016, arXiv:1604.00695), and needs no new compil
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Self, override
 
@@ -179,12 +179,10 @@ class Nuts(AbstractMethod):
         numbers: np.ndarray,
         seed: int,
         describe: Describe,
-        starts: Sequence[np.ndarray | None] | None = None,
     ) -> Outcome:
         # Several batches run at once, each on a thread of its own.
         on_one = dataclasses.replace(self, threads=1)
-        given = engine, observations, numbers, seed, describe, starts
-        return AbstractMethod.run_batch(on_one, *given)
+        return AbstractMethod.run_batch(on_one, engine, observations, numbers, seed, describe)
 
 
 # --- Chains -------------------------------------------------------------------------------------

@@ -115,15 +115,12 @@ class Problem:
         key: Random key of the search for modes.
         start_time: When the fit was asked for, on the clock of `time.perf_counter`, unit second;
             time limits count from there.
-        starts: Unconstrained vectors from which modes are searched, (start, size); by default draws
-            from the prior.
     """
 
     compiled_model: CompiledModel
     data: Observations
     key: Array
     start_time: float = dataclasses.field(default_factory=time.perf_counter)
-    starts: np.ndarray | None = None
     _search: _ModeSearch = dataclasses.field(default_factory=_ModeSearch, init=False, repr=False)
 
     @property
@@ -161,7 +158,7 @@ class Problem:
         if self._search.found is None:
             begun = time.perf_counter()
             find = self.compiled_model.initializer.find
-            found = find(self.data, self.key, progress, self.starts)
+            found = find(self.data, self.key, progress)
             self._search.seconds = time.perf_counter() - begun
             self._search.found = found
         return self._search.found

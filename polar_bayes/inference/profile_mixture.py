@@ -11,13 +11,13 @@ Source:
     mode); Geweke (1989), Econometrica 57, 1317-1339 (proposals widened along each axis).
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
-from jaxtyping import DTypeLike
+from jaxtyping import DTypeLike, Float, Int
 
 from polar_bayes.inference.initialization import Coordinates
 from polar_bayes.inference.optimize import (
@@ -45,69 +45,113 @@ MOST_COORDINATES = 20
 """Posteriors of more coordinates are described by their modes alone."""
 
 COMPONENTS = 64
-"""Of the mixture, at least: one program draws from those of most posteriors."""
+"""Of the mixture, or a multiple: one program draws from those of most posteriors."""
 
 
-class _Component(NamedTuple):
-    x: np.ndarray
-    covariance: np.ndarray
-    log_evidence: float
+class Peaks(NamedTuple):
+    """Modes of one posterior or of several, and the normal distributions there."""
+
+    z: Float[np.ndarray, "peak size"]
+    value: Float[np.ndarray, " peak"]
+    covariance: Float[np.ndarray, "peak size size"]
 
 
-def profile_mixture(coordinates: Coordinates) -> Mixture:
-    """Normal components at every heavy mode, and along its profiles."""
-    modes = coordinates.modes
-    dtype = jnp.asarray(modes.z).dtype  # of the fit: modes are searched in double precision
-    components: list[_Component] = []
-    with ignore_line_search_warnings():
-        for mode in np.flatnonzero(modes.weight >= LEAST_WEIGHT):
-            z, covariance = modes.z[mode], modes.covariance[mode]
-            evidence = -coordinates.potential(z)[0] + 0.5 * np.linalg.slogdet(covariance)[1]
-            components.append(_Component(z, covariance, evidence))
-            if z.size <= MOST_COORDINATES:
-                components += _along_profiles(coordinates, z, covariance, dtype)
-    evidence = np.array([each.log_evidence for each in components])
+class Components(NamedTuple):
+    """Normal distributions, and the number of the peak that each belongs to."""
+
+    peak: Int[np.ndarray, " component"]
+    z: Float[np.ndarray, "component size"]
+    covariance: Float[np.ndarray, "component size size"]
+    log_evidence: Float[np.ndarray, " component"]
+
+
+Conditional = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Modes of all coordinates but one, (row, size), the potentials there, and the Hessians, which may
+be NaN where the potential is more than `LARGEST_DROP` above that of the peak."""
+
+ConditionalModes = Callable[[np.ndarray, np.ndarray, np.ndarray], Conditional]
+"""From numbers of peaks, (row,), vectors near the modes, and the coordinate that stays of each."""
+
+
+def profile_components(peaks: Peaks, axes: np.ndarray, conditional: ConditionalModes) -> Components:
+    """Normal distributions at every peak, and along its profiles."""
+    size = peaks.z.shape[1]
+    every = np.arange(len(peaks.z))
+    found = [_components(every, *peaks)]
+    sd = np.sqrt(np.diagonal(peaks.covariance, axis1=1, axis2=2))
+    factor = np.linalg.cholesky(peaks.covariance)
+    corners = np.meshgrid(every, axes if size <= MOST_COORDINATES else [], [-1.0, 1.0])
+    peak, axis, sign = (corner.ravel() for corner in corners)
+    axis = axis.astype(int)
+    z, own, step = peaks.z[peak], peaks.covariance[peak], sign * FIRST_STEP * sd[peak, axis]
+    for _ in range(MOST_STEPS):
+        if not peak.size:
+            break
+        # The others are first moved to where a normal distribution has their mean.
+        along = np.take_along_axis(own, axis[:, None, None], axis=1)[:, 0]
+        slope = along / np.take_along_axis(along, axis[:, None], axis=1)
+        z, value, hessian = conditional(peak, z + step[:, None] * slope, axis)
+        curvature = np.swapaxes(factor[peak], 1, 2) @ hessian @ factor[peak]
+        inside = (value - peaks.value[peak] <= LARGEST_DROP) & np.isfinite(curvature).all((1, 2))
+        peak, axis, z, step, value, curvature = (
+            each[inside] for each in (peak, axis, z, step, value, curvature)
+        )
+        values, vectors = np.linalg.eigh(curvature)
+        root = factor[peak] @ vectors / np.sqrt(np.maximum(values, WIDEST**-2))[:, None]
+        own = root @ np.swapaxes(root, 1, 2)
+        found.append(_components(peak, z, value, own))
+        step = step * GROWTH
+    return Components(*map(np.concatenate, zip(*found, strict=True)))
+
+
+def _components(
+    peak: np.ndarray, z: np.ndarray, value: np.ndarray, covariance: np.ndarray
+) -> Components:
+    evidence = -value + 0.5 * np.linalg.slogdet(covariance)[1]
+    return Components(peak, z, covariance, evidence)
+
+
+def mixture_of(components: Components, dtype: DTypeLike) -> Mixture:
+    """The mixture of components, each as heavy as the square root of its evidence."""
     # The square root: tails need more draws than they weigh.
-    share = np.exp(0.5 * (evidence - evidence.max()))
-    which = np.resize(np.arange(share.size), max(COMPONENTS, share.size))
+    share = np.exp(0.5 * (components.log_evidence - components.log_evidence.max()))
+    which = np.resize(np.arange(share.size), COMPONENTS * -(-share.size // COMPONENTS))
     share = (share / np.bincount(which))[which]
-    scale = np.linalg.cholesky(np.stack([components[i].covariance for i in which]))
-    size = modes.z.shape[1]
+    size = components.z.shape[1]
     return Mixture(
         center=jnp.zeros(size, dtype),
         half=jnp.eye(size, dtype=dtype),
         log_share=jnp.asarray(np.log(share / share.sum()), dtype),
-        mean=jnp.asarray(np.stack([components[i].x for i in which]), dtype),
-        scale=jnp.asarray(scale, dtype),
+        mean=jnp.asarray(components.z[which], dtype),
+        scale=jnp.asarray(np.linalg.cholesky(components.covariance)[which], dtype),
     )
 
 
-def _along_profiles(
-    coordinates: Coordinates, mode: np.ndarray, covariance: np.ndarray, dtype: DTypeLike
-) -> Iterator[_Component]:
+def profile_mixture(coordinates: Coordinates) -> Mixture:
+    """Components at every heavy mode of one capture, and along its profiles."""
+    modes = coordinates.modes
+    dtype = jnp.asarray(modes.z).dtype  # of the fit: modes are searched in double precision
     potential = finite_potential(coordinates.potential)
-    sd, factor = np.sqrt(np.diagonal(covariance)), np.linalg.cholesky(covariance)
-    lowest, precision = potential(mode)[0], np.linalg.inv(covariance)
-    for axis in coordinates.axes:
-        others = np.setdiff1d(np.arange(mode.size), axis)
-        half = np.linalg.cholesky(np.linalg.inv(precision[np.ix_(others, others)]))
-        for sign in (-1.0, 1.0):
-            x, own, step = mode, covariance, FIRST_STEP * sd[axis]
-            for _ in range(MOST_STEPS):
-                # The others are first moved to where a normal distribution has their mean.
-                x = x + sign * step * own[axis] / own[axis, axis]
-                x, value = _conditional_mode(potential, x, others, half)
-                if not value - lowest <= LARGEST_DROP:
-                    break
-                hessian = forward_difference_hessian(potential, x, 0.3 * sd, dtype)
-                curvature = factor.T @ symmetrize(hessian) @ factor
-                if not np.isfinite(curvature).all():
-                    break
-                values, vectors = np.linalg.eigh(curvature)
-                root = factor @ vectors / np.sqrt(np.maximum(values, WIDEST**-2))
-                own = root @ root.T
-                yield _Component(x, own, -value + 0.5 * np.linalg.slogdet(own)[1])
-                step *= GROWTH
+    heavy = modes.weight >= LEAST_WEIGHT
+    z, covariance = modes.z[heavy], modes.covariance[heavy]
+    peaks = Peaks(z, np.array([potential(each)[0] for each in z]), covariance)
+    sd, precision = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), np.linalg.inv(covariance)
+
+    def conditional(peak: np.ndarray, z: np.ndarray, axis: np.ndarray) -> Conditional:
+        found = []
+        for at, start, fixed in zip(peak, z, axis, strict=True):
+            others = np.setdiff1d(np.arange(start.size), fixed)
+            half = np.linalg.cholesky(np.linalg.inv(precision[at][np.ix_(others, others)]))
+            x, height = _conditional_mode(potential, start, others, half)
+            hessian = np.full(covariance.shape[1:], np.nan)
+            if height - peaks.value[at] <= LARGEST_DROP:
+                hessian = symmetrize(forward_difference_hessian(potential, x, 0.3 * sd[at], dtype))
+            found.append((x, height, hessian))
+        xs, heights, hessians = map(np.stack, zip(*found, strict=True))
+        return xs, heights, hessians
+
+    with ignore_line_search_warnings():
+        return mixture_of(profile_components(peaks, coordinates.axes, conditional), dtype)
 
 
 def _conditional_mode(

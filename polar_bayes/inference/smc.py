@@ -38,7 +38,7 @@ from jaxtyping import Array, Float
 from scipy.special import ndtr
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine
+from polar_bayes.inference.batch_engine import DRAW_BATCH, SMALL_BATCH, BatchEngine
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status, batched, take_rows
 from polar_bayes.inference.compile import JitOnce
@@ -184,10 +184,6 @@ TARGET_ACCEPTANCE = 0.25
 
 PRIOR_BATCH = 256
 """Prior draws that are evaluated together: thousands leave the cache of a core."""
-
-DRAW_BATCH = 64
-"""Draws of one pixel that are evaluated together: more are shared among cores that then wait for
-each other."""
 
 ENGINE = "tempered"
 """Key of the engine among the programs of a model."""

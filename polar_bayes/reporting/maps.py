@@ -201,6 +201,7 @@ FITTED_BY = {
     "PixelLaplace": "normal approximation of each pixel, checked and corrected",
     "PixelSMC": "tempered sequential Monte Carlo in each pixel",
     "PixelNuts": "NUTS in each pixel",
+    "PixelImportance": "importance sampling from mixtures in each pixel",
     "PixelByPixel": "a method of one capture in each pixel",
 }
 

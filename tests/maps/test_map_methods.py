@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, plate_image
-from toy_models import squared
+from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, planned, plate_image
+from toy_models import BEND, bent, squared
 
 import polar_bayes as pb
+from polar_bayes.inference.batch_method import AbstractPixelMethod
 from polar_bayes.inference.batching import MethodUsed, Status
+from polar_bayes.inference.levenberg_marquardt import find_conditional_modes
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.reporting.text import APPROACHES
 
@@ -59,9 +61,16 @@ def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, tempered: xr.Datase
         assert (np.abs(one - other) < 4.0 * error).all()
 
 
-def test_any_method_of_one_capture_makes_a_map(image: xr.Dataset) -> None:
+@pytest.mark.parametrize(
+    "method",
+    [
+        pb.methods.PixelByPixel(pb.methods.Importance(draws=1024)),
+        pb.methods.PixelImportance(draws=1024),
+    ],
+    ids=["a method of one capture", "all pixels at once"],
+)
+def test_importance_sampling_makes_a_map(image: xr.Dataset, method: AbstractPixelMethod) -> None:
     some = image.isel(y=[0, 1], x=[0, 1])
-    method = pb.methods.PixelByPixel(pb.methods.Importance(draws=1024))
     maps = pb.fit_pixels(some, method=method, **ASKED)
     assert (maps["status"] == Status.GOOD).all()
     assert (maps["approach"] == MethodUsed.IMPORTANCE).all()
@@ -77,6 +86,23 @@ def test_any_method_of_one_capture_makes_a_map(image: xr.Dataset) -> None:
     # A pixel's answer does not depend on the others.
     alone = pb.fit_pixels(some.isel(y=[0], x=[0]), method=method, **ASKED)
     assert (alone[NAMES[0]].values == maps[NAMES[0]].values[:1, :1]).all()
+
+
+def test_modes_given_one_coordinate_are_found_around_a_bend(image: xr.Dataset) -> None:
+    one = image.isel(y=[0], x=[0])
+    plan = planned(one, model=bent)
+    at = {name: int(index) for name, index in plan.engine.program.positions.items()}
+    z, fixed = np.zeros((3, 3)), np.full(3, at["place"])
+    z[:, at["place"]] = place = np.array([-2.0, 0.5, 3.0])
+    pixels = plan.pixels(one).subset(np.zeros(3, int))
+    found, value, _ = find_conditional_modes(plan.engine, pixels, z, fixed)
+    along = place / (1.0 + BEND**2)
+    expected = {"along": along, "across": along**2, "place": place}
+    for name, truth in expected.items():
+        np.testing.assert_allclose(found[:, at[name]], truth, atol=1e-6)
+    # What is left of the potential, beside a constant, is that of the two others.
+    height = 0.5 * (along**2 + ((place - along) / BEND) ** 2)
+    np.testing.assert_allclose(np.diff(value), np.diff(height), rtol=1e-6)
 
 
 def test_a_second_mode_that_another_start_finds_is_not_left_out(image: xr.Dataset) -> None:

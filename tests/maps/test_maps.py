@@ -17,9 +17,9 @@ from polar_bayes.models.per_material import per_material
 from scipy import optimize, stats
 
 import polar_bayes as pb
+from polar_bayes.inference.batch_importance import PixelImportance
 from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batch_nuts import PixelNuts
-from polar_bayes.inference.batch_one_by_one import PixelByPixel
 from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status
 from polar_bayes.inference.levenberg_marquardt import find_modes
 from polar_bayes.inference.program import Program
@@ -271,7 +271,7 @@ def test_a_map_says_what_it_holds_and_how_it_was_made(plan: MapPlan, maps: xr.Da
     assert maps["approach"].attrs["flag_meanings"].split()[MethodUsed.NUTS] == "nuts"
     said = json.loads(maps.attrs[PROVENANCE])
     assert said["seed"] == 0
-    assert PixelLaplace(**{**said["settings"], "sampler": PixelByPixel()}) == plan.settings
+    assert PixelLaplace(**{**said["settings"], "sampler": PixelImportance()}) == plan.settings
     assert said["fixed"] == {"stokes_error_factor": 1.0}
     assert (maps["x"].values == np.arange(100.0, 130.0)).all()
 
