@@ -123,13 +123,15 @@ class BatchEngine:
 
     def prior_draws(self, count: int) -> np.ndarray:
         """Draws from the prior, the starting points of mode searches. (draw, size)."""
+        # Moments need many, and a draw does not depend on how many there are: keys compile once.
+        drawn = max(count, MOMENTS)
 
         def draw() -> np.ndarray:
             with jax.enable_x64(self.precision == "double"):
                 key = jax.random.key(self.seed)
-                return np.asarray(from_prior(self.program, key, count, self.layout))
+                return np.asarray(from_prior(self.program, key, drawn, self.layout))
 
-        return self.programs.of(("prior draws", count), draw)
+        return self.programs.of(("prior draws", drawn), draw)[:count]
 
     @property
     def prior_moments(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:

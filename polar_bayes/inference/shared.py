@@ -63,6 +63,9 @@ DRAWS = 256
 """Resampled draws of each pixel at which derivatives are taken. With 64, Monte Carlo errors are a
 large part of the information of 256 pixels whose readings say little that priors do not."""
 
+SCORED = 2**14
+"""Draws whose scores are computed together."""
+
 LONGEST_STEP, SHRINKAGE, GROWTH, MOST_STEPS = 4.0, 30.0, 2.0, 20
 """Of Newton's method: the longest step in sds of the priors of pixels, how fast these narrow and
 widen, and the number of steps."""
@@ -99,11 +102,11 @@ class SharedParameter:
     def scores(self, prior: dist.Distribution, draws: Values) -> np.ndarray:
         """Standard scores of draws, in the shape of these."""
         values = np.asarray(draws[self.name], float)
-        # Pixels that are fitted one by one have as many draws as they need. JAX compiles for each
-        # length, so that lengths are powers of two.
-        padded = np.resize(values, 1 << (values.size - 1).bit_length())
+        # Some pixels have as many draws as they need, and JAX compiles for each length.
+        blocks = np.resize(values, (-(-values.size // SCORED), SCORED))
         with jax.enable_x64(True):
-            x = np.asarray(_coordinates_of(dist.biject_to(prior.support), padded))
+            transform = dist.biject_to(prior.support)
+            x = np.concatenate([_coordinates_of(transform, block) for block in blocks])
         return (x[: values.size].reshape(values.shape) - self.mean) / self.sd
 
 
