@@ -10,10 +10,8 @@ compilation, on as many pixels as it can do in some seconds.
     scipy      least_squares in a loop, its own differences, normal priors of the coordinates
     guide      AutoLaplaceApproximation in a loop: BFGS, then its Hessian; compiled once
     newton     vmap of 25 damped Newton steps with full Hessians and jax.numpy.linalg
-    ours       `find_modes`: mode and covariance, one thread as the others
-    threads    the same, a thread for each core
-    single     the same in single precision, one thread
-    both       single precision, a thread for each core
+    ours       `find_modes`: mode and covariance, on all cores; the others compute a pixel at a time
+    single     the same in single precision
     weighed    `fit_pixels`: all of it, drawn from, weighed and summarized, on all cores
 
 The second table is the roofline: what one look at a pixel costs in operations and bytes, as the
@@ -22,13 +20,11 @@ multiply-adds that stays in registers, the bandwidth that of a copy; both of one
 """
 
 import dataclasses
-import functools
 import os
 import platform
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -151,14 +147,6 @@ def heights(engine: BatchEngine, pixels: ObservationBatch, z: np.ndarray) -> np.
         return np.asarray(jax.jit(jax.vmap(height))(some.batched, jnp.asarray(z)))
 
 
-def threaded(engine: BatchEngine, pixels: ObservationBatch) -> Callable:
-    """Climbs of equal shares of the pixels, a thread for each core."""
-    cores = os.cpu_count() or 1
-    shares = [pixels.subset(part) for part in np.array_split(np.arange(len(pixels)), cores)]
-    pool = ThreadPoolExecutor(cores)
-    return lambda: list(pool.map(functools.partial(find_modes, engine), shares))
-
-
 def fastest(function: Callable, *given: Any) -> float:
     """Seconds of the fastest of some calls of a compiled function."""
     times = []
@@ -221,9 +209,7 @@ def main(count: int) -> None:
         pixels = plans["double"].pixels(mask_missing(capture))
         many = len(pixels)
         ours, settled = rate(many, lambda: find_modes(engine, pixels))
-        threads, _ = rate(many, threaded(engine, pixels))
         single, near = rate(many, lambda: find_modes(plans["single"].engine, pixels))
-        both, _ = rate(many, threaded(plans["single"].engine, pixels))
         scipy_rate, _ = rate(60, lambda: by_scipy(engine, pixels, 60))
         guide_rate, _ = rate(200, by_guide(engine, pixels, 200))
         newton_rate, newton = rate(1024, by_newton(engine, pixels, 1024))
@@ -235,9 +221,7 @@ def main(count: int) -> None:
         "guide": guide_rate,
         "newton": newton_rate,
         "ours": ours,
-        "threads": threads,
         "single": single,
-        "both": both,
         "weighed": whole,
     }.items():
         ratios = (speed / peer for peer in (scipy_rate, newton_rate, guide_rate))

@@ -6,14 +6,16 @@ compiles each once and keeps it, so all pixels of all images of one layout share
 
 import contextlib
 import dataclasses
+import os
 from collections.abc import Callable, Hashable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from polar_bayes.inference.batching import ObservationBatch, map_batches
+from polar_bayes.inference.batching import ObservationBatch, batches, map_batches
 from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache, cache_key
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.program import Program, compile_program
@@ -32,6 +34,9 @@ DRAW_BATCH = 64
 each other."""
 
 MOST_PROGRAMS = 64
+
+_THREADS = ThreadPoolExecutor(os.cpu_count() or 1, "polar_bayes batches")
+"""That run batches of all images at once: a core is not shared by two."""
 
 MOMENTS = 4000
 """Draws by which the moments of priors are found."""
@@ -73,9 +78,17 @@ class BatchEngine:
         single: bool = False,
     ) -> Any:
         """Run a program on all pixels; `given` arguments are the same for all of them."""
+        double = not single and self.dtype == np.float64
         with self._arguments(pixels, states, given, batch, single=single) as arguments:
-            program = self.compiled(make, settings)
-            return map_batches(lambda index: program(*arguments(index)), len(pixels), batch)
+            first = arguments(next(batches(len(pixels), batch)))
+            program = self.compiled(make, settings).program(*first)  # before the threads start
+
+            def of_batch(index: np.ndarray) -> Any:
+                with jax.enable_x64(double):  # a thread does not inherit it
+                    return program(*arguments(index))
+
+            threads = _THREADS.map if len(pixels) > batch else map
+            return map_batches(of_batch, len(pixels), batch, threads)
 
     def begin[S: Hashable](
         self,

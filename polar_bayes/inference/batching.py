@@ -193,9 +193,11 @@ def batches(count: int, size: int) -> Iterator[np.ndarray]:
         yield np.minimum(np.arange(begin, begin + size), count - 1)
 
 
-def map_batches(function: Callable[[np.ndarray], Any], count: int, size: int) -> Any:
+def map_batches(
+    function: Callable[[np.ndarray], Any], count: int, size: int, over: Callable = map
+) -> Any:
     """Results of a function of the indices of one batch, joined along the pixel axis."""
-    parts = [jax.tree.map(np.asarray, function(index)) for index in batches(count, size)]
+    parts = over(lambda index: jax.tree.map(np.asarray, function(index)), batches(count, size))
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
