@@ -83,8 +83,10 @@ class BatchEngine:
             first = arguments(next(batches(len(pixels), batch)))
             program = self.compiled(make, settings).program(*first)  # before the threads start
 
+            device = jax.config.jax_default_device
+
             def of_batch(index: np.ndarray) -> Any:
-                with jax.enable_x64(double):  # a thread does not inherit it
+                with jax.enable_x64(double), jax.default_device(device):  # no thread inherits them
                     return program(*arguments(index))
 
             threads = _THREADS.map if len(pixels) > batch else map
@@ -95,13 +97,14 @@ class BatchEngine:
         make: Callable[["BatchEngine", S], JitOnce],
         settings: S,
         pixels: ObservationBatch,
-        state: Any,
+        *states: Any,
         given: tuple = (),
+        single: bool = False,
     ) -> None:
-        """Begin to compile what `run` needs, in parallel with what follows; one state is enough."""
+        """Begin to compile what `run` needs, in parallel with what follows, given one state."""
         program = self.compiled(make, settings)
         if not program.is_begun:
-            with self._arguments(pixels, (state,), given, BATCH, single=False) as arguments:
+            with self._arguments(pixels, states, given, BATCH, single=single) as arguments:
                 program.begin(*arguments(np.zeros(BATCH, int)))
 
     @contextlib.contextmanager

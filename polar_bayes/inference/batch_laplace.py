@@ -203,6 +203,7 @@ class _Run:
         starts = self.settings.starts or (PixelLaplace.most_starts if weighted else 1)
         if known is None:
             ranked = find_starts(self.engine, self.pixels, candidates)
+            self._begin_draws()
         else:
             ranked = known[:, None]
         search = find_modes_from(self.engine, self.pixels, ranked[:, 0])
@@ -243,6 +244,14 @@ class _Run:
         states, given = (tuple(np.float32(x) for x in each) for each in (proposal, points))
         some, weighted = self.pixels.subset(which), self.settings.weighted
         return self.engine.run(_draws, weighted, some, *states, given=given, single=True)
+
+    def _begin_draws(self) -> None:
+        """Compile while modes are searched."""
+        size = self.points.z.shape[1]
+        shapes = (1, size), (1, size, size), self.points.z.shape, self.points.log_density.shape
+        *states, z, log_density = (np.zeros(shape, np.float32) for shape in shapes)
+        given, weighted = (z, log_density), self.settings.weighted
+        self.engine.begin(_draws, weighted, self.pixels, *states, given=given, single=True)
 
     def record(self, found: Approximation) -> None:
         """Normal approximations, corrected by their weights where these can be trusted."""

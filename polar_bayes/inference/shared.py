@@ -103,7 +103,7 @@ class SharedParameter:
         """Standard scores of draws, in the shape of these."""
         values = np.asarray(draws[self.name], float)
         # Some pixels have as many draws as they need, and JAX compiles for each length.
-        blocks = np.resize(values, (-(-values.size // SCORED), SCORED))
+        blocks = np.resize(values, (max(1, -(-values.size // SCORED)), SCORED))
         with jax.enable_x64(True):
             transform = dist.biject_to(prior.support)
             x = np.concatenate([_coordinates_of(transform, block) for block in blocks])
@@ -208,11 +208,15 @@ def estimate_shared(
         if not ratio < WIDE:
             # Under a wide prior the posterior of a pixel, divided by that prior, says more than
             # derivatives do (expectation propagation).
-            inverse = np.linalg.inv(found.covariance) * (1.0 - (sd.size + 1) / (DRAWS - 1))
+            inverse = np.linalg.pinv(found.covariance, hermitian=True)
+            inverse *= 1.0 - (sd.size + 1) / (DRAWS - 1)
             total = slope + np.einsum("pij,pj->i", inverse, found.mean - mean)
             whole = curvature + np.sum(inverse - np.diag(sd**-2.0), axis=0)
         if not np.isfinite(_precision(whole)).all():
-            whole = np.diag(sd**-2.0) * count**0.5
+            # Monte Carlo errors hide what some directions say; others may be known well.
+            known, directions = np.linalg.eigh(sd[:, None] * whole * sd)
+            root = directions / sd[:, None] * np.sqrt(np.maximum(known, count**0.5))
+            whole = root @ root.T
         step, reached = np.linalg.solve(whole, total), _precision(whole) ** -0.5
         is_settled = bool(ratio < NARROW and np.all(np.abs(step) < SETTLED * reached))
         if is_settled and is_last:

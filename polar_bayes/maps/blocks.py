@@ -40,12 +40,16 @@ AHEAD = 2
 """Blocks that wait for each that is being fitted: none idles, and memory stays small."""
 
 
+BLOCK_THREADS = "polar_bayes blocks"
+"""Prefix of the names of threads that fit blocks."""
+
+
 @contextlib.contextmanager
 def workers(scheduler: str | None) -> Iterator[tuple[Executor, int]]:
     """Something that runs functions, and how many at a time."""
     if scheduler is None:
         threads = os.cpu_count() or 1
-        pool = ThreadPoolExecutor(threads)
+        pool = ThreadPoolExecutor(threads, BLOCK_THREADS)
         try:
             yield pool, threads
         except BaseException:  # an interrupt must not wait for blocks that take minutes

@@ -10,6 +10,7 @@ from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, planned, plate_i
 from toy_models import BEND, bent, squared
 
 import polar_bayes as pb
+from polar_bayes.inference import batch_importance
 from polar_bayes.inference.batch_method import AbstractPixelMethod
 from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.levenberg_marquardt import find_conditional_modes
@@ -86,6 +87,18 @@ def test_importance_sampling_makes_a_map(image: xr.Dataset, method: AbstractPixe
     # A pixel's answer does not depend on the others.
     alone = pb.fit_pixels(some.isel(y=[0], x=[0]), method=method, **ASKED)
     assert (alone[NAMES[0]].values == maps[NAMES[0]].values[:1, :1]).all()
+
+
+def test_a_pixel_without_a_mode_is_searched_by_the_method_of_one_capture(
+    image: xr.Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = image.isel(y=[0], x=[0])
+    monkeypatch.setattr(batch_importance, "find_all_modes", lambda *_: (np.zeros(0, int), None))
+    maps = pb.fit_pixels(one, method=pb.methods.PixelImportance(draws=1024), **ASKED)
+    assert (maps["status"] == Status.GOOD).all()
+    mean, sd, _ = on_a_grid(one["q"].values[0, 0], NOISE, VIEWS)[NAMES[0]]
+    error = sd / np.sqrt(float(maps["effective_draws"][0, 0]))
+    assert abs(float(maps[NAMES[0]][0, 0]) - mean) < 4.5 * error
 
 
 def test_modes_given_one_coordinate_are_found_around_a_bend(image: xr.Dataset) -> None:

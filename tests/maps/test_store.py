@@ -6,6 +6,7 @@ import itertools
 import os
 import re
 import shutil
+import threading
 import time
 import tracemalloc
 from pathlib import Path
@@ -22,7 +23,7 @@ from polar_bayes.inference import batch_engine
 from polar_bayes.interrupts import clean_up
 from polar_bayes.maps import lazy
 from polar_bayes.maps import store as module
-from polar_bayes.maps.blocks import workers
+from polar_bayes.maps.blocks import BLOCK_THREADS, workers
 from polar_bayes.maps.fit_map import MapPlan
 from polar_bayes.reporting.report import render
 
@@ -97,6 +98,9 @@ def test_a_store_is_begun_without_holding_the_maps_in_memory(
     tracemalloc.start()
     with pytest.raises(BrokenOff):
         mapped(tmp_path / "large.zarr", tmp_path / "map.zarr")
+    for thread in threading.enumerate():  # Python crashes where one of them still allocates
+        if thread.name.startswith(BLOCK_THREADS):
+            thread.join()
     tracemalloc.stop()
     values = side**2 * len(NAMES) * 9 * 4  # mean, sd and seven quantiles, in single precision
     assert written[0] < values / 4
