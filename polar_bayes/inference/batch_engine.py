@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from polar_bayes.inference.batching import ObservationBatch, batches, map_batches
 from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache, cache_key
@@ -80,10 +81,9 @@ class BatchEngine:
         """Run a program on all pixels; `given` arguments are the same for all of them."""
         double = not single and self.dtype == np.float64
         with self._arguments(pixels, states, given, batch, single=single) as arguments:
-            first = arguments(next(batches(len(pixels), batch)))
-            program = self.compiled(make, settings).program(*first)  # before the threads start
-
-            device = jax.config.jax_default_device
+            program, device = self.compiled(make, settings), jax.config.jax_default_device
+            if not program.is_begun:  # a thread that was abandoned must not trace in another one
+                program.program(*arguments(next(batches(len(pixels), batch))))
 
             def of_batch(index: np.ndarray) -> Any:
                 with jax.enable_x64(double), jax.default_device(device):  # no thread inherits them
@@ -162,6 +162,18 @@ class BatchEngine:
             return {name: two for name, two in moments.items() if np.isfinite(two).all()}
 
         return self.programs.of("prior moments", find)
+
+
+def evaluate_draws(
+    program: Any, z: Float[Array, "draw size"], data: Observations
+) -> tuple[dict[str, Array], Float[Array, " draw"]]:
+    """Parameters and log posterior densities of draws of one pixel; minus infinity for NaN."""
+    parameters, values = jax.lax.map(
+        lambda z: (program.parameters(z, data), program.potential(z, data)),
+        z,
+        batch_size=DRAW_BATCH,
+    )
+    return parameters, jnp.where(jnp.isnan(values), -jnp.inf, -values)
 
 
 _ENGINES: LRUCache[BatchEngine] = LRUCache(4)

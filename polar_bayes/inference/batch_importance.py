@@ -5,6 +5,7 @@ densities of all their draws in compiled programs.
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import override
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.inference.batch_engine import DRAW_BATCH, SMALL_BATCH, BatchEngine
+from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine, evaluate_draws
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batch_one_by_one import PixelByPixel
 from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status, batched, take_rows
@@ -67,17 +68,15 @@ class PixelImportance(AbstractPixelMethod):
         self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
     ) -> None:
         groups = np.array_split(at, max(min(THREADS, at.size), -(-at.size // GROUP)))
-        lost = [np.zeros(0, int)]
+        found: list[int] = []
         with ThreadPoolExecutor(THREADS) as pool:
-            for group, found in zip(
-                groups, pool.map(lambda group: self._fit(batch, group), groups), strict=True
-            ):
-                lost.append(np.setdiff1d(group, [pixel.at for pixel in found]))
-                for pixel in found:
+            for pixels in pool.map(functools.partial(self._fit, batch), groups):
+                for pixel in pixels:
                     pixel.record(batch)
-        left = np.concatenate(lost)
-        if left.size:
-            PixelByPixel(Importance(self.draws, self.rounds)).fit(batch, left)
+                    found.append(pixel.at)
+        lost = np.setdiff1d(at, found)
+        if lost.size:
+            PixelByPixel(Importance(self.draws, self.rounds)).fit(batch, lost)
 
     def _fit(self, batch: BatchFit, at: np.ndarray) -> list["_Pixel"]:
         """Weighted draws of the pixels that have a mode."""
@@ -91,9 +90,9 @@ class PixelImportance(AbstractPixelMethod):
             while left:
                 z = np.stack([found[row].draw() for row in left])
                 some = pixels.subset(np.array(left))
-                values, parameters = engine.run(_densities, self.draws, some, z, batch=SMALL_BATCH)
-                for row, value, *own in zip(left, values, *parameters.values(), strict=True):
-                    found[row].weigh(-value, dict(zip(parameters, own, strict=True)))
+                drawn = engine.run(_densities, self.draws, some, z, batch=SMALL_BATCH)
+                for at_row, row in enumerate(left):
+                    found[row].weigh(*jax.tree.map(lambda x, i=at_row: x[i], drawn))
                 left = [row for row in left if found[row].rounds.calls_for_more]
         return list(found.values())
 
@@ -111,9 +110,9 @@ class _Pixel:
         self._key, key_draw = jax.random.split(self._key)
         return self.rounds.draw(self._proposal, key_draw)
 
-    def weigh(self, log_posterior: np.ndarray, parameters: Values) -> None:
+    def weigh(self, parameters: Values, log_posterior: np.ndarray) -> None:
         """Weigh these draws, and fit a proposal to all where a further round is needed."""
-        self.rounds.weigh(np.where(np.isnan(log_posterior), -np.inf, log_posterior))
+        self.rounds.weigh(log_posterior)
         self._parameters.append(parameters)
         if self.rounds.calls_for_more:
             self._key, key_fit = jax.random.split(self._key)
@@ -122,8 +121,7 @@ class _Pixel:
     def record(self, batch: BatchFit) -> None:
         """The answer, where any draw has a density."""
         one, rounds = np.array([self.at]), self.rounds
-        if np.isnan(batch.outcome.pareto_k[one]):  # else it is that of another proposal
-            batch.outcome.pareto_k[one] = rounds.k_hat
+        batch.record_pareto_k(one, np.array([rounds.k_hat]))
         if np.isfinite(rounds.weights).all():
             draws = jax.tree.map(lambda *rows: np.concatenate(rows)[None], *self._parameters)
             status = Status.GOOD if rounds.k_hat <= MAX_PARETO_K else Status.NOT_TRUSTED
@@ -149,7 +147,6 @@ def _profile_mixtures(
         return find_conditional_modes(engine, pixels.subset(owner[peak]), z, axis)
 
     peaks = Peaks(z, value, np.swapaxes(root, 1, 2) @ root)
-
     components = profile_components(peaks, np.arange(engine.program.size), conditional)
     for pixel in np.unique(owner):
         own = take_rows(components, owner[components.peak] == pixel)
@@ -157,14 +154,11 @@ def _profile_mixtures(
 
 
 def _densities(engine: BatchEngine, draws: int) -> JitOnce:
-    """The program of potentials and parameters of so many draws of one pixel."""
+    """The program of parameters and log posterior densities of so many draws of one pixel."""
     del draws  # programs of other numbers are others
     program = engine.program
 
-    def of_pixel(data: Observations, z: Array) -> tuple[Array, Values]:
-        def of_draw(z: Array) -> tuple[Array, Values]:
-            return program.potential(z, data), program.parameters(z, data)
-
-        return jax.lax.map(of_draw, z, batch_size=DRAW_BATCH)
+    def of_pixel(data: Observations, z: Array) -> tuple[Values, Array]:
+        return evaluate_draws(program, z, data)
 
     return batched(of_pixel, lanes=1)

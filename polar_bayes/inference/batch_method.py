@@ -46,6 +46,11 @@ class BatchFit:
         self.outcome.condition[at] = np.where(found, search.mode.condition, np.nan)
         self.outcome.status[at] = np.where(found, Status.NOT_TRUSTED, Status.NOT_CONVERGED)
 
+    def record_pareto_k(self, at: np.ndarray, pareto_k: np.ndarray) -> None:
+        """Pareto k of pixels that have none; else it is that of an earlier proposal."""
+        known = self.outcome.pareto_k[at]
+        self.outcome.pareto_k[at] = np.where(np.isnan(known), pareto_k, known)
+
     def record(
         self,
         at: np.ndarray,

@@ -48,8 +48,7 @@ class PixelByPixel(AbstractPixelMethod):
 
         with ThreadPoolExecutor(THREADS) as pool:
             for one, outcome, found in pool.map(run, at):
-                if np.isnan(batch.outcome.pareto_k[one]):  # else it is that of another proposal
-                    batch.outcome.pareto_k[one] = outcome.pareto_k
+                batch.record_pareto_k(one, outcome.pareto_k)
                 for draws, weights in found:
                     judged = outcome.effective_draws, outcome.approach, outcome.status
                     batch.record(one, draws, weights, *judged)

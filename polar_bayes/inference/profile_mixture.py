@@ -11,6 +11,7 @@ Source:
     mode); Geweke (1989), Econometrica 57, 1317-1339 (proposals widened along each axis).
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -137,12 +138,16 @@ def profile_mixture(coordinates: Coordinates) -> Mixture:
     peaks = Peaks(z, np.array([potential(each)[0] for each in z]), covariance)
     sd, precision = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), np.linalg.inv(covariance)
 
+    @functools.cache
+    def given_one(at: int, fixed: int) -> tuple[np.ndarray, np.ndarray]:
+        """The other coordinates, and the factor of their covariance."""
+        others = np.setdiff1d(np.arange(z.shape[1]), fixed)
+        return others, np.linalg.cholesky(np.linalg.inv(precision[at][np.ix_(others, others)]))
+
     def conditional(peak: np.ndarray, z: np.ndarray, axis: np.ndarray) -> Conditional:
         found = []
-        for at, start, fixed in zip(peak, z, axis, strict=True):
-            others = np.setdiff1d(np.arange(start.size), fixed)
-            half = np.linalg.cholesky(np.linalg.inv(precision[at][np.ix_(others, others)]))
-            x, height = _conditional_mode(potential, start, others, half)
+        for at, start, fixed in zip(peak.tolist(), z, axis.tolist(), strict=True):
+            x, height = _conditional_mode(potential, start, *given_one(at, fixed))
             hessian = np.full(covariance.shape[1:], np.nan)
             if height - peaks.value[at] <= LARGEST_DROP:
                 hessian = symmetrize(forward_difference_hessian(potential, x, 0.3 * sd[at], dtype))

@@ -38,14 +38,14 @@ from jaxtyping import Array, Float
 from scipy.special import ndtr
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_engine import DRAW_BATCH, SMALL_BATCH, BatchEngine
+from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine, evaluate_draws
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status, batched, take_rows
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.levenberg_marquardt import NormalApproximation
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import CompiledModel, Problem
-from polar_bayes.inference.program import Program, Values
+from polar_bayes.inference.program import Program
 from polar_bayes.inference.proposals import (
     Proposed,
     WeightedSample,
@@ -552,13 +552,7 @@ def _mixture_draws(engine: BatchEngine, settings: PixelSMC) -> JitOnce:
         mixture = fit_mixture(u, weights, settings.components, key_fit)
         drawn = draw_mixture(mixture, settings.draws, key_draw)
         scored = ScoredProgram(engine.single_program, transform)
-
-        def evaluate(u: Array) -> tuple[Values, Array]:
-            return scored.parameters(u, data), scored.potential(u, data)
-
-        parameters, values = jax.lax.map(evaluate, drawn, batch_size=DRAW_BATCH)
-        log_posterior = jnp.where(jnp.isnan(values), -jnp.inf, -values)
-        return Proposed(mixture, drawn, parameters, log_posterior)
+        return Proposed(mixture, drawn, *evaluate_draws(scored, drawn, data))
 
     return batched(pixel, given=2, lanes=1)
 

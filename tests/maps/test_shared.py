@@ -167,7 +167,7 @@ def test_another_number_of_draws_compiles_nothing() -> None:
     draws = np.random.default_rng(0).uniform(0.5, 0.99, 2000)
     whole = gain.scores(prior, {"dolp_gain": draws})
     with compilations() as compiled:
-        for count in (1999, 1500, 0):
+        for count in (1999, 1500, 1025, 0):
             part = gain.scores(prior, {"dolp_gain": draws[:count].reshape(1, count)})
             np.testing.assert_allclose(part[0], whole[:count], rtol=1e-12)
     assert not compiled
