@@ -393,7 +393,7 @@ definite everywhere and exact curvature is not, so that the long way is gone wit
 narrow lobes take up to 60 steps."""
 
 CONDITIONAL_PASSES = (4, 4, 8, 16, 32)
-"""Steps of the passes to a mode given one coordinate: bent ridges take about forty."""
+"""Steps of the passes to a mode given one coordinate: bent ridges take dozens."""
 
 SINGLE_GOAL = 1e-4
 """The Newton decrement, in posterior sds, at which steps in single precision stop."""
