@@ -361,9 +361,9 @@ def step(
 
 @jax.jit
 @jax.vmap
-def finalize(z: Float[Array, " size"], derivatives: Derivatives) -> NormalApproximation:
+def finalize(z: Float[Array, " size"], there: Derivatives) -> NormalApproximation:
     """The last step, with exact curvature, and the normal approximation at its end."""
-    value, gradient, curvature = derivatives
+    value, gradient, curvature = there
     root = inverse(cholesky(curvature))
     whitened = root @ gradient
     covariance = root.T @ root

@@ -3,12 +3,13 @@ r"""A mixture of Laplace approximations along the profiles of a posterior.
 A posterior with an arm, such as a roughness that no view resolves together with an index that makes
 up for it, is not like the normal distribution at its mode, and draws from that never reach the arm.
 From each mode every coordinate is moved outwards in growing steps, the others following to their
-conditional mode, until the density has fallen by `LARGEST_DROP`. Each point on these profiles gets
-a normal distribution with the covariance there.
+conditional mode, until the Laplace approximation to its marginal density has fallen by
+`LARGEST_DROP`. Each point on these profiles gets a normal distribution with the covariance there.
 
 Source:
-    Rue, Martino & Chopin (2009), J. R. Stat. Soc. B 71, 319-392 (exploration along axes from the
-    mode); Geweke (1989), Econometrica 57, 1317-1339 (proposals widened along each axis).
+    Rue, Martino & Chopin (2009), J. R. Stat. Soc. B 71, 319-392 (Laplace approximations to marginal
+    densities; exploration along axes from the mode); Geweke (1989), Econometrica 57, 1317-1339
+    (proposals widened along each axis).
 """
 
 import functools
@@ -34,13 +35,14 @@ LEAST_WEIGHT = 1e-3
 """Share of the Laplace evidence; modes of less get no draws."""
 
 LARGEST_DROP = 4.5
-"""Of the log density along a profile: that of a normal distribution at three sds."""
+"""Of a log marginal density along its profile: that of a normal distribution at three sds."""
 
 FIRST_STEP, GROWTH, MOST_STEPS = 1.5, 1.5, 8
 """Of a profile: the first in posterior sds, each longer than the one before; 74 sds in all."""
 
-WIDEST = 3.0
-"""Standard deviations at a point, at most, in units of those at the mode."""
+WIDEST, WIDEST_UNSURE = 300.0, 3.0
+"""Standard deviations at a point, at most, in units of those at the mode; the second where the
+curvature is not positive definite, so that it says nothing of them."""
 
 MOST_COORDINATES = 20
 """Posteriors of more coordinates are described by their modes alone."""
@@ -67,8 +69,7 @@ class Components(NamedTuple):
 
 
 Conditional = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Modes of all coordinates but one, (row, size), the potentials there, and the Hessians, which may
-be NaN where the potential is more than `LARGEST_DROP` above that of the peak."""
+"""Modes of all coordinates but one, (row, size), the potentials there, and the Hessians."""
 
 ConditionalModes = Callable[[np.ndarray, np.ndarray, np.ndarray], Conditional]
 """From numbers of peaks, (row,), vectors near the modes, and the coordinate that stays of each."""
@@ -93,13 +94,16 @@ def profile_components(peaks: Peaks, axes: np.ndarray, conditional: ConditionalM
         slope = along / np.take_along_axis(along, axis[:, None], axis=1)
         z, value, hessian = conditional(peak, z + step[:, None] * slope, axis)
         curvature = np.swapaxes(factor[peak], 1, 2) @ hessian @ factor[peak]
-        inside = (value - peaks.value[peak] <= LARGEST_DROP) & np.isfinite(curvature).all((1, 2))
-        peak, axis, z, step, value, curvature = (
-            each[inside] for each in (peak, axis, z, step, value, curvature)
-        )
-        values, vectors = np.linalg.eigh(curvature)
-        root = factor[peak] @ vectors / np.sqrt(np.maximum(values, WIDEST**-2))[:, None]
+        known = np.isfinite(value) & np.isfinite(curvature).all((1, 2))
+        values, vectors = np.linalg.eigh(np.where(known[:, None, None], curvature, np.eye(size)))
+        widest = np.where(values[:, :1] > 0.0, WIDEST, WIDEST_UNSURE)
+        root = factor[peak] @ vectors / np.sqrt(np.maximum(values, widest**-2))[:, None]
         own = root @ np.swapaxes(root, 1, 2)
+        at_peak = _log_marginal(axis, peaks.value[peak], peaks.covariance[peak])
+        inside = known & (at_peak - _log_marginal(axis, value, own) <= LARGEST_DROP)
+        peak, axis, z, step, value, own = (
+            each[inside] for each in (peak, axis, z, step, value, own)
+        )
         found.append(_components(peak, z, value, own))
         step = step * GROWTH
     return Components(*map(np.concatenate, zip(*found, strict=True)))
@@ -110,6 +114,12 @@ def _components(
 ) -> Components:
     evidence = -value + 0.5 * np.linalg.slogdet(covariance)[1]
     return Components(peak, z, covariance, evidence)
+
+
+def _log_marginal(axis: np.ndarray, value: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Of each coordinate, by a normal distribution of the others where they have their mode."""
+    variance = covariance[np.arange(axis.size), axis, axis]
+    return -value + 0.5 * (np.linalg.slogdet(covariance)[1] - np.log(variance))
 
 
 def mixture_of(components: Components, dtype: DTypeLike) -> Mixture:
@@ -148,9 +158,7 @@ def profile_mixture(coordinates: Coordinates) -> Mixture:
         found = []
         for at, start, fixed in zip(peak.tolist(), z, axis.tolist(), strict=True):
             x, height = _conditional_mode(potential, start, *given_one(at, fixed))
-            hessian = np.full(covariance.shape[1:], np.nan)
-            if height - peaks.value[at] <= LARGEST_DROP:
-                hessian = symmetrize(forward_difference_hessian(potential, x, 0.3 * sd[at], dtype))
+            hessian = symmetrize(forward_difference_hessian(potential, x, 0.3 * sd[at], dtype))
             found.append((x, height, hessian))
         xs, heights, hessians = map(np.stack, zip(*found, strict=True))
         return xs, heights, hessians

@@ -24,10 +24,14 @@ def test_the_table_has_a_row_per_parameter(
 ) -> None:
     out = tmp_path / "fit.nc"
     assert main(["fit", str(plate), "--method", "laplace", "--out", str(out)]) == 0
-    header, *rows = capsys.readouterr().out.splitlines()
+    table, meanings = capsys.readouterr().out.split("\n\n")
+    header, *rows = table.splitlines()
     assert header.split() == ["mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"]
     names = [row.split()[0] for row in rows]
     assert names[:2] == ["subsurface_fraction", "refractive_index"]
+    assert {line.split(":")[0] for line in meanings.splitlines()} == {
+        name.split("[")[0] for name in names[2:]
+    }
     assert out.exists()
 
 

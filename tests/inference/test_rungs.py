@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 from cases import each
-from toy_models import capture, funnel, line, of_line, squared
+from toy_models import capture, deep_funnel, funnel, line, of_line, squared
 
 import polar_bayes as pb
 from polar_bayes.benchmark.run import labeled, sample_point
@@ -151,7 +151,7 @@ def test_weighted_draws_find_what_chains_left_out():
 
 @pytest.mark.thorough
 def test_weights_that_do_not_reach_all_of_a_posterior_are_a_problem():
-    found = run(SMALL["importance"], problem(funnel))
+    found = run(SMALL["importance"], problem(deep_funnel))
     assert found.k_hat > 0.7
     assert any("Pareto k-hat" in problem for problem in found.problems)
 
