@@ -367,10 +367,14 @@ def _slopes(engine: BatchEngine, names: tuple[str, ...]) -> JitOnce:
         mean, sd = (jnp.stack([data.shared[name][part] for name in names]) for part in (0, 1))
 
         def of_draw(z: Array) -> tuple[AnyArray, AnyArray]:
+            # By name, so that what does not depend on them is not differentiated.
+            sites = program.unravel(z)
+
             def potential(x: Array) -> Array:
                 # Without the prior of the shared parameters, which counts once for all pixels.
                 own = 0.5 * jnp.sum(((x - mean) / sd) ** 2)
-                return program.potential(z.at[where].set(x), data) - own
+                moved = dict(zip(names, x, strict=True))
+                return program.potential_at(sites | moved, data) - own
 
             found = derivatives(potential, z[where])
             return -found.gradient, found.curvature
