@@ -7,6 +7,7 @@ pixels as are wanted.
 
 import dataclasses
 import enum
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -203,6 +204,19 @@ def map_batches(
 
 def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnce:
     """A function of one pixel, mapped over a batch, compiled."""
+
+    def of_lanes(over: Callable, *arguments: Any) -> Any:
+        common, states = arguments[:given], arguments[given:]
+        return over(functools.partial(function, *common), *states)
+
+    return batched_lanes(of_lanes, given=given, lanes=lanes)
+
+
+def batched_lanes(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnce:
+    """A function of as many pixels as there are lanes, compiled for a batch.
+
+    Its first argument maps a function of the observations and states of one pixel over them.
+    """
     # The compiled program takes: arguments that are the same for all pixels, as many as `given`;
     # the number of pixels that are wanted; the batched and the static readings; and the state of
     # each pixel. Pixels beyond the wanted number only fill the batch and are not computed.
@@ -213,10 +227,12 @@ def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnc
 
         @jax.jit  # asked for its shape and then in the loop, it is traced once
         def of_lanes(own: Any, states: Any, static: Any, common: tuple) -> Any:
-            def of_pixel(pixel: Any, state: Any) -> Any:
-                return function(*common, eqx.combine(pixel, static), *state)
+            def over(of_pixel: Callable, *states: Any) -> Any:
+                return jax.vmap(lambda pixel, *s: of_pixel(eqx.combine(pixel, static), *s))(
+                    own, *states
+                )
 
-            return jax.vmap(of_pixel)(own, states)
+            return function(over, *common, *states)
 
         def group(at: Array) -> Any:
             return of_lanes(*jax.tree.map(lambda x: x[at], grouped), static, common)

@@ -34,6 +34,7 @@ from polar_bayes.inference.batching import (
     AnyArray,
     ObservationBatch,
     batched,
+    batched_lanes,
     map_batches,
     put_rows,
     take_rows,
@@ -553,16 +554,21 @@ def _stepping(engine: BatchEngine, single: bool) -> JitOnce:
     program = engine.single_program if single else engine.program
     derivatives_of = scoring_derivatives if single else exact_derivatives
 
-    def several(count: Array, data: Observations, state: LMState) -> LMState:
+    # The loop is around the map: a loop in a map is traced three times.
+
+    def one(data: Observations, state: LMState) -> LMState:
+        return step(program, derivatives_of, goal, state, data)
+
+    def several(over: Callable, count: Array, state: LMState) -> LMState:
         def goes_on(at: tuple[Array, LMState]) -> Array:
-            return (at[0] < count) & ~at[1].settled
+            return (at[0] < count) & ~jnp.all(at[1].settled)
 
         def advance(at: tuple[Array, LMState]) -> tuple[Array, LMState]:
-            return at[0] + 1, step(program, derivatives_of, goal, at[1], data)
+            return at[0] + 1, over(one, at[1])
 
         return jax.lax.while_loop(goes_on, advance, (jnp.zeros_like(count), state))[1]
 
-    return batched(several, given=1)
+    return batched_lanes(several, given=1)
 
 
 def _finalized(engine: BatchEngine, state: LMState) -> NormalApproximation:
