@@ -15,7 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.inference.batch_engine import SMALL_BATCH, BatchEngine, evaluate_draws
+from polar_bayes.inference.batch_engine import (
+    MOMENTS,
+    SMALL_BATCH,
+    BatchEngine,
+    evaluate_draws,
+)
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batch_one_by_one import PixelByPixel
 from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status, batched, take_rows
@@ -147,7 +152,8 @@ def _profile_mixtures(
         return find_conditional_modes(engine, pixels.subset(owner[peak]), z, axis)
 
     peaks = Peaks(z, value, np.swapaxes(root, 1, 2) @ root)
-    components = profile_components(peaks, np.arange(engine.program.size), conditional)
+    prior_sd = engine.prior_draws(MOMENTS).astype(float).std(axis=0)
+    components = profile_components(peaks, np.arange(engine.program.size), prior_sd, conditional)
     for pixel in np.unique(owner):
         own = take_rows(components, owner[components.peak] == pixel)
         yield int(pixel), mixture_of(own, engine.dtype)

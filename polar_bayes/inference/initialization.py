@@ -32,6 +32,7 @@ from polar_bayes.inference.hierarchical_reparam import (
     fit_reparam,
 )
 from polar_bayes.inference.optimize import (
+    KEYS,
     Modes,
     NumpyPotential,
     ValueAndGradient,
@@ -86,6 +87,7 @@ class Coordinates:
         log_density_of: Log densities of vectors of the program, (draw, size).
         modes: The modes in these coordinates.
         axes: Positions of the coordinates that are not standardized.
+        prior_sd: Standard deviations of all of them before any reading.
         to_program: From these coordinates to the program's, with the log volume, for a block of
             vectors, compiled; None where they are the same.
     """
@@ -96,6 +98,7 @@ class Coordinates:
     log_density_of: Callable[[np.ndarray], np.ndarray]
     modes: Modes
     axes: np.ndarray
+    prior_sd: np.ndarray
     to_program: JitOnce | None = None
 
     def forward(self, x: np.ndarray) -> np.ndarray:
@@ -179,6 +182,7 @@ class JointInit(AbstractInit):
     @functools.cached_property
     def _coordinates(self) -> Coordinates:
         reparam, program = self.initializer.reparam, self.initializer.program
+        prior_sd = from_prior(program, jax.random.key(0), KEYS, self.data).astype(float).std(axis=0)
         own = Coordinates(
             program.potential_jit,
             self.data,
@@ -186,6 +190,7 @@ class JointInit(AbstractInit):
             lambda z: program.log_density(z, self.data),
             self.modes,
             np.arange(program.size),
+            prior_sd,
         )
         if reparam is None:
             return own
@@ -194,6 +199,7 @@ class JointInit(AbstractInit):
         potential = NumpyPotential(reparam.value_and_gradient, given, dtype)
         starts = self.modes.z.copy()
         starts[:, reparam.coefficients] = 0.0  # given the others, their mean
+        prior_sd[reparam.coefficients] = 1.0
         with ignore_line_search_warnings():
             modes = distinct_modes([find_mode(potential, start) for start in starts])
         if modes is None:
@@ -205,6 +211,7 @@ class JointInit(AbstractInit):
             own.log_density_of,
             modes,
             reparam.others,
+            prior_sd,
             reparam.forward_of_block,
         )
 

@@ -40,9 +40,9 @@ LARGEST_DROP = 4.5
 FIRST_STEP, GROWTH, MOST_STEPS = 1.5, 1.5, 8
 """Of a profile: the first in posterior sds, each longer than the one before; 74 sds in all."""
 
-WIDEST, WIDEST_UNSURE = 300.0, 3.0
-"""Standard deviations at a point, at most, in units of those at the mode; the second where the
-curvature is not positive definite, so that it says nothing of them."""
+WIDEST = 3.0
+"""Standard deviations at a point, at most, in units of those of the prior; of those at the mode
+where the curvature is not positive definite, so that it says nothing of them."""
 
 MOST_COORDINATES = 20
 """Posteriors of more coordinates are described by their modes alone."""
@@ -75,8 +75,17 @@ ConditionalModes = Callable[[np.ndarray, np.ndarray, np.ndarray], Conditional]
 """From numbers of peaks, (row,), vectors near the modes, and the coordinate that stays of each."""
 
 
-def profile_components(peaks: Peaks, axes: np.ndarray, conditional: ConditionalModes) -> Components:
-    """Normal distributions at every peak, and along its profiles."""
+def profile_components(
+    peaks: Peaks, axes: np.ndarray, prior_sd: np.ndarray, conditional: ConditionalModes
+) -> Components:
+    """Normal distributions at every peak, and along its profiles.
+
+    Args:
+        peaks: The peaks.
+        axes: The coordinates that are moved.
+        prior_sd: Standard deviations of all coordinates before any reading.
+        conditional: Finds the modes of the others.
+    """
     size = peaks.z.shape[1]
     every = np.arange(len(peaks.z))
     found = [_components(every, *peaks)]
@@ -93,11 +102,10 @@ def profile_components(peaks: Peaks, axes: np.ndarray, conditional: ConditionalM
         along = np.take_along_axis(own, axis[:, None, None], axis=1)[:, 0]
         slope = along / np.take_along_axis(along, axis[:, None], axis=1)
         z, value, hessian = conditional(peak, z + step[:, None] * slope, axis)
-        curvature = np.swapaxes(factor[peak], 1, 2) @ hessian @ factor[peak]
-        known = np.isfinite(value) & np.isfinite(curvature).all((1, 2))
-        values, vectors = np.linalg.eigh(np.where(known[:, None, None], curvature, np.eye(size)))
-        widest = np.where(values[:, :1] > 0.0, WIDEST, WIDEST_UNSURE)
-        root = factor[peak] @ vectors / np.sqrt(np.maximum(values, widest**-2))[:, None]
+        known = np.isfinite(value) & np.isfinite(hessian).all((1, 2))
+        hessian = np.where(known[:, None, None], hessian, np.eye(size))
+        is_definite, root = _root(hessian, np.diag(prior_sd))
+        root = np.where(is_definite[:, None, None], root, _root(hessian, factor[peak])[1])
         own = root @ np.swapaxes(root, 1, 2)
         at_peak = _log_marginal(axis, peaks.value[peak], peaks.covariance[peak])
         inside = known & (at_peak - _log_marginal(axis, value, own) <= LARGEST_DROP)
@@ -114,6 +122,13 @@ def _components(
 ) -> Components:
     evidence = -value + 0.5 * np.linalg.slogdet(covariance)[1]
     return Components(peak, z, covariance, evidence)
+
+
+def _root(hessian: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether Hessians are positive definite, and factors of covariances: `root @ root.T`."""
+    values, vectors = np.linalg.eigh(np.swapaxes(unit, -2, -1) @ hessian @ unit)
+    limited = np.maximum(values, WIDEST**-2)
+    return values[:, 0] > 0.0, unit @ vectors / np.sqrt(limited)[:, None]
 
 
 def _log_marginal(axis: np.ndarray, value: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -164,7 +179,9 @@ def profile_mixture(coordinates: Coordinates) -> Mixture:
         return xs, heights, hessians
 
     with ignore_line_search_warnings():
-        return mixture_of(profile_components(peaks, coordinates.axes, conditional), dtype)
+        return mixture_of(
+            profile_components(peaks, coordinates.axes, coordinates.prior_sd, conditional), dtype
+        )
 
 
 def _conditional_mode(

@@ -33,6 +33,7 @@ def coordinates_at(density, z: np.ndarray, covariance: np.ndarray, axes: np.ndar
         log_density_of=lambda x: -np.asarray(jax.vmap(lambda one: density(one, None))(x)),
         modes=modes,
         axes=axes,
+        prior_sd=np.full(z.shape[1], 10.0),
     )
 
 
