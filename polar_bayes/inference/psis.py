@@ -106,6 +106,10 @@ def summarize(
     random: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean, standard deviation and quantiles of weighted draws; quasi-random unless `random`."""
+    # Draws without weight may be as far out as infinity, and zero times infinity is NaN.
+    low = np.min(draws, axis=-1, keepdims=True, where=weights > 0.0, initial=np.inf)
+    high = np.max(draws, axis=-1, keepdims=True, where=weights > 0.0, initial=-np.inf)
+    draws = np.clip(draws, low, high)
     mean = np.sum(weights * draws, axis=-1)
     sd = np.sqrt(np.sum(weights * (draws - mean[:, None]) ** 2, axis=-1))
     order = np.argsort(draws, axis=-1)

@@ -147,7 +147,7 @@ def test_a_level_beyond_the_outermost_middle_is_the_outermost_draw() -> None:
 def test_draws_without_weight_change_nothing() -> None:
     rng = np.random.default_rng(8)
     draws, weights = rng.normal(size=(2, 100)), rng.dirichlet(np.ones(100), 2)
-    more = np.concatenate([draws, rng.normal(size=(2, 50))], axis=-1)
+    more = np.concatenate([draws, rng.normal(size=(2, 48)), [[-np.inf, np.inf]] * 2], axis=-1)
     told = summarize(more, np.concatenate([weights, np.zeros((2, 50))], axis=-1), LEVELS)
     plain = summarize(draws, weights, LEVELS)
     for one, two in zip(told[:2], plain[:2], strict=True):
