@@ -31,6 +31,7 @@ from polar_bayes.inference.levenberg_marquardt import (
     find_all_modes,
     find_conditional_modes,
 )
+from polar_bayes.inference.optimize import finite_sd
 from polar_bayes.inference.profile_mixture import (
     LEAST_WEIGHT,
     Conditional,
@@ -152,7 +153,7 @@ def _profile_mixtures(
         return find_conditional_modes(engine, pixels.subset(owner[peak]), z, axis)
 
     peaks = Peaks(z, value, np.swapaxes(root, 1, 2) @ root)
-    prior_sd = engine.prior_draws(MOMENTS).astype(float).std(axis=0)
+    prior_sd = finite_sd(engine.prior_draws(MOMENTS))
     components = profile_components(peaks, np.arange(engine.program.size), prior_sd, conditional)
     for pixel in np.unique(owner):
         own = take_rows(components, owner[components.peak] == pixel)

@@ -40,6 +40,7 @@ from polar_bayes.inference.optimize import (
     distinct_modes,
     find_mode,
     find_modes,
+    finite_sd,
     from_prior,
     ignore_line_search_warnings,
 )
@@ -182,7 +183,7 @@ class JointInit(AbstractInit):
     @functools.cached_property
     def _coordinates(self) -> Coordinates:
         reparam, program = self.initializer.reparam, self.initializer.program
-        prior_sd = from_prior(program, jax.random.key(0), KEYS, self.data).astype(float).std(axis=0)
+        prior_sd = finite_sd(from_prior(program, jax.random.key(0), KEYS, self.data))
         own = Coordinates(
             program.potential_jit,
             self.data,

@@ -300,3 +300,8 @@ def from_prior(program: Program, key: Array, draws: int, data: Observations) -> 
         for begin in range(0, draws, KEYS)
     ]
     return np.concatenate(drawn)[:draws]
+
+
+def finite_sd(draws: np.ndarray) -> np.ndarray:
+    """Standard deviations of coordinates, (draw, size), without those at a bound of a support."""
+    return np.std(draws, axis=0, dtype=float, where=np.isfinite(draws))
