@@ -205,11 +205,10 @@ def map_batches(
 def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnce:
     """A function of one pixel, mapped over a batch, compiled."""
 
-    def of_lanes(over: Callable, *arguments: Any) -> Any:
-        common, states = arguments[:given], arguments[given:]
-        return over(functools.partial(function, *common), *states)
+    def mapped(over: Callable, *arguments: Any) -> Any:
+        return over(functools.partial(function, *arguments[:given]), *arguments[given:])
 
-    return batched_lanes(of_lanes, given=given, lanes=lanes)
+    return batched_lanes(mapped, given=given, lanes=lanes)
 
 
 def batched_lanes(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnce:

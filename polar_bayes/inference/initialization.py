@@ -183,7 +183,6 @@ class JointInit(AbstractInit):
     @functools.cached_property
     def _coordinates(self) -> Coordinates:
         reparam, program = self.initializer.reparam, self.initializer.program
-        prior_sd = finite_sd(from_prior(program, jax.random.key(0), KEYS, self.data))
         own = Coordinates(
             program.potential_jit,
             self.data,
@@ -191,7 +190,7 @@ class JointInit(AbstractInit):
             lambda z: program.log_density(z, self.data),
             self.modes,
             np.arange(program.size),
-            prior_sd,
+            finite_sd(from_prior(program, jax.random.key(0), KEYS, self.data)),
         )
         if reparam is None:
             return own
@@ -200,11 +199,12 @@ class JointInit(AbstractInit):
         potential = NumpyPotential(reparam.value_and_gradient, given, dtype)
         starts = self.modes.z.copy()
         starts[:, reparam.coefficients] = 0.0  # given the others, their mean
-        prior_sd[reparam.coefficients] = 1.0
         with ignore_line_search_warnings():
             modes = distinct_modes([find_mode(potential, start) for start in starts])
         if modes is None:
             return own
+        prior_sd = own.prior_sd.copy()
+        prior_sd[reparam.coefficients] = 1.0
         return Coordinates(
             reparam.potential_jit,
             given,

@@ -21,6 +21,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import DTypeLike, Float, Int
 
+from polar_bayes.inference.batching import take_rows
 from polar_bayes.inference.initialization import Coordinates
 from polar_bayes.inference.optimize import (
     ValueAndGradient,
@@ -90,6 +91,7 @@ def profile_components(
     every = np.arange(len(peaks.z))
     found = [_components(every, *peaks)]
     sd = np.sqrt(np.diagonal(peaks.covariance, axis1=1, axis2=2))
+    marginal = found[0].log_evidence[:, None] - np.log(sd)
     factor = np.linalg.cholesky(peaks.covariance)
     corners = np.meshgrid(every, axes if size <= MOST_COORDINATES else [], [-1.0, 1.0])
     peak, axis, sign = (corner.ravel() for corner in corners)
@@ -104,16 +106,19 @@ def profile_components(
         z, value, hessian = conditional(peak, z + step[:, None] * slope, axis)
         known = np.isfinite(value) & np.isfinite(hessian).all((1, 2))
         hessian = np.where(known[:, None, None], hessian, np.eye(size))
-        is_definite, root = _root(hessian, np.diag(prior_sd))
-        root = np.where(is_definite[:, None, None], root, _root(hessian, factor[peak])[1])
-        own = root @ np.swapaxes(root, 1, 2)
-        at_peak = _log_marginal(axis, peaks.value[peak], peaks.covariance[peak])
-        inside = known & (at_peak - _log_marginal(axis, value, own) <= LARGEST_DROP)
-        peak, axis, z, step, value, own = (
-            each[inside] for each in (peak, axis, z, step, value, own)
-        )
-        found.append(_components(peak, z, value, own))
-        step = step * GROWTH
+        curvature = prior_sd[:, None] * hessian * prior_sd
+        is_definite = np.linalg.eigvalsh(curvature)[:, 0] > 0.0
+        unit = np.where(is_definite[:, None, None], np.diag(prior_sd), factor[peak])
+        values, vectors = np.linalg.eigh(np.swapaxes(unit, 1, 2) @ hessian @ unit)
+        root = unit @ vectors / np.sqrt(np.maximum(values, WIDEST**-2))[:, None]
+        reached = _components(peak, z, value, root @ np.swapaxes(root, 1, 2))
+        # Of the coordinate that was moved, by a normal distribution of the others.
+        variance = reached.covariance[np.arange(axis.size), axis, axis]
+        drop = marginal[peak, axis] - (reached.log_evidence - 0.5 * np.log(variance))
+        inside = known & (drop <= LARGEST_DROP)
+        reached, axis, step = take_rows((reached, axis, step * GROWTH), inside)
+        peak, z, own, _ = reached
+        found.append(reached)
     return Components(*map(np.concatenate, zip(*found, strict=True)))
 
 
@@ -122,19 +127,6 @@ def _components(
 ) -> Components:
     evidence = -value + 0.5 * np.linalg.slogdet(covariance)[1]
     return Components(peak, z, covariance, evidence)
-
-
-def _root(hessian: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether Hessians are positive definite, and factors of covariances: `root @ root.T`."""
-    values, vectors = np.linalg.eigh(np.swapaxes(unit, -2, -1) @ hessian @ unit)
-    limited = np.maximum(values, WIDEST**-2)
-    return values[:, 0] > 0.0, unit @ vectors / np.sqrt(limited)[:, None]
-
-
-def _log_marginal(axis: np.ndarray, value: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Of each coordinate, by a normal distribution of the others where they have their mode."""
-    variance = covariance[np.arange(axis.size), axis, axis]
-    return -value + 0.5 * (np.linalg.slogdet(covariance)[1] - np.log(variance))
 
 
 def mixture_of(components: Components, dtype: DTypeLike) -> Mixture:
