@@ -9,8 +9,9 @@ bounds are those of the largest and the smallest index that a dielectric is like
 """
 
 import itertools
-from collections.abc import Iterator
-from typing import Any
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -31,7 +32,126 @@ BREWSTER_GAP = 10.0
 """Largest step, in degrees, between mirror views from which Brewster's angle is read by eye."""
 BREWSTER_PEAK, PURE_PEAK = 0.5, 0.9
 """Polarization from which a peak is one, and from which the surface alone makes it."""
+BREWSTER_DEPTH = 0.05
+"""How far below the top of the peak its width is measured, as a share of the top."""
+DEFAULT_INDICES = (1.2, 2.0)
+"""Smallest and largest index that the default priors allow; a test compares them."""
 MAX_LISTED = 4
+
+
+class IndexByEye(NamedTuple):
+    """The index of a bare mirror whose Brewster's angle is where mirror views are polarized most.
+
+    Args:
+        low: Smallest index that the peak allows.
+        center: Index that the middle of the peak means.
+        high: Largest index that the peak allows.
+        polarization: Of the peak; light of a body lowers it, and moves it to larger angles.
+    """
+
+    low: float
+    center: float
+    high: float
+    polarization: float
+
+    @property
+    def angle(self) -> float:
+        """The middle of the peak, unit degree."""
+        return math.degrees(math.atan(self.center))
+
+    @property
+    def is_pure(self) -> bool:
+        """Whether the surface alone makes the peak."""
+        return self.polarization >= PURE_PEAK
+
+    @property
+    def spread(self) -> float:
+        """Half the range, rounded up to one digit."""
+        half = 0.5 * (self.high - self.low)
+        step = 10.0 ** math.floor(math.log10(half))
+        return math.ceil(half / step - 1e-9) * step
+
+    @property
+    def prior(self) -> str:
+        """A prior that allows the range, as text."""
+        decimals = 1 if self.spread >= 0.1 else 2
+        return f"TruncatedNormal({self.center:.{decimals}f}, {self.spread:g}, low=1)"
+
+    def is_beyond(self, bounds: tuple[float, float]) -> bool:
+        """Whether a prior ends before the middle, and is not narrower than the range itself."""
+        within = self.low <= bounds[0] and bounds[1] <= self.high
+        return self.is_pure and not within and not bounds[0] <= self.center <= bounds[1]
+
+    def is_excluded(self, bounds: tuple[float, float], degrees: float = 0.0) -> bool:
+        """Whether a prior ends before the range, also where all angles are off by so much."""
+        low, high = (
+            _index(math.degrees(math.atan(end)) + turn)
+            for end, turn in ((self.low, -degrees), (self.high, degrees))
+        )
+        return self.is_beyond(bounds) and (high < bounds[0] or bounds[1] < low)
+
+
+def indices_by_eye(capture: xr.Dataset) -> dict[str, IndexByEye | None]:
+    """Brewster's angle by eye, as an index, for each material or patch of a capture.
+
+    The angles are those of mirror views, smoothed by a running median of three, so that a single
+    reading makes no peak. The middle is that of the flanks.
+
+    Args:
+        capture: A validated capture.
+
+    Returns:
+        By the words that name a material, "" where there is one only: the index with its range, or
+        None where the views do not show a peak.
+    """
+    return {name.removeprefix(" of "): _brewster(part) for name, part in _materials(capture)}
+
+
+def index_sentences(
+    found: Mapping[str, IndexByEye | None],
+    bounds: tuple[float, float] = DEFAULT_INDICES,
+    parameter: str = "refractive_index",
+    prior: str = "the default prior",
+) -> tuple[str, ...]:
+    """What Brewster's angle means where a prior excludes it, and the prior that allows it.
+
+    Args:
+        found: What `indices_by_eye` returned.
+        bounds: Smallest and largest index that the prior allows.
+        parameter: Whose prior it is.
+        prior: Which prior it is, in words.
+
+    Returns:
+        One sentence; none where the prior excludes no index.
+    """
+    beyond = {name: each for name, each in found.items() if each and each.is_beyond(bounds)}
+    remedy = allowing_prior(found, bounds)
+    if not remedy:
+        return ()
+    indices = " and ".join(
+        f"{each.center:.2f} ({each.low:.2f} to {each.high:.2f}){name and f' of {name}'}"
+        for name, each in itertools.islice(beyond.items(), MAX_LISTED)
+    )
+    ends = dict.fromkeys(
+        f"ends at {bounds[1]:g}" if each.center > bounds[1] else f"begins at {bounds[0]:g}"
+        for each in beyond.values()
+    )
+    sentence = (
+        f"Brewster's angle means an index near {indices}, but {prior} of {parameter} "
+        f"{' and '.join(ends)}: give priors={{'{parameter}': {remedy}}}."
+    )
+    return (sentence,)
+
+
+def allowing_prior(found: Mapping[str, IndexByEye | None], bounds: tuple[float, float]) -> str:
+    """The text of a prior that allows the indices of all materials; "" where bounds do."""
+    pure = [each for each in found.values() if each and each.is_pure]
+    if not any(each.is_beyond(bounds) for each in pure):
+        return ""
+    if len(pure) == 1:
+        return pure[0].prior
+    low, high = min(each.low for each in pure), max(each.high for each in pure)
+    return IndexByEye(low, 0.5 * (low + high), high, PURE_PEAK).prior
 
 
 def cautions(capture: xr.Dataset) -> tuple[str, ...]:
@@ -233,10 +353,10 @@ def _side_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
 def _scale_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
     """A Brewster angle below that of vacuum, as if angles counted from the surface."""
     peak = _brewster(capture)
-    if peak is not None and peak[2] < 45.0:
+    if peak is not None and peak.high < 1.0:
         yield (
-            f"The polarization{name} is largest near {peak[1]:.0f} degrees, which would be "
-            f"Brewster's angle of an index of {_index(peak[1])}, below that of vacuum: the angles "
+            f"The polarization{name} is largest near {peak.angle:.0f} degrees, which would be "
+            f"Brewster's angle of an index of {peak.center:.2f}, below that of vacuum: the angles "
             "were likely counted from the surface; give 90 degrees less each of them, from the "
             "normal."
         )
@@ -275,25 +395,19 @@ def _sign_sentences(name: str, capture: xr.Dataset) -> Iterator[str]:
 def _brewster_sentences(name: str, capture: xr.Dataset) -> Iterator[str]:
     peak = _brewster(capture)
     if peak is not None:
-        low, center, high, top = peak
         moved = (
-            f"; the peak is {top:.2f}, so light of the body has likely moved it to larger "
-            "angles, and the index is smaller"
+            f"; the peak is {peak.polarization:.2f}, so light of the body has likely moved it to "
+            "larger angles, and the index is smaller"
         )
-        moved = "" if top >= PURE_PEAK else moved
         yield (
-            f"Brewster's angle by eye{name}: the polarization is largest near {center:.0f} "
-            f"degrees, which would mean an index near {_index(center)} "
-            f"({_index(low)} to {_index(high)}){moved}."
+            f"Brewster's angle by eye{name}: the polarization is largest near {peak.angle:.0f} "
+            f"degrees, which would mean an index near {peak.center:.2f} "
+            f"({peak.low:.2f} to {peak.high:.2f}){'' if peak.is_pure else moved}."
         )
 
 
-def _index(angle: float) -> str:
-    return f"{np.tan(np.deg2rad(angle)):.2f}"
-
-
-def _brewster(capture: xr.Dataset) -> tuple[float, float, float, float] | None:
-    """Least, middle and largest angle at which mirror views are polarized most, and how much."""
+def _brewster(capture: xr.Dataset) -> IndexByEye | None:
+    """The index that the largest polarization of mirror views means, where they show a peak."""
     signal = next((each for each in ("q", "dop") if each in capture), None)
     if signal is None or {"y", "x"} & set(capture.dims):
         return None
@@ -310,14 +424,43 @@ def _brewster(capture: xr.Dataset) -> tuple[float, float, float, float] | None:
     if len(angles) < 2 * SMALLEST_VIEWS:
         return None
     values = np.bincount(position, values) / np.bincount(position)
-    top = float(values.max())
     noise = float(_noise(capture, signal).where(used).median()) / NOISE_ERRORS
-    near = np.flatnonzero(values >= top - max(2.0 * noise, 0.01))
-    first, last = int(near[0]), int(near[-1])
-    if top < BREWSTER_PEAK or first == 0 or last == len(angles) - 1:
+    return _peak(angles, values, noise)
+
+
+def _peak(angles: np.ndarray, values: np.ndarray, noise: float) -> IndexByEye | None:
+    """The index that the middle of the flanks means, of values over angles in degrees."""
+    # A single reading far from its neighbors, which is no peak, does not pass a running median. It
+    # moves a flank by one step at most.
+    smooth = values.copy()
+    smooth[1:-1] = np.median([values[:-2], values[1:-1], values[2:]], axis=0)
+    peak = 1 + int(np.argmax(smooth[1:-1]))
+    top = float(smooth[peak])
+    level = top - max(2.0 * noise, BREWSTER_DEPTH * top)
+    below = np.flatnonzero(smooth < level)
+    if top < BREWSTER_PEAK or not below.size or not below[0] < peak < below[-1]:
         return None
-    below, above = angles[first - 1 : first + 1], angles[last : last + 2]
-    if max(np.ptp(below), np.ptp(above), *np.diff(angles[first : last + 1]), 0.0) > BREWSTER_GAP:
+    first, last = below[below < peak][-1], below[below > peak][0]
+    step = float(np.diff(angles[first : last + 1]).max())
+    if step > BREWSTER_GAP:
         return None
-    center = float(np.mean(angles[near]))
-    return float(np.mean(below)), center, float(np.mean(above)), top
+    rises = np.interp(level, smooth[first : first + 2], angles[first : first + 2])
+    falls = np.interp(level, smooth[[last, last - 1]], angles[[last, last - 1]])
+    middle = _middle(rises, falls)
+    half = max(0.25 * float(falls - rises), step)
+    low, center, high = map(_index, (middle - half, middle, middle + half))
+    return IndexByEye(low, center, high, top)
+
+
+def _index(angle: float) -> float:
+    """The index that an angle in degrees, as Brewster's, means."""
+    return math.tan(math.radians(min(max(angle, 0.0), 89.0)))
+
+
+def _middle(rises: float, falls: float) -> float:
+    """Brewster's angle of the mirror that polarizes alike at two angles, all in degrees."""
+    # Both reflect the same |cos(z + t) / cos(z - t)|, with t the angle of refraction: the product
+    # of tan(z) tan(t) is 1, and Snell's law makes that a quadratic equation for n^2.
+    a, b = np.sin(np.deg2rad([rises, falls])) ** 2
+    square = 0.5 * (a + b + np.sqrt((a - b) ** 2 + 4.0 * (a * b) ** 2 / ((1.0 - a) * (1.0 - b))))
+    return float(np.rad2deg(np.arctan(np.sqrt(square))))

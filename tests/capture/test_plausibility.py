@@ -8,9 +8,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import polar_bayes as pb
-from polar_bayes.capture.plausibility import cautions, fresnel, inferred, stated
+from polar_bayes.capture.plausibility import (
+    DEFAULT_INDICES,
+    IndexByEye,
+    cautions,
+    fresnel,
+    index_sentences,
+    indices_by_eye,
+    inferred,
+    stated,
+)
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError
+from polar_bayes.priors import support_bounds
+from polar_bayes.setups import default_priors
 
 ZENITHS = np.arange(20.0, 79.0, 3.0)
 
@@ -183,7 +194,7 @@ def test_what_was_inferred_is_told():
     )
     assert sign == "Sign: q is positive (s light) at 20 of 20 mirror angles."
     assert "the polarization is largest near 56 degrees" in brewster
-    assert "an index near 1.48" in brewster
+    assert "an index near 1.50 (1.33 to 1.70)" in brewster
 
 
 @each("index", [1.33, 1.5, 1.77])
@@ -203,6 +214,89 @@ def test_a_peak_that_the_body_lowers_is_told_as_one():
 @each("zeniths", [ZENITHS[::6], ZENITHS[:6], ZENITHS[15:]], ids=["sparse", "below it", "beyond it"])
 def test_no_brewster_angle_where_the_views_do_not_show_it(zeniths):
     assert not any("Brewster" in sentence for sentence in inferred(validate(plate(zeniths))))
+
+
+# --- an index beyond the prior --------------------------------------------------------------------
+
+
+def by_eye(capture: xr.Dataset) -> IndexByEye | None:
+    (found,) = indices_by_eye(capture).values()
+    return found
+
+
+@each("index", [1.33, 1.5, 2.03, 3.87])
+@each("step", [2.0, 3.0, 5.0])
+def test_the_middle_of_the_flanks_is_brewsters_angle(index, step):
+    found = by_eye(plate(np.arange(20.0, 86.0, step), index))
+    assert found is not None
+    assert found.is_pure
+    assert abs(found.angle - np.rad2deg(np.arctan(index))) < 0.15 * step
+    assert found.low < index < found.high
+
+
+@each("index", [1.33, 1.5, 2.03, 3.87])
+@each("value", [-1.0, 0.0, 0.6, 1.0])
+def test_one_spoiled_reading_moves_the_index_by_eye_less_than_its_range(index, value):
+    """Wherever it is: far from the peak, on its flanks, next to it, or the largest one itself."""
+    zeniths = np.arange(20.0, 84.0, 3.0)
+    for place in range(len(zeniths) - 1):  # without the last one the peak of 3.87 has no far side
+        capture = plate(zeniths, index)
+        capture["q"][place] = value
+        found = by_eye(capture)
+        assert found is not None, place
+        assert found.low < index < found.high, place
+
+
+def test_a_single_high_reading_is_no_peak():
+    capture = plate(q=np.full(len(ZENITHS), 0.4))
+    capture["q"][10] = 0.99
+    assert by_eye(capture) is None
+
+
+def test_the_limits_of_the_default_priors_are_those_of_every_set_up():
+    for setup in pb.setups.SETUPS.values():
+        priors = {**pb.PRIORS, **default_priors(setup, plate())}
+        assert support_bounds(priors["refractive_index"]) == DEFAULT_INDICES
+
+
+def test_an_index_beyond_the_prior_is_one_sentence():
+    assert index_sentences(indices_by_eye(plate(index=1.5))) == ()
+    (sentence,) = index_sentences(indices_by_eye(plate(index=2.4)))
+    assert sentence == (
+        "Brewster's angle means an index near 2.39 (2.08 to 2.79), but the default prior of "
+        "refractive_index ends at 2: give "
+        "priors={'refractive_index': TruncatedNormal(2.4, 0.4, low=1)}."
+    )
+    (sentence,) = index_sentences(indices_by_eye(plate(index=1.3)), (1.4, 1.8), "cauchy_a", "its")
+    assert "its of cauchy_a begins at 1.4" in sentence
+
+
+def test_materials_share_one_prior_that_allows_all():
+    parts = {"a": plate(index=1.5), "b": plate(index=2.4), "c": plate(index=1.7)}
+    found = indices_by_eye(pb.capture.combine(parts, dim="material"))
+    assert list(found) == ["material a", "material b", "material c"]
+    (sentence,) = index_sentences(found)
+    assert "an index near 2.39 (2.08 to 2.79) of material b, but" in sentence
+    assert "TruncatedNormal(2.1, 0.8, low=1)" in sentence
+
+
+def test_bounds_inside_the_range_by_eye_know_more_than_the_eye():
+    found = by_eye(plate(index=1.5))
+    assert found is not None
+    assert not found.is_beyond((1.40, 1.45))
+    assert found.is_beyond((1.2, 1.45))
+    assert not found.is_excluded((1.2, 1.45))
+    assert found.is_excluded((1.1, 1.3))
+    assert not found.is_excluded((1.1, 1.3), degrees=3.0)
+
+
+def test_a_peak_that_light_of_a_body_may_have_moved_is_beyond_no_prior():
+    s, p = fresnel(ZENITHS, 2.4)
+    q = (s - p) / (s + p + 0.1)
+    found = indices_by_eye(plate(q=q, dop=q))
+    assert found[""] is not None
+    assert not found[""].is_pure
+    assert index_sentences(found) == ()
 
 
 def test_set_up_and_incident_levels_are_told():
