@@ -14,7 +14,8 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
-from polar_bayes.diagnostics.criticism import criticize, listed
+from polar_bayes.diagnostics.criticism import criticize
+from polar_bayes.diagnostics.finding import listed
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
     Scalar,
@@ -111,7 +112,8 @@ def verdict(
         *dict.fromkeys(against.get("not computed", [])),
     )
     faults = tuple(against.get("problem", []))
-    return Verdict(not problems and not faults, (*problems, *faults), cautions, (), not problems)
+    notes = tuple(against.get("note", []))
+    return Verdict(not problems and not faults, (*problems, *faults), cautions, notes, not problems)
 
 
 def json_summary(result: xr.DataTree) -> dict[str, Any]:

@@ -79,12 +79,6 @@ class PitBand:
     lower: np.ndarray
     upper: np.ndarray
 
-    @property
-    def rejects_uniformity(self) -> bool:
-        """True where the curve leaves the band anywhere."""
-        outside = (self.difference < self.lower - 1e-9) | (self.difference > self.upper + 1e-9)
-        return bool(np.any(outside))
-
 
 def predictive_checks(result: xr.DataTree) -> dict[str, PredictiveCheck]:
     """Compare every recorded variable with its prediction."""

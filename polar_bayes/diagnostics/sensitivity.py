@@ -5,7 +5,8 @@ no information, small where they do. Unlike a ratio of widths it is the same for
 logarithm, and it does not take a posterior in the prior's tail for the prior. `width_left` is the
 interval's width over that of the prior, `contraction` 1 - variance over prior variance. The two
 sensitivities are the rates at which the posterior changes when the log priors (all together) or the
-log likelihood are multiplied by a number near 1.
+log likelihood are multiplied by a number near 1. The remark names a reading that alone knows a
+parameter, such as the highlight that knows the roughness.
 
 Source: Kallioinen et al. (2024), Statistics and Computing 34, 57 (power scaling).
 """
@@ -24,6 +25,8 @@ from polar_bayes.diagnostics.parameters import (
     posterior_scalars,
     scalars,
 )
+from polar_bayes.diagnostics.predictive import flat_variables
+from polar_bayes.diagnostics.residuals import readings_alone, residuals_of
 from polar_bayes.inference.result import CENTRAL_95
 
 DETERMINED = 0.5
@@ -48,11 +51,16 @@ def sensitivity(result: xr.DataTree) -> pd.DataFrame:
     if "prior" in result.children:
         priors = {scalar.label: scalar.draws for scalar in scalars(result["prior"].to_dataset())}
     weights = [_scaled_weights(_total(result, group)) for group in ("log_prior", "log_likelihood")]
+    alone = readings_alone(residuals_of(result, flat_variables(result), found))
     rows = []
     for scalar in found:
         compared = _compare(priors.get(scalar.label), scalar.draws)
         rates = [_sensitivity(scalar.draws, each) for each in weights]
-        rows.append([*compared, *rates, _remark(scalar.draws, compared, *rates)])
+        remarks = _remarks(scalar.draws, compared, *rates)
+        if scalar.label in alone:
+            reading, factor = alone[scalar.label]
+            remarks.append(f"rests on {reading}: {factor:.1f} times as wide without it")
+        rows.append([*compared, *rates, "; ".join(remarks)])
     index = pd.Index([scalar.label for scalar in found])
     return pd.DataFrame(rows, columns=list(COLUMNS), index=index)
 
@@ -113,7 +121,7 @@ def _sensitivity(draws: np.ndarray, weights: list[np.ndarray] | None) -> float:
     return float(array_stats.power_scale_sense(draws, *weights, *POWERS))
 
 
-def _remark(draws: np.ndarray, compared: list[Any], prior: float, likelihood: float) -> str:
+def _remarks(draws: np.ndarray, compared: list[Any], prior: float, likelihood: float) -> list[str]:
     prior_low, prior_high, *_ = compared
     median, remarks = float(np.median(draws)), []
     if median < prior_low or median > prior_high:
@@ -121,4 +129,4 @@ def _remark(draws: np.ndarray, compared: list[Any], prior: float, likelihood: fl
     if prior >= SENSITIVE:
         pulled = likelihood >= SENSITIVE
         remarks.append("priors and data may pull apart" if pulled else "leans on the priors")
-    return "; ".join(remarks)
+    return remarks

@@ -13,7 +13,9 @@ can change.
 
 import abc
 import dataclasses
+import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import ClassVar, override
 
 import jax
@@ -309,13 +311,15 @@ class StokesLink(AbstractLink):
         degrees_of_freedom: Of Student's t, which forgives single bad readings; None for
             normal noise. Range > 2.
         stated_errors: True where the capture states the error of every reading.
-        least_brightness: Smallest $I/I_{\max}$ that counts in the shot noise. Range (0, 1].
+        least_brightness: Smallest $I/I_{\max}$ that counts in the shot noise, a tenth of an
+            electron where 10,000 are full scale: nothing is known of a view without light.
+            Range (0, 1].
     """
 
     observables: ClassVar[tuple[str, ...]] = ("q", "u")
     degrees_of_freedom: float | None = None
     stated_errors: bool = False
-    least_brightness: float = 1e-3
+    least_brightness: float = 1e-5
 
     def __post_init__(self) -> None:
         if self.degrees_of_freedom is not None and not self.degrees_of_freedom > 2.0:
@@ -411,3 +415,16 @@ class StudentTLink(AbstractLink):
 def noise_parameters(links: Mapping[str, AbstractLink]) -> tuple[str, ...]:
     """The noise parameters that a set of links reads, each once, in the order of the links."""
     return tuple(dict.fromkeys(name for link in links.values() for name in link.parameters))
+
+
+PERFECT: Mapping[str, float] = MappingProxyType(
+    {
+        "concentration_scale": math.inf,
+        "logit_scale": 0.0,
+        "normal_scale": 0.0,
+        "stokes_scale": 0.0,
+        "stokes_error_factor": 0.0,
+        "intensity_scale": 0.0,
+    }
+)
+"""Value of each noise parameter at which readings are perfect."""

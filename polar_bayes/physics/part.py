@@ -209,6 +209,30 @@ NOTATION: dict[str, Quantity] = {
 }
 
 
+class Absence(NamedTuple):
+    """Where what a parameter describes is absent or perfect.
+
+    Args:
+        value: Of the parameter, an end of its range.
+        words: What is then not there.
+    """
+
+    value: float
+    words: str
+
+
+ABSENT: dict[str, Absence] = {
+    "roughness": Absence(0.0, "no roughness"),
+    "subsurface_fraction": Absence(0.0, "no light from the body"),
+    "absorption": Absence(0.0, "no absorption"),
+    "coat_absorbance": Absence(0.0, "no absorption in the coat"),
+    "leakage": Absence(0.0, "no leakage between the channels"),
+    "dolp_gain": Absence(1.0, "no loss of polarization in the polarizer"),
+    "discrepancy_amplitude": Absence(0.0, "no smooth error over angle"),
+}
+"""The simplest world: a bare and smooth surface, and an instrument without faults."""
+
+
 POPULATION = {
     "_location": "population median of",
     "_spread": "population spread of",
@@ -222,3 +246,8 @@ def notation(name: str) -> Quantity:
             _, meaning, unit = NOTATION[name.removesuffix(ending)]
             return Quantity("", f"{words} {meaning}", unit if ending == "_location" else "1")
     return NOTATION.get(name, Quantity("", name.replace("_", " ")))
+
+
+def absence(name: str) -> Absence | None:
+    """Where what a parameter, or the location of its population, describes is absent, if it can."""
+    return ABSENT.get(name.removesuffix("_location"))

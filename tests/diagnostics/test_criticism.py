@@ -8,7 +8,8 @@ from scipy import stats
 from synthetic_results import SCALE, edit_provenance, make_result, replace
 
 import polar_bayes as pb
-from polar_bayes.diagnostics.criticism import CHECKS, PROBLEM, criticize
+from polar_bayes.diagnostics.criticism import CHECKS, criticize
+from polar_bayes.inference.checks import PROBLEM
 
 SMALL = {"wavelengths": (), "variables": ("dop",), "draws": 250}
 

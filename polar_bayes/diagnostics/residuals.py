@@ -1,0 +1,306 @@
+r"""Residuals of the readings of a fit: structure, outliers, and readings that decide the answer.
+
+The residuals of the readings are compared with residuals of replicated readings. A replicate is
+drawn from the posterior predictive distribution, and refitted in the linear-Gaussian approximation:
+with C the posterior covariance of the noise-free readings and $\Sigma$ the covariance of the noise,
+
+$$ e = (I - C \Sigma^{-1}) \varepsilon $$
+
+is what remains of noise $\varepsilon$ after a fit. Without the refit the observed residuals, which
+the parameters have absorbed in part, would look too small compared with those of the replicates.
+The same approximation tells the fit without reading i: with the leverage
+$h_i = C_{ii} / \Sigma_{ii}$ its residual is $e_i / (1 - h_i)$, whose standard deviation is
+$(1 - h_i)^{-1/2}$, and the mean of a parameter moves by its covariance with the noise-free reading
+times that residual.
+
+Source: Gelman, Meng & Stern (1996), Statistica Sinica 6, 733 (posterior predictive assessment);
+Moran (1950), Biometrika 37, 17 (spatial autocorrelation); Cook (1977), Technometrics 19, 15
+(influence of one reading).
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from polar_bayes.diagnostics.finding import Finding, judged_by, listed, p_text
+from polar_bayes.diagnostics.parameters import Scalar
+from polar_bayes.diagnostics.predictive import FlatVariable
+from polar_bayes.observation.data import ANGLES
+
+REPLICATES = 1000
+MAX_READINGS = 600
+"""Readings that the checks use; of more, evenly spaced ones."""
+MAX_SATURATED = 0.01
+"""Share of the replicates at full scale beyond which the checks leave a reading out."""
+ANGLE_SCALES = (4.0, 15.0)
+"""Length scales of structure over directions, unit degree."""
+STATED_ERRORS = 3.0
+"""Stated errors within which a reading is no outlier, however little the others scatter."""
+MAX_LEVERAGE = 0.999
+"""Draws may give a reading more than all of the information about itself."""
+LARGE_SHIFT = 1.0
+"""Change of a posterior mean without one reading that counts, in posterior sds."""
+ALONE = 2.0
+"""Factor by which an interval would widen without a reading that is named as its source."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Residuals:
+    """Standardized residuals of the readings and of replicates, with where each was read."""
+
+    observed: np.ndarray  # (reading,)
+    replicated: np.ndarray  # (replicate, reading)
+    stated: np.ndarray  # (reading,): stated errors, 0 where there is none
+    left_out: np.ndarray  # (reading,): one minus the leverage, the variance of the residual
+    gains: np.ndarray  # (parameter, reading): correlation times sd of the noise-free reading
+    parameters: tuple[str, ...]
+    directions: np.ndarray  # (reading, 4), degree
+    wavelength: np.ndarray  # (reading,): index
+    group: np.ndarray  # (reading,): index of variable and material
+    labels: tuple[str, ...]
+
+
+def residuals_of(
+    result: xr.DataTree, variables: Sequence[FlatVariable], found: Sequence[Scalar]
+) -> Residuals | None:
+    """Residuals of all variables together, since they share the parameters that absorb them."""
+    if not variables or not all(
+        np.isfinite(v.predicted).all() and np.isfinite(v.noise_free).all() for v in variables
+    ):
+        return None
+    noise_free = np.concatenate([v.noise_free for v in variables], axis=1)
+    noise = np.concatenate([v.predicted for v in variables], axis=1) - noise_free
+    observed = np.concatenate([v.observed for v in variables])
+    where = [_positions(result, v) for v in variables]
+    sd = noise.std(axis=0)
+    # Replicates of a reading near full scale are cut off there, and have no residuals of their own.
+    cut = np.concatenate([(v.predicted >= v.full_scale).mean(axis=0) for v in variables])
+    keep = np.flatnonzero((sd > 0.0) & (cut < MAX_SATURATED))
+    keep = keep[:: max(1, -(-keep.size // MAX_READINGS))]
+    if keep.size < 4 or len(noise) < 100:
+        return None
+    noise, noise_free, sd = noise[:, keep] / sd[keep], noise_free[:, keep] / sd[keep], sd[keep]
+    random = np.random.default_rng(0)
+    pick = random.permutation(len(noise))[:REPLICATES]
+    centered = noise_free - noise_free.mean(axis=0)
+    covariance = centered.T @ centered / (len(centered) - 1)
+    replicated = noise[pick] - noise[pick] @ covariance
+    material = {s.label: s.draws.ravel() for s in found if s.is_material}
+    material = {n: x for n, x in material.items() if np.isfinite(x).all() and np.ptp(x) > 0.0}
+    scores = np.array([(x - x.mean()) / x.std() for x in material.values()]).reshape(
+        len(material), len(centered)
+    )
+    group = [name for each in where for name in each.group]
+    labels = [label for each in where for label in each.labels]
+    groups = {name: number for number, name in enumerate(dict.fromkeys(group))}
+    return Residuals(
+        observed=observed[keep] / sd - noise_free.mean(axis=0),
+        replicated=replicated,
+        stated=np.concatenate([each.stated for each in where])[keep] / sd,
+        left_out=np.maximum(replicated.var(axis=0), 1.0 - MAX_LEVERAGE),
+        gains=scores @ centered / (len(centered) - 1),
+        parameters=tuple(material),
+        directions=np.concatenate([each.directions for each in where])[keep],
+        wavelength=np.concatenate([each.wavelength for each in where])[keep],
+        group=np.array([groups[name] for name in group])[keep],
+        labels=tuple(str(labels[i]) for i in keep),
+    )
+
+
+class _Positions(NamedTuple):
+    """Where each reading of a variable was read."""
+
+    directions: np.ndarray  # (reading, 4), degree
+    wavelength: np.ndarray  # (reading,)
+    stated: np.ndarray  # (reading,): stated error, 0 where there is none
+    group: list[str]
+    labels: list[str]
+
+
+def _positions(result: xr.DataTree, variable: FlatVariable) -> _Positions:
+    """Directions, wavelength, group and label of every reading of a variable."""
+    reading = result["observed_data"].to_dataset()[variable.name]
+    constants = result["constant_data"].to_dataset()
+
+    def along(values: xr.DataArray) -> np.ndarray:
+        return values.variable.set_dims(reading.sizes).to_numpy()[variable.usable]
+
+    angles = [along(constants[name]) for name in ANGLES]
+    wavelength = np.zeros(variable.observed.size)
+    if "wavelength" in reading.coords and "wavelength" in reading.dims:
+        wavelength = along(reading["wavelength"])
+    stated = np.zeros(variable.observed.size)
+    if f"{variable.name}_error" in constants:
+        stated = np.nan_to_num(along(constants[f"{variable.name}_error"]).astype(float))
+    others = [str(dim) for dim in reading.dims if dim not in ("view", "wavelength")]
+    index = [along(xr.DataArray(np.arange(reading.sizes[dim]), dims=dim)) for dim in others]
+    group = [
+        " ".join([variable.name, *(str(each[i]) for each in index)])
+        for i in range(variable.observed.size)
+    ]
+    colored = len(np.unique(wavelength)) > 1
+    labels = [
+        f"{variable.name} at {zenith:.3g} degrees" + (f", {length:g} nm" if colored else "")
+        for zenith, length in zip(angles[0], wavelength, strict=True)
+    ]
+    return _Positions(np.stack(angles, axis=1), wavelength, stated, group, labels)
+
+
+def residual_findings(residuals: Residuals | None) -> dict[str, Finding]:
+    """The checks of residuals by name."""
+    checks = {
+        "angle": _angle,
+        "wavelength": _wavelength,
+        "outliers": _outliers,
+        "influence": _influence,
+    }
+    if residuals is None:
+        missing = Finding("not computed", sentence="The fit holds no predicted readings.")
+        return dict.fromkeys(checks, missing)
+    return {name: check(residuals) for name, check in checks.items()}
+
+
+def _unit_vectors(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    zenith, azimuth = np.radians(zenith), np.radians(azimuth)
+    return np.stack(
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1
+    )
+
+
+def _angle(residuals: Residuals) -> Finding:
+    """Neighbors with residuals of one sign, where a coordinate and a scale show it most."""
+    view_zenith, view_azimuth, light_zenith, light_azimuth = residuals.directions.T
+    view = _unit_vectors(view_zenith, view_azimuth)
+    light = _unit_vectors(light_zenith, light_azimuth)
+    half = (view + light) / np.maximum(np.linalg.norm(view + light, axis=1, keepdims=True), 1e-9)
+    # A wrong microfacet distribution errs by the tilt of the half vector, a wrong reflectance by
+    # the angle of incidence on the facet, a wrong body or instrument by the view zenith.
+    coordinates = (
+        np.hstack([view, light]),
+        np.arccos(np.clip(half[:, 2:], -1.0, 1.0)),
+        np.arccos(np.clip(np.sum(half * light, axis=1, keepdims=True), -1.0, 1.0)),
+        np.radians(view_zenith[:, None]),
+    )
+    same = residuals.group[:, None] == residuals.group[None]
+    kernels = []
+    for x in coordinates:
+        apart = np.sum((x[:, None] - x[None]) ** 2, axis=-1)
+        kernels += [
+            np.where(same, np.exp(-0.5 * apart / math.radians(scale) ** 2), 0.0)
+            for scale in ANGLE_SCALES
+        ]
+    p_value, statistic = _autocorrelation(residuals, kernels)
+    sentence = (
+        f"The residuals have structure over the angle ({p_text(p_value)}): neighboring readings "
+        "err in the same direction, which noise does not, so the scene lacks what the readings "
+        "show; look at the residuals in the report, and try polar_bayes.compare_scenes."
+    )
+    return judged_by(p_value, statistic, sentence)
+
+
+def _wavelength(residuals: Residuals) -> Finding:
+    """Readings of one view that err alike, or with opposite signs, in several wavelengths."""
+    if len(np.unique(residuals.wavelength)) < 2:
+        return Finding("passed")
+    view = np.unique(residuals.directions, axis=0, return_inverse=True)[1].ravel()
+    same = (view[:, None] == view[None]) & (residuals.group[:, None] == residuals.group[None])
+    kernels = [np.where(same, sign, 0.0) for sign in (1.0, -1.0)]
+    p_value, statistic = _autocorrelation(residuals, kernels)
+    sentence = (
+        f"The residuals of one view depend on those at other wavelengths ({p_text(p_value)}): the "
+        "errors of the wavelengths are not independent, so intervals are too narrow; look at the "
+        "residuals in the report."
+    )
+    return judged_by(p_value, statistic, sentence)
+
+
+def _autocorrelation(residuals: Residuals, kernels: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Moran's I for each kernel, standardized by the replicates; the largest and its p-value."""
+    scores, null = [], []
+    for kernel in kernels:
+        kernel = kernel - np.diag(np.diag(kernel))
+        if not kernel.any():
+            continue
+        replicated = _moran(residuals.replicated, kernel)
+        center, sd = replicated.mean(), replicated.std()
+        scores.append((_moran(residuals.observed[None], kernel)[0] - center) / sd)
+        null.append((replicated - center) / sd)
+    if not scores:
+        return 1.0, math.nan
+    observed, replicates = max(scores), np.max(null, axis=0)
+    return _p_value(observed, replicates), float(observed)
+
+
+def _p_value(observed: float, replicates: np.ndarray) -> float:
+    """Share of the replicates, the readings among them, whose statistic is as large."""
+    return float((1 + np.sum(replicates >= observed)) / (1 + replicates.size))
+
+
+def _moran(e: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    return np.sum((e @ kernel) * e, axis=1) / np.sum(e**2, axis=1)
+
+
+def _outliers(residuals: Residuals) -> Finding:
+    """The largest residual in units of their root mean square."""
+
+    def largest(e: np.ndarray) -> np.ndarray:
+        return np.abs(e).max(axis=-1) / np.sqrt(np.mean(e**2, axis=-1))
+
+    # Where all readings scatter less than stated, one that keeps to its statement is no outlier.
+    size = np.abs(residuals.observed)
+    beyond = np.where(size > STATED_ERRORS * residuals.stated, size, 0.0)
+    observed = float(beyond.max() / np.sqrt(np.mean(size**2)))
+    p_value = _p_value(observed, largest(residuals.replicated))
+    farthest = residuals.labels[int(beyond.argmax())]
+    sentence = (
+        f"A reading is farther out than the noise explains ({p_text(p_value)}): {farthest}, "
+        f"{observed:.1f} times the rms residual; check it, or mark it valid=False."
+    )
+    return judged_by(p_value, observed, sentence)
+
+
+# --- Readings that decide the answer --------------------------------------------------------------
+
+
+def _influence(residuals: Residuals) -> Finding:
+    """Readings that move a parameter, and that the others contradict."""
+    if not residuals.parameters:
+        return Finding("passed")
+    left_out = residuals.left_out
+    gain = np.abs(residuals.gains).max(axis=0) / left_out
+
+    def contradiction(e: np.ndarray) -> np.ndarray:
+        """Residuals without the reading itself, in their own sd, where it moves the answer."""
+        return np.where(gain * np.abs(e) > LARGE_SHIFT, np.abs(e) / np.sqrt(left_out), 0.0)
+
+    observed = contradiction(residuals.observed)
+    largest = float(observed.max())
+    if not largest > 0.0:
+        return Finding("passed")
+    p_value = _p_value(largest, contradiction(residuals.replicated).max(axis=-1))
+    order = np.argsort(-observed)[: int(np.sum(observed >= 0.75 * largest))]
+    moved = float((gain * np.abs(residuals.observed))[order].max())
+    which = "A reading decides" if len(order) == 1 else f"{len(order)} readings decide"
+    sentence = (
+        f"{which} the answer against the others ({p_text(p_value)}): without "
+        f"{listed(residuals.labels[i] for i in order)} the mean of a parameter would move by up to "
+        f"{moved:.1f} sd; repeat {'it' if len(order) == 1 else 'them'}."
+    )
+    return judged_by(p_value, largest, sentence, most="caution")
+
+
+def readings_alone(residuals: Residuals | None) -> dict[str, tuple[str, float]]:
+    """By parameter: the reading without which its sd would at least double, and by what factor."""
+    if residuals is None or not residuals.parameters:
+        return {}
+    widened = np.sqrt(1.0 + residuals.gains**2 / residuals.left_out)
+    best = widened.argmax(axis=1)
+    return {
+        name: (residuals.labels[at], float(factors[at]))
+        for name, factors, at in zip(residuals.parameters, widened, best, strict=True)
+        if factors[at] > ALONE
+    }

@@ -1,0 +1,80 @@
+r"""Checks of a model that fits and maps share, as functions of arrays, and limits of their levels.
+
+A parameter at the value at which what it describes is absent or perfect is no conflict, however
+rarely the prior has it there: a body that sends no light is the simplest object there is. Its
+tail is therefore one-sided, and of k such tails the sum of squared scores has a mixture of
+$\chi^2$ distributions,
+
+$$ P\Big(\sum_j \max(z_j, 0)^2 > s\Big) = \sum_i \binom{k}{i} 2^{-k} P(\chi^2_i > s) $$
+
+Source: Evans & Moshonov (2006), Bayesian Analysis 1, 893 (prior-data conflict by tail probability);
+Silvapulle & Sen (2005), Constrained Statistical Inference, section 3.4 (chi-bar-square).
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+CAUTION = 0.02
+"""Probability, under a right model, that one check gives a caution or a problem."""
+
+PROBLEM = 0.004
+"""Probability, under a right model, that one check gives a problem."""
+
+NEAR_BOUND = 0.05
+"""Width of the strip at a bound, as a share of the 95% interval."""
+
+MASS_AT_BOUND = 0.03
+"""Share of the draws in that strip that counts: a uniform density over the interval has 0.0475."""
+
+NOISE_FACTOR = "stokes_error_factor"
+
+LARGE_FACTOR = 3.0
+"""Stated errors that are exceeded by this factor, with probability 97.5%, give a caution."""
+
+SMALLEST_TAIL = 1e-300
+"""Probability below which a tail is not told from zero."""
+
+
+def tail_scores(
+    below: Float[np.ndarray, "... parameter"], end: Float[np.ndarray, " parameter"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Tail probabilities of the prior and their normal scores, (..., parameter).
+
+    `below` is the prior probability below each posterior median; `end` says where the parameter is
+    absent or perfect, -1 at the low end, 1 at the high end, 0 nowhere: that end is no tail.
+    """
+    away = np.where(end < 0.0, 1.0 - below, below)
+    tails = np.where(end == 0.0, 2.0 * np.minimum(below, 1.0 - below), away)
+    tails = np.clip(tails, SMALLEST_TAIL, 1.0)
+    scores = stats.norm.isf(np.where(end == 0.0, tails / 2.0, tails))
+    return tails, np.maximum(scores, 0.0)
+
+
+def prior_conflict(
+    below: Float[np.ndarray, "... parameter"], end: Float[np.ndarray, " parameter"]
+) -> np.ndarray:
+    """p-value of the smallest tail (Bonferroni) and of all tails together, for each row."""
+    tails, scores = tail_scores(below, end)
+    farthest = tails.min(axis=-1) * tails.shape[-1]
+    one_sided = int(np.sum(end != 0.0))
+    squares, two_sided = np.sum(scores**2, axis=-1), tails.shape[-1] - one_sided
+    together = sum(
+        math.comb(one_sided, i) * 0.5**one_sided * _chi2_tail(squares, i + two_sided)
+        for i in range(one_sided + 1)
+    )
+    return np.minimum(1.0, 2.0 * np.minimum(farthest, together))
+
+
+def _chi2_tail(squares: np.ndarray, degrees: int) -> np.ndarray:
+    """Probability above; without degrees of freedom all of it is at zero."""
+    return stats.chi2.sf(squares, degrees) if degrees else np.where(squares > 0.0, 0.0, 1.0)
+
+
+def level(p_value: float) -> str:
+    """The level of a check with this p-value."""
+    if not math.isfinite(p_value):
+        return "not computed"
+    return "problem" if p_value < PROBLEM else "caution" if p_value < CAUTION else "passed"
