@@ -556,9 +556,8 @@ _ROWS: dict[str, dist.Distribution] = {
     "dark_level": dist.Normal(0.0, 0.001),
     "angle_zero": dist.Normal(0.0, 0.75),
     "beam_overlap_zenith": dist.TruncatedNormal(80.0, 5.0, low=45.0, high=89.0),
-    # No set-up is free of smooth errors of some percent: a prior that allows none would let a
-    # few lucky readings claim an accuracy that no goniometer has. One in 400 is worse than 50%.
-    "discrepancy_amplitude": dist.LogNormal(math.log(0.08), 0.65),
+    # Smooth errors of some percent are usual, and none is possible; one in 400 is worse than 36%.
+    "discrepancy_amplitude": HalfNormal(0.12),
     "discrepancy_weights": dist.Normal(0.0, 1.0).expand([4]).to_event(1),
     # The noise: scales that the data themselves determine. None may reach zero: where the scene
     # can match a few readings exactly, a scale of zero would have infinite posterior density.

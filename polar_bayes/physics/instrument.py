@@ -410,8 +410,9 @@ def tilted_direction(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Arr
 # --- Discrepancy: a smooth unknown factor between the channels, over angle ------------------------
 
 
-# View angles run over 0 to 90 degrees; the basis vanishes at the ends of a domain this much wider.
-MIDDLE, HALF_WIDTH, WIDER = 45.0, 45.0, 1.3
+# View angles run over 0 to 90 degrees. The basis vanishes at normal incidence, where an isotropic
+# sample reflects s and p alike, and at the end of a domain that is wider than the angles.
+DOMAIN = 117.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -419,7 +420,7 @@ class Discrepancy(AbstractInstrumentTerm):
     r"""A smooth factor exp(f) on the ratio of channels s and p, over the view zenith.
 
     $$ f(\theta) = \text{amplitude} \sum_j w_j \sqrt{S(\omega_j)}\,
-       \sin\!\Big(\frac{j\pi(x+L)}{2L}\Big), \qquad
+       \sin\frac{j\pi\theta}{L}, \qquad
        q' = \frac{q+t}{1+qt}, \quad t = \tanh(f/2) $$
 
     A Gaussian process with squared-exponential kernel, in its Hilbert-space approximation. With
@@ -463,17 +464,14 @@ class Discrepancy(AbstractInstrumentTerm):
     def functions(self, view_zenith: Array) -> Array:
         """Basis functions, scaled by the spectrum: (..., view) -> (..., basis, view)."""
         frequency, scale = self._spectrum()
-        phase = view_zenith[..., None, :] + (HALF_WIDTH * WIDER - MIDDLE)
         dtype = jnp.result_type(float, view_zenith)
-        return jnp.asarray(scale[:, None], dtype) * jnp.sin(
-            jnp.asarray(frequency[:, None], dtype) * phase
-        )
+        phase = jnp.asarray(frequency[:, None], dtype) * view_zenith[..., None, :]
+        return jnp.asarray(scale[:, None], dtype) * jnp.sin(phase)
 
     def _spectrum(self) -> tuple[np.ndarray, np.ndarray]:
         """Frequencies, and amplitudes that make the mean variance over 0 to 90 degrees one."""
-        span = 2.0 * HALF_WIDTH * WIDER
-        frequency = math.pi * np.arange(1, self.basis + 1) / span
+        frequency = math.pi * np.arange(1, self.basis + 1) / DOMAIN
         amplitude = np.exp(-((self.length * frequency) ** 2) / 4.0)
-        angle = np.linspace(0.0, 90.0, 181)[:, None] + (HALF_WIDTH * WIDER - MIDDLE)
+        angle = np.linspace(0.0, 90.0, 181)[:, None]
         variance = np.mean(np.sum((amplitude * np.sin(frequency * angle)) ** 2, axis=1))
         return frequency, amplitude / math.sqrt(variance)
