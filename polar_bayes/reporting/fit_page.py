@@ -14,7 +14,7 @@ from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
 from polar_bayes.diagnostics.convergence import Verdict
-from polar_bayes.diagnostics.criticism import CAUTION, PROBLEM, QUESTIONS, REFUTED, criticize
+from polar_bayes.diagnostics.criticism import QUESTIONS, REFUTED, criticize
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
     Scalar,
@@ -33,6 +33,7 @@ from polar_bayes.diagnostics.population import (
 from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck, predictive_checks
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, sensitivity
 from polar_bayes.errors import FitError, one_line
+from polar_bayes.inference.checks import CAUTION, PROBLEM
 from polar_bayes.inference.files import auto_sentences
 from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
@@ -155,11 +156,10 @@ def fit_page(result: xr.DataTree) -> page.Page:
     summary = population_summary(result)
     sentences = fit.determined()
     if fit.verdict.passed:
-        trust = text.trust(fit.method, fit.verdict.cautions, fit.checks)
+        trust = text.trust(fit.method, fit.verdict, fit.criticism)
         following = text.next_sentence(result)
         sentences = [*text.index_sentences(fit), trust, following, *sentences]
         sentences += text.between_members(summary, pooled, fit.posterior)
-        sentences += text.predictive_sentences(fit.checks)
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")
     source = [page.Details("Source of the model", code=code)] if code else []
@@ -193,7 +193,7 @@ def fit_page(result: xr.DataTree) -> page.Page:
         headline=fit.headline(),
         passed=fit.verdict.passed,
         problems=fit.verdict.problems,
-        sentences=sentences,
+        sentences=[*sentences, *text.notes(fit.verdict)],
         cautions=fit.verdict.cautions,
         sections=sections,
         footer="Computed from result.nc, which lies in the same folder and holds every draw.",
@@ -461,6 +461,8 @@ def _readings(fit: Fit) -> Iterator[page.Picture]:
 
 
 def _checks(fit: Fit) -> Iterator[page.Block]:
+    if fit.method != "point":
+        yield from text.predictive_sentences(fit.checks, fit.criticism)
     if fit.checks:
         yield check_table(fit.checks)
     if any(check.pit.size > 1 for check in fit.checks.values()):

@@ -276,10 +276,9 @@ def _pit_panel(axes: Axes, values: np.ndarray | None) -> None:
     if band is None:
         style.write_in_panel(axes, "not available")
         return
-    color = VERMILLION if band.rejects_uniformity else BLUE
     axes.fill_between(band.at, band.lower, band.upper, color=lighten(GRAY, 0.75), lw=0, step="mid")
     axes.axhline(0.0, color=GRAY, lw=0.8)
-    axes.step(band.at, band.difference, where="mid", color=color, lw=1.4)
+    axes.step(band.at, band.difference, where="mid", color=BLUE, lw=1.4)
     axes.set_xlim(0, 1)
 
 

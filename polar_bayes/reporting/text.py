@@ -16,11 +16,12 @@ import xarray as xr
 from polar_bayes.benchmark.advice import accuracy_dataset
 from polar_bayes.calibration.scores import is_calibrated, p_values, significance_level
 from polar_bayes.calibration.verdict import calibration_verdict
+from polar_bayes.diagnostics.checked import nothing_against
 from polar_bayes.diagnostics.compare import FitComparison
 from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.population import Population
-from polar_bayes.diagnostics.predictive import PitBand, PredictiveCheck, pit_band
+from polar_bayes.diagnostics.predictive import PredictiveCheck
 from polar_bayes.errors import one_line
 from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.inference.psis import MAX_PARETO_K
@@ -283,45 +284,31 @@ def _coordinates(group: Sequence[Scalar], posterior: xr.Dataset) -> str:
     return f" ({'; '.join(places[:MAX_NAMED])}{more})"
 
 
-def predictive_sentences(checks: Mapping[str, PredictiveCheck]) -> list[str]:
-    """Whether the readings are distributed as the model expects, variable by variable."""
-    sentences = []
-    for check in checks.values():
-        band = _band(check)
-        name = QUANTITIES.get(check.name, check.name)
-        if band is not None and band.rejects_uniformity:
-            sentences.append(
-                f"The readings of {name} are not distributed as the model expects: "
-                f"{_departure(band)}. The intervals may be off."
-            )
-        elif band is not None:
-            sentences.append(f"The readings of {name} are distributed as the model expects.")
-        if check.loo and check.loo.unreliable:
+def predictive_sentences(
+    checks: Mapping[str, PredictiveCheck], criticism: pd.DataFrame
+) -> list[str]:
+    """Whether readings scatter about their predictions as the model says, by its one check."""
+    check = criticism.loc["leave-one-out"]
+    sentences = [str(check["sentence"])] if check["sentence"] else []
+    if check["level"] == "passed" and math.isfinite(check["p_value"]):
+        sentences.append(
+            "The readings are distributed as the model expects (the check leave-one-out, "
+            f"p = {check['p_value']:.2g})."
+        )
+    for each in checks.values():
+        if each.loo and each.loo.unreliable:
             effect = (
                 "leave-one-out cannot be approximated with these draws, so its results on this "
                 "page mean little."
-                if check.loo.unreliable > HALF * check.count
+                if each.loo.unreliable > HALF * each.count
                 else "they are so influential that leave-one-out cannot be approximated for them. "
                 "Inspect them first."
             )
             sentences.append(
-                f"Pareto k is above 0.7 for {check.loo.unreliable} of {check.count} readings of "
-                f"{name}: {effect}"
+                f"Pareto k is above 0.7 for {each.loo.unreliable} of {each.count} readings of "
+                f"{QUANTITIES.get(each.name, each.name)}: {effect}"
             )
     return sentences
-
-
-def _band(check: PredictiveCheck) -> PitBand | None:
-    return pit_band(check.loo.pit if check.loo else check.pit)
-
-
-def _departure(band: PitBand) -> str:
-    """How the readings depart from the prediction, once the curve leaves its band."""
-    above = np.flatnonzero(band.difference > band.upper)
-    below = np.flatnonzero(band.difference < band.lower)
-    if above.size and below.size:
-        return f"they scatter {'more' if above[0] < below[0] else 'less'} than it says"
-    return f"more of them lie {'low' if above.size else 'high'} than it says"
 
 
 def index_sentences(fit: Any, quantity: str = "refractive_index") -> list[str]:
@@ -373,20 +360,24 @@ def next_sentence(result: xr.DataTree) -> str:
     return f"{views}: the 95% intervals{of} are expected to narrow by {by}."
 
 
-def trust(method: str, cautions: Sequence[str], checks: Mapping[str, PredictiveCheck]) -> str:
+def trust(method: str, verdict: Verdict, criticism: pd.DataFrame) -> str:
     """Whether the intervals can be trusted, as far as one fit can tell."""
     if method == "point":
         return (
             "The standard errors are those of least squares: they include no prior and no bounds, "
             "so do not read them as intervals."
         )
-    bands = [_band(check) for check in checks.values()]
-    if cautions or any(band is not None and band.rejects_uniformity for band in bands):
-        return "Trust the intervals with care: this page lists what speaks against them."
+    if verdict.cautions:
+        return "Trust the intervals with care: the cautions say what speaks against them."
     return (
-        "Nothing here speaks against the intervals. A calibration of this layout shows how often "
-        "such intervals contain the truth."
+        f"{nothing_against(method, verdict, criticism)} A calibration of this layout shows how "
+        "often such intervals contain the truth, if the scene is the right one."
     )
+
+
+def notes(verdict: Verdict) -> list[str]:
+    """What a reader may want to know of a fit, which changes nothing about its verdict."""
+    return [f"Note: {finding}" for finding in verdict.findings]
 
 
 def overconfidence(

@@ -13,12 +13,18 @@ from polar_bayes.diagnostics.predictive import pit_band, predictive_checks, usab
 SMALL = {"wavelengths": (), "views": 20, "draws": 150}
 
 
+def leaves(band) -> bool:
+    """Whether the curve leaves its band anywhere."""
+    outside = (band.difference < band.lower - 1e-9) | (band.difference > band.upper + 1e-9)
+    return bool(np.any(outside))
+
+
 def test_a_calibrated_fit_raises_no_more_alarms_than_it_should() -> None:
     """Of 60 calibrated fits 5% may leave the band: more than 9 has probability 0.0013."""
     alarms = 0
     for seed in range(60):
         check = predictive_checks(make_result(**SMALL, variables=("dop",), seed=seed))["dop"]
-        alarms += pit_band(check.loo.pit).rejects_uniformity
+        alarms += leaves(pit_band(check.loo.pit))
     assert alarms <= stats.binom.isf(0.002, 60, 0.05)
 
 
@@ -36,7 +42,7 @@ def test_pooled_pit_of_calibrated_fits_is_uniform() -> None:
 def test_readings_that_scatter_otherwise_leave_the_band(noise: float, first_side: str) -> None:
     check = predictive_checks(make_result(noise=noise))["dop"]
     band = pit_band(check.loo.pit)
-    assert band.rejects_uniformity
+    assert leaves(band)
     early = band.difference[: len(band.at) // 4]
     assert (early.mean() > 0.0) == (first_side == "above")
 
@@ -127,15 +133,15 @@ def test_a_band_needs_two_values() -> None:
     assert pit_band(np.array([0.5])) is None
     assert pit_band(np.array([np.nan, 0.5])) is None
     assert pit_band(np.array([])) is None
-    assert not pit_band(np.array([0.3, 0.8])).rejects_uniformity
-    assert pit_band(np.full(50, 0.5)).rejects_uniformity
+    assert not leaves(pit_band(np.array([0.3, 0.8])))
+    assert leaves(pit_band(np.full(50, 0.5)))
 
 
 @pytest.mark.thorough
 def test_many_readings_are_fast_and_calibrated() -> None:
     values = np.random.default_rng(1).uniform(size=20_000)
     band = pit_band(values)
-    assert not band.rejects_uniformity
+    assert not leaves(band)
     assert len(band.at) < 1000
 
 

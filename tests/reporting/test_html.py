@@ -1,5 +1,6 @@
 """The page stands alone, tells the truth first, and runs nothing that a capture smuggles in."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,15 @@ from cases import each
 from pages import EVIL, Page
 from synthetic_results import edit_provenance, make_result, replace
 
+import polar_bayes as pb
+from polar_bayes.diagnostics import convergence, criticism
+from polar_bayes.diagnostics.checked import checks_made
 from polar_bayes.diagnostics.compare import compare_without
-from polar_bayes.diagnostics.convergence import summary
+from polar_bayes.diagnostics.convergence import Verdict, summary, verdict
+from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.diagnostics.parameters import posterior_scalars
 from polar_bayes.errors import FitError, PolarBayesError
+from polar_bayes.reporting import fit_page
 from polar_bayes.reporting.report import render, report
 from polar_bayes.reporting.text import interval, join, numbers, overconfidence, percent
 from polar_bayes.results import load
@@ -173,13 +179,72 @@ def test_a_comparison_that_failed_is_told() -> None:
 
 
 def test_it_says_whether_intervals_can_be_trusted(small) -> None:
-    assert "Nothing here speaks against the intervals." in small[1].text
+    result, page = small
+    assert (
+        "Nothing speaks against the intervals in what was checked: chains (R-hat, effective sample "
+        "sizes, divergences), priors, "
+    ) in page.text
+    assert "such intervals contain the truth, if the scene is the right one." in page.text
     scattered = Page(render(make_result(**{**SMALL, "draws": 250}, noise=4.0))).text
-    assert "Nothing here speaks against" not in scattered
+    assert "Nothing speaks against" not in scattered
     assert "The fit converged, but the readings speak against the model" in scattered
     assert "problem (fails)" in scattered
-    repeated = edit_provenance(make_result(**SMALL), prior_probability={"roughness": [0.997]})
-    assert "Trust the intervals with care" in Page(render(repeated)).text
+    doubted = Page(render(_in_conflict(result))).text
+    assert "Trust the intervals with care: the cautions say what" in doubted
+    assert "The fit converged. Mind the cautions." in doubted
+
+
+def _in_conflict(result: xr.DataTree) -> xr.DataTree:
+    """The result with a parameter in the tail of its prior, far enough for a caution."""
+    return edit_provenance(result.copy(), prior_probability={"roughness": [0.997]})
+
+
+def test_one_rule_judges_pit_values(monkeypatch: pytest.MonkeyPatch, small) -> None:
+    """Verdict, first screen, section and card follow the level of the check, whatever the band."""
+    levels = {"passed": 0.5, "caution": 0.01, "problem": 0.001}
+    for level, p_value in levels.items():
+        monkeypatch.setattr(criticism, "_uniformity", lambda pit, p=p_value: p)
+        text, card = Page(render(small[0])).text, repr(pb.show(small[0]))
+        is_passed = level == "passed"
+        uniform = "distributed as the model expects (the check leave-one-out, p = 0.5)" in text
+        assert uniform == is_passed
+        for shown in (text, card):
+            assert ("Nothing speaks against the intervals" in shown) == is_passed
+            assert ("PIT values of dop are not uniform" in shown) != is_passed
+            assert ("do not use these intervals" in shown) == (level == "problem")
+        assert ("Trust the intervals with care" in text) == (level == "caution")
+
+
+def test_what_is_said_to_be_checked_was_checked(small) -> None:
+    """Checks for which there was nothing, or that were not computed, are not in the list."""
+    table = criticize(small[0])
+    made, missing = checks_made("nuts", table)
+    assert made[0].startswith("chains")
+    assert "outliers" in made
+    assert "residuals over the wavelength" not in made  # there is one wavelength only
+    assert missing == []
+    table.loc["outliers", "level"] = "not computed"
+    made, missing = checks_made("laplace", table)
+    assert made[0].startswith("the approximation")
+    assert "outliers" not in made
+    assert missing == ["outliers"]
+
+
+def test_a_note_is_told_and_changes_nothing(monkeypatch: pytest.MonkeyPatch, small) -> None:
+    def with_note(*arguments: object) -> pd.DataFrame:
+        table = criticize(*arguments)
+        table.loc["bounds", ["level", "sentence"]] = "note", "No light from the body is seen."
+        return table
+
+    def verdict_with_note(*arguments: object) -> Verdict:
+        return dataclasses.replace(verdict(*arguments), findings=("No light is seen.",))
+
+    monkeypatch.setattr(fit_page, "criticize", with_note)
+    monkeypatch.setattr(convergence, "verdict", verdict_with_note)
+    for shown in (Page(render(small[0])).text, repr(pb.show(small[0]))):
+        assert "The fit converged. " in f"{shown} ".replace("\n", " ")
+        assert "Note: No light is seen." in shown
+        assert "Nothing speaks against the intervals" in shown
 
 
 def test_the_first_screen_tells_the_index_the_trust_and_the_next_views(small) -> None:
@@ -187,7 +252,7 @@ def test_the_first_screen_tells_the_index_the_trust_and_the_next_views(small) ->
     first = page.text.partition("parameter mean sd")[0]
     row = summary(result).loc["refractive_index"]
     assert f"The refractive index n is {numbers([row['mean']], row['sd'])[0]} (95% int" in first
-    assert first.index("The refractive index n is") < first.index("Nothing here speaks against")
+    assert first.index("The refractive index n is") < first.index("Nothing speaks against")
     assert "What to measure next is not worked out here" in first
     told = result.copy()
     told["next_views"] = xr.Dataset(
