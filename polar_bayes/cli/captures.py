@@ -20,10 +20,10 @@ from polar_bayes.cli.options import (
     link_option,
     option,
     out_option,
-    print_cautions,
     read_scene_options,
     seed_option,
 )
+from polar_bayes.cli.printing import print_cautions
 
 out_capture = out_option(CAPTURE_FILE, "Capture to write.")
 name_option = option("--name", help="Name of the capture.")

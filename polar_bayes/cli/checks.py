@@ -8,23 +8,20 @@ import click
 import polar_bayes as pb
 from polar_bayes.cli.options import (
     CALIBRATION_METHOD,
-    NOT_CONVERGED,
     RESULT_FILE,
     STUDY_METHOD,
     capture_argument,
     command,
     json_option,
-    json_rows,
     model_option,
     option,
     out_option,
-    print_frame,
-    print_json,
     read_scene_options,
     scene_options,
     scheduler_option,
     seed_option,
 )
+from polar_bayes.cli.printing import NOT_CONVERGED, json_rows, print_frame, print_json, say
 from polar_bayes.progress import stages
 
 CALIBRATION_COLUMNS = (
@@ -86,7 +83,7 @@ def calibrate(
             click.echo()
             print_frame(tables["readings"].drop(columns=["reading", "test"]))
         next_step = NEXT_STEPS[verdict.passed].format(capture=capture, out=out)
-        click.echo("\n".join(["", *verdict.sentences, "", next_step]))
+        say("\n".join(["", *verdict.sentences, "", next_step]))
     return 0 if verdict.passed else NOT_CONVERGED
 
 
@@ -184,7 +181,7 @@ def accuracy(
         pb.save(study, out)
         name, row = list(pb.summary(study).iterrows())[-1]
         told = f"off by {row['error']:.2g} sd ({row['worst']}), {row['seconds_first']:.0f} s"
-        click.echo(f"{name}: {row['problems'] if row['error'] != row['error'] else told}", err=True)
+        say(f"{name}: {row['problems'] if row['error'] != row['error'] else told}", err=True)
 
     study = pb.accuracy(data, partial=keep, **settings)
     pb.save(study, out)

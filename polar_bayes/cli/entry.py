@@ -34,6 +34,7 @@ import click
 from polar_bayes.cli.captures import COMMANDS as CAPTURE_COMMANDS
 from polar_bayes.cli.checks import COMMANDS as CHECK_COMMANDS
 from polar_bayes.cli.fits import COMMANDS as FIT_COMMANDS
+from polar_bayes.cli.printing import say
 from polar_bayes.errors import PolarBayesError, one_line
 from polar_bayes.interrupts import clean_up
 from polar_bayes.paths import compiled_folder, make_private, system_error
@@ -236,7 +237,7 @@ def _run(arguments: list[str] | None) -> int:
         click.echo(f"{where}: {line} (see `{where} --help`)", err=True)
         return 1
     except PolarBayesError as error:
-        click.echo(str(error), err=True)
+        say(error, err=True)
         return 1
     except SystemExit as error:  # click, which replaces a stream whose pipe is broken
         if sys.stdout is not output:

@@ -12,7 +12,6 @@ from polar_bayes.cli.options import (
     FIT_SCENE,
     FOLDER,
     INPUT,
-    NOT_CONVERGED,
     RESULT_FILE,
     SCENE_FILE,
     SCENE_HELP,
@@ -21,17 +20,11 @@ from polar_bayes.cli.options import (
     capture_argument,
     command,
     json_option,
-    json_rows,
     link_option,
     model_option,
     nuts_options,
     option,
     out_option,
-    print_cautions,
-    print_fit,
-    print_frame,
-    print_json,
-    print_verdict,
     prior_option,
     read_scene_options,
     scene_options,
@@ -39,6 +32,16 @@ from polar_bayes.cli.options import (
     seed_option,
     view_limit_option,
     with_nuts_options,
+)
+from polar_bayes.cli.printing import (
+    NOT_CONVERGED,
+    json_rows,
+    print_cautions,
+    print_fit,
+    print_frame,
+    print_json,
+    print_verdict,
+    say,
 )
 from polar_bayes.paths import write_errors
 from polar_bayes.progress import stages
@@ -124,7 +127,7 @@ def fit(
             options = {key: settings[key] for key in OF_CHOICE}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             chosen: Any = pb.choose_effects(data, progress=progress, **options)
-            click.echo("\n".join(pb.verdict(chosen.ledger).sentences), err=True)
+            say("\n".join(pb.verdict(chosen.ledger).sentences), err=True)
             settings["scene"] = _in_setup(chosen, settings["scene"])
         settings |= {"tolerance": tolerance} if is_auto else {}
         result = pb.fit(data, progress=progress, **settings)
@@ -136,11 +139,8 @@ def fit(
         *pb.scenes.scene_sentences(result),
     )
     for sentence in told:
-        click.echo(sentence, err=True)
-    if not as_json:
-        return print_fit(result)
-    print_json(pb.diagnostics.json_summary(result))
-    return print_verdict(result)
+        say(sentence, err=True)
+    return print_fit(result, as_json=as_json)
 
 
 OF_CHOICE = ("scene", "model", "priors", "links", "largest_view_zenith", "seed")
@@ -203,7 +203,7 @@ def map_(
         interval = f"{row['q50']:.5g} [{row['q2.5']:.5g}, {row['q97.5']:.5g}]"
         click.echo(f"{name}: {interval} in all pixels, from {row['pixels']:.0f} of them")
     for sentence in pb.maps.start_sentences(maps):
-        click.echo(sentence)
+        say(sentence)
     print_cautions(pb.maps.shared_cautions(maps))
 
 
@@ -339,7 +339,7 @@ def _add_next_views(result: Any) -> None:
         with stages() as progress:
             result["next_views"] = pb.next_views(result, progress=progress)
     except pb.PolarBayesError as error:
-        click.echo(f"no next views: {error}", err=True)
+        say(f"no next views: {error}", err=True)
 
 
 @command()
@@ -354,7 +354,7 @@ def compare(fits: tuple[Path, ...], out: Path) -> int:
         print_frame(comparison.loo.rename(columns={"elpd_diff": "difference", "dse": "error"}))
         click.echo()
     for sentence in pb.reporting.comparison_of_fits_sentences(comparison):
-        click.echo(sentence)
+        say(sentence)
     click.echo(f"report: {page}")
     converged = all(verdict.passed for verdict in comparison.verdicts.values())
     return 0 if converged else NOT_CONVERGED

@@ -1,13 +1,11 @@
-"""Option types and options that several commands share, and what commands print.
+"""Option types and options that several commands share.
 
 Option types refuse wrong values before anything is computed and before JAX is loaded.
 """
 
 import dataclasses
 import functools
-import json
-import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, override
 
@@ -17,10 +15,6 @@ from click.core import ParameterSource
 import polar_bayes as pb
 from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
 from polar_bayes.paths import as_path, check_output, is_scene_file, refuse_inputs
-from polar_bayes.repr_html import Row, Table
-
-NOT_CONVERGED = 2
-"""Exit status of a fit whose diagnostics fail."""
 
 
 class Name(click.ParamType):
@@ -36,7 +30,7 @@ class Name(click.ParamType):
         if value not in self.names:
             raise self.error(
                 f"no such {self.kind}",
-                where=f"{param.name.rstrip('s')}={value!r}",
+                where=f"{param.opts[0]} {value}",
                 hint=f"give one of {', '.join(self.names)}",
             )
         return str(value)
@@ -120,7 +114,7 @@ class NamedInput(Input):
         if path.suffix == self.suffix or path.exists():
             return path
         hint = f"give one of {', '.join(self.names)}, or {self.otherwise}"
-        raise SceneError("no such scene", where=f"scene={value!r}", hint=hint)
+        raise SceneError("no such scene", where=f"{param.opts[0]} {value}", hint=hint)
 
 
 class Output(click.ParamType):
@@ -282,65 +276,3 @@ def read_scene_options(settings: dict[str, Any]) -> dict[str, Any]:
         raise click.UsageError("--link without a variable stands for all: give it once")
     found["links"] = links.get("") or links or stated.get("links")
     return found
-
-
-# --- Printing -------------------------------------------------------------------------------------
-
-
-def print_json(value: object) -> None:
-    """Print a value as strict JSON."""
-    click.echo(json.dumps(value, indent=2, allow_nan=False))
-
-
-def json_rows(table: Any, orient: str = "index") -> Any:
-    """The rows of a data frame by label, or in a list (`"records"`), as JSON has them."""
-    return json.loads(table.to_json(orient=orient))
-
-
-def print_frame(frame: Any, sentences: Iterable[str] = ()) -> None:
-    """Print a data frame, numbers with four digits and missing ones as -, and sentences below."""
-    rows = (Row(str(label), tuple(map(_text, cells))) for label, *cells in frame.itertuples())
-    click.echo(Table(("", *frame.columns), tuple(rows)).to_text(sys.stdout))
-    if sentences:
-        click.echo("\n".join(["", *sentences]))
-
-
-def _text(cell: Any) -> str:
-    if cell is None or cell != cell:  # NaN
-        return "-"
-    if not isinstance(cell, float):
-        return str(cell)
-    return f"{cell:.0f}" if 1e4 <= abs(cell) < 1e7 else f"{cell:.4g}"
-
-
-def print_fit(result: Any) -> int:
-    """Print a row per parameter, and the problems on the error stream; returns the exit status."""
-    columns = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
-    titles = ["mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"]
-    print_frame(pb.summary(result)[[*columns]].set_axis(titles, axis="columns"))
-    if words := list(_explanations(result["posterior"].dataset)):
-        click.echo("\n".join(["", *words]))
-    return print_verdict(result)
-
-
-def _explanations(posterior: Any) -> Iterator[str]:
-    """What parameters mean whose names do not say it, with their units."""
-    for name, variable in posterior.data_vars.items():
-        meaning, unit = (variable.attrs.get(key, "") for key in ("long_name", "units"))
-        if meaning and not meaning.startswith(str(name).replace("_", " ")):
-            yield f"{name}: {meaning}{'' if unit == '1' else f' [{unit}]'}"
-
-
-def print_cautions(sentences: Iterable[str]) -> None:
-    """Print cautions on the error stream."""
-    for sentence in sentences:
-        click.echo(f"caution: {sentence}", err=True)
-
-
-def print_verdict(result: Any) -> int:
-    """Print problems and cautions of a fit on the error stream; returns the exit status."""
-    verdict = pb.verdict(result)
-    for problem in verdict.problems:
-        click.echo(f"problem: {problem}", err=True)
-    print_cautions(verdict.cautions)
-    return 0 if verdict.passed else NOT_CONVERGED

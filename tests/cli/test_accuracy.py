@@ -61,7 +61,7 @@ def test_rungs_and_dials_are_chosen_and_json_is_json(plate, tmp_path, capsys, st
 def test_a_method_that_is_not_there_is_refused(plate, tmp_path, capsys):
     words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--method", "magic"]
     assert main(words) == 1
-    assert "method='magic': no such method; give one of point, laplace" in capsys.readouterr().err
+    assert "--method magic: no such method; give one of point, laplace" in capsys.readouterr().err
 
 
 @pytest.mark.thorough

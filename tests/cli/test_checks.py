@@ -83,4 +83,4 @@ def test_a_mistake_is_one_line(
     assert main(["calibrate", str(plate), "--out", out, "--simulations", "3"]) == 1
     assert capsys.readouterr().err.splitlines() == ["calibrate: simulations is 3; give 20 or more"]
     assert main(["calibrate", str(plate), "--out", out, "--method", "magic"]) == 1
-    assert "method='magic': no such method" in capsys.readouterr().err
+    assert "--method magic: no such method" in capsys.readouterr().err

@@ -114,7 +114,7 @@ def test_a_fit_says_what_it_chose_and_what_is_unlikely(
     told = capsys.readouterr()
     assert "q is negative" in " ".join(json.loads(told.out)["cautions"])
     assert "Set-up: picture, which the caller gave." in told.err
-    assert "Links: q by StokesLink(" in told.err
+    assert "Links: --link 'q=StokesLink(" in told.err
     assert "Readings: 4 of 5 are used; 0 are masked, and 1 are set aside beyond 70" in told.err
     assert pb.inference.choice_sentences(pb.load(out))[0] in told.err
 
@@ -167,7 +167,7 @@ WRONG = {
         "only 1 valid view",
     ),
     "folder": (["fit", "PLATE", "--out", "/nowhere/fit.nc"], "its folder is not there"),
-    "effect": (["effects", "PLATE", "--drop", "Fog"], "drop='Fog': the scene has no such effect"),
+    "effect": (["effects", "PLATE", "--drop", "Fog"], "--drop Fog: the scene has no such effect"),
     "set-up": (["effects", "PLATE", "--scene", "x"], "no such scene"),
     "tolerance": (["effects", "PLATE", "--tolerance", "0"], "tolerance is 0.0"),
     "tolerance of what": (

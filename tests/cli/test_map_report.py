@@ -41,7 +41,7 @@ def test_a_map_has_a_page(files: Path, capsys: pytest.CaptureFixture[str]) -> No
     ("options", "says"),
     [
         (["nowhere.zarr"], "nowhere.zarr: there is no such store"),
-        (["map.zarr", "--uncorrected", "bare.zarr"], "give truth=capture as well"),
+        (["map.zarr", "--uncorrected", "bare.zarr"], "give --truth as well"),
         (["map.zarr", "--truth", "nowhere.nc"], "nowhere.nc: there is no such file"),
         (["map.zarr", "--truth", "leaf.zarr", "--uncorrected", "map.zarr"], "corrected as well"),
     ],
@@ -81,7 +81,7 @@ def test_what_an_image_shares_is_told_with_its_interval(
     words = ["map", str(tmp_path / "plates.zarr"), "--out", str(tmp_path / "map.zarr")]
     assert main([*words, "--scene", "goniometer", "--share", "roughness"]) == 1
     told = capsys.readouterr().err
-    assert "shared='roughness': an image cannot share it; give names among" in told
+    assert "map: --share roughness: an image cannot share it; give names among" in told
     assert "stokes_error_factor" in told
     assert main([*words, "--share", "none", "--share", "dolp_gain"]) == 1
     assert "--share none excludes every other --share" in capsys.readouterr().err

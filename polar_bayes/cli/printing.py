@@ -1,0 +1,127 @@
+"""What commands print: sentences in their own words, tables, JSON, and the verdict of a fit."""
+
+import json
+import sys
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple, Self
+
+import click
+
+import polar_bayes as pb
+from polar_bayes.cli.wording import as_commands
+from polar_bayes.repr_html import Row, Table
+
+NOT_CONVERGED = 2
+"""Exit status of a fit whose diagnostics fail."""
+
+
+def say(sentence: object, *, err: bool = False) -> None:
+    """Print a sentence of the package, or an error, in the words of the command line."""
+    click.echo(as_commands(str(sentence)), err=err)
+
+
+def print_json(value: object) -> None:
+    """Print a value as strict JSON, its sentences in the words of the command line."""
+    click.echo(json.dumps(_in_commands(value), indent=2, allow_nan=False))
+
+
+def _in_commands(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _in_commands(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_in_commands(item) for item in value]
+    return as_commands(value) if isinstance(value, str) else value
+
+
+def json_rows(table: Any, orient: str = "index") -> Any:
+    """The rows of a data frame by label, or in a list (`"records"`), as JSON has them."""
+    return json.loads(table.to_json(orient=orient))
+
+
+def print_frame(frame: Any, sentences: Iterable[str] = ()) -> None:
+    """Print a data frame, numbers with four digits and missing ones as -, and sentences below."""
+    rows = (Row(str(label), tuple(map(_text, cells))) for label, *cells in frame.itertuples())
+    click.echo(Table(("", *frame.columns), tuple(rows)).to_text(sys.stdout))
+    if sentences:
+        say("\n".join(["", *sentences]))
+
+
+def _text(cell: Any) -> str:
+    if cell is None or cell != cell:  # NaN
+        return "-"
+    if not isinstance(cell, float):
+        return as_commands(str(cell))
+    return f"{cell:.0f}" if 1e4 <= abs(cell) < 1e7 else f"{cell:.4g}"
+
+
+# --- Fits -----------------------------------------------------------------------------------------
+
+
+class _Judged(NamedTuple):
+    """The verdict of a fit, and what was checked for it."""
+
+    verdict: Any
+    checks: tuple[list[str], list[str]]
+    nothing_against: str
+
+    @classmethod
+    def of(cls, result: Any) -> Self:
+        from polar_bayes.diagnostics.checked import checks_made, nothing_against
+        from polar_bayes.diagnostics.convergence import verdict
+        from polar_bayes.diagnostics.parameters import method_of
+
+        criticism, method = pb.diagnostics.criticize(result), method_of(result)
+        found = verdict(result, criticism=criticism)
+        checks = checks_made(method, criticism)
+        return cls(found, checks, nothing_against(method, found, criticism))
+
+    def print(self) -> int:
+        """Print problems, cautions and notes, or what was checked; returns the exit status."""
+        for problem in self.verdict.problems:
+            say(f"problem: {problem}", err=True)
+        print_cautions(self.verdict.cautions)
+        for note in self.verdict.findings:
+            say(f"note: {note}", err=True)
+        if self.nothing_against:
+            say(self.nothing_against, err=True)
+        return 0 if self.verdict.passed else NOT_CONVERGED
+
+
+def print_verdict(result: Any) -> int:
+    """Print what speaks against a fit on the error stream; returns the exit status."""
+    return _Judged.of(result).print()
+
+
+def print_fit(result: Any, *, as_json: bool = False) -> int:
+    """Print a row per parameter, and the verdict as `print_verdict` does."""
+    judged = _Judged.of(result)
+    if as_json:
+        made, missing = judged.checks
+        notes = {"notes": judged.verdict.findings, "checked": made, "not_checked": missing}
+        print_json({**pb.diagnostics.json_summary(result), **notes})
+    else:
+        _print_parameters(result)
+    return judged.print()
+
+
+def _print_parameters(result: Any) -> None:
+    """A row per parameter, and what those mean whose names do not say it."""
+    columns = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
+    titles = ["mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"]
+    print_frame(pb.summary(result)[[*columns]].set_axis(titles, axis="columns"))
+    if words := list(_explanations(result["posterior"].dataset)):
+        click.echo("\n".join(["", *words]))
+
+
+def _explanations(posterior: Any) -> Iterator[str]:
+    """What parameters mean whose names do not say it, with their units."""
+    for name, variable in posterior.data_vars.items():
+        meaning, unit = (variable.attrs.get(key, "") for key in ("long_name", "units"))
+        if meaning and not meaning.startswith(str(name).replace("_", " ")):
+            yield f"{name}: {meaning}{'' if unit == '1' else f' [{unit}]'}"
+
+
+def print_cautions(sentences: Iterable[str]) -> None:
+    """Print cautions on the error stream."""
+    for sentence in sentences:
+        say(f"caution: {sentence}", err=True)

@@ -1,0 +1,120 @@
+r"""Advice in the words of the command line.
+
+Sentences and hints are written once, in their Python form. Whatever a command prints of them passes
+through `as_commands`, which puts an option or a command in the place of each keyword, setting or
+function that a sentence names:
+
+    use method='nuts', or Nuts(most_draws=9000)  ->  use --method nuts, or --most-draws 9000
+"""
+
+import re
+import shlex
+from collections.abc import Callable
+
+import click
+
+from polar_bayes.cli.options import NUTS_OPTIONS
+
+FUNCTIONS = {
+    "accuracy": "accuracy",
+    "calibrate": "calibrate",
+    "capture.combine": "combine",
+    "choose_effects": "effects",
+    "compare_fits": "compare",
+    "compare_scenes": "scenes",
+    "fit": "fit",
+    "fit_pixels": "map",
+    "identify": "identify",
+    "maps.count_pixels": "report",
+    "next_views": "identify",
+    "profile": "identify",
+    "region_means": "regions",
+    "report": "report",
+    "simulate": "simulate",
+}
+"""Functions, and the command that calls each."""
+
+KEYWORDS = {
+    **{name: f"--{name}" for name in ("angle", "dim", "drop", "keep", "method", "model", "p")},
+    **{name: f"--{name}" for name in ("precision", "preset", "s", "scene", "scheduler", "seed")},
+    **{name: f"--{name}" for name in ("setup", "table", "truth")},
+    "links": "--link",
+    "parameter": "--profile",
+    "priors": "--prior",
+    "shared": "--share",
+    "store": "--out",
+}
+"""Keyword arguments, and the option that stands for each."""
+
+CALL = r"\((?:[^()']|'[^']*')*\)"
+FREE = r"(?<![\w.('=])"  # not within quotes, brackets or another name
+PACKAGE = r"(?:polar_bayes|pb)\."
+KEYWORD, FUNCTION = ("|".join(map(re.escape, names)) for names in (KEYWORDS, FUNCTIONS))
+
+RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
+    # What a command cannot do is left to Python, or left out.
+    (r"goes with pb\.fit only", "is fitted in Python only"),
+    (r"fit with load_scene and model= in Python", "fit it in Python"),
+    (r"polar_bayes\.save or (?=a command)", ""),
+    (r", or pb\.from_table\([^)]*\)", ""),
+    (r", as by capture\['valid'\] = capture\['\w+'\]\.notnull\(\)", ""),
+    (r"select one with isel\([^)]*\), or ", ""),
+    (r", for example capture\.mean\(.*?\)\)", ", or fit each pixel with polar-bayes map"),
+    # Variables of a capture, which a table has as columns.
+    (r"\bvalid=(False|True)", lambda found: f"{int(found[1] == 'True')} in column valid"),
+    (r"drop_vars\('([^']*)'\)", r"--drop \1"),
+    (r"drop=\['[^']*'\], in a command (?=--drop)", ""),
+    # Priors, links and settings of methods, as calls in quotes.
+    (r"priors=\{'(\w+)': <[^>]*>\}", r"--prior '\1=DISTRIBUTION'"),
+    (r"priors=\{'(\w+)': ([^{}]*)\}", r"--prior '\1=\2'"),
+    (rf"(?:a mapping (?:such as )?)?\{{'(\w+)': (\w+Link{CALL})\}}", r"--link '\1=\2'"),
+    (rf"\b(\w+) by (\w+Link{CALL})", r"--link '\1=\2'"),
+    (rf"{FREE}(\w+Link(?!\(\)){CALL})", r"--link '\1'"),
+    (r"use stated_errors=False", "use --link 'StokesLink(stated_errors=False)'"),
+    (r"\b(priors|links)\[('?)(\w+)\2\]", lambda found: f"{KEYWORDS[found[1]]} {found[3]}"),
+    (rf"(?:{FREE}|(?:{PACKAGE})?methods\.)(Nuts|Laplace|Importance|Tempered|Point|Auto)\(\)",
+     lambda found: f"--method {found[1].lower()}"),
+    (rf"{FREE}Nuts(\([^()]*\))", lambda found: _nuts_options(found[1])),
+    (rf"{FREE}((?:Importance|Tempered|Point|Auto){CALL})", r"--method '\1'"),
+    # Other keywords, and functions.
+    (r"shared=\(\)", "--share none"),
+    (r"truth=capture", "--truth"),
+    (rf"\b({KEYWORD})='([^']*)'(?: or '([^']*)')?", lambda found: _option(*found.groups())),
+    (rf"{FREE}({KEYWORD})=(?=[\s,;)]|\.\s|\.?$)", lambda found: KEYWORDS[found[1]]),
+    (rf"give the tree (that|as) (?={PACKAGE})", r"give the file \1 "),
+    (rf"({PACKAGE}(?:{FUNCTION}))(?: or load)? return(?:ed|s)\b", r"\1 wrote"),
+    (r", or a polar_bayes\.Scene", ", or a scene file"),
+    (rf"{PACKAGE}compare_scenes|\bcompare_scenes(?!:)",
+     lambda _: f"polar-bayes scenes {_capture()}"),
+    (rf"{PACKAGE}({FUNCTION})\b", lambda found: f"polar-bayes {FUNCTIONS[found[1]]}"),
+    (rf"^({FUNCTION}):", lambda found: f"{FUNCTIONS[found[1]]}:"),
+)  # fmt: skip
+"""What is replaced by what, from the first to the last."""
+
+
+def as_commands(text: str) -> str:
+    """A sentence or error that names options and commands in place of Python."""
+    for pattern, replacement in RULES:
+        text = re.sub(pattern, replacement, text)
+    return text
+
+
+def _capture() -> str:
+    """The capture that the command is about, so that its advice can be typed as it stands."""
+    context = click.get_current_context(silent=True)
+    given = context.params.get("capture") if context else None
+    return shlex.quote(str(given)) if given else "capture.nc"
+
+
+def _option(name: str, value: str, other: str | None) -> str:
+    """`--method importance or nuts`, quoted as a shell needs it."""
+    values = (shlex.quote(each) for each in (value, other) if each)
+    return f"{KEYWORDS[name]} {' or '.join(values)}"
+
+
+def _nuts_options(arguments: str) -> str:
+    """`--warmup 1000 --most-draws 20000`, or the call where a setting has no option of its own."""
+    pairs = [part.split("=") for part in arguments.strip("()").split(", ")]
+    if all(len(pair) == 2 and pair[0] in NUTS_OPTIONS for pair in pairs):
+        return " ".join(f"--{name.replace('_', '-')} {value}" for name, value in pairs)
+    return f"--method 'Nuts{arguments}'"
