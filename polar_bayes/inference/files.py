@@ -68,6 +68,10 @@ BOUNDS = Leaf(
     lambda value: _is_pair(value, lambda bound: bound is None or _is_finite(bound)),
 )
 SHARES = Leaf("a share below and a share above", lambda value: _is_pair(value, _is_finite))
+INDEX_BY_EYE = Leaf(
+    "an index with its range, and a polarization",
+    lambda value: isinstance(value, list) and len(value) == 4 and all(map(_is_finite, value)),
+)
 OPTIONAL = Leaf("a number or null", lambda value: value is None or _is_number(value))
 
 type Spec = Leaf | Mapping[str, Spec] | list[Spec]
@@ -314,6 +318,7 @@ _FIT_PROVENANCE: Mapping[str, Spec] = {
     "fixed?": {EACH: ANY},
     "scene_chosen_by?": TEXT,
     "capture_cautions?": [TEXT],
+    "indices_by_eye?": {EACH: INDEX_BY_EYE},
     "swapped?": [TEXT],
     "largest_view_zenith?": FINITE,
     "machine?": {EACH: ANY},
@@ -397,10 +402,12 @@ _OF_SCENES = {
 }
 SCENES = Group(
     labeled=False,
-    names=tuple(_OF_SCENES),
+    dims=("scene",),
+    extra_dims=False,
+    names=(*_OF_SCENES, "index_bound"),  # which earlier versions did not write
     variables=_OF_SCENES,
     kinds=dict.fromkeys(("scene", "parameter", "parts", "criticism"), TEXTS),
-    attributes={"left_out": TEXT},
+    attributes={"left_out": TEXT, "lifted?": TEXT},
 )
 """The group `scenes`: the comparison behind a fit with scene="auto"."""
 

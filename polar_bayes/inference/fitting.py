@@ -18,7 +18,7 @@ from jaxtyping import Array
 from numpyro import distributions as dist
 from numpyro.primitives import Messenger
 
-from polar_bayes.capture.plausibility import cautions
+from polar_bayes.capture.plausibility import cautions, indices_by_eye
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference import methods
@@ -277,6 +277,15 @@ def _prior_probability(request: Request, posterior: Mapping[str, Any]) -> dict[s
     return found
 
 
+def _indices_by_eye(request: Request) -> dict[str, list[float]]:
+    """Index by eye of each material; none where a coat or polarized light moves the peak."""
+    source = getattr(request.scene.surface, "illumination", None)
+    if request.scene.coat is not None or getattr(source, "polarization", None) is not None:
+        return {}
+    found = indices_by_eye(request.capture)
+    return {name: list(index) for name, index in found.items() if index is not None}
+
+
 def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> dict[str, Any]:
     """Everything that is needed to repeat the fit."""
     data = problem.data
@@ -294,6 +303,7 @@ def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> d
         "model_settings": _model_settings(request.model),
         "model_source": _model_source(request.model),
         "capture_cautions": list(cautions(request.capture)),
+        "indices_by_eye": _indices_by_eye(request),
         "bounds": {name: _finite_bounds(prior) for name, prior in request.priors.items()},
         "declared": request.declared,
         "fixed": request.fixed,

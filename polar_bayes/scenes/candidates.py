@@ -157,7 +157,8 @@ def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None)
 
     A mirror needs views in the mirror direction of the light; a rough surface under a point source
     in that direction sends the polarization of the mirror, so that it needs a fitted brightness. A
-    thin film needs several wavelengths, a leaning normal needs u.
+    sky is no candidate where the light is stated to be a beam. A thin film needs several
+    wavelengths, a leaning normal needs u.
 
     Args:
         capture: A validated Dataset of the capture schema.
@@ -174,7 +175,7 @@ def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None)
     surfaces = [
         *(["mirror"] if mirrored else []),
         *(["rough surface"] if "intensity" in fitted or not mirrored else []),
-        "sky",
+        *([] if has_beam(capture) else ["sky"]),
     ]
     surfaces += [OTHER_SLOPES[name] for name in surfaces if name in OTHER_SLOPES]
     several_colors = capture.sizes.get("wavelength", 1) > 2
@@ -231,6 +232,11 @@ def is_mirrored(capture: xr.Dataset) -> bool:
     around = np.abs((capture["view_azimuth"] - capture["light_azimuth"]) % 360.0 - 180.0)
     sideways = around * np.sin(np.radians(capture["view_zenith"]))
     return bool((zenith <= MIRROR_TOLERANCE).all() and (sideways <= MIRROR_TOLERANCE).all())
+
+
+def has_beam(capture: xr.Dataset) -> bool:
+    """Whether a capture states that its light is a beam, as that of a goniometer is."""
+    return capture.attrs.get("setup") == "goniometer" or "incident_levels" in capture.attrs
 
 
 def _bodies(setup: Setup | None, shows_absorption: bool) -> Mapping[str, Any]:

@@ -26,19 +26,22 @@ import pandas as pd
 import xarray as xr
 from numpyro import distributions as dist
 
+from polar_bayes.capture.plausibility import allowing_prior, indices_by_eye
 from polar_bayes.capture.schema import validate
 from polar_bayes.diagnostics.compare import compare_predictions
-from polar_bayes.diagnostics.criticism import criticize
+from polar_bayes.diagnostics.criticism import INDEX_PARAMETERS, criticize
 from polar_bayes.diagnostics.parameters import scalars
 from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.errors import FitError, SceneError, one_line
+from polar_bayes.inference.checks import NEAR_BOUND
 from polar_bayes.inference.fitting import fit_request
 from polar_bayes.inference.laplace import Importance
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
-from polar_bayes.inference.result import CENTRAL_95
+from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
+from polar_bayes.priors import parse_prior, support_bounds
 from polar_bayes.progress import Progress, no_progress, with_progress
 from polar_bayes.scenes.candidates import (
     Choice,
@@ -79,6 +82,7 @@ class _Fit:
     findings: pd.Series
     pointwise: np.ndarray
     unreliable: int
+    index_bound: float
 
     @property
     def elpd(self) -> float:
@@ -153,10 +157,30 @@ def compare_scenes(
 def compare_candidates(arguments: "FitArguments", progress: Progress) -> SceneComparison:
     """Compare the scenes that the capture allows, as far as its readings call for them."""
     library = scene_library(arguments.capture, arguments.variables)
-    fits = _Fits(arguments.among(library.single_parts()), progress)
+    arguments = arguments.among(library.single_parts())
+    lifted = lifted_prior(arguments, library.scene(library.simplest))
+    fits = _Fits(arguments.with_priors(lifted), progress)
     with jax.enable_x64(arguments.precision == "double"):
         _select(fits, library)
-    return _comparison(fits)
+    if not lifted:
+        return _comparison(fits)
+    found = _comparison(fits)
+    stated = {name: arguments.request(scene) for name, scene in found.scenes.items()}
+    return dataclasses.replace(found, lifted=lifted, requests=stated)
+
+
+def lifted_prior(arguments: "FitArguments", scene: Scene) -> dict[str, dist.Distribution]:
+    """A prior for the index that Brewster's angle by eye means, where the default excludes it."""
+    # A scene could otherwise win by bending the optics until the index is one that is allowed.
+    by_eye = indices_by_eye(arguments.capture)
+    if not any(by_eye.values()):
+        return {}
+    priors, own = arguments.request(scene).priors, arguments.priors or {}
+    name = next((name for name in INDEX_PARAMETERS if name in priors), None)
+    if name is None or name in own:
+        return {}
+    text = allowing_prior(by_eye, support_bounds(priors[name]))
+    return {name: parse_prior(text, name)} if text else {}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -191,6 +215,10 @@ class FitArguments:
         """The same, for these scenes."""
         names = frozenset(name for scene in scenes for name in scene.parameters)
         return dataclasses.replace(self, scene_parameters=names)
+
+    def with_priors(self, priors: Mapping[str, dist.Distribution]) -> "FitArguments":
+        """The same, with these priors in the place of others."""
+        return dataclasses.replace(self, priors={**(self.priors or {}), **priors} or None)
 
     def request(self, scene: Scene) -> Request:
         """The request for one scene; a prior for a parameter that only others read is not used."""
@@ -252,7 +280,20 @@ class _Fits:
             findings=findings[findings.isin(["caution", "problem"])],
             pointwise=np.concatenate([each.pointwise for each in loo]),
             unreliable=sum(each.unreliable for each in loo),
+            index_bound=_index_bound(tree),
         )
+
+
+def _index_bound(tree: xr.DataTree) -> float:
+    """The bound of its prior at which an interval of the index ends; NaN where none does."""
+    provenance = provenance_of(tree)
+    for scalar in scalars(tree["posterior"].to_dataset()):
+        if scalar.name in INDEX_PARAMETERS:
+            ends = np.quantile(scalar.draws, CENTRAL_95)
+            for bound in bounds_of(provenance, scalar.name):
+                if np.abs(ends - bound).min() < NEAR_BOUND * np.ptp(ends):
+                    return bound
+    return float("nan")
 
 
 def _begin_to_compile(request: Request) -> None:
@@ -367,6 +408,7 @@ def _comparison(fits: _Fits) -> SceneComparison:
     table["weight"] = (weights / weights.sum()).reindex(table.index).fillna(0.0)
     ordered = {name: fits.done[name] for name in table.index}
     table["seconds"] = [fit.seconds for fit in ordered.values()]
+    table["index_bound"] = [fit.index_bound for fit in ordered.values()]
     table["criticism"] = [", ".join(fit.findings.index) for fit in ordered.values()]
     trees = {name: fit.tree for name, fit in ordered.items()}
     intervals = _intervals(trees)

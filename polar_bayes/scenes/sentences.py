@@ -2,14 +2,17 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
 import xarray as xr
+from numpyro import distributions as dist
 
+from polar_bayes.diagnostics.finding import listed
 from polar_bayes.inference.request import Request
 from polar_bayes.physics.scene import Scene
+from polar_bayes.priors import describe_prior
 
 SMALL_DIFFERENCE = 4.0
 """Difference in elpd, unit nat, below which two scenes are not told apart, whatever its error."""
@@ -29,6 +32,7 @@ class SceneComparison:
         table: A row for each scene, best first: elpd and se (nat), elpd_diff and dse (to the best),
             weight (stacking; 0 for a scene that does not remain), unreliable (readings whose Pareto
             k is above 0.7), seconds (of the fit, which is compiled while the one before runs),
+            index_bound (bound of the prior at which the interval of the index ends, or NaN),
             criticism (checks that found a caution or problem).
         intervals: A row for each material parameter and scene that has it, in the order of the
             table: mean, sd, q2.5, q97.5 (unit of the parameter).
@@ -37,7 +41,9 @@ class SceneComparison:
         scenes: The scenes, by name.
         fits: The fits that were compared, by name.
         left_out: By scene, why it could not be fitted.
-        requests: What was fitted, by scene, with every default filled in.
+        requests: What is to be fitted, by scene, with every default filled in.
+        lifted: Prior of the index by which all scenes were compared, by its name, where Brewster's
+            angle by eye means an index that the stated prior excludes; otherwise empty.
     """
 
     table: pd.DataFrame
@@ -47,6 +53,7 @@ class SceneComparison:
     fits: Mapping[str, xr.DataTree]
     left_out: Mapping[str, str]
     requests: Mapping[str, Request]
+    lifted: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
 
     @property
     def weights(self) -> dict[str, float]:
@@ -65,7 +72,10 @@ class SceneComparison:
         }
         parts = [repr(self.scenes[name]) for name in table.index]
         texts = {"parts": parts, "criticism": list(table["criticism"])}
-        numbers = ("elpd", "se", "elpd_diff", "dse", "weight", "unreliable", "seconds")
+        numbers = (
+            *("elpd", "se", "elpd_diff", "dse", "weight", "unreliable", "seconds"),
+            "index_bound",
+        )
         return xr.Dataset(
             {
                 **{name: ("scene", table[name].to_numpy(float)) for name in numbers},
@@ -74,7 +84,10 @@ class SceneComparison:
                 "between_share": ("parameter", self.between.reindex(labels).to_numpy(float)),
             },
             {"scene": table.index.to_numpy(str), "parameter": np.array(labels, dtype=str)},
-            {"left_out": json.dumps(dict(self.left_out))},
+            {
+                "left_out": json.dumps(dict(self.left_out)),
+                "lifted": ", ".join(f"{n} by {describe_prior(x)}" for n, x in self.lifted.items()),
+            },
         )
 
 
@@ -123,6 +136,11 @@ def scene_sentences(result: xr.DataTree | SceneComparison) -> list[str]:
     count = found.sizes["scene"]
     were = "scene was" if count == 1 else "scenes were"
     sentences = [f"{count} {were} fitted, from simple to complex."]
+    if lifted := found.attrs.get("lifted"):
+        sentences.append(
+            f"Scenes were compared with {lifted}, since Brewster's angle means an index that the "
+            "stated prior excludes; a fit keeps the stated prior."
+        )
     if len(remaining) == 1:
         sentences.append(f"One remains: {chosen}.")
     else:
@@ -133,6 +151,7 @@ def scene_sentences(result: xr.DataTree | SceneComparison) -> list[str]:
         )
     others = found.sel(scene=[name for name in found["scene"].to_numpy() if weight[name] == 0.0])
     sentences += [_why_not(others.sel(scene=name)) for name in others["scene"].to_numpy()[:4]]
+    sentences += _escaped(found, chosen)
     if len(remaining) > 1:
         sentences += _between(found)
     unexplained = str(found["criticism"].sel(scene=chosen).item())
@@ -155,6 +174,20 @@ def _why_not(scene: xr.Dataset) -> str:
     if "priors" in str(scene["criticism"].item()):
         return f"Not {name}: its parameters are where their priors hardly allow them."
     return f"Not {name}: it adds nothing to the others ({difference:.1f} ± {error:.1f} nat behind)."
+
+
+def _escaped(found: xr.Dataset, chosen: str) -> Iterator[str]:
+    """Scenes that lie against a bound of the index, which the chosen one may only have escaped."""
+    if "index_bound" not in found or np.isfinite(found["index_bound"].sel(scene=chosen)):
+        return
+    bound = found["index_bound"].to_series().dropna()
+    for value, names in bound.groupby(bound):
+        yield (
+            f"The index of {listed(names.index)} lies against {value:g}, where its prior ends, so "
+            f"that {chosen} may predict better only because its index does not: if the index may "
+            "lie beyond, compare again with "
+            f"priors={{'refractive_index': TruncatedNormal({value:g}, 0.3, low=1)}}."
+        )
 
 
 def _between(found: xr.Dataset) -> list[str]:

@@ -56,11 +56,15 @@ def fit_best_scenes(
     comparison = compare_candidates(arguments, progress)
     weights = comparison.weights
     alone = len(weights) == 1
+    as_compared = not comparison.lifted  # otherwise the stated priors are others
     with jax.enable_x64(arguments.precision == "double"):
         fits = {
             name: comparison.fits[name]
-            if isinstance(method, Importance)  # the comparison has more rounds of the same
-            or (method == Nuts() and _serves_as_chains(comparison.fits[name]))
+            if as_compared
+            and (
+                isinstance(method, Importance)  # the comparison has more rounds of the same
+                or (method == Nuts() and _serves_as_chains(comparison.fits[name]))
+            )
             else fit_request(
                 comparison.requests[name],
                 method,
