@@ -57,7 +57,8 @@ def _save_import(capture: Any, out: Path) -> None:
     _save(capture, out)
     for sentence in pb.capture.inferred(capture) + pb.capture.stated(capture):
         click.echo(sentence)
-    print_cautions(pb.capture.cautions(capture))
+    indices = pb.capture.indices_by_eye(capture)
+    print_cautions(pb.capture.cautions(capture) + pb.capture.index_sentences(indices))
 
 
 OF_PROTOCOL = ("views", "largest_view_zenith", "wavelengths")
