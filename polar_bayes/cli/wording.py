@@ -46,7 +46,7 @@ KEYWORDS = {
 }
 """Keyword arguments, and the option that stands for each."""
 
-CALL = r"\((?:[^()']|'[^']*')*\)"
+CALL = r"\((?:[^()']|'[^']*'|\([^()]*\))*\)"
 FREE = r"(?<![\w.('=])"  # not within quotes, brackets or another name
 PACKAGE = r"(?:polar_bayes|pb)\."
 KEYWORD, FUNCTION = ("|".join(map(re.escape, names)) for names in (KEYWORDS, FUNCTIONS))
@@ -69,6 +69,8 @@ RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"priors=\{'(\w+)': ([^{}]*)\}", r"--prior '\1=\2'"),
     (rf"(?:a mapping (?:such as )?)?\{{'(\w+)': (\w+Link{CALL})\}}", r"--link '\1=\2'"),
     (rf"\b(\w+) by (\w+Link{CALL})", r"--link '\1=\2'"),
+    (r"for example (TruncatedNormal\([^()]*\))", r"for example --prior 'NAME=\1'"),
+    (rf"the prior of (\w+) is (\w+{CALL})", r"its prior is --prior '\1=\2'"),
     (rf"{FREE}(\w+Link(?!\(\)){CALL})", r"--link '\1'"),
     (r"use stated_errors=False", "use --link 'StokesLink(stated_errors=False)'"),
     (r"\b(priors|links)\[('?)(\w+)\2\]", lambda found: f"{KEYWORDS[found[1]]} {found[3]}"),

@@ -45,12 +45,21 @@ SENTENCES = {
     "priors['bend']: it has no prior; give one: priors={'bend': <a NumPyro distribution>}": (
         "--prior bend: it has no prior; give one: --prior 'bend=DISTRIBUTION'"
     ),
+    "truncate it, for example TruncatedNormal(..., low=1)": (
+        "truncate it, for example --prior 'NAME=TruncatedNormal(..., low=1)'"
+    ),
     "links['dop']: no link": "--link dop: no link",
     "give a link such as BetaLink(), or a mapping {'dop': BetaLink()}": (
         "give a link such as BetaLink(), or --link 'dop=BetaLink()'"
     ),
     "Links: q by StokesLink(stated_errors=True); dop by BetaLink().": (
         "Links: --link 'q=StokesLink(stated_errors=True)'; --link 'dop=BetaLink()'."
+    ),
+    "Links: dop by BetaLink(margin=0.1, schedule=ConcentrationSchedule(minimum=5.0)).": (
+        "Links: --link 'dop=BetaLink(margin=0.1, schedule=ConcentrationSchedule(minimum=5.0))'."
+    ),
+    "Angles set by: hand; the prior of angle_zero is Normal(loc=0, scale=0.75).": (
+        "Angles set by: hand; its prior is --prior 'angle_zero=Normal(loc=0, scale=0.75)'."
     ),
     "StokesLink(stated_errors=True): no q_error; add it or use stated_errors=False": (
         "--link 'StokesLink(stated_errors=True)': no q_error; add it or use "
@@ -183,6 +192,9 @@ def bad_fit():
         modes={"weights": [0.6, 0.4]},
         counts={"views": 20, "masked": 8},
         scene_chosen_by="default",
+        links={name: str(link) for name, link in pb.setups.SETUPS["paper"].links.items()},
+        priors={"angle_zero": "Normal(loc=0.0, scale=0.75)"},
+        capture={"name": "plate", "angle_set_by": "hand"},
         problems=["the mode is not settled: use method='nuts'"],
     )
 
@@ -196,8 +208,7 @@ def test_a_bad_fit_is_told_in_the_words_of_the_command_line(
     words = ["fit", str(plate), *(["--json"] if as_json else []), "--out", out]
     assert main(words) == 2
     told = capsys.readouterr()
-    python = [line for line in told if PYTHON.search(QUOTED.sub("", line))]
-    assert not python
+    assert not PYTHON.findall(QUOTED.sub("", told.out + told.err))
     for words in (
         "problem: The mode is not settled: use --method nuts.",
         "as in --warmup 1000 --most-draws 20000,",
