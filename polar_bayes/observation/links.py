@@ -304,22 +304,27 @@ class StokesLink(AbstractLink):
     r"""Noise of the signed normalized Stokes parameters, free of the bias of an unsigned DoP.
 
     Where the capture states an error for each reading, the scale is `stokes_error_factor`
-    times that error. Elsewhere it is the shot noise of a view, $\sigma_q = \sigma_1 /
-    \sqrt{I/I_{\max}}$ with $\sigma_1$ = `stokes_scale`.
+    times that error. Elsewhere it is the shot noise of a view,
+
+    $$ s = \frac{\sigma_1}{\sqrt{I/I_{\max}}}, \quad
+       q \sim \mathrm{Normal}\Big(\frac{q_0}{\sqrt{1+s^4}}, \frac{s}{\sqrt{1+2s^2}}\Big) $$
+
+    with $\sigma_1$ = `stokes_scale`, and I the predicted intensity where that is fitted, else the
+    recorded one. In light this is noise s around the prediction $q_0$. A view without light has
+    any polarization, since its reading is a quotient of noise: in the dark the mean tends to zero
+    and the variance to that of a point on the unit circle.
 
     Args:
         degrees_of_freedom: Of Student's t, which forgives single bad readings; None for
             normal noise. Range > 2.
         stated_errors: True where the capture states the error of every reading.
-        least_brightness: Smallest $I/I_{\max}$ that counts in the shot noise, a tenth of an
-            electron where 10,000 are full scale: nothing is known of a view without light.
-            Range (0, 1].
+        least_brightness: Smallest $I/I_{\max}$ that counts in the shot noise. Range (0, 1].
     """
 
     observables: ClassVar[tuple[str, ...]] = ("q", "u")
     degrees_of_freedom: float | None = None
     stated_errors: bool = False
-    least_brightness: float = 1e-5
+    least_brightness: float = 1e-9
 
     def __post_init__(self) -> None:
         if self.degrees_of_freedom is not None and not self.degrees_of_freedom > 2.0:
@@ -356,16 +361,32 @@ class StokesLink(AbstractLink):
                     where="StokesLink(stated_errors=True)",
                     hint="add that variable to the capture or use stated_errors=False",
                 )
-            scale = noise["stokes_error_factor"] * data.errors[name]
+            location, scale = prediction[name], noise["stokes_error_factor"] * data.errors[name]
         else:
-            brightness = jnp.maximum(data.brightness, self.least_brightness)
-            scale = noise["stokes_scale"] / jnp.sqrt(brightness)
+            light = self._brightness(prediction, data, noise)
+            square = noise["stokes_scale"] ** 2
+            location = prediction[name] * light / jnp.hypot(light, square)
+            scale = noise["stokes_scale"] / jnp.sqrt(light + 2.0 * square)
         scale = scale_by_confidence(scale, data.confidence)
         if self.degrees_of_freedom is None:
-            return dist.Normal(prediction[name], scale)
+            return dist.Normal(location, scale)
         # As a bare number it would become double precision whatever the rest of the program is.
         freedom = jnp.asarray(self.degrees_of_freedom, jnp.result_type(scale))
-        return dist.StudentT(freedom, prediction[name], scale)
+        return dist.StudentT(freedom, location, scale)
+
+    def _brightness(
+        self, prediction: Prediction, data: Observations, noise: Noise
+    ) -> Float[Array, "... view"]:
+        """The light of each view over full scale, by which its polarization is known."""
+        brightness = data.brightness
+        if "exposure" in noise:
+            # Not the reading, which is noise where there is no light. At full scale it bends
+            # smoothly, since a corner there would put one on top of the posterior.
+            predicted = noise["exposure"] * prediction["intensity"]
+            larger = jnp.maximum(predicted, 1.0)  # the fourth power of a bright lobe may overflow
+            bend = (predicted / larger) ** 4 + (1.0 / larger) ** 4
+            brightness = predicted / larger * bend**-0.25
+        return jnp.maximum(brightness, self.least_brightness)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -220,11 +220,27 @@ def test_stated_errors_set_the_scale_and_the_factor_stretches_it():
     np.testing.assert_allclose(found.scale, [0.2, 0.4, 0.6, 0.8], rtol=1e-15)
 
 
-def test_shot_noise_grows_as_the_view_darkens_down_to_a_floor():
+def test_shot_noise_grows_as_the_view_darkens_until_nothing_is_known():
     data = make_observations(ZENITHS, brightness=[1.0, 0.25, 1e-3, 0.0])
-    prediction, noise = {"q": jnp.zeros(4)}, {"stokes_scale": jnp.asarray(0.01)}
-    found = StokesLink(least_brightness=0.01).distribution("q", prediction, data, noise)
-    np.testing.assert_allclose(found.scale, [0.01, 0.02, 0.1, 0.1], rtol=1e-15)
+    prediction, noise = {"q": jnp.full(4, 0.5)}, {"stokes_scale": jnp.asarray(0.01)}
+    found = StokesLink().distribution("q", prediction, data, noise)
+    shot = np.array([0.01, 0.02, 0.1**0.5, 1e-2 / StokesLink().least_brightness**0.5])
+    np.testing.assert_allclose(found.scale, shot / np.sqrt(1.0 + 2.0 * shot**2), rtol=1e-12)
+    np.testing.assert_allclose(found.loc, 0.5 / np.sqrt(1.0 + shot**4), rtol=1e-12)
+    assert abs(found.scale[3] - 0.5**0.5) < 1e-4  # of a point on the unit circle
+    assert found.loc[3] < 1e-4
+
+
+def test_the_light_of_a_view_is_that_of_the_prediction_where_it_is_fitted():
+    """A dark view reads noise: as if bright, its polarization would count."""
+    data = make_observations(ZENITHS, brightness=[0.3, 0.3, 0.3, 0.3])
+    light = jnp.array([0.1, 0.03, 1e-8, 5.0])
+    prediction = {"q": jnp.full(4, 0.5), "intensity": light}
+    noise = {"stokes_scale": jnp.asarray(0.01), "exposure": jnp.asarray(2.0)}
+    scale = StokesLink().distribution("q", prediction, data, noise).scale
+    np.testing.assert_allclose(scale[:2], 0.01 / np.sqrt([0.2, 0.06]), rtol=3e-3)
+    assert scale[2] > 0.5
+    assert 0.0099 < scale[3] < 0.0101  # no more than full scale
 
 
 def test_a_capture_without_errors_is_refused_where_they_are_needed():
