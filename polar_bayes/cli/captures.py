@@ -23,7 +23,7 @@ from polar_bayes.cli.options import (
     read_scene_options,
     seed_option,
 )
-from polar_bayes.cli.printing import print_cautions
+from polar_bayes.cli.printing import print_cautions, say
 
 out_capture = out_option(CAPTURE_FILE, "Capture to write.")
 name_option = option("--name", help="Name of the capture.")
@@ -56,7 +56,7 @@ def _save_import(capture: Any, out: Path) -> None:
     """Write a capture; print its counts, what was inferred and what is unlikely."""
     _save(capture, out)
     for sentence in pb.capture.inferred(capture) + pb.capture.stated(capture):
-        click.echo(sentence)
+        say(sentence)
     indices = pb.capture.indices_by_eye(capture)
     print_cautions(pb.capture.cautions(capture) + pb.capture.index_sentences(indices))
 

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import click
 
@@ -57,51 +57,26 @@ def _text(cell: Any) -> str:
 # --- Fits -----------------------------------------------------------------------------------------
 
 
-class _Judged(NamedTuple):
-    """The verdict of a fit, and what was checked for it."""
-
-    verdict: Any
-    checks: tuple[list[str], list[str]]
-    nothing_against: str
-
-    @classmethod
-    def of(cls, result: Any) -> Self:
-        from polar_bayes.diagnostics.checked import checks_made, nothing_against
-        from polar_bayes.diagnostics.convergence import verdict
-        from polar_bayes.diagnostics.parameters import method_of
-
-        criticism, method = pb.diagnostics.criticize(result), method_of(result)
-        found = verdict(result, criticism=criticism)
-        checks = checks_made(method, criticism)
-        return cls(found, checks, nothing_against(method, found, criticism))
-
-    def print(self) -> int:
-        """Print problems, cautions and notes, or what was checked; returns the exit status."""
-        for problem in self.verdict.problems:
-            say(f"problem: {problem}", err=True)
-        print_cautions(self.verdict.cautions)
-        for note in self.verdict.findings:
-            say(f"note: {note}", err=True)
-        if self.nothing_against:
-            say(self.nothing_against, err=True)
-        return 0 if self.verdict.passed else NOT_CONVERGED
-
-
 def print_verdict(result: Any) -> int:
-    """Print what speaks against a fit on the error stream; returns the exit status."""
-    return _Judged.of(result).print()
+    """Print what speaks against a fit, or what was checked, on the error stream; exit status."""
+    verdict = pb.verdict(result)
+    for problem in verdict.problems:
+        say(f"problem: {problem}", err=True)
+    print_cautions(verdict.cautions)
+    for note in verdict.findings:
+        say(f"note: {note}", err=True)
+    if verdict.nothing_against:
+        say(verdict.nothing_against, err=True)
+    return 0 if verdict.passed else NOT_CONVERGED
 
 
 def print_fit(result: Any, *, as_json: bool = False) -> int:
     """Print a row per parameter, and the verdict as `print_verdict` does."""
-    judged = _Judged.of(result)
     if as_json:
-        made, missing = judged.checks
-        notes = {"notes": judged.verdict.findings, "checked": made, "not_checked": missing}
-        print_json({**pb.diagnostics.json_summary(result), **notes})
+        print_json(pb.diagnostics.json_summary(result))
     else:
         _print_parameters(result)
-    return judged.print()
+    return print_verdict(result)
 
 
 def _print_parameters(result: Any) -> None:

@@ -4,8 +4,8 @@ import math
 
 import pandas as pd
 
-from polar_bayes.diagnostics.convergence import WEIGHTED, Verdict
-from polar_bayes.diagnostics.parameters import APPROXIMATIONS
+from polar_bayes.diagnostics.finding import LEVELS
+from polar_bayes.diagnostics.parameters import APPROXIMATIONS, WEIGHTED
 
 NAMES = {
     "angle": "residuals over the angle",
@@ -23,10 +23,9 @@ TESTED = (
     "alternatives",
 )
 """Checks that have a p-value wherever there is something to check."""
-LEVELS = ("passed", "note", "caution", "problem")
 
 
-def checks_made(method: str, criticism: pd.DataFrame) -> tuple[list[str], list[str]]:
+def checks_made(method: str, criticism: pd.DataFrame) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What was checked of a fit by draws, and what could not be, in words.
 
     Args:
@@ -45,14 +44,4 @@ def checks_made(method: str, criticism: pd.DataFrame) -> tuple[list[str], list[s
             missing.append(name)
         elif row["level"] in LEVELS and (check not in TESTED or math.isfinite(row["p_value"])):
             made.append(name)
-    return made, missing
-
-
-def nothing_against(method: str, verdict: Verdict, criticism: pd.DataFrame) -> str:
-    """What was checked, of a fit without problem and caution; empty of any other."""
-    if not verdict.passed or verdict.cautions:
-        return ""
-    made, missing = checks_made(method, criticism)
-    left = f" Not computed: {', '.join(missing)}." if missing else ""
-    listed = " and ".join(filter(None, [", ".join(made[:-1]), made[-1]]))
-    return f"Nothing speaks against the intervals in what was checked: {listed}.{left}"
+    return tuple(made), tuple(missing)

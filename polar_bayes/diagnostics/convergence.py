@@ -14,10 +14,12 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
+from polar_bayes.diagnostics.checked import checks_made
 from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.diagnostics.finding import listed
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
+    WEIGHTED,
     Scalar,
     method_of,
     posterior_scalars,
@@ -33,7 +35,6 @@ COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse
 TAILS = (0.05, 0.95)
 LARGE_CORRECTION = 0.1
 """Error of an approximate mean in sds, or of an sd in its log, that is told."""
-WEIGHTED = ("importance", "tempered")
 MAX_SECOND_MODE = 0.01
 TAIL_ERRORS = 3.5
 """Standard errors by which the share in a tail must exceed that of chains: of twenty tails of two
@@ -64,6 +65,8 @@ class Verdict:
         findings: What the result says.
         converged: False where the method itself failed; where it is True and `passed` is False,
             the draws are of the posterior, but the readings speak against the model.
+        checked: What was checked of a fit, in words.
+        not_checked: Checks of a fit that could not be computed.
     """
 
     passed: bool
@@ -71,11 +74,23 @@ class Verdict:
     cautions: tuple[str, ...]
     findings: tuple[str, ...] = ()
     converged: bool = True
+    checked: tuple[str, ...] = ()
+    not_checked: tuple[str, ...] = ()
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """Problems, cautions and findings, in this order."""
         return self.problems + self.cautions + self.findings
+
+    @property
+    def nothing_against(self) -> str:
+        """What was checked, of a fit without problem and caution; empty of any other."""
+        if not self.passed or self.cautions or not self.checked:
+            return ""
+        first, last = ", ".join(self.checked[:-1]), self.checked[-1]
+        left = f" Not computed: {', '.join(self.not_checked)}." if self.not_checked else ""
+        made = f"{first} and {last}" if first else last
+        return f"Nothing speaks against the intervals in what was checked: {made}.{left}"
 
 
 def summary(result: xr.DataTree) -> pd.DataFrame:
@@ -113,7 +128,16 @@ def verdict(
     )
     faults = tuple(against.get("problem", []))
     notes = tuple(against.get("note", []))
-    return Verdict(not problems and not faults, (*problems, *faults), cautions, notes, not problems)
+    made, missing = checks_made(method, criticism)
+    return Verdict(
+        passed=not problems and not faults,
+        problems=(*problems, *faults),
+        cautions=cautions,
+        findings=notes,
+        converged=not problems,
+        checked=() if method == "point" else made,
+        not_checked=missing,
+    )
 
 
 def json_summary(result: xr.DataTree) -> dict[str, Any]:
@@ -124,8 +148,8 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
 
     Returns:
         Keys parameters (label to mean, sd, q2.5, q97.5, r_hat, ess_bulk, ess_tail), converged,
-        passed, problems, cautions, criticism (check to level and p_value), method, model, scene,
-        seed, counts and timings.
+        passed, problems, cautions, notes, checked, not_checked, criticism (check to level and
+        p_value), method, model, scene, seed, counts and timings.
 
     Raises:
         FitError: The tree holds no posterior.
@@ -144,6 +168,9 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
         "passed": found.passed,
         "problems": list(found.problems),
         "cautions": list(found.cautions),
+        "notes": list(found.findings),
+        "checked": list(found.checked),
+        "not_checked": list(found.not_checked),
         "criticism": {
             str(check): {"level": row["level"], "p_value": _number(row["p_value"])}
             for check, row in criticism.iterrows()

@@ -62,8 +62,8 @@ LARGE_DIFFERENCE = 1.5
 """Difference of a posterior mean without the discrepancy that counts, in posterior sds."""
 SAME = 0.5
 """Difference of a posterior mean without what is absent up to which it is the same, in sds."""
-FAVORED = 0.0
-"""Log Bayes factor above which the readings are for an alternative, however little."""
+FAVORED = math.log(3.0)
+"""Log Bayes factor up to which evidence is worth no more than a bare mention (Kass and Raftery)."""
 REFUTED = -math.log(20.0)
 """Log Bayes factor below which the readings speak strongly against an alternative."""
 OUTSIDE = 1.96
@@ -269,8 +269,10 @@ def _noise(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     worse = {
         s.label: share if math.isinf(PERFECT[s.name]) else 1.0 - share for s, share in below.items()
     }
-    p_value = min(1.0, min(worse.values(), default=1.0) * max(len(worse), 1))
-    largest = min(worse, key=lambda label: worse[label], default="")
+    if not worse:
+        return Finding("passed")
+    largest = min(worse, key=lambda label: worse[label])
+    p_value = min(1.0, worse[largest] * len(worse))
     sentence = (
         f"The readings scatter more than the prior of their noise allows ({p_text(p_value)} by "
         f"{largest}): the scene lacks what the readings show, or the noise is not as supposed; "
@@ -413,6 +415,10 @@ def _leave_one_out(checks: Mapping[str, PredictiveCheck]) -> Finding:
     pits = {name: check.loo.pit for name, check in checks.items() if check.loo is not None}
     if not pits:
         return Finding("not computed", sentence="The fit holds no log likelihoods.")
+    lost = [n for n, x in checks.items() if x.loo is not None and 2 * x.loo.unreliable > x.count]
+    if lost:
+        why = f"Leave-one-out cannot be approximated for most readings of {listed(lost)}."
+        return Finding("not computed", sentence=why)
     p_values = {name: _uniformity(pit) for name, pit in pits.items() if pit.size > 3}
     if not p_values:
         return Finding("passed")

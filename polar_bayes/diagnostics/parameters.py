@@ -17,6 +17,9 @@ APPROXIMATIONS = ("laplace", "variational")
 """Methods whose draws are of the approximation, stored with `log_weight`: log posterior minus log
 approximation, up to a constant."""
 
+WEIGHTED = ("importance", "tempered")
+"""Methods whose draws were resampled from weighted ones."""
+
 # Of a population, and of a process over wavelength.
 HYPERPARAMETER_SUFFIXES = ("_location", "_spread", "_level", "_amplitude", "_length")
 

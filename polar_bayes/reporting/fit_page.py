@@ -156,7 +156,7 @@ def fit_page(result: xr.DataTree) -> page.Page:
     summary = population_summary(result)
     sentences = fit.determined()
     if fit.verdict.passed:
-        trust = text.trust(fit.method, fit.verdict, fit.criticism)
+        trust = text.trust(fit.method, fit.verdict)
         following = text.next_sentence(result)
         sentences = [*text.index_sentences(fit), trust, following, *sentences]
         sentences += text.between_members(summary, pooled, fit.posterior)

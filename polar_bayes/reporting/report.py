@@ -16,7 +16,6 @@ from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences, i
 from polar_bayes.calibration.verdict import calibration_table, calibration_verdict, is_calibration
 from polar_bayes.capture import plausibility
 from polar_bayes.capture.schema import validate
-from polar_bayes.diagnostics.checked import nothing_against
 from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.errors import FitError
 from polar_bayes.expressions import short_text
@@ -143,7 +142,7 @@ def _fit_card(result: xr.DataTree) -> Card:
         fit.headline(),
         *fit.verdict.problems,
         *fit.determined(),
-        nothing_against(fit.method, fit.verdict, fit.criticism),
+        fit.verdict.nothing_against,
         *text.notes(fit.verdict),
         *(f"Caution: {caution}" for caution in fit.verdict.cautions),
         text.swapped_sentence(fit.provenance),

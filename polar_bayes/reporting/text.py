@@ -16,7 +16,6 @@ import xarray as xr
 from polar_bayes.benchmark.advice import accuracy_dataset
 from polar_bayes.calibration.scores import is_calibrated, p_values, significance_level
 from polar_bayes.calibration.verdict import calibration_verdict
-from polar_bayes.diagnostics.checked import nothing_against
 from polar_bayes.diagnostics.compare import FitComparison
 from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.parameters import Scalar
@@ -360,7 +359,7 @@ def next_sentence(result: xr.DataTree) -> str:
     return f"{views}: the 95% intervals{of} are expected to narrow by {by}."
 
 
-def trust(method: str, verdict: Verdict, criticism: pd.DataFrame) -> str:
+def trust(method: str, verdict: Verdict) -> str:
     """Whether the intervals can be trusted, as far as one fit can tell."""
     if method == "point":
         return (
@@ -370,7 +369,7 @@ def trust(method: str, verdict: Verdict, criticism: pd.DataFrame) -> str:
     if verdict.cautions:
         return "Trust the intervals with care: the cautions say what speaks against them."
     return (
-        f"{nothing_against(method, verdict, criticism)} A calibration of this layout shows how "
+        f"{verdict.nothing_against} A calibration of this layout shows how "
         "often such intervals contain the truth, if the scene is the right one."
     )
 
