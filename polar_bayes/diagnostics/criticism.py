@@ -221,7 +221,7 @@ def _absent(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     words = list(dict.fromkeys(a.words for s in absent if (a := absence(s.name)) is not None))
     if not words:
         return Finding("passed")
-    shown = f"The readings show {' and '.join(words)}"
+    shown = f"The readings show {' and '.join(filter(None, [', '.join(words[:-1]), words[-1]]))}"
     if not others:
         return Finding("note", sentence=f"{shown}.")
     shifts = {s.label: _without(s, absent) for s in others}

@@ -9,7 +9,9 @@ from synthetic_results import SCALE, edit_provenance, make_result, replace
 
 import polar_bayes as pb
 from polar_bayes.diagnostics.criticism import CHECKS, criticize
+from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.inference.checks import PROBLEM
+from polar_bayes.inference.result import provenance_of
 
 SMALL = {"wavelengths": (), "variables": ("dop",), "draws": 250}
 
@@ -147,3 +149,192 @@ def test_the_verdict_fails_though_the_chains_converged() -> None:
     assert not found.passed
     assert found.converged
     assert any("structure over the angle" in text for text in found.problems)
+
+
+# --- The simplest world: what is absent or perfect ------------------------------------------------
+
+
+def _at(tree, name, draws, *, prior, below, bounds):
+    """A result with another parameter: its draws, those of its prior, and where these are."""
+    for group, values in (("posterior", draws), ("prior", prior)):
+        dataset = tree[group].to_dataset()
+        shape = tuple(dataset.sizes[dim] for dim in ("chain", "draw"))
+        tree[group] = xr.DataTree(dataset.assign({name: (("chain", "draw"), values(shape))}))
+    known = provenance_of(tree)
+    return edit_provenance(
+        tree,
+        prior_probability=known["prior_probability"] | {name: [below]},
+        bounds=known.get("bounds", {}) | {name: bounds},
+    )
+
+
+def _half_normal(scale, seed=0):
+    return lambda shape: np.abs(np.random.default_rng(seed).normal(0.0, scale, shape))
+
+
+@each("below", [1e-3, 1e-9, 1e-30])
+def test_a_fraction_of_zero_is_no_conflict(below) -> None:
+    tree = _at(
+        make_result(**SMALL),
+        "subsurface_fraction",
+        _half_normal(1e-3),
+        prior=_half_normal(0.3),
+        below=below,
+        bounds=[0.0, 1.0],
+    )
+    table = criticize(tree)
+    assert table.loc["priors", "level"] == "passed"
+    assert table.loc["absent", "level"] == "note"
+    assert "no light from the body" in table.loc["absent", "sentence"]
+    assert "is the same without (within 0." in table.loc["absent", "sentence"]
+    assert table.loc["bounds", "level"] == "passed"
+    found = pb.verdict(tree)
+    assert found.passed
+    assert not found.cautions
+    assert any("no light from the body" in text for text in found.findings)
+
+
+def test_a_fraction_of_one_is_a_conflict() -> None:
+    tree = edit_provenance(make_result(**SMALL), bounds={"subsurface_fraction": [0.0, 1.0]})
+    known = provenance_of(tree)["prior_probability"]
+    row = criticize(
+        edit_provenance(tree, prior_probability=known | {"subsurface_fraction": [1.0 - 1e-7]})
+    ).loc["priors"]
+    assert row["level"] == "problem"
+    assert "subsurface_fraction 5.2 sd" in row["sentence"]
+
+
+def test_an_answer_that_leans_on_what_is_absent_says_what_it_would_be() -> None:
+    """The index follows the fraction: without it, it is what the slope says."""
+    tree = make_result(**SMALL)
+    fraction = _half_normal(1e-3)(tree["posterior"]["refractive_index"].shape)
+    rest = np.random.default_rng(5).normal(0.0, 1e-3, fraction.shape)
+    tree = replace(tree, "posterior", "refractive_index", 1.5 - 10.0 * fraction + rest)
+    tree = _at(
+        tree,
+        "subsurface_fraction",
+        lambda shape: fraction,
+        prior=_half_normal(0.3),
+        below=0.01,
+        bounds=[0.0, 1.0],
+    )
+    assert "refractive_index would be 1.5 " in criticize(tree).loc["absent", "sentence"]
+
+
+@each(
+    ("name", "below", "level"),
+    [
+        ("stokes_error_factor", 1e-9, "passed"),  # better than the prior
+        ("stokes_error_factor", 1.0 - 1e-9, "problem"),
+        ("concentration_scale", 1.0 - 1e-9, "passed"),  # large is good
+        ("concentration_scale", 1e-9, "problem"),
+    ],
+)
+def test_noise_is_a_problem_only_where_it_is_worse_than_its_prior(name, below, level) -> None:
+    normal = lambda shape: np.random.default_rng(0).normal(2.0, 0.01, shape)  # noqa: E731
+    tree = _at(make_result(**SMALL), name, normal, prior=normal, below=below, bounds=[0.0, None])
+    assert criticize(tree).loc["noise", "level"] == level
+    assert criticize(tree).loc["priors", "level"] == "passed"
+
+
+@each(
+    ("factor", "level", "words"),
+    [
+        (0.1, "note", "scatter 0.0999 times [0.0981, 0.102] their stated errors"),
+        (1.0, "passed", ""),
+        (5.0, "caution", "scatter 5 times [4.98, 5.02] their stated errors"),
+    ],
+)
+def test_errors_stated_too_large_or_too_small_have_their_own_sentence(factor, level, words) -> None:
+    tree = _at(
+        make_result(**SMALL),
+        "stokes_error_factor",
+        lambda shape: np.random.default_rng(0).normal(factor, 0.01 if factor > 1 else 0.001, shape),
+        prior=_half_normal(2.0),
+        below=0.5,
+        bounds=[0.0, None],
+    )
+    row = criticize(tree).loc["noise"]
+    assert row["level"] == level
+    assert words in row["sentence"]
+
+
+# --- Systematic errors ----------------------------------------------------------------------------
+
+
+def _with_discrepancy(amplitude, shift=0.0, below=0.5):
+    """A plate whose fit without smooth errors differs by so many sds."""
+    tree = _at(
+        make_result(**SMALL, discrepancy=True),
+        "discrepancy_amplitude",
+        amplitude,
+        prior=_half_normal(0.12, seed=3),
+        below=below,
+        bounds=[0.0, None],
+    )
+    index = tree["posterior"]["refractive_index"]
+    without = tree["without_discrepancy"].to_dataset()
+    moved = index - index.mean() + index.mean() + shift * index.std()
+    tree["without_discrepancy"] = xr.DataTree(without.assign(refractive_index=moved))
+    return tree
+
+
+def test_an_answer_that_rests_on_smooth_errors_nobody_sees_is_a_problem() -> None:
+    row = criticize(_with_discrepancy(_half_normal(0.1), shift=-1.8)).loc["systematic errors"]
+    assert row["level"] == "problem"
+    assert "1.8 sd away" in row["sentence"]
+    assert criticize(_with_discrepancy(_half_normal(0.1), shift=-1.2))["level"].isin(
+        ["passed", "note"]
+    )["systematic errors"]
+
+
+def test_smooth_errors_that_the_readings_show_may_move_the_answer() -> None:
+    """The fit without them is refuted by the readings, so that its answer is no witness."""
+
+    def seen(shape):
+        return np.random.default_rng(0).normal(0.15, 0.02, shape)
+
+    assert criticize(_with_discrepancy(seen, shift=4.0)).loc["systematic errors", "level"] == (
+        "passed"
+    )
+
+
+def test_smooth_errors_beyond_their_prior_are_a_problem() -> None:
+    def large(shape):
+        return np.random.default_rng(0).normal(0.6, 0.02, shape)
+
+    row = criticize(_with_discrepancy(large, below=1.0 - 1e-6)).loc["systematic errors"]
+    assert row["level"] == "problem"
+    assert "amplitude 0.6" in row["sentence"]
+
+
+# --- Single readings ------------------------------------------------------------------------------
+
+
+def test_a_reading_that_alone_knows_a_parameter_is_named_and_is_no_caution() -> None:
+    """One view of six reaches the highlight, so to say: nobody can tell it from wrong."""
+    tree = make_result(**SMALL, views=6)
+    tree = replace(tree, "constant_data", "view_zenith", [10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
+    draws = tree["posterior"]["roughness"].to_numpy()
+    score = (draws - draws.mean()) / draws.std()
+    rng = np.random.default_rng(4)
+    noise_free = np.zeros((*draws.shape, 6))
+    noise_free[..., 3] = 0.9 * score * SCALE["dop"]
+    noise = rng.normal(0.0, SCALE["dop"], noise_free.shape)
+    tree = replace(tree, "noise_free", "dop", noise_free)
+    tree = replace(tree, "posterior_predictive", "dop", noise_free + noise)
+    tree = replace(tree, "observed_data", "dop", 0.5 * SCALE["dop"] * rng.standard_normal(6))
+    assert criticize(tree).loc["influence", "level"] == "passed"
+    remark = sensitivity(tree).loc["roughness", "remark"]
+    assert "rests on dop at 40 degrees" in remark
+    assert "rests on" not in sensitivity(tree).loc["absorption", "remark"]
+
+
+def test_a_reading_within_its_stated_error_is_no_outlier() -> None:
+    """The others scatter less than stated; one that keeps to its statement is no news."""
+    tree = _changed(_outlier)
+    assert criticize(tree).loc["outliers", "level"] == "problem"
+    constants = tree["constant_data"].to_dataset()
+    error = 0.0 * tree["observed_data"]["dop"] + 4.0 * SCALE["dop"]
+    tree["constant_data"] = xr.DataTree(constants.assign(dop_error=error))
+    assert criticize(tree).loc["outliers", "level"] == "passed"

@@ -222,12 +222,12 @@ def test_what_is_said_to_be_checked_was_checked(small) -> None:
     assert made[0].startswith("chains")
     assert "outliers" in made
     assert "residuals over the wavelength" not in made  # there is one wavelength only
-    assert missing == []
+    assert missing == ()
     table.loc["outliers", "level"] = "not computed"
     made, missing = checks_made("laplace", table)
     assert made[0].startswith("the approximation")
     assert "outliers" not in made
-    assert missing == ["outliers"]
+    assert missing == ("outliers",)
 
 
 def test_a_note_is_told_and_changes_nothing(monkeypatch: pytest.MonkeyPatch, small) -> None:
