@@ -70,7 +70,7 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             {"q": StokesLink(stated_errors=True), "u": StokesLink(stated_errors=True)},
             # A fraction of .009 dilutes the polarization of a surface by a fifth already: a body of
             # which nothing is seen must not be improbable, or the index follows it.
-            priors={"subsurface_fraction": Beta(0.25, 1.0)},
+            priors={"subsurface_fraction": Beta(0.2, 1.0)},
         ),
         # A laser beam grows longer than the sample towards grazing, each channel losing its own
         # share: beyond 78 degrees a plate's readings say more about its size than its index.

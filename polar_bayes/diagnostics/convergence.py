@@ -40,6 +40,7 @@ TAIL_ERRORS = 3.5
 """Standard errors by which the share in a tail must exceed that of chains: of twenty tails of two
 right methods one does so in 0.5% of the fits."""
 MAX_MASKED = 0.25
+MAX_AT_MARGIN = 0.25
 MAX_DEEP_TREES = 0.01
 ROUNDING = 1e-6
 """Tolerance of draws in single precision at the ends of their prior."""
@@ -127,7 +128,7 @@ def verdict(
         *dict.fromkeys(against.get("not computed", [])),
     )
     faults = tuple(against.get("problem", []))
-    notes = tuple(against.get("note", []))
+    notes = (*against.get("note", []), *_reading_notes(provenance.get("counts", {})))
     made, missing = checks_made(method, criticism)
     return Verdict(
         passed=not problems and not faults,
@@ -419,10 +420,21 @@ def _reading_cautions(counts: Mapping[str, Any]) -> Iterator[str]:
             "sample of the angles."
         )
     for name, count in (counts.get("at_margin") or {}).items():
-        if count:
+        if total and count / total > MAX_AT_MARGIN:
             yield (
                 f"{count} readings of {name} lie at the edge of their range and were moved to "
                 "the link's margin: their noise is not what the link describes."
+            )
+
+
+def _reading_notes(counts: Mapping[str, Any]) -> Iterator[str]:
+    """Readings at the edge of their range, as a mirror has near Brewster's angle, where few."""
+    total = counts.get("views") or 0
+    for name, count in (counts.get("at_margin") or {}).items():
+        if count and total and count / total <= MAX_AT_MARGIN:
+            yield (
+                f"{count} of {total} readings of {name} lie at the edge of their range and were "
+                "moved to the link's margin."
             )
 
 

@@ -44,6 +44,8 @@ MAX_LEVERAGE = 0.999
 """Draws may give a reading more than all of the information about itself."""
 LARGE_SHIFT = 1.0
 """Change of a posterior mean without one reading that counts, in posterior sds."""
+KNOWN_TOO = 0.2
+"""One minus the leverage of a reading from which the others know what it says, and may disagree."""
 ALONE = 2.0
 """Factor by which an interval would widen without a reading that is named as its source."""
 
@@ -275,7 +277,8 @@ def _influence(residuals: Residuals) -> Finding:
 
     def contradiction(e: np.ndarray) -> np.ndarray:
         """Residuals without the reading itself, in their own sd, where it moves the answer."""
-        return np.where(gain * np.abs(e) > LARGE_SHIFT, np.abs(e) / np.sqrt(left_out), 0.0)
+        moves = (gain * np.abs(e) > LARGE_SHIFT) & (left_out > KNOWN_TOO)
+        return np.where(moves, np.abs(e) / np.sqrt(left_out), 0.0)
 
     observed = contradiction(residuals.observed)
     largest = float(observed.max())

@@ -26,8 +26,8 @@ PROBLEM = 0.004
 NEAR_BOUND = 0.05
 """Width of the strip at a bound, as a share of the 95% interval."""
 
-MASS_AT_BOUND = 0.03
-"""Share of the draws in that strip that counts: a uniform density over the interval has 0.0475."""
+MASS_AT_BOUND = 0.0475
+"""Share of the draws in that strip that counts: that of a uniform density over the interval."""
 
 NOISE_FACTOR = "stokes_error_factor"
 

@@ -165,13 +165,20 @@ def test_what_the_fit_noted_itself_fails(method: str) -> None:
     [
         ({"modes": {"weights": [0.9, 0.1]}}, "another mode, of weight 0.1"),
         ({"counts": {"views": 100, "masked": 40}}, "40 of 100 readings are marked valid=False"),
-        ({"counts": {"at_margin": {"dop": 3}}}, "3 readings of dop lie at the edge"),
+        ({"counts": {"views": 8, "at_margin": {"dop": 3}}}, "3 readings of dop lie at the edge"),
     ],
 )
 def test_cautions_do_not_fail(change: dict, words: str) -> None:
     judged = verdict(edit_provenance(make_result(), **change))
     assert judged.passed
     assert any(words in caution for caution in judged.cautions)
+
+
+def test_a_few_readings_at_the_edge_of_their_range_are_a_note() -> None:
+    """A mirror has a degree of polarization of 1 at Brewster's angle."""
+    judged = verdict(edit_provenance(make_result(), counts={"views": 40, "at_margin": {"dop": 2}}))
+    assert not judged.cautions
+    assert any("2 of 40 readings of dop lie at the edge" in note for note in judged.findings)
 
 
 def test_tails_that_chains_may_have_missed_are_told() -> None:
@@ -252,7 +259,8 @@ def test_k_hat_has_the_right_sign(width: float, trusted: bool) -> None:
 def test_a_guide_is_judged_by_its_weights_as_laplace_is() -> None:
     z = np.random.default_rng(3).normal(0.0, 0.3, (4, 1000))
     tree = laplace_tree(stats.norm.logpdf(z) - stats.norm.logpdf(z, scale=0.3))
-    (caution,) = verdict(edit_provenance(tree, method="variational")).cautions
+    caution, lost = verdict(edit_provenance(tree, method="variational")).cautions
+    assert "Leave-one-out cannot be approximated" in lost
     assert "Pareto k-hat of the guide's draws is" in caution
     # Weights of draws that were chosen by weight are another matter.
     assert not verdict(edit_provenance(tree, method="tempered")).cautions
