@@ -28,6 +28,15 @@ def test_a_mirror_needs_views_in_the_mirror_direction(plate: xr.Dataset) -> None
     assert next(library.alternatives(library.simplest)) == ("rough GGX surface", "", "")
 
 
+def test_a_beam_is_no_sky(plate: xr.Dataset) -> None:
+    """The light of a goniometer is stated, and so is that of a capture with incident levels."""
+    assert list(scene_library(plate.assign_attrs(setup="goniometer")).surfaces) == ["mirror"]
+    assert list(scene_library(plate.assign_attrs(incident_levels="given")).surfaces) == ["mirror"]
+    aside = scene_library(off_mirror(plate).assign_attrs(setup="goniometer"))
+    assert list(aside.surfaces) == ["rough surface", "rough GGX surface"]
+    assert "sky" in scene_library(plate.assign_attrs(setup="camera")).surfaces
+
+
 def test_the_setup_gives_its_body_and_its_systematic_errors(plate: xr.Dataset) -> None:
     named = scene_library(plate.assign_attrs(setup="goniometer"))
     terms = named.others["instrument"]["systematic errors"].terms

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from numpyro import distributions as dist
-from plates import LINKS, PLATE, plate_capture
+from plates import LINKS, PLATE, plate_capture, plates
 
 import polar_bayes as pb
 from polar_bayes.scenes import comparison as selection
+from polar_bayes.scenes.candidates import SceneLibrary
 from polar_bayes.scenes.comparison import FitArguments, between_scenes, stacking_weights
 from polar_bayes.scenes.sentences import SceneComparison
 from polar_bayes.scenes.stacking import stack_fits
@@ -95,6 +97,57 @@ def test_sentences_name_the_scenes_and_why_others_went(comparison: SceneComparis
     assert "with body" in said
     assert "2 scenes were fitted" in said
     assert list(pb.scenes.scene_table(comparison)["weight"]) == list(comparison.table["weight"])
+
+
+def small_library(*_: object) -> SceneLibrary:
+    """A mirror with a body or without."""
+    return SceneLibrary(
+        {"mirror": MIRROR.surface}, {"body": PLATE.subsurface}, pb.StokesMixing(), others={}
+    )
+
+
+def test_scenes_are_compared_with_an_index_that_the_prior_excludes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The fit keeps the prior that was stated, and its verdict says where that ends."""
+    monkeypatch.setattr(selection, "scene_library", small_library)
+    plate = plates([2.6], 0.01, np.arange(40.0, 82.0, 3.0)).isel(patch=0)
+    result = pb.fit(plate, scene="auto", method="importance", links=LINKS)
+    scenes = result["scenes"].to_dataset()
+    assert np.allclose(scenes["mean"].sel(parameter="refractive_index"), 2.6, atol=0.1)
+    assert float(result["posterior"]["refractive_index"].max()) < 2.0
+    said = " ".join(pb.scenes.scene_sentences(result))
+    assert "Scenes were compared with refractive_index by TruncatedNormal(loc=2.6" in said
+    verdict = pb.verdict(result)
+    assert not verdict.passed
+    assert any("Brewster's angle means an index near 2.56" in each for each in verdict.problems)
+
+
+@each("given", [{"refractive_index": dist.TruncatedNormal(1.5, 0.1, low=1.0)}, {}])
+def test_a_prior_of_the_users_own_and_one_that_allows_the_index_stay(given) -> None:
+    index = 2.6 if given else 1.5
+    plate = plates([index], 0.01, np.arange(40.0, 82.0, 3.0)).isel(patch=0)
+    arguments = FitArguments(plate, "per_material", given, LINKS, None, 0, "double")
+    assert not selection.lifted_prior(arguments.among([MIRROR]), MIRROR)
+
+
+def test_a_scene_that_may_have_escaped_a_bound_of_the_index_is_told(
+    comparison: SceneComparison,
+) -> None:
+    assert comparison.table["index_bound"].isna().all()
+    table = comparison.table.assign(index_bound=[np.nan, 2.0])
+    said = " ".join(pb.scenes.scene_sentences(dataclasses.replace(comparison, table=table)))
+    assert "The index of mirror lies against 2, where its prior ends" in said
+    assert "priors={'refractive_index': TruncatedNormal(2, 0.3, low=1)}" in said
+    table = comparison.table.assign(index_bound=2.0)
+    said = " ".join(pb.scenes.scene_sentences(dataclasses.replace(comparison, table=table)))
+    assert "lies against" not in said  # the verdict has the bound of the scene that was chosen
+
+
+def test_the_bound_at_which_an_interval_ends_is_found(capture: xr.Dataset) -> None:
+    narrow = {"refractive_index": dist.TruncatedNormal(1.6, 0.1, low=1.55)}
+    found = pb.compare_scenes(capture, {"mirror": MIRROR}, links=LINKS, priors=narrow)
+    assert list(found.table["index_bound"]) == [1.55]
 
 
 def test_what_is_no_scene_is_refused(capture: xr.Dataset) -> None:
