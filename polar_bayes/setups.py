@@ -55,9 +55,15 @@ class Setup(HTMLRepr):
     shared: tuple[str, ...] = ()
 
 
+# A bare surface is as common as any body, and where it is one, the index must not follow a fraction
+# that its prior keeps away from zero: half of this one is below .031, a quarter below .001.
+MAYBE_BARE = {"subsurface_fraction": Beta(0.2, 1.0)}
+
 SETUPS: Mapping[str, Setup] = MappingProxyType(
     {
-        "paper": Setup(SCENES["paper"], {"dop": BetaLink(), "intensity": StudentTLink()}),
+        "paper": Setup(
+            SCENES["paper"], {"dop": BetaLink(), "intensity": StudentTLink()}, priors=MAYBE_BARE
+        ),
         "camera": Setup(
             SCENES["camera"],
             {"q": StokesLink(), "u": StokesLink(), "intensity": StudentTLink()},
@@ -68,9 +74,8 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
         "picture": Setup(
             SCENES["picture"],
             {"q": StokesLink(stated_errors=True), "u": StokesLink(stated_errors=True)},
-            # A fraction of .009 dilutes the polarization of a surface by a fifth already: a body of
-            # which nothing is seen must not be improbable, or the index follows it.
-            priors={"subsurface_fraction": Beta(0.2, 1.0)},
+            # A fraction of .009 dilutes the polarization of a mirror by a fifth already.
+            priors=MAYBE_BARE,
         ),
         # A laser beam grows longer than the sample towards grazing, each channel losing its own
         # share: beyond 78 degrees a plate's readings say more about its size than its index.

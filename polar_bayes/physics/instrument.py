@@ -410,21 +410,24 @@ def tilted_direction(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Arr
 # --- Discrepancy: a smooth unknown factor between the channels, over angle ------------------------
 
 
-# View angles run over 0 to 90 degrees. The basis vanishes at normal incidence, where an isotropic
-# sample reflects s and p alike, and at the end of a domain that is wider than the angles.
-DOMAIN = 117.0
+# View angles run over 0 to 90 degrees; sines vanish at the ends of a domain that begins so many
+# degrees before and is so many degrees long.
+BEFORE, SPAN = 13.5, 117.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Discrepancy(AbstractInstrumentTerm):
     r"""A smooth factor exp(f) on the ratio of channels s and p, over the view zenith.
 
-    $$ f(\theta) = \text{amplitude} \sum_j w_j \sqrt{S(\omega_j)}\,
-       \sin\frac{j\pi\theta}{L}, \qquad
+    $$ f(\theta) = \text{amplitude} \sum_j w_j \phi_j(\theta), \qquad
        q' = \frac{q+t}{1+qt}, \quad t = \tanh(f/2) $$
 
-    A Gaussian process with squared-exponential kernel, in its Hilbert-space approximation. With
-    standard normal weights the amplitude is the root mean square of f over 0 to 90 degrees.
+    A Gaussian process with squared-exponential kernel, in its Hilbert-space approximation by sines
+    $\sqrt{S(\omega_j)} \sin(\omega_j(\theta + 13.5))$, $\omega_j = j\pi/117$ per degree, and
+    conditioned on f(0) = 0: an isotropic sample reflects s and p alike at normal incidence, so that
+    a ratio there is a gain (`ChannelGain`). The functions $\phi_j$ are the combinations of one sine
+    more that vanish at 0. With standard normal weights the amplitude is the root mean square of f
+    over 0 to 90 degrees.
 
     Parameters are `discrepancy_amplitude` (...) and `discrepancy_weights` (..., basis).
 
@@ -436,7 +439,9 @@ class Discrepancy(AbstractInstrumentTerm):
         SceneError: The number or the length is not positive.
 
     Source:
-        Solin and Sarkka 2020, Hilbert space methods for reduced-rank Gaussian process regression.
+        Solin and Sarkka 2020, Hilbert space methods for reduced-rank Gaussian process regression;
+        Rasmussen and Williams 2006, Gaussian processes for machine learning, eq. 2.19 (conditioned
+        on a value without noise).
     """
 
     basis: int = 4
@@ -462,16 +467,21 @@ class Discrepancy(AbstractInstrumentTerm):
         return diattenuate(light, jnp.tanh(half_log_ratio), 1.0 / jnp.cosh(half_log_ratio))
 
     def functions(self, view_zenith: Array) -> Array:
-        """Basis functions, scaled by the spectrum: (..., view) -> (..., basis, view)."""
-        frequency, scale = self._spectrum()
+        """Basis functions that vanish at 0: (..., view) -> (..., basis, view)."""
         dtype = jnp.result_type(float, view_zenith)
-        phase = jnp.asarray(frequency[:, None], dtype) * view_zenith[..., None, :]
-        return jnp.asarray(scale[:, None], dtype) * jnp.sin(phase)
+        frequency, mixing = (jnp.asarray(x, dtype) for x in self._sines())
+        sines = jnp.sin(frequency[:, None] * (view_zenith[..., None, :] + BEFORE))
+        return jnp.einsum("bs,...sv->...bv", mixing, sines)
 
-    def _spectrum(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frequencies, and amplitudes that make the mean variance over 0 to 90 degrees one."""
-        frequency = math.pi * np.arange(1, self.basis + 1) / DOMAIN
-        amplitude = np.exp(-((self.length * frequency) ** 2) / 4.0)
-        angle = np.linspace(0.0, 90.0, 181)[:, None]
-        variance = np.mean(np.sum((amplitude * np.sin(frequency * angle)) ** 2, axis=1))
-        return frequency, amplitude / math.sqrt(variance)
+    def _sines(self) -> tuple[np.ndarray, np.ndarray]:
+        """Frequencies (sine,), and their coefficients in each function (basis, sine)."""
+        frequency = math.pi * np.arange(1, self.basis + 2) / SPAN
+        scale = np.exp(-((self.length * frequency) ** 2) / 4.0)
+        # A reflection that takes the values at 0 to the first axis: the others vanish there.
+        normal = scale * np.sin(frequency * BEFORE)
+        normal[0] += math.copysign(float(np.linalg.norm(normal)), normal[0])
+        reflection = np.eye(normal.size) - 2.0 * np.outer(normal, normal) / (normal @ normal)
+        mixing = reflection[1:] * scale
+        angle = np.linspace(0.0, 90.0, 181)[:, None] + BEFORE
+        variance = np.mean(np.sum((np.sin(frequency * angle) @ mixing.T) ** 2, axis=1))
+        return frequency, mixing / math.sqrt(variance)

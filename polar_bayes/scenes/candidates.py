@@ -16,7 +16,13 @@ import xarray as xr
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
 from polar_bayes.physics.coat import ThinFilm
 from polar_bayes.physics.illumination import PointSource, UniformSky
-from polar_bayes.physics.instrument import AngleZero, Discrepancy, Instrument, TiltedNormal
+from polar_bayes.physics.instrument import (
+    AngleZero,
+    ChannelGain,
+    Discrepancy,
+    Instrument,
+    TiltedNormal,
+)
 from polar_bayes.physics.microfacet import GGX, Beckmann
 from polar_bayes.physics.mixing import AbstractMixing, StokesMixing
 from polar_bayes.physics.scene import WAY_OUT, Scene
@@ -251,7 +257,9 @@ def _bodies(setup: Setup | None, shows_absorption: bool) -> Mapping[str, Any]:
 
 
 def _systematic_errors(setup: Setup | None) -> Instrument:
-    """The instrument terms of the set-up, an unknown angle zero, and a discrepancy."""
+    """The instrument terms of the set-up, an unknown angle zero and gains, and a discrepancy."""
+    # The discrepancy vanishes at normal incidence: what is the same at all angles is a gain.
     given = setup.scene.instrument.terms if setup and setup.scene.instrument else ()
-    kinds = (AngleZero, Discrepancy)
-    return Instrument((AngleZero(), *(t for t in given if not isinstance(t, kinds)), Discrepancy()))
+    kinds = (AngleZero, ChannelGain, Discrepancy)
+    others = (term for term in given if not isinstance(term, kinds))
+    return Instrument((AngleZero(), ChannelGain(), *others, Discrepancy()))

@@ -123,6 +123,13 @@ def test_discrepancy_has_the_amplitude_it_says(basis: int, length: float) -> Non
     np.testing.assert_allclose(np.mean(np.sum(functions**2, axis=0)), 1.0, rtol=5e-3)
 
 
+@each("basis", [1, 4, 40])
+def test_discrepancy_vanishes_at_normal_incidence(basis: int) -> None:
+    """An isotropic sample reflects s and p alike there: what they differ by is the gain."""
+    at_zero = np.asarray(Discrepancy(basis).functions(jnp.zeros(1)))
+    np.testing.assert_allclose(at_zero, 0.0, atol=4.0 * np.finfo(float).eps)
+
+
 @pytest.mark.thorough
 def test_discrepancy_of_many_functions_is_the_kernel() -> None:
     """In the middle of the range the covariance is that of the squared exponential."""
