@@ -12,6 +12,7 @@ from paper_study import (
     GRAZING,
     INDEX,
     NAMES,
+    PAPER,
     SCENE,
     Population,
     Study,
@@ -64,7 +65,7 @@ def dop(study: Study) -> Picture:
             protocol=pb.simulation.Protocol(wavelengths=()),
             seed=study.seed + at,
         )
-        result = pb.fit(capture, method="laplace", scene=SCENE, seed=study.seed)
+        result = pb.fit(capture, method="laplace", scene=PAPER, seed=study.seed)
         told = result["posterior_predictive"]["dop"].stack(all=("chain", "draw"))
         low, high = told.quantile([0.025, 0.975], "all").to_numpy()
         zenith, azimuth = (capture[f"view_{angle}"].to_numpy() for angle in ("zenith", "azimuth"))

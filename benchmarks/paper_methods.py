@@ -12,6 +12,7 @@ import xarray as xr
 from jaxtyping import Array
 from paper_study import (
     NAMES,
+    PAPER,
     SCENE,
     NormalScores,
     Population,
@@ -60,7 +61,7 @@ class LeastSquares:
             resolve(
                 capture,
                 model,
-                SCENE,
+                PAPER,
                 None,
                 None,
                 None,

@@ -15,6 +15,7 @@ from paper_study import (
     INDEX,
     LARGEST,
     NAMES,
+    PAPER,
     SCENE,
     Figure,
     NormalScores,
@@ -117,7 +118,7 @@ class Information:
             request = resolve(
                 capture,
                 "per_material",
-                SCENE,
+                PAPER,
                 None,
                 None,
                 largest_view_zenith,
