@@ -211,6 +211,10 @@ def numpy_generator(key: Array) -> np.random.Generator:
 LEVELS = (0.025, 0.1, 0.25, 0.5, 0.75, 0.9, 0.975)
 
 
+CACHED = 512
+"""Pixels that are summarized together: more do not fit into the cache."""
+
+
 class Marginals:
     """Marginals of a batch of pixels, filled in as answers come: NaN where a pixel has none.
 
@@ -237,6 +241,14 @@ class Marginals:
 
     def describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
         """Summarize the weighted draws of some pixels."""
+        for begin in range(0, at.size, CACHED):
+            some = slice(begin, begin + CACHED)
+            own = {name: np.asarray(x)[some] for name, x in parameters.items()}
+            self._describe(at[some], own, weights[some])
+
+    def _describe(
+        self, at: np.ndarray, parameters: dict[str, np.ndarray], weights: np.ndarray
+    ) -> None:
         scores = [score(parameters) for score in self._scores]
         centered = [x - np.sum(weights * x, axis=1, keepdims=True) for x in scores]
         gains = [weights * x / np.sum(weights * x**2, axis=1, keepdims=True) for x in centered]
