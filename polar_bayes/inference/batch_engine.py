@@ -150,18 +150,23 @@ class BatchEngine:
         return self.programs.of(("prior draws", drawn), draw)[:count]
 
     @property
-    def prior_moments(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Mean and sd of every parameter before any reading, where they are finite."""
+    def prior_parameters(self) -> dict[str, np.ndarray]:
+        """Parameters of `MOMENTS` draws from the prior, each (draw, ...)."""
 
-        def find() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        def find() -> dict[str, np.ndarray]:
             z = self.prior_draws(MOMENTS)
             with jax.enable_x64(self.precision == "double"):
                 draws = self.program.parameters_of_chains(jnp.asarray(z[None]), self.layout)
-            found = {name: np.asarray(x[0], float) for name, x in draws.items()}
-            moments = {name: (x.mean(axis=0), x.std(axis=0)) for name, x in found.items()}
-            return {name: two for name, two in moments.items() if np.isfinite(two).all()}
+            return {name: np.asarray(x[0], float) for name, x in draws.items()}
 
-        return self.programs.of("prior moments", find)
+        return self.programs.of("prior parameters", find)
+
+    @property
+    def prior_moments(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Mean and sd of every parameter before any reading, where they are finite."""
+        found = self.prior_parameters.items()
+        moments = {name: (x.mean(axis=0), x.std(axis=0)) for name, x in found}
+        return {name: two for name, two in moments.items() if np.isfinite(two).all()}
 
 
 def evaluate_draws(

@@ -23,7 +23,7 @@ from polar_bayes.inference.batch_engine import (
 )
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batch_one_by_one import PixelByPixel
-from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status, batched, take_rows
+from polar_bayes.inference.batching import MethodUsed, Status, batched, take_rows
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.laplace import Importance, Rounds
 from polar_bayes.inference.levenberg_marquardt import (
@@ -90,7 +90,7 @@ class PixelImportance(AbstractPixelMethod):
         with jax.enable_x64(engine.precision == "double"):  # a thread does not inherit it
             found = {
                 row: _Pixel(at[row], Rounds(self.draws, self.rounds), batch.keys[at[row]], mixture)
-                for row, mixture in _profile_mixtures(engine, pixels)
+                for row, mixture in _profile_mixtures(batch, at)
             }
             left = list(found)
             while left:
@@ -135,15 +135,16 @@ class _Pixel:
             batch.record(one, draws, rounds.weights[None], effective, MethodUsed.IMPORTANCE, status)
 
 
-def _profile_mixtures(
-    engine: BatchEngine, pixels: ObservationBatch
-) -> Iterator[tuple[int, Mixture]]:
+def _profile_mixtures(batch: BatchFit, at: np.ndarray) -> Iterator[tuple[int, Mixture]]:
     """The first proposal of every pixel that has a mode, and the number of the pixel."""
+    engine, pixels = batch.engine, batch.pixels.subset(at)
     owner, modes = find_all_modes(engine, pixels)
     if not owner.size:
         return
     evidence, largest = modes.log_evidence, np.full(len(pixels), -np.inf)
     np.maximum.at(largest, owner, evidence)
+    is_first = evidence == largest[owner]
+    batch.record_approximation(at[owner[is_first]], take_rows(modes, is_first))
     weight = np.exp(evidence - largest[owner])
     heavy = weight >= LEAST_WEIGHT * np.bincount(owner, weight)[owner]
     owner, modes = owner[heavy], take_rows(modes, heavy)

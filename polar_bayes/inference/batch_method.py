@@ -18,6 +18,7 @@ from polar_bayes.inference.batching import (
     Outcome,
     Status,
     empty_outcome,
+    take_rows,
 )
 from polar_bayes.inference.levenberg_marquardt import ModeSearch, NormalApproximation
 from polar_bayes.inference.method import AbstractBatchMethod
@@ -25,7 +26,11 @@ from polar_bayes.inference.program import Values
 
 
 class BatchFit:
-    """One fit of a batch of pixels: what is fitted, and the outcome as it is filled in."""
+    """One fit of a batch of pixels: what is fitted, and the outcome as it is filled in.
+
+    `mode_z` and `mode_root` are the mode of each pixel and a root of the covariance there, NaN
+    where none is known.
+    """
 
     def __init__(
         self,
@@ -37,14 +42,23 @@ class BatchFit:
     ) -> None:
         self.engine, self.pixels, self.keys, self.seed = engine, pixels, keys, seed
         self.outcome = empty_outcome(len(pixels))
+        size = engine.program.size
+        self.mode_z = np.full((len(pixels), size), np.nan)
+        self.mode_root = np.full((len(pixels), size, size), np.nan)
         self._describe = describe
 
     def record_modes(self, at: np.ndarray, search: ModeSearch) -> None:
         """Modes were found, and it is not known yet how good a normal approximation there is."""
         found = search.converged
+        self.record_approximation(at[found], take_rows(search.mode, found))
         self.outcome.steps[at] = search.steps
         self.outcome.condition[at] = np.where(found, search.mode.condition, np.nan)
         self.outcome.status[at] = np.where(found, Status.NOT_TRUSTED, Status.NOT_CONVERGED)
+
+    def record_approximation(self, at: np.ndarray, mode: NormalApproximation) -> None:
+        """Modes of some pixels, those left out of which one is known."""
+        new = np.isnan(self.mode_z[at]).any(axis=1)
+        self.mode_z[at[new]], self.mode_root[at[new]] = mode.z[new], mode.root[new]
 
     def record_pareto_k(self, at: np.ndarray, pareto_k: np.ndarray) -> None:
         """Pareto k of pixels that have none; else it is that of an earlier proposal."""
@@ -91,12 +105,17 @@ class AbstractPixelMethod(AbstractBatchMethod[BatchEngine]):
         describe: Describe,
     ) -> Outcome:
         batch = BatchFit(engine, observations, random_keys(seed, numbers), describe, seed)
-        batch.outcome.status[observations.views < MIN_VIEWS] = Status.TOO_FEW_VIEWS
-        batch.outcome.status[observations.views == 0] = Status.MASKED
-        at = np.flatnonzero(observations.views >= MIN_VIEWS)
+        self.fit_batch(batch)
+        return batch.outcome
+
+    def fit_batch(self, batch: BatchFit) -> None:
+        """Fit every pixel that has enough views, and record the outcome of all."""
+        views = batch.pixels.views
+        batch.outcome.status[views < MIN_VIEWS] = Status.TOO_FEW_VIEWS
+        batch.outcome.status[views == 0] = Status.MASKED
+        at = np.flatnonzero(views >= MIN_VIEWS)
         for begin in range(0, at.size, self.memory_limit):
             self.fit(batch, at[begin : begin + self.memory_limit])
-        return batch.outcome
 
     @abc.abstractmethod
     def fit(

@@ -135,13 +135,17 @@ MIN_VIEWS = 2
 
 
 class Status(enum.IntEnum):
-    """Status of a pixel; the last is the value of chunks that are not written."""
+    """Status of a pixel; the last is the value of chunks that are not written.
+
+    A contradicted pixel has a good posterior, and its readings speak against the model.
+    """
 
     GOOD = 0
     MASKED = 1
     TOO_FEW_VIEWS = 2
     NOT_CONVERGED = 3
     NOT_TRUSTED = 4
+    CONTRADICTED = 5
     NOT_FITTED = -1
 
 
