@@ -93,7 +93,7 @@ CASES = {
             "channel_gain_ratio": 1.02,
             "beam_overlap_zenith": 82.0,
             "discrepancy_amplitude": 0.03,
-            "discrepancy_weights": np.asarray([0.5, -0.5, 0.5, -0.5]),
+            "discrepancy_weights": np.asarray([0.5, -0.5, 0.5]),
         },
     ),
     "plastic": Case(

@@ -558,7 +558,7 @@ _ROWS: dict[str, dist.Distribution] = {
     "beam_overlap_zenith": dist.TruncatedNormal(80.0, 5.0, low=45.0, high=89.0),
     # Smooth errors of some percent are usual, and none is possible; one in 400 is worse than 36%.
     "discrepancy_amplitude": HalfNormal(0.12),
-    "discrepancy_weights": dist.Normal(0.0, 1.0).expand([4]).to_event(1),
+    "discrepancy_weights": dist.Normal(0.0, 1.0).expand([3]).to_event(1),
     # The noise: scales that the data themselves determine. None may reach zero: where the scene
     # can match a few readings exactly, a scale of zero would have infinite posterior density.
     "concentration_scale": dist.LogNormal(math.log(200.0), 1.0),

@@ -154,7 +154,7 @@ _ZEROS = ("leakage", "dark_level", "angle_zero", "normal_tilt_x", "normal_tilt_y
 NEUTRAL: Mapping[str, np.ndarray] = {
     **dict.fromkeys((*_ZEROS, "discrepancy_amplitude"), np.asarray(0.0)),
     **dict.fromkeys(("dolp_gain", "channel_gain_ratio"), np.asarray(1.0)),
-    "discrepancy_weights": np.zeros(4),
+    "discrepancy_weights": np.zeros(3),
     "beam_overlap_zenith": np.asarray(90.0),
 }
 """A perfect instrument and a level sample, by the names of the terms' parameters."""

@@ -444,7 +444,7 @@ class Discrepancy(AbstractInstrumentTerm):
         on a value without noise).
     """
 
-    basis: int = 4
+    basis: int = 3
     length: float = 25.0
 
     parameters: ClassVar[tuple[str, ...]] = ("discrepancy_amplitude", "discrepancy_weights")

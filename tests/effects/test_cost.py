@@ -57,7 +57,7 @@ NEUTRAL = {
     "dark_level": 0.0,
     "degree": 0.0,
     "discrepancy_amplitude": 0.0,
-    "discrepancy_weights": np.zeros(4),
+    "discrepancy_weights": np.zeros(3),
     "dolp_gain": 1.0,
     "leakage": 0.0,
 }

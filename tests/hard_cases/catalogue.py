@@ -87,7 +87,7 @@ INSTRUMENTS = {
         "dark_level": 0.0,
         "angle_zero": 0.0,
         "discrepancy_amplitude": 0.0,
-        "discrepancy_weights": np.zeros(4),
+        "discrepancy_weights": np.zeros(3),
     },
     "ordinary": {
         "dolp_gain": 0.9,
@@ -96,7 +96,7 @@ INSTRUMENTS = {
         "dark_level": 1e-3,
         "angle_zero": 0.2,
         "discrepancy_amplitude": 0.1,
-        "discrepancy_weights": np.array([1.0, -0.5, 0.3, 1.2]),
+        "discrepancy_weights": np.array([1.0, -0.5, 1.2]),
     },
     "hopeless": {
         "dolp_gain": 0.0,
@@ -105,7 +105,7 @@ INSTRUMENTS = {
         "dark_level": 10.0,
         "angle_zero": -3.0,
         "discrepancy_amplitude": 5.0,
-        "discrepancy_weights": np.array([3.0, -3.0, 3.0, -3.0]),
+        "discrepancy_weights": np.array([3.0, -3.0, 3.0]),
     },
 }
 

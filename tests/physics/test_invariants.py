@@ -119,7 +119,7 @@ VALUES = {
     "discrepancy_amplitude": st.floats(0.0, 0.5),
 }
 parameters = st.fixed_dictionaries(VALUES).map(
-    lambda values: values | {"discrepancy_weights": np.array([1.0, -0.5, 0.3, 1.2])}
+    lambda values: values | {"discrepancy_weights": np.array([1.0, -0.5, 1.2])}
 )
 zenith = st.floats(0.0, 89.5)
 azimuth = st.floats(-180.0, 180.0)

@@ -216,7 +216,7 @@ def test_without_a_lean_nothing_changes(name: str) -> None:
     around = np.array([0.0, 80.0, 30.0, 0.0, 45.0, 0.0, 0.0, 10.0, 10.0])
     views = Geometry(*(jnp.asarray(x) for x in (zenith, azimuth, light, around)))
     values = tilted((0.0, 0.0)) | {name: 0.1 for name in scene.parameters if name not in PARAMETERS}
-    values |= {"discrepancy_weights": np.zeros(4), "channel_gain_ratio": 1.1}
+    values |= {"discrepancy_weights": np.zeros(3), "channel_gain_ratio": 1.1}
     level = predict(scene, values, views)
     found = predict(leaning(scene), values, views)
     for reading in level:
