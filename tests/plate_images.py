@@ -31,6 +31,7 @@ ASKED = {
     "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
     "scene": PLATE,
     "links": {"q": pb.links.StokesLink(stated_errors=True)},
+    "priors": {"subsurface_fraction": pb.PRIORS["subsurface_fraction"]},
 }
 
 
@@ -93,8 +94,10 @@ def planned(
 ) -> MapPlan:
     """The plan of a map; with one plan, the same programs serve many tests."""
     given = {**ASKED, **asked}
-    scene, links = given["scene"], given["links"]
-    asked_for = plan_map(capture, given["model"], method, scene, None, links, None, seed, precision)
+    scene, priors, links = given["scene"], given["priors"], given["links"]
+    asked_for = plan_map(
+        capture, given["model"], method, scene, priors, links, None, seed, precision
+    )
     return estimate_plan(asked_for, capture)
 
 

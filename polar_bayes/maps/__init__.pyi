@@ -1,6 +1,8 @@
 from .fit_map import fit_pixels as fit_pixels
 from .lazy import (
+    count_criticism as count_criticism,
     count_pixels as count_pixels,
+    criticism_sentences as criticism_sentences,
     open_capture as open_capture,
     open_map as open_map,
     shared_cautions as shared_cautions,

@@ -30,6 +30,7 @@ from polar_bayes.inference.batching import (
     cut,
     empty_outcome,
 )
+from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE
@@ -42,6 +43,7 @@ from polar_bayes.inference.shared import (
 )
 from polar_bayes.inference.shared import PIXELS as SHARED_PIXELS
 from polar_bayes.maps.blocks import as_completed, workers
+from polar_bayes.maps.criticism import PROBLEMS, UNKNOWN, Criticism, PixelCriticism, criteria
 from polar_bayes.observation.data import ANGLES, READINGS, Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.part import notation
@@ -62,6 +64,9 @@ DIAGNOSTICS = {
 }
 
 FLAGS: dict[str, type[enum.IntEnum]] = {"approach": MethodUsed, "status": Status}
+
+FILL_VALUES = {"status": int(Status.NOT_FITTED), "criticism": UNKNOWN}
+"""Of chunks in a Zarr store that are not written."""
 
 NUMBER = "pixel_number"
 """Variable of a block: index of each pixel in the whole image, row by row."""
@@ -114,8 +119,9 @@ def fit_pixels(
         what is shared has no map, and is told by `maps.shared_parameters`; `<name>_slope` is the
         change of the mean with one standard deviation of each shared parameter;
         `pareto_k`, `effective_draws`, `condition`, `steps`, `approach` (the method by which the
-        numbers were found) and `status` of each pixel. NaN where a pixel has no answer; the
-        attribute `polar_bayes` holds the provenance.
+        numbers were found) and `status` of each pixel; `criticism`, the checks in which its
+        readings speak against the model (`maps.count_criticism`). NaN where a pixel has no answer;
+        the attribute `polar_bayes` holds the provenance.
 
     Raises:
         CaptureError: The capture is no image, or does not hold what a fit needs.
@@ -131,7 +137,8 @@ def fit_pixels(
         maps = xr.map_blocks(fit_block, numbered, args=[plan], template=blank(capture, plan))
     else:
         maps = _in_memory(capture, plan, progress or no_progress)
-    maps["status"].encoding["fill_value"] = int(Status.NOT_FITTED)  # of chunks in a Zarr store
+    for name, value in FILL_VALUES.items():
+        maps[name].encoding["fill_value"] = value
     return maps
 
 
@@ -399,8 +406,9 @@ def with_pixel_numbers(image: xr.Dataset, region: Mapping[str, slice] | None = N
 def blank(capture: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     """Maps of the image without values: names, axes, types and attributes; lazy (Dask)."""
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
-    nothing = empty_outcome(1, Status.NOT_FITTED)
-    tiny = maps_of(plan.marginals(1), nothing, corner, plan).drop_vars(IMAGE, errors="ignore")
+    nothing, unknown = empty_outcome(1, Status.NOT_FITTED), np.full(1, UNKNOWN, np.int8)
+    tiny = maps_of(plan.marginals(1), nothing, unknown, corner, plan)
+    tiny = tiny.drop_vars(IMAGE, errors="ignore")
     sizes = dict(tiny.sizes) | {dim: capture.sizes[dim] for dim in IMAGE}
     coords = {dim: capture[dim] for dim in IMAGE if dim in capture.coords}
     whole = tiny.coords.to_dataset().assign_coords(coords)
@@ -440,11 +448,22 @@ def fit_block(block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     found = plan.marginals(numbers.size)
     readings = mask_missing(block.drop_vars(NUMBER))
     if not readings["valid"].any():  # a corner of a picture; as a capture it would be refused
-        return maps_of(found, empty_outcome(numbers.size, Status.MASKED), block, plan)
-    pixels = plan.pixels(readings)
-    seed = plan.request.seed
-    outcome = plan.settings.run_batch(plan.engine, pixels, numbers, seed, found.describe)
-    return maps_of(found, outcome, block, plan)
+        nothing = empty_outcome(numbers.size, Status.MASKED)
+        return maps_of(found, nothing, np.zeros(numbers.size, np.int8), block, plan)
+    engine, seed = plan.engine, plan.request.seed
+    checks = criteria(engine, plan.request.priors, plan.sizes)
+    criticism = PixelCriticism(checks, found, numbers.size)
+
+    def describe(at: np.ndarray, draws: Values, weights: np.ndarray) -> None:
+        found.describe(at, draws, weights)
+        criticism.describe(at, draws, weights)
+
+    keys = random_keys(seed, numbers)
+    batch = BatchFit(engine, plan.pixels(readings), keys, describe, seed)
+    plan.settings.fit_batch(batch)
+    flags = criticism.judge(batch)
+    batch.outcome.status[(flags & PROBLEMS) != 0] = Status.CONTRADICTED
+    return maps_of(found, batch.outcome, flags, block, plan)
 
 
 def mask_missing(capture: xr.Dataset) -> xr.Dataset:
@@ -456,8 +475,10 @@ def mask_missing(capture: xr.Dataset) -> xr.Dataset:
     return capture.assign(valid=valid)
 
 
-def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
-    """The marginals of a block as labeled maps."""
+def maps_of(
+    found: Marginals, outcome: Outcome, criticism: np.ndarray, block: xr.Dataset, plan: MapPlan
+) -> xr.Dataset:
+    """The marginals of a block, and how they are judged, as labeled maps."""
     shape = tuple(block.sizes[dim] for dim in IMAGE)
     variables: dict[str, Any] = {}
     for name, (own, sizes) in plan.axes.items():
@@ -484,6 +505,12 @@ def maps_of(found: Marginals, outcome: Outcome, block: xr.Dataset, plan: MapPlan
                 "flag_meanings": " ".join(each.name.lower() for each in flags),
             }
         variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), attrs)
+    attrs = {
+        "long_name": "checks in which the readings speak against the model",
+        "flag_masks": [int(each) for each in Criticism],
+        "flag_meanings": " ".join(str(each.name).lower() for each in Criticism),
+    }
+    variables["criticism"] = (IMAGE, criticism.reshape(shape), attrs)
     coords = {dim: block.coords[dim] for dim in (*IMAGE, "wavelength") if dim in block.coords}
     found_maps = xr.Dataset(variables, coords={**coords, "quantile": list(LEVELS)})
     names = [each.name for each in plan.shared]

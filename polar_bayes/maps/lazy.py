@@ -18,6 +18,7 @@ from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.inference.psis import LEVELS
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.inference.shared import DISAGREEMENT
+from polar_bayes.maps.criticism import UNKNOWN
 from polar_bayes.observation.data import READINGS
 from polar_bayes.paths import as_path
 
@@ -110,7 +111,7 @@ def _check_maps(maps: xr.Dataset, store: Path) -> None:
     if "quantile" in maps.dims and not np.array_equal(maps["quantile"], LEVELS):
         raise FitError("its levels are not those of a map", where=f"{store}: quantile", hint=COPY)
     for name, variable in maps.variables.items():
-        where, is_flag = f"{store}: {name}", name in ("status", "approach")
+        where, is_flag = f"{store}: {name}", name in ("status", "approach", "criticism")
         if variable.dtype.kind not in ("iu" if is_flag else "iufUOT"):
             what = f"it holds {variable.dtype.name}, which no map does"
             raise FitError(what, where=where, hint=COPY)
@@ -131,7 +132,8 @@ def _check_maps(maps: xr.Dataset, store: Path) -> None:
 def _has_meanings(flags: xr.Variable) -> bool:
     """Whether every value of a flag has a meaning."""
     meanings = str(flags.attrs.get("flag_meanings", "")).split()
-    values = flags.attrs.get("flag_values", list(range(len(meanings))))
+    numbered = flags.attrs.get("flag_values", list(range(len(meanings))))
+    values = flags.attrs.get("flag_masks", numbered)
     listed = list(values) if isinstance(values, list | tuple | np.ndarray) else [values]
     are_whole = all(isinstance(value, int | np.integer) for value in listed)
     return 0 < len(meanings) == len(listed) and are_whole
@@ -222,6 +224,9 @@ def ensure_loaded(maps: xr.Dataset) -> xr.Dataset:
 CHUNK = 65536
 """Pixels of a chunk of a store, which are read together."""
 
+ANSWERED = (Status.GOOD, Status.CONTRADICTED)
+"""Statuses of pixels whose numbers are those of their model."""
+
 
 def count_pixels(maps: xr.Dataset) -> dict[str, int]:
     """The number of pixels of each status.
@@ -230,8 +235,9 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
         maps: Of `fit_pixels`, or opened from a store.
 
     Returns:
-        How many are good, masked, with too few views, not converged, not trusted and not fitted:
-        those whose chunk is lost, or whose numbers are not finite though they are called good.
+        How many are good, masked, with too few views, not converged, not trusted, contradicted by
+        their readings and not fitted: those whose chunk is lost, or whose numbers are not finite
+        though they have an answer.
 
     Raises:
         FitError: It holds no `status`.
@@ -246,6 +252,60 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
         for each in Status:
             counts[each] += int(np.sum(found == each))
     return {each.name.lower().replace("_", " "): count for each, count in counts.items()}
+
+
+def count_criticism(maps: xr.Dataset) -> pd.DataFrame:
+    """The number of pixels in which each check found that the readings speak against the model.
+
+    Args:
+        maps: Of `fit_pixels`, or opened from a store.
+
+    Returns:
+        A row for each check ("priors", "noise", "residuals" and "bounds") and for all together
+        ("any"), columns caution, problem and not computed. A pixel with a problem is contradicted.
+        Empty for maps of earlier versions, which were not checked.
+
+    Raises:
+        FitError: It holds no `status`.
+    """
+    columns = ["caution", "problem", "not computed"]
+    if "criticism" not in maps:
+        return pd.DataFrame(columns=columns, dtype=int)
+    attrs = maps["criticism"].attrs
+    words = (name.replace("_", " ").partition(" ") for name in attrs["flag_meanings"].split())
+    names = [(check, level) for check, _, level in words]
+    masks = dict(zip(names, np.asarray(attrs["flag_masks"]), strict=True))
+    for level in columns:
+        masks["any", level] = sum(mask for name, mask in masks.items() if name[1] == level)
+    checks = list(dict.fromkeys(check for check, _ in masks))
+    table = pd.DataFrame(0, index=checks, columns=columns)
+    for region in cut(maps, CHUNK):
+        block = maps[["status", "criticism", *_answers(maps)]].isel(region).load()
+        has_answer = checked_status(block).isin(ANSWERED)
+        flags = block["criticism"].where(has_answer, 0).to_numpy()
+        for (check, level), mask in masks.items():
+            table.loc[check, level] += int(np.sum((flags & mask) != 0))
+    return table
+
+
+def criticism_sentences(maps: xr.Dataset) -> list[str]:
+    """How many pixels their readings contradict or give a caution, and by which checks."""
+    table, sentences = count_criticism(maps), []
+    for level, one, several in (
+        ("problem", "pixel is contradicted by its", "pixels are contradicted by their"),
+        ("caution", "pixel has a caution from its", "pixels have a caution from their"),
+    ):
+        counts = table[level]
+        if total := int(counts.get("any", 0)):
+            by = [f"{n:,} by {check}" for check, n in counts.drop("any").items() if n]
+            phrase = one if total == 1 else several
+            sentences.append(f"{total:,} {phrase} readings: {', '.join(by)}.")
+    if left := int(table["not computed"].get("any", 0)):
+        sentences.append(
+            f"The residuals of {left:,} pixel{'s' if left > 1 else ''} were not checked: there are "
+            "too few readings, or the method searched for no mode."
+        )
+    return sentences
 
 
 def shared_parameters(maps: xr.Dataset) -> pd.DataFrame:
@@ -310,18 +370,25 @@ def map_parameters(maps: xr.Dataset) -> list[str]:
 
 
 def checked_status(maps: xr.Dataset) -> xr.DataArray:
-    """Statuses of maps, in memory; a pixel that is called good without numbers is not fitted."""
-    # A chunk that was lost from a store reads as not a number.
-    answers = [
+    """Statuses of maps, in memory; a pixel that has an answer without numbers is not fitted."""
+    # A chunk that was lost from a store reads as not a number, or as a flag that is not known.
+    answers = _answers(maps)
+    here = maps[["status", *answers, *(["criticism"] if "criticism" in maps else [])]].load()
+    is_known = xr.ones_like(here["status"], dtype=bool)
+    for name in answers:
+        is_finite = abs(here[name]) < np.inf
+        is_known &= is_finite.all([dim for dim in is_finite.dims if dim not in IMAGE])
+    if "criticism" in here:
+        is_known &= here["criticism"] != UNKNOWN
+    is_hole = here["status"].isin(ANSWERED) & ~is_known
+    return here["status"].where(~is_hole, Status.NOT_FITTED).astype(here["status"].dtype)
+
+
+def _answers(maps: xr.Dataset) -> list[str]:
+    """Names of the maps that are finite where a pixel has an answer."""
+    return [
         f"{name}{ending}"
         for name in map_parameters(maps)
         for ending in ("", "_sd", "_quantile")
         if f"{name}{ending}" in maps
     ]
-    here = maps[["status", *answers]].load()
-    is_known = xr.ones_like(here["status"], dtype=bool)
-    for name in answers:
-        is_finite = abs(here[name]) < np.inf
-        is_known &= is_finite.all([dim for dim in is_finite.dims if dim not in IMAGE])
-    is_hole = (here["status"] == Status.GOOD) & ~is_known
-    return here["status"].where(~is_hole, Status.NOT_FITTED).astype(here["status"].dtype)

@@ -21,7 +21,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from polar_bayes.capture.schema import CONTRACT, LABELS, WAVELENGTH
 from polar_bayes.errors import CaptureError, FitError, OutputError
-from polar_bayes.inference.batching import IMAGE, Status, cut
+from polar_bayes.inference.batching import IMAGE, cut
 from polar_bayes.interrupts import on_interrupt, resume_hint
 from polar_bayes.maps.blocks import (
     OTHER_OUT,
@@ -38,6 +38,7 @@ from polar_bayes.maps.blocks import (
     written,
 )
 from polar_bayes.maps.fit_map import (
+    FILL_VALUES,
     MapPlan,
     blank,
     estimate_plan,
@@ -267,7 +268,8 @@ class _MapStore:
         """The store with names, axes and attributes; chunks not yet written read as not fitted."""
         compressors = (ZstdCodec(), Crc32cCodec())
         encoding: dict = {str(name): {"compressors": compressors} for name in self._maps.variables}
-        encoding["status"]["fill_value"] = int(Status.NOT_FITTED)
+        for name, value in FILL_VALUES.items():
+            encoding[name]["fill_value"] = value
         self._maps.chunk(self._chunks).assign_attrs({REQUEST: self.request}).to_zarr(
             path,
             mode="w-",

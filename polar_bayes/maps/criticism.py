@@ -1,0 +1,339 @@
+"""What the readings of each pixel say against its model: priors, noise, residuals and bounds.
+
+These are the checks of a fit that need no more than the draws of a pixel, by whatever method, and
+its readings as predicted at its mode, where the method found one. A pixel with a problem is
+contradicted by its readings.
+"""
+
+import dataclasses
+import enum
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from numpyro import distributions as dist
+
+from polar_bayes.inference.batch_engine import MOMENTS, BatchEngine
+from polar_bayes.inference.batch_method import BatchFit
+from polar_bayes.inference.batching import Status
+from polar_bayes.inference.checks import (
+    CAUTION,
+    LARGE_FACTOR,
+    MASS_AT_BOUND,
+    NEAR_BOUND,
+    NOISE_FACTOR,
+    PROBLEM,
+    prior_conflict,
+    tail_scores,
+)
+from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.program import Values
+from polar_bayes.inference.psis import LEVELS, Marginals
+from polar_bayes.maps.residuals import (
+    Fitted,
+    direction_kernels,
+    fitted_readings,
+    residual_tail,
+)
+from polar_bayes.observation.links import PERFECT
+from polar_bayes.physics.part import absence
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS
+from polar_bayes.priors import RANGES, cast_prior, support_bounds
+
+CARRIES = 0.3
+"""Correlation with a material parameter from which another one is judged with it."""
+
+LOWEST, MEDIAN, HIGHEST = (LEVELS.index(level) for level in (0.025, 0.5, 0.975))
+
+ROWS = 1024
+"""Pixels whose prior probabilities are computed together."""
+
+PIXELS = 4096
+"""Pixels whose residuals are in memory at a time."""
+
+
+class Criticism(enum.IntEnum):
+    """Bits of what the checks found in a pixel."""
+
+    PRIORS_CAUTION = 1
+    NOISE_CAUTION = 2
+    RESIDUALS_CAUTION = 4
+    BOUNDS_CAUTION = 8
+    PRIORS_PROBLEM = 16
+    NOISE_PROBLEM = 32
+    RESIDUALS_PROBLEM = 64
+    RESIDUALS_NOT_COMPUTED = -128
+
+
+PROBLEMS = Criticism.PRIORS_PROBLEM | Criticism.NOISE_PROBLEM | Criticism.RESIDUALS_PROBLEM
+
+UNKNOWN = -1
+"""Value of chunks that are not written: no check has a caution and a problem."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scalar:
+    """One number of a pixel: a parameter, and its place where that has axes of its own."""
+
+    name: str
+    index: tuple[int, ...]
+
+    def of(self, values: Mapping[str, Any]) -> np.ndarray:
+        """Its values, (..., pixel) or (pixel, draw), among those of all parameters."""
+        found = np.asarray(values[self.name])
+        return found[(slice(None),) * (found.ndim - len(self.index)) + self.index]
+
+
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """An end of the support of a scalar at which little of the prior is."""
+
+    scalar: Scalar
+    value: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Criteria:
+    """What is checked in each pixel of one model.
+
+    Args:
+        judged: Scalars with a prior probability that are no noise.
+        ends: Where each of them is absent or perfect, as `tail_scores` has it.
+        noise: Scalars of the noise with a prior probability.
+        noise_ends: Where each of them is perfect.
+        material: Numbers of the material, which others of `judged` may carry.
+        bounds: Of all scalars.
+        below: The program of the prior probabilities below values of all of `judged` and `noise`.
+        kernels: How near the directions of views are.
+    """
+
+    judged: tuple[Scalar, ...]
+    ends: np.ndarray
+    noise: tuple[Scalar, ...]
+    noise_ends: np.ndarray
+    material: tuple[Scalar, ...]
+    bounds: tuple[Bound, ...]
+    below: JitOnce
+    kernels: list[np.ndarray]
+
+    def prior_probabilities(self, scalars: tuple[Scalar, ...], values: np.ndarray) -> np.ndarray:
+        """Prior probabilities below values of some scalars, (pixel, scalar)."""
+        every = self.judged + self.noise
+        columns = [every.index(each) for each in scalars]
+        # One program serves any number of pixels.
+        blocks = np.zeros((max(1, -(-len(values) // ROWS)), ROWS, len(every)))
+        rows = blocks.reshape(-1, len(every))
+        rows[: len(values), columns] = values
+        with jax.enable_x64(True):
+            found = [np.asarray(self.below(block)) for block in blocks]
+        return np.concatenate(found)[: len(values), columns]
+
+
+def criteria(
+    engine: BatchEngine,
+    priors: Mapping[str, dist.Distribution],
+    sizes: Mapping[str, tuple[int, ...]],
+) -> Criteria:
+    """The criteria of the parameters that have a map, made once for each engine."""
+
+    def make() -> Criteria:
+        stated = [
+            scalar
+            for name, prior in priors.items()
+            if name in sizes and _has_probabilities(prior)
+            for scalar in _scalars(name, sizes[name])
+        ]
+        judged = tuple(each for each in stated if each.name not in PERFECT)
+        noise = tuple(each for each in stated if each.name in PERFECT)
+        every = [scalar for name, own in sizes.items() for scalar in _scalars(name, own)]
+
+        def below(values: Array) -> Array:
+            columns = zip(judged + noise, values.T, strict=True)
+            return jnp.stack([cast_prior(priors[s.name]).cdf(x) for s, x in columns], axis=1)
+
+        return Criteria(
+            judged=judged,
+            ends=np.array([_end(each.name, priors[each.name]) for each in judged]),
+            noise=noise,
+            noise_ends=np.array([_end(each.name, priors[each.name]) for each in noise]),
+            material=tuple(each for each in every if each.name in MATERIAL_PARAMETERS),
+            bounds=tuple(_bounds(engine, priors, every)),
+            below=JitOnce(below),
+            kernels=direction_kernels(engine.layout.geometry),
+        )
+
+    return engine.programs.of("criteria", make)
+
+
+def _scalars(name: str, own: tuple[int, ...]) -> list[Scalar]:
+    return [Scalar(name, index) for index in np.ndindex(*own)]
+
+
+def _has_probabilities(prior: dist.Distribution) -> bool:
+    """Whether a prior of one number says how much of it is below a value."""
+    if prior.batch_shape or prior.event_shape:
+        return False
+    try:
+        jax.eval_shape(lambda x: cast_prior(prior).cdf(x), jnp.zeros(()))
+    except NotImplementedError:  # NumPyro asks few distributions for one
+        return False
+    return True
+
+
+def _end(name: str, prior: dist.Distribution) -> float:
+    """-1 or 1 where the low or the high end is where the parameter is absent or perfect, else 0."""
+    low, high = support_bounds(prior)
+    absent = absence(name)
+    best = PERFECT.get(name, math.nan if absent is None else absent.value)
+    return -1.0 if best <= low else 1.0 if best >= high else 0.0
+
+
+def _bounds(
+    engine: BatchEngine, priors: Mapping[str, dist.Distribution], scalars: list[Scalar]
+) -> Iterator[Bound]:
+    """Bounds at which a parameter is not absent, and the prior has little probability."""
+    for scalar in scalars:
+        name = scalar.name
+        ends = support_bounds(priors[name]) if name in priors else RANGES.get(name, ())
+        absent = absence(name)
+        for bound in filter(math.isfinite, ends):
+            if absent is None or absent.value != bound:
+                draws = scalar.of(engine.prior_parameters)[None]
+                strip = NEAR_BOUND * np.diff(np.quantile(draws, (0.025, 0.975)))
+                if _share_at(bound, draws, np.full((1, MOMENTS), 1.0 / MOMENTS), strip) < (
+                    MASS_AT_BOUND
+                ):
+                    yield Bound(scalar, bound)
+
+
+def _share_at(
+    bound: float, draws: np.ndarray, weights: np.ndarray, strip: np.ndarray
+) -> np.ndarray:
+    """Share of weighted draws, (pixel, draw), in a strip at a bound."""
+    return np.sum(weights * (np.abs(draws - bound) < strip[:, None]), axis=1)
+
+
+class PixelCriticism:
+    """The checks of the pixels of a block, filled in as answers come: marginals first."""
+
+    def __init__(self, checks: Criteria, marginals: Marginals, count: int) -> None:
+        self._checks, self._marginals = checks, marginals
+        self._at_bound = np.zeros(count, bool)
+        self._carries = np.ones((count, len(checks.judged)), bool)
+
+    def describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
+        """Take in the weighted draws of some pixels."""
+        self._at_bound[at] = False
+        for bound in self._checks.bounds:
+            self._find_bound(bound, at, parameters, weights)
+        self._find_carriers(at, parameters, weights)
+
+    def _find_bound(
+        self, bound: Bound, at: np.ndarray, parameters: Values, weights: np.ndarray
+    ) -> None:
+        """Which pixels lie against a bound."""
+        quantiles = bound.scalar.of(self._marginals.quantiles)[:, at]
+        strip = NEAR_BOUND * (quantiles[HIGHEST] - quantiles[LOWEST])
+        gap = np.min(np.abs(quantiles[[LOWEST, HIGHEST]] - bound.value), axis=0)
+        near = np.flatnonzero(gap < 2.0 * strip)  # of the others, no more than 2.5% can be there
+        if near.size:
+            draws = bound.scalar.of(parameters)[near]
+            share = _share_at(bound.value, draws, weights[near], strip[near])
+            self._at_bound[at[near]] |= share >= MASS_AT_BOUND
+
+    def _find_carriers(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
+        """Which numbers of the instrument are correlated with one of the material."""
+        material, marginals = self._checks.material, self._marginals
+        for column, scalar in enumerate(self._checks.judged):
+            if not material or scalar in material:
+                continue
+            centered = scalar.of(parameters) - scalar.of(marginals.mean)[at, None]
+            centered = weights * centered / scalar.of(marginals.sd)[at, None]
+            found = np.zeros(at.size, bool)
+            for other in material:
+                scores = other.of(parameters) - other.of(marginals.mean)[at, None]
+                with np.errstate(invalid="ignore"):  # a parameter may not move at all
+                    correlation = np.sum(centered * scores, axis=1) / other.of(marginals.sd)[at]
+                found |= np.abs(correlation) >= CARRIES
+            self._carries[at, column] = found
+
+    def judge(self, batch: BatchFit) -> np.ndarray:
+        """The `Criticism` of each pixel with a good posterior; zero of the others."""
+        status = batch.outcome.status
+        good = np.flatnonzero(status == Status.GOOD)
+        flags = np.zeros(status.size, np.int8)
+        if good.size:
+            found = self._of_priors(good) | self._of_noise(good)
+            found |= np.where(self._at_bound[good], Criticism.BOUNDS_CAUTION, 0).astype(np.int8)
+            tails = self._residual_tails(batch, good)
+            found |= np.where(np.isnan(tails), Criticism.RESIDUALS_NOT_COMPUTED, 0).astype(np.int8)
+            flags[good] = found | _flags(tails, "RESIDUALS")
+        return flags
+
+    def _of_priors(self, good: np.ndarray) -> np.ndarray:
+        """Flags of medians in the tails of their priors."""
+        scalars, ends = self._checks.judged, self._checks.ends
+        if not scalars:
+            return np.zeros(good.size, np.int8)
+        # What carries nothing of the material is where the prior has it: it has no tail.
+        none = np.where(ends == 0.0, 0.5, ends > 0.0)
+        below = np.where(self._carries[good], self._below(scalars, good), none)
+        return _flags(prior_conflict(below, ends), "PRIORS")
+
+    def _of_noise(self, good: np.ndarray) -> np.ndarray:
+        """Flags of noise above its prior, or far above the stated errors."""
+        scalars, flags = self._checks.noise, np.zeros(good.size, np.int8)
+        if scalars:
+            tails, _ = tail_scores(self._below(scalars, good), self._checks.noise_ends)
+            flags = _flags(tails.shape[1] * tails.min(axis=1), "NOISE")
+        is_large = self._quantile(NOISE_FACTOR, LOWEST)[good] > LARGE_FACTOR
+        return np.where(is_large & (flags == 0), Criticism.NOISE_CAUTION, flags).astype(np.int8)
+
+    def _below(self, scalars: tuple[Scalar, ...], good: np.ndarray) -> np.ndarray:
+        medians = [each.of(self._marginals.quantiles)[MEDIAN, good] for each in scalars]
+        return self._checks.prior_probabilities(scalars, np.stack(medians, axis=1))
+
+    def _quantile(self, name: str, which: int) -> np.ndarray:
+        """One quantile of a parameter of the noise; one where the model has no such parameter."""
+        known = self._marginals.quantiles
+        return known[name][which] if name in known else np.ones(self._at_bound.size)
+
+    def _residual_tails(self, batch: BatchFit, good: np.ndarray) -> np.ndarray:
+        """p-values of the residuals of these pixels at their modes; NaN where there is none."""
+        tails = np.full(good.size, np.nan)
+        known = np.flatnonzero(np.isfinite(batch.mode_root[good]).all(axis=(1, 2)))
+        factor = self._quantile(NOISE_FACTOR, MEDIAN)
+        for some in np.array_split(known, range(PIXELS, known.size, PIXELS)):
+            fitted = _fitted(batch, good[some])
+            if fitted is not None:
+                kernels = self._checks.kernels
+                tails[some] = residual_tail(fitted, kernels, factor[good[some]])
+        return tails
+
+
+def _fitted(batch: BatchFit, at: np.ndarray) -> Fitted | None:
+    """Readings of some pixels at their modes; None where no distribution is known."""
+    if not at.size:
+        return None
+    engine, pixels = batch.engine, batch.pixels.subset(at)
+    modes = np.float32(batch.mode_z[at]), np.float32(batch.mode_root[at])
+    found = engine.run(fitted_readings, engine.program.observed, pixels, *modes, single=True)
+    valid = np.asarray(pixels.batched.valid)
+    views, scores, changes = valid.shape[-1], [], []
+    for standard, jacobian in found.values():
+        if np.shape(jacobian)[:-1] == valid.shape:  # one number for each reading
+            e = np.where(valid, standard.scores(), np.nan)
+            scores.append(e.reshape(at.size, -1, views))
+            changes.append(jacobian.reshape(at.size, -1, views, jacobian.shape[-1]))
+    return Fitted(*(np.concatenate(x, axis=1) for x in (scores, changes))) if scores else None
+
+
+def _flags(p_value: np.ndarray, check: str) -> np.ndarray:
+    """The flag of each p-value; none where it is NaN."""
+    caution, problem = Criticism[f"{check}_CAUTION"], Criticism[f"{check}_PROBLEM"]
+    found = np.where(p_value < PROBLEM, problem, np.where(p_value < CAUTION, caution, 0))
+    return found.astype(np.int8)
