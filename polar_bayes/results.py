@@ -27,7 +27,7 @@ from polar_bayes.frames import PrintedFrame
 from polar_bayes.inference.batching import Status
 from polar_bayes.inference.files import FIT, check_fit
 from polar_bayes.inference.result import provenance_of
-from polar_bayes.maps.lazy import count_pixels, open_map
+from polar_bayes.maps.lazy import count_pixels, criticism_sentences, open_map
 from polar_bayes.paths import as_path, atomic_write, existing_file
 
 MIN_GOOD_SHARE = 0.95
@@ -97,8 +97,9 @@ def _map_verdict(maps: xr.Dataset) -> Verdict:
     others = tuple(
         f"{number:,} pixels are {status}."
         for status, number in counts.items()
-        if number and status != "good"
+        if number and status not in ("good", "contradicted")
     )
+    others += tuple(criticism_sentences(maps))
     return Verdict(passed, () if passed else (sentence,), others, (sentence,) if passed else ())
 
 
@@ -180,8 +181,8 @@ def verdict(result: xr.DataTree | xr.Dataset) -> Verdict:
     divergence; every method fails on a draw that is not finite or that its prior or physics rules
     out, on draws of a parameter that are all equal, and on a problem that the fit itself noted. A
     calibration fails where ranks are not uniform, a map where fewer than 95% of the pixels read
-    have an answer, an accuracy study where its reference is in doubt. The other kinds describe and
-    do not fail.
+    have an answer that their readings bear out, an accuracy study where its reference is in doubt.
+    The other kinds describe and do not fail.
 
     Args:
         result: As for `summary`.

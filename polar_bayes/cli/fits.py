@@ -202,7 +202,7 @@ def map_(
     for name, row in pb.maps.shared_parameters(maps).iterrows():
         interval = f"{row['q50']:.5g} [{row['q2.5']:.5g}, {row['q97.5']:.5g}]"
         click.echo(f"{name}: {interval} in all pixels, from {row['pixels']:.0f} of them")
-    for sentence in pb.maps.start_sentences(maps):
+    for sentence in (*pb.maps.criticism_sentences(maps), *pb.maps.start_sentences(maps)):
         say(sentence)
     print_cautions(pb.maps.shared_cautions(maps))
 

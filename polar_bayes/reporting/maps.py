@@ -20,6 +20,8 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.lazy import (
     COPY,
     checked_status,
+    count_criticism,
+    criticism_sentences,
     ensure_loaded,
     map_parameters,
     shared_cautions,
@@ -39,7 +41,15 @@ STATUSES = {
     "too few views": f"fewer than {MIN_VIEWS} valid views",
     "not converged": "no answer was reached; NaN",
     "not trusted": "numbers that no check confirms, by the approach in the next table",
+    "contradicted": "numbers of a good posterior, whose model the readings contradict",
     "not fitted": "called good without finite numbers, or never written",
+}
+CHECKS = {
+    "priors": "medians in the tails of their priors",
+    "noise": "scatter above its prior, or three times the stated errors",
+    "residuals": "neighboring views that err alike, an outlier, or all larger than the noise",
+    "bounds": "a posterior that lies against a bound",
+    "any": "any of these",
 }
 
 # --- Figures --------------------------------------------------------------------------------------
@@ -50,7 +60,15 @@ MAX_PIXELS = 800
 MAX_K = 1.0
 NO_ANSWER = "#dadada"
 APPROACH_COLORS = (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE)
-STATUS_COLORS = (BLUE, NO_ANSWER, SKY, VERMILLION, ORANGE, PURPLE)
+STATUS_COLORS = {
+    "good": BLUE,
+    "masked": NO_ANSWER,
+    "too few views": SKY,
+    "not converged": VERMILLION,
+    "not trusted": ORANGE,
+    "contradicted": GREEN,
+    "not fitted": PURPLE,
+}
 
 
 @style.styled
@@ -93,7 +111,9 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
         _draw_values(panel(1, at), high - low, "95% width", "cividis")
     _draw_values(panel(2, 0), shown["pareto_k"], "Pareto k", "magma", limits=(0.0, MAX_K))
     _draw_flags(panel(2, 1), shown["approach"], APPROACH_COLORS)
-    _draw_flags(panel(2, 2), checked_status(shown), STATUS_COLORS)
+    status = checked_status(shown)
+    colors = [STATUS_COLORS.get(each, NO_ANSWER) for each in flag_meanings(status).values()]
+    _draw_flags(panel(2, 2), status, colors)
     return figure
 
 
@@ -221,7 +241,11 @@ def map_page(
     is_weighted = _is_weighted(provenance, default=True)
     method = FITTED_BY[provenance.get("fitted_by", "PixelLaplace")] if is_weighted else UNCORRECTED
     size = " x ".join(f"{maps.sizes[dim]:,}" for dim in IMAGE)
-    sentences = [*text.pixel_sentences(counts), *start_sentences(maps)]
+    sentences = [
+        *text.pixel_sentences(counts),
+        *criticism_sentences(maps),
+        *start_sentences(maps),
+    ]
     coverage: list[page.Block] = []
     if truth is not None:
         conclusions, coverage = _coverage(maps, titles, truth, uncorrected)
@@ -233,7 +257,7 @@ def map_page(
         tables.append(shared_table(shared))
     sections = [
         page.Section("maps", "Maps", list(_pictures(maps, list(titles)))),
-        page.Section("pixels", "Pixels", _pixel_tables(counts)),
+        page.Section("pixels", "Pixels", [*_pixel_tables(counts), *_criticism_table(maps)]),
         page.Section("parameters", "Parameters", tables),
         page.Section("coverage", "Coverage", coverage),
         page.Section("provenance", "Provenance", provenance_facts(provenance)),
@@ -328,6 +352,22 @@ def _pixel_tables(counts: pd.DataFrame) -> Iterator[Table]:
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
     data = pd.DataFrame({"pixels": counts.sum(), "good": good})
     yield count_table("approach", caption, data, APPROACHES)
+
+
+def _criticism_table(maps: xr.Dataset) -> Iterator[Table]:
+    """Pixels by check of the model; none of maps that were not checked."""
+    data = count_criticism(maps)
+    if not data.empty:
+        yield page.make_table(
+            "criticism",
+            "What the readings of a pixel say against its model. A pixel with a problem is "
+            "contradicted; a caution is told next to numbers that are good otherwise.",
+            {str(level): text.column(str(level), ",.0f") for level in data.columns},
+            data,
+            label="check",
+            descriptions=CHECKS,
+            prose=["check"],
+        )
 
 
 def count_table(name: str, caption: str, data: pd.DataFrame, meanings: Mapping[str, str]) -> Table:

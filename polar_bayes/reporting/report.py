@@ -20,6 +20,7 @@ from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.errors import FitError
 from polar_bayes.expressions import short_text
 from polar_bayes.inference.result import PROVENANCE, provenance_of
+from polar_bayes.maps.lazy import criticism_sentences
 from polar_bayes.paths import as_path
 from polar_bayes.priors import describe_prior, prior_card
 from polar_bayes.reporting import maps, text
@@ -154,7 +155,8 @@ def _map_card(result: xr.Dataset) -> Card:
     table = maps.parameter_table(result, maps.parameter_titles(map_scalars(result)))
     counts = maps.count_cases(result)
     headline, passed = text.map_headline(counts)
-    return [headline, *text.pixel_sentences(counts)], table, passed
+    sentences = [headline, *text.pixel_sentences(counts), *criticism_sentences(result)]
+    return sentences, table, passed
 
 
 def _calibration_card(calibration: xr.DataTree) -> Card:

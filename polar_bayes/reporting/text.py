@@ -517,6 +517,8 @@ def map_headline(counts: pd.DataFrame) -> tuple[str, bool]:
     read = total - int(by_status.get("masked", 0))
     if read == 0:
         return "No pixel was read: these maps are empty.", False
+    if good == 0 and by_status.get("contradicted", 0):
+        return "No pixel has an answer that its readings bear out: do not use these maps.", False
     if good == 0:
         return "No pixel has an answer: do not use these maps.", False
     if good == read:
@@ -529,7 +531,7 @@ def map_headline(counts: pd.DataFrame) -> tuple[str, bool]:
 
 
 def pixel_sentences(counts: pd.DataFrame) -> list[str]:
-    """How many pixels have each status."""
+    """How many pixels have each status; `maps.criticism_sentences` tells the contradicted ones."""
     by_status = {str(status): int(number) for status, number in counts.sum(axis=1).items()}
     total, good = sum(by_status.values()), by_status.get("good", 0)
     sentences = []
