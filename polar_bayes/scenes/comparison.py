@@ -269,7 +269,8 @@ class _Fits:
                 raise FitError(
                     "its draws do not predict the readings", where=name, hint="fit it alone"
                 )
-            findings = criticize(tree, checks)["level"]
+            levels = criticize(tree, checks)["level"]
+            findings = levels[levels.isin(["caution", "problem"])]
         except (FitError, np.linalg.LinAlgError) as error:
             self.failed[name] = one_line(str(error))
             return
@@ -277,10 +278,10 @@ class _Fits:
             tree,
             request,
             seconds=time.perf_counter() - begun,
-            findings=findings[findings.isin(["caution", "problem"])],
+            findings=findings,
             pointwise=np.concatenate([each.pointwise for each in loo]),
             unreliable=sum(each.unreliable for each in loo),
-            index_bound=_index_bound(tree),
+            index_bound=_index_bound(tree) if "bounds" in findings.index else float("nan"),
         )
 
 
