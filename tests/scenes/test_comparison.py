@@ -145,7 +145,7 @@ def test_a_scene_that_may_have_escaped_a_bound_of_the_index_is_told(
 
 
 def test_the_bound_at_which_an_interval_ends_is_found(capture: xr.Dataset) -> None:
-    narrow = {"refractive_index": dist.TruncatedNormal(1.7, 0.1, low=1.65)}
+    narrow = {"refractive_index": dist.TruncatedNormal(1.9, 0.1, low=1.65)}
     found = pb.compare_scenes(capture, {"mirror": MIRROR}, links=LINKS, priors=narrow)
     assert list(found.table["index_bound"]) == [1.65]
 
