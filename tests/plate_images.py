@@ -26,12 +26,13 @@ NOISE = 0.02
 VIEWS = np.array([30.0, 36.0, 42.0, 68.0, 74.0, 80.0])
 NAMES = ("refractive_index", "subsurface_fraction")
 
-# A plate read by q with normal noise as large as each pixel says: two parameters.
+# A plate read by q with normal noise as large as each pixel says: two parameters. A set-up of its
+# own has the priors from which the truth is drawn.
+LINKS = {"q": pb.links.StokesLink(stated_errors=True)}
 ASKED = {
     "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
-    "scene": PLATE,
-    "links": {"q": pb.links.StokesLink(stated_errors=True)},
-    "priors": {"subsurface_fraction": pb.PRIORS["subsurface_fraction"]},
+    "scene": pb.setups.Setup(PLATE, LINKS),
+    "links": LINKS,
 }
 
 
@@ -94,10 +95,8 @@ def planned(
 ) -> MapPlan:
     """The plan of a map; with one plan, the same programs serve many tests."""
     given = {**ASKED, **asked}
-    scene, priors, links = given["scene"], given["priors"], given["links"]
-    asked_for = plan_map(
-        capture, given["model"], method, scene, priors, links, None, seed, precision
-    )
+    scene, links = given["scene"], given["links"]
+    asked_for = plan_map(capture, given["model"], method, scene, None, links, None, seed, precision)
     return estimate_plan(asked_for, capture)
 
 

@@ -120,7 +120,7 @@ def test_too_few_pixels_are_an_error(image: xr.Dataset) -> None:
         pb.fit_pixels(image.isel(y=slice(4), x=slice(5)), scene=PLATE, links=LINKS, shared=SHARED)
 
 
-SETUP = pb.setups.Setup(PLATE, LINKS, shared=SHARED)
+SETUP = pb.setups.Setup(PLATE, LINKS, priors=pb.setups.SETUPS["paper"].priors, shared=SHARED)
 
 
 def test_a_setup_says_what_its_images_share(
