@@ -284,7 +284,7 @@ def test_a_chunk_that_a_finished_map_lost_is_not_good(
     capture: Path, finished: Path, tmp_path: Path
 ) -> None:
     whole = pb.maps.count_pixels(pb.maps.open_map(finished))
-    for name in ("status", "refractive_index", "refractive_index_sd"):
+    for name in ("status", "refractive_index", "refractive_index_sd", "criticism"):
         out = copied(finished, tmp_path / f"{name}.zarr")
         chunk_of(out, name, 1).unlink()
         maps = pb.maps.open_map(out)
@@ -296,7 +296,7 @@ def test_a_chunk_that_a_finished_map_lost_is_not_good(
         assert f"{lost} of 180 pixels are not fitted: this map has holes." in page
         assert "Every pixel" not in page
         assert f"{lost} pixels are not fitted: they are called good" in str(pb.show(maps))
-        with pytest.raises(pb.OutputError, match="1 of 60 chunks are missing; copy"):
+        with pytest.raises(pb.OutputError, match="1 of 65 chunks are missing; copy"):
             mapped(capture, out, resume=True)
     out = copied(finished, tmp_path / "map.zarr")
     for name, says in (("y", "its values are missing"), ("quantile", "its levels are not those")):
