@@ -261,6 +261,7 @@ def judge(capture: xr.Dataset, truth: Mapping[str, float], **settings: Any) -> d
         "p_values": {name: p for name, p in table["p_value"].items() if np.isfinite(p)},
         "cautions": len(found.cautions),
         "problems": len(found.problems),
+        "against": int(table["level"].eq("problem").sum()),
         "messages": [*found.problems, *found.cautions],
         "miss": float(max(0.0, *misses.values())),
     }
@@ -301,18 +302,21 @@ RIGHT: tuple[tuple[str, Protocol], ...] = (
 """Set-ups and layouts of right models."""
 
 
-def right(fits: int, *, perfect: bool = False) -> Any:
+def right(fits: int, *, perfect: bool = False, method: str = "nuts") -> Any:
     """Right models: truth from the priors, or a bare surface and a perfect instrument."""
     for setup, layout in RIGHT:
         for seed in range(fits):
-            name = f"{setup}, {layout.views} readings{', perfect' * perfect}"
-            yield f"{name}|{seed}", lambda s=setup, x=layout, k=seed: _right(s, x, k, perfect)
+            name = f"{setup}, {layout.views} readings, {method}{', perfect' * perfect}"
+            yield (
+                f"{name}|{seed}",
+                lambda s=setup, x=layout, k=seed: _right(s, x, k, perfect, method),
+            )
 
 
-def _right(setup: str, layout: Protocol, seed: int, perfect: bool) -> dict[str, Any]:
+def _right(setup: str, layout: Protocol, seed: int, perfect: bool, method: str) -> dict[str, Any]:
     scene = SETUPS[setup].scene
     capture, truth = drawn_from_priors(setup, scene, layout, seed, perfect=perfect)
-    return judge(capture, truth, scene=setup, seed=seed)
+    return judge(capture, truth, scene=setup, method=method, seed=seed)
 
 
 def drawn_from_priors(
@@ -437,6 +441,7 @@ def main() -> None:
     parser.add_argument("part", choices=("right", "perfect", "wrong", "chosen", "cost"))
     parser.add_argument("--fits", type=int, default=5)
     parser.add_argument("--chosen", action="store_true", help="wrong: the fit chooses its scene")
+    parser.add_argument("--method", default="nuts", help="right, perfect: of the fits")
     parser.add_argument("--only", default="", help="worlds whose name holds this text")
     parser.add_argument("--keep", type=Path, help="file of JSON lines", default="criticism.jsonl")
     asked = parser.parse_args()
@@ -450,8 +455,8 @@ def main() -> None:
     )
     done = {line["key"] for line in lines}
     worlds = {
-        "right": right,
-        "perfect": functools.partial(right, perfect=True),
+        "right": functools.partial(right, method=asked.method),
+        "perfect": functools.partial(right, perfect=True, method=asked.method),
         "wrong": functools.partial(wrong, chosen=asked.chosen),
         "chosen": chosen,
     }
@@ -473,6 +478,8 @@ def main() -> None:
     failed = sum(line["problems"] > 0 for line in lines)
     silent = round(float((found["silent_and_wrong"] * found["fits"]).sum()))
     print("with a problem:", wilson(failed, len(lines)))
+    against = sum(line.get("against", 0) > 0 for line in lines)
+    print("with a problem of the model, not of the method:", wilson(against, len(lines)))
     print("silent and wrong:", wilson(silent, len(lines)))
     held = pd.DataFrame([line.get("holds", {}) for line in lines])
     for name, column in held.items():
