@@ -62,15 +62,17 @@ def test_ends_count_as_inside_in_the_precision_of_the_map() -> None:
 
 
 def test_pixels_without_an_answer_are_counted_and_never_held() -> None:
-    status = np.array([list(Status), [Status.GOOD] * 6])
-    true = np.full((2, 6), 0.5)
-    true[1, 4:] = 9.0, np.nan
-    maps = make_maps({"roughness": np.full((2, 6), 0.5)}, status=status)
+    count = len(Status)
+    status = np.array([list(Status), [Status.GOOD] * count])
+    true = np.full((2, count), 0.5)
+    true[1, -2:] = 9.0, np.nan
+    maps = make_maps({"roughness": np.full((2, count), 0.5)}, status=status)
     row = pb.diagnostics.map_coverage(maps, known(roughness=true)).loc["roughness"]
-    # Good: one of the first row and five of the second, one of whose truths lies outside.
-    assert row[["unknown", "masked", "unanswered", "answered"]].tolist() == [1, 1, 4, 6]
-    assert row["held_95"] == 5 / 6
-    assert row["held_95_of_read"] == 5 / 10
+    # Good: one of the first row and all but one of the second, one of whose truths lies outside.
+    counts = [1, 1, count - 2, count]
+    assert row[["unknown", "masked", "unanswered", "answered"]].tolist() == counts
+    assert row["held_95"] == (count - 1) / count
+    assert row["held_95_of_read"] == (count - 1) / (2 * count - 2)
 
 
 @pytest.mark.thorough
