@@ -224,7 +224,7 @@ def test_shot_noise_grows_as_the_view_darkens_until_nothing_is_known():
     data = make_observations(ZENITHS, brightness=[1.0, 0.25, 1e-3, 0.0])
     prediction, noise = {"q": jnp.full(4, 0.5)}, {"stokes_scale": jnp.asarray(0.01)}
     found = StokesLink().distribution("q", prediction, data, noise)
-    shot = np.array([0.01, 0.02, 0.1**0.5, 1e-2 / StokesLink().least_brightness**0.5])
+    shot = np.array([0.01, 0.02, 0.1**0.5, 1e-2 / StokesLink().least_brightness ** 0.5])
     np.testing.assert_allclose(found.scale, shot / np.sqrt(1.0 + 2.0 * shot**2), rtol=1e-12)
     np.testing.assert_allclose(found.loc, 0.5 / np.sqrt(1.0 + shot**4), rtol=1e-12)
     assert abs(found.scale[3] - 0.5**0.5) < 1e-4  # of a point on the unit circle
