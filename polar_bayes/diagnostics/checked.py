@@ -8,6 +8,7 @@ from polar_bayes.diagnostics.finding import LEVELS
 from polar_bayes.diagnostics.parameters import APPROXIMATIONS, WEIGHTED
 
 NAMES = {
+    "index": "Brewster's angle",
     "angle": "residuals over the angle",
     "wavelength": "residuals over the wavelength",
     "leave-one-out": "leave-one-out predictions",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from arviz_stats.base import array_stats
+from numpyro import distributions as dist
 from plates import LINKS, PLATE, plate_capture
 
 import polar_bayes as pb
@@ -55,7 +56,8 @@ def grid_posterior(capture: xr.Dataset) -> Grid:
     # Axes: the unconstrained coordinates in the program's order, around the sampled range,
     # widened by half on each side; the density at the border proves that nothing is cut off.
     unconstrained = [
-        np.asarray(unconstrain(name, posterior[name].to_numpy().ravel())) for name in sorted(NAMES)
+        np.asarray(dist.biject_to(program.supports[name]).inv(posterior[name].to_numpy().ravel()))
+        for name in sorted(NAMES)
     ]
     axes = []
     for values in unconstrained:
@@ -74,16 +76,6 @@ def grid_posterior(capture: xr.Dataset) -> Grid:
     assert weights[border.ravel()].sum() < 1e-4
     constrained = jax.vmap(program.constrain)(jnp.asarray(mesh))
     return Grid({name: np.asarray(constrained[name]) for name in NAMES}, weights)
-
-
-def unconstrain(name: str, values: np.ndarray) -> np.ndarray:
-    low, high = {"subsurface_fraction": (0.0, 1.0), "refractive_index": (1.2, 2.0)}.get(
-        name, (0.0, np.inf)
-    )
-    if np.isinf(high):
-        return np.log(values)
-    share = (values - low) / (high - low)
-    return np.log(share) - np.log1p(-share)
 
 
 @pytest.fixture(
