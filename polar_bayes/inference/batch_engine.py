@@ -21,7 +21,7 @@ from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache, cache
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import Request
-from polar_bayes.inference.result import dims_of
+from polar_bayes.inference.result import dims_of, shape_of
 from polar_bayes.observation.data import Observations
 
 BATCH = 128
@@ -131,9 +131,9 @@ class BatchEngine:
         def find() -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
             z = np.zeros(self.program.size, self.dtype)
             with jax.enable_x64(self.precision == "double"), TRACING_LOCK:
-                shapes = jax.eval_shape(self.program.parameters, z, self.layout)
+                names = jax.eval_shape(self.program.parameters, z, self.layout)
             dims = dims_of(self.program)
-            return {name: (tuple(dims[name]), x.shape) for name, x in shapes.items()}
+            return {name: (tuple(dims[name]), shape_of(self.program, name)) for name in names}
 
         return self.programs.of("parameter axes", find)
 
@@ -157,7 +157,8 @@ class BatchEngine:
             z = self.prior_draws(MOMENTS)
             with jax.enable_x64(self.precision == "double"):
                 draws = self.program.parameters_of_chains(jnp.asarray(z[None]), self.layout)
-            return {name: np.asarray(x[0], float) for name, x in draws.items()}
+            sizes = {name: own for name, (_, own) in self.parameter_axes.items()}
+            return {n: np.asarray(x[0], float).reshape(-1, *sizes[n]) for n, x in draws.items()}
 
         return self.programs.of("prior parameters", find)
 

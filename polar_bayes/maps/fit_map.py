@@ -455,8 +455,11 @@ def fit_block(block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     criticism = PixelCriticism(checks, found, numbers.size)
 
     def describe(at: np.ndarray, draws: Values, weights: np.ndarray) -> None:
-        found.describe(at, draws, weights)
-        criticism.describe(at, draws, weights)
+        own = {name: np.asarray(values) for name, values in draws.items()}
+        for name, size in plan.sizes.items():  # plates may leave axes of length one behind
+            own[name] = own[name].reshape(*weights.shape, *size)
+        found.describe(at, own, weights)
+        criticism.describe(at, own, weights)
 
     keys = random_keys(seed, numbers)
     batch = BatchFit(engine, plan.pixels(readings), keys, describe, seed)

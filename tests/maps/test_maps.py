@@ -24,7 +24,7 @@ from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status
 from polar_bayes.inference.levenberg_marquardt import find_modes
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.result import PROVENANCE
-from polar_bayes.maps.fit_map import MapPlan, fit_pixels
+from polar_bayes.maps.fit_map import MapPlan, blank, fit_pixels
 from polar_bayes.physics.facets import FacetQuadrature
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
@@ -274,6 +274,31 @@ def test_a_map_says_what_it_holds_and_how_it_was_made(plan: MapPlan, maps: xr.Da
     assert PixelLaplace(**{**said["settings"], "sampler": PixelImportance()}) == plan.settings
     assert said["fixed"] == {"stokes_error_factor": 1.0}
     assert (maps["x"].values == np.arange(100.0, 130.0)).all()
+
+
+def two_colors() -> xr.Dataset:
+    """An image whose plates look the same in two colors."""
+    colors = xr.DataArray([450.0, 650.0], dims="wavelength", name="wavelength")
+    image = plate_image(1, 3)
+    image = image.drop_vars([f"true_{name}" for name in NAMES])
+    both = {name: xr.concat([image[name]] * 2, colors) for name in ("q", "q_error")}
+    order = ("y", "x", "wavelength", "view")
+    return image.drop_vars(both).assign({n: values.transpose(*order) for n, values in both.items()})
+
+
+def test_an_image_in_two_colors_has_an_index_of_each() -> None:
+    image = two_colors()
+    maps = blank(image, planned(image))
+    assert maps["refractive_index"].dims == ("y", "x", "wavelength")
+    assert maps["refractive_index_quantile"].dims == ("quantile", "y", "x", "wavelength")
+    assert maps["subsurface_fraction"].dims == ("y", "x")
+
+
+@pytest.mark.thorough
+def test_plates_that_look_the_same_in_two_colors_have_the_same_index() -> None:
+    maps = fit_pixels(two_colors(), method=PixelLaplace(sampler=None, draws=1024), **ASKED)
+    apart = maps["refractive_index"].diff("wavelength") / maps["refractive_index_sd"]
+    assert (abs(apart) < 0.2).all()
 
 
 def masked(image: xr.Dataset) -> xr.Dataset:
