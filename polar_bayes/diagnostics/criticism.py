@@ -145,7 +145,7 @@ def criticize(
             **residual_findings(residuals_of(result, variables, found)),
             "leave-one-out": _leave_one_out(checks),
             "repeats": _repeats(result),
-            "alternatives": _alternatives(result),
+            "alternatives": _alternatives(result, found),
         }
     )
 
@@ -472,7 +472,7 @@ def _repeats(result: xr.DataTree) -> Finding:
 # --- Alternatives ---------------------------------------------------------------------------------
 
 
-def _alternatives(result: xr.DataTree) -> Finding:
+def _alternatives(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     """Parts that explain the readings better, or as well with another answer."""
     try:
         table = alternatives(result)
@@ -492,10 +492,13 @@ def _alternatives(result: xr.DataTree) -> Finding:
             f"({path}), by a Bayes factor of {_factor_text(highest)}; fit the scene that has it."
         )
         return judged_by(p_value, highest, sentence)
+    provenance, priors = provenance_of(result), _prior_draws(result)
+    absent = [s.label for s in found if _is_absent(s, provenance, priors.get(s.label))]
     undecided = table[
         (table["log_bayes_factor"] > REFUTED)
         & (table["shift"].abs() > OUTSIDE)
         & ~table["redefined"]
+        & ~table.index.isin(absent)  # what is not there has no size to rest on a part
     ]
     if undecided.empty:
         return Finding("passed", p_value, highest)
