@@ -279,6 +279,11 @@ FULL_SCALE = 1.0
 BRIGHT_QUANTILE = 0.9
 BRIGHT_LEVEL = 0.6
 """Exposure puts the 90% brightest view at 60% of full scale; a specular lobe may saturate."""
+LARGEST_CONTRAST = 1e4
+"""Brightest view over the 90% brightest one beyond which the brightest one sets the exposure.
+
+Outside its highlight a bare mirror is black: no camera exposes for what is left of a lobe there.
+"""
 
 
 def simulate(
@@ -383,7 +388,9 @@ def _record(
     parameters = {name: jnp.asarray(_align_image(x, axes - 1)) for name, x in truth.items()}
     prediction = scene.predict(parameters, layout.geometry)
     prediction = {n: jnp.broadcast_to(x, layout.shape) for n, x in prediction.items()}
-    exposure = BRIGHT_LEVEL / jnp.quantile(prediction["intensity"], BRIGHT_QUANTILE)
+    light = prediction["intensity"]
+    brightest = jnp.max(light) / LARGEST_CONTRAST
+    exposure = BRIGHT_LEVEL / jnp.maximum(jnp.quantile(light, BRIGHT_QUANTILE), brightest)
     levels = {
         name: exposure if level is None else jnp.asarray(_align_image(level, axes))
         for name, level in noise.items()

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.inference.batch_engine import BatchEngine
+from polar_bayes.inference.batch_engine import BatchEngine, parameters_and_potential
 from polar_bayes.inference.batch_importance import PixelImportance
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batching import (
@@ -328,10 +328,10 @@ def _draws(engine: BatchEngine, weighted: bool) -> JitOnce:
         points: Array, log_density: Array, data: Observations, center: Array, root: Array
     ) -> tuple[Values, Array]:
         z = center + points @ root
-        parameters = jax.vmap(lambda z: program.parameters(z, data))(z)
         if not weighted:
+            parameters = jax.vmap(lambda z: program.parameters(z, data))(z)
             return parameters, jnp.zeros(len(points))
-        values = jax.vmap(lambda z: program.potential(z, data))(z)
+        parameters, values = jax.vmap(lambda z: parameters_and_potential(program, z, data))(z)
         return parameters, -values - log_density
 
     return batched(draws, given=2, lanes=LANES)

@@ -26,6 +26,7 @@ from polar_bayes.inference.alternatives import compare_alternatives
 from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_until
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import from_prior
+from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.program import BLOCK, THREADS
 from polar_bayes.inference.request import Request
@@ -269,11 +270,9 @@ def _prior_probability(request: Request, posterior: Mapping[str, Any]) -> dict[s
     found = {}
     for name, prior in request.priors.items():
         if name in posterior and name not in request.fixed:
-            median = np.median(np.asarray(posterior[name]), axis=(0, 1))
-            try:
-                found[name] = np.asarray(prior.cdf(median), float).ravel().tolist()
-            except NotImplementedError:  # NumPyro asks few distributions for one
-                continue
+            median = np.median(np.asarray(posterior[name], float), axis=(0, 1))
+            if has_probabilities(prior):
+                found[name] = probability_below(prior, median).ravel().tolist()
     return found
 
 

@@ -11,10 +11,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 from numpyro import distributions as dist
 
 from polar_bayes.inference.batch_engine import MOMENTS, BatchEngine
@@ -30,7 +27,7 @@ from polar_bayes.inference.checks import (
     prior_conflict,
     tail_scores,
 )
-from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.maps.residuals import (
@@ -42,15 +39,12 @@ from polar_bayes.maps.residuals import (
 from polar_bayes.observation.links import PERFECT
 from polar_bayes.physics.part import absence
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
-from polar_bayes.priors import RANGES, cast_prior, support_bounds
+from polar_bayes.priors import RANGES, support_bounds
 
 CARRIES = 0.3
 """Correlation with a material parameter from which another one is judged with it."""
 
 LOWEST, MEDIAN, HIGHEST = (LEVELS.index(level) for level in (0.025, 0.5, 0.975))
-
-ROWS = 1024
-"""Pixels whose prior probabilities are computed together."""
 
 PIXELS = 4096
 """Pixels whose residuals are in memory at a time."""
@@ -101,36 +95,24 @@ class Criteria:
     """What is checked in each pixel of one model.
 
     Args:
+        priors: By parameter.
         judged: Scalars with a prior probability that are no noise.
         ends: Where each of them is absent or perfect, as `tail_scores` has it.
         noise: Scalars of the noise with a prior probability.
         noise_ends: Where each of them is perfect.
         material: Numbers of the material, which others of `judged` may carry.
         bounds: Of all scalars.
-        below: The program of the prior probabilities below values of all of `judged` and `noise`.
         kernels: How near the directions of views are.
     """
 
+    priors: Mapping[str, dist.Distribution]
     judged: tuple[Scalar, ...]
     ends: np.ndarray
     noise: tuple[Scalar, ...]
     noise_ends: np.ndarray
     material: tuple[Scalar, ...]
     bounds: tuple[Bound, ...]
-    below: JitOnce
     kernels: list[np.ndarray]
-
-    def prior_probabilities(self, scalars: tuple[Scalar, ...], values: np.ndarray) -> np.ndarray:
-        """Prior probabilities below values of some scalars, (pixel, scalar)."""
-        every = self.judged + self.noise
-        columns = [every.index(each) for each in scalars]
-        # One program serves any number of pixels.
-        blocks = np.zeros((max(1, -(-len(values) // ROWS)), ROWS, len(every)))
-        rows = blocks.reshape(-1, len(every))
-        rows[: len(values), columns] = values
-        with jax.enable_x64(True):
-            found = [np.asarray(self.below(block)) for block in blocks]
-        return np.concatenate(found)[: len(values), columns]
 
 
 def criteria(
@@ -144,25 +126,21 @@ def criteria(
         stated = [
             scalar
             for name, prior in priors.items()
-            if name in sizes and _has_probabilities(prior)
+            if name in sizes and not prior.batch_shape and has_probabilities(prior)
             for scalar in _scalars(name, sizes[name])
         ]
         judged = tuple(each for each in stated if each.name not in PERFECT)
         noise = tuple(each for each in stated if each.name in PERFECT)
         every = [scalar for name, own in sizes.items() for scalar in _scalars(name, own)]
 
-        def below(values: Array) -> Array:
-            columns = zip(judged + noise, values.T, strict=True)
-            return jnp.stack([cast_prior(priors[s.name]).cdf(x) for s, x in columns], axis=1)
-
         return Criteria(
+            priors=priors,
             judged=judged,
             ends=np.array([_end(each.name, priors[each.name]) for each in judged]),
             noise=noise,
             noise_ends=np.array([_end(each.name, priors[each.name]) for each in noise]),
             material=tuple(each for each in every if each.name in MATERIAL_PARAMETERS),
             bounds=tuple(_bounds(engine, priors, every)),
-            below=JitOnce(below),
             kernels=direction_kernels(engine.layout.geometry),
         )
 
@@ -171,17 +149,6 @@ def criteria(
 
 def _scalars(name: str, own: tuple[int, ...]) -> list[Scalar]:
     return [Scalar(name, index) for index in np.ndindex(*own)]
-
-
-def _has_probabilities(prior: dist.Distribution) -> bool:
-    """Whether a prior of one number says how much of it is below a value."""
-    if prior.batch_shape or prior.event_shape:
-        return False
-    try:
-        jax.eval_shape(lambda x: cast_prior(prior).cdf(x), jnp.zeros(()))
-    except NotImplementedError:  # NumPyro asks few distributions for one
-        return False
-    return True
 
 
 def _end(name: str, prior: dist.Distribution) -> float:
@@ -294,8 +261,10 @@ class PixelCriticism:
         return np.where(is_large & (flags == 0), Criticism.NOISE_CAUTION, flags).astype(np.int8)
 
     def _below(self, scalars: tuple[Scalar, ...], good: np.ndarray) -> np.ndarray:
-        medians = [each.of(self._marginals.quantiles)[MEDIAN, good] for each in scalars]
-        return self._checks.prior_probabilities(scalars, np.stack(medians, axis=1))
+        """Prior probabilities below the medians, (pixel, scalar)."""
+        priors, quantiles = self._checks.priors, self._marginals.quantiles
+        medians = ((s.name, s.of(quantiles)[MEDIAN, good]) for s in scalars)
+        return np.stack([probability_below(priors[name], x) for name, x in medians], axis=1)
 
     def _quantile(self, name: str, which: int) -> np.ndarray:
         """One quantile of a parameter of the noise; one where the model has no such parameter."""
@@ -313,6 +282,13 @@ class PixelCriticism:
                 kernels = self._checks.kernels
                 tails[some] = residual_tail(fitted, kernels, factor[good[some]])
         return tails
+
+
+def begin_compiling(batch: BatchFit) -> None:
+    """Compile what residuals need, in parallel with what follows."""
+    size, names = batch.engine.program.size, batch.engine.program.observed
+    mode = np.zeros((1, size), np.float32), np.zeros((1, size, size), np.float32)
+    batch.engine.begin(fitted_readings, names, batch.pixels, *mode, single=True)
 
 
 def _fitted(batch: BatchFit, at: np.ndarray) -> Fitted | None:

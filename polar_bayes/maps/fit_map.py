@@ -43,7 +43,14 @@ from polar_bayes.inference.shared import (
 )
 from polar_bayes.inference.shared import PIXELS as SHARED_PIXELS
 from polar_bayes.maps.blocks import as_completed, workers
-from polar_bayes.maps.criticism import PROBLEMS, UNKNOWN, Criticism, PixelCriticism, criteria
+from polar_bayes.maps.criticism import (
+    PROBLEMS,
+    UNKNOWN,
+    Criticism,
+    PixelCriticism,
+    begin_compiling,
+    criteria,
+)
 from polar_bayes.observation.data import ANGLES, READINGS, Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.part import notation
@@ -463,6 +470,7 @@ def fit_block(block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
 
     keys = random_keys(seed, numbers)
     batch = BatchFit(engine, plan.pixels(readings), keys, describe, seed)
+    begin_compiling(batch)
     plan.settings.fit_batch(batch)
     flags = criticism.judge(batch)
     batch.outcome.status[(flags & PROBLEMS) != 0] = Status.CONTRADICTED
