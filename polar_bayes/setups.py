@@ -67,7 +67,6 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
         "camera": Setup(
             SCENES["camera"],
             {"q": StokesLink(), "u": StokesLink(), "intensity": StudentTLink()},
-            priors=MAYBE_BARE,
             shared=("dolp_gain",),  # one polarizer took the image
         ),
         # The irradiance of a pixel is unknown, so brightness carries no information; the noise of

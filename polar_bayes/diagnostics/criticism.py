@@ -170,10 +170,15 @@ def _prior_conflict(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     tails, score = tail_scores(probability, end)
     names = [scalar.label for scalar in below]
     far = [f"{names[i]} {score[i]:.1f} sd" for i in np.argsort(-score) if score[i] > 1.5]
+    advice = "state priors that hold for this object"
+    if not _index(result, found).sentence:  # else a wider prior is what mends it
+        advice = (
+            "a scene without what the readings show forces its parameters there, so try "
+            f"polar_bayes.compare_scenes, or {advice}"
+        )
     sentence = (
         f"Priors and data are in conflict ({p_text(p_value)}): {listed(far)} from the center of "
-        "the prior; a scene without what the readings show forces its parameters there, so try "
-        "polar_bayes.compare_scenes, or state priors that hold for this object."
+        f"the prior; {advice}."
     )
     least = "caution" if tails.min() < FAR else "passed"
     return judged_by(p_value, float(score.max()), sentence, least=least)
@@ -317,10 +322,12 @@ def _bounds(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
         return Finding("passed")
     hits.sort(key=lambda hit: -hit[0])
     where = [f"{s.label} at {bound:g} ({share:.0%} of its draws)" for share, s, bound in hits]
+    # The check of the index by eye names the prior that reaches beyond.
+    beyond = "" if _index(result, found).sentence else _beyond(hits[0][1], hits[0][2])
     sentence = (
         f"The posterior lies against a bound: {listed(where)}; what is beyond is excluded by the "
         "prior or by physics, not by the readings, so the interval is too narrow or the scene is "
-        f"wrong.{_beyond(hits[0][1], hits[0][2])}"
+        f"wrong.{beyond}"
     )
     return Finding("caution", statistic=hits[0][0], sentence=sentence)
 
@@ -480,6 +487,11 @@ def _alternatives(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
         return Finding("not computed", sentence=f"{error.what[:1].upper()}{error.what[1:]}.")
     if table.empty:
         return Finding("passed")
+    provenance, priors = provenance_of(result), _prior_draws(result)
+    absent = {s.label: s for s in found if _is_absent(s, provenance, priors.get(s.label))}
+    table = _without_idle(table, absent)
+    if table.empty:
+        return Finding("passed")
     factors = table.groupby(["part", "alternative", "path"])["log_bayes_factor"].first()
     part, alternative, path = factors.idxmax()
     highest = float(factors.max())
@@ -492,8 +504,6 @@ def _alternatives(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
             f"({path}), by a Bayes factor of {_factor_text(highest)}; fit the scene that has it."
         )
         return judged_by(p_value, highest, sentence)
-    provenance, priors = provenance_of(result), _prior_draws(result)
-    absent = [s.label for s in found if _is_absent(s, provenance, priors.get(s.label))]
     undecided = table[
         (table["log_bayes_factor"] > REFUTED)
         & (table["shift"].abs() > OUTSIDE)
@@ -513,6 +523,17 @@ def _alternatives(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     )
     is_favored = bool((undecided["log_bayes_factor"] > FAVORED).any())
     return Finding("caution" if is_favored else "note", p_value, highest, sentence)
+
+
+def _without_idle(table: pd.DataFrame, absent: Mapping[str, Scalar]) -> pd.DataFrame:
+    """Alternatives but those to a part that sends nothing, where all else is the same with them.
+
+    No reading tells one body that is not there from another: their Bayes factor is that of priors.
+    """
+    idle = {a.part for s in absent.values() if (a := absence(s.name)) is not None and a.part}
+    moves = (table["shift"].abs() > OUTSIDE) & ~table["redefined"] & ~table.index.isin(absent)
+    moved = moves.groupby([table["path"], table["alternative"]]).transform("any")
+    return table[~table["path"].str.split(".").str[0].isin(idle) | moved]
 
 
 def _factor_text(log_factor: float) -> str:

@@ -15,8 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpyro import distributions as dist
-from numpyro.infer.util import compute_log_probs
 
 from polar_bayes.inference.batching import ObservationBatch, batches, map_batches
 from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache, cache_key
@@ -172,26 +170,12 @@ class BatchEngine:
         return {name: two for name, two in moments.items() if np.isfinite(two).all()}
 
 
-def parameters_and_potential(
-    program: Program, z: Float[Array, " size"], data: Observations
-) -> tuple[dict[str, Array], Array]:
-    """What `program.parameters` and `program.potential` give, by one trace of the model."""
-    sites = program.unravel(z)
-    maps = {name: dist.biject_to(support) for name, support in program.supports.items()}
-    values = {name: maps[name](x) for name, x in sites.items()}
-    log_probs, trace = compute_log_probs(program.model, (data,), {}, values)
-    volumes = [maps[n].log_abs_det_jacobian(x, values[n]) for n, x in sites.items()]
-    names = (*(n for n in program.supports if n not in program.auxiliary), *program.derived)
-    terms = (*log_probs.values(), *volumes)
-    return {n: trace[n]["value"] for n in names}, -sum(map(jnp.sum, terms), jnp.zeros((), z.dtype))
-
-
 def evaluate_draws(
     program: Any, z: Float[Array, "draw size"], data: Observations
 ) -> tuple[dict[str, Array], Float[Array, " draw"]]:
     """Parameters and log posterior densities of draws of one pixel; minus infinity for NaN."""
     parameters, values = jax.lax.map(
-        lambda z: parameters_and_potential(program, z, data), z, batch_size=DRAW_BATCH
+        lambda z: program.parameters_and_potential(z, data), z, batch_size=DRAW_BATCH
     )
     return parameters, jnp.where(jnp.isnan(values), -jnp.inf, -values)
 

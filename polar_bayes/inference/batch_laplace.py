@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.inference.batch_engine import BatchEngine, parameters_and_potential
+from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batch_importance import PixelImportance
 from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
 from polar_bayes.inference.batching import (
@@ -331,7 +331,7 @@ def _draws(engine: BatchEngine, weighted: bool) -> JitOnce:
         if not weighted:
             parameters = jax.vmap(lambda z: program.parameters(z, data))(z)
             return parameters, jnp.zeros(len(points))
-        parameters, values = jax.vmap(lambda z: parameters_and_potential(program, z, data))(z)
+        parameters, values = jax.vmap(lambda z: program.parameters_and_potential(z, data))(z)
         return parameters, -values - log_density
 
     return batched(draws, given=2, lanes=LANES)

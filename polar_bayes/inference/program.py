@@ -111,6 +111,20 @@ class Program:
         """The parameters: latent sites that are not auxiliary, and what derives from them."""
         return self._parameters(self.trace(z, data))
 
+    def parameters_and_potential(
+        self, z: Float[Array, " size"], data: Observations
+    ) -> tuple[dict[str, Array], Float[Array, ""]]:
+        """Both, by one trace of the model."""
+        sites = self.unravel(z)
+        values = self._constrain(sites)
+        log_probs, trace = compute_log_probs(self.model, (data,), {}, values)
+        terms = (*log_probs.values(), *self._volumes(sites, values))
+        return self._parameters(trace), -sum(map(jnp.sum, terms), jnp.zeros((), z.dtype))
+
+    def _volumes(self, sites: dict[str, Array], values: dict[str, Array]) -> list[Array]:
+        maps = {name: dist.biject_to(self.supports[name]) for name in sites}
+        return [maps[n].log_abs_det_jacobian(x, values[n]) for n, x in sites.items()]
+
     def _parameters(self, trace: dict) -> dict[str, Array]:
         names = (*(name for name in self.supports if name not in self.auxiliary), *self.derived)
         return {name: trace[name]["value"] for name in names}
@@ -126,10 +140,7 @@ class Program:
         values = self._constrain(sites)
         seeded = handlers.seed(self.model, key)
         log_probs, trace = compute_log_probs(seeded, (data,), {}, values)
-        volumes = [
-            dist.biject_to(self.supports[name]).log_abs_det_jacobian(x, values[name])
-            for name, x in sites.items()
-        ]
+        volumes = self._volumes(sites, values)
         keys = dict(zip(self.observed, jax.random.split(key, len(self.observed)), strict=True))
         readings = {name: trace[name] for name in self.observed}
         return Draw(

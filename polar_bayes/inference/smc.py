@@ -128,9 +128,13 @@ class ScoredProgram:
         z, log_jacobian = self.transform.inverse(u)
         return self.program.prior_potential(z, data) - log_jacobian
 
-    def parameters(self, u: Float[Array, " size"], data: Observations) -> dict[str, Array]:
-        """The parameters of the model."""
-        return self.program.parameters(self.transform.inverse(u)[0], data)
+    def parameters_and_potential(
+        self, u: Float[Array, " size"], data: Observations
+    ) -> tuple[dict[str, Array], Float[Array, ""]]:
+        """The parameters of the model, and minus the log posterior density of the scores."""
+        z, log_jacobian = self.transform.inverse(u)
+        parameters, potential = self.program.parameters_and_potential(z, data)
+        return parameters, potential - log_jacobian
 
 
 def inverse_of_pixels(

@@ -215,15 +215,17 @@ class Absence(NamedTuple):
     Args:
         value: Of the parameter, an end of its range.
         words: What is then not there.
+        part: Name of the field of a scene whose part then sends nothing; empty where none is idle.
     """
 
     value: float
     words: str
+    part: str = ""
 
 
 ABSENT: dict[str, Absence] = {
     "roughness": Absence(0.0, "no roughness"),
-    "subsurface_fraction": Absence(0.0, "no light from the body"),
+    "subsurface_fraction": Absence(0.0, "no light from the body", "subsurface"),
     "absorption": Absence(0.0, "no absorption"),
     "coat_absorbance": Absence(0.0, "no absorption in the coat"),
     "leakage": Absence(0.0, "no leakage between the channels"),

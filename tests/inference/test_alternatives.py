@@ -131,6 +131,23 @@ def test_a_body_that_may_absorb_is_told_with_the_answer_it_gives(absorbing_body)
     assert abs(told["other"] - truth) < 0.2 * abs(told["mean"] - truth)
 
 
+def test_a_body_that_is_not_there_has_no_alternative() -> None:
+    """Another body that sends nothing either is no better explanation, whatever its prior says."""
+    own = pb.setups.SETUPS["camera"]
+    capture = pb.simulate(
+        "plastic",
+        scene=own.scene,
+        links=own.links,
+        protocol=Protocol(views=16, wavelengths=()),
+        parameters={"subsurface_fraction": 0.0},
+        seed=2,
+    )
+    fit = pb.fit(capture, scene="camera", method="laplace", seed=2)
+    row = criticize(fit).loc["alternatives"]
+    assert row["level"] == "passed"
+    assert "Depolarizer" in set(alternatives(fit)["alternative"])  # compared, and no news
+
+
 def test_roughness_of_another_distribution_is_not_the_same_quantity(absorbing_body) -> None:
     table = alternatives(absorbing_body)
     slopes = table[table["alternative"] == "GGX"]
