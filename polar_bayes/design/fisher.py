@@ -18,12 +18,15 @@ $\kappa^2[\psi_1(\mu\kappa) + \psi_1((1-\mu)\kappa)]$, which is about $\kappa/(\
 times the paper's at $\mu = 1/2$ and without bound towards 0 and 1.
 """
 
+import functools
+import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 import scipy.stats
 from jax.scipy.special import polygamma
 from jaxtyping import Array, Float
@@ -39,6 +42,10 @@ from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorS
 
 NODES = 400
 """Equally likely readings over which the information of a saturating sensor is averaged."""
+
+FAR_FROM_MARGIN, MARGIN_NODES = 4.0, 128
+"""Sds of a Beta distribution from the margin beyond which none of its readings lies there (1e-5);
+readings between the margins over which the information is averaged elsewhere."""
 
 
 class FisherInformation(NamedTuple):
@@ -129,7 +136,33 @@ def _beta(beta: MeanConcentrationBeta) -> FisherInformation:
     of_mean = concentration**2 * (first + second)
     across = concentration * (mean * first - (1.0 - mean) * second)
     of_concentration = mean**2 * first + (1.0 - mean) ** 2 * second - whole
-    return FisherInformation((mean, concentration), _symmetric(of_mean, across, of_concentration))
+    matrix = _symmetric(of_mean, across, of_concentration)
+    if beta.margin:
+        nearest = concentration * jnp.minimum(mean, 1.0 - mean)
+        is_far = nearest - concentration * beta.margin > FAR_FROM_MARGIN * jnp.sqrt(nearest)
+        censored = jnp.vectorize(
+            functools.partial(_censored_beta, margin=beta.margin), signature="(),()->(p,p)"
+        )(mean, concentration)
+        matrix = jnp.where(is_far[..., None, None], matrix, censored)
+    return FisherInformation((mean, concentration), matrix)
+
+
+def _censored_beta(mean: Array, concentration: Array, margin: float) -> Array:
+    """The mean outer product of the score: between the margins by quadrature, and at their ends."""
+    end = math.log(margin) - math.log1p(-margin)
+    nodes, weights = np.polynomial.legendre.leggauss(MARGIN_NODES)
+    inside = scipy.special.expit(end * nodes)
+    reading = jnp.asarray(np.concatenate([inside, [margin, 1.0 - margin]]), mean.dtype)
+    volume = np.concatenate([-end * weights * inside * (1.0 - inside), [1.0, 1.0]])
+
+    def log_prob(at: Array, value: Array) -> Array:
+        return MeanConcentrationBeta(at[0], at[1], margin).log_prob(value)
+
+    def term(value: Array, volume: Array) -> Array:
+        log_density, score = jax.value_and_grad(log_prob)(jnp.stack([mean, concentration]), value)
+        return volume * jnp.exp(log_density) * jnp.outer(score, score)
+
+    return jnp.sum(jax.vmap(term)(reading, jnp.asarray(volume, mean.dtype)), axis=0)
 
 
 _FORMULAS: Mapping[type, Callable] = {

@@ -234,6 +234,8 @@ class BetaLink(_DopLink):
     $$ \rho \sim Beta(\mu\kappa, (1-\mu)\kappa), \quad
        \mu = clip(\rho_{model}, \epsilon, 1-\epsilon) $$
 
+    Readings within the margin are censored at its end.
+
     Args:
         margin: $\epsilon$, unit 1, range [1e-6, 1e-3].
         schedule: How $\kappa$ depends on brightness and angle.
@@ -254,7 +256,7 @@ class BetaLink(_DopLink):
             data.brightness,
             cos_degrees(data.geometry.view_zenith),
         )
-        return MeanConcentrationBeta(self._mean(prediction), concentration)
+        return MeanConcentrationBeta(self._mean(prediction), concentration, self.margin)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,6 +26,20 @@ CASES = {
     "student": (lambda loc, scale: dist.StudentT(5.0, loc, scale), (0.3, 0.02)),
     "beta": (MeanConcentrationBeta, (0.3, 80.0)),
     "beta near the edge": (MeanConcentrationBeta, (0.01, 40.0)),
+    **{
+        f"censored beta, mean {mean}, concentration {concentration}": (
+            lambda m, k: MeanConcentrationBeta(m, k, 1e-3),
+            (mean, concentration),
+        )
+        for mean, concentration in (
+            (1e-3, 40.0),
+            (0.003, 300.0),
+            (0.998, 300.0),
+            (0.05, 300.0),
+            (0.06, 500.0),
+            (0.002, 1e4),
+        )
+    },
     "logit": (
         lambda loc, scale: dist.TransformedDistribution(
             dist.Normal(loc, scale), dist.transforms.SigmoidTransform()

@@ -12,6 +12,7 @@ from cases import each
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.util import log_density
+from scipy import stats
 
 from polar_bayes.observation.distributions import (
     MeanConcentrationBeta,
@@ -206,6 +207,45 @@ def test_the_beta_equals_numpyros_at_moderate_values():
     np.testing.assert_allclose(found, expected, atol=1e-12)
     np.testing.assert_allclose(ours.mean, theirs.mean, rtol=1e-15)
     np.testing.assert_allclose(ours.variance, theirs.variance, rtol=1e-14)
+
+
+CENSORED = np.array(
+    [
+        (mean, concentration, reading)
+        for mean in (1e-4, 3e-4, 1e-2, 0.5, 0.999, 1.0 - 1e-4)
+        for concentration in (1e-3, 0.3, 10.0, 300.0, 1e4, 1e5)
+        for reading in (1e-4, 1.0 - 1e-4)
+    ]
+)
+MARGIN = 1e-4
+
+
+def censored_log_probability(row):
+    return MeanConcentrationBeta(row[0], row[1], MARGIN, validate_args=False).log_prob(row[2])
+
+
+@each("dtype", [np.float64, np.float32])
+def test_a_reading_at_the_margin_has_the_probability_beyond_it(dtype):
+    """Eight nodes leave .003 of the logarithm up to 30 expected readings within the margin."""
+    rows = CENSORED.astype(dtype)
+    found = value_gradient_hessian(censored_log_probability, rows)
+    assert_finite(found, rows, dtype)
+    for (mean, concentration, reading), value in zip(CENSORED, found[0], strict=True):
+        shapes = mean * concentration, (1.0 - mean) * concentration
+        low, high = stats.beta.logcdf(MARGIN, *shapes), stats.beta.logsf(1.0 - MARGIN, *shapes)
+        truth = low if reading < 0.5 else high
+        if truth > -30.0:
+            assert abs(value - truth) < 0.003, (mean, concentration, reading)
+
+
+def test_draws_of_a_censored_beta_are_its_readings():
+    censored, free = (MeanConcentrationBeta(0.003, 300.0, margin) for margin in (1e-3, 0.0))
+    drawn, all_drawn = (each.sample(jax.random.key(0), (4000,)) for each in (censored, free))
+    np.testing.assert_array_equal(drawn, np.clip(all_drawn, 1e-3, 1.0 - 1e-3))
+    share, expected = np.mean(drawn == 1e-3), np.exp(float(censored.log_prob(1e-3)))
+    assert abs(share - expected) < 4.0 * np.sqrt(expected * (1.0 - expected) / 4000.0)
+    inside = np.linspace(0.01, 0.5, 5)
+    np.testing.assert_array_equal(censored.log_prob(inside), free.log_prob(inside))
 
 
 @pytest.mark.thorough
