@@ -128,7 +128,11 @@ def verdict(
         *dict.fromkeys(against.get("not computed", [])),
     )
     faults = tuple(against.get("problem", []))
-    notes = (*against.get("note", []), *_reading_notes(provenance.get("counts", {})))
+    notes = (
+        *against.get("note", []),
+        *_chain_notes(result),
+        *_reading_notes(provenance.get("counts", {})),
+    )
     made, missing = checks_made(method, criticism)
     return Verdict(
         passed=not problems and not faults,
@@ -364,7 +368,9 @@ def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
 
 def _mode_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
     weights = (provenance.get("modes") or {}).get("weights", [])
-    if len(weights) > 1 and weights[1] > MAX_SECOND_MODE:
+    # Weighted draws of all modes have told whether chains have their tails.
+    compared = (provenance.get("tails") or {}).get("k_hat", math.inf) <= MAX_PARETO_K
+    if len(weights) > 1 and weights[1] > MAX_SECOND_MODE and not compared:
         effect = OTHER_MODES.get(str(provenance.get("method", "laplace")), "; ")
         yield (
             f"The posterior has another mode, of weight {weights[1]:.2g}: another explanation of "
@@ -396,7 +402,8 @@ def _tail_cautions(
         )
 
 
-def _estimate_cautions(result: xr.DataTree, table: pd.DataFrame, method: str) -> Iterator[str]:
+def _chain_notes(result: xr.DataTree) -> Iterator[str]:
+    """Trajectories that were cut short, which costs time and biases nothing."""
     deep = stats_of(result).get("reached_max_treedepth")
     if deep is not None and deep.sum() > MAX_DEEP_TREES * deep.size:
         yield (
@@ -404,6 +411,9 @@ def _estimate_cautions(result: xr.DataTree, table: pd.DataFrame, method: str) ->
             "cut short, which biases nothing but makes draws alike; raise it, as in "
             "Nuts(max_tree_depth=10)."
         )
+
+
+def _estimate_cautions(result: xr.DataTree, table: pd.DataFrame, method: str) -> Iterator[str]:
     undetermined = table.index[table["sd"].isna()]
     if method == "point" and len(undetermined):
         yield (

@@ -226,14 +226,25 @@ def test_the_method_is_called_as_it_was_stated() -> None:
 
 
 @pytest.mark.thorough
-def test_deep_trees_are_a_caution_once_they_are_many() -> None:
+def test_deep_trees_are_a_note_once_they_are_many() -> None:
+    """They cost time, and bias nothing."""
     tree = make_result()
     deep = np.zeros((4, 250), bool)
-    deep[0, :5] = True
-    assert not verdict(replace(tree, "sample_stats", "reached_max_treedepth", deep)).cautions
-    deep[0, :50] = True
-    cautions = verdict(replace(tree, "sample_stats", "reached_max_treedepth", deep)).cautions
-    assert "50 of 1000 draws reached the largest tree depth" in cautions[0]
+    for count, is_told in ((5, False), (50, True)):
+        deep[0, :count] = True
+        judged = verdict(replace(tree, "sample_stats", "reached_max_treedepth", deep))
+        assert not judged.cautions
+        told = any(f"{count} of 1000 draws reached" in note for note in judged.findings)
+        assert told == is_told
+
+
+def test_another_mode_is_no_caution_where_weighted_draws_of_it_agree_with_the_chains() -> None:
+    modes = {"weights": [0.8, 0.2]}
+    tails = {"k_hat": 0.4, "effective_draws": 900.0, "shares": {}}
+    tree = edit_provenance(make_result(), modes=modes, tails=tails)
+    assert not verdict(tree).cautions
+    unknown = edit_provenance(tree, tails=tails | {"k_hat": 0.9})
+    assert "another mode, of weight 0.2" in verdict(unknown).cautions[0]
 
 
 def laplace_tree(log_weight: np.ndarray) -> xr.DataTree:
