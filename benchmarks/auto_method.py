@@ -30,7 +30,7 @@ from polar_bayes.progress import no_progress
 LAYOUTS = ("smooth glass, 6 views", "leaf, 40 views")
 REFERENCE = pb.benchmark.Reference(error=0.02)
 CHUNK = 10
-RUNGS = ("importance", "tempered", "nuts")
+RUNGS = ("importance", "nuts")
 
 
 def fit_some(case: Case, numbers: np.ndarray, auto: pb.methods.Auto) -> list[dict[str, Any]]:

@@ -125,5 +125,5 @@ def main(count: int, methods: Sequence[str]) -> None:
 if __name__ == "__main__":
     main(
         int(sys.argv[1]) if len(sys.argv) > 1 else 1000,
-        sys.argv[2:] or ("tempered", "nuts", "importance", "laplace"),
+        sys.argv[2:] or ("nuts", "importance", "corrected-laplace", "laplace"),
     )

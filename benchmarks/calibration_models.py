@@ -7,8 +7,8 @@
     python benchmarks/calibration_models.py links --keep FOLDER  kept there, and gone on with
 
 `material`: one material of the paper's scene, 40 views of the degree of polarization and of
-intensity, by tempered draws. `links`: the same, 16 views, each way in which readings may scatter,
-by tempered draws and by chains. `hierarchical`: 4 smooth plates, 6 views of q with stated errors,
+intensity, by weighted draws. `links`: the same, 16 views, each way in which readings may scatter,
+by weighted draws and by chains. `hierarchical`: 4 smooth plates, 6 views of q with stated errors,
 indices and fractions from one population. `spectral`: a smooth plate in 4 colors, 6 views of q,
 index a Gaussian process over wavelength. Both by `pb.methods.Nuts()`. `rough-hierarchical` and
 `rough-spectral`: the same axes by the paper's scene, 16 views; minutes for each fit. `goniometer`:
@@ -76,7 +76,7 @@ Asked = Iterator[tuple[str, xr.Dataset, dict[str, Any]]]
 
 
 def material() -> Asked:
-    yield "one material, 40 views", layout(), {"method": "tempered", "scene": SCENE}
+    yield "one material, 40 views", layout(), {"method": "importance", "scene": SCENE}
 
 
 def links() -> Asked:
@@ -85,7 +85,7 @@ def links() -> Asked:
         read = [name for name in ("dop", "q", "u") if name in capture]
         for title, link in ways.items():
             chosen = {name: link for name in read} | {"intensity": intensity}
-            for method in ("tempered", "nuts"):
+            for method in ("importance", "nuts"):
                 arguments = {"links": chosen, "method": method, "scene": SCENE}
                 yield f"{title}, {method}", capture, arguments
 
@@ -102,7 +102,7 @@ def spectral() -> Asked:
 
 def goniometer() -> Asked:
     capture = plate_capture(GONIOMETER_VIEWS, ERROR, seed=1)
-    for name, method in {"tempered": "tempered", "pb.methods.Nuts()": pb.methods.Nuts()}.items():
+    for name, method in {"importance": "importance", "nuts": "nuts"}.items():
         yield f"a plate on a goniometer, {name}", capture, GONIOMETER | {"method": method}
 
 

@@ -22,19 +22,19 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from numpyro import handlers
-from polar_bayes.models.per_material import per_material
 from scipy import stats
 
 import polar_bayes as pb
+from polar_bayes.models.per_material import per_material
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from plate_images import ASKED, plate_image
 
 SIDE = 100
 METHODS = {
-    "normal approximation": pb.methods.PixelLaplace(weighted=False),
-    "corrected, 256 draws": pb.methods.PixelLaplace(),
-    "corrected, 1024 draws": pb.methods.PixelLaplace(draws=1024),
+    "normal approximation": pb.methods.Laplace(draws=256, chains=1),
+    "corrected, 256 draws": pb.methods.CorrectedLaplace(),
+    "corrected, 1024 draws": pb.methods.CorrectedLaplace(draws=1024),
 }
 
 CAMERA_SIDE = 30
@@ -76,7 +76,7 @@ def camera() -> None:
             print(pb.diagnostics.map_coverage(maps, in_band)[["answered", "held_95"]].round(3))
     rows = camera_image(None).isel(y=slice(MIXTURES))
     begun = time.perf_counter()
-    maps = pb.fit_pixels(rows, method=pb.methods.PixelImportance())
+    maps = pb.fit_pixels(rows, method="importance")
     seconds = time.perf_counter() - begun
     print(f"by mixtures, {MIXTURES * CAMERA_SIDE} pixels: {seconds:.0f} s with compilation")
     print(pb.diagnostics.map_coverage(maps, rows)[["answered", "held_95"]].round(3))

@@ -34,9 +34,10 @@ from polar_bayes.design.fisher import (
 )
 from polar_bayes.design.optimal_design import Selection, fedorov_exchange
 from polar_bayes.design.setup import parameter_vector, unconstrain
-from polar_bayes.inference.batch_engine import BatchEngine, engine_key, make_engine
-from polar_bayes.inference.batch_laplace import PixelLaplace
+from polar_bayes.inference.batch_fit import BatchFit, random_keys
 from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.inference.compiled_model import CompiledModel, compile_layout, layout_key
+from polar_bayes.inference.corrected_laplace import CorrectedLaplace
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
@@ -74,7 +75,7 @@ def layout() -> xr.Dataset:
     )
 
 
-def fit_some(engine: BatchEngine, captures: ObservationBatch, seen: np.ndarray) -> Fits:
+def fit_some(engine: CompiledModel, captures: ObservationBatch, seen: np.ndarray) -> Fits:
     """Fit every capture by the views that it has seen, (material, view)."""
     valid = np.broadcast_to(seen, captures.batched.valid.shape)
     masked = ObservationBatch(
@@ -97,7 +98,8 @@ def fit_some(engine: BatchEngine, captures: ObservationBatch, seen: np.ndarray) 
             for name, kept in few.items():
                 kept[material] = np.asarray(parameters[name])[row, some]
 
-    PixelLaplace(draws=512).run_batch(engine, masked, np.arange(count), 0, describe)
+    batch = BatchFit(engine, masked, random_keys(0, np.arange(count)), describe)
+    CorrectedLaplace(draws=512).fit_batch(batch)
     flat = {name: kept.ravel() for name, kept in few.items()}
     z = unconstrain(engine.program, flat).reshape(count, DRAWS, -1)
     return Fits(mean, sd, z)
@@ -106,7 +108,7 @@ def fit_some(engine: BatchEngine, captures: ObservationBatch, seen: np.ndarray) 
 class Designer:
     """Chooses views as `next_views` does, from a program that is compiled once."""
 
-    def __init__(self, engine: BatchEngine, data: Any) -> None:
+    def __init__(self, engine: CompiledModel, data: Any) -> None:
         program = engine.program
         self.size, self.measured = program.size, len(MEASURED)
         self.prior = from_prior(program, jax.random.key(9), 500, data)
@@ -159,8 +161,8 @@ def main(count: int) -> None:
     with jax.enable_x64(True):
         request = resolve(capture, "per_material", SCENE, None, links, None, 0, "double")
         data = observe(request.capture)
-        key = engine_key(request, request.largest_view_zenith)
-        engine = make_engine(key, request, lambda: data)
+        key = layout_key(request, request.largest_view_zenith)
+        engine = compile_layout(key, request, lambda: data)
         drawn = draw_captures(engine.program, data, np.arange(count), jax.random.key(1))
         before = np.arange(views) < len(MEASURED)
         first = fit_some(engine, drawn.captures, np.tile(before, (count, 1)))

@@ -3,7 +3,7 @@
     python benchmarks/paper.py table1       every class: error, coverage, width
     python benchmarks/paper.py table2       with and without views beyond 75 degrees
     python benchmarks/paper.py ablations    noise models that are wrong, and pooling
-    python benchmarks/paper.py methods      least squares, Laplace, weights, NUTS, tempering
+    python benchmarks/paper.py methods      least squares, Laplace, weights, NUTS
     python benchmarks/paper.py figures      the pictures of docs/paper.md, into docs/figures
 
 Options: --simulations N of each cell, --method of `polar_bayes.calibrate`, --seed. Each prints a
@@ -35,7 +35,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("task", choices=TASKS)
     parser.add_argument("--simulations", type=int, help="of each cell of the table")
-    parser.add_argument("--method", default="tempered", help="of polar_bayes.calibrate")
+    parser.add_argument("--method", default="importance", help="of polar_bayes.calibrate")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     task, usual = TASKS[asked.task]

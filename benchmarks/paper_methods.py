@@ -35,7 +35,7 @@ from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 
-USUAL = ("laplace", "importance", "tempered", "nuts")
+USUAL = ("laplace", "importance", "nuts")
 NORMAL_95 = 1.959964
 
 

@@ -17,9 +17,9 @@ import xarray as xr
 from jaxtyping import Array
 from numpyro import distributions as dist
 from one_material import SCENE
-from polar_bayes.models.sites import declare_readings, draw_independent, material_parameters
 
 import polar_bayes as pb
+from polar_bayes.models.sites import declare_readings, draw_independent, material_parameters
 from polar_bayes.observation.data import Observations
 from polar_bayes.simulation import BRIGHT_LEVEL, BRIGHT_QUANTILE, NOISE
 
@@ -52,7 +52,7 @@ class Study:
     """
 
     simulations: int
-    method: str = "tempered"
+    method: str = "importance"
     seed: int = 0
 
     def calibrate(self, capture: xr.Dataset, **asked: Any) -> xr.DataTree:

@@ -36,17 +36,17 @@ import xarray as xr
 from numpyro import handlers, optim
 from numpyro.infer import SVI, Trace_ELBO
 from numpyro.infer.autoguide import AutoLaplaceApproximation
-from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batching import LANES, ObservationBatch
+from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.levenberg_marquardt import (
     exact_derivatives,
     find_modes,
     scoring_derivatives,
 )
 from polar_bayes.maps.fit_map import mask_missing, plan_map
+from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import Observations
 
 NOISE, VIEWS, STEPS = 0.01, 40, 25
@@ -89,7 +89,7 @@ def rate(count: int, run: Callable[[], Any]) -> tuple[float, Any]:
     return count / (time.perf_counter() - start), found
 
 
-def by_scipy(engine: BatchEngine, pixels: ObservationBatch, count: int) -> np.ndarray:
+def by_scipy(engine: CompiledModel, pixels: ObservationBatch, count: int) -> np.ndarray:
     residuals = jax.jit(
         lambda z, data: jnp.concatenate([engine.program.residuals(z, data)["dop"] / NOISE, z])
     )
@@ -100,7 +100,7 @@ def by_scipy(engine: BatchEngine, pixels: ObservationBatch, count: int) -> np.nd
     return np.stack(found)
 
 
-def by_guide(engine: BatchEngine, pixels: ObservationBatch, count: int) -> Any:
+def by_guide(engine: CompiledModel, pixels: ObservationBatch, count: int) -> Any:
     guide = AutoLaplaceApproximation(engine.program.model)
     search = SVI(engine.program.model, guide, optim.Minimize(), Trace_ELBO())
     state = search.init(jax.random.key(0), pixels.pixel(0))
@@ -114,7 +114,7 @@ def by_guide(engine: BatchEngine, pixels: ObservationBatch, count: int) -> Any:
     return lambda: [jax.block_until_ready(fit(pixels.pixel(i))) for i in range(count)]
 
 
-def by_newton(engine: BatchEngine, pixels: ObservationBatch, count: int) -> Callable:
+def by_newton(engine: CompiledModel, pixels: ObservationBatch, count: int) -> Callable:
     def fit(own: Observations, shared: Observations) -> jax.Array:
         data = eqx.combine(own, shared)
 
@@ -136,7 +136,7 @@ def by_newton(engine: BatchEngine, pixels: ObservationBatch, count: int) -> Call
     return lambda: jax.block_until_ready(compiled(some.batched, some.static))
 
 
-def heights(engine: BatchEngine, pixels: ObservationBatch, z: np.ndarray) -> np.ndarray:
+def heights(engine: CompiledModel, pixels: ObservationBatch, z: np.ndarray) -> np.ndarray:
     """The potential of the first pixels at some places."""
     some = pixels.subset(np.arange(len(z)))
     with jax.enable_x64(True):
@@ -171,7 +171,7 @@ def peaks(dtype: type) -> tuple[float, float]:
     return 2 * rounds * lanes / fastest(multiply_add, x), copied
 
 
-def roofline(engine: BatchEngine, pixels: ObservationBatch) -> None:
+def roofline(engine: CompiledModel, pixels: ObservationBatch) -> None:
     print("one look at a pixel      us   operations   bytes   Gop/s  of peak  of bandwidth")
     for name, program, look, dtype in (
         ("scoring, single", engine.single_program, scoring_derivatives, np.float32),

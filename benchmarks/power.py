@@ -6,7 +6,7 @@
     python benchmarks/power.py 400 --keep FOLDER  fits are kept there, and gone on with
 
 The layout is that of benchmarks/one_material.py: 40 views of the degree of polarization and
-of intensity, seven parameters, fitted by tempered draws. Captures are simulated by one model and
+of intensity, seven parameters, fitted by weighted draws. Captures are simulated by one model and
 fitted by another; the first row fits what it simulates, and its shares are false alarms.
 
 Repetitions are disjoint subsets of one calibration: of 1000 simulations 20 subsets of 50, 5 of 200
@@ -108,7 +108,7 @@ def main(count: int, names: list[str], keep: Path | None) -> None:
         calibration = pb.calibrate(
             capture,
             simulations=count,
-            method="tempered",
+            method="importance",
             scene=SCENE,
             truth=truth,
             store=store,

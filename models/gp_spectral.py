@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpyro
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
+
 from polar_bayes.models.hierarchical import check_members, check_pooled, draw_pooled
 from polar_bayes.models.sites import (
     constant_axes,
@@ -32,7 +33,6 @@ from polar_bayes.models.spectral_process import (
     wavelengths_of,
     weight_scale,
 )
-
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene

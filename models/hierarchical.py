@@ -19,6 +19,8 @@ import jax.numpy as jnp
 import numpyro
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
+
+from polar_bayes.errors import FitError
 from polar_bayes.models.sites import (
     SoftClip,
     constant_axes,
@@ -28,8 +30,6 @@ from polar_bayes.models.sites import (
     material_parameters,
     over_axes,
 )
-
-from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene

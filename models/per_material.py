@@ -8,8 +8,8 @@ turns them into what the instrument would record (eq. 1), the links say how read
 from collections.abc import Mapping
 
 from numpyro import distributions as dist
-from polar_bayes.models.sites import declare_readings, draw_independent, material_parameters
 
+from polar_bayes.models.sites import declare_readings, draw_independent, material_parameters
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
-from polar_bayes.models.sites import SoftClip
 from tinygp import kernels
 
 from polar_bayes.errors import FitError
+from polar_bayes.models.sites import SoftClip
 from polar_bayes.observation.data import Observations
 from polar_bayes.physics.scene import Scene
 from polar_bayes.repr_html import HTMLRepr

@@ -95,7 +95,7 @@ pb.summary(result).round(3)
 # %% [markdown]
 # It asked importance sampling twice, the second time with more draws, and did not believe it: the
 # weights themselves say that a few draws carry much. The study above knows better, since it has a
-# reference; a choice without one has to be careful. Tempered draws satisfied it. Most of the
+# reference; a choice without one has to be careful. Chains satisfied it. Most of the
 # seconds are compilation, which a second fit of this layout does not pay.
 #
 # What no diagnostic here sees is a wrong scene: every method is measured against the posterior, not

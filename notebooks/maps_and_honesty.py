@@ -11,9 +11,9 @@
 import numpy as np
 import numpyro
 import pandas as pd
-from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
+from polar_bayes.models.per_material import per_material
 
 # %% [markdown]
 # ## An image with a shadow and a highlight
@@ -77,7 +77,7 @@ pb.plots.plot_maps(maps)
 # Beside the corrected map, one that takes the normal approximation at its word:
 
 # %%
-bare = pb.fit_pixels(image, method=pb.methods.PixelLaplace(weighted=False), **fitted)
+bare = pb.fit_pixels(image, method="laplace", **fitted)
 held = ["held_50", "held_80", "held_95", "held_95_low", "held_95_high", "unanswered"]
 both = {"corrected": maps, "normal approximation": bare}
 pd.concat(

@@ -13,12 +13,12 @@ import pandas as pd
 import xarray as xr
 from numpyro import distributions as dist
 from numpyro import handlers
-from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
 from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.inference.result import provenance_of
+from polar_bayes.models.per_material import per_material
 
 # %% [markdown]
 # ## A plate with two bad readings

@@ -4,13 +4,12 @@ import numpy as np
 import xarray as xr
 from numpyro import handlers
 from plates import PLATE
-from polar_bayes.models.per_material import per_material
 from scipy import stats
 from textbook import plate_q
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batching import ObservationBatch, cut
+from polar_bayes.inference.corrected_laplace import CorrectedLaplace
 from polar_bayes.maps.fit_map import (
     MapPlan,
     blank,
@@ -20,6 +19,7 @@ from polar_bayes.maps.fit_map import (
     plan_map,
     with_pixel_numbers,
 )
+from polar_bayes.models.per_material import per_material
 
 NOISE = 0.02
 # Away from Brewster's angle q stays so far from -1 that ordinary noise is never clipped.
@@ -87,7 +87,7 @@ def on_a_grid(
 
 def planned(
     capture: xr.Dataset,
-    method: PixelLaplace | None = None,
+    method: CorrectedLaplace | None = None,
     *,
     seed: int = 0,
     precision: str = "double",

@@ -24,7 +24,7 @@ def make_maps(
     status: np.ndarray | None = None,
     approach: np.ndarray | None = None,
     wavelengths: tuple[float, ...] = (),
-    weighted: bool = True,
+    method: str = "corrected-laplace",
     **provenance: object,
 ) -> xr.Dataset:
     """Uniform posteriors of that width about the means, (y, x) or (y, x, wavelength)."""
@@ -43,7 +43,7 @@ def make_maps(
     found["pareto_k"] = (("y", "x"), np.where(status == Status.NOT_TRUSTED, 0.9, 0.2))
     found["status"] = flags(Status, status)
     found["approach"] = flags(MethodUsed, told if approach is None else approach)
-    about = {"method": "pixels", "settings": {"weighted": weighted}, "seed": 3, **provenance}
+    about = {"method": method, "seed": 3, **provenance}
     coords: dict = {"quantile": LEVELS_HERE}
     coords |= {"wavelength": list(wavelengths)} if wavelengths else {}
     return xr.Dataset(found, coords=coords, attrs={"polar_bayes": json.dumps(about)})

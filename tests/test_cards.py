@@ -18,7 +18,7 @@ VALUES = {
     "method": pb.methods.Nuts(draws=700),
     "rung": pb.methods.Importance(),
     "model": pb.models.Hierarchical(),
-    "pixels": pb.methods.PixelLaplace(),
+    "pixels": pb.methods.CorrectedLaplace(),
     "priors": pb.PRIORS,
 }
 

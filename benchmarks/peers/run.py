@@ -40,7 +40,7 @@ import polar_bayes as pb
 from polar_bayes.inference.mcse import measure
 
 PEERS = (
-    "polar_bayes", "tempering", "numpyro", "blackjax", "pymc", "emcee", "bumps", "scipy",
+    "polar_bayes", "numpyro", "blackjax", "pymc", "emcee", "bumps", "scipy",
 )  # fmt: skip
 DEVICE_EACH = ("numpyro", "blackjax")
 """Whose guides ask for a device for each chain, which is set before JAX is imported."""

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,12 +12,12 @@ from jaxtyping import Array, Float
 
 from polar_bayes.benchmark.run import labeled
 from polar_bayes.errors import FitError
+from polar_bayes.inference.importance import Importance
 from polar_bayes.inference.mcse import LARGEST_R_HAT
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.result import CENTRAL_95
-from polar_bayes.inference.smc import PixelSMC, Tempered
 from polar_bayes.progress import no_progress
 
 # --- Distances from the reference -----------------------------------------------------------------
@@ -89,11 +90,11 @@ class Reference:
         )
 
     @property
-    def tempered(self) -> Tempered:
+    def weighted(self) -> Importance:
         """The method that is tried where chains do not agree."""
-        goal = 4.0 / self.error**2  # half of it is lost where draws are chosen by weight
-        settings = Tempered(PixelSMC(num_chains=1024, draws=4096)).with_draws(4.0 * goal).settings
-        return Tempered(dataclasses.replace(settings, effective_draws=goal))
+        # Half of the effective draws is lost where draws are chosen by weight, and of all draws a
+        # few tenths are effective.
+        return Importance(draws=math.ceil(16.0 / self.error**2))
 
 
 class ReferenceRun(NamedTuple):
@@ -125,12 +126,12 @@ class ReferenceRun(NamedTuple):
 
 def run_reference(settings: Reference, problem: Problem, key: Array) -> ReferenceRun:
     """Chains that are lengthened until their own error is small enough."""
-    # Where they do not agree, or some of them missed a mode, tempered draws are tried, where the
+    # Where they do not agree, or some of them missed a mode, weighted draws are tried, where the
     # capture allows it.
     runs = [_run_until(settings, "NUTS", settings.chains, problem, key)]
     if runs[0].doubts:
-        with contextlib.suppress(FitError):  # several patches or colors
-            runs.append(_run_until(settings, "tempered draws", settings.tempered, problem, key))
+        with contextlib.suppress(FitError):  # no joint approximation
+            runs.append(_run_until(settings, "weighted draws", settings.weighted, problem, key))
     return best_reference(runs)
 
 

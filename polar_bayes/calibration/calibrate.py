@@ -16,39 +16,28 @@ from polar_bayes.calibration.runner import (
     Block,
     BlockStore,
     CalibrationPlan,
-    Method,
     cut,
     fit_block,
     join,
     open_store,
 )
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_engine import engine_key
-from polar_bayes.inference.batch_laplace import PixelLaplace
-from polar_bayes.inference.batch_nuts import PixelNuts
 from polar_bayes.inference.batching import MethodUsed, Status
-from polar_bayes.inference.least_squares import Point
-from polar_bayes.inference.nuts import Nuts
+from polar_bayes.inference.compiled_model import layout_key
+from polar_bayes.inference.method import AbstractBatchMethod, find_method, name_of
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
+from polar_bayes.inference.registry import FIT_DEFAULT
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE, dims_of, shape_of
-from polar_bayes.inference.smc import PixelSMC
 from polar_bayes.maps.blocks import as_completed, workers
-from polar_bayes.observation.data import READINGS, Observations
+from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.paths import as_path
-from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Counter, no_progress, with_counter
 
-METHODS: dict[str, Method] = {
-    "laplace": PixelLaplace(weighted=False),
-    "importance": PixelLaplace(draws=512),
-    "tempered": PixelSMC(),
-    "nuts": PixelNuts(start=PixelSMC()),
-}
 MIN_SIMULATIONS = 20
 
 
@@ -58,7 +47,7 @@ def calibrate(
     *,
     simulations: int = 1000,
     model: str | Callable = "per_material",
-    method: str | Method | None = None,
+    method: str | AbstractBatchMethod | None = None,
     scene: str | Scene | None = None,
     priors: Mapping[str, dist.Distribution] | None = None,
     links: AbstractLink | Mapping[str, AbstractLink] | None = None,
@@ -82,13 +71,10 @@ def calibrate(
             errors and masks.
         simulations: How many, at least 20.
         model: As for `polar_bayes.fit`; scene, priors, links and largest_view_zenith too.
-        method: "tempered" (sequential Monte Carlo from the prior to the posterior, which finds
-            every mode: the default for one material in one color), "nuts" (chains that start at
-            such draws), or a method that starts at one mode: "importance" (the normal
-            approximation, its draws weighted by the posterior, corrected as in maps), "laplace"
-            (the same unweighted). Where the capture has patches, materials or wavelengths, or the
-            scene a discrepancy, the default is "nuts", and these chains are those of
-            `polar_bayes.fit`. Or the settings of any method of `pb.methods` but `Point`.
+        method: As for `polar_bayes.fit`, by default the one that it takes: a name is one algorithm,
+            so what is tested here is what a fit does. "nuts" runs chains for each simulation, which
+            takes seconds each; "importance" fits many side by side. Or the settings of a method of
+            `pb.methods`, such as those of a map; least squares make no draws.
         scene: A name, a `Scene` or None.
         priors: Overrides.
         links: One link, a mapping or None.
@@ -140,7 +126,7 @@ def calibrate(
         return resolve(capture, model, scene, priors, links, limit, seed, "double")
 
     request = resolved({})
-    settings = _settings(method, request)
+    settings = find_method(FIT_DEFAULT if method is None else method, "calibrate", many=True)
     start = time.perf_counter()
     plan = make_plan(request, resolved(truth) if truth else None, settings, readings)
     if not plan.compiled.shared:
@@ -157,11 +143,10 @@ def calibrate(
         stored = np.concatenate([*(block.numbers for block in done), []])
         missing = np.setdiff1d(np.arange(simulations), stored).astype(int)
         done += _fit_all(plan, missing, simulations, blocks, scheduler, progress or no_progress)
-    names = (name for name, each in METHODS.items() if each == settings)
     provenance = {
         **request.describe(),
         "calibration": simulations,
-        "method": next(names, type(settings).__name__),
+        "method": name_of(settings),
         "settings": repr(settings),
         "truth": {name: repr(value) for name, value in (truth or {}).items()},
         "capture": str(request.capture.attrs.get("name", "capture")),
@@ -174,36 +159,15 @@ def calibrate(
     return _assemble(plan, join(done, simulations), provenance)
 
 
-def _settings(method: str | Method | None, request: Request) -> Method:
-    if isinstance(method, Point) or method == "point":
-        what = "least squares make no draws whose intervals could be checked"
-        hint = "give a method with draws, such as pb.methods.Laplace()"
-        raise FitError(what, where="method='point'", hint=hint)
-    if isinstance(method, Method):
-        return method
-    if _needs_mcmc(request) and method in (None, "nuts"):
-        return Nuts()
-    if method is None:
-        return METHODS["tempered"]
-    if method not in METHODS:
-        hint = f"give one of {', '.join(METHODS)}, or settings such as PixelNuts(draws=1000)"
-        raise FitError("no such method", where=f"method={method!r}", hint=hint)
-    return METHODS[method]
-
-
-def _needs_mcmc(request: Request) -> bool:
-    """Whether the posteriors of a capture are out of reach of weighted draws."""
-    read = [request.capture[name].sizes for name in READINGS if name in request.capture]
-    several = any(dim != "view" and length > 1 for sizes in read for dim, length in sizes.items())
-    return several or request.scene.has(Discrepancy)
-
-
 def make_plan(
-    request: Request, generative_request: Request | None, settings: Method, readings: bool
+    request: Request,
+    generative_request: Request | None,
+    settings: AbstractBatchMethod,
+    readings: bool,
 ) -> CalibrationPlan:
     """What is done to every block; without a generative request, the fitted model simulates."""
-    own_key = engine_key(request, request.largest_view_zenith)
-    generative_key = "" if generative_request is None else engine_key(generative_request)
+    own_key = layout_key(request, request.largest_view_zenith)
+    generative_key = "" if generative_request is None else layout_key(generative_request)
     key = tokenize(own_key, generative_key, repr(settings), readings, tokenize(request.capture))
     return CalibrationPlan(request, generative_request, settings, readings, own_key, key)
 

@@ -21,12 +21,12 @@ from jaxtyping import Array
 from polar_bayes.calibration.predictive import Arrays, PredictivePit, unranked_reason
 from polar_bayes.calibration.scores import PitCrps
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_engine import BatchEngine, make_engine
-from polar_bayes.inference.batch_method import AbstractPixelMethod
+from polar_bayes.inference.batch_fit import BatchFit, random_keys
 from polar_bayes.inference.batching import ObservationBatch, Outcome
 from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache
-from polar_bayes.inference.method import AbstractMethod
-from polar_bayes.inference.problem import CompiledModel, compile_model, observe_request
+from polar_bayes.inference.compiled_model import CompiledModel, compile_layout
+from polar_bayes.inference.method import AbstractBatchMethod
+from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.program import Program, Values, compile_program
 from polar_bayes.inference.psis import Marginals
 from polar_bayes.inference.request import Request
@@ -45,16 +45,6 @@ from polar_bayes.maps.blocks import (
 from polar_bayes.observation.data import Observations
 from polar_bayes.paths import TEMPORARY_PREFIX, replace_file, temporary_folder
 from polar_bayes.priors import describe_prior
-
-Method = AbstractPixelMethod | AbstractMethod
-CHAINS_BLOCK = 4
-"""Simulations of a block where they are fitted one after another: each may take half a minute."""
-
-BLOCK = 64
-"""Simulations of a block elsewhere: what one thread or worker fits, and what a crash can lose."""
-
-RANKED = 128
-"""About so many draws of a chain are ranked: far enough apart to be nearly independent."""
 
 
 class Block(NamedTuple):
@@ -80,9 +70,9 @@ class CalibrationPlan:
 
     request: Request
     generative_request: Request | None
-    settings: Method
+    settings: AbstractBatchMethod
     readings: bool
-    engine_key: str
+    layout_key: str
     key: str
 
     @property
@@ -93,12 +83,7 @@ class CalibrationPlan:
     @property
     def block(self) -> int:
         """Simulations of a block."""
-        return CHAINS_BLOCK if self.is_sequential else BLOCK
-
-    @property
-    def is_sequential(self) -> bool:
-        """Whether one capture is fitted after another."""
-        return isinstance(self.settings, AbstractMethod)
+        return self.settings.group_size
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -114,13 +99,10 @@ class CompiledPlan:
             return observe_request(self.plan.request)
 
     @functools.cached_property
-    def engine(self) -> CompiledModel | BatchEngine:
-        """The programs that fit one capture after another, or many side by side."""
+    def engine(self) -> CompiledModel:
+        """The programs that fit captures."""
         plan = self.plan
-        if not plan.is_sequential:
-            return make_engine(plan.engine_key, plan.request, lambda: self.data)
-        with jax.enable_x64(True):
-            return compile_model(plan.request, self.data)
+        return compile_layout(plan.layout_key, plan.request, lambda: self.data)
 
     @property
     def program(self) -> Program:
@@ -166,25 +148,22 @@ def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), 1)
         drawn = draw_captures(program, data, filled, key, replicate=is_ranked)
-    engine: Any = compiled.engine
+    engine = compiled.engine
     truth: Arrays = {name: np.asarray(drawn.truth[name])[:count] for name in shared}
     captures = drawn.captures.subset(np.arange(count))
     marginals, scores = Marginals(count, shared, random=True), PitCrps(truth, numbers, seed)
     ranked = None
     if is_ranked:
         again = {name: np.asarray(values)[:count] for name, values in drawn.replicated.items()}
-        single = engine.single if plan.is_sequential else engine.single_program
-        ranked = PredictivePit(single, captures, again, numbers, seed)
-    step = plan.settings.thinning(RANKED)
+        ranked = PredictivePit(engine.single_program, captures, again, numbers, seed)
 
     def describe(at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        thinned = {name: np.asarray(x)[:, ::step] for name, x in parameters.items()}
-        share = weights[:, ::step] / weights[:, ::step].sum(axis=-1, keepdims=True)
         for statistic in (marginals, scores, ranked):
             if statistic is not None:
-                statistic.describe(at, thinned, share)
+                statistic.describe(at, parameters, weights)
 
-    outcome = plan.settings.run_batch(engine, captures, numbers, seed, describe)
+    batch = BatchFit(engine, captures, random_keys(seed, numbers), describe, seed)
+    plan.settings.fit_batch(batch)
     return Block(
         numbers=np.asarray(numbers),
         truth=truth,
@@ -193,7 +172,7 @@ def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
         mean=marginals.mean,
         sd=marginals.sd,
         quantiles={name: np.moveaxis(x, 0, 1) for name, x in marginals.quantiles.items()},
-        outcome=outcome,
+        outcome=batch.outcome,
         fresh=ranked.fresh if ranked else {},
         left_out=ranked.left_out if ranked else {},
         left_out_k=ranked.left_out_k if ranked else {},

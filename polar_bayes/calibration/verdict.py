@@ -271,22 +271,17 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
     if np.mean(statuses == Status.NOT_TRUSTED) > MOST_UNTRUSTED:
         sentences.append(
             "Most fits say themselves that they cannot be trusted: the ranks judge the method, not "
-            "the model. Another method or longer chains may do; chains (pb.methods.Nuts()) are "
-            "the slowest and the surest."
+            "the model. Another method or longer chains may do; chains (method='nuts') are the "
+            "slowest and the surest."
         )
     return sentences + _reading_sentences(calibration)
 
 
 def _better_method(calibration: xr.DataTree) -> str:
     """What to try where half of the fits have failed."""
-    method = str(provenance_of(calibration).get("method", ""))
-    several = {"material", "patch", "wavelength"} & set(calibration["prior_sbc"].dims)
-    if method == "nuts":
-        advice = "give longer chains, as in --method 'Nuts(most_draws=20000)', or narrower priors"
-    elif method == "tempered" or several:
-        advice = "try --method nuts, whose chains begin at every mode"
-    else:
-        advice = "try --method tempered, which begins at the prior and finds every mode"
+    advice = "use method='nuts', whose chains begin at every mode"
+    if provenance_of(calibration).get("method") == "nuts":
+        advice = "give longer chains, as in Nuts(most_draws=20000), or narrower priors"
     return f"Half of the fits or more have failed: {advice}."
 
 

@@ -7,7 +7,7 @@ import click
 
 import polar_bayes as pb
 from polar_bayes.cli.options import (
-    CALIBRATION_METHOD,
+    MANY_METHOD,
     RESULT_FILE,
     STUDY_METHOD,
     capture_argument,
@@ -22,6 +22,7 @@ from polar_bayes.cli.options import (
     seed_option,
 )
 from polar_bayes.cli.printing import NOT_CONVERGED, json_rows, print_frame, print_json, say
+from polar_bayes.inference.registry import FIT_DEFAULT
 from polar_bayes.progress import stages
 
 CALIBRATION_COLUMNS = (
@@ -43,8 +44,8 @@ NEXT_STEPS = {
 @out_option(RESULT_FILE, "File to write.")
 @model_option
 @option(
-    "--method", type=CALIBRATION_METHOD,
-    help="laplace, importance, tempered or nuts; by default what suits the capture.",
+    "--method", type=MANY_METHOD, default=FIT_DEFAULT,
+    help=f"{', '.join(MANY_METHOD.names)}; importance and laplace fit many captures side by side.",
 )  # fmt: skip
 @option("--simulations", type=int, default=1000)
 @scene_options

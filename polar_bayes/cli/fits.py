@@ -12,6 +12,7 @@ from polar_bayes.cli.options import (
     FIT_SCENE,
     FOLDER,
     INPUT,
+    MANY_METHOD,
     RESULT_FILE,
     SCENE_FILE,
     SCENE_HELP,
@@ -43,6 +44,7 @@ from polar_bayes.cli.printing import (
     print_verdict,
     say,
 )
+from polar_bayes.inference.registry import FIT_DEFAULT, MAP_DEFAULT
 from polar_bayes.paths import write_errors
 from polar_bayes.progress import stages
 
@@ -90,8 +92,8 @@ def _make_folder(folder: Path) -> None:
 @out_option(RESULT_FILE, "Result to write.")
 @model_option
 @option(
-    "--method", type=FIT_METHOD, default="nuts",
-    help="point, laplace, importance, tempered, nuts, or auto: the cheapest that is good enough.",
+    "--method", type=FIT_METHOD, default=FIT_DEFAULT,
+    help=f"{', '.join(FIT_METHOD.names)}; auto is the cheapest that is good enough.",
 )  # fmt: skip
 @nuts_options
 @option("--seconds", type=float, help="Of --method auto; 60 by default.")
@@ -160,10 +162,10 @@ def _in_setup(chosen: Any, scene: Any) -> Any:
 @model_option
 @scene_options
 @option(
-    "--method", type=click.Choice(("laplace", "importance", "tempered")), default="laplace",
-    help="One mode of each pixel, corrected; or all modes, many times slower.",
+    "--method", type=MANY_METHOD, default=MAP_DEFAULT,
+    help=f"{', '.join(MANY_METHOD.names)}; all others are many times slower.",
 )  # fmt: skip
-@option("--draws", type=int, help="Of laplace, weighted, in each pixel.  [default: 256]")
+@option("--draws", type=int, help=f"Of {MAP_DEFAULT}, in each pixel.  [default: 256]")
 @option(
     "--share", "shared", multiple=True,
     help="Noise or instrument parameter of the whole image; repeatable; none for none.  "
@@ -182,19 +184,18 @@ def map_(
     **settings: Any,
 ) -> None:
     """Fit every pixel of an image."""
-    if draws is not None and method != "laplace":
-        raise click.UsageError("--draws needs --method laplace")
+    from polar_bayes.inference.scene_file import parse_method
+
+    if draws is not None and method != MAP_DEFAULT:
+        raise click.UsageError(f"--draws needs --method {MAP_DEFAULT}")
     if "none" in shared and len(shared) > 1:
         raise click.UsageError("--share none excludes every other --share")
     settings = read_scene_options(settings)
     settings["shared"] = () if shared == ("none",) else shared or None
-    given: dict[str, Any] = {} if draws is None else {"draws": draws}
-    methods: dict[str, Any] = {
-        "laplace": pb.methods.PixelLaplace(**given),
-        "importance": pb.methods.PixelImportance(),
-        "tempered": pb.methods.PixelSMC(),
-    }
-    maps = pb.maps.map_file(capture, out, method=methods[method], **settings)
+    chosen: Any = parse_method(method, "--method")
+    if draws is not None:
+        chosen = pb.methods.CorrectedLaplace(draws=draws)
+    maps = pb.maps.map_file(capture, out, method=chosen, **settings)
     counts = ", ".join(
         f"{count} {what}" for what, count in pb.maps.count_pixels(maps).items() if count
     )
@@ -267,7 +268,7 @@ def scene(source: Path | str, out: Path | None) -> None:
 @capture_argument
 @out_option(RESULT_FILE, "Fit of the scenes that remain, stacked, to write.", required=False)
 @model_option
-@option("--method", type=FIT_METHOD, default="nuts", help="Of the fit that --out writes.")
+@option("--method", type=FIT_METHOD, default=FIT_DEFAULT, help="Of the fit that --out writes.")
 @prior_option
 @link_option
 @view_limit_option

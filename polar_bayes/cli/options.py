@@ -14,6 +14,7 @@ from click.core import ParameterSource
 
 import polar_bayes as pb
 from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
+from polar_bayes.inference.registry import method_names
 from polar_bayes.paths import as_path, check_output, is_scene_file, refuse_inputs
 
 
@@ -66,18 +67,10 @@ class Assignment(click.ParamType):
 
 MODEL = Name("model", ("per_material", "hierarchical", "gp_spectral"), FitError)
 MATERIAL = Name("material", ("leaf", "fruit", "plastic", "coating", "glass", "water"), CaptureError)
-FIT_METHOD = Settings(
-    "method", ("nuts", "laplace", "point", "importance", "tempered", "auto"), FitError
-)
-CALIBRATION_METHOD = Settings("method", ("laplace", "importance", "tempered", "nuts"), FitError)
-STUDY_METHOD = Name(
-    "method",
-    (
-        *("point", "laplace", "importance", "tempered", "normal guide", "flow guide"),
-        *("nuts short", "nuts", "nuts long"),
-    ),
-    FitError,
-)
+FIT_METHOD = Settings("method", method_names(one=True), FitError)
+MANY_METHOD = Settings("method", method_names(many=True), FitError)
+STUDIED = tuple(name for name in method_names(one=True) if name != "auto")
+STUDY_METHOD = Name("method", (*STUDIED, "nuts short", "nuts long"), FitError)
 
 
 class Input(click.ParamType):

@@ -74,10 +74,10 @@ RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (rf"{FREE}(\w+Link(?!\(\)){CALL})", r"--link '\1'"),
     (r"use stated_errors=False", "use --link 'StokesLink(stated_errors=False)'"),
     (r"\b(priors|links)\[('?)(\w+)\2\]", lambda found: f"{KEYWORDS[found[1]]} {found[3]}"),
-    (rf"(?:{FREE}|(?:{PACKAGE})?methods\.)(Nuts|Laplace|Importance|Tempered|Point|Auto)\(\)",
+    (rf"(?:{FREE}|(?:{PACKAGE})?methods\.)(Nuts|Laplace|Importance|Point|Auto)\(\)",
      lambda found: f"--method {found[1].lower()}"),
     (rf"{FREE}Nuts(\([^()]*\))", lambda found: _nuts_options(found[1])),
-    (rf"{FREE}((?:Importance|Tempered|Point|Auto){CALL})", r"--method '\1'"),
+    (rf"{FREE}((?:Importance|CorrectedLaplace|Point|Auto){CALL})", r"--method '\1'"),
     # Other keywords, and functions.
     (r"shared=\(\)", "--share none"),
     (r"truth=capture", "--truth"),

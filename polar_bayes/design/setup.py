@@ -17,6 +17,7 @@ from numpyro.infer.util import log_density
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
+from polar_bayes.inference.compiled_model import compile_model
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.initialization import STARTS
 from polar_bayes.inference.optimize import (
@@ -26,7 +27,7 @@ from polar_bayes.inference.optimize import (
     find_modes,
     from_prior,
 )
-from polar_bayes.inference.problem import compile_model, observe_request
+from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import PROVENANCE, posterior_of, shape_of

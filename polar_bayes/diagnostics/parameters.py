@@ -17,7 +17,7 @@ APPROXIMATIONS = ("laplace", "variational")
 """Methods whose draws are of the approximation, stored with `log_weight`: log posterior minus log
 approximation, up to a constant."""
 
-WEIGHTED = ("importance", "tempered")
+WEIGHTED = ("importance",)
 """Methods whose draws were resampled from weighted ones."""
 
 # Of a population, and of a process over wavelength.

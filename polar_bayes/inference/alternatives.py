@@ -25,6 +25,7 @@ from jaxtyping import Array
 from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
+from polar_bayes.inference.compiled_model import compile_model
 from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
 from polar_bayes.inference.optimize import (
     DifferencedPotential,
@@ -33,7 +34,7 @@ from polar_bayes.inference.optimize import (
     find_modes,
     symmetrize,
 )
-from polar_bayes.inference.problem import Problem, compile_model, observe_request
+from polar_bayes.inference.problem import Problem, observe_request
 from polar_bayes.inference.request import Request
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.variants import alternatives_of

@@ -12,15 +12,13 @@ from jaxtyping import Array
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import OutOfTimeError, run_until
-from polar_bayes.inference.laplace import Importance, Laplace
-from polar_bayes.inference.least_squares import Point
+from polar_bayes.inference.importance import Importance
 from polar_bayes.inference.mcse import LARGEST_R_HAT, draws_needed, largest_error
-from polar_bayes.inference.method import AbstractMethod, PosteriorDraws, flatten
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws, flatten, make_method
 from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.psis import MAX_PARETO_K, max_effective_size
-from polar_bayes.inference.smc import PixelSMC, Tempered
-from polar_bayes.inference.variational import FlowGuide, NormalGuide
+from polar_bayes.inference.registry import method_names
 from polar_bayes.progress import Progress
 
 RESERVE = 8
@@ -45,9 +43,8 @@ def expected_error(draws: PosteriorDraws, problem: Problem) -> float:
 class Auto(AbstractMethod):
     """The cheapest method whose own diagnostics say that it is good enough.
 
-    Methods are tried from cheap to exact: importance, tempered draws (of one material in one
-    color), NUTS. Tempered draws come after NUTS where their programs must be compiled first: that
-    takes longer than the chains of most captures. One is taken when Pareto k-hat is at most 0.7,
+    Methods are tried from cheap to exact: importance (of one material in one color), NUTS. One is
+    taken when Pareto k-hat is at most 0.7,
     R-hat at most 1.01, nothing diverged, no mode was left out, and the Monte Carlo error of every
     mean and standard deviation is within the tolerance (but in 1% of the fits). Where only that is
     missing, the same method is tried once more with more draws.
@@ -95,19 +92,10 @@ class Auto(AbstractMethod):
         chains = Nuts(effective_draws=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
         if not problem.is_one_spectrum_point:
             return {"nuts": chains}
-        weighted = min(RESERVE * needed, MOST_DRAWS)
-        settings = Tempered(PixelSMC()).with_draws(weighted).settings
-        enough = min(needed, 0.5 * settings.answer_draws)
-        methods: dict[str, AbstractMethod] = {
-            "importance": Importance(draws=max(2048, 2 * weighted)),
-            "tempered": Tempered(dataclasses.replace(settings, effective_draws=enough)),
-        }
-        able = {
-            name: method
-            for name, method in methods.items()
-            if max_effective_size(method.num_draws or 0) >= needed
-        }
-        return able | {"nuts": chains}
+        weighted = Importance(draws=max(2048, 2 * min(RESERVE * needed, MOST_DRAWS)), rounds=1)
+        if max_effective_size(weighted.draws) < needed:
+            return {"nuts": chains}
+        return {"importance": weighted, "nuts": chains}
 
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
@@ -117,7 +105,6 @@ class Auto(AbstractMethod):
         waiting = list(self.candidates(problem).items())
         tried: set[str] = set()
         while waiting:
-            waiting = _compiled_first(waiting, problem)
             name, method = waiting.pop(0)
             # The first one always ends: there is nothing else to return.
             until = deadline if attempts else np.inf
@@ -229,19 +216,6 @@ class Attempt(NamedTuple):
         return texts | {name: _rounded(getattr(self, name)) for name in numbers}
 
 
-def _compiled_first(
-    waiting: list[tuple[str, AbstractMethod]], problem: Problem
-) -> list[tuple[str, AbstractMethod]]:
-    """The same with tempered draws that must still be compiled at the end."""
-
-    # Half a minute for the particles and mixtures of the paper's scene, where chains that begin at
-    # modes already found compile and run in three seconds.
-    def must_compile(each: tuple[str, AbstractMethod]) -> bool:
-        return isinstance(each[1], Tempered) and not each[1].is_compiled(problem)
-
-    return sorted(waiting, key=must_compile)  # stable
-
-
 def _bias_doubts(draws: PosteriorDraws, problem: Problem) -> list[str]:
     """Why draws may be biased."""
     doubts = draws.doubts
@@ -263,16 +237,10 @@ def _rounded(value: float) -> float | None:
 
 STUDY_METHODS: Mapping[str, AbstractMethod] = MappingProxyType(
     {
-        "point": Point(),
-        "laplace": Laplace(),
-        "importance": Importance(),
-        "tempered": Tempered(),
-        "normal guide": NormalGuide(),
-        "flow guide": FlowGuide(),
+        **{name: make_method(name) for name in method_names(one=True) if name != "auto"},
         "nuts short": Nuts(warmup=100, draws=100, most_draws=100),
-        "nuts": Nuts(),
         "nuts long": Nuts(warmup=1000, draws=4000, most_draws=4000),
     }
 )
-"""Methods that `polar_bayes.accuracy` compares, from cheap to exact. One more is one more value:
+"""Methods that `polar_bayes.accuracy` compares. One more is one more value:
 `{**STUDY_METHODS, "mine": Mine()}`."""

@@ -157,8 +157,6 @@ class MethodUsed(enum.IntEnum):
     IMPORTANCE = 2
     ADAPTED = 3
     NUTS = 4
-    TEMPERED = 5
-    VARIATIONAL = 6
     OTHER = 7
 
 

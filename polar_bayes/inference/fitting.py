@@ -24,7 +24,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference import methods
 from polar_bayes.inference.alternatives import compare_alternatives
 from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_until
-from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
+from polar_bayes.inference.method import AbstractMethod, PosteriorDraws, find_method
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.problem import Problem, make_problem
@@ -40,17 +40,6 @@ PRIOR_DRAWS = 500
 
 DIAGNOSTICS = ("r_hat", "k_hat", "effective_draws")
 """What a method states of its own draws, stored with the result; None where it states nothing."""
-
-
-METHODS: Mapping[str, Callable[[], AbstractMethod]] = {
-    "nuts": lambda: methods.Nuts(),
-    "laplace": lambda: methods.Laplace(),
-    "point": lambda: methods.Point(),
-    "importance": lambda: methods.Importance(),
-    "tempered": lambda: methods.Tempered(),
-    "auto": lambda: methods.Auto(),
-}
-"""Methods that `fit` knows by name; a function makes each, because it loads what it needs."""
 
 
 def fit_request(
@@ -124,7 +113,7 @@ def fit_request(
     )
 
 
-def find_method(
+def choose_method(
     method: str | AbstractMethod, tolerance: float | None, seconds: float | None
 ) -> AbstractMethod:
     """The settings that a caller asks for, by name or as they are."""
@@ -138,15 +127,7 @@ def find_method(
         )
     if given:
         return methods.Auto(**given)
-    if isinstance(method, AbstractMethod):
-        return method
-    if not isinstance(method, str) or method not in METHODS:
-        raise FitError(
-            "no such method",
-            where=f"method={method!r}",
-            hint=f"give one of {', '.join(METHODS)}, or settings such as Nuts(draws=2000)",
-        )
-    return METHODS[method]()
+    return find_method(method, "fit", one=True)
 
 
 def try_alternatives(

@@ -11,7 +11,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, override
+from typing import Any, ClassVar, NamedTuple, override
 
 import jax
 import jax.numpy as jnp
@@ -312,6 +312,14 @@ def _weigh(potential: ValueAndGradient, z: np.ndarray, noise: np.ndarray) -> dic
 class AbstractInitializer(abc.ABC):
     """The search for modes in all captures of one layout."""
 
+    is_joint: ClassVar[bool]
+    """Whether all coordinates are optimized together, as those of pixels are."""
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether draws are made in the coordinates of the program itself, as those of pixels."""
+        return False
+
     @abc.abstractmethod
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
         """The modes of one capture, searched from prior draws; a `FitError` where it has none."""
@@ -334,6 +342,13 @@ class JointInitializer(AbstractInitializer):
 
     program: Program
     reparam: ConditionalReparam | None
+
+    is_joint: ClassVar[bool] = True
+
+    @property
+    @override
+    def is_plain(self) -> bool:
+        return self.reparam is None
 
     @functools.cached_property
     def guide(self) -> Callable[[Array, Array, Observations], tuple[Array, Array, Array]]:
@@ -381,6 +396,8 @@ class HierarchicalInitializer(AbstractInitializer):
 
     group_model: GroupModel
     reparam: HierarchicalReparam
+
+    is_joint: ClassVar[bool] = False
 
     @override
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:

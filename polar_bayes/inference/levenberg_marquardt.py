@@ -29,7 +29,6 @@ from jaxtyping import Array, Bool, Float, Int
 from numpyro import distributions as dist
 from numpyro.infer.util import compute_log_probs
 
-from polar_bayes.inference.batch_engine import BATCH, BatchEngine
 from polar_bayes.inference.batching import (
     AnyArray,
     ObservationBatch,
@@ -40,6 +39,7 @@ from polar_bayes.inference.batching import (
     take_rows,
 )
 from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.compiled_model import BATCH, CompiledModel
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 
@@ -412,7 +412,7 @@ class ModeSearch(NamedTuple):
 
 
 def find_starts(
-    engine: BatchEngine, pixels: ObservationBatch, candidates: int = PRIOR_DRAWS
+    engine: CompiledModel, pixels: ObservationBatch, candidates: int = PRIOR_DRAWS
 ) -> Float[np.ndarray, "pixel rank size"]:
     """Draws from the prior at which each pixel starts, the one of highest density first."""
     # The largest program compiles while the others are traced and run.
@@ -421,13 +421,13 @@ def find_starts(
     return engine.run(_starts, candidates, pixels, single=True)
 
 
-def find_modes(engine: BatchEngine, pixels: ObservationBatch) -> ModeSearch:
+def find_modes(engine: CompiledModel, pixels: ObservationBatch) -> ModeSearch:
     """The mode of every pixel, from the best of its starts."""
     return find_modes_from(engine, pixels, find_starts(engine, pixels)[:, 0])
 
 
 def find_modes_from(
-    engine: BatchEngine,
+    engine: CompiledModel,
     pixels: ObservationBatch,
     start: Float[np.ndarray, "pixel size"],
     known: ModeSearch | None = None,
@@ -449,7 +449,7 @@ def find_modes_from(
 
 
 def _refine(
-    engine: BatchEngine, pixels: ObservationBatch, start: np.ndarray, fast: LMState
+    engine: CompiledModel, pixels: ObservationBatch, start: np.ndarray, fast: LMState
 ) -> ModeSearch:
     """The modes near where searches in single precision have ended."""
     is_finite = np.isfinite(fast.z).all(axis=-1, keepdims=True)
@@ -471,7 +471,7 @@ def _refine(
 
 
 def _advance(
-    engine: BatchEngine,
+    engine: CompiledModel,
     pixels: ObservationBatch,
     state: LMState,
     which: np.ndarray,
@@ -483,21 +483,8 @@ def _advance(
     return engine.run(_stepping, single, *some, given=(np.int32(count),), single=single)
 
 
-def find_modes_again(engine: BatchEngine, pixels: ObservationBatch) -> ModeSearch:
-    """The mode of every pixel; those that did not converge start again elsewhere."""
-    starts = find_starts(engine, pixels)
-    found = jax.tree.map(np.array, find_modes_from(engine, pixels, starts[:, 0]))
-    for rank in RESTARTS:
-        left = np.flatnonzero(~found.converged)
-        if not left.size:
-            break
-        again = find_modes_from(engine, pixels.subset(left), starts[left, rank])
-        put_rows(found, left[again.converged], take_rows(again, again.converged))
-    return found
-
-
 def find_all_modes(
-    engine: BatchEngine, pixels: ObservationBatch
+    engine: CompiledModel, pixels: ObservationBatch
 ) -> tuple[Int[np.ndarray, " mode"], NormalApproximation]:
     """Distinct modes of all pixels, and the index of the pixel that each belongs to."""
     ends: list[NormalApproximation] = []
@@ -515,7 +502,7 @@ def find_all_modes(
 
 
 def find_conditional_modes(
-    engine: BatchEngine,
+    engine: CompiledModel,
     pixels: ObservationBatch,
     z: Float[np.ndarray, "pixel size"],
     fixed: Int[np.ndarray, " pixel"],
@@ -531,7 +518,7 @@ def find_conditional_modes(
     return np.asarray(state.z), np.asarray(value), np.asarray(curvature)
 
 
-def _starts(engine: BatchEngine, candidates: int) -> JitOnce:
+def _starts(engine: CompiledModel, candidates: int) -> JitOnce:
     """A program that ranks draws from the prior, and keeps the first `RANKS`."""
     draws = engine.prior_draws(candidates).astype(np.float32)
 
@@ -548,7 +535,7 @@ def _starts(engine: BatchEngine, candidates: int) -> JitOnce:
     return batched(start)
 
 
-def _stepping(engine: BatchEngine, single: bool) -> JitOnce:
+def _stepping(engine: CompiledModel, single: bool) -> JitOnce:
     """A program of any number of steps."""
     goal = SINGLE_GOAL if single else 0.1 * GOALS[engine.precision]
     program = engine.single_program if single else engine.program
@@ -571,7 +558,7 @@ def _stepping(engine: BatchEngine, single: bool) -> JitOnce:
     return batched_lanes(several, given=1)
 
 
-def _finalized(engine: BatchEngine, state: LMState) -> NormalApproximation:
+def _finalized(engine: CompiledModel, state: LMState) -> NormalApproximation:
     def of_batch(index: np.ndarray) -> NormalApproximation:
         return finalize(*take_rows((state.z, state.derivatives), index))
 

@@ -6,22 +6,20 @@ import difflib
 import inspect
 import math
 from collections.abc import Callable
-from typing import Any, Self, override
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, ClassVar, NamedTuple, NoReturn, Self, override
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batching import (
-    Describe,
-    MethodUsed,
-    ObservationBatch,
-    Outcome,
-    Status,
-    empty_outcome,
-)
+from polar_bayes.inference import methods
+from polar_bayes.inference.batch_fit import BatchFit
+from polar_bayes.inference.batching import MIN_VIEWS, MethodUsed, Status
 from polar_bayes.inference.compile import TRACING_LOCK
+from polar_bayes.inference.levenberg_marquardt import NormalApproximation
 from polar_bayes.inference.mcse import (
     LARGEST_R_HAT,
     SMALLEST_ESS,
@@ -29,8 +27,9 @@ from polar_bayes.inference.mcse import (
     standard_errors,
     weighted_standard_errors,
 )
-from polar_bayes.inference.problem import CompiledModel, Problem
-from polar_bayes.inference.program import Values
+from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.program import THREADS, Values
+from polar_bayes.inference.registry import METHODS, method_names
 from polar_bayes.progress import Progress, no_progress
 from polar_bayes.repr_html import HTMLRepr
 
@@ -101,6 +100,9 @@ class PosteriorDraws:
         return np.hypot(weighted[0], mean), np.hypot(weighted[1], sd)
 
 
+_THREADS = ThreadPoolExecutor(THREADS, "polar_bayes fits")
+"""That fit captures one after another, of all blocks at once: a core is not shared by two."""
+
 SYNONYMS = {
     "num_chains": "chains",
     "num_draws": "draws",
@@ -115,12 +117,15 @@ SYNONYMS = {
 """What NumPyro, PyMC and others call settings."""
 
 
-class AbstractBatchMethod[Engine](HTMLRepr, abc.ABC):
-    """A way to fit many captures of one layout together.
+@dataclasses.dataclass(frozen=True)
+class AbstractBatchMethod(HTMLRepr, abc.ABC):
+    """A way to fit many captures of one layout; a small frozen dataclass of settings."""
 
-    `Engine` is what is compiled for the layout: `BatchEngine` where the captures run side by side
-    in one program, `CompiledModel` where they are fitted one after another.
-    """
+    memory_limit: ClassVar[int] = 1024
+    """Captures whose draws are in memory at a time."""
+
+    group_size: ClassVar[int] = 64
+    """Captures that one thread or worker fits at a time, and that a crash can lose."""
 
     def __new__(cls, *_: object, **settings: object) -> Self:
         """Refuse a setting that it does not have, naming the one that is meant."""
@@ -140,48 +145,50 @@ class AbstractBatchMethod[Engine](HTMLRepr, abc.ABC):
         return super().__new__(cls)
 
     @abc.abstractmethod
-    def run_batch(
-        self,
-        engine: Engine,
-        observations: ObservationBatch,
-        numbers: np.ndarray,
-        seed: int,
-        describe: Describe,
-    ) -> Outcome:
-        """Fit every capture.
+    def fit(
+        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
+    ) -> None:
+        """Fit the captures `at` these indices, and record their outcome; modes may be known.
 
-        Args:
-            engine: Compiled programs of the model.
-            observations: The captures.
-            numbers: An integer for each capture, shape (capture,). What is drawn for a capture
-                depends on this number and the seed only.
-            seed: Of everything that is drawn.
-            describe: Called with the indices of captures that have an answer, their parameters by
-                name, each (capture, draw, ...), and the weights of these draws (capture, draw); a
-                later call for the same capture replaces an earlier one.
-
-        Returns:
-            Status, method, Pareto k-hat, effective sample size and steps of every capture, each of
-            shape (capture,); NaN where there is nothing to say. A fit that fails is a status, not
-            an error.
+        A fit that fails is a status, not an error.
         """
 
-    def thinning(self, count: int) -> int:
-        """Every how many of the draws that it describes are nearly independent.
+    def fit_batch(self, batch: BatchFit) -> None:
+        """Fit every capture that has enough views, and record the outcome of all."""
+        views = batch.pixels.views
+        batch.outcome.status[views < MIN_VIEWS] = Status.TOO_FEW_VIEWS
+        batch.outcome.status[views == 0] = Status.MASKED
+        at = np.flatnonzero(views >= MIN_VIEWS)
+        for begin in range(0, at.size, self.memory_limit):
+            self.fit(batch, at[begin : begin + self.memory_limit])
 
-        Args:
-            count: Draws that are wanted, about.
+    def for_image(
+        self, size: int, sample: Callable[[int], BatchFit], *, is_shared: bool
+    ) -> tuple[Self, dict[str, Any]]:
+        """Settings for an image, and entries of its provenance.
 
-        Returns:
-            1 where all are, as resampled draws and those that `run_batch` thins itself.
+        `size` is the number of its pixels, `sample` gives some of them drawn at random, and
+        `is_shared` says whether pixels share parameters.
         """
-        del count
-        return 1
+        del size, sample, is_shared
+        return self, {}
+
+    def check_least(self, **least: int) -> None:
+        """Refuse settings below their least values."""
+        for name, lowest in least.items():
+            if getattr(self, name) < lowest:
+                self.refuse(f"{name} is {getattr(self, name)}", f"give {lowest} or more")
+
+    def refuse(self, what: str, hint: str) -> NoReturn:
+        """Raise the error of a setting."""
+        raise FitError(what, where=type(self).__name__, hint=hint)
 
 
 @dataclasses.dataclass(frozen=True)
-class AbstractMethod(AbstractBatchMethod[CompiledModel]):
-    """A way to draw from the posterior of one capture; a small frozen dataclass of settings."""
+class AbstractMethod(AbstractBatchMethod):
+    """A way to draw from the posterior of one capture; of many it fits one after another."""
+
+    group_size: ClassVar[int] = 4
 
     @abc.abstractmethod
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
@@ -252,47 +259,58 @@ class AbstractMethod(AbstractBatchMethod[CompiledModel]):
         return {}
 
     @override
-    def run_batch(
-        self,
-        engine: CompiledModel,
-        observations: ObservationBatch,
-        numbers: np.ndarray,
-        seed: int,
-        describe: Describe,
-    ) -> Outcome:
+    def fit(
+        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
+    ) -> None:
         """Fit one capture after another, and describe nearly independent draws of each."""
         # Chains are thinned to every k-th draw, where k is the number of draws over the smallest
         # bulk effective sample size of all parameters, rounded up. A fit that must not be trusted
         # is described all the same.
-        outcome, base = (
-            empty_outcome(len(observations)),
-            jax.random.fold_in(jax.random.key(seed), 3),
-        )
-        double = engine.precision == "double"
+        del modes
+        double = batch.engine.precision == "double"
         with jax.enable_x64(double), TRACING_LOCK:  # two threads that begin at once share it
-            _ = engine.initializer
-        for at, number in enumerate(numbers):
+            _ = batch.engine.initializer
+
+        def run(pixel: int) -> tuple[Assessment, dict[str, np.ndarray]] | None:
             with jax.enable_x64(double):  # a thread does not inherit it
-                key_search, key_draws = jax.random.split(jax.random.fold_in(base, int(number)))
-                problem = Problem(engine, observations.pixel(at), key_search)
+                key = jax.random.wrap_key_data(jnp.asarray(batch.keys[pixel]))
+                key_search, key_draws = jax.random.split(key)
+                problem = Problem(batch.engine, batch.pixels.pixel(pixel), key_search)
                 try:
                     draws = self.run(problem, key_draws, no_progress)
                 except (FitError, np.linalg.LinAlgError):  # no mode, or no width around it
-                    continue
+                    return None
                 parameters = problem.constrain(draws.z)
             if not finite_draws(parameters).any():
+                return None
+            found = assess_draws(draws, parameters)
+            return found, thin_draws(parameters, found.effective_draws)
+
+        for pixel, found in zip(at, _THREADS.map(run, at), strict=True):
+            if found is None:
                 continue
-            for name, value in assess_draws(draws, parameters).items():
-                getattr(outcome, name)[at] = value
-            thinned = thin_draws(parameters, outcome.effective_draws[at])
-            count = len(next(iter(thinned.values())))
-            weights = np.full((1, count), 1.0 / count)
-            describe(np.array([at]), {name: x[None] for name, x in thinned.items()}, weights)
-        return outcome
+            judged, thinned = found
+            one, count = np.array([pixel]), len(next(iter(thinned.values())))
+            batch.record_pareto_k(one, np.array([judged.pareto_k]))
+            draws, weights = (
+                {n: x[None] for n, x in thinned.items()},
+                np.full((1, count), 1 / count),
+            )
+            effective = np.array([judged.effective_draws])
+            batch.record(one, draws, weights, effective, judged.approach, judged.status)
 
 
-def assess_draws(draws: PosteriorDraws, parameters: Values) -> dict[str, float]:
-    """Status and effective sample size of one fit, by the names of `Outcome`."""
+class Assessment(NamedTuple):
+    """Of one fit, as `Outcome` has it of many."""
+
+    effective_draws: float
+    pareto_k: float
+    approach: MethodUsed
+    status: Status
+
+
+def assess_draws(draws: PosteriorDraws, parameters: Values) -> Assessment:
+    """Status and effective sample size of one fit."""
     finite = finite_draws(parameters)
     good, effective = not draws.doubts and bool(finite.all()), float(finite.sum())
     approach = MethodUsed.__members__.get(draws.method.upper(), MethodUsed.OTHER)
@@ -301,12 +319,8 @@ def assess_draws(draws: PosteriorDraws, parameters: Values) -> dict[str, float]:
         mixed = min(bulk.min(), tail.min()) >= SMALLEST_ESS and r_hat.max() <= LARGEST_R_HAT
         good = good and bool(mixed and draws.metadata.get("goals_reached", True))
         effective = float(np.nan_to_num(bulk.min(), nan=1.0))
-    return {
-        "effective_draws": effective,
-        "pareto_k": draws.k_hat,
-        "approach": approach,
-        "status": Status.GOOD if good else Status.NOT_TRUSTED,
-    }
+    status = Status.GOOD if good else Status.NOT_TRUSTED
+    return Assessment(effective, draws.k_hat, approach, status)
 
 
 def thin_draws(parameters: Values, effective: float) -> dict[str, np.ndarray]:
@@ -330,3 +344,41 @@ def flatten(parameters: Values) -> np.ndarray:
     """Every scalar of parameters of shape (chain, draw, ...): (scalar, chain, draw)."""
     flat = [np.asarray(x, float).reshape(*np.shape(x)[:2], -1) for x in parameters.values()]
     return np.moveaxis(np.concatenate(flat, axis=-1), -1, 0)
+
+
+# --- Methods by name ------------------------------------------------------------------------------
+
+
+def make_method(name: str) -> Any:
+    """The method of a name, with its default settings."""
+    return getattr(methods, METHODS[name].settings)()
+
+
+def find_method(method: Any, where: str, *, one: bool = False, many: bool = False) -> Any:
+    """The settings that a caller asks for, by name or as they are.
+
+    Raises:
+        FitError: There is no such method, or it cannot do what is asked for.
+    """
+    names = method_names(one=one, many=many)
+    hint = f"give one of {', '.join(names)}, or settings such as Importance(draws=4096)"
+    if isinstance(method, AbstractBatchMethod):
+        entry = METHODS.get(name_of(method))
+        does_many = entry is None or entry.fits_many
+        if isinstance(method, AbstractMethod) >= one and does_many >= many:
+            return method
+        name = name_of(method)
+    elif isinstance(method, str) and method in METHODS:
+        if method in names:
+            return make_method(method)
+        name = method
+    else:
+        raise FitError("no such method", where=f"{where}: method={method!r}", hint=hint)
+    what = "fits many captures side by side, not one" if one else "gives no draws of many captures"
+    raise FitError(f"{name} {what}", where=f"{where}: method={method!r}", hint=hint)
+
+
+def name_of(method: Any) -> str:
+    """The name of a method, whatever its settings; that of its class where it has none."""
+    made = type(method).__name__
+    return next((name for name, each in METHODS.items() if each.settings == made), made)

@@ -22,13 +22,14 @@ from jaxtyping import Array, Float
 from numpyro import infer
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batching import Describe, ObservationBatch, Outcome
+from polar_bayes.inference.batch_fit import BatchFit
 from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.importance import tail_shares
 from polar_bayes.inference.initialization import Target
-from polar_bayes.inference.laplace import tail_shares
+from polar_bayes.inference.levenberg_marquardt import NormalApproximation
 from polar_bayes.inference.mcse import measure
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
-from polar_bayes.inference.problem import CompiledModel, Problem
+from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.program import Values
 from polar_bayes.progress import Progress
 
@@ -172,17 +173,11 @@ class Nuts(AbstractMethod):
         return dataclasses.replace(self, effective_draws=factor * self.effective_draws, **scaled)
 
     @override
-    def run_batch(
-        self,
-        engine: CompiledModel,
-        observations: ObservationBatch,
-        numbers: np.ndarray,
-        seed: int,
-        describe: Describe,
-    ) -> Outcome:
-        # Several batches run at once, each on a thread of its own.
-        on_one = dataclasses.replace(self, threads=1)
-        return AbstractMethod.run_batch(on_one, engine, observations, numbers, seed, describe)
+    def fit(
+        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
+    ) -> None:
+        # Several captures are fitted at once, each on a thread of its own.
+        AbstractMethod.fit(dataclasses.replace(self, threads=1), batch, at, modes)
 
 
 # --- Chains -------------------------------------------------------------------------------------

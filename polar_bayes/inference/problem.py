@@ -5,93 +5,25 @@ layout; `Problem` adds the readings and the posterior modes that were found for 
 """
 
 import dataclasses
-import functools
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, Float
-from numpyro import distributions as dist
 
-from polar_bayes.inference.compile import (
-    TRACING_LOCK,
-    LRUCache,
-    cache_key,
-    layout_of,
-)
-from polar_bayes.inference.initialization import AbstractInit, AbstractInitializer, make_initializer
-from polar_bayes.inference.program import (
-    BLOCK,
-    Draw,
-    Model,
-    Program,
-    Values,
-    compile_program,
-    in_blocks,
-)
-from polar_bayes.inference.request import Request, bind_model
+from polar_bayes.inference.compile import TRACING_LOCK
+from polar_bayes.inference.compiled_model import CompiledModel, compile_model
+from polar_bayes.inference.initialization import AbstractInit
+from polar_bayes.inference.program import BLOCK, Draw, Program, Values, in_blocks
+from polar_bayes.inference.request import Request
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.priors import RANGES, describe_prior, support_bounds
 from polar_bayes.progress import Progress, no_progress
 
-MAX_LAYOUTS = 16
-"""Models by layout that stay compiled: all candidates of a comparison of scenes, and some more."""
-
-MAX_PROGRAMS = 16
-"""Further programs that methods have made of one of them, by settings, that stay compiled."""
-
 KEYS = 1 << 15
 """Random keys are split in multiples of this number: one compiled program serves any number."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class CompiledModel:
-    """What fits of one model to captures of one layout have in common."""
-
-    bind: Callable[[], Model]
-    model: Model
-    program: Program
-    layout: Observations
-    precision: str
-    priors: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
-    programs: LRUCache[Any] = dataclasses.field(default_factory=lambda: LRUCache(MAX_PROGRAMS))
-    """Further compiled programs of the model, which methods keep here by keys of their own."""
-
-    @functools.cached_property
-    def initializer(self) -> AbstractInitializer:
-        """The search for posterior modes."""
-        with TRACING_LOCK:
-            return make_initializer(self.model, self.program, self.layout)
-
-    @functools.cached_property
-    def single(self) -> Program:
-        """The same model in single precision."""
-        if self.precision == "single":
-            return self.program
-        with jax.enable_x64(False), TRACING_LOCK:
-            return compile_program(self.bind(), self.layout.in_single_precision())
-
-
-_COMPILED: LRUCache[CompiledModel] = LRUCache(MAX_LAYOUTS)
-
-
-def compile_model(request: Request, data: Observations) -> CompiledModel:
-    """The compiled model of a capture and of every other one of its layout, from the cache."""
-    parts = request.model, request.scene, request.priors, request.links
-    key = cache_key(*parts, request.precision, layout_of(data))
-
-    def make() -> CompiledModel:
-        bind = functools.partial(bind_model, *parts)
-        model = bind()
-        program = compile_program(model, data)
-        return CompiledModel(bind, model, program, data, request.precision, request.priors)
-
-    with TRACING_LOCK:
-        return _COMPILED.of(key, make)
 
 
 @dataclasses.dataclass

@@ -25,10 +25,6 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 from scipy.stats import qmc
 
-from polar_bayes.inference.batching import AnyArray, map_batches, take_rows
-from polar_bayes.inference.program import Values
-from polar_bayes.inference.psis import effective_draws, effective_tails, smooth
-
 # --- One normal or Student t distribution for each pixel ------------------------------------------
 
 
@@ -161,29 +157,6 @@ class Mixture(NamedTuple):
     scale: Float[Array, "component size size"]
 
 
-class Proposed(NamedTuple):
-    """Draws of a mixture for every pixel of a batch."""
-
-    mixture: Mixture
-    z: AnyArray
-    parameters: Values
-    log_posterior: AnyArray
-
-
-class WeightedSample(NamedTuple):
-    """Weighted draws of a batch of pixels."""
-
-    z: np.ndarray
-    parameters: Values
-    weights: np.ndarray
-    pareto_k: np.ndarray
-
-    @property
-    def ess(self) -> np.ndarray:
-        """Effective sample size, the least of the bulk and of both tails. (pixel,)."""
-        return np.minimum(effective_draws(self.weights), effective_tails(self.z, self.weights))
-
-
 def moments(
     z: Float[Array, "draw size"], weights: Float[Array, " draw"]
 ) -> tuple[Float[Array, " size"], Float[Array, "size size"]]:
@@ -260,31 +233,6 @@ def log_density(mixture: Mixture, z: Float[Array, "draw size"]) -> Float[Array, 
     each = -0.5 * (freedom + size) * jnp.log1p(squares / freedom) - log_volume
     whole = jnp.sum(jnp.log(jnp.diagonal(mixture.half)))
     return logsumexp(each + mixture.log_share, axis=-1) - whole
-
-
-def combine_samples(first: Proposed, second: Proposed) -> WeightedSample:
-    """The draws of two mixtures, weighted by the posterior over the mean density of both.
-
-    Multiple importance sampling with the balance heuristic: regions that one mixture covers badly
-    may be covered by the other, and a mixture that is too narrow shows in the other's draws.
-    """
-    z, parameters, log_posterior = jax.tree.map(
-        lambda *x: np.concatenate(x, axis=1), first[1:], second[1:]
-    )
-    with jax.enable_x64(False):
-        log_mean = map_batches(
-            lambda index: _log_means(*take_rows((first.mixture, second.mixture, z), index)),
-            len(z),
-            PIXELS,
-        )
-    return WeightedSample(z, parameters, *smooth(log_posterior - log_mean))
-
-
-@jax.jit
-@jax.vmap
-def _log_means(first: Mixture, second: Mixture, z: Array) -> Array:
-    """Log of the mean density of two mixtures at each draw of one pixel, up to a constant."""
-    return jnp.logaddexp(log_density(first, z), log_density(second, z))
 
 
 def _whitened(x: Array, mean: Array, scale: Array) -> tuple[Array, Array]:

@@ -141,30 +141,6 @@ def effective_draws(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarra
     return 1.0 / np.sum(weights**2, axis=-1)
 
 
-def effective_tails(
-    draws: Float[np.ndarray, "pixel draw size"], weights: Float[np.ndarray, "pixel draw"]
-) -> Float[np.ndarray, " pixel"]:
-    """Tail effective sample size of weighted draws."""
-    # Source: Vehtari, Gelman, Simpson, Carpenter & Buerkner (2021), Bayesian Anal. 16(2), section
-    # 4.3 (tail effective sample size); Owen (2013), Monte Carlo theory, methods and examples, eq.
-    # 9.8 (variance of weighted means).
-    least = np.full(len(draws), np.inf)
-    for coordinate in np.moveaxis(draws, -1, 0):
-        order = np.argsort(coordinate, axis=-1)
-        rising = np.take_along_axis(weights, order, axis=-1)
-        for share in (rising, rising[:, ::-1]):
-            within, squares = np.cumsum(share, axis=-1), np.cumsum(share**2, axis=-1)
-            at = np.argmax(within >= TAIL, axis=-1)[:, None]
-            p, inside = (np.take_along_axis(x, at, axis=-1)[:, 0] for x in (within, squares))
-            outside = squares[:, -1] - inside
-            variance = inside * (1.0 - p) ** 2 + outside * p**2
-            with np.errstate(invalid="ignore"):  # weights may be NaN
-                # One draw with all the weight has p = 1 and variance 0; its sample size is 1.
-                size = np.where(p < 1.0, p * (1.0 - p) / np.where(p < 1.0, variance, 1.0), 1.0)
-                least = np.fmin(least, size)
-    return least
-
-
 # --- Systematic resampling (Kitagawa 1996) --------------------------------------------------------
 
 

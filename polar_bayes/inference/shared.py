@@ -36,11 +36,11 @@ from numpyro import distributions as dist
 from numpyro.distributions import transforms
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_engine import BatchEngine
-from polar_bayes.inference.batch_laplace import PixelLaplace
-from polar_bayes.inference.batch_method import BatchFit, random_keys
+from polar_bayes.inference.batch_fit import BatchFit, random_keys
 from polar_bayes.inference.batching import LANES, AnyArray, ObservationBatch, Status, batched
 from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.compiled_model import CompiledModel
+from polar_bayes.inference.corrected_laplace import CorrectedLaplace
 from polar_bayes.inference.levenberg_marquardt import (
     ModeSearch,
     NormalApproximation,
@@ -161,9 +161,9 @@ def of_priors(
 
 
 def estimate_shared(
-    engine: BatchEngine,
+    engine: CompiledModel,
     pixels: ObservationBatch,
-    method: PixelLaplace,
+    method: CorrectedLaplace,
     priors: Mapping[str, dist.Distribution],
     shared: Sequence[SharedParameter],
     seed: int,
@@ -180,7 +180,7 @@ def estimate_shared(
     mean, sd = (np.array([getattr(each, part) for each in shared]) for part in ("mean", "sd"))
     once, everywhere = (
         dataclasses.replace(method, sampler=None, starts=starts)
-        for starts in (1, PixelLaplace.most_starts)
+        for starts in (1, CorrectedLaplace.most_starts)
     )
     # Compiled while the first modes are searched for.
     engine.begin(_slopes, names, pixels, np.zeros((1, DRAWS, engine.program.size), engine.dtype))
@@ -288,7 +288,7 @@ class _Batch(BatchFit):
 
     modes: NormalApproximation
 
-    def __init__(self, engine: BatchEngine, pixels: ObservationBatch, seed: int) -> None:
+    def __init__(self, engine: CompiledModel, pixels: ObservationBatch, seed: int) -> None:
         every = np.arange(len(pixels))
         super().__init__(engine, pixels, random_keys(seed, every), seed=seed)
         self.z = np.zeros((every.size, DRAWS, engine.program.size), engine.dtype)
@@ -308,9 +308,9 @@ class _Batch(BatchFit):
 
 
 def _expectations(
-    engine: BatchEngine,
+    engine: CompiledModel,
     pixels: ObservationBatch,
-    method: PixelLaplace,
+    method: CorrectedLaplace,
     shared: Sequence[SharedParameter],
     seed: int,
     modes: NormalApproximation | None,
@@ -343,7 +343,7 @@ def _resampled(weights: np.ndarray) -> np.ndarray:
     return np.take_along_axis(order, np.stack([draws_at(levels, row) for row in rows]), axis=1)
 
 
-def _coordinates(engine: BatchEngine, _: None) -> JitOnce:
+def _coordinates(engine: CompiledModel, _: None) -> JitOnce:
     """The program of unconstrained vectors of the draws of one pixel."""
 
     def of_pixel(data: Observations, draws: dict[str, Array]) -> Array:
@@ -358,7 +358,7 @@ def _positions(program: Program, names: Sequence[str]) -> np.ndarray:
     return np.array([int(program.positions[name]) for name in names])
 
 
-def _slopes(engine: BatchEngine, names: tuple[str, ...]) -> JitOnce:
+def _slopes(engine: CompiledModel, names: tuple[str, ...]) -> JitOnce:
     """The program of slope and information of one pixel."""
     program = engine.program
     where = _positions(program, names)

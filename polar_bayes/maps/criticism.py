@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpyro import distributions as dist
 
-from polar_bayes.inference.batch_engine import MOMENTS, BatchEngine
-from polar_bayes.inference.batch_method import BatchFit
+from polar_bayes.inference.batch_fit import BatchFit
 from polar_bayes.inference.batching import Status
 from polar_bayes.inference.checks import (
     CAUTION,
@@ -27,6 +26,7 @@ from polar_bayes.inference.checks import (
     prior_conflict,
     tail_scores,
 )
+from polar_bayes.inference.compiled_model import MOMENTS, CompiledModel
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LEVELS, Marginals
@@ -116,7 +116,7 @@ class Criteria:
 
 
 def criteria(
-    engine: BatchEngine,
+    engine: CompiledModel,
     priors: Mapping[str, dist.Distribution],
     sizes: Mapping[str, tuple[int, ...]],
 ) -> Criteria:
@@ -160,7 +160,7 @@ def _end(name: str, prior: dist.Distribution) -> float:
 
 
 def _bounds(
-    engine: BatchEngine, priors: Mapping[str, dist.Distribution], scalars: list[Scalar]
+    engine: CompiledModel, priors: Mapping[str, dist.Distribution], scalars: list[Scalar]
 ) -> Iterator[Bound]:
     """Bounds at which a parameter is not absent, and the prior has little probability."""
     for scalar in scalars:

@@ -16,9 +16,7 @@ from numpyro import distributions as dist
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.batch_engine import BatchEngine, engine_key, make_engine
-from polar_bayes.inference.batch_laplace import PixelLaplace
-from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit, random_keys
+from polar_bayes.inference.batch_fit import BatchFit, random_keys
 from polar_bayes.inference.batching import (
     IMAGE,
     MIN_VIEWS,
@@ -30,8 +28,12 @@ from polar_bayes.inference.batching import (
     cut,
     empty_outcome,
 )
+from polar_bayes.inference.compiled_model import CompiledModel, compile_layout, layout_key
+from polar_bayes.inference.corrected_laplace import CorrectedLaplace
+from polar_bayes.inference.method import AbstractBatchMethod, find_method, name_of
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LEVELS, Marginals
+from polar_bayes.inference.registry import MAP_DEFAULT
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.inference.shared import (
@@ -84,7 +86,7 @@ def fit_pixels(
     capture: xr.Dataset,
     *,
     model: str | Callable = "per_material",
-    method: AbstractPixelMethod | None = None,
+    method: str | AbstractBatchMethod | None = None,
     scene: str | Scene | None = None,
     priors: Mapping[str, dist.Distribution] | None = None,
     links: AbstractLink | Mapping[str, AbstractLink] | None = None,
@@ -96,19 +98,19 @@ def fit_pixels(
 ) -> xr.Dataset:
     """Fit every pixel of an image by itself.
 
-    Each pixel is the fit that `polar_bayes.fit` makes of it, by the normal approximation at its
-    mode unless `method` says otherwise: the same model, priors and links. Parameters in `shared`
-    are one unknown of the whole image: their posterior, estimated from 512 pixels drawn at random,
-    is the prior of every pixel. A map has the marginals of each pixel, from which
+    Each pixel is the fit that `polar_bayes.fit` makes of it, by the Laplace approximation at its
+    mode, corrected, unless `method` says otherwise: the same model, priors and links. Parameters in
+    `shared` are one unknown of the whole image: their posterior, estimated from 512 pixels drawn at
+    random, is the prior of every pixel. A map has the marginals of each pixel, from which
     `maps.region_means` tells means and contrasts of regions.
 
     Args:
         capture: A capture with dims y and x. In chunks (Dask), it is read block by block, and the
             maps come in the same chunks, computed when they are asked for.
         model: See `polar_bayes.fit`; the other arguments too.
-        method: By default `PixelLaplace()`.
-            `PixelSMC()` explores all modes of a pixel, at many times the cost; `PixelNuts()` runs
-            chains in each.
+        method: "corrected-laplace" by default. "importance" explores all modes of every pixel, at
+            many times the cost; "laplace" checks nothing; other methods of `polar_bayes.fit` fit
+            one pixel after another. Or settings, such as `pb.methods.CorrectedLaplace(draws=512)`.
         scene: A name in `SETUPS` or a `Scene`.
         priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
         links: One link for the polarization, or a mapping from variable to link.
@@ -155,7 +157,7 @@ class MapPlan:
 
     key: str  # that of the compiled programs; plans with the same key are equal
     request: Request = dataclasses.field(compare=False)
-    settings: AbstractPixelMethod
+    settings: AbstractBatchMethod
     intensity_unit: float | None = dataclasses.field(compare=False)
     own_directions: frozenset[str] = dataclasses.field(compare=False)
     shared: tuple[SharedParameter, ...] = ()
@@ -165,7 +167,7 @@ class MapPlan:
     def sharing(self, names: Sequence[str]) -> "MapPlan":
         """The same request, where pixels share these parameters."""
         own, no_unit = sorted(self.own_directions), self.intensity_unit is None
-        key = engine_key(self.request, own, no_unit, tuple(names))
+        key = layout_key(self.request, own, no_unit, tuple(names))
         shared = tuple(of_priors(names, self.request.priors))
         return dataclasses.replace(self, key=key, shared=shared)
 
@@ -191,14 +193,14 @@ class MapPlan:
             return batch_pixels(self.observe(validate(image)), self.own_directions)
 
     @property
-    def engine(self) -> BatchEngine:
+    def engine(self) -> CompiledModel:
         """The compiled programs, made at first use in each process."""
 
         def pixel() -> Observations:
             with jax.enable_x64(True):
                 return self.observe(self.request.capture)
 
-        return make_engine(self.key, self.request, pixel)
+        return compile_layout(self.key, self.request, pixel)
 
     @property
     def axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
@@ -216,7 +218,7 @@ class MapPlan:
 def plan_map(
     capture: xr.Dataset,
     model: str | Callable,
-    method: AbstractPixelMethod | None,
+    method: str | AbstractBatchMethod | None,
     scene: str | Scene | None,
     priors: Mapping[str, dist.Distribution] | None,
     links: AbstractLink | Mapping[str, AbstractLink] | None,
@@ -226,10 +228,7 @@ def plan_map(
     shared: str | Sequence[str] | None = None,
 ) -> MapPlan:
     """Check the request of a map on one of its pixels."""
-    settings = PixelLaplace() if method is None else method
-    if not isinstance(settings, AbstractPixelMethod):
-        hint = "give settings such as PixelLaplace(draws=512) or PixelSMC()"
-        raise FitError(f"{method!r} is no method for pixels", where="fit_pixels: method", hint=hint)
+    settings = find_method(MAP_DEFAULT if method is None else method, "fit_pixels", many=True)
     missing = [dim for dim in IMAGE if dim not in capture.dims]
     if missing:
         what = f"it has no axis {' or '.join(missing)}"
@@ -276,9 +275,7 @@ def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     """The plan with the posterior of what pixels share, from some of them drawn at random."""
     request, settings = plan.request, plan.settings
     pixels = plan.pixels(_random_pixels(capture, request.seed, SHARED_PIXELS))
-    method = PixelLaplace()
-    if isinstance(settings, PixelLaplace) and settings.weighted:
-        method = settings
+    method = settings if isinstance(settings, CorrectedLaplace) else CorrectedLaplace()
     given = plan.engine, pixels, method, request.priors, plan.shared, request.seed
     try:
         found = estimate_shared(*given)
@@ -371,8 +368,7 @@ def provenance_json(plan: MapPlan) -> str:
     request = plan.request
     provenance = {
         **request.describe(),
-        "method": "pixels",
-        "fitted_by": type(plan.settings).__name__,
+        "method": name_of(plan.settings),
         "settings": dataclasses.asdict(plan.settings),
         "fixed": request.fixed,
         "swapped": list(request.swapped),

@@ -29,9 +29,9 @@ from jaxtyping import Array, Float
 from numpyro import distributions as dist
 from scipy import special
 
-from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batching import AnyArray, batched
 from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
 from polar_bayes.physics.geometry import Geometry
@@ -188,7 +188,7 @@ class Fitted(NamedTuple):
     """Change of each noise-free reading with one posterior sd, in units of its noise."""
 
 
-def fitted_readings(engine: BatchEngine, names: tuple[str, ...]) -> JitOnce:
+def fitted_readings(engine: CompiledModel, names: tuple[str, ...]) -> JitOnce:
     """The program of the readings of one pixel at its mode, and of what changes them."""
     program = engine.single_program
 

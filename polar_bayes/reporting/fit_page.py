@@ -36,6 +36,7 @@ from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.checks import CAUTION, PROBLEM
 from polar_bayes.inference.files import auto_sentences
 from polar_bayes.inference.psis import MAX_PARETO_K
+from polar_bayes.inference.registry import METHODS
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
@@ -52,14 +53,6 @@ INSTRUMENT_GROUP = "Instrument and noise"
 TRUTH = "true value"
 """A column that is left out where no true value is known."""
 
-METHODS = {
-    "nuts": "NUTS",
-    "laplace": "Laplace approximation",
-    "importance": "Laplace approximation with importance weights",
-    "tempered": "tempered sequential Monte Carlo",
-    "variational": "variational guide",
-    "point": "least squares",
-}
 SCALES = {
     "log": "on the scale of its logarithm",
     "log odds": "on the scale of its log odds",
@@ -184,7 +177,7 @@ def fit_page(result: xr.DataTree) -> page.Page:
         Section("accuracy", "Accuracy against time", _accuracy(result)),
         Section("provenance", "Provenance", [*provenance_facts(fit.provenance), *source]),
     ]
-    method = METHODS.get(fit.method, one_line(fit.method))
+    method = METHODS[fit.method].label if fit.method in METHODS else one_line(fit.method)
     swapped = text.swapped_sentence(fit.provenance)
     return page.Page(
         kind="Fit report",

@@ -16,6 +16,7 @@ from polar_bayes.diagnostics.coverage import BLOCK, INTERVALS, map_coverage, map
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, cut
+from polar_bayes.inference.registry import MAP_DEFAULT, METHODS
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.lazy import (
     COPY,
@@ -213,17 +214,11 @@ def count_cases(maps: xr.Dataset) -> pd.DataFrame:
 # --- The page -------------------------------------------------------------------------------------
 
 TRUST = ("pareto_k", "approach", "status")
+UNCHECKED = "laplace"
+"""The method whose draws nothing checks in a map."""
+
 MAX_COLUMNS = 4
 """Parameters of one figure: more would be too small to read."""
-
-UNCORRECTED = "bare normal approximation of each pixel"
-FITTED_BY = {
-    "PixelLaplace": "normal approximation of each pixel, checked and corrected",
-    "PixelSMC": "tempered sequential Monte Carlo in each pixel",
-    "PixelNuts": "NUTS in each pixel",
-    "PixelImportance": "importance sampling from mixtures in each pixel",
-    "PixelByPixel": "a method of one capture in each pixel",
-}
 
 
 def map_page(
@@ -238,8 +233,8 @@ def map_page(
     maps, provenance = ensure_loaded(maps), provenance_of(maps)
     counts = count_cases(maps)
     headline, passed = text.map_headline(counts)
-    is_weighted = _is_weighted(provenance, default=True)
-    method = FITTED_BY[provenance.get("fitted_by", "PixelLaplace")] if is_weighted else UNCORRECTED
+    name = str(provenance.get("method", MAP_DEFAULT))
+    method = METHODS[name].label if name in METHODS else one_line(name)
     size = " x ".join(f"{maps.sizes[dim]:,}" for dim in IMAGE)
     sentences = [
         *text.pixel_sentences(counts),
@@ -271,7 +266,7 @@ def map_page(
         passed=passed,
         sentences=sentences,
         cautions=[
-            *([] if is_weighted else [page.caption("map.unchecked")]),
+            *([page.caption("map.unchecked")] if name == UNCHECKED else []),
             *shared_cautions(maps),
         ],
         sections=sections,
@@ -287,14 +282,9 @@ def _check_uncorrected(maps: xr.Dataset, truth: xr.Dataset | None, uncorrected: 
     map_scalars(uncorrected)
     if any(uncorrected.sizes[dim] != maps.sizes[dim] for dim in IMAGE):
         raise FitError("it is of another image", where=where, hint="map the same capture")
-    if _is_weighted(provenance_of(uncorrected), default=False):
-        hint = "make it with PixelLaplace(weighted=False)"
+    if provenance_of(uncorrected).get("method") != UNCHECKED:
+        hint = "make it with method='laplace'"
         raise FitError("it was corrected as well", where=where, hint=hint)
-
-
-def _is_weighted(provenance: Mapping[str, Any], *, default: bool) -> bool:
-    """Whether the approximation was checked and corrected by weights."""
-    return bool((provenance.get("settings") or {}).get("weighted", default))
 
 
 def _name(maps: xr.Dataset, provenance: Mapping[str, Any], truth: xr.Dataset | None) -> str:

@@ -69,7 +69,7 @@ def report(
         truth: Of maps: the simulated capture, whose `true_<parameter>` the intervals are checked
             against.
         uncorrected: Of maps, with `truth`: those of the same image by
-            `PixelLaplace(weighted=False)`, whose coverage is compared.
+            the Laplace approximation alone, whose coverage is compared.
         comparisons: Of a calibration: others of the same layout, by a name such as their method
             ("laplace"), with which it is compared.
 

@@ -24,6 +24,7 @@ from polar_bayes.diagnostics.predictive import PredictiveCheck
 from polar_bayes.errors import one_line
 from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.inference.psis import MAX_PARETO_K
+from polar_bayes.inference.registry import METHODS
 from polar_bayes.reporting.style import QUANTITIES, coordinate_labels, short_title
 from polar_bayes.results import MIN_GOOD_SHARE, verdict
 
@@ -133,22 +134,12 @@ EQUAL_WIDTHS = 0.05
 PLURALS = {"patch": "patches", "material": "materials"}
 HALF = 0.5
 
-METHODS = {
-    "nuts": "The fit",
-    "laplace": "The approximation",
-    "variational": "The guide",
-    "importance": "The weighted draws",
-    "tempered": "The tempered draws",
-    "point": "Least squares",
-}
-"""How a headline calls what each method computes; a method of the user's own is `The method`."""
-
 HELD, PRIOR = " held fixed", "prior of "
 
 
 def fit_headline(method: str, verdict: Verdict) -> str:
     """The verdict in one sentence."""
-    name = METHODS.get(method, "The method")
+    name = METHODS[method].subject if method in METHODS else "The method"
     if not verdict.converged:
         failed = "did not converge" if method == "nuts" else "failed"
         return f"{name} {failed}: do not use these numbers."
@@ -504,7 +495,6 @@ APPROACHES = {
     "importance": "weighted draws of normal approximations",
     "adapted": "a proposal fitted to its own draws and corrected by weights",
     "nuts": "sampling (NUTS)",
-    "tempered": "tempered draws",
     "variational": "a variational guide",
     "other": "a method of the user's own",
 }

@@ -35,7 +35,7 @@ from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.errors import FitError, SceneError, one_line
 from polar_bayes.inference.checks import NEAR_BOUND
 from polar_bayes.inference.fitting import fit_request
-from polar_bayes.inference.laplace import Importance
+from polar_bayes.inference.importance import Importance
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of

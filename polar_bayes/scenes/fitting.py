@@ -9,7 +9,7 @@ from numpyro import distributions as dist
 
 import polar_bayes.scenes  # its names load the comparison, and with it diagnostics, on first use
 from polar_bayes.capture.schema import validate
-from polar_bayes.inference.fitting import find_method, fit_request
+from polar_bayes.inference.fitting import choose_method, fit_request
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.links import AbstractLink
@@ -39,10 +39,9 @@ def fit(
         capture: A Dataset of the capture schema; validated here.
         model: A name in `polar_bayes.inference.request.MODELS` or a callable
             `model(data, scene, priors, links)`.
-        method: "nuts", "laplace", "point", "importance" (Laplace, its draws weighted by the
-            posterior), "tempered" (adaptive tempered SMC from the prior to the posterior; one
-            material in one color), "auto" (the cheapest of these that is good enough), or settings
-            such as `Nuts(draws=2000)`.
+        method: "nuts", "laplace", "point", "importance" (weighted draws of mixtures at all modes),
+            "auto" (the cheapest of these that is good enough), or settings such as
+            `Nuts(draws=2000)`. A name is the same algorithm in maps and calibrations.
         tolerance: Of "auto": largest error of a posterior mean or standard deviation, in posterior
             standard deviations, above 0 and at most 1; by default 0.1.
         seconds: Of "auto": wall time of the whole fit, by default 60. Only the first method always
@@ -74,7 +73,7 @@ def fit(
         FitError: A model, method, prior or link cannot be used, or the memory is too small.
     """
     start_time = time.perf_counter()
-    chosen, show = find_method(method, tolerance, seconds), progress or no_progress
+    chosen, show = choose_method(method, tolerance, seconds), progress or no_progress
     if isinstance(scene, str) and scene == "auto":
         arguments = polar_bayes.scenes.stacking.FitArguments(
             validate(capture), model, priors, links, largest_view_zenith, seed, precision

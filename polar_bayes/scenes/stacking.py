@@ -17,7 +17,7 @@ from polar_bayes.diagnostics.convergence import verdict
 from polar_bayes.diagnostics.parameters import SAMPLE_DIMS
 from polar_bayes.errors import FitError
 from polar_bayes.inference.fitting import fit_request, try_alternatives
-from polar_bayes.inference.laplace import Importance
+from polar_bayes.inference.importance import Importance
 from polar_bayes.inference.least_squares import Point
 from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.nuts import Nuts

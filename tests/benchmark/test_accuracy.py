@@ -210,14 +210,6 @@ def test_an_override_of_draws_turns_what_its_name_says_or_nothing():
         assert (changed is None) == (name in ("point", "nuts short"))  # no draws, or too few
         if changed is not None:
             assert changed[1].num_draws == pytest.approx(0.25 * method.num_draws, abs=1)
-    # A crowd and a half, of which half would be three quarters: fewer than the crowd.
-    few = pb.methods.Tempered(pb.methods.PixelSMC(draws=1536))
-    assert pb.benchmark.DrawsOverride(0.5).apply(request, few) is None
-    enough = pb.benchmark.DrawsOverride(0.5).apply(
-        request, pb.methods.Tempered(pb.methods.PixelSMC(draws=3072))
-    )
-    assert enough is not None
-    assert enough[1].num_draws == 3072
 
 
 @pytest.mark.thorough
@@ -233,10 +225,10 @@ def test_every_override_has_a_name_of_its_own():
 
 
 @pytest.mark.thorough
-def test_where_chains_miss_a_mode_tempered_draws_are_the_reference():
+def test_where_chains_miss_a_mode_weighted_draws_are_the_reference():
     request = resolve(capture(), squared, "paper", None, LINKS, 90.0, 0, "double")
     reference = run_reference(ROUGHLY, make_problem(request, jax.random.key(0)), jax.random.key(1))
-    assert reference.method == "tempered draws"
+    assert reference.method == "weighted draws"
     assert not reference.doubts
     # Its own error is that of the weights, too.
     assert (reference.mean_error > 1.1 * standard_errors(reference.draws)[0]).all()
@@ -269,7 +261,7 @@ def test_draws_chosen_by_weight_have_the_error_of_their_weights_too():
         weights = np.exp(-0.5 * z[:, 0] ** 2 * (1.0 - 1.0 / 1.5**2))
         weights /= weights.sum()
         chosen = z[systematic_resample(weights, 1.0 / np.sum(weights**2), random)]
-        found = PosteriorDraws("tempered", chosen, {}, weighted=(z, weights))
+        found = PosteriorDraws("importance", chosen, {}, weighted=(z, weights))
         mean, _ = found.standard_errors(lambda z: np.moveaxis(z, -1, 0))
         told.append(mean[0])
         seen.append(chosen.mean())
@@ -277,15 +269,6 @@ def test_draws_chosen_by_weight_have_the_error_of_their_weights_too():
     # worth at most 0.0245; the sd of 60 means is known to 9%.
     assert np.mean(told) == pytest.approx(np.hypot(0.0197, 0.0245), rel=0.05)
     assert np.std(seen) < (1.0 + 4 * 0.09) * np.mean(told)
-
-
-@pytest.mark.thorough
-def test_the_tempered_reference_draws_what_its_own_error_takes():
-    settings = pb.benchmark.Reference(error=0.02).tempered.settings
-    assert settings.effective_draws == pytest.approx(4.0 / 0.02**2)
-    least = 4 * settings.effective_draws
-    assert least <= settings.answer_draws < least + settings.num_particles
-    assert settings.num_particles == 8192
 
 
 @each(

@@ -17,20 +17,20 @@ import xarray as xr
 from cases import each
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture
-from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
 from polar_bayes import interrupts
 from polar_bayes.calibration import runner as module
-from polar_bayes.calibration.calibrate import METHODS, make_plan
+from polar_bayes.calibration.calibrate import make_plan
 from polar_bayes.inference.request import resolve
 from polar_bayes.maps.blocks import digest, locked_ledger
+from polar_bayes.models.per_material import per_material
 
 ASKED = {
     "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
     "scene": PLATE,
     "links": LINKS,
-    "method": "tempered",
+    "method": "importance",
 }
 COUNT = 40
 
@@ -45,7 +45,7 @@ def small_blocks():
     """Blocks of few fits; compilation is what they cost, so it is done in haste."""
     jax.config.update("jax_disable_most_optimizations", True)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(module, "BLOCK", 12)
+        patched.setattr(pb.methods.Importance, "group_size", 12)
         yield
     jax.config.update("jax_disable_most_optimizations", False)
 
@@ -136,7 +136,7 @@ def test_a_damaged_block_is_fitted_again(capture, whole, begun, tmp_path) -> Non
     ("other", "topic"),
     [
         ({"seed": 1}, "seed"),
-        ({"method": pb.methods.PixelSMC(num_chains=32)}, "method"),
+        ({"method": pb.methods.Importance(draws=512)}, "method"),
         ({"priors": {"refractive_index": dist.Uniform(1.2, 2.0 + 1e-9)}}, "priors"),
         ({"truth": {"priors": {"refractive_index": dist.Uniform(1.2, 2.0)}}}, "truth"),
         (
@@ -202,7 +202,7 @@ def test_a_damaged_ledger_is_refused_and_can_be_removed(capture, whole, begun, t
 def test_a_plan_that_was_sent_makes_the_same_block(capture, whole) -> None:
     """As a worker gets it."""
     request = resolve(capture, ASKED["model"], PLATE, None, LINKS, None, 0, "double")
-    plan = make_plan(request, None, METHODS["tempered"], True)
+    plan = make_plan(request, None, pb.methods.Importance(), True)
     sent = cloudpickle.loads(cloudpickle.dumps(plan))
     assert sent.key == plan.key
     found = module.fit_block(sent, np.array([17, 3]))
@@ -228,7 +228,7 @@ import json
 import numpy as np
 import numpyro.distributions as dist
 from plates import plate_capture
-from polar_bayes.calibration.calibrate import METHODS, make_plan
+from polar_bayes.calibration.calibrate import make_plan
 from polar_bayes.calibration.runner import fingerprint_of
 from polar_bayes.inference.request import resolve
 from test_resuming import ASKED
@@ -237,7 +237,7 @@ priors = {"refractive_index": dist.TruncatedNormal(1.5, 0.1, low=1.2)}
 asked = {**ASKED, "priors": priors}
 asked = [asked.get(name) for name in ("scene", "priors", "links")]
 request = resolve(capture, ASKED["model"], *asked, None, 0, "double")
-print(json.dumps(fingerprint_of(make_plan(request, None, METHODS["tempered"], True))))
+print(json.dumps(fingerprint_of(make_plan(request, None, pb.methods.Importance(), True))))
 """
 
 

@@ -8,6 +8,7 @@ from cases import each
 
 import polar_bayes as pb
 from polar_bayes.cli import main
+from polar_bayes.inference import method
 
 
 def test_simulate_writes_what_fit_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -38,10 +39,8 @@ def test_the_table_has_a_row_per_parameter(
 def test_a_fit_whose_diagnostics_fail_is_written_and_exits_with_2(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:
-    from polar_bayes.inference import fitting
-
     short = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
-    monkeypatch.setitem(fitting.METHODS, "nuts", lambda: short)
+    monkeypatch.setattr(method, "make_method", lambda name: short)
     out = tmp_path / "fit.nc"
     assert main(["fit", str(plate), "--scene", "picture", "--out", str(out)]) == 2
     assert "problem: " in capsys.readouterr().err
@@ -178,8 +177,8 @@ WRONG = {
     "no image": (["map", "nowhere.zarr", "--out", "OUT"], "nowhere.zarr: there is no such store"),
     "draws": (["map", "PLATE", "--draws", "5", "--out", "OUT"], "draws is 5; give 64, 128"),
     "draws of what": (
-        ["map", "PLATE", "--method", "tempered", "--draws", "256", "--out", "OUT"],
-        "--draws needs --method laplace",
+        ["map", "PLATE", "--method", "importance", "--draws", "256", "--out", "OUT"],
+        "--draws needs --method corrected-laplace",
     ),
     "report of a capture": (["report", "PLATE", "--out", "OUT"], "it holds no result"),
     "preset": (["simulate", "--preset", "x", "--out", "OUT"], "no such material"),

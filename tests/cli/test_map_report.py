@@ -19,7 +19,7 @@ from polar_bayes.maps.fit_map import blank
 def files(tmp_path: Path) -> Path:
     mean = {"roughness": np.full((4, 5), 0.5)}
     make_maps(mean).to_zarr(tmp_path / "map.zarr", consolidated=False)
-    make_maps(mean, weighted=False).to_zarr(tmp_path / "bare.zarr", consolidated=False)
+    make_maps(mean, method="laplace").to_zarr(tmp_path / "bare.zarr", consolidated=False)
     truth = xr.Dataset({"true_roughness": 0.5}, attrs={"name": "leaf"})
     truth.to_zarr(tmp_path / "leaf.zarr", consolidated=False)
     return tmp_path

@@ -120,16 +120,15 @@ def test_a_demo_writes_in_no_folder_of_anothers(held, plate, tmp_path, capsys):
 
 
 def test_names_of_options_are_those_of_the_tables():
-    from polar_bayes.calibration.calibrate import METHODS as CALIBRATION_METHODS
-    from polar_bayes.inference.fitting import METHODS
+    from polar_bayes.inference.registry import method_names
     from polar_bayes.inference.request import MODELS
 
     known = {
         cli_options.MODEL: MODELS,
         cli_options.SCENE: pb.setups.SETUPS,
         cli_options.MATERIAL: pb.simulation.PRESETS,
-        cli_options.FIT_METHOD: METHODS,
-        cli_options.CALIBRATION_METHOD: CALIBRATION_METHODS,
+        cli_options.FIT_METHOD: method_names(one=True),
+        cli_options.MANY_METHOD: method_names(many=True),
         cli_options.STUDY_METHOD: pb.methods.STUDY_METHODS,
     }
     for kind, table in known.items():

@@ -11,10 +11,10 @@ import pytest
 from cases import each
 from numpyro import distributions as dist
 from numpyro.infer.util import log_density
-from polar_bayes.models.per_material import per_material
 from synthetic_observations import make_observations
 
 from polar_bayes.errors import FitError
+from polar_bayes.models.per_material import per_material
 from polar_bayes.observation import links
 from polar_bayes.observation.data import observe
 from polar_bayes.observation.links import (

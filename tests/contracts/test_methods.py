@@ -14,9 +14,6 @@ LINKS = {"q": pb.links.StokesLink()}
 METHODS = {
     "laplace": pb.methods.Laplace(draws=1000),
     "importance": pb.methods.Importance(),
-    "tempered": pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)),
-    "normal guide": pb.methods.NormalGuide(steps=400, draws=1000),
-    "flow guide": pb.methods.FlowGuide(steps=400, draws=1000),
     "nuts": pb.methods.Nuts(effective_draws=2000.0),
 }
 QUICK = ("laplace", "importance", "nuts")
@@ -31,12 +28,12 @@ def fit(method: object) -> xr.DataTree:
     [name if name in QUICK else pytest.param(name, marks=pytest.mark.thorough) for name in METHODS],
 )
 def test_every_method_finds_a_normal_posterior(name: str, tmp_path) -> None:
-    """Within five standard errors; variational guides stop close to their optimum."""
+    """Within five standard errors."""
     result = fit(METHODS[name])
     assert pb.verdict(result).converged  # of the model itself these few readings may say anything
     mean, covariance = of_line(capture()["q"].to_numpy())
     rows = pb.diagnostics.json_summary(result)["parameters"]
-    slack = 5.0 / np.sqrt(400.0) + (0.05 if "guide" in name else 0.0)
+    slack = 5.0 / np.sqrt(400.0)
     for number, parameter in enumerate(("level", "slope")):
         sd = np.sqrt(covariance[number, number])
         assert abs(rows[parameter]["mean"] - mean[number]) < slack * sd

@@ -6,12 +6,12 @@ import pytest
 import xarray as xr
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture
-from polar_bayes.models.per_material import per_material
 from scipy.special import polygamma
 from textbook import plate_q
 
 import polar_bayes as pb
 from polar_bayes.design.fisher import positive_definite
+from polar_bayes.models.per_material import per_material
 
 ASKED = {
     "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),

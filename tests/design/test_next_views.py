@@ -20,11 +20,11 @@ from design_lines import (
 from numpyro import distributions as dist
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture
-from polar_bayes.models.per_material import per_material
 from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.design.optimal_design import fedorov_exchange
+from polar_bayes.models.per_material import per_material
 
 START = np.array([40.0, 50.0])
 GRID = np.linspace(10.0, 80.0, 8)

@@ -274,7 +274,7 @@ def test_a_guide_is_judged_by_its_weights_as_laplace_is() -> None:
     assert "Leave-one-out cannot be approximated" in lost
     assert "Pareto k-hat of the guide's draws is" in caution
     # Weights of draws that were chosen by weight are another matter.
-    assert not verdict(edit_provenance(tree, method="tempered")).cautions
+    assert not verdict(edit_provenance(tree, method="importance")).cautions
 
 
 @pytest.mark.thorough
@@ -338,7 +338,7 @@ def test_what_is_no_result_is_refused(wrong: object) -> None:
         summary(wrong)
 
 
-@each("method", ["importance", "tempered"])
+@each("method", ["importance"])
 def test_weighted_draws_have_the_floor_of_chains(method: str) -> None:
     for effective, is_enough in ((399.0, False), (401.0, True)):
         judged = verdict(edit_provenance(make_result(method=method), effective_draws=effective))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from cases import each
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polar_bayes.errors import CaptureError
@@ -108,6 +108,7 @@ def test_readings_that_are_not_valid_are_not_looked_at(write):
     assert capture["valid"].values.tolist() == [False, True]
 
 
+@settings(deadline=None)  # a machine may be busy
 @given(st.data())
 def test_the_order_of_lines_changes_nothing(tmp_path_factory, data):
     """Of directions that are read once at each wavelength."""

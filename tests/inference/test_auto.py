@@ -18,7 +18,6 @@ from toy_models import capture, funnel, line, of_line
 
 import polar_bayes as pb
 from polar_bayes.inference import fitting
-from polar_bayes.inference.auto import _compiled_first
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.request import resolve
@@ -301,11 +300,7 @@ def test_comparisons_that_are_stuck_are_abandoned_and_told():
 @pytest.mark.thorough
 def test_tolerances_that_weighted_draws_cannot_meet_are_left_to_chains():
     here = problem(line)
-    assert list(pb.methods.Auto(tolerance=0.03).candidates(here)) == [
-        "importance",
-        "tempered",
-        "nuts",
-    ]
+    assert list(pb.methods.Auto(tolerance=0.03).candidates(here)) == ["importance", "nuts"]
     assert list(pb.methods.Auto(tolerance=0.01).candidates(here)) == ["nuts"]
 
 
@@ -352,21 +347,6 @@ def test_of_a_funnel_no_draws_are_taken_that_are_worse_than_they_say(seed):
 def test_what_cannot_be_asked_is_refused(asked, said):
     with pytest.raises(pb.FitError, match=said):
         pb.fit(capture(), model=line, links=LINKS, **asked)
-
-
-@pytest.mark.thorough
-def test_chains_come_before_tempered_draws_that_must_still_compile() -> None:
-    """And after them once they are compiled, as by an earlier fit of this layout."""
-    here = problem(line)
-    tempered = pb.methods.Tempered(pb.methods.PixelSMC(draws=1024, effective_draws=100.0))
-    rungs = {"importance": Made(), "tempered": tempered, "nuts": Made()}
-    assert [name for name, _ in _compiled_first(list(rungs.items()), here)] == [
-        "importance", "nuts", "tempered"
-    ]  # fmt: skip
-    tempered.run(here, KEY, no_progress)
-    assert list(_compiled_first(list(rungs.items()), here)) == list(rungs.items())
-    other = dataclasses.replace(tempered, settings=pb.methods.PixelSMC())
-    assert not other.is_compiled(here)
 
 
 def test_each_of_several_methods_is_tried_once_more_with_more_draws() -> None:

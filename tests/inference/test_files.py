@@ -436,7 +436,7 @@ def _with_draws(method, name, values, **provenance):
 
 
 @pytest.mark.thorough
-@each("method", ["nuts", "laplace", "importance", "tempered"])
+@each("method", ["nuts", "laplace", "importance"])
 def test_draws_that_are_all_equal_are_a_problem(method):
     kind = "nuts" if method == "nuts" else "laplace"
     judged = pb.verdict(edit_provenance(_with_draws(kind, "roughness", 0.2), method=method))

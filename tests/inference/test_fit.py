@@ -246,7 +246,10 @@ def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:
     ("settings", "says"),
     [
         ({"model": "per_leaf"}, r"model='per_leaf': no such model; give one of per_material"),
-        ({"method": "magic"}, r"method='magic': no such method; give one of nuts, laplace, point"),
+        (
+            {"method": "magic"},
+            r"method='magic': no such method; give one of point, laplace, importance",
+        ),
         (
             {"scene": "moon"},
             r"scene='moon': no such scene; give one of paper, camera, picture, goniometer",

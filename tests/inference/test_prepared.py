@@ -18,7 +18,6 @@ from compilations import compilations
 from numpyro import distributions as dist
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture, plates
-from polar_bayes.models.per_material import per_material
 from spectral_plates import spectral_plate
 
 import polar_bayes as pb
@@ -30,6 +29,7 @@ from polar_bayes.inference.optimize import ignore_line_search_warnings
 from polar_bayes.inference.problem import compile_model
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.inference.request import resolve
+from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import observe
 
 # The goals let chains of other readings stop at another length.

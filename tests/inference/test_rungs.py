@@ -12,7 +12,7 @@ import polar_bayes as pb
 from polar_bayes.benchmark.run import labeled, sample_point
 from polar_bayes.errors import FitError
 from polar_bayes.inference.auto import expected_error
-from polar_bayes.inference.laplace import tail_shares
+from polar_bayes.inference.importance import tail_shares
 from polar_bayes.inference.mcse import draws_needed, quantile
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import resolve
@@ -22,9 +22,6 @@ SMALL = {
     "point": pb.methods.Point(starts=2),
     "laplace": pb.methods.Laplace(draws=1000),
     "importance": pb.methods.Importance(),
-    "tempered": pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)),
-    "normal guide": pb.methods.NormalGuide(steps=400, draws=1000),
-    "flow guide": pb.methods.FlowGuide(steps=400, draws=1000),
     "nuts": pb.methods.Nuts(effective_draws=2000.0),
 }
 WITHOUT_PRIOR = {"point"}
@@ -75,12 +72,12 @@ def test_a_normal_posterior_is_found_by_every_rung(name):
     mean, covariance = of_line(capture()["q"].to_numpy())
     sd = np.sqrt(np.diagonal(covariance))
     flat = draws.reshape(2, -1)
-    # Five standard errors; the guides stop a little beside their optimum.
+    # Five standard errors.
     worth = min(found.effective_draws, flat.shape[1])
-    slack = 5.0 / np.sqrt(worth) + (0.05 if "guide" in name else 0.0)
+    slack = 5.0 / np.sqrt(worth)
     assert (np.abs(flat.mean(axis=1) - mean) / sd < slack).all()
     assert (np.abs(flat.std(axis=1) / sd - 1.0) < slack).all()
-    assert name == "flow guide" or not found.k_hat > 0.7  # tails of a flow are short
+    assert not found.k_hat > 0.7
     assert not found.r_hat > 1.01
 
 
@@ -107,10 +104,9 @@ def test_a_point_fit_has_the_width_of_its_standard_errors():
 
 
 @pytest.mark.thorough
-@each("name", ["importance", "tempered"])
-def test_both_modes_are_weighed_alike(name):
+def test_both_modes_are_weighed_alike():
     here = problem(squared)
-    found = run(SMALL[name], here)
+    found = run(SMALL["importance"], here)
     assert not found.problems
     _, draws = labeled(here, found.z)
     share = float(np.mean(draws[-1] > 0.0))  # the root is the last in the alphabet
@@ -203,28 +199,14 @@ def test_draws_are_scaled_and_settings_kept():
     chains = pb.methods.Nuts(warmup=77).scale_draws(2.0)
     assert (chains.draws, chains.most_draws, chains.effective_draws) == (1000, 16000, 900.0)
     assert chains.warmup == 77
-    tempered = pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)).scale_draws(4.0).settings
-    assert (tempered.draws, tempered.effective_draws) == (16384, 1600.0)
-    assert pb.methods.Tempered(tempered).num_draws == tempered.answer_draws == 32768
-    fewer = pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)).scale_draws(0.25).settings
-    assert (fewer.draws, fewer.effective_draws) == (1024, 100.0)
-    with pytest.raises(FitError, match="512 draws are fewer than the 2048 particles"):
-        pb.methods.Tempered(pb.methods.PixelSMC(draws=1024)).scale_draws(0.25)
     assert pb.methods.Point().scale_draws(2.0) is None
 
 
 @pytest.mark.thorough
-def test_tempered_answers_have_as_many_draws_as_are_asked_for():
-    settings = pb.methods.PixelSMC()
-    for count, draws in ((1.0, 2048), (2048, 2048), (2049, 2050), (5000, 5000)):
-        assert pb.methods.Tempered(settings).with_draws(count).num_draws == draws
+def test_the_automatic_choice_asks_for_as_many_draws_as_it_needs():
     auto, here = pb.methods.Auto(tolerance=0.1), problem(line)
     needed = draws_needed(0.1, 2)
     rungs = auto.candidates(here)
-    assert (
-        8 * needed <= rungs["tempered"].settings.answer_draws < 8 * needed + settings.num_particles
-    )
-    assert rungs["tempered"].settings.effective_draws == needed
     assert rungs["importance"].draws == 16 * needed
 
 
@@ -233,8 +215,8 @@ def test_tempered_answers_have_as_many_draws_as_are_asked_for():
     [
         (lambda: pb.methods.Importance(draws=10), "draws is 10"),
         (lambda: pb.methods.Importance(rounds=0), "rounds is 0"),
-        (lambda: pb.methods.NormalGuide(steps=1), "steps is 1"),
-        (lambda: pb.methods.FlowGuide(learning_rate=0.0), "learning_rate 0.0"),
+        (lambda: pb.methods.Laplace(draws=10), "draws is 10"),
+        (lambda: pb.methods.CorrectedLaplace(draws=100), "draws is 100"),
     ],
 )
 def test_settings_out_of_range_are_refused(make, said):

@@ -11,12 +11,12 @@ from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.reparam import LocScaleReparam
 from plates import LINKS, PLATE, plate_capture
-from polar_bayes.models.hierarchical import Hierarchical
-from polar_bayes.models.per_material import per_material
-from polar_bayes.models.sites import declare_readings
 
 import polar_bayes as pb
 from polar_bayes.inference.result import provenance_of
+from polar_bayes.models.hierarchical import Hierarchical
+from polar_bayes.models.per_material import per_material
+from polar_bayes.models.sites import declare_readings
 
 MODELS = Path(__file__).parents[2] / "models"
 FEW = pb.methods.Laplace(draws=100, chains=2)

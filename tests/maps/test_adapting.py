@@ -6,8 +6,8 @@ from cases import each
 from plate_images import NAMES, VIEWS, mapped, on_a_grid, planned, plate_image
 from scipy import stats
 
-from polar_bayes.inference.batch_laplace import PixelLaplace
 from polar_bayes.inference.batching import MethodUsed, Status
+from polar_bayes.inference.corrected_laplace import CorrectedLaplace
 from polar_bayes.inference.proposals import PROPOSAL_DEGREES_OF_FREEDOM as DEGREES_OF_FREEDOM
 from polar_bayes.inference.proposals import Points, Proposal, fit_t, normal_points, student_t_points
 
@@ -75,7 +75,7 @@ def test_draws_without_a_volume_propose_nothing() -> None:
 @pytest.mark.thorough
 def test_where_a_normal_distribution_fails_the_posterior_of_a_grid_is_found() -> None:
     """Largest error of 4 Monte Carlo errors: 6e-5 a comparison, 1e-3 over all of them."""
-    method = PixelLaplace(sampler=None)
+    method = CorrectedLaplace(sampler=None)
     maps = mapped(WEAK, planned(WEAK, method))
     adapted = np.argwhere((maps["approach"] == MethodUsed.ADAPTED).values)
     assert len(adapted) >= 3

@@ -31,8 +31,8 @@ pb.maps.map_file(
     resume=resume == "resume",
     scheduler=scheduler if scheduler != "none" else None,
     progress=lambda done, every: print(done, flush=True),
-    method=pb.methods.PixelLaplace(
-        draws=64, sampler=pb.methods.PixelNuts(warmup=20, draws=50, largest_r_hat=9.0)
+    method=pb.methods.CorrectedLaplace(
+        draws=64, sampler=pb.methods.Nuts(warmup=50, draws=50, most_draws=50)
     ),
     **ASKED,
 )

@@ -24,7 +24,7 @@ from polar_bayes.reporting.report import render
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
-METHOD = pb.methods.PixelLaplace(sampler=None)
+METHOD = pb.methods.CorrectedLaplace(sampler=None)
 KNOWN = {**ASKED, "method": METHOD}
 INFERRED = {**KNOWN, "model": "per_material"}
 """Where the stated errors are taken as they are, and where pixels infer by what factor they err."""

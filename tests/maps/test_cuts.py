@@ -9,15 +9,15 @@ import xarray as xr
 from cases import each
 from plate_images import ASKED, NAMES, mapped, planned, plate_image
 
-from polar_bayes.inference.batch_laplace import PixelLaplace
-from polar_bayes.inference.batch_nuts import PixelNuts
+import polar_bayes as pb
+from polar_bayes.inference.batch_fit import random_keys
 from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.maps import fit_map as verb
 from polar_bayes.maps.fit_map import MapPlan, fit_block, fit_pixels, with_pixel_numbers
 
 # Chains too short to be believed are as good as any to compare bits.
-SHORT = PixelLaplace(
-    draws=64, candidates=8, rounds=1, sampler=PixelNuts(warmup=20, draws=50, largest_r_hat=9.0)
+SHORT = pb.methods.CorrectedLaplace(
+    draws=64, candidates=8, rounds=1, sampler=pb.methods.Nuts(warmup=50, draws=50, most_draws=50)
 )
 
 
@@ -176,3 +176,10 @@ def test_another_seed_moves_draws_not_modes(image: xr.Dataset, whole: xr.Dataset
     sd = other[f"{name}_sd"].values[there]
     # 64 weighted points in mirrored pairs; independent draws would scatter by 0.125 sd.
     assert (np.abs(one - two) < 4.0 * 0.125 * 2.0**0.5 * sd).all()
+
+
+def test_keys_differ_by_number_and_by_seed() -> None:
+    numbers = np.array([0, 1, 2**31, 10**8])
+    one = random_keys(0, numbers)
+    assert len({tuple(key) for key in (*one, *random_keys(1, numbers))}) == 8
+    assert (random_keys(0, numbers[::-1]) == one[::-1]).all()

@@ -13,12 +13,12 @@ from cases import each
 from numpyro import handlers
 from plate_images import ASKED, plate_image
 from plates import PLATE
-from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
 from polar_bayes.inference.levenberg_marquardt import exact_derivatives, scoring_derivatives
 from polar_bayes.inference.program import Program, compile_program
 from polar_bayes.inference.request import resolve
+from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import Observations, observe
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")

@@ -1,4 +1,4 @@
-"""Maps by other ways than one mode: tempered draws and chains in every pixel."""
+"""Maps by other ways than one mode: weighted draws of mixtures and chains in every pixel."""
 
 import json
 from pathlib import Path
@@ -10,16 +10,14 @@ from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, planned, plate_i
 from toy_models import BEND, bent, squared
 
 import polar_bayes as pb
-from polar_bayes.inference import batch_importance
-from polar_bayes.inference.batch_method import AbstractPixelMethod
+from polar_bayes.inference import importance
 from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.levenberg_marquardt import find_conditional_modes
+from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.reporting.text import APPROACHES
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
-
-TEMPERING = pb.methods.PixelSMC(num_chains=64, draws=256, effective_draws=100.0)
 
 
 @pytest.fixture(scope="module")
@@ -28,49 +26,33 @@ def image() -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
-def tempered(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
-    return pb.fit_pixels(image, method=TEMPERING, **ASKED)
+def weighted(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
+    return pb.fit_pixels(image, method="importance", **ASKED)
 
 
 @pytest.mark.thorough
-def test_tempered_maps_are_those_of_a_grid(image: xr.Dataset, tempered: xr.Dataset) -> None:
-    assert (tempered["status"] == Status.GOOD).all()
-    assert (tempered["approach"] == MethodUsed.TEMPERED).all()
-    apart = []
-    for y, x in np.ndindex(3, 4):
-        truth = on_a_grid(image["q"].values[y, x], NOISE, VIEWS)
-        for name in NAMES:
-            mean, sd, _ = truth[name]
-            error = sd / np.sqrt(tempered["effective_draws"].values[y, x])
-            apart.append((tempered[name].values[y, x] - mean) / error)
-    # 24 standard normals, in pairs that depend on each other: the largest is above 4 in fewer than
-    # two of a thousand cases.
-    assert np.abs(apart).max() < 4.0
-
-
-@pytest.mark.thorough
-def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, tempered: xr.Dataset) -> None:
-    chains = pb.fit_pixels(image.isel(y=[0], x=[0, 1]), method=pb.methods.PixelNuts(), **ASKED)
+def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, weighted: xr.Dataset) -> None:
+    chains = pb.fit_pixels(image.isel(y=[0], x=[0, 1]), method=pb.methods.Nuts(), **ASKED)
     assert (chains["approach"] == MethodUsed.NUTS).all()
     assert (chains["status"] == Status.GOOD).all()
     for name in NAMES:
-        one, other = chains[name].values[0], tempered[name].values[0, :2]
+        one, other = chains[name].values[0], weighted[name].values[0, :2]
         worth = 1.0 / chains["effective_draws"].values[0]
-        worth += 1.0 / tempered["effective_draws"].values[0, :2]
+        worth += 1.0 / weighted["effective_draws"].values[0, :2]
         # Four standard normals, in two pairs: the largest is above 4 in 3 of ten thousand cases.
-        error = tempered[f"{name}_sd"].values[0, :2] * np.sqrt(worth)
+        error = weighted[f"{name}_sd"].values[0, :2] * np.sqrt(worth)
         assert (np.abs(one - other) < 4.0 * error).all()
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        pb.methods.PixelByPixel(pb.methods.Importance(draws=1024)),
-        pb.methods.PixelImportance(draws=1024),
-    ],
-    ids=["a method of one capture", "all pixels at once"],
-)
-def test_importance_sampling_makes_a_map(image: xr.Dataset, method: AbstractPixelMethod) -> None:
+class OneByOne(pb.methods.Importance):
+    """The same settings, for one pixel after another."""
+
+    fit = AbstractMethod.fit
+
+
+@pytest.mark.parametrize("kind", [OneByOne, pb.methods.Importance])
+def test_importance_sampling_makes_a_map(image: xr.Dataset, kind: type) -> None:
+    method = kind(draws=1024)
     some = image.isel(y=[0, 1], x=[0, 1])
     maps = pb.fit_pixels(some, method=method, **ASKED)
     assert (maps["status"] == Status.GOOD).all()
@@ -93,8 +75,8 @@ def test_a_pixel_without_a_mode_is_searched_by_the_method_of_one_capture(
     image: xr.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = image.isel(y=[0], x=[0])
-    monkeypatch.setattr(batch_importance, "find_all_modes", lambda *_: (np.zeros(0, int), None))
-    maps = pb.fit_pixels(one, method=pb.methods.PixelImportance(draws=1024), **ASKED)
+    monkeypatch.setattr(importance, "find_all_modes", lambda *_: (np.zeros(0, int), None))
+    maps = pb.fit_pixels(one, method=pb.methods.Importance(draws=1024), **ASKED)
     assert (maps["status"] == Status.GOOD).all()
     mean, sd, _ = on_a_grid(one["q"].values[0, 0], NOISE, VIEWS)[NAMES[0]]
     error = sd / np.sqrt(float(maps["effective_draws"][0, 0]))
@@ -124,7 +106,7 @@ def test_a_second_mode_that_another_start_finds_is_not_left_out(image: xr.Datase
     asked = ASKED | {"model": squared}
     one = pb.fit_pixels(positive, **asked)
     assert (one["approach"] == MethodUsed.IMPORTANCE).all()
-    maps = pb.fit_pixels(positive, method=pb.methods.PixelLaplace(starts=4), **asked)
+    maps = pb.fit_pixels(positive, method=pb.methods.CorrectedLaplace(starts=4), **asked)
     assert (maps["status"] == Status.GOOD).all()
     for x in range(3):
         error = 0.6 / np.sqrt(float(maps["effective_draws"][0, x]))
@@ -134,19 +116,19 @@ def test_a_second_mode_that_another_start_finds_is_not_left_out(image: xr.Datase
 
 
 @pytest.mark.thorough
-def test_the_map_says_how_it_was_made(tempered: xr.Dataset, tmp_path: Path) -> None:
-    assert json.loads(tempered.attrs[PROVENANCE])["fitted_by"] == "PixelSMC"
-    page = pb.report(tempered, tmp_path / "report").read_text()
-    assert "tempered sequential Monte Carlo in each pixel" in page
+def test_the_map_says_how_it_was_made(weighted: xr.Dataset, tmp_path: Path) -> None:
+    assert json.loads(weighted.attrs[PROVENANCE])["method"] == "importance"
+    page = pb.report(weighted, tmp_path / "report").read_text()
+    assert "importance sampling from mixtures at all modes" in page
     assert len(APPROACHES) == len(MethodUsed)  # each has a color
-    assert "all by tempered draws" in page
+    assert "all by weighted draws of normal approximations" in page
 
 
 @pytest.mark.thorough
-def test_files_give_the_same_map(image: xr.Dataset, tempered: xr.Dataset, tmp_path: Path) -> None:
+def test_files_give_the_same_map(image: xr.Dataset, weighted: xr.Dataset, tmp_path: Path) -> None:
     image.to_zarr(tmp_path / "image.zarr", consolidated=False)
     stored = pb.maps.map_file(
-        tmp_path / "image.zarr", tmp_path / "map.zarr", method=TEMPERING, **ASKED
+        tmp_path / "image.zarr", tmp_path / "map.zarr", method="importance", **ASKED
     )
-    for name in tempered.data_vars:
-        np.testing.assert_array_equal(stored[name], tempered[name], err_msg=str(name))
+    for name in weighted.data_vars:
+        np.testing.assert_array_equal(stored[name], weighted[name], err_msg=str(name))

@@ -26,7 +26,7 @@ def watched(self, *given):
         seen.update(array.devices())
     return found
 
-image, method = plate_image(2, 3), pb.methods.PixelLaplace(draws=64, sampler=None)
+image, method = plate_image(2, 3), pb.methods.CorrectedLaplace(draws=64, sampler=None)
 here = pb.fit_pixels(image, method=method, **ASKED)
 jax.config.update("jax_default_device", second)
 jax.clear_caches()

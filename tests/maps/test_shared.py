@@ -9,12 +9,12 @@ from compilations import compilations
 from numpyro import handlers
 from plate_images import plate_image
 from plates import PLATE
-from polar_bayes.models.per_material import per_material
 
 import polar_bayes as pb
 from polar_bayes.inference.batching import Status
 from polar_bayes.inference.shared import SharedParameter
 from polar_bayes.maps import fit_map
+from polar_bayes.models.per_material import per_material
 
 SHARED = ("stokes_error_factor",)
 FACTOR = 1.6

@@ -19,7 +19,7 @@ from cases import each
 from plate_images import ASKED, NAMES, plate_image
 
 import polar_bayes as pb
-from polar_bayes.inference import batch_engine
+from polar_bayes.inference import compiled_model
 from polar_bayes.interrupts import clean_up
 from polar_bayes.maps import lazy
 from polar_bayes.maps import store as module
@@ -27,7 +27,7 @@ from polar_bayes.maps.blocks import BLOCK_THREADS, workers
 from polar_bayes.maps.fit_map import MapPlan
 from polar_bayes.reporting.report import render
 
-METHOD = pb.methods.PixelLaplace(draws=64, sampler=None)
+METHOD = pb.methods.CorrectedLaplace(draws=64, sampler=None)
 ROWS = 2  # of a block of 40 pixels in an image 20 wide
 
 
@@ -160,7 +160,7 @@ def test_the_maps_are_those_that_are_made_in_memory(
     image = xr.open_zarr(capture, consolidated=False).load()
     found = pb.maps.open_map(finished).load()
     xr.testing.assert_equal(found, pb.fit_pixels(image, method=METHOD, **ASKED))
-    monkeypatch.delattr(batch_engine, "compile_program")  # nothing is compiled a second time
+    monkeypatch.delattr(compiled_model, "compile_program")  # nothing is compiled a second time
     xr.testing.assert_equal(found, pb.fit_pixels(image, method=METHOD, **ASKED))
 
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from cases import each
+
 from polar_bayes.models.sites import SoftClip
 
 LOW, HIGH = 1.2, 2.0

@@ -14,7 +14,6 @@ import xarray as xr
 from arviz_stats.base import array_stats
 from cases import each
 from jax.flatten_util import ravel_pytree
-from polar_bayes.models.gp_spectral import gp_spectral
 from scipy import stats
 from spectral_plates import FRACTION, LINKS, PLATE, spectral_plate, tabulated
 from textbook import mirror_and_body
@@ -23,6 +22,7 @@ from tinygp import kernels
 import polar_bayes as pb
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
+from polar_bayes.models.gp_spectral import gp_spectral
 from polar_bayes.observation.data import observe
 from polar_bayes.priors import PRIORS
 

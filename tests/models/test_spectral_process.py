@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import each
-from polar_bayes.models.spectral_process import KERNELS, LEAST_NUGGET, SpectralProcess
 from tinygp import GaussianProcess, kernels
 
 from polar_bayes.errors import FitError
+from polar_bayes.models.spectral_process import KERNELS, LEAST_NUGGET, SpectralProcess
 
 IRREGULAR = np.array([405.0, 450.0, 452.0, 532.0, 550.0, 633.0, 780.0])
 

@@ -20,15 +20,9 @@ METHODS = {
     "nuts": pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50),
     "laplace": pb.methods.Laplace(chains=2, draws=100),
     "importance": pytest.param("importance", marks=pytest.mark.thorough),
-    "normal guide": pytest.param("normal guide", marks=pytest.mark.thorough),
-    "flow guide": pytest.param("flow guide", marks=pytest.mark.thorough),
-    "tempered": pytest.param("tempered", marks=pytest.mark.thorough),
 }
 DEAR = {
     "importance": pb.methods.Importance(),
-    "normal guide": pb.methods.NormalGuide(steps=200, draws=200),
-    "flow guide": pb.methods.FlowGuide(steps=200, draws=200),
-    "tempered": pb.methods.Tempered(pb.methods.PixelSMC(draws=4096)),
 }
 OF_DRAWS = (
     "plot_dist",

@@ -254,7 +254,7 @@ def test_dots_mark_where_the_curve_leaves_its_band(broken: xr.DataTree) -> None:
 
 @each(
     "method",
-    {"laplace": "--method tempered", "tempered": "--method nuts", "nuts": "longer"}.items(),
+    {"laplace": "method='nuts'", "importance": "method='nuts'", "nuts": "longer"}.items(),
 )
 def test_where_half_of_the_fits_fail_a_better_method_is_named(method) -> None:
     name, advice = method

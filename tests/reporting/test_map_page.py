@@ -52,7 +52,7 @@ def text_of(page: str) -> str:
 @pytest.fixture(scope="module")
 def page() -> str:
     maps = mixed(scene="paper", model="per_material", priors={"roughness": "Beta(2, 3)"})
-    bare = make_maps(MEANS, width=0.5, weighted=False)
+    bare = make_maps(MEANS, width=0.5, method="laplace")
     return render(maps, truth=truth(), uncorrected=bare)
 
 
@@ -145,8 +145,8 @@ def test_every_parameter_is_drawn_four_at_a_time_and_a_few_wavelengths() -> None
 
 @pytest.mark.thorough
 def test_a_map_that_was_not_checked_says_so_and_an_empty_one_fails() -> None:
-    unchecked = text_of(render(mixed(weighted=False)))
-    assert "The approximation was taken as it is (weighted=False)" in unchecked
+    unchecked = text_of(render(mixed(method="laplace")))
+    assert "The approximation was taken as it is (method='laplace')" in unchecked
     for status, said in (
         (Status.NOT_CONVERGED, "No pixel has an answer: do not use these maps."),
         (Status.MASKED, "No pixel was read: these maps are empty."),

@@ -1,27 +1,18 @@
-"""The contract of methods that fit many pixels at once, and the fit of one batch of pixels."""
-
-import abc
-import dataclasses
-from collections.abc import Callable
-from typing import Any, ClassVar, NoReturn, Self, override
+"""The fit of one batch of captures: what is fitted, and its outcome."""
 
 import jax
 import numpy as np
 
-from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_engine import BatchEngine
 from polar_bayes.inference.batching import (
-    MIN_VIEWS,
     Describe,
     MethodUsed,
     ObservationBatch,
-    Outcome,
     Status,
     empty_outcome,
     take_rows,
 )
+from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.levenberg_marquardt import ModeSearch, NormalApproximation
-from polar_bayes.inference.method import AbstractBatchMethod
 from polar_bayes.inference.program import Values
 
 
@@ -34,7 +25,7 @@ class BatchFit:
 
     def __init__(
         self,
-        engine: BatchEngine,
+        engine: CompiledModel,
         pixels: ObservationBatch,
         keys: np.ndarray,
         describe: Describe = lambda at, draws, weights: None,
@@ -86,59 +77,3 @@ def random_keys(seed: int, numbers: np.ndarray) -> np.ndarray:
     base = jax.random.key(seed)
     keys = jax.vmap(lambda number: jax.random.fold_in(base, number))(numbers.astype(np.uint32))
     return np.asarray(jax.random.key_data(keys))
-
-
-@dataclasses.dataclass(frozen=True)
-class AbstractPixelMethod(AbstractBatchMethod[BatchEngine]):
-    """A method that fits many pixels side by side."""
-
-    memory_limit: ClassVar[int] = 1024
-    """Pixels whose draws are in memory at a time."""
-
-    @override
-    def run_batch(
-        self,
-        engine: BatchEngine,
-        observations: ObservationBatch,
-        numbers: np.ndarray,
-        seed: int,
-        describe: Describe,
-    ) -> Outcome:
-        batch = BatchFit(engine, observations, random_keys(seed, numbers), describe, seed)
-        self.fit_batch(batch)
-        return batch.outcome
-
-    def fit_batch(self, batch: BatchFit) -> None:
-        """Fit every pixel that has enough views, and record the outcome of all."""
-        views = batch.pixels.views
-        batch.outcome.status[views < MIN_VIEWS] = Status.TOO_FEW_VIEWS
-        batch.outcome.status[views == 0] = Status.MASKED
-        at = np.flatnonzero(views >= MIN_VIEWS)
-        for begin in range(0, at.size, self.memory_limit):
-            self.fit(batch, at[begin : begin + self.memory_limit])
-
-    @abc.abstractmethod
-    def fit(
-        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
-    ) -> None:
-        """Fit the pixels `at` these indices, and record their outcome; modes may be known."""
-
-    def for_image(
-        self, size: int, sample: Callable[[int], BatchFit], *, is_shared: bool
-    ) -> tuple[Self, dict[str, Any]]:
-        """Settings for an image, and entries of its provenance.
-
-        `size` is the number of its pixels, `sample` gives some of them drawn at random, and
-        `is_shared` says whether pixels share parameters.
-        """
-        del size, sample, is_shared
-        return self, {}
-
-    def _check_least(self, **least: int) -> None:
-        """Refuse settings below their least values."""
-        for name, lowest in least.items():
-            if getattr(self, name) < lowest:
-                self._refuse(f"{name} is {getattr(self, name)}", f"give {lowest} or more")
-
-    def _refuse(self, what: str, hint: str) -> NoReturn:
-        raise FitError(what, where=type(self).__name__, hint=hint)

@@ -1,13 +1,14 @@
-"""Compiled programs of one model for batches of pixels, and how pixels pass through them.
+"""A model compiled for a layout: its programs, for one capture or many side by side.
 
-Programs are made by functions `make(engine, settings)` in the file of their algorithm. An engine
-compiles each once and keeps it, so all pixels of all images of one layout share the programs.
+Programs of batches are made by functions `make(compiled_model, settings)` in the file of their
+algorithm. A model compiles each once and keeps it, so all captures of a layout share the programs.
 """
 
 import contextlib
 import dataclasses
+import functools
 import os
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -15,26 +16,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpyro import distributions as dist
 
 from polar_bayes.inference.batching import ObservationBatch, batches, map_batches
-from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache, cache_key
+from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache, cache_key, layout_of
+from polar_bayes.inference.initialization import AbstractInitializer, make_initializer
 from polar_bayes.inference.optimize import from_prior
-from polar_bayes.inference.program import Program, compile_program
-from polar_bayes.inference.request import Request
+from polar_bayes.inference.program import Model, Program, compile_program
+from polar_bayes.inference.request import Request, bind_model
 from polar_bayes.inference.result import dims_of, shape_of
 from polar_bayes.observation.data import Observations
 
 BATCH = 128
-"""Pixels that one call of a program takes."""
+"""Captures that one call of a program takes."""
 
 SMALL_BATCH = 4
-"""The same where each pixel has chains or particles of its own."""
+"""The same where each has particles of its own."""
 
 DRAW_BATCH = 64
-"""Draws of one pixel that are evaluated together: more are shared among cores that then wait for
+"""Draws of one capture that are evaluated together: more are shared among cores that then wait for
 each other."""
 
-MOST_PROGRAMS = 64
+MAX_LAYOUTS = 16
+"""Models by layout that stay compiled: all candidates of a comparison of scenes, and some more."""
+
+MAX_PROGRAMS = 64
+"""Programs that methods have made of one of them, by settings, that stay compiled."""
 
 _THREADS = ThreadPoolExecutor(os.cpu_count() or 1, "polar_bayes batches")
 """That run batches of all images at once: a core is not shared by two."""
@@ -44,18 +51,34 @@ MOMENTS = 4000
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class BatchEngine:
-    """The model of one pixel, and the programs compiled of it.
+class CompiledModel:
+    """What fits of one model to captures of one layout have in common.
 
-    `single_program` is the model in single precision; `layout` is a pixel of the same layout.
+    `program` is the model in the precision of the fit; `layout` is a capture of that layout.
     """
 
+    bind: Callable[[], Model]
+    model: Model
     program: Program
-    single_program: Program
     layout: Observations
     precision: str
-    seed: int = 0
-    programs: LRUCache[Any] = dataclasses.field(default_factory=lambda: LRUCache(MOST_PROGRAMS))
+    priors: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
+    programs: LRUCache[Any] = dataclasses.field(default_factory=lambda: LRUCache(MAX_PROGRAMS))
+    """Further compiled programs of the model, which methods keep here by keys of their own."""
+
+    @functools.cached_property
+    def initializer(self) -> AbstractInitializer:
+        """The search for posterior modes of one capture."""
+        with jax.enable_x64(self.precision == "double"), TRACING_LOCK:  # whoever asks first
+            return make_initializer(self.model, self.program, self.layout)
+
+    @functools.cached_property
+    def single_program(self) -> Program:
+        """The same model in single precision."""
+        if self.precision == "single":
+            return self.program
+        with jax.enable_x64(False), TRACING_LOCK:
+            return compile_program(self.bind(), self.layout.in_single_precision())
 
     @property
     def dtype(self) -> Any:
@@ -63,14 +86,14 @@ class BatchEngine:
         return np.float64 if self.precision == "double" else np.float32
 
     def compiled[S: Hashable](
-        self, make: Callable[["BatchEngine", S], JitOnce], settings: S
+        self, make: Callable[["CompiledModel", S], JitOnce], settings: S
     ) -> JitOnce:
         """The program for these settings, made at its first use."""
         return self.programs.of((make, settings), lambda: make(self, settings))
 
     def run[S: Hashable](
         self,
-        make: Callable[["BatchEngine", S], JitOnce],
+        make: Callable[["CompiledModel", S], JitOnce],
         settings: S,
         pixels: ObservationBatch,
         *states: Any,
@@ -94,7 +117,7 @@ class BatchEngine:
 
     def begin[S: Hashable](
         self,
-        make: Callable[["BatchEngine", S], JitOnce],
+        make: Callable[["CompiledModel", S], JitOnce],
         settings: S,
         pixels: ObservationBatch,
         *states: Any,
@@ -144,7 +167,7 @@ class BatchEngine:
 
         def draw() -> np.ndarray:
             with jax.enable_x64(self.precision == "double"):
-                key = jax.random.key(self.seed)
+                key = jax.random.key(0)
                 return np.asarray(from_prior(self.program, key, drawn, self.layout))
 
         return self.programs.of(("prior draws", drawn), draw)[:count]
@@ -180,39 +203,39 @@ def evaluate_draws(
     return parameters, jnp.where(jnp.isnan(values), -jnp.inf, -values)
 
 
-_ENGINES: LRUCache[BatchEngine] = LRUCache(4)
+_COMPILED: LRUCache[CompiledModel] = LRUCache(MAX_LAYOUTS)
 
 
-def make_engine(key: str, request: Request, observe: Callable[[], Observations]) -> BatchEngine:
-    """The engine of a request, from the cache where it has one of this key."""
-
-    def make() -> BatchEngine:
-        data = observe()
-        layout = {"double": data, "single": data.in_single_precision()}
-
-        def program(precision: str) -> Program:
-            with jax.enable_x64(precision == "double"), TRACING_LOCK:
-                model = dataclasses.replace(request, precision=precision).bind(request.scene)
-                return compile_program(model, layout[precision])
-
-        precision = request.precision
-        exact, single = program(precision), program("single")
-        return BatchEngine(exact, single, layout[precision], precision, request.seed)
-
-    return _ENGINES.of(key, make)
+def compile_model(request: Request, data: Observations) -> CompiledModel:
+    """The compiled model of a capture and of every other one of its layout, from the cache."""
+    parts = request.model, request.scene, request.priors, request.links
+    key = cache_key(*parts, request.precision, layout_of(data))
+    return compile_layout(key, request, lambda: data)
 
 
-def engine_key(request: Request, *further: Any) -> str:
-    """A text that is the same for requests whose programs are the same."""
+def compile_layout(
+    key: str, request: Request, observe: Callable[[], Observations]
+) -> CompiledModel:
+    """The same where a text is known that tells layouts apart without a capture."""
+    parts = request.model, request.scene, request.priors, request.links
+
+    def make() -> CompiledModel:
+        bind = functools.partial(bind_model, *parts)
+        data, is_double = observe(), request.precision == "double"
+        data = data if is_double else data.in_single_precision()
+        with jax.enable_x64(is_double):
+            model = bind()
+            program = compile_program(model, data)
+        return CompiledModel(bind, model, program, data, request.precision, request.priors)
+
+    with TRACING_LOCK:
+        return _COMPILED.of(key, make)
+
+
+def layout_key(request: Request, *further: Any) -> str:
+    """A text that is the same for requests whose captures have one layout and one model."""
     layout = [
         (name, v.dims, v.shape, str(v.dtype)) for name, v in request.capture.variables.items()
     ]
-    return cache_key(
-        request.model,
-        request.scene,
-        request.priors,
-        request.links,
-        (request.seed, request.precision),
-        layout,
-        *further,
-    )
+    parts = request.model, request.scene, request.priors, request.links
+    return cache_key(*parts, request.precision, layout, *further)

@@ -3,7 +3,7 @@
 Each pixel takes the first of these that can be trusted: quasi-random draws of the normal
 approximation at the mode, weighted by Pareto-smoothed importance sampling; draws of Student t
 proposals that are fitted to the weighted draws of the previous round (population Monte Carlo);
-draws of a sampler (`PixelImportance`, `PixelNuts` or `PixelSMC`), which also fits pixels whose mode
+draws of a sampler (`Importance`, say), which also fits pixels whose mode
 was not found.
 """
 
@@ -13,13 +13,10 @@ from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, Self, override
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.inference.batch_engine import BatchEngine
-from polar_bayes.inference.batch_importance import PixelImportance
-from polar_bayes.inference.batch_method import AbstractPixelMethod, BatchFit
+from polar_bayes.inference.batch_fit import BatchFit
 from polar_bayes.inference.batching import (
     MethodUsed,
     Status,
@@ -28,6 +25,8 @@ from polar_bayes.inference.batching import (
     take_rows,
 )
 from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.compiled_model import CompiledModel
+from polar_bayes.inference.importance import Importance
 from polar_bayes.inference.levenberg_marquardt import (
     PRIOR_DRAWS,
     RESTARTS,
@@ -36,6 +35,7 @@ from polar_bayes.inference.levenberg_marquardt import (
     find_modes_from,
     find_starts,
 )
+from polar_bayes.inference.method import AbstractBatchMethod
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.proposals import (
     Points,
@@ -81,46 +81,44 @@ one: docs/maps.md has the measurement. The longer tails of Student t distributio
 
 
 @dataclasses.dataclass(frozen=True)
-class PixelLaplace(AbstractPixelMethod):
-    """The normal approximation of every pixel, checked and corrected.
+class CorrectedLaplace(AbstractBatchMethod):
+    """The Laplace approximation of many captures, checked and corrected by importance weights.
+
+    Weights of its own draws tell where the normal distribution serves, and correct it; proposals
+    that are fitted to weighted draws serve elsewhere, and importance sampling what is left.
 
     Args:
         draws: Of the approximation in each pixel, from which means and quantiles are taken; a
             power of two, >= 64.
-        weighted: True weights them by the posterior, which corrects the approximation and
-            diagnoses it (Pareto k); False takes them as they are, without a diagnosis.
         candidates: Prior draws among which the start of each pixel is chosen, >= 8.
         starts: From how many of them every pixel is searched, 1 to 8; the lowest mode counts. By
-            default 8, and 1 without weights. Of an image of more than 2,048 pixels that share
-            nothing, 512 drawn at random decide: 1 serves where 8 find another mode in at most 1%
-            of them. Pixels whose weights cannot be trusted are searched from 8 in any case.
+            default 8. Of an image of more than 2,048 pixels that share nothing, 512 drawn at
+            random decide: 1 serves where 8 find another mode in at most 1% of them. Pixels whose
+            weights cannot be trusted are searched from 8 in any case.
         rounds: In which the proposal of a pixel with Pareto k above 0.7, or with too few effective
-            draws, is fitted to its own weighted draws, until it has neither; >= 0. Without weights
-            there are none.
+            draws, is fitted to its own weighted draws, until it has neither; >= 0.
         sampler: The method of pixels that still have, and of those whose mode was not found, such
-            as `PixelImportance()` or `PixelNuts()`; None marks them only, and so do maps without
-            weights.
+            as `Importance()` or `Nuts()`; None marks them only.
 
     Raises:
         FitError: A setting is outside its range.
     """
 
     draws: int = 256
-    weighted: bool = True
     candidates: int = PRIOR_DRAWS
     starts: int | None = None
     rounds: int = 3
-    sampler: AbstractPixelMethod | None = dataclasses.field(default_factory=PixelImportance)
+    sampler: AbstractBatchMethod | None = dataclasses.field(default_factory=Importance)
 
     memory_limit: ClassVar[int] = 4096
     most_starts: ClassVar[int] = 1 + len(RESTARTS)
 
     def __post_init__(self) -> None:
         if self.draws < 64 or self.draws & (self.draws - 1):
-            self._refuse(f"draws is {self.draws}", "give 64, 128, 256 or so")
-        self._check_least(candidates=8, rounds=0)
+            self.refuse(f"draws is {self.draws}", "give 64, 128, 256 or so")
+        self.check_least(candidates=8, rounds=0)
         if self.starts is not None and not 1 <= self.starts <= self.most_starts:
-            self._refuse(f"starts is {self.starts}", f"give 1 to {self.most_starts}")
+            self.refuse(f"starts is {self.starts}", f"give 1 to {self.most_starts}")
 
     @override
     def fit(
@@ -130,7 +128,7 @@ class PixelLaplace(AbstractPixelMethod):
         found = run.approximate(None if modes is None else np.asarray(modes.z))
         run.record(found)
         several = np.zeros(at.size, bool)
-        if self.sampler is not None and self.weighted:
+        if self.sampler is not None:
             several = found.search.converged & found.has_rival
             if several.any():
                 self.sampler.fit(batch, at[several], take_rows(found.search.mode, several))
@@ -141,14 +139,14 @@ class PixelLaplace(AbstractPixelMethod):
             if self.sampler is not None and left.size:
                 self.sampler.fit(batch, at[left], take_rows(found.search.mode, left))
         lost = at[~found.search.converged]
-        if self.sampler is not None and self.weighted and lost.size:
+        if self.sampler is not None and lost.size:
             self.sampler.fit(batch, lost)
 
     @override
     def for_image(
         self, size: int, sample: Callable[[int], BatchFit], *, is_shared: bool
     ) -> tuple[Self, dict[str, Any]]:
-        if self.starts is not None or not self.weighted:
+        if self.starts is not None:
             return self, {}
         every = dataclasses.replace(self, starts=self.most_starts)
         if is_shared or size <= SMALL_IMAGE:
@@ -184,9 +182,9 @@ class Approximation(NamedTuple):
 
 
 class _Run:
-    """One run of `PixelLaplace` for some pixels of a batch."""
+    """One run of `CorrectedLaplace` for some pixels of a batch."""
 
-    def __init__(self, settings: PixelLaplace, batch: BatchFit, at: np.ndarray) -> None:
+    def __init__(self, settings: CorrectedLaplace, batch: BatchFit, at: np.ndarray) -> None:
         self.settings, self.batch, self.at = settings, batch, at
         self.engine, self.pixels = batch.engine, batch.pixels.subset(at)
         size, draws = self.engine.program.size, settings.draws
@@ -199,8 +197,10 @@ class _Run:
 
         With known starts, (pixel, size), each pixel is fitted from its own alone.
         """
-        candidates, weighted = self.settings.candidates, self.settings.weighted
-        starts = self.settings.starts or (PixelLaplace.most_starts if weighted else 1)
+        candidates, starts = (
+            self.settings.candidates,
+            self.settings.starts or self.settings.most_starts,
+        )
         if known is None:
             ranked = find_starts(self.engine, self.pixels, candidates)
             self._begin_draws()
@@ -228,41 +228,35 @@ class _Run:
         return found
 
     def _weigh(self, which: np.ndarray, search: ModeSearch) -> Approximation:
-        """Draws of the normal approximations, and their weights where they are asked for."""
+        """Draws of the normal approximations, and their weights."""
         proposal = _proposal_at(search.mode).rotated(self.rotations[which])
         parameters, ratios = self._draw(which, proposal, self.points)
-        none = np.full(which.size, -np.inf)
-        if self.settings.weighted:
-            return Approximation(search, parameters, *smooth(ratios), none)
-        weights = np.full((which.size, self.settings.draws), 1.0 / self.settings.draws)
-        return Approximation(search, parameters, weights, np.zeros(which.size), none)
+        return Approximation(search, parameters, *smooth(ratios), np.full(which.size, -np.inf))
 
     def _draw(
         self, which: np.ndarray, proposal: Proposal, points: Points
     ) -> tuple[Values, np.ndarray]:
         """Draws of the proposal of every pixel, and their log importance ratios."""
         states, given = (tuple(np.float32(x) for x in each) for each in (proposal, points))
-        some, weighted = self.pixels.subset(which), self.settings.weighted
-        return self.engine.run(_draws, weighted, some, *states, given=given, single=True)
+        some = self.pixels.subset(which)
+        return self.engine.run(_draws, None, some, *states, given=given, single=True)
 
     def _begin_draws(self) -> None:
         """Compile while modes are searched."""
         size = self.points.z.shape[1]
         shapes = (1, size), (1, size, size), self.points.z.shape, self.points.log_density.shape
         *states, z, log_density = (np.zeros(shape, np.float32) for shape in shapes)
-        given, weighted = (z, log_density), self.settings.weighted
-        self.engine.begin(_draws, weighted, self.pixels, *states, given=given, single=True)
+        given = z, log_density
+        self.engine.begin(_draws, None, self.pixels, *states, given=given, single=True)
 
     def record(self, found: Approximation) -> None:
         """Normal approximations, corrected by their weights where these can be trusted."""
         at, outcome = self.at, self.batch.outcome
         self.batch.record_modes(at, found.search)
         converged, trusted = found.search.converged, found.is_trusted
-        method, effective = np.full(at.size, MethodUsed.LAPLACE), np.full(at.size, np.nan)
-        if self.settings.weighted:
-            outcome.pareto_k[at] = np.where(converged, found.pareto_k, np.nan)
-            effective = np.where(trusted, effective_draws(found.weights), np.nan)
-            method = np.where(trusted, MethodUsed.IMPORTANCE, MethodUsed.LAPLACE)
+        outcome.pareto_k[at] = np.where(converged, found.pareto_k, np.nan)
+        effective = np.where(trusted, effective_draws(found.weights), np.nan)
+        method = np.where(trusted, MethodUsed.IMPORTANCE, MethodUsed.LAPLACE)
         # Weights that cannot be trusted do not correct anything.
         weights = np.where(trusted[:, None], found.weights, 1.0 / self.settings.draws)
         status = np.where(trusted, Status.GOOD, Status.NOT_TRUSTED)
@@ -320,7 +314,7 @@ def _proposal_at(mode: NormalApproximation) -> Proposal:
     return Proposal(np.asarray(mode.z), np.asarray(mode.root))
 
 
-def _draws(engine: BatchEngine, weighted: bool) -> JitOnce:
+def _draws(engine: CompiledModel, _: None) -> JitOnce:
     """The program that draws from the proposal of one pixel."""
     program = engine.single_program
 
@@ -328,9 +322,6 @@ def _draws(engine: BatchEngine, weighted: bool) -> JitOnce:
         points: Array, log_density: Array, data: Observations, center: Array, root: Array
     ) -> tuple[Values, Array]:
         z = center + points @ root
-        if not weighted:
-            parameters = jax.vmap(lambda z: program.parameters(z, data))(z)
-            return parameters, jnp.zeros(len(points))
         parameters, values = jax.vmap(lambda z: program.parameters_and_potential(z, data))(z)
         return parameters, -values - log_density
 
