@@ -70,6 +70,9 @@ def residuals_of(
     result: xr.DataTree, variables: Sequence[FlatVariable], found: Sequence[Scalar]
 ) -> Residuals | None:
     """Residuals of all variables together, since they share the parameters that absorb them."""
+    constants = result.children.get("constant_data", xr.DataTree()).data_vars
+    if not all(name in constants for name in ANGLES):
+        return None
     if not variables or not all(
         np.isfinite(v.predicted).all() and np.isfinite(v.noise_free).all() for v in variables
     ):

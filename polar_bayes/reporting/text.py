@@ -495,7 +495,6 @@ APPROACHES = {
     "importance": "weighted draws of normal approximations",
     "adapted": "a proposal fitted to its own draws and corrected by weights",
     "nuts": "sampling (NUTS)",
-    "variational": "a variational guide",
     "other": "a method of the user's own",
 }
 

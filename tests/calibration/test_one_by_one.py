@@ -130,6 +130,7 @@ def test_fits_without_draws_are_counted(
     class Refusing:
         def __init__(self, initializer) -> None:
             self._grounds = initializer
+            self.is_joint = initializer.is_joint
 
         def find(self, data, *further):
             if float(data.readings["q"].mean()) > 0.0:

@@ -227,6 +227,7 @@ ASK = """
 import json
 import numpy as np
 import numpyro.distributions as dist
+import polar_bayes as pb
 from plates import plate_capture
 from polar_bayes.calibration.calibrate import make_plan
 from polar_bayes.calibration.runner import fingerprint_of
@@ -260,10 +261,9 @@ import sys
 import numpy as np
 import polar_bayes as pb
 from plates import plate_capture
-from polar_bayes.calibration import runner
 from test_resuming import ASKED
 store, resume, scheduler, out, size, count = sys.argv[1:]
-runner.BLOCK = int(size)
+pb.methods.Importance.group_size = int(size)
 found = pb.calibrate(
     plate_capture(np.array([30.0, 42.0, 68.0, 80.0]), 0.03, seed=0),
     simulations=int(count),

@@ -147,7 +147,7 @@ def test_weighted_draws_find_what_chains_left_out():
 
 @pytest.mark.thorough
 def test_weights_that_do_not_reach_all_of_a_posterior_are_a_problem():
-    found = run(SMALL["importance"], problem(deep_funnel))
+    found = run(pb.methods.Importance(draws=4096, rounds=1), problem(deep_funnel))
     assert found.k_hat > 0.7
     assert any("Pareto k-hat" in problem for problem in found.problems)
 
