@@ -22,7 +22,7 @@ from polar_bayes.cli.options import (
     seed_option,
 )
 from polar_bayes.cli.printing import NOT_CONVERGED, json_rows, print_frame, print_json, say
-from polar_bayes.inference.registry import FIT_DEFAULT
+from polar_bayes.inference.registry import FIT_DEFAULT, MAP_DEFAULT
 from polar_bayes.progress import stages
 
 CALIBRATION_COLUMNS = (
@@ -32,8 +32,9 @@ CALIBRATION_COLUMNS = (
     "crps: mean distance of the posterior from the truth, in the unit of the parameter",
 )
 NEXT_STEPS = {
-    True: "Next: polar-bayes fit {capture} with the same --scene, --model and --prior; its 95% "
-    "intervals may be quoted as such. polar-bayes report {out} --out report draws the ranks.",
+    True: "Next: polar-bayes {verb} {capture} with the same --method, --scene, --model and "
+    "--prior; its 95% intervals may be quoted as such. polar-bayes report {out} --out report "
+    "draws the ranks.",
     False: "Next: polar-bayes report {out} --out report shows where the ranks fail; try another "
     "--method first (nuts is the slowest and the surest), then the model.",
 }
@@ -83,7 +84,8 @@ def calibrate(
         if "readings" in tables:
             click.echo()
             print_frame(tables["readings"].drop(columns=["reading", "test"]))
-        next_step = NEXT_STEPS[verdict.passed].format(capture=capture, out=out)
+        verb = "map" if settings["method"] == MAP_DEFAULT else "fit"
+        next_step = NEXT_STEPS[verdict.passed].format(verb=verb, capture=capture, out=out)
         say("\n".join(["", *verdict.sentences, "", next_step]))
     return 0 if verdict.passed else NOT_CONVERGED
 
