@@ -22,7 +22,7 @@ from polar_bayes.cli.options import (
     seed_option,
 )
 from polar_bayes.cli.printing import NOT_CONVERGED, json_rows, print_frame, print_json, say
-from polar_bayes.inference.registry import FIT_DEFAULT, MAP_DEFAULT
+from polar_bayes.inference.registry import FIT_DEFAULT, METHODS
 from polar_bayes.progress import stages
 
 CALIBRATION_COLUMNS = (
@@ -62,6 +62,8 @@ def calibrate(
     capture: Path, out: Path, no_readings: bool, resume: bool, as_json: bool, **settings: Any
 ) -> int:
     """Simulate captures of this layout, fit each, and test the coverage of the intervals."""
+    from polar_bayes.inference.result import provenance_of
+
     data = pb.load_capture(capture)
     settings = read_scene_options(settings)
     store = out.with_name(f"{out.name}.fits")
@@ -84,7 +86,8 @@ def calibrate(
         if "readings" in tables:
             click.echo()
             print_frame(tables["readings"].drop(columns=["reading", "test"]))
-        verb = "map" if settings["method"] == MAP_DEFAULT else "fit"
+        method = METHODS.get(provenance_of(calibration)["method"])
+        verb = "map" if method is not None and not method.fits_one else "fit"
         next_step = NEXT_STEPS[verdict.passed].format(verb=verb, capture=capture, out=out)
         say("\n".join(["", *verdict.sentences, "", next_step]))
     return 0 if verdict.passed else NOT_CONVERGED

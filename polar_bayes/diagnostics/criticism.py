@@ -134,18 +134,23 @@ def criticize(
         return _table(dict.fromkeys(CHECKS, Finding("not computed", sentence=why)))
     variables = flat_variables(result)
     checks = predictive_checks(result) if checks is None else checks
+    provenance, priors = provenance_of(result), _prior_draws(result)
+    absent = [s for s in found if _is_absent(s, provenance, priors.get(s.label))]
+    index = _index(result, found)
+    # Where the index by eye says so, a wider prior is the remedy, and no other check names one.
+    is_beyond = bool(index.sentence)
     return _table(
         {
-            "priors": _prior_conflict(result, found),
-            "absent": _absent(result, found),
+            "priors": _prior_conflict(result, found, is_beyond),
+            "absent": _absent(found, absent),
             "noise": _noise(result, found),
-            "bounds": _bounds(result, found),
-            "index": _index(result, found),
-            "systematic errors": _systematic_errors(result, found),
+            "bounds": _bounds(result, found, is_beyond),
+            "index": index,
+            "systematic errors": _systematic_errors(result, found, absent),
             **residual_findings(residuals_of(result, variables, found)),
             "leave-one-out": _leave_one_out(checks),
             "repeats": _repeats(result),
-            "alternatives": _alternatives(result, found),
+            "alternatives": _alternatives(result, absent),
         }
     )
 
@@ -158,7 +163,7 @@ def _table(findings: Mapping[str, Finding]) -> pd.DataFrame:
 # --- Priors, noise and bounds ---------------------------------------------------------------------
 
 
-def _prior_conflict(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
+def _prior_conflict(result: xr.DataTree, found: Sequence[Scalar], is_beyond: bool) -> Finding:
     """Posterior medians in the tails of their priors: the farthest, and all of them together."""
     below = _prior_probability(result, _carriers(found))
     if not below:
@@ -171,7 +176,7 @@ def _prior_conflict(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     names = [scalar.label for scalar in below]
     far = [f"{names[i]} {score[i]:.1f} sd" for i in np.argsort(-score) if score[i] > 1.5]
     advice = "state priors that hold for this object"
-    if not _index(result, found).sentence:  # else a wider prior is what mends it
+    if not is_beyond:
         advice = (
             "a scene without what the readings show forces its parameters there, so try "
             f"polar_bayes.compare_scenes, or {advice}"
@@ -219,10 +224,8 @@ def _prior_probability(result: xr.DataTree, found: Sequence[Scalar]) -> dict[Sca
     }
 
 
-def _absent(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
+def _absent(found: Sequence[Scalar], absent: Sequence[Scalar]) -> Finding:
     """Parts and faults at the value at which they are absent, and the answer without them."""
-    provenance, priors = provenance_of(result), _prior_draws(result)
-    absent = [s for s in found if _is_absent(s, provenance, priors.get(s.label))]
     others = [s for s in found if s.is_material and s not in absent and np.isfinite(s.draws).all()]
     others = [s for s in others if s.name == INDEX] or others
     words = list(dict.fromkeys(a.words for s in absent if (a := absence(s.name)) is not None))
@@ -304,7 +307,7 @@ def _noise(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     return judged_by(p_value, math.nan, sentence, least=least)
 
 
-def _bounds(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
+def _bounds(result: xr.DataTree, found: Sequence[Scalar], is_beyond: bool) -> Finding:
     """Posterior density at a bound of the support that is as high as inside, unlike the prior's."""
     provenance, hits = provenance_of(result), []
     priors = _prior_draws(result)
@@ -322,8 +325,7 @@ def _bounds(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
         return Finding("passed")
     hits.sort(key=lambda hit: -hit[0])
     where = [f"{s.label} at {bound:g} ({share:.0%} of its draws)" for share, s, bound in hits]
-    # The check of the index by eye names the prior that reaches beyond.
-    beyond = "" if _index(result, found).sentence else _beyond(hits[0][1], hits[0][2])
+    beyond = "" if is_beyond else _beyond(hits[0][1], hits[0][2])
     sentence = (
         f"The posterior lies against a bound: {listed(where)}; what is beyond is excluded by the "
         "prior or by physics, not by the readings, so the interval is too narrow or the scene is "
@@ -368,7 +370,9 @@ def _share_at(bound: float, draws: np.ndarray) -> float:
 # --- Systematic errors ----------------------------------------------------------------------------
 
 
-def _systematic_errors(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
+def _systematic_errors(
+    result: xr.DataTree, found: Sequence[Scalar], absent: Sequence[Scalar]
+) -> Finding:
     """Smooth errors that are larger than their prior, or that alone move the answer."""
     amplitude = [s for s in found if s.name == "discrepancy_amplitude"]
     if not amplitude:
@@ -381,13 +385,11 @@ def _systematic_errors(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     sizes = [*amplitude, *(s for s in found if s.name == NOISE_FACTOR)]
     below = _prior_probability(result, sizes)
     p_value = float(prior_conflict(np.array(list(below.values())), -np.ones(len(below))))
-    priors = _prior_draws(result)
     without = {s.label: s.draws for s in scalars(result[WITHOUT].to_dataset())}
     shifts = {
         s.label: float((without[s.label].mean() - s.draws.mean()) / s.draws.std())
         for s in found
-        if s.is_material and s.label in without and np.ptp(s.draws) > 0.0
-        if not _is_absent(s, provenance_of(result), priors.get(s.label))
+        if s.is_material and s.label in without and np.ptp(s.draws) > 0.0 and s not in absent
     }
     label = max(shifts, key=lambda name: abs(shifts[name]), default="")
     shift = abs(shifts.get(label, 0.0))
@@ -479,7 +481,7 @@ def _repeats(result: xr.DataTree) -> Finding:
 # --- Alternatives ---------------------------------------------------------------------------------
 
 
-def _alternatives(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
+def _alternatives(result: xr.DataTree, absent: Sequence[Scalar]) -> Finding:
     """Parts that explain the readings better, or as well with another answer."""
     try:
         table = alternatives(result)
@@ -487,9 +489,9 @@ def _alternatives(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
         return Finding("not computed", sentence=f"{error.what[:1].upper()}{error.what[1:]}.")
     if table.empty:
         return Finding("passed")
-    provenance, priors = provenance_of(result), _prior_draws(result)
-    absent = {s.label: s for s in found if _is_absent(s, provenance, priors.get(s.label))}
-    table = _without_idle(table, absent)
+    # What is not there has no size to rest on a part.
+    own = ~table["redefined"] & ~table.index.isin([s.label for s in absent])
+    table = _without_idle(table.assign(moves=own & (table["shift"].abs() > OUTSIDE)), absent)
     if table.empty:
         return Finding("passed")
     factors = table.groupby(["part", "alternative", "path"])["log_bayes_factor"].first()
@@ -504,12 +506,7 @@ def _alternatives(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
             f"({path}), by a Bayes factor of {_factor_text(highest)}; fit the scene that has it."
         )
         return judged_by(p_value, highest, sentence)
-    undecided = table[
-        (table["log_bayes_factor"] > REFUTED)
-        & (table["shift"].abs() > OUTSIDE)
-        & ~table["redefined"]
-        & ~table.index.isin(absent)  # what is not there has no size to rest on a part
-    ]
+    undecided = table[table["moves"] & (table["log_bayes_factor"] > REFUTED)]
     if undecided.empty:
         return Finding("passed", p_value, highest)
     answers = [
@@ -525,14 +522,13 @@ def _alternatives(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     return Finding("caution" if is_favored else "note", p_value, highest, sentence)
 
 
-def _without_idle(table: pd.DataFrame, absent: Mapping[str, Scalar]) -> pd.DataFrame:
+def _without_idle(table: pd.DataFrame, absent: Sequence[Scalar]) -> pd.DataFrame:
     """Alternatives but those to a part that sends nothing, where all else is the same with them.
 
     No reading tells one body that is not there from another: their Bayes factor is that of priors.
     """
-    idle = {a.part for s in absent.values() if (a := absence(s.name)) is not None and a.part}
-    moves = (table["shift"].abs() > OUTSIDE) & ~table["redefined"] & ~table.index.isin(absent)
-    moved = moves.groupby([table["path"], table["alternative"]]).transform("any")
+    idle = {a.part for s in absent if (a := absence(s.name)) is not None and a.part}
+    moved = table.groupby(["path", "alternative"])["moves"].transform("any")
     return table[~table["path"].str.split(".").str[0].isin(idle) | moved]
 
 

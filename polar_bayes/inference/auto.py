@@ -44,10 +44,10 @@ class Auto(AbstractMethod):
     """The cheapest method whose own diagnostics say that it is good enough.
 
     Methods are tried from cheap to exact: importance (of one material in one color), NUTS. One is
-    taken when Pareto k-hat is at most 0.7,
-    R-hat at most 1.01, nothing diverged, no mode was left out, and the Monte Carlo error of every
-    mean and standard deviation is within the tolerance (but in 1% of the fits). Where only that is
-    missing, the same method is tried once more with more draws.
+    taken when Pareto k-hat is at most 0.7, R-hat at most 1.01, nothing diverged, no mode was left
+    out, and the Monte Carlo error of every mean and standard deviation is within the tolerance (but
+    in 1% of the fits). Where only that is missing, the same method is tried once more with more
+    draws.
 
     Args:
         tolerance: Largest error of a posterior mean or standard deviation, in posterior standard

@@ -3,8 +3,7 @@
 Each pixel takes the first of these that can be trusted: quasi-random draws of the normal
 approximation at the mode, weighted by Pareto-smoothed importance sampling; draws of Student t
 proposals that are fitted to the weighted draws of the previous round (population Monte Carlo);
-draws of a sampler (`Importance`, say), which also fits pixels whose mode
-was not found.
+draws of a sampler (`Importance`, say), which also fits pixels whose mode was not found.
 """
 
 import dataclasses
@@ -197,12 +196,9 @@ class _Run:
 
         With known starts, (pixel, size), each pixel is fitted from its own alone.
         """
-        candidates, starts = (
-            self.settings.candidates,
-            self.settings.starts or self.settings.most_starts,
-        )
+        starts = self.settings.starts or self.settings.most_starts
         if known is None:
-            ranked = find_starts(self.engine, self.pixels, candidates)
+            ranked = find_starts(self.engine, self.pixels, self.settings.candidates)
             self._begin_draws()
         else:
             ranked = known[:, None]

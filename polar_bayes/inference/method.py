@@ -207,11 +207,6 @@ class AbstractMethod(AbstractBatchMethod):
         """
 
     @property
-    def name(self) -> str:
-        """Name of the method, as results state it."""
-        return type(self).__name__.lower()
-
-    @property
     def num_draws(self) -> int | None:
         """Draws that the method makes, at least; None where their number is not a setting."""
         draws = getattr(self, "draws", None)
@@ -292,10 +287,8 @@ class AbstractMethod(AbstractBatchMethod):
             judged, thinned = found
             one, count = np.array([pixel]), len(next(iter(thinned.values())))
             batch.record_pareto_k(one, np.array([judged.pareto_k]))
-            draws, weights = (
-                {n: x[None] for n, x in thinned.items()},
-                np.full((1, count), 1 / count),
-            )
+            draws = {name: x[None] for name, x in thinned.items()}
+            weights = np.full((1, count), 1.0 / count)
             effective = np.array([judged.effective_draws])
             batch.record(one, draws, weights, effective, judged.approach, judged.status)
 
