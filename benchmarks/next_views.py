@@ -34,11 +34,11 @@ from polar_bayes.design.fisher import (
 )
 from polar_bayes.design.optimal_design import Selection, fedorov_exchange
 from polar_bayes.design.setup import parameter_vector, unconstrain
-from polar_bayes.inference.batch_fit import BatchFit, random_keys
 from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout, layout_key
 from polar_bayes.inference.corrected_laplace import CorrectedLaplace
 from polar_bayes.inference.optimize import from_prior
+from polar_bayes.inference.problem_batch import problem_batch
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 
@@ -86,20 +86,19 @@ def fit_some(engine: CompiledModel, captures: ObservationBatch, seen: np.ndarray
     few = {name: np.full((count, DRAWS), np.nan) for name in engine.program.supports}
     rng = np.random.default_rng(0)
 
-    def describe(at: np.ndarray, parameters: Any, weights: np.ndarray) -> None:
-        for name in NAMES:
-            draws = np.asarray(parameters[name], float)
+    batch = problem_batch(engine, masked, np.arange(count), 0)
+    for found in CorrectedLaplace(draws=512).fit_batch(batch):
+        at, weights = found.at, found.weights
+        for name in NAMES if found.draws else ():
+            draws = np.asarray(found.draws[name], float)
             mean[name][at] = np.sum(weights * draws, axis=1)
             spread = np.sum(weights * (draws - mean[name][at, None]) ** 2, axis=1)
             sd[name][at] = np.sqrt(spread)
-        for row, material in enumerate(at):
+        for row, material in enumerate(at if found.draws else ()):
             share = weights[row] / weights[row].sum()
             some = rng.choice(share.size, DRAWS, p=share)
             for name, kept in few.items():
-                kept[material] = np.asarray(parameters[name])[row, some]
-
-    batch = BatchFit(engine, masked, random_keys(0, np.arange(count)), describe)
-    CorrectedLaplace(draws=512).fit_batch(batch)
+                kept[material] = np.asarray(found.draws[name])[row, some]
     flat = {name: kept.ravel() for name, kept in few.items()}
     z = unconstrain(engine.program, flat).reshape(count, DRAWS, -1)
     return Fits(mean, sd, z)

@@ -58,6 +58,15 @@ def write_lines(write: Callable[[str], object]) -> None:
     _write_line[:] = [write]
 
 
+def notice(text: str) -> None:
+    """Say a sentence where somebody watches, or in the log."""
+    console = Console(stderr=True)
+    if _in_notebook() or console.is_terminal:
+        console.print(text, markup=False, highlight=False, soft_wrap=True)  # above the bars
+    elif _write_line:
+        _write_line[0](text)
+
+
 def no_progress(stage: object, done: object) -> None:
     """Discard progress."""
 

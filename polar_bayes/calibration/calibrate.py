@@ -1,8 +1,10 @@
 """Simulation-based calibration (Talts et al. 2018): draw from the prior, simulate, fit, rank."""
 
 import contextlib
+import dataclasses
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -24,7 +26,7 @@ from polar_bayes.calibration.runner import (
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.compiled_model import layout_key
-from polar_bayes.inference.method import AbstractBatchMethod, find_method, name_of
+from polar_bayes.inference.method import AbstractBatchMethod, find_method, make_method, name_of
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
 from polar_bayes.inference.registry import FIT_DEFAULT
@@ -36,7 +38,7 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.paths import as_path
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
-from polar_bayes.progress import Counter, no_progress, with_counter
+from polar_bayes.progress import Counter, no_progress, notice, with_counter
 
 MIN_SIMULATIONS = 20
 
@@ -142,7 +144,10 @@ def calibrate(
         done = [] if blocks is None else blocks.blocks()
         stored = np.concatenate([*(block.numbers for block in done), []])
         missing = np.setdiff1d(np.arange(simulations), stored).astype(int)
-        done += _fit_all(plan, missing, simulations, blocks, scheduler, progress or no_progress)
+        forecast = Forecast(plan)
+        done += _fit_all(
+            plan, missing, simulations, blocks, scheduler, progress or no_progress, forecast
+        )
     provenance = {
         **request.describe(),
         "calibration": simulations,
@@ -151,6 +156,7 @@ def calibrate(
         "truth": {name: repr(value) for name, value in (truth or {}).items()},
         "capture": str(request.capture.attrs.get("name", "capture")),
         "seconds": round(time.perf_counter() - start, 3),
+        **({"forecast": forecast.sentence} if forecast.sentence else {}),
     }
     if missing.size < simulations:
         provenance["fits found in the store"] = simulations - missing.size
@@ -179,6 +185,7 @@ def _fit_all(
     store: BlockStore | None,
     scheduler: str | None,
     progress: Counter,
+    forecast: "Forecast",
 ) -> list[Block]:
     """Fit blocks on threads or workers; the result does not depend on which of them fits what."""
     found: list[Block] = []
@@ -193,7 +200,58 @@ def _fit_all(
             found.append(block)
             done += len(block.numbers)
             progress(done, total)
+            forecast.see(block, total - done)
     return found
+
+
+@dataclasses.dataclass
+class Forecast:
+    """Of a calibration that takes long: how long, and how a faster method fits the same.
+
+    It is made after `pilot` fits, where those that are left take `long` seconds or more.
+    """
+
+    plan: CalibrationPlan
+    sentence: str = ""
+    pilot: int = 8
+    long: float = 300.0
+    faster: str = "importance"
+    _seen: list[Block] = dataclasses.field(default_factory=list)
+    _begin: float = 0.0
+
+    def see(self, block: Block, left: int) -> None:
+        """Take in a finished block; once there are enough, say what can be said."""
+        self._seen.append(block)
+        if len(self._seen) == 1:  # its programs are compiled
+            self._begin = time.perf_counter()
+        count = sum(len(each.numbers) for each in self._seen[1:])
+        if self.sentence or count < self.pilot:
+            return
+        seconds = left * (time.perf_counter() - self._begin) / count
+        name = name_of(self.plan.settings)
+        if seconds >= self.long:
+            self.sentence = f"{left} more fits by {name} take about {seconds / 60.0:.0f} min"
+            self.sentence += "" if name == self.faster else self._faster(left)
+            notice(self.sentence)
+
+    def _faster(self, left: int) -> str:
+        """What the faster method makes of the same simulations."""
+        plan = dataclasses.replace(self.plan, settings=make_method(self.faster), readings=False)
+        own = join(self._seen, sys.maxsize)
+        fit_block(plan, own.numbers)  # compiles its programs
+        begin = time.perf_counter()
+        other = fit_block(plan, own.numbers)
+        minutes = left * (time.perf_counter() - begin) / len(own.numbers) / 60.0
+        both = (own.outcome.status == Status.GOOD) & (other.outcome.status == Status.GOOD)
+        moved = [
+            np.abs(other.mean[name] - mean)[both] / own.sd[name][both]
+            for name, mean in own.mean.items()
+        ]
+        largest = max((np.max(each, initial=0.0) for each in moved), default=0.0)
+        return (
+            f", by {self.faster} about {max(minutes, 0.1):.2g} min; both vouch for {both.sum()} of "
+            f"{len(both)}, whose means differ by at most {largest:.2g} sd"
+        )
 
 
 # --- The finished calibration as a tree -----------------------------------------------------------

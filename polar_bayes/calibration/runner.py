@@ -21,12 +21,12 @@ from jaxtyping import Array
 from polar_bayes.calibration.predictive import Arrays, PredictivePit, unranked_reason
 from polar_bayes.calibration.scores import PitCrps
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import BatchFit, random_keys
-from polar_bayes.inference.batching import ObservationBatch, Outcome
+from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout
 from polar_bayes.inference.method import AbstractBatchMethod
 from polar_bayes.inference.problem import observe_request
+from polar_bayes.inference.problem_batch import Outcome, empty_outcome, problem_batch
 from polar_bayes.inference.program import Program, Values, compile_program
 from polar_bayes.inference.psis import Marginals
 from polar_bayes.inference.request import Request
@@ -156,14 +156,13 @@ def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
     if is_ranked:
         again = {name: np.asarray(values)[:count] for name, values in drawn.replicated.items()}
         ranked = PredictivePit(engine.single_program, captures, again, numbers, seed)
-
-    def describe(at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        for statistic in (marginals, scores, ranked):
-            if statistic is not None:
-                statistic.describe(at, parameters, weights)
-
-    batch = BatchFit(engine, captures, random_keys(seed, numbers), describe, seed)
-    plan.settings.fit_batch(batch)
+    statistics: list[Marginals | PitCrps | PredictivePit] = [marginals, scores]
+    statistics += [ranked] if ranked else []
+    outcome = empty_outcome(count)
+    for found in plan.settings.fit_batch(problem_batch(engine, captures, numbers, seed)):
+        outcome.put(found)
+        for statistic in statistics if found.draws else ():
+            statistic.describe(found.at, found.draws, found.weights)
     return Block(
         numbers=np.asarray(numbers),
         truth=truth,
@@ -172,7 +171,7 @@ def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
         mean=marginals.mean,
         sd=marginals.sd,
         quantiles={name: np.moveaxis(x, 0, 1) for name, x in marginals.quantiles.items()},
-        outcome=batch.outcome,
+        outcome=outcome,
         fresh=ranked.fresh if ranked else {},
         left_out=ranked.left_out if ranked else {},
         left_out_k=ranked.left_out_k if ranked else {},

@@ -65,15 +65,10 @@ class Auto(AbstractMethod):
 
     def __post_init__(self) -> None:
         if not 0.0 < self.tolerance <= 1.0:
-            raise FitError(
-                f"tolerance is {self.tolerance}",
-                where="Auto",
-                hint="give posterior standard deviations above 0, at most 1, such as 0.1",
-            )
+            hint = "give posterior standard deviations above 0, at most 1, such as 0.1"
+            self.refuse(f"tolerance is {self.tolerance}", hint)
         if not self.seconds > 0.0:
-            raise FitError(
-                f"seconds is {self.seconds}", where="Auto", hint="give a time above 0, such as 60"
-            )
+            self.refuse(f"seconds is {self.seconds}", "give a time above 0, such as 60")
 
     def candidates(self, problem: Problem) -> dict[str, AbstractMethod]:
         """What is tried for a capture, each with as many draws as it takes.
@@ -99,7 +94,7 @@ class Auto(AbstractMethod):
 
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
-        deadline = problem.start_time + self.seconds
+        deadline = self.deadline(problem)
         attempts: list[Attempt] = []
         best: tuple[Attempt, PosteriorDraws] | None = None
         waiting = list(self.candidates(problem).items())
@@ -112,11 +107,7 @@ class Auto(AbstractMethod):
             attempts.append(attempt)
             # Of two in doubt the more expensive one is nearer to exact.
             if draws is not None and (best is None or attempt.error <= best[0].error):
-                other = draws.comparison_method or method
-                best = (
-                    attempt,
-                    dataclasses.replace(draws, comparison_method=other, deadline=deadline),
-                )
+                best = attempt, draws
             if attempt.taken:
                 break
             if name not in tried and np.isfinite(attempt.error):
@@ -132,6 +123,15 @@ class Auto(AbstractMethod):
                 hint="give more seconds, or check the capture against the prior predictive",
             )
         return self._report(*best, attempts)
+
+    @override
+    def deadline(self, problem: Problem) -> float:
+        return problem.start_time + self.seconds
+
+    @override
+    def for_comparison(self, problem: Problem, draws: PosteriorDraws) -> AbstractMethod:
+        chosen = self.candidates(problem)[draws.metadata["auto"]["chosen"]]
+        return chosen.for_comparison(problem, draws)
 
     def _try(
         self,

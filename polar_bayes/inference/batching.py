@@ -1,4 +1,4 @@
-"""Batches of pixels: their readings, the outcome of their fits, and compiled functions of them.
+"""Batches of pixels: their readings, what is known of a fit, and compiled functions of them.
 
 Some arrays differ between pixels, others are shared by all. A batch has a fixed number of pixels,
 so every batch of every image runs the same compiled program, which computes only as many of its
@@ -9,7 +9,7 @@ import dataclasses
 import enum
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,7 +19,6 @@ import xarray as xr
 from jaxtyping import Array
 
 from polar_bayes.inference.compile import JitOnce
-from polar_bayes.inference.program import Values
 from polar_bayes.observation.data import Observations
 from polar_bayes.physics.geometry import Geometry
 
@@ -127,7 +126,7 @@ def put_rows[T](values: T, which: np.ndarray, new: T) -> None:
         whole[which] = part
 
 
-# --- The outcome of a batch: status, method used and diagnostics of each pixel --------------------
+# --- Status of each pixel, and the method used ----------------------------------------------------
 
 
 MIN_VIEWS = 2
@@ -158,33 +157,6 @@ class MethodUsed(enum.IntEnum):
     ADAPTED = 3
     NUTS = 4
     OTHER = 7
-
-
-Describe = Callable[[np.ndarray, Values, np.ndarray], None]
-"""Receives indices of pixels with an answer, their draws by name and weights of (pixel, draw)."""
-
-
-class Outcome(NamedTuple):
-    """Diagnostics of a batch of pixels: NaN where there are none."""
-
-    pareto_k: np.ndarray
-    effective_draws: np.ndarray
-    condition: np.ndarray
-    steps: np.ndarray
-    approach: np.ndarray
-    status: np.ndarray
-
-
-def empty_outcome(count: int, status: Status = Status.NOT_CONVERGED) -> Outcome:
-    """Diagnostics of pixels that are not fitted yet."""
-    return Outcome(
-        pareto_k=np.full(count, np.nan),
-        effective_draws=np.full(count, np.nan),
-        condition=np.full(count, np.nan),
-        steps=np.zeros(count, np.int32),
-        approach=np.full(count, MethodUsed.NONE, np.int8),
-        status=np.full(count, status, np.int8),
-    )
 
 
 # --- A function of one pixel as a compiled program of a batch -------------------------------------

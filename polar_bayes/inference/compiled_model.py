@@ -63,8 +63,7 @@ class CompiledModel:
     layout: Observations
     precision: str
     priors: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
-    programs: LRUCache[Any] = dataclasses.field(default_factory=lambda: LRUCache(MAX_PROGRAMS))
-    """Further compiled programs of the model, which methods keep here by keys of their own."""
+    _made: LRUCache[Any] = dataclasses.field(default_factory=lambda: LRUCache(MAX_PROGRAMS))
 
     @functools.cached_property
     def initializer(self) -> AbstractInitializer:
@@ -85,11 +84,9 @@ class CompiledModel:
         """Floating type of the answer."""
         return np.float64 if self.precision == "double" else np.float32
 
-    def compiled[S: Hashable](
-        self, make: Callable[["CompiledModel", S], JitOnce], settings: S
-    ) -> JitOnce:
-        """The program for these settings, made at its first use."""
-        return self.programs.of((make, settings), lambda: make(self, settings))
+    def made[S: Hashable, P](self, make: Callable[["CompiledModel", S], P], settings: S) -> P:
+        """What a method makes of the model for its settings, a program say, at its first use."""
+        return self._made.of((make, settings), lambda: make(self, settings))
 
     def run[S: Hashable](
         self,
@@ -104,7 +101,7 @@ class CompiledModel:
         """Run a program on all pixels; `given` arguments are the same for all of them."""
         double = not single and self.dtype == np.float64
         with self._arguments(pixels, states, given, batch, single=single) as arguments:
-            program, device = self.compiled(make, settings), jax.config.jax_default_device
+            program, device = self.made(make, settings), jax.config.jax_default_device
             if not program.is_begun:  # a thread that was abandoned must not trace in another one
                 program.program(*arguments(next(batches(len(pixels), batch))))
 
@@ -125,7 +122,7 @@ class CompiledModel:
         single: bool = False,
     ) -> None:
         """Begin to compile what `run` needs, in parallel with what follows, given one state."""
-        program = self.compiled(make, settings)
+        program = self.made(make, settings)
         if not program.is_begun:
             with self._arguments(pixels, states, given, BATCH, single=single) as arguments:
                 program.begin(*arguments(np.zeros(BATCH, int)))
@@ -147,43 +144,28 @@ class CompiledModel:
 
             yield arguments
 
-    @property
+    @functools.cached_property
     def parameter_axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
         """By parameter: names and lengths of the axes that it has in one pixel."""
-
-        def find() -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
-            z = np.zeros(self.program.size, self.dtype)
-            with jax.enable_x64(self.precision == "double"), TRACING_LOCK:
-                names = jax.eval_shape(self.program.parameters, z, self.layout)
-            dims = dims_of(self.program)
-            return {name: (tuple(dims[name]), shape_of(self.program, name)) for name in names}
-
-        return self.programs.of("parameter axes", find)
+        z = np.zeros(self.program.size, self.dtype)
+        with jax.enable_x64(self.precision == "double"), TRACING_LOCK:
+            names = jax.eval_shape(self.program.parameters, z, self.layout)
+        dims = dims_of(self.program)
+        return {name: (tuple(dims[name]), shape_of(self.program, name)) for name in names}
 
     def prior_draws(self, count: int) -> np.ndarray:
         """Draws from the prior, the starting points of mode searches. (draw, size)."""
         # Moments need many, and a draw does not depend on how many there are: keys compile once.
-        drawn = max(count, MOMENTS)
+        return self.made(_prior_draws, max(count, MOMENTS))[:count]
 
-        def draw() -> np.ndarray:
-            with jax.enable_x64(self.precision == "double"):
-                key = jax.random.key(0)
-                return np.asarray(from_prior(self.program, key, drawn, self.layout))
-
-        return self.programs.of(("prior draws", drawn), draw)[:count]
-
-    @property
+    @functools.cached_property
     def prior_parameters(self) -> dict[str, np.ndarray]:
         """Parameters of `MOMENTS` draws from the prior, each (draw, ...)."""
-
-        def find() -> dict[str, np.ndarray]:
-            z = self.prior_draws(MOMENTS)
-            with jax.enable_x64(self.precision == "double"):
-                draws = self.program.parameters_of_chains(jnp.asarray(z[None]), self.layout)
-            sizes = {name: own for name, (_, own) in self.parameter_axes.items()}
-            return {n: np.asarray(x[0], float).reshape(-1, *sizes[n]) for n, x in draws.items()}
-
-        return self.programs.of("prior parameters", find)
+        z = self.prior_draws(MOMENTS)
+        with jax.enable_x64(self.precision == "double"):
+            draws = self.program.parameters_of_chains(jnp.asarray(z[None]), self.layout)
+        sizes = {name: own for name, (_, own) in self.parameter_axes.items()}
+        return {n: np.asarray(x[0], float).reshape(-1, *sizes[n]) for n, x in draws.items()}
 
     @property
     def prior_moments(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -191,6 +173,12 @@ class CompiledModel:
         found = self.prior_parameters.items()
         moments = {name: (x.mean(axis=0), x.std(axis=0)) for name, x in found}
         return {name: two for name, two in moments.items() if np.isfinite(two).all()}
+
+
+def _prior_draws(compiled_model: CompiledModel, count: int) -> np.ndarray:
+    with jax.enable_x64(compiled_model.precision == "double"):
+        key = jax.random.key(0)
+        return np.asarray(from_prior(compiled_model.program, key, count, compiled_model.layout))
 
 
 def evaluate_draws(

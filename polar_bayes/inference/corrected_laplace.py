@@ -8,14 +8,13 @@ draws of a sampler (`Importance`, say), which also fits pixels whose mode was no
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
 from typing import Any, ClassVar, NamedTuple, Self, override
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.inference.batch_fit import BatchFit
 from polar_bayes.inference.batching import (
     MethodUsed,
     Status,
@@ -35,6 +34,7 @@ from polar_bayes.inference.levenberg_marquardt import (
     find_starts,
 )
 from polar_bayes.inference.method import AbstractBatchMethod
+from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.proposals import (
     Points,
@@ -120,30 +120,31 @@ class CorrectedLaplace(AbstractBatchMethod):
             self.refuse(f"starts is {self.starts}", f"give 1 to {self.most_starts}")
 
     @override
-    def fit(
-        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
-    ) -> None:
-        run = _Run(self, batch, at)
-        found = run.approximate(None if modes is None else np.asarray(modes.z))
-        run.record(found)
-        several = np.zeros(at.size, bool)
-        if self.sampler is not None:
-            several = found.search.converged & found.has_rival
-            if several.any():
-                self.sampler.fit(batch, at[several], take_rows(found.search.mode, several))
-        hard = np.flatnonzero(found.search.converged & ~found.is_trusted & ~several)
+    def run_batch(
+        self, batch: ProblemBatch, known: np.ndarray | None = None
+    ) -> Iterator[BatchDraws]:
+        """The same as of other methods; `known` modes, (pixel, size), are where searches begin."""
+
+        def sample(which: np.ndarray) -> Iterator[BatchDraws]:
+            if self.sampler is not None and which.size:
+                yield from self.sampler.run_batch(batch.subset(which))
+
+        run = _Run(self, batch)
+        found = run.approximate(known)
+        yield from run.answers(found)
+        converged = found.search.converged
+        several = converged & found.has_rival & (self.sampler is not None)
+        yield from sample(np.flatnonzero(several))
+        hard = np.flatnonzero(converged & ~found.is_trusted & ~several)
         for begin in range(0, hard.size, HARD):
             some = hard[begin : begin + HARD]
-            left = some[run.adapt(some, take_rows(found, some))]
-            if self.sampler is not None and left.size:
-                self.sampler.fit(batch, at[left], take_rows(found.search.mode, left))
-        lost = at[~found.search.converged]
-        if self.sampler is not None and lost.size:
-            self.sampler.fit(batch, lost)
+            left = yield from run.adapt(some, take_rows(found, some))
+            yield from sample(some[left])
+        yield from sample(np.flatnonzero(~converged))
 
     @override
     def for_image(
-        self, size: int, sample: Callable[[int], BatchFit], *, is_shared: bool
+        self, size: int, sample: Callable[[int], ProblemBatch], *, is_shared: bool
     ) -> tuple[Self, dict[str, Any]]:
         if self.starts is not None:
             return self, {}
@@ -151,12 +152,12 @@ class CorrectedLaplace(AbstractBatchMethod):
         if is_shared or size <= SMALL_IMAGE:
             return every, {}
         batch = sample(SAMPLE)
-        at, once = np.arange(len(batch.pixels)), dataclasses.replace(self, starts=1)
-        one, best = (_Run(method, batch, at).approximate() for method in (once, every))
+        once = dataclasses.replace(self, starts=1)
+        one, best = (_Run(method, batch).approximate() for method in (once, every))
         is_lower = best.search.mode.value < one.search.mode.value - SAME_MODE
         missed = int(np.sum(one.is_trusted & (is_lower | best.has_rival)))
-        chosen = once if missed <= MOST_MISSED * at.size else every
-        return chosen, {"starts_compared": {"pixels": at.size, "missed": missed}}
+        chosen = once if missed <= MOST_MISSED * len(batch) else every
+        return chosen, {"starts_compared": {"pixels": len(batch), "missed": missed}}
 
 
 class Approximation(NamedTuple):
@@ -183,13 +184,13 @@ class Approximation(NamedTuple):
 class _Run:
     """One run of `CorrectedLaplace` for some pixels of a batch."""
 
-    def __init__(self, settings: CorrectedLaplace, batch: BatchFit, at: np.ndarray) -> None:
-        self.settings, self.batch, self.at = settings, batch, at
-        self.engine, self.pixels = batch.engine, batch.pixels.subset(at)
+    def __init__(self, settings: CorrectedLaplace, batch: ProblemBatch) -> None:
+        self.settings, self.at = settings, batch.at
+        self.engine, self.pixels = batch.engine, batch.pixels
         size, draws = self.engine.program.size, settings.draws
         self.points = normal_points(draws, size, batch.seed)
         self.student_t = student_t_points(STUDENT_T_FACTOR * draws, size, batch.seed)
-        self.rotations = random_rotations(batch.keys[at], size)
+        self.rotations = random_rotations(batch.keys, size)
 
     def approximate(self, known: np.ndarray | None = None) -> Approximation:
         """Fit from the best candidate; untrusted pixels start again and keep the lower mode.
@@ -245,21 +246,36 @@ class _Run:
         given = z, log_density
         self.engine.begin(_draws, None, self.pixels, *states, given=given, single=True)
 
-    def record(self, found: Approximation) -> None:
+    def answers(self, found: Approximation) -> Iterator[BatchDraws]:
         """Normal approximations, corrected by their weights where these can be trusted."""
-        at, outcome = self.at, self.batch.outcome
-        self.batch.record_modes(at, found.search)
-        converged, trusted = found.search.converged, found.is_trusted
-        outcome.pareto_k[at] = np.where(converged, found.pareto_k, np.nan)
-        effective = np.where(trusted, effective_draws(found.weights), np.nan)
-        method = np.where(trusted, MethodUsed.IMPORTANCE, MethodUsed.LAPLACE)
-        # Weights that cannot be trusted do not correct anything.
-        weights = np.where(trusted[:, None], found.weights, 1.0 / self.settings.draws)
-        status = np.where(trusted, Status.GOOD, Status.NOT_TRUSTED)
-        answers = found.parameters, weights, effective, method, status
-        self.batch.record(at[converged], *take_rows(answers, converged))
+        converged = found.search.converged
+        lost = take_rows(found.search, ~converged)
+        no_root = np.full_like(lost.mode.root, np.nan)
+        yield BatchDraws(
+            self.at[~converged],
+            Status.NOT_CONVERGED,
+            steps=lost.steps,
+            mode=(lost.mode.z, no_root),
+        )
+        found, trusted = take_rows(found, converged), found.is_trusted[converged]
+        mode = found.search.mode
+        yield BatchDraws(
+            self.at[converged],
+            np.where(trusted, Status.GOOD, Status.NOT_TRUSTED),
+            found.parameters,
+            # Weights that cannot be trusted do not correct anything.
+            np.where(trusted[:, None], found.weights, 1.0 / self.settings.draws),
+            np.where(trusted, effective_draws(found.weights), np.nan),
+            np.where(trusted, MethodUsed.IMPORTANCE, MethodUsed.LAPLACE),
+            found.pareto_k,
+            mode.condition,
+            found.search.steps,
+            (mode.z, mode.root),
+        )
 
-    def adapt(self, which: np.ndarray, normal: Approximation) -> np.ndarray:
+    def adapt(
+        self, which: np.ndarray, normal: Approximation
+    ) -> Generator[BatchDraws, None, np.ndarray]:
         """Fit proposals to their own weighted draws; returns which have no answer after that."""
         left, points, weights = np.arange(which.size), self.points, normal.weights
         proposal = _proposal_at(normal.search.mode).rotated(self.rotations[which])
@@ -280,7 +296,7 @@ class _Run:
             if self.settings.sampler is not None and enough.any():
                 enough[enough] = ~self._has_arm(some[enough], take_rows(proposal, enough))
             answers = take_rows((parameters, weights, effective), enough)
-            self.batch.record(self.at[some[enough]], *answers, MethodUsed.ADAPTED)
+            yield BatchDraws(self.at[some[enough]], Status.GOOD, *answers, MethodUsed.ADAPTED)
             left, weights, proposal = take_rows((left, weights, proposal), ~enough)
         return left
 

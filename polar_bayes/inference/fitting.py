@@ -24,7 +24,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference import methods
 from polar_bayes.inference.alternatives import compare_alternatives
 from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_until
-from polar_bayes.inference.method import AbstractMethod, PosteriorDraws, find_method
+from polar_bayes.inference.method import AbstractMethod, find_method
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.problem import Problem, make_problem
@@ -76,15 +76,18 @@ def fit_request(
     comparisons: dict[str, xr.Dataset] = {}
     failed: dict[str, str] = {}
     alternatives: dict[str, Any] = {}
+    deadline = method.deadline(problem)
     compares = with_comparisons and draws.covariance is None  # a point has no intervals to compare
     if compares:
-        comparisons, failed = _fit_comparisons(request, method, draws, key_comparisons, progress)
+        comparisons, failed = _fit_comparisons(
+            request, method.for_comparison(problem, draws), deadline, key_comparisons, progress
+        )
     if isinstance(request.scene.ledger, xr.Dataset):
         comparisons["effects"] = request.scene.ledger  # how the scene was chosen
     timings.record("comparisons")
     if compares:
         alternatives = try_alternatives(
-            request, problem, posterior.parameters, key_check, progress, deadline=draws.deadline
+            request, problem, posterior.parameters, key_check, progress, deadline=deadline
         )
     timings.record("alternatives")
 
@@ -178,12 +181,11 @@ def _check_room(problem: Problem, draws: int) -> None:
 
 
 def _fit_comparisons(
-    request: Request, method: AbstractMethod, draws: PosteriorDraws, key: Array, progress: Progress
+    request: Request, method: AbstractMethod, deadline: float, key: Array, progress: Progress
 ) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
     """Posteriors of the same capture under simpler scenes, by name, and why others failed."""
     if not request.scene.has(Discrepancy):
         return {}, {}
-    method = draws.comparison_method or method
     scenes = {
         "without_discrepancy": request.scene.without(Discrepancy),
         "without_instrument": dataclasses.replace(request.scene, instrument=None),
@@ -213,7 +215,7 @@ def _fit_comparisons(
 
     late = ""
     try:
-        run_until(draws.deadline, progress, compare)
+        run_until(deadline, progress, compare)
     except OutOfTimeError as error:
         late = str(error)
     progress("comparing", 1.0)

@@ -11,6 +11,7 @@ Source:
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -24,8 +25,14 @@ import scipy.special
 from jaxtyping import Array, Float
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import BatchFit
-from polar_bayes.inference.batching import MethodUsed, Status, batched, take_rows
+from polar_bayes.inference.batching import (
+    AnyArray,
+    MethodUsed,
+    ObservationBatch,
+    Status,
+    batched,
+    take_rows,
+)
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import (
     MOMENTS,
@@ -41,6 +48,7 @@ from polar_bayes.inference.levenberg_marquardt import (
 from polar_bayes.inference.method import AbstractBatchMethod, AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import finite_sd
 from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.profile_mixture import (
     LEAST_WEIGHT,
     MOST_COORDINATES,
@@ -98,10 +106,7 @@ class Importance(AbstractMethod):
     group_size: ClassVar[int] = AbstractBatchMethod.group_size
 
     def __post_init__(self) -> None:
-        if self.draws < 256:
-            raise FitError(f"draws is {self.draws}", where="Importance", hint="give at least 256")
-        if self.rounds < 1:
-            raise FitError(f"rounds is {self.rounds}", where="Importance", hint="give at least 1")
+        self.check_least(draws=256, rounds=1)
 
     @override
     def prepare(self, problem: Problem) -> None:
@@ -110,25 +115,19 @@ class Importance(AbstractMethod):
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
         initialization = problem.initialize(progress)
-        key_draw, key_resample = jax.random.split(key)
         coordinates = initialization.joint_coordinates("Importance")
-        sample = Rounds(self.draws, self.rounds)
-        proposal = profile_mixture(coordinates)
-        while True:
-            sample.weigh(coordinates.log_density(sample.draw(proposal, key_draw)))
-            if not sample.calls_for_more:
-                break
+        key_rounds, key_resample = jax.random.split(key)
+        sample = Rounds(self, profile_mixture(coordinates), key_rounds)
+        while sample.is_open:
+            sample.weigh(coordinates.log_density(sample.draw()))
             progress("weighting draws", len(sample.proposals) / self.rounds)
-            key_draw, key_fit = jax.random.split(key_draw)
-            proposal = sample.fit(key_fit)
-        weights, k_hat = sample.weights, sample.k_hat
+        weights, k_hat, effective = sample.weights, sample.k_hat, sample.effective
         if not np.isfinite(weights).all():
             raise FitError(
                 "the posterior density is zero at every draw",
                 where="Importance",
                 hint="use method='nuts'",
             )
-        effective = sample.effective
         z = coordinates.forward(sample.z)
         index = systematic_resample(weights, effective, numpy_generator(key_resample))
         problems = []
@@ -143,7 +142,7 @@ class Importance(AbstractMethod):
             stats={"lp": sample.log_posterior[index]},
             problems=problems,
             weighted=(z, weights),
-            k_hat=float(k_hat),
+            k_hat=k_hat,
             effective_draws=effective,
             gradients=float(initialization.metadata["gradients"]),
             densities=float(len(z)),
@@ -151,40 +150,45 @@ class Importance(AbstractMethod):
         )
 
     @override
-    def fit(
-        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
-    ) -> None:
+    def run_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
         if not batch.engine.initializer.is_plain:
-            super().fit(batch, at)
+            yield from super().run_batch(batch)
             return
-        groups = np.array_split(at, max(min(THREADS, at.size), -(-at.size // GROUP)))
+        count = max(min(THREADS, len(batch)), -(-len(batch) // GROUP))
+        groups = [batch.subset(x) for x in np.array_split(np.arange(len(batch)), count)]
         found: list[int] = []
         with ThreadPoolExecutor(THREADS) as pool:
-            for pixels in pool.map(functools.partial(self._fit, batch), groups):
-                for pixel in pixels:
-                    pixel.record(batch)
-                    found.append(pixel.at)
-        lost = np.setdiff1d(at, found)
+            for answer in itertools.chain.from_iterable(pool.map(self._run_group, groups)):
+                found.extend(answer.at)
+                yield answer
+        lost = np.flatnonzero(~np.isin(batch.at, found))
         if lost.size:  # no mode was found side by side
-            super().fit(batch, lost)
+            yield from super().run_batch(batch.subset(lost))
 
-    def _fit(self, batch: BatchFit, at: np.ndarray) -> list["_Pixel"]:
-        """Weighted draws of the pixels that have a mode."""
-        engine, pixels = batch.engine, batch.pixels.subset(at)
+    def _run_group(self, batch: ProblemBatch) -> list[BatchDraws]:
+        """Weighted draws of the captures that have a mode."""
+        engine, pixels = batch.engine, batch.pixels
         with jax.enable_x64(engine.precision == "double"):  # a thread does not inherit it
-            found = {
-                row: _Pixel(at[row], Rounds(self.draws, self.rounds), batch.keys[at[row]], mixture)
-                for row, mixture in _profile_mixtures(batch, at)
+            owner, modes = find_all_modes(engine, pixels)
+            if not owner.size:
+                return []
+            mixtures = profile_mixtures(engine, pixels, owner, modes)
+            samples = {
+                row: Rounds(self, mixture, jax.random.wrap_key_data(jnp.asarray(batch.keys[row])))
+                for row, mixture in mixtures.items()
             }
-            left = list(found)
-            while left:
-                z = np.stack([found[row].draw() for row in left])
+            while left := [row for row, sample in samples.items() if sample.is_open]:
+                z = np.stack([samples[row].draw() for row in left])
                 some = pixels.subset(np.array(left))
                 drawn = engine.run(_densities, self.draws, some, z, batch=SMALL_BATCH)
-                for at_row, row in enumerate(left):
-                    found[row].weigh(*jax.tree.map(lambda x, i=at_row: x[i], drawn))
-                left = [row for row in left if found[row].rounds.calls_for_more]
-        return list(found.values())
+                for at, row in enumerate(left):
+                    parameters, log_posterior = jax.tree.map(lambda x, at=at: x[at], drawn)
+                    samples[row].weigh(log_posterior, parameters)
+        heaviest = take_rows((modes.z, modes.root), np.unique(owner, return_index=True)[1])
+        return [
+            sample.answer(batch.at[[row]], take_rows(heaviest, np.array([at])))
+            for at, (row, sample) in enumerate(samples.items())
+        ]
 
 
 def tail_shares(problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
@@ -223,14 +227,22 @@ raised to a power below 1."""
 
 
 class Rounds:
-    """Draws of all rounds, weighted over the mean density of their proposals."""
+    """Draws of one posterior in all rounds, weighted over the mean density of their proposals."""
 
-    def __init__(self, draws: int, rounds: int) -> None:
-        self._draws, self._rounds = draws, rounds
+    def __init__(self, settings: Importance, proposal: Mixture, key: Array) -> None:
+        self._draws, self._rounds = settings.draws, settings.rounds
+        self._next: Mixture | None = proposal
+        self._key = key
         self.proposals: list[Mixture] = []
         self._z: list[np.ndarray] = []
         self._log_posterior: list[np.ndarray] = []
+        self._parameters: list[Values] = []
         self._log_proposals = np.empty((0, 0))  # (proposal, draw)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a further round is needed, and there are draws to which it can be fitted."""
+        return self._next is not None
 
     @property
     def z(self) -> Float[np.ndarray, "draw size"]:
@@ -242,8 +254,11 @@ class Rounds:
         """Their log posterior densities."""
         return np.concatenate(self._log_posterior)
 
-    def draw(self, proposal: Mixture, key: Array) -> np.ndarray:
-        """Draws of one more proposal, (draw, size), to be weighed next."""
+    def draw(self) -> np.ndarray:
+        """Draws of the next proposal, (draw, size), to be weighed then."""
+        assert self._next is not None
+        self._key, key = jax.random.split(self._key)
+        proposal = self._next
         z, log_proposal = map(np.asarray, _propose(proposal, self._draws, key))
         older = [np.asarray(_log_densities(each, z)) for each in self.proposals]
         newer = [np.asarray(_log_densities(proposal, block)) for block in self._z]
@@ -254,26 +269,44 @@ class Rounds:
         self._z.append(z)
         return z
 
-    def weigh(self, log_posterior: np.ndarray) -> None:
-        """Weigh the last draws by their log posterior densities, and all others anew."""
+    def weigh(self, log_posterior: np.ndarray, parameters: Values | None = None) -> None:
+        """Weigh the last draws by their densities, all others anew, and fit the next proposal."""
         self._log_posterior.append(log_posterior)
+        self._parameters.append(parameters or {})
         mean = scipy.special.logsumexp(self._log_proposals, axis=0) - math.log(len(self.proposals))
-        self.log_ratios = self.log_posterior - mean
-        weights, k_hat = smooth(self.log_ratios[None])
+        log_ratios = self.log_posterior - mean
+        weights, k_hat = smooth(log_ratios[None])
         self.weights, self.k_hat = weights[0], float(k_hat[0])
         self.effective = float(effective_draws(weights)[0])
+        enough = self.effective >= ENOUGH_SHARE * self._draws and self.k_hat <= FINITE_VARIANCE
+        is_last = enough or len(self.proposals) == self._rounds
+        self._next = None if is_last or not self.is_finite else self._fit(log_ratios)
 
     @property
-    def calls_for_more(self) -> bool:
-        """Whether a further round is needed, and there are draws to which it can be fitted."""
-        enough = self.effective >= ENOUGH_SHARE * self._draws and self.k_hat <= FINITE_VARIANCE
-        is_last = len(self.proposals) == self._rounds
-        return not (enough or is_last) and bool(np.isfinite(self.weights).all())
+    def is_finite(self) -> bool:
+        """Whether any draw has a density."""
+        return bool(np.isfinite(self.weights).all())
 
-    def fit(self, key: Array) -> Mixture:
+    def answer(self, at: np.ndarray, mode: tuple[AnyArray, AnyArray]) -> BatchDraws:
+        """All draws as those of the capture at one place of a batch."""
+        if not self.is_finite:
+            return BatchDraws(at, Status.NOT_CONVERGED, pareto_k=self.k_hat, mode=mode)
+        return BatchDraws(
+            at,
+            Status.GOOD if self.k_hat <= MAX_PARETO_K else Status.NOT_TRUSTED,
+            jax.tree.map(lambda *rows: np.concatenate(rows)[None], *self._parameters),
+            self.weights[None],
+            self.effective,
+            MethodUsed.IMPORTANCE,
+            self.k_hat,
+            mode=mode,
+        )
+
+    def _fit(self, log_ratios: np.ndarray) -> Mixture:
         """A mixture for the next round."""
+        self._key, key = jax.random.split(self._key)
         z = self.z
-        weights = _temper(self.log_ratios, FITTED_PER_SIZE * z.shape[1])
+        weights = _temper(log_ratios, FITTED_PER_SIZE * z.shape[1])
         # One length compiles once: the draws of rounds to come have no weight.
         missing = self._rounds * self._draws - len(z)
         z = np.pad(z, ((0, missing), (0, 0)))
@@ -316,50 +349,13 @@ def _propose(proposal: Mixture, count: int, key: Array) -> tuple[Array, Array]:
 # --- Many captures side by side -------------------------------------------------------------------
 
 
-class _Pixel:
-    """Rounds of one pixel, and the parameters of their draws."""
-
-    def __init__(self, at: int, rounds: Rounds, key: np.ndarray, proposal: Mixture) -> None:
-        self.at, self.rounds = at, rounds
-        self._key, self._proposal = jax.random.wrap_key_data(jnp.asarray(key)), proposal
-        self._parameters: list[Values] = []
-
-    def draw(self) -> np.ndarray:
-        """Draws of the next proposal, (draw, size)."""
-        self._key, key_draw = jax.random.split(self._key)
-        return self.rounds.draw(self._proposal, key_draw)
-
-    def weigh(self, parameters: Values, log_posterior: np.ndarray) -> None:
-        """Weigh these draws, and fit a proposal to all where a further round is needed."""
-        self.rounds.weigh(log_posterior)
-        self._parameters.append(parameters)
-        if self.rounds.calls_for_more:
-            self._key, key_fit = jax.random.split(self._key)
-            self._proposal = self.rounds.fit(key_fit)
-
-    def record(self, batch: BatchFit) -> None:
-        """The answer, where any draw has a density."""
-        one, rounds = np.array([self.at]), self.rounds
-        batch.record_pareto_k(one, np.array([rounds.k_hat]))
-        if np.isfinite(rounds.weights).all():
-            draws = jax.tree.map(lambda *rows: np.concatenate(rows)[None], *self._parameters)
-            status = Status.GOOD if rounds.k_hat <= MAX_PARETO_K else Status.NOT_TRUSTED
-            effective = np.array([rounds.effective])
-            batch.record(one, draws, rounds.weights[None], effective, MethodUsed.IMPORTANCE, status)
-
-
-def _profile_mixtures(batch: BatchFit, at: np.ndarray) -> Iterator[tuple[int, Mixture]]:
-    """The first proposal of every pixel that has a mode, and the number of the pixel."""
-    engine, pixels = batch.engine, batch.pixels.subset(at)
-    owner, modes = find_all_modes(engine, pixels)
-    if not owner.size:
-        return
-    evidence, largest = modes.log_evidence, np.full(len(pixels), -np.inf)
-    np.maximum.at(largest, owner, evidence)
-    is_first = evidence == largest[owner]
-    batch.record_approximation(at[owner[is_first]], take_rows(modes, is_first))
-    weight = np.exp(evidence - largest[owner])
-    heavy = weight >= LEAST_WEIGHT * np.bincount(owner, weight)[owner]
+def profile_mixtures(
+    engine: CompiledModel, pixels: ObservationBatch, owner: np.ndarray, modes: NormalApproximation
+) -> dict[int, Mixture]:
+    """The first proposal of every pixel from its modes, the heaviest of which come first."""
+    first, inverse = np.unique(owner, return_index=True, return_inverse=True)[1:]
+    weight = np.exp(modes.log_evidence - modes.log_evidence[first][inverse])
+    heavy = weight >= LEAST_WEIGHT * np.bincount(inverse, weight)[inverse]
     owner, modes = owner[heavy], take_rows(modes, heavy)
     z, value, root = map(np.asarray, modes[:3])
 
@@ -369,9 +365,10 @@ def _profile_mixtures(batch: BatchFit, at: np.ndarray) -> Iterator[tuple[int, Mi
     peaks = Peaks(z, value, np.swapaxes(root, 1, 2) @ root)
     prior_sd = finite_sd(engine.prior_draws(MOMENTS))
     components = profile_components(peaks, np.arange(engine.program.size), prior_sd, conditional)
-    for pixel in np.unique(owner):
-        own = take_rows(components, owner[components.peak] == pixel)
-        yield int(pixel), mixture_of(own, engine.dtype)
+    return {
+        int(pixel): mixture_of(take_rows(components, owner[components.peak] == pixel), engine.dtype)
+        for pixel in np.unique(owner)
+    }
 
 
 def _densities(engine: CompiledModel, draws: int) -> JitOnce:

@@ -5,21 +5,21 @@ Source:
 """
 
 import dataclasses
+from collections.abc import Iterator
 from typing import ClassVar, override
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
-from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import BatchFit
-from polar_bayes.inference.batching import MethodUsed, batched, take_rows
+from polar_bayes.inference.batching import MethodUsed, Status, batched, take_rows
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
-from polar_bayes.inference.levenberg_marquardt import NormalApproximation, find_all_modes
+from polar_bayes.inference.levenberg_marquardt import find_all_modes
 from polar_bayes.inference.method import AbstractBatchMethod, AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import SETTLED
 from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import smooth
 from polar_bayes.observation.data import Observations
@@ -44,12 +44,7 @@ class Laplace(AbstractMethod):
     group_size: ClassVar[int] = AbstractBatchMethod.group_size
 
     def __post_init__(self) -> None:
-        if self.draws < 50 or self.chains < 1:
-            raise FitError(
-                f"draws is {self.draws} and chains is {self.chains}",
-                where="Laplace",
-                hint="give at least 50 draws and 1 chain",
-            )
+        self.check_least(draws=50, chains=1)
 
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
@@ -75,28 +70,27 @@ class Laplace(AbstractMethod):
         )
 
     @override
-    def fit(
-        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
-    ) -> None:
+    def run_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
         engine = batch.engine
         if not engine.initializer.is_joint:
-            super().fit(batch, at)
+            yield from super().run_batch(batch)
             return
-        owner = np.arange(at.size)
-        if modes is None:
-            owner, modes = find_all_modes(engine, batch.pixels.subset(at))
-            order = np.lexsort((-modes.log_evidence, owner))
-            heaviest = order[np.unique(owner[order], return_index=True)[1]]
-            owner, modes = owner[heaviest], take_rows(modes, heaviest)
+        owner, modes = find_all_modes(engine, batch.pixels)
         if not owner.size:
             return
-        found, count = at[owner], self.chains * self.draws
-        batch.record_approximation(found, modes)
-        batch.outcome.condition[found] = modes.condition
-        states = np.asarray(modes.z), np.asarray(modes.root), batch.keys[found]
-        draws = engine.run(_normal_draws, count, batch.pixels.subset(found), *states)
-        weights = np.full((found.size, count), 1.0 / count)
-        batch.record(found, draws, weights, np.full(found.size, float(count)), MethodUsed.LAPLACE)
+        heaviest = np.unique(owner, return_index=True)[1]
+        found, modes = batch.subset(owner[heaviest]), take_rows(modes, heaviest)
+        count, mode = self.chains * self.draws, (np.asarray(modes.z), np.asarray(modes.root))
+        yield BatchDraws(
+            found.at,
+            Status.GOOD,
+            engine.run(_normal_draws, count, found.pixels, *mode, found.keys),
+            np.full((len(found), count), 1.0 / count),
+            float(count),
+            MethodUsed.LAPLACE,
+            condition=np.asarray(modes.condition),
+            mode=mode,
+        )
 
 
 def _normal_draws(engine: CompiledModel, count: int) -> JitOnce:

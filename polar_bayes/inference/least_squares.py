@@ -14,8 +14,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.initialization import STARTS
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.optimize import from_prior
@@ -39,18 +39,13 @@ class Point(AbstractMethod):
     starts: int = 16
 
     def __post_init__(self) -> None:
-        if self.starts < 1:
-            raise FitError(f"starts is {self.starts}", where="Point", hint="give at least 1")
+        self.check_least(starts=1)
 
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
         # The starts are those from which other methods search for modes.
         starts = from_prior(problem.program, problem.key, STARTS, problem.data)
-        program = problem.program
-        solve = problem.compiled_model.programs.of(
-            "least squares",
-            lambda: JitOnce(lambda starts, data: estimate(program, data, starts)),
-        )
+        program, solve = problem.program, problem.compiled_model.made(_solver, None)
         found = solve(jnp.asarray(starts[: self.starts]), problem.data)
         return PosteriorDraws(
             method="point",
@@ -60,6 +55,11 @@ class Point(AbstractMethod):
             covariance=np.asarray(found.covariance),
             metadata={"standard_errors": standard_errors(program, found)},
         )
+
+
+def _solver(compiled_model: CompiledModel, _: None) -> JitOnce:
+    program = compiled_model.program
+    return JitOnce(lambda starts, data: estimate(program, data, starts))
 
 
 class Estimate(NamedTuple):

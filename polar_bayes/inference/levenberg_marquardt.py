@@ -486,7 +486,7 @@ def _advance(
 def find_all_modes(
     engine: CompiledModel, pixels: ObservationBatch
 ) -> tuple[Int[np.ndarray, " mode"], NormalApproximation]:
-    """Distinct modes of all pixels, and the index of the pixel that each belongs to."""
+    """Distinct modes of each pixel, the heaviest first, and the pixel that each belongs to."""
     ends: list[NormalApproximation] = []
     is_new: list[np.ndarray] = []
     starts, first = find_starts(engine, pixels), None
@@ -498,7 +498,9 @@ def find_all_modes(
         ends.append(mode)
         is_new.append(converged)
     rank, owner = np.nonzero(is_new)
-    return owner, jax.tree.map(lambda *each: np.stack(each)[rank, owner], *ends)
+    modes = jax.tree.map(lambda *each: np.stack(each)[rank, owner], *ends)
+    order = np.lexsort((-modes.log_evidence, owner))
+    return owner[order], take_rows(modes, order)
 
 
 def find_conditional_modes(

@@ -5,7 +5,7 @@ import dataclasses
 import difflib
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar, NamedTuple, NoReturn, Self, override
 
@@ -16,10 +16,8 @@ from jaxtyping import Array
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference import methods
-from polar_bayes.inference.batch_fit import BatchFit
 from polar_bayes.inference.batching import MIN_VIEWS, MethodUsed, Status
 from polar_bayes.inference.compile import TRACING_LOCK
-from polar_bayes.inference.levenberg_marquardt import NormalApproximation
 from polar_bayes.inference.mcse import (
     LARGEST_R_HAT,
     SMALLEST_ESS,
@@ -28,6 +26,7 @@ from polar_bayes.inference.mcse import (
     weighted_standard_errors,
 )
 from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import THREADS, Values
 from polar_bayes.inference.registry import METHODS, method_names
 from polar_bayes.progress import Progress, no_progress
@@ -53,8 +52,6 @@ class PosteriorDraws:
         gradients: Evaluations of the log density with its gradient.
         densities: Evaluations of the log density alone.
         metadata: Anything that JSON can hold and the result should keep, by name.
-        comparison_method: The method that fits comparisons, where it is another one.
-        deadline: When comparisons are abandoned, on the clock of `time.perf_counter`, unit second.
     """
 
     method: str
@@ -69,8 +66,6 @@ class PosteriorDraws:
     gradients: float = np.nan
     densities: float = np.nan
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
-    comparison_method: "AbstractMethod | None" = None
-    deadline: float = np.inf
 
     @property
     def doubts(self) -> list[str]:
@@ -145,25 +140,26 @@ class AbstractBatchMethod(HTMLRepr, abc.ABC):
         return super().__new__(cls)
 
     @abc.abstractmethod
-    def fit(
-        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
-    ) -> None:
-        """Fit the captures `at` these indices, and record their outcome; modes may be known.
+    def run_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
+        """Draw from the posteriors of many captures, each of which has enough views.
 
-        A fit that fails is a status, not an error.
+        Draws come a part at a time, since those of all would fill the memory. A fit that fails is a
+        status, not an error, and a capture of which nothing is said has not converged.
         """
 
-    def fit_batch(self, batch: BatchFit) -> None:
-        """Fit every capture that has enough views, and record the outcome of all."""
+    def fit_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
+        """The same, with a status of those that have too few views."""
         views = batch.pixels.views
-        batch.outcome.status[views < MIN_VIEWS] = Status.TOO_FEW_VIEWS
-        batch.outcome.status[views == 0] = Status.MASKED
-        at = np.flatnonzero(views >= MIN_VIEWS)
-        for begin in range(0, at.size, self.memory_limit):
-            self.fit(batch, at[begin : begin + self.memory_limit])
+        few = views < MIN_VIEWS
+        yield BatchDraws(
+            batch.at[few], np.where(views == 0, Status.MASKED, Status.TOO_FEW_VIEWS)[few]
+        )
+        enough = np.flatnonzero(~few)
+        for begin in range(0, enough.size, self.memory_limit):
+            yield from self.run_batch(batch.subset(enough[begin : begin + self.memory_limit]))
 
     def for_image(
-        self, size: int, sample: Callable[[int], BatchFit], *, is_shared: bool
+        self, size: int, sample: Callable[[int], ProblemBatch], *, is_shared: bool
     ) -> tuple[Self, dict[str, Any]]:
         """Settings for an image, and entries of its provenance.
 
@@ -176,8 +172,9 @@ class AbstractBatchMethod(HTMLRepr, abc.ABC):
     def check_least(self, **least: int) -> None:
         """Refuse settings below their least values."""
         for name, lowest in least.items():
-            if getattr(self, name) < lowest:
-                self.refuse(f"{name} is {getattr(self, name)}", f"give {lowest} or more")
+            given = getattr(self, name)
+            if given is not None and given < lowest:
+                self.refuse(f"{name} is {given}", f"give at least {lowest}")
 
     def refuse(self, what: str, hint: str) -> NoReturn:
         """Raise the error of a setting."""
@@ -237,6 +234,16 @@ class AbstractMethod(AbstractBatchMethod):
         """
         del problem
 
+    def deadline(self, problem: Problem) -> float:
+        """When comparisons are abandoned, on the clock of `time.perf_counter`, unit second."""
+        del problem
+        return np.inf
+
+    def for_comparison(self, problem: Problem, draws: PosteriorDraws) -> "AbstractMethod":
+        """The method that fits the capture under simpler scenes, once these draws are made."""
+        del problem, draws
+        return self
+
     def cross_check(self, problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
         """What other draws of the same posterior say of those of this method.
 
@@ -254,23 +261,20 @@ class AbstractMethod(AbstractBatchMethod):
         return {}
 
     @override
-    def fit(
-        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
-    ) -> None:
-        """Fit one capture after another, and describe nearly independent draws of each."""
+    def run_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
+        """Fit one capture after another; the draws of each are nearly independent."""
         # Chains are thinned to every k-th draw, where k is the number of draws over the smallest
         # bulk effective sample size of all parameters, rounded up. A fit that must not be trusted
-        # is described all the same.
-        del modes
+        # gives its draws all the same.
         double = batch.engine.precision == "double"
         with jax.enable_x64(double), TRACING_LOCK:  # two threads that begin at once share it
             _ = batch.engine.initializer
 
-        def run(pixel: int) -> tuple[Assessment, dict[str, np.ndarray]] | None:
+        def run(row: int) -> BatchDraws | None:
             with jax.enable_x64(double):  # a thread does not inherit it
-                key = jax.random.wrap_key_data(jnp.asarray(batch.keys[pixel]))
+                key = jax.random.wrap_key_data(jnp.asarray(batch.keys[row]))
                 key_search, key_draws = jax.random.split(key)
-                problem = Problem(batch.engine, batch.pixels.pixel(pixel), key_search)
+                problem = Problem(batch.engine, batch.pixels.pixel(row), key_search)
                 try:
                     draws = self.run(problem, key_draws, no_progress)
                 except (FitError, np.linalg.LinAlgError):  # no mode, or no width around it
@@ -278,19 +282,20 @@ class AbstractMethod(AbstractBatchMethod):
                 parameters = problem.constrain(draws.z)
             if not finite_draws(parameters).any():
                 return None
-            found = assess_draws(draws, parameters)
-            return found, thin_draws(parameters, found.effective_draws)
+            judged = assess_draws(draws, parameters)
+            thinned = thin_draws(parameters, judged.effective_draws)
+            count = len(next(iter(thinned.values())))
+            return BatchDraws(
+                batch.at[[row]],
+                judged.status,
+                {name: x[None] for name, x in thinned.items()},
+                np.full((1, count), 1.0 / count),
+                judged.effective_draws,
+                judged.approach,
+                judged.pareto_k,
+            )
 
-        for pixel, found in zip(at, _THREADS.map(run, at), strict=True):
-            if found is None:
-                continue
-            judged, thinned = found
-            one, count = np.array([pixel]), len(next(iter(thinned.values())))
-            batch.record_pareto_k(one, np.array([judged.pareto_k]))
-            draws = {name: x[None] for name, x in thinned.items()}
-            weights = np.full((1, count), 1.0 / count)
-            effective = np.array([judged.effective_draws])
-            batch.record(one, draws, weights, effective, judged.approach, judged.status)
+        yield from (found for found in _THREADS.map(run, range(len(batch))) if found is not None)
 
 
 class Assessment(NamedTuple):

@@ -11,7 +11,7 @@ acceptance leads to (Betancourt 2016, arXiv:1604.00695), and needs no new compil
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Self, override
 
@@ -21,15 +21,14 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpyro import infer
 
-from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import BatchFit
 from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.importance import tail_shares
 from polar_bayes.inference.initialization import Target
-from polar_bayes.inference.levenberg_marquardt import NormalApproximation
 from polar_bayes.inference.mcse import measure
 from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import Values
 from polar_bayes.progress import Progress
 
@@ -74,26 +73,11 @@ class Nuts(AbstractMethod):
     block: int = 100
 
     def __post_init__(self) -> None:
-        limits = {
-            "chains": 2,
-            "warmup": 50,
-            "draws": 50,
-            "most_draws": self.draws,
-            "max_tree_depth": 1,
-            "threads": 1,
-            "block": 1,
-        }
-        for name, least in limits.items():
-            given = getattr(self, name)
-            if given is not None and given < least:
-                raise FitError(f"{name} is {given}", where="Nuts", hint=f"give at least {least}")
+        limits = {"chains": 2, "warmup": 50, "draws": 50, "most_draws": self.draws}
+        self.check_least(**limits, max_tree_depth=1, threads=1, block=1)
         wanted = self.target_acceptance
         if wanted is not None and not 0.5 <= wanted < 1.0:
-            raise FitError(
-                f"target_acceptance is {wanted}",
-                where="Nuts",
-                hint="give a number from 0.5 to below 1",
-            )
+            self.refuse(f"target_acceptance is {wanted}", "give a number from 0.5 to below 1")
 
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
@@ -123,7 +107,6 @@ class Nuts(AbstractMethod):
                 "goals_reached": mixed,
                 "step_size_halvings": halvings,
             },
-            comparison_method=self._for_comparison(),
         )
 
     @override
@@ -136,12 +119,13 @@ class Nuts(AbstractMethod):
             state = sampler.init(target, jax.random.key(0), target.starts[0])
             sampler.advance.begin(state, target.given)
 
-    def _for_comparison(self) -> Self:
-        """Half the effective draws: the ends of an interval then move by a tenth of a sd."""
-        draws = max(self.draws // 2, 50)
-        most = max(self.most_draws // 4, draws)
+    @override
+    def for_comparison(self, problem: Problem, draws: PosteriorDraws) -> Self:
+        # Half the effective draws: the ends of an interval then move by a tenth of a sd.
+        least = max(self.draws // 2, 50)
+        most = max(self.most_draws // 4, least)
         half = 0.5 * self.effective_draws
-        return dataclasses.replace(self, draws=draws, most_draws=most, effective_draws=half)
+        return dataclasses.replace(self, draws=least, most_draws=most, effective_draws=half)
 
     @override
     def cross_check(self, problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
@@ -149,10 +133,7 @@ class Nuts(AbstractMethod):
 
     def _sampler(self, target: Target, problem: Problem) -> "Sampler":
         """The compiled sampler of these settings."""
-        static = self.static(target)
-        return problem.compiled_model.programs.of(
-            ("nuts", target.density, static), lambda: Sampler(target.density, static)
-        )
+        return problem.compiled_model.made(_make_sampler, (target.density, self.static(target)))
 
     def static(self, target: Target) -> "Static":
         """What a sampler is compiled for; the target supplies what the settings leave open."""
@@ -173,11 +154,13 @@ class Nuts(AbstractMethod):
         return dataclasses.replace(self, effective_draws=factor * self.effective_draws, **scaled)
 
     @override
-    def fit(
-        self, batch: BatchFit, at: np.ndarray, modes: NormalApproximation | None = None
-    ) -> None:
+    def run_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
         # Several captures are fitted at once, each on a thread of its own.
-        AbstractMethod.fit(dataclasses.replace(self, threads=1), batch, at, modes)
+        return AbstractMethod.run_batch(dataclasses.replace(self, threads=1), batch)
+
+
+def _make_sampler(_: CompiledModel, settings: tuple[Callable, "Static"]) -> "Sampler":
+    return Sampler(*settings)
 
 
 # --- Chains -------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ Source:
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, override
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,16 +36,12 @@ from numpyro import distributions as dist
 from numpyro.distributions import transforms
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batch_fit import BatchFit, random_keys
 from polar_bayes.inference.batching import LANES, AnyArray, ObservationBatch, Status, batched
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.corrected_laplace import CorrectedLaplace
-from polar_bayes.inference.levenberg_marquardt import (
-    ModeSearch,
-    NormalApproximation,
-    derivatives,
-)
+from polar_bayes.inference.levenberg_marquardt import derivatives
+from polar_bayes.inference.problem_batch import empty_outcome, problem_batch
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.inference.psis import draws_at
 from polar_bayes.observation.data import Observations
@@ -283,54 +279,43 @@ def _prior_derivatives(
     return first, -np.diag(second)
 
 
-class _Batch(BatchFit):
-    """A fit that keeps its modes, and draws of equal weight as unconstrained vectors."""
-
-    modes: NormalApproximation
-
-    def __init__(self, engine: CompiledModel, pixels: ObservationBatch, seed: int) -> None:
-        every = np.arange(len(pixels))
-        super().__init__(engine, pixels, random_keys(seed, every), seed=seed)
-        self.z = np.zeros((every.size, DRAWS, engine.program.size), engine.dtype)
-
-    @override
-    def record_modes(self, at: np.ndarray, search: ModeSearch) -> None:
-        super().record_modes(at, search)
-        self.modes = search.mode
-
-    @override
-    def record(self, at: np.ndarray, draws: Values, weights: np.ndarray, *further: Any) -> None:
-        super().record(at, draws, weights, *further)
-        if at.size:
-            rows, which = np.arange(at.size)[:, None], _resampled(weights)
-            values = {n: np.asarray(draws[n])[rows, which] for n in self.engine.program.supports}
-            self.z[at] = self.engine.run(_coordinates, None, self.pixels.subset(at), values)
-
-
 def _expectations(
     engine: CompiledModel,
     pixels: ObservationBatch,
     method: CorrectedLaplace,
     shared: Sequence[SharedParameter],
     seed: int,
-    modes: NormalApproximation | None,
-) -> tuple[_Expectations, NormalApproximation]:
-    """What each pixel says about the shared parameters, at the priors that they have now."""
+    modes: np.ndarray | None,
+) -> tuple[_Expectations, np.ndarray]:
+    """What each pixel says about the shared parameters, at the priors that they have now.
+
+    The modes, (pixel, size), are where the search begins and where it has ended.
+    """
     static = dataclasses.replace(pixels.static, shared=as_priors(shared))
     pixels = dataclasses.replace(pixels, static=static)
-    batch = _Batch(engine, pixels, seed)
-    method.fit(batch, np.arange(len(pixels)), modes)
-    good = np.flatnonzero(batch.outcome.status == Status.GOOD)
+    count, size = len(pixels), engine.program.size
+    batch = problem_batch(engine, pixels, np.arange(count), seed)
+    every, outcome = np.zeros((count, DRAWS, size), engine.dtype), empty_outcome(count)
+    ends = np.zeros((count, size), engine.dtype)
+    for found in method.run_batch(batch, modes):
+        outcome.put(found)
+        if found.mode is not None:
+            ends[found.at] = found.mode[0]
+        if found.at.size and found.draws:
+            rows, which = np.arange(found.at.size)[:, None], _resampled(found.weights)
+            values = {n: np.asarray(found.draws[n])[rows, which] for n in engine.program.supports}
+            every[found.at] = engine.run(_coordinates, None, pixels.subset(found.at), values)
+    good = np.flatnonzero(outcome.status == Status.GOOD)
     names = tuple(each.name for each in shared)
     if not good.size:
-        return _Expectations(*(np.zeros((0, len(names))) for _ in range(5))), batch.modes
-    z = batch.z[good]
+        return _Expectations(*(np.zeros((0, len(names))) for _ in range(5))), ends
+    z = every[good]
     coordinates = z[..., _positions(engine.program, names)].astype(float)
     mean = coordinates.mean(axis=1)
     centered = coordinates - mean[:, None]
     covariance = np.einsum("pdi,pdj->pij", centered, centered) / (DRAWS - 1)
     slope, error, information = engine.run(_slopes, names, pixels.subset(good), z)
-    return _Expectations(slope, error, information, mean, covariance), batch.modes
+    return _Expectations(slope, error, information, mean, covariance), ends
 
 
 def _resampled(weights: np.ndarray) -> np.ndarray:

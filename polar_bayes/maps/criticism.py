@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpyro import distributions as dist
 
-from polar_bayes.inference.batch_fit import BatchFit
-from polar_bayes.inference.batching import Status
+from polar_bayes.inference.batching import ObservationBatch, Status
 from polar_bayes.inference.checks import (
     CAUTION,
     LARGE_FACTOR,
@@ -28,6 +27,7 @@ from polar_bayes.inference.checks import (
 )
 from polar_bayes.inference.compiled_model import MOMENTS, CompiledModel
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
+from polar_bayes.inference.problem_batch import BatchDraws
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.maps.residuals import (
@@ -115,36 +115,29 @@ class Criteria:
     kernels: list[np.ndarray]
 
 
-def criteria(
-    engine: CompiledModel,
-    priors: Mapping[str, dist.Distribution],
-    sizes: Mapping[str, tuple[int, ...]],
-) -> Criteria:
-    """The criteria of the parameters that have a map, made once for each engine."""
-
-    def make() -> Criteria:
-        stated = [
-            scalar
-            for name, prior in priors.items()
-            if name in sizes and not prior.batch_shape and has_probabilities(prior)
-            for scalar in _scalars(name, sizes[name])
-        ]
-        judged = tuple(each for each in stated if each.name not in PERFECT)
-        noise = tuple(each for each in stated if each.name in PERFECT)
-        every = [scalar for name, own in sizes.items() for scalar in _scalars(name, own)]
-
-        return Criteria(
-            priors=priors,
-            judged=judged,
-            ends=np.array([_end(each.name, priors[each.name]) for each in judged]),
-            noise=noise,
-            noise_ends=np.array([_end(each.name, priors[each.name]) for each in noise]),
-            material=tuple(each for each in every if each.name in MATERIAL_PARAMETERS),
-            bounds=tuple(_bounds(engine, priors, every)),
-            kernels=direction_kernels(engine.layout.geometry),
-        )
-
-    return engine.programs.of("criteria", make)
+def criteria(engine: CompiledModel, sizes: tuple[tuple[str, tuple[int, ...]], ...]) -> Criteria:
+    """The criteria of the parameters that have a map, by their names and sizes."""
+    priors = engine.priors
+    every = [scalar for name, own in sizes for scalar in _scalars(name, own)]
+    stated = [
+        each
+        for each in every
+        if each.name in priors
+        and not priors[each.name].batch_shape
+        and has_probabilities(priors[each.name])
+    ]
+    judged = tuple(each for each in stated if each.name not in PERFECT)
+    noise = tuple(each for each in stated if each.name in PERFECT)
+    return Criteria(
+        priors=priors,
+        judged=judged,
+        ends=np.array([_end(each.name, priors[each.name]) for each in judged]),
+        noise=noise,
+        noise_ends=np.array([_end(each.name, priors[each.name]) for each in noise]),
+        material=tuple(each for each in every if each.name in MATERIAL_PARAMETERS),
+        bounds=tuple(_bounds(engine, priors, every)),
+        kernels=direction_kernels(engine.layout.geometry),
+    )
 
 
 def _scalars(name: str, own: tuple[int, ...]) -> list[Scalar]:
@@ -187,13 +180,26 @@ def _share_at(
 class PixelCriticism:
     """The checks of the pixels of a block, filled in as answers come: marginals first."""
 
-    def __init__(self, checks: Criteria, marginals: Marginals, count: int) -> None:
-        self._checks, self._marginals = checks, marginals
+    def __init__(
+        self, engine: CompiledModel, pixels: ObservationBatch, marginals: Marginals
+    ) -> None:
+        self._engine, self._pixels, self._marginals = engine, pixels, marginals
+        sizes = tuple((name, x.shape[1:]) for name, x in marginals.mean.items())
+        self._checks = checks = engine.made(criteria, sizes)
+        count, size = len(pixels), engine.program.size
+        self._mode = np.full((count, size), np.nan), np.full((count, size, size), np.nan)
         self._at_bound = np.zeros(count, bool)
         self._carries = np.ones((count, len(checks.judged)), bool)
 
-    def describe(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        """Take in the weighted draws of some pixels."""
+    def describe(self, found: BatchDraws, parameters: Values) -> None:
+        """Take in the weighted draws of some pixels, and their modes where none is known."""
+        at, weights = found.at, found.weights
+        if found.mode is not None:
+            new = np.isnan(self._mode[1][at]).any(axis=(1, 2))
+            for own, mode in zip(self._mode, found.mode, strict=True):
+                own[at[new]] = mode[new]
+        if not parameters:
+            return
         self._at_bound[at] = False
         for bound in self._checks.bounds:
             self._find_bound(bound, at, parameters, weights)
@@ -228,15 +234,14 @@ class PixelCriticism:
                 found |= np.abs(correlation) >= CARRIES
             self._carries[at, column] = found
 
-    def judge(self, batch: BatchFit) -> np.ndarray:
+    def judge(self, status: np.ndarray) -> np.ndarray:
         """The `Criticism` of each pixel with a good posterior; zero of the others."""
-        status = batch.outcome.status
         good = np.flatnonzero(status == Status.GOOD)
         flags = np.zeros(status.size, np.int8)
         if good.size:
             found = self._of_priors(good) | self._of_noise(good)
             found |= np.where(self._at_bound[good], Criticism.BOUNDS_CAUTION, 0).astype(np.int8)
-            tails = self._residual_tails(batch, good)
+            tails = self._residual_tails(good)
             found |= np.where(np.isnan(tails), Criticism.RESIDUALS_NOT_COMPUTED, 0).astype(np.int8)
             flags[good] = found | _flags(tails, "RESIDUALS")
         return flags
@@ -271,41 +276,40 @@ class PixelCriticism:
         known = self._marginals.quantiles
         return known[name][which] if name in known else np.ones(self._at_bound.size)
 
-    def _residual_tails(self, batch: BatchFit, good: np.ndarray) -> np.ndarray:
+    def _residual_tails(self, good: np.ndarray) -> np.ndarray:
         """p-values of the residuals of these pixels at their modes; NaN where there is none."""
         tails = np.full(good.size, np.nan)
-        known = np.flatnonzero(np.isfinite(batch.mode_root[good]).all(axis=(1, 2)))
+        known = np.flatnonzero(np.isfinite(self._mode[1][good]).all(axis=(1, 2)))
         factor = self._quantile(NOISE_FACTOR, MEDIAN)
         for some in np.array_split(known, range(PIXELS, known.size, PIXELS)):
-            fitted = _fitted(batch, good[some])
+            fitted = self._fitted(good[some])
             if fitted is not None:
                 kernels = self._checks.kernels
                 tails[some] = residual_tail(fitted, kernels, factor[good[some]])
         return tails
 
+    def begin_compiling(self) -> None:
+        """Compile what residuals need, in parallel with what follows."""
+        names, mode = self._engine.program.observed, [np.float32(x[:1]) for x in self._mode]
+        self._engine.begin(fitted_readings, names, self._pixels, *mode, single=True)
 
-def begin_compiling(batch: BatchFit) -> None:
-    """Compile what residuals need, in parallel with what follows."""
-    size, names = batch.engine.program.size, batch.engine.program.observed
-    mode = np.zeros((1, size), np.float32), np.zeros((1, size, size), np.float32)
-    batch.engine.begin(fitted_readings, names, batch.pixels, *mode, single=True)
-
-
-def _fitted(batch: BatchFit, at: np.ndarray) -> Fitted | None:
-    """Readings of some pixels at their modes; None where no distribution is known."""
-    if not at.size:
-        return None
-    engine, pixels = batch.engine, batch.pixels.subset(at)
-    modes = np.float32(batch.mode_z[at]), np.float32(batch.mode_root[at])
-    found = engine.run(fitted_readings, engine.program.observed, pixels, *modes, single=True)
-    valid = np.asarray(pixels.batched.valid)
-    views, scores, changes = valid.shape[-1], [], []
-    for standard, jacobian in found.values():
-        if np.shape(jacobian)[:-1] == valid.shape:  # one number for each reading
-            e = np.where(valid, standard.scores(), np.nan)
-            scores.append(e.reshape(at.size, -1, views))
-            changes.append(jacobian.reshape(at.size, -1, views, jacobian.shape[-1]))
-    return Fitted(*(np.concatenate(x, axis=1) for x in (scores, changes))) if scores else None
+    def _fitted(self, at: np.ndarray) -> Fitted | None:
+        """Readings of some pixels at their modes; None where no distribution is known."""
+        if not at.size:
+            return None
+        engine, pixels = self._engine, self._pixels.subset(at)
+        modes = [np.float32(x[at]) for x in self._mode]
+        found = engine.run(fitted_readings, engine.program.observed, pixels, *modes, single=True)
+        valid = np.asarray(pixels.batched.valid)
+        views, scores, changes = valid.shape[-1], [], []
+        for standard, jacobian in found.values():
+            if np.shape(jacobian)[:-1] == valid.shape:  # one number for each reading
+                e = np.where(valid, standard.scores(), np.nan)
+                scores.append(e.reshape(at.size, -1, views))
+                changes.append(jacobian.reshape(at.size, -1, views, jacobian.shape[-1]))
+        if not scores:
+            return None
+        return Fitted(*(np.concatenate(x, axis=1) for x in (scores, changes)))
 
 
 def _flags(p_value: np.ndarray, check: str) -> np.ndarray:

@@ -16,22 +16,24 @@ from numpyro import distributions as dist
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.batch_fit import BatchFit, random_keys
 from polar_bayes.inference.batching import (
     IMAGE,
     MIN_VIEWS,
     MethodUsed,
     ObservationBatch,
-    Outcome,
     Status,
     batch_pixels,
     cut,
-    empty_outcome,
 )
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout, layout_key
 from polar_bayes.inference.corrected_laplace import CorrectedLaplace
 from polar_bayes.inference.method import AbstractBatchMethod, find_method, name_of
-from polar_bayes.inference.program import Values
+from polar_bayes.inference.problem_batch import (
+    Outcome,
+    ProblemBatch,
+    empty_outcome,
+    problem_batch,
+)
 from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.inference.registry import MAP_DEFAULT
 from polar_bayes.inference.request import Request, resolve
@@ -50,8 +52,6 @@ from polar_bayes.maps.criticism import (
     UNKNOWN,
     Criticism,
     PixelCriticism,
-    begin_compiling,
-    criteria,
 )
 from polar_bayes.observation.data import ANGLES, READINGS, Observations, observe
 from polar_bayes.observation.links import AbstractLink
@@ -300,10 +300,10 @@ def _sharing_nothing(plan: MapPlan, reason: str) -> MapPlan:
 def _with_settings(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     """The plan with the settings that the image calls for."""
 
-    def sample(count: int) -> BatchFit:
+    def sample(count: int) -> ProblemBatch:
         seed = plan.request.seed
         pixels = plan.pixels(_random_pixels(capture, seed, count))
-        return BatchFit(plan.engine, pixels, random_keys(seed, np.arange(len(pixels))), seed=seed)
+        return problem_batch(plan.engine, pixels, np.arange(len(pixels)), seed)
 
     size = capture.sizes["y"] * capture.sizes["x"]
     settings, found = plan.settings.for_image(size, sample, is_shared=bool(plan.shared))
@@ -453,24 +453,21 @@ def fit_block(block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     if not readings["valid"].any():  # a corner of a picture; as a capture it would be refused
         nothing = empty_outcome(numbers.size, Status.MASKED)
         return maps_of(found, nothing, np.zeros(numbers.size, np.int8), block, plan)
-    engine, seed = plan.engine, plan.request.seed
-    checks = criteria(engine, plan.request.priors, plan.sizes)
-    criticism = PixelCriticism(checks, found, numbers.size)
-
-    def describe(at: np.ndarray, draws: Values, weights: np.ndarray) -> None:
-        own = {name: np.asarray(values) for name, values in draws.items()}
-        for name, size in plan.sizes.items():  # plates may leave axes of length one behind
-            own[name] = own[name].reshape(*weights.shape, *size)
-        found.describe(at, own, weights)
-        criticism.describe(at, own, weights)
-
-    keys = random_keys(seed, numbers)
-    batch = BatchFit(engine, plan.pixels(readings), keys, describe, seed)
-    begin_compiling(batch)
-    plan.settings.fit_batch(batch)
-    flags = criticism.judge(batch)
-    batch.outcome.status[(flags & PROBLEMS) != 0] = Status.CONTRADICTED
-    return maps_of(found, batch.outcome, flags, block, plan)
+    batch = problem_batch(plan.engine, plan.pixels(readings), numbers, plan.request.seed)
+    criticism = PixelCriticism(batch.engine, batch.pixels, found)
+    outcome = empty_outcome(len(batch))
+    criticism.begin_compiling()
+    for part in plan.settings.fit_batch(batch):
+        outcome.put(part)
+        draws = {name: np.asarray(x) for name, x in part.draws.items()}
+        if draws:
+            for name, size in plan.sizes.items():  # plates may leave axes of length one behind
+                draws[name] = draws[name].reshape(*part.weights.shape, *size)
+            found.describe(part.at, draws, part.weights)
+        criticism.describe(part, draws)
+    flags = criticism.judge(outcome.status)
+    outcome.status[(flags & PROBLEMS) != 0] = Status.CONTRADICTED
+    return maps_of(found, outcome, flags, block, plan)
 
 
 def mask_missing(capture: xr.Dataset) -> xr.Dataset:

@@ -1,5 +1,8 @@
 """Calibration of plates, whose fits take no time: right methods pass, broken ones are caught."""
 
+import re
+import sys
+
 import numpy as np
 import numpyro.distributions as dist
 import pytest
@@ -9,7 +12,11 @@ from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture
 
 import polar_bayes as pb
+from polar_bayes import progress
+from polar_bayes.calibration.calibrate import Forecast, make_plan
+from polar_bayes.calibration.runner import fit_block
 from polar_bayes.inference.batching import Status
+from polar_bayes.inference.request import resolve
 from polar_bayes.models.per_material import per_material
 
 ASKED = {
@@ -153,3 +160,24 @@ def test_mistakes_are_told(capture: xr.Dataset) -> None:
         pb.calibrate(capture, truth={"seed": 1}, **ASKED)
     with pytest.raises(pb.FitError, match="it holds no fit; give the tree"):
         pb.summary(xr.DataTree())
+
+
+def test_a_long_calibration_says_how_long_and_what_a_faster_method_makes_of_it(
+    capture: xr.Dataset, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "_write_line", [lambda text: sys.stderr.write(f"{text}\n")])
+    asked = ASKED["model"], ASKED["scene"], None, ASKED["links"], 90.0, 0, "double"
+    plan = make_plan(resolve(capture, *asked), None, pb.methods.Laplace(), False)
+    blocks = [fit_block(plan, np.arange(4) + begin) for begin in (0, 4, 8)]
+    brief, long = Forecast(plan, long=1e9), Forecast(plan, long=0.0)
+    for block in blocks:
+        brief.see(block, left=88)
+        long.see(block, left=88)
+    assert brief.sentence == ""
+    assert capsys.readouterr().err.splitlines() == [long.sentence]
+    said = (
+        r"88 more fits by laplace take about \d+ min, by importance about [\d.]+ min; both vouch "
+    )
+    assert re.fullmatch(
+        said + r"for \d+ of 12, whose means differ by at most [\d.]+ sd", long.sentence
+    )

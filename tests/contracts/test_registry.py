@@ -40,8 +40,8 @@ def calibrate(name: str) -> None:
 
 VERBS: dict[str, tuple[Callable[[str], None], str]] = {
     "fit": (fit, "run"),
-    "fit_pixels": (fit_pixels, "fit"),
-    "calibrate": (calibrate, "fit"),
+    "fit_pixels": (fit_pixels, "run_batch"),
+    "calibrate": (calibrate, "run_batch"),
 }
 """Each verb, and the function of a method that it calls."""
 

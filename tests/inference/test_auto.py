@@ -98,10 +98,12 @@ class Handing(Made):
     seconds: float = np.inf
 
     @override
-    def run(self, problem, key, progress) -> PosteriorDraws:
-        deadline = time.perf_counter() + self.seconds
-        draws = super().run(problem, key, progress)
-        return dataclasses.replace(draws, comparison_method=self.other, deadline=deadline)
+    def deadline(self, problem) -> float:
+        return time.perf_counter() + self.seconds
+
+    @override
+    def for_comparison(self, problem, draws) -> AbstractMethod:
+        return self.other
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,8 +264,8 @@ def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left()
     taken, here = Made(), problem(line)
     auto = Given(given=(("rung 0", Made(k_hat=0.9)), ("rung 1", taken)), seconds=600.0)
     found = auto.run(here, KEY, no_progress)
-    assert found.comparison_method == taken
-    assert found.deadline == here.start_time + 600.0
+    assert auto.for_comparison(here, found) == taken
+    assert auto.deadline(here) == here.start_time + 600.0
 
 
 @pytest.mark.thorough

@@ -10,8 +10,8 @@ from cases import each
 from plate_images import ASKED, NAMES, mapped, planned, plate_image
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_fit import random_keys
 from polar_bayes.inference.batching import MethodUsed, Status
+from polar_bayes.inference.problem_batch import random_keys
 from polar_bayes.maps import fit_map as verb
 from polar_bayes.maps.fit_map import MapPlan, fit_block, fit_pixels, with_pixel_numbers
 

@@ -47,7 +47,7 @@ def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, weighted: xr.Datase
 class OneByOne(pb.methods.Importance):
     """The same settings, for one pixel after another."""
 
-    fit = AbstractMethod.fit
+    run_batch = AbstractMethod.run_batch
 
 
 @pytest.mark.parametrize("kind", [OneByOne, pb.methods.Importance])

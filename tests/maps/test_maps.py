@@ -342,7 +342,7 @@ def test_what_cannot_be_mapped_is_refused_with_the_mend(change, settings: dict, 
         ),
         (
             lambda: CorrectedLaplace(candidates=2),
-            r"CorrectedLaplace: candidates is 2; give 8 or more",
+            r"CorrectedLaplace: candidates is 2; give at least 8",
         ),
     ],
 )
