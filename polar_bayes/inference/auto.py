@@ -129,7 +129,7 @@ class Auto(AbstractMethod):
         return problem.start_time + self.seconds
 
     @override
-    def for_comparison(self, problem: Problem, draws: PosteriorDraws) -> AbstractMethod:
+    def for_comparison(self, problem: Problem, draws: PosteriorDraws) -> tuple[AbstractMethod, ...]:
         chosen = self.candidates(problem)[draws.metadata["auto"]["chosen"]]
         return chosen.for_comparison(problem, draws)
 

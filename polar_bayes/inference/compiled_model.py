@@ -71,6 +71,10 @@ class CompiledModel:
         with jax.enable_x64(self.precision == "double"), TRACING_LOCK:  # whoever asks first
             return make_initializer(self.model, self.program, self.layout)
 
+    def free(self, data: Observations) -> Observations:
+        """A capture with room for what is held; not one of groups that are fitted apart first."""
+        return self.program.free(data) if self.initializer.is_joint else data
+
     @functools.cached_property
     def single_program(self) -> Program:
         """The same model in single precision."""

@@ -1,5 +1,6 @@
 """One capture and one scene in, an ArviZ DataTree out."""
 
+import contextlib
 import dataclasses
 import inspect
 import json
@@ -24,6 +25,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference import methods
 from polar_bayes.inference.alternatives import compare_alternatives
 from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_until
+from polar_bayes.inference.mcse import SMALLEST_ESS
 from polar_bayes.inference.method import AbstractMethod, find_method
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
@@ -31,7 +33,7 @@ from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.program import BLOCK, THREADS
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import assemble, posterior_of
-from polar_bayes.physics.instrument import Discrepancy
+from polar_bayes.physics.instrument import AbstractInstrumentTerm, Discrepancy
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import support_bounds
 from polar_bayes.progress import Progress
@@ -79,9 +81,9 @@ def fit_request(
     deadline = method.deadline(problem)
     compares = with_comparisons and draws.covariance is None  # a point has no intervals to compare
     if compares:
-        comparisons, failed = _fit_comparisons(
-            request, method.for_comparison(problem, draws), deadline, key_comparisons, progress
-        )
+        methods = method.for_comparison(problem, draws)
+        given = request, problem, methods, deadline, key_comparisons, progress
+        comparisons, failed = _fit_comparisons(*given)
     if isinstance(request.scene.ledger, xr.Dataset):
         comparisons["effects"] = request.scene.ledger  # how the scene was chosen
     timings.record("comparisons")
@@ -181,36 +183,37 @@ def _check_room(problem: Problem, draws: int) -> None:
 
 
 def _fit_comparisons(
-    request: Request, method: AbstractMethod, deadline: float, key: Array, progress: Progress
+    request: Request,
+    problem: Problem,
+    methods: tuple[AbstractMethod, ...],
+    deadline: float,
+    key: Array,
+    progress: Progress,
 ) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
-    """Posteriors of the same capture under simpler scenes, by name, and why others failed."""
-    if not request.scene.has(Discrepancy):
+    """Posteriors of the same capture with less of the instrument, and why others failed."""
+    instrument = request.scene.instrument
+    if instrument is None or not request.scene.has(Discrepancy):
         return {}, {}
-    scenes = {
-        "without_discrepancy": request.scene.without(Discrepancy),
-        "without_instrument": dataclasses.replace(request.scene, instrument=None),
+    removed: dict[str, list[AbstractInstrumentTerm]] = {
+        "without_discrepancy": [each for each in instrument.terms if isinstance(each, Discrepancy)],
+        "without_instrument": list(instrument.terms),
     }
     found: dict[str, xr.Dataset] = {}
     failed: dict[str, str] = {}
-    key_search, key_draws = jax.random.split(key)
 
     def compare(progress: Progress) -> None:
-        problems: dict[str, Problem] = {}
-        for name, scene in scenes.items():
-            try:
-                problems[name] = make_problem(dataclasses.replace(request, scene=scene), key_search)
-                method.prepare(problems[name])
-            except FitError as error:  # a failed comparison must not cost the user the fit
-                failed[name] = str(error)
-        for number, (name, problem) in enumerate(problems.items()):
-            done = number / len(problems)
+        for number, (name, terms) in enumerate(removed.items()):
+            done = number / len(removed)
             progress("comparing", done)
             try:
-                one = method.run(
-                    problem, key_draws, lambda *_, done=done: progress("comparing", done)
+                other, gone = _without(request, problem, terms)
+                z = _first_trusted(
+                    methods, other, key, lambda *_, done=done: progress("comparing", done)
                 )
-                found[name] = posterior_of(problem.program, problem.constrain(one.z))
-            except FitError as error:
+                values = other.constrain(z)
+                kept = {name: x for name, x in values.items() if name not in gone}
+                found[name] = posterior_of(other.program, kept)
+            except FitError as error:  # a failed comparison must not cost the user the fit
                 failed[name] = str(error)
 
     late = ""
@@ -220,7 +223,33 @@ def _fit_comparisons(
         late = str(error)
     progress("comparing", 1.0)
     done = dict(found)  # an abandoned thread may still write to its own
-    return done, {name: late for name in scenes if late and name not in done} | failed
+    return done, {name: late for name in removed if late and name not in done} | failed
+
+
+def _first_trusted(
+    methods: tuple[AbstractMethod, ...], problem: Problem, key: Array, progress: Progress
+) -> np.ndarray:
+    """Draws of the first method that trusts enough of its own, or of the last."""
+    for method in methods[:-1]:
+        with contextlib.suppress(FitError):
+            draws = method.run(problem, key, progress)
+            if not draws.doubts and draws.effective_draws >= 0.5 * SMALLEST_ESS:
+                return draws.z
+    return methods[-1].run(problem, key, progress).z
+
+
+def _without(
+    request: Request, problem: Problem, terms: list[AbstractInstrumentTerm]
+) -> tuple[Problem, set[str]]:
+    """The problem without terms of the instrument, and the parameters that it does not have."""
+    gone = {name for term in terms for name in term.parameters}
+    neutral = {name: value for term in terms for name, value in term.neutral.items()}
+    if all(term.neutral or not term.parameters for term in terms) and problem.data.held:
+        return problem.hold(neutral), gone
+    scene = request.scene
+    for term in terms:
+        scene = scene.without(type(term))
+    return make_problem(dataclasses.replace(request, scene=scene), problem.key), gone
 
 
 def _model_settings(model: Callable) -> dict[str, Any]:

@@ -191,16 +191,25 @@ class Importance(AbstractMethod):
         ]
 
 
+ONE_ROUND = Importance(rounds=1)
+"""Draws that check others, or serve a comparison."""
+
+
+def suits_profiles(problem: Problem) -> bool:
+    """Whether draws along all profiles are few enough to serve as a check."""
+    return problem.program.size <= MOST_COORDINATES
+
+
 def tail_shares(problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
     """Shares of weighted draws beyond the 95% intervals of chains, an entry of the provenance.
 
     Chains that never entered an arm of the posterior agree with each other; draws along its
     profiles reach the arm. Empty where such draws do not suit the problem.
     """
-    if problem.program.size > MOST_COORDINATES:
+    if not suits_profiles(problem):
         return {}
     try:
-        found = Importance(draws=2048, rounds=1).run(problem, key, no_progress)
+        found = ONE_ROUND.run(problem, key, no_progress)
     except FitError:
         return {}
     assert found.weighted is not None

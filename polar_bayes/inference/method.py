@@ -239,10 +239,15 @@ class AbstractMethod(AbstractBatchMethod):
         del problem
         return np.inf
 
-    def for_comparison(self, problem: Problem, draws: PosteriorDraws) -> "AbstractMethod":
-        """The method that fits the capture under simpler scenes, once these draws are made."""
+    def for_comparison(
+        self, problem: Problem, draws: PosteriorDraws
+    ) -> tuple["AbstractMethod", ...]:
+        """Methods for the capture with less of the instrument, once these draws are made.
+
+        The first that trusts its draws is taken, and else the last.
+        """
         del problem, draws
-        return self
+        return (self,)
 
     def cross_check(self, problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
         """What other draws of the same posterior say of those of this method.
@@ -274,7 +279,8 @@ class AbstractMethod(AbstractBatchMethod):
             with jax.enable_x64(double):  # a thread does not inherit it
                 key = jax.random.wrap_key_data(jnp.asarray(batch.keys[row]))
                 key_search, key_draws = jax.random.split(key)
-                problem = Problem(batch.engine, batch.pixels.pixel(row), key_search)
+                data = batch.engine.free(batch.pixels.pixel(row))
+                problem = Problem(batch.engine, data, key_search)
                 try:
                     draws = self.run(problem, key_draws, no_progress)
                 except (FitError, np.linalg.LinAlgError):  # no mode, or no width around it

@@ -6,13 +6,15 @@ layout; `Problem` adds the readings and the posterior modes that were found for 
 
 import dataclasses
 import time
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
+from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import TRACING_LOCK
 from polar_bayes.inference.compiled_model import CompiledModel, compile_model
 from polar_bayes.inference.initialization import AbstractInit
@@ -153,6 +155,36 @@ class Problem:
             for name in pieces[0]
         }
 
+    def hold(self, values: Mapping[str, ArrayLike]) -> "Problem":
+        """The same problem with some parameters known: it compiles nothing.
+
+        Args:
+            values: By latent site, in its support or at the end of it; NaN where an entry is to be
+                estimated. What is held has a coordinate still, whose density is a standard normal
+                one.
+
+        Returns:
+            The problem whose density is that of the other parameters given these.
+
+        Raises:
+            FitError: No latent site has such a name or shape, only some entries of one density are
+                given, or captures of this layout hold nothing.
+        """
+        held = dict(self.data.held)
+        for name, value in values.items():
+            where = f"hold: {name}"
+            if name not in held:
+                hint = f"give some of {', '.join(held)}" if held else "fit one patch alone"
+                raise FitError("it cannot be held", where=where, hint=hint)
+            shape, given = held[name].shape, np.asarray(value, self.dtype)
+            if given.shape not in ((), shape):
+                hint = f"give one of {shape}"
+                raise FitError(f"its shape is {given.shape}", where=where, hint=hint)
+            if self.program.events[name] and len(set(np.isnan(given).flat)) > 1:
+                raise FitError("its entries have one density", where=where, hint="hold all or none")
+            held[name] = jnp.broadcast_to(jnp.asarray(given), shape)
+        return dataclasses.replace(self, data=dataclasses.replace(self.data, held=held))
+
     def prepare_search(self) -> None:
         """Begin to compile what `initialize` needs, in parallel with whatever follows."""
         self.compiled_model.initializer.prepare(self.data)
@@ -195,4 +227,5 @@ def make_problem(request: Request, key: Array, start_time: float | None = None) 
     """A request's posterior, ready for any method; compiled where its layout is new."""
     data = observe_request(request)
     begun = time.perf_counter() if start_time is None else start_time
-    return Problem(compile_model(request, data), data, key, begun)
+    compiled_model = compile_model(request, data)
+    return Problem(compiled_model, compiled_model.free(data), key, begun)

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 from numpyro import handlers
-from numpyro.infer.util import compute_log_probs, potential_energy
+from numpyro.infer.util import compute_log_probs
 from numpyro.primitives import Messenger
 
 from polar_bayes.errors import FitError
@@ -37,6 +37,9 @@ THREADS = 2
 """That run such calls."""
 
 Values = dict[str, Array] | dict[str, np.ndarray]
+
+
+Sites = dict[str, dict[str, Any]]
 
 
 class Draw(NamedTuple):
@@ -73,12 +76,12 @@ class Program:
 
     def potential_at(self, sites: dict[str, Array], data: Observations) -> Float[Array, ""]:
         """The same of the unconstrained latent sites by name."""
-        return potential_energy(self.model, (data,), {}, sites)
+        return -_total(self._log_terms(self.model, sites, data)[0], data)
 
     def prior_potential(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """The potential without the likelihood."""
         prior = handlers.block(self.model, hide=list(self.observed))
-        return potential_energy(prior, (data,), {}, self.unravel(z))
+        return -_total(self._log_terms(prior, self.unravel(z), data)[0], data)
 
     def constrain(self, z: Float[Array, " size"]) -> dict[str, Array]:
         """The latent sites in their supports."""
@@ -98,13 +101,51 @@ class Program:
     def _constrain(self, sites: dict[str, Array]) -> dict[str, Array]:
         return {name: dist.biject_to(self.supports[name])(x) for name, x in sites.items()}
 
+    def _values(self, sites: dict[str, Array], data: Observations) -> dict[str, Array]:
+        """The latent sites in their supports, those that are held at their values."""
+        values = self._constrain(sites)
+        held = {n: jnp.where(jnp.isnan(x), values[n], x) for n, x in data.held.items()}
+        return values | held
+
+    def _log_terms(
+        self, model: Model, sites: dict[str, Array], data: Observations
+    ) -> tuple[list[Array], Sites]:
+        """Terms of the log density of the unconstrained sites, and the trace of the model.
+
+        The coordinate of what is held has a standard normal density, and its prior none.
+        """
+        log_probs, trace = compute_log_probs(
+            model, (data,), {}, self._values(sites, data), sum_log_prob=False
+        )
+        terms = [own for name, own in log_probs.items() if name not in sites]
+        for name, x in sites.items():
+            bijection = dist.biject_to(self.supports[name])
+            own = [log_probs[name], bijection.log_abs_det_jacobian(x, bijection(x))]
+            if name in data.held:
+                free = jnp.isnan(data.held[name])
+                own = [jnp.where(_all_of(free, term), term, 0.0) for term in own]
+                own.append(jnp.where(_all_of(free, x), 0.0, -0.5 * x**2))
+            terms += own
+        return terms, trace
+
+    def free(self, data: Observations) -> Observations:
+        """The data with room for what is held, and nothing held; programs are those of `hold`."""
+        dtype = data.brightness.dtype
+        held = {n: jnp.full(x.shape, jnp.nan, dtype) for n, x in self._latent_shapes.items()}
+        return dataclasses.replace(data, held=held)
+
+    @functools.cached_property
+    def _latent_shapes(self) -> dict[str, jax.ShapeDtypeStruct]:
+        """Of the latent sites in their supports."""
+        return jax.eval_shape(self.constrain, jax.ShapeDtypeStruct((self.size,), jnp.float32))
+
     def trace(self, z: Float[Array, " size"], data: Observations) -> dict[str, dict]:
         """The sites of the model at an unconstrained vector."""
         return self.trace_at(self.unravel(z), data)
 
     def trace_at(self, sites: dict[str, Array], data: Observations) -> dict[str, dict]:
         """The same of the unconstrained latent sites by name."""
-        fixed = handlers.substitute(self.model, data=self._constrain(sites))
+        fixed = handlers.substitute(self.model, data=self._values(sites, data))
         return _trace(fixed, jax.random.key(0), data)
 
     def parameters(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
@@ -115,15 +156,8 @@ class Program:
         self, z: Float[Array, " size"], data: Observations
     ) -> tuple[dict[str, Array], Float[Array, ""]]:
         """Both, by one trace of the model."""
-        sites = self.unravel(z)
-        values = self._constrain(sites)
-        log_probs, trace = compute_log_probs(self.model, (data,), {}, values)
-        terms = (*log_probs.values(), *self._volumes(sites, values))
-        return self._parameters(trace), -sum(map(jnp.sum, terms), jnp.zeros((), z.dtype))
-
-    def _volumes(self, sites: dict[str, Array], values: dict[str, Array]) -> list[Array]:
-        maps = {name: dist.biject_to(self.supports[name]) for name in sites}
-        return [maps[n].log_abs_det_jacobian(x, values[n]) for n, x in sites.items()]
+        terms, trace = self._log_terms(self.model, self.unravel(z), data)
+        return self._parameters(trace), -_total(terms, data)
 
     def _parameters(self, trace: dict) -> dict[str, Array]:
         names = (*(name for name in self.supports if name not in self.auxiliary), *self.derived)
@@ -136,11 +170,8 @@ class Program:
 
     def describe(self, key: Array, z: Float[Array, " size"], data: Observations) -> Draw:
         """Parameters, densities and predicted readings of one draw."""
-        sites = self.unravel(z)
-        values = self._constrain(sites)
         seeded = handlers.seed(self.model, key)
-        log_probs, trace = compute_log_probs(seeded, (data,), {}, values)
-        volumes = self._volumes(sites, values)
+        terms, trace = self._log_terms(seeded, self.unravel(z), data)
         keys = dict(zip(self.observed, jax.random.split(key, len(self.observed)), strict=True))
         readings = {name: trace[name] for name in self.observed}
         return Draw(
@@ -158,7 +189,7 @@ class Program:
                 if n not in self.auxiliary
             },
             predictive={name: site["fn"].sample(keys[name]) for name, site in readings.items()},
-            log_density=sum(map(jnp.sum, (*log_probs.values(), *volumes)), jnp.zeros(())),
+            log_density=_total(terms, data),
         )
 
     def residuals(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
@@ -228,6 +259,17 @@ class Program:
     def slopes(self) -> Callable[[Array], dict[str, Array]]:
         """Jacobian of `constrain`, compiled."""
         return JitOnce(jax.jacfwd(self.constrain))
+
+
+def _total(terms: list[Array], data: Observations) -> Array:
+    return sum(map(jnp.sum, terms), jnp.zeros((), data.brightness.dtype))
+
+
+def _all_of(mask: Array, like: Array) -> Array:
+    """A mask of the entries of a site as one of its log density, whose event axes are summed."""
+    if mask.shape == like.shape:
+        return mask
+    return jnp.all(mask, axis=tuple(range(like.ndim, mask.ndim)))
 
 
 def in_blocks(function: JitOnce, rows: tuple[np.ndarray, ...], given: Any) -> Any:
@@ -304,9 +346,6 @@ def family_of(distribution: dist.Distribution) -> str:
     while isinstance(distribution, dist.Independent | dist.ExpandedDistribution):
         distribution = distribution.base_dist
     return type(distribution).__name__
-
-
-Sites = dict[str, dict[str, Any]]
 
 
 def _trace(model: Callable, key: Array, data: Observations, **arguments: Any) -> Sites:

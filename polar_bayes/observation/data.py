@@ -34,6 +34,8 @@ class Observations(eqx.Module):
             None where the capture states none.
         shared: Means and sds of normal priors, in the unconstrained coordinates, of parameters
             that other pixels determine too; they replace the priors of those names.
+        held: Values of latent sites that are not estimated, in their supports, NaN where one is;
+            a site that is not among them is estimated.
     """
 
     geometry: Geometry
@@ -49,6 +51,7 @@ class Observations(eqx.Module):
     shared: dict[str, tuple[Float[Array, "..."], Float[Array, "..."]]] = eqx.field(
         default_factory=dict
     )
+    held: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
 
     @property
     def shape(self) -> tuple[int, ...]:

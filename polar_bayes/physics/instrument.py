@@ -10,6 +10,8 @@ normal is not tilted: the directions are then those that were stated, to the las
 
 import dataclasses
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Annotated, ClassVar, NamedTuple, override
 
 import jax.numpy as jnp
@@ -53,7 +55,13 @@ __all__ = [
 
 @dataclasses.dataclass(frozen=True)
 class AbstractInstrumentTerm(Part):
-    """One imperfection of an instrument. Override `aim`, `record`, or both."""
+    """One imperfection of an instrument. Override `aim`, `record`, or both.
+
+    `neutral` has values of parameters at which the term changes nothing. A fit of the same readings
+    without the term then compiles nothing.
+    """
+
+    neutral: ClassVar[Mapping[str, float]] = MappingProxyType({})
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
@@ -140,6 +148,7 @@ class AngleZero(AbstractInstrumentTerm):
     """The angle scale is off: both zeniths are larger by `angle_zero` degrees than read."""
 
     parameters: ClassVar[tuple[str, ...]] = ("angle_zero",)
+    neutral: ClassVar[Mapping[str, float]] = MappingProxyType({"angle_zero": 0.0})
 
     @override
     def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
@@ -155,6 +164,7 @@ class DolpGain(AbstractInstrumentTerm):
     """A polarizer that is not perfect: q and u shrink to `dolp_gain` of themselves."""
 
     parameters: ClassVar[tuple[str, ...]] = ("dolp_gain",)
+    neutral: ClassVar[Mapping[str, float]] = MappingProxyType({"dolp_gain": 1.0})
 
     @override
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
@@ -167,6 +177,7 @@ class ChannelGain(AbstractInstrumentTerm):
     """The s channel is `channel_gain_ratio` times as sensitive as the p channel."""
 
     parameters: ClassVar[tuple[str, ...]] = ("channel_gain_ratio",)
+    neutral: ClassVar[Mapping[str, float]] = MappingProxyType({"channel_gain_ratio": 1.0})
 
     @override
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
@@ -184,6 +195,7 @@ class Leakage(AbstractInstrumentTerm):
     """
 
     parameters: ClassVar[tuple[str, ...]] = ("leakage",)
+    neutral: ClassVar[Mapping[str, float]] = MappingProxyType({"leakage": 0.0})
 
     @override
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
@@ -197,6 +209,7 @@ class DarkLevel(AbstractInstrumentTerm):
     """Unpolarized light `dark_level`, in units of the predicted intensity, adds to every view."""
 
     parameters: ClassVar[tuple[str, ...]] = ("dark_level",)
+    neutral: ClassVar[Mapping[str, float]] = MappingProxyType({"dark_level": 0.0})
 
     @override
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
@@ -219,6 +232,7 @@ class BeamOverlap(AbstractInstrumentTerm):
     """
 
     parameters: ClassVar[tuple[str, ...]] = ("beam_overlap_zenith",)
+    neutral: ClassVar[Mapping[str, float]] = MappingProxyType({"beam_overlap_zenith": 90.0})
 
     @override
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
@@ -448,6 +462,7 @@ class Discrepancy(AbstractInstrumentTerm):
     length: float = 25.0
 
     parameters: ClassVar[tuple[str, ...]] = ("discrepancy_amplitude", "discrepancy_weights")
+    neutral: ClassVar[Mapping[str, float]] = MappingProxyType({"discrepancy_amplitude": 0.0})
 
     @override
     def __post_init__(self) -> None:

@@ -102,8 +102,8 @@ class Handing(Made):
         return time.perf_counter() + self.seconds
 
     @override
-    def for_comparison(self, problem, draws) -> AbstractMethod:
-        return self.other
+    def for_comparison(self, problem, draws) -> tuple[AbstractMethod, ...]:
+        return (self.other,)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,7 +264,7 @@ def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left()
     taken, here = Made(), problem(line)
     auto = Given(given=(("rung 0", Made(k_hat=0.9)), ("rung 1", taken)), seconds=600.0)
     found = auto.run(here, KEY, no_progress)
-    assert auto.for_comparison(here, found) == taken
+    assert auto.for_comparison(here, found) == (taken,)
     assert auto.deadline(here) == here.start_time + 600.0
 
 

@@ -27,16 +27,19 @@ ANGLES = jnp.array([0.0, 30.0, 60.0, 89.9])
 GEOMETRY = Geometry(ANGLES, jnp.zeros(4), ANGLES, jnp.full(4, 180.0))
 LIGHT = Light(jnp.array([0.1, 0.2, 0.5, 1.0]), jnp.array([0.0, 0.4, 1.0, -0.3]), jnp.full(4, 0.0))
 TILTED = LIGHT._replace(q=0.5 * LIGHT.q, u=jnp.array([0.0, 0.3, -0.2, 0.1]))
+TERMS = (
+    AngleZero(),
+    DolpGain(),
+    ChannelGain(),
+    Leakage(),
+    DarkLevel(),
+    BeamOverlap(),
+    Discrepancy(),
+)
 PERFECT = {
-    "angle_zero": jnp.array([0.0]),
-    "dolp_gain": jnp.array([1.0]),
-    "channel_gain_ratio": jnp.array([1.0]),
-    "leakage": jnp.array([0.0]),
-    "dark_level": jnp.array([0.0]),
-    "discrepancy_amplitude": jnp.array([0.0]),
+    **{name: jnp.array([value]) for term in TERMS for name, value in term.neutral.items()},
     "discrepancy_weights": jnp.ones((3, 1)),
 }
-TERMS = (AngleZero(), DolpGain(), ChannelGain(), Leakage(), DarkLevel(), Discrepancy())
 
 
 def channels(light: Light) -> tuple[np.ndarray, np.ndarray]:
