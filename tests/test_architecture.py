@@ -55,7 +55,7 @@ HOMES = {
     "netCDF4": ("polar_bayes.capture",),
     "PIL": ("polar_bayes.importers",),
     "polanalyser": ("polar_bayes.importers",),
-    "optimistix": ("polar_bayes.inference", "polar_bayes.design"),
+    "optimistix": ("polar_bayes.inference",),
     "tinygp": ("polar_bayes.models",),
     "arviz_base": (
         "polar_bayes.inference",

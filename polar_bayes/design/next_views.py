@@ -50,9 +50,9 @@ from polar_bayes.design.setup import (
 )
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
+from polar_bayes.inference.compiled_model import compile_model
 from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.problem import observe_request
-from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import capture_of
 from polar_bayes.inference.scene_file import arguments_of
@@ -243,7 +243,9 @@ def _extended(
     recorded = jnp.broadcast_to(problem.data.brightness, problem.data.shape)
     rest = jnp.full((*data.shape[:-1], data.shape[-1] - views.measured), jnp.median(recorded))
     data = dataclasses.replace(data, brightness=jnp.concatenate([recorded, rest], axis=-1))
-    program = compile_program(request.bind(request.scene), data)
+    compiled_model = compile_model(request, data)
+    data = compiled_model.free(data)
+    program = compiled_model.program
     unknown = [name for name in new if name not in program.observed]
     if unknown:
         raise FitError(
@@ -254,7 +256,7 @@ def _extended(
     prior = problem.prior
     if program.size != problem.program.size:
         prior = from_prior(program, jax.random.key(seed), PRIOR_DRAWS, data)
-    return DesignProblem(request, data, program, prior)
+    return DesignProblem(request, data, compiled_model, prior)
 
 
 def _design(

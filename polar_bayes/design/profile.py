@@ -4,12 +4,14 @@ At every value of the coordinate $z_i$ of a parameter all others are optimized,
 
 $$ \max_{z_{-i}} [\log L(z) + w \log \pi(z)] $$
 
-by numerical continuation: BFGS starts where the value before ended. $w = 1$ gives the profile of
+by numerical continuation: BFGS starts where the value before ended. All grids and parameters share
+one compiled potential. $w = 1$ gives the profile of
 the posterior, $w$ = `PRIOR_WEIGHT` that of the likelihood: a thousandth of the prior keeps
 coordinates that the data do not determine from diverging. The priors of the instrument's parameters
 belong to $L$ in both: a calibration determines them, and without it they trade for one another.
 """
 
+import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -17,8 +19,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pandas as pd
+import scipy.optimize
 import xarray as xr
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
@@ -35,8 +37,15 @@ from polar_bayes.design.setup import (
     provenance_attrs,
 )
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import compiled
-from polar_bayes.inference.optimize import Modes, NumpyPotential, ValueAndGradient
+from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.compiled_model import CompiledModel
+from polar_bayes.inference.optimize import (
+    Modes,
+    NumpyPotential,
+    ValueAndGradient,
+    finite_potential,
+    ignore_line_search_warnings,
+)
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations
@@ -117,14 +126,11 @@ def profile(
         given = None if values is None else _unconstrained(problem, coordinate, values)
         instrument = request.scene.instrument
         known = set() if instrument is None else {*instrument.parameters} - {coordinate.site}
-        parts = partial(log_density_parts, problem.program, known)
-        run, dtype = compiled(jax.value_and_grad(partial(_potential, parts))), problem.prior.dtype
+        run = problem.compiled_model.made(_weighted_potential, frozenset(known))
+        dtype = problem.prior.dtype
         potentials = [NumpyPotential(run, (w, problem.data), dtype) for w in KINDS.values()]
         modes = posterior_modes(problem, progress, potentials[0])
-        follow = compile_continuation(parts, index)
-
-        def on_grid(grid: np.ndarray) -> ProfileCurve:
-            return _trace_profile(problem, index, modes, potentials, follow, grid)
+        on_grid = partial(_trace_profile, index, modes, potentials)
 
         if given is not None:
             curve = on_grid(np.sort(np.append(given, modes.z[0, index])))
@@ -228,9 +234,6 @@ class LogDensityParts(NamedTuple):
     prior: Float[Array, ""]
 
 
-Parts = Callable[[Array, Observations], LogDensityParts]
-
-
 def log_density_parts(
     program: Program, known: Collection[str], z: Float[Array, " size"], data: Observations
 ) -> LogDensityParts:
@@ -246,24 +249,28 @@ def log_density_parts(
     return LogDensityParts(likelihood, whole - likelihood)
 
 
-def _potential(parts: Parts, z: Array, given: tuple[float | Array, Observations]) -> Array:
-    """Minus log likelihood and weighted log prior, given the weight and the data."""
-    weight, data = given
-    terms = parts(z, data)
-    return -(terms.likelihood + weight * terms.prior)
+def _weighted_potential(compiled_model: CompiledModel, known: frozenset[str]) -> JitOnce:
+    """Minus log likelihood and weighted log prior with their gradient, given weight and data."""
+
+    def potential(z: Array, given: tuple[float | Array, Observations]) -> Array:
+        weight, data = given
+        terms = log_density_parts(compiled_model.program, known, z, data)
+        return -(terms.likelihood + weight * terms.prior)
+
+    return JitOnce(jax.value_and_grad(potential))
 
 
 # --- Numerical continuation of the conditional modes ----------------------------------------------
 
 
-MAX_STEPS = 300
 MAX_GRADIENT = 0.03
 """Largest gradient left, per posterior sd: a profile is then within half its square of its mode."""
 
+SETTLED_GRADIENT = 1e-4
+"""The same at which a search ends."""
+
 MAX_MODES = 3
 """Modes from which a profile is followed, at most; the best of them counts."""
-
-Continuation = Callable[[Array, Array, Array, Array, Observations], Array]
 
 
 class ProfileCurve(NamedTuple):
@@ -288,94 +295,45 @@ def conditional_normal(
     return slope, factor
 
 
-def compile_continuation(parts: Parts, index: int) -> Continuation:
-    """Compile the conditional modes along the targets of every track, of both kinds."""
-    solver = optx.BFGS(rtol=1e-6, atol=1e-5)
-    weights = tuple(KINDS.values())
-
-    def evaluate(y: Array, guess: Array, weight: Array, factor: Array, data: Observations) -> Array:
-        value = _potential(parts, guess + factor @ y, (weight, data))
-        return jnp.where(jnp.isfinite(value), value, jnp.inf)
-
-    # The solver linearizes the loss and transposes that. Giving it the gradient at once halves what
-    # is compiled; only y is differentiated.
-    loss = jax.custom_jvp(evaluate)
-
-    @loss.defjvp
-    def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-        value, gradient = jax.value_and_grad(evaluate)(*primals)
-        return value, gradient @ tangents[0]
-
-    def follow(
-        starts: Array, targets: Array, slope: Array, factor: Array, data: Observations
-    ) -> Array:
-        origin = jnp.zeros(factor.shape[1])
-
-        def objective(y: Array, args: tuple[Array, Array]) -> Array:
-            return loss(y, *args, factor, data)
-
-        def optimize(other: Array, args: tuple[Array, Array]) -> tuple[Array, Array]:
-            # The likelihood starts at the posterior's mode where that is better than its own guess.
-            own, weight = args
-            losses = jax.lax.map(lambda z: objective(origin, (z, weight)), jnp.stack([own, other]))
-            guess = jnp.where(losses[0] <= losses[1], own, other)
-            found = optx.minimise(
-                objective, solver, origin, (guess, weight), max_steps=MAX_STEPS, throw=False
-            )
-            # A start at the mode itself may give no finite step; the gradient is judged later.
-            y = jnp.where(jnp.isfinite(found.value).all(), found.value, origin)
-            z = guess + factor @ y
-            return z, z
-
-        def step(last: Array, target: Array) -> tuple[Array, Array]:
-            guesses = last + slope * (target - last[:, index, None])
-            found = jax.lax.scan(optimize, guesses[0], (guesses, jnp.asarray(weights)))[1]
-            return found, found
-
-        def track(pair: tuple[Array, Array]) -> Array:
-            start, along = pair
-            return jax.lax.scan(step, jnp.stack([start] * len(weights)), along)[1]
-
-        return jax.lax.map(track, (starts, targets))
-
-    return compiled(follow)
-
-
 def _trace_profile(
-    problem: DesignProblem,
-    index: int,
-    modes: Modes,
-    potentials: Sequence[ValueAndGradient],
-    follow: Continuation,
-    grid: np.ndarray,
+    index: int, modes: Modes, potentials: Sequence[ValueAndGradient], grid: np.ndarray
 ) -> ProfileCurve:
     """Follow both kinds from every mode to both ends of the grid, and keep the best."""
-    center = modes.z[0, index]
-    sides = [np.flatnonzero(grid <= center)[::-1], np.flatnonzero(grid > center)]
-    longest = max(map(len, sides))
-    # Both sides of one program have one length: the shorter one repeats its end.
-    targets = [
-        np.append(grid[side], np.full(longest - len(side), (*grid[side], center)[-1]))
-        for side in sides
-    ]
     slope, factor = conditional_normal(modes.covariance[0], index)
-    tracks = [(start, side) for start in modes.z[:MAX_MODES] for side in (0, 1)]
-    ends = follow(
-        jnp.asarray(np.stack([start for start, _ in tracks])),
-        jnp.asarray(np.stack([targets[side] for _, side in tracks])),
-        jnp.asarray(slope),
-        jnp.asarray(factor),
-        problem.data,
-    )
-    value = np.full((len(KINDS), grid.size), np.nan)
-    best = np.full((len(KINDS), grid.size, problem.program.size), np.nan)
-    for (_, side), track in zip(tracks, np.asarray(ends), strict=True):
-        for point, found in zip(sides[side], track, strict=False):
-            for kind, z in enumerate(found):
-                height = _log_density_at(potentials[kind], z, factor)
-                if height > np.nan_to_num(value[kind, point], nan=-np.inf):
-                    value[kind, point], best[kind, point] = height, z
+    value = np.full((len(potentials), grid.size), np.nan)
+    best = np.full((len(potentials), grid.size, slope.size), np.nan)
+    center = modes.z[0, index]
+    sides = np.flatnonzero(grid <= center)[::-1], np.flatnonzero(grid > center)
+    with ignore_line_search_warnings():
+        for start, side in itertools.product(modes.z[:MAX_MODES], sides):
+            last = [start] * len(potentials)
+            for point in side:
+                guesses = [z + slope * (grid[point] - z[index]) for z in last]
+                for kind, potential in enumerate(potentials):
+                    # The likelihood starts at the posterior's mode where that is better.
+                    near = [guesses[kind], *last[:kind]]
+                    z = _conditional_mode(potential, near, factor)
+                    last[kind] = z
+                    height = _log_density_at(potential, z, factor)
+                    if height > np.nan_to_num(value[kind, point], nan=-np.inf):
+                        value[kind, point], best[kind, point] = height, z
     return ProfileCurve(grid, value, best)
+
+
+def _conditional_mode(
+    potential: ValueAndGradient, guesses: Sequence[np.ndarray], factor: np.ndarray
+) -> np.ndarray:
+    """The best vector near the best guess, along the directions that the factor has."""
+    guarded = finite_potential(potential)
+    guess = min(guesses, key=lambda z: guarded(z)[0])
+
+    def along(y: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = guarded(guess + factor @ y)
+        return value, factor.T @ gradient
+
+    origin, options = np.zeros(factor.shape[1]), {"gtol": SETTLED_GRADIENT}
+    found = scipy.optimize.minimize(along, origin, jac=True, method="BFGS", options=options)
+    return guess + factor @ found.x
 
 
 def _log_density_at(potential: ValueAndGradient, z: np.ndarray, factor: np.ndarray) -> float:

@@ -17,7 +17,7 @@ from numpyro.infer.util import log_density
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
-from polar_bayes.inference.compiled_model import compile_model
+from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.initialization import STARTS
 from polar_bayes.inference.optimize import (
@@ -27,7 +27,7 @@ from polar_bayes.inference.optimize import (
     find_modes,
     from_prior,
 )
-from polar_bayes.inference.problem import observe_request
+from polar_bayes.inference.problem import compile_request
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import PROVENANCE, posterior_of, shape_of
@@ -42,8 +42,13 @@ class DesignProblem(NamedTuple):
 
     request: Request
     data: Observations
-    program: Program
+    compiled_model: CompiledModel
     prior: np.ndarray
+
+    @property
+    def program(self) -> Program:
+        """The model as functions of one unconstrained vector."""
+        return self.compiled_model.program
 
 
 def provenance_attrs(request: Request, **more: Any) -> dict[str, str]:
@@ -55,10 +60,9 @@ def provenance_attrs(request: Request, **more: Any) -> dict[str, str]:
 
 def make_design_problem(request: Request) -> DesignProblem:
     """Compile the model of a request, or take it from the cache; call it with x64 enabled."""
-    data = observe_request(request)
-    program = compile_model(request, data).program
-    prior = from_prior(program, jax.random.key(request.seed), PRIOR_DRAWS, data)
-    return DesignProblem(request, data, program, prior)
+    compiled_model, data = compile_request(request)
+    prior = from_prior(compiled_model.program, jax.random.key(request.seed), PRIOR_DRAWS, data)
+    return DesignProblem(request, data, compiled_model, prior)
 
 
 def posterior_modes(

@@ -25,7 +25,6 @@ from jaxtyping import Array
 from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compiled_model import compile_model
 from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
 from polar_bayes.inference.optimize import (
     DifferencedPotential,
@@ -34,7 +33,7 @@ from polar_bayes.inference.optimize import (
     find_modes,
     symmetrize,
 )
-from polar_bayes.inference.problem import Problem, observe_request
+from polar_bayes.inference.problem import Problem, compile_request
 from polar_bayes.inference.request import Request
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.variants import alternatives_of
@@ -115,8 +114,8 @@ def _with_scene(
     new = [name for name in scene.parameters if name not in request.scene.parameters]
     priors = {**resolve_priors(new), **request.priors}
     other = dataclasses.replace(request, scene=scene, priors=priors, precision="double")
-    data = observe_request(other)
-    program = compile_model(other, data).program
+    compiled_model, data = compile_request(other)
+    program = compiled_model.program
     known = problem.program.positions
     both = [name for name in program.positions if name in known]
     here, there = (np.hstack([of[n].ravel() for n in both]) for of in (program.positions, known))

@@ -73,7 +73,7 @@ class CompiledModel:
 
     def free(self, data: Observations) -> Observations:
         """A capture with room for what is held; not one of groups that are fitted apart first."""
-        return self.program.free(data) if self.initializer.is_joint else data
+        return data if data.leading else self.program.free(data)
 
     @functools.cached_property
     def single_program(self) -> Program:
@@ -167,7 +167,7 @@ class CompiledModel:
         """Parameters of `MOMENTS` draws from the prior, each (draw, ...)."""
         z = self.prior_draws(MOMENTS)
         with jax.enable_x64(self.precision == "double"):
-            draws = self.program.parameters_of_chains(jnp.asarray(z[None]), self.layout)
+            draws = self.program.parameters_of_chains(jnp.asarray(z[None]), self.free(self.layout))
         sizes = {name: own for name, (_, own) in self.parameter_axes.items()}
         return {n: np.asarray(x[0], float).reshape(-1, *sizes[n]) for n, x in draws.items()}
 
@@ -182,7 +182,8 @@ class CompiledModel:
 def _prior_draws(compiled_model: CompiledModel, count: int) -> np.ndarray:
     with jax.enable_x64(compiled_model.precision == "double"):
         key = jax.random.key(0)
-        return np.asarray(from_prior(compiled_model.program, key, count, compiled_model.layout))
+        data = compiled_model.free(compiled_model.layout)
+        return np.asarray(from_prior(compiled_model.program, key, count, data))
 
 
 def evaluate_draws(

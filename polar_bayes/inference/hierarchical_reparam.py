@@ -63,9 +63,6 @@ from polar_bayes.progress import Progress
 # --- The model of one group: the modes of each patch or material, and its density around a point --
 
 
-SHARED_AXES = ("wavelength", "view")
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Groups:
     """Positions in the flat vector of a program: of each group, (group, local), and of the rest."""
@@ -82,10 +79,9 @@ class Groups:
 
 def find_groups(program: Program, data: Observations) -> Groups | None:
     """The groups along the only leading axis of a capture; None without one."""
-    leading = [(name, length) for name, length in data.dims if name not in SHARED_AXES]
-    if len(leading) != 1:
+    if len(data.leading) != 1:
         return None
-    name, length = leading[0]
+    name, length = data.leading[0]
     local, common = [], [np.zeros(0, int)]
     for site, positions in program.unravel(jnp.arange(float(program.size))).items():
         flat = np.asarray(positions).astype(int)

@@ -223,9 +223,14 @@ def observe_request(request: Request) -> Observations:
     return data.in_single_precision() if request.precision == "single" else data
 
 
+def compile_request(request: Request) -> tuple[CompiledModel, Observations]:
+    """The compiled model of a request, from the cache, and its capture."""
+    data = observe_request(request)
+    compiled_model = compile_model(request, data)
+    return compiled_model, compiled_model.free(data)
+
+
 def make_problem(request: Request, key: Array, start_time: float | None = None) -> Problem:
     """A request's posterior, ready for any method; compiled where its layout is new."""
-    data = observe_request(request)
     begun = time.perf_counter() if start_time is None else start_time
-    compiled_model = compile_model(request, data)
-    return Problem(compiled_model, compiled_model.free(data), key, begun)
+    return Problem(*compile_request(request), key, begun)

@@ -58,6 +58,11 @@ class Observations(eqx.Module):
         """Length of every axis, outermost first."""
         return tuple(length for _, length in self.dims)
 
+    @property
+    def leading(self) -> tuple[tuple[str, int], ...]:
+        """Names and lengths of the axes of materials, patches or pixels."""
+        return tuple(axis for axis in self.dims if axis[0] not in ("wavelength", "view"))
+
     def in_single_precision(self) -> "Observations":
         """The same readings as 32-bit numbers; masks stay masks."""
         return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, self)

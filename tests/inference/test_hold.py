@@ -106,3 +106,13 @@ def test_what_cannot_be_held_is_refused() -> None:
         here.hold({"gloss": 0.0})
     with pytest.raises(pb.FitError, match=r"hold: level: its shape is \(2,\); give one of \(\)"):
         here.hold({"level": [0.0, 1.0]})
+
+
+def test_a_capture_of_a_layout_that_was_fitted_side_by_side_is_fitted_alone() -> None:
+    """Both share programs, whatever is held."""
+    one = capture(seed=1)
+    asked = {"model": line, "links": LINKS, "scene": PLATE}
+    pb.calibrate(one, simulations=20, method="importance", readings=False, **asked)
+    result = pb.fit(one, method=pb.methods.Importance(draws=256), **asked)
+    assert result["posterior"].sizes["draw"] > 0
+    pb.design.identify(one, **asked)
