@@ -13,6 +13,7 @@ import polar_bayes as pb
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat
 from polar_bayes.physics.dispersion import Sellmeier
+from polar_bayes.physics.instrument import AbstractInstrumentTerm
 from polar_bayes.physics.part import (
     Part,
     check_part,
@@ -21,6 +22,7 @@ from polar_bayes.physics.part import (
     parameters_of,
     value_of,
 )
+from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
 SETTINGS: dict[type, tuple] = {
@@ -117,3 +119,21 @@ def test_parts_are_frozen_values() -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         RoughSurface().shadowing = None
     assert SmoothSurface().simpler() == ()
+
+
+TERMS = {n: x for n, x in PARTS.items() if isinstance(x, AbstractInstrumentTerm) and x.parameters}
+
+
+@each("term", TERMS.values(), ids=TERMS)
+def test_a_term_at_its_neutral_values_changes_nothing(term: AbstractInstrumentTerm) -> None:
+    assert set(term.neutral) <= set(term.parameters)
+    zeniths = jnp.array([0.0, 30.0, 60.0, 89.0])
+    geometry = pb.Geometry(zeniths, jnp.full(4, 180.0), zeniths, jnp.zeros(4))
+    light = Light(jnp.array([0.1, 0.2, 0.5, 1.0]), jnp.array([0.0, 0.4, 0.9, -0.3]), jnp.zeros(4))
+    known = {name: jnp.array([value]) for name, value in term.neutral.items()}
+    # What has no neutral value must not matter then: weights of a function of amplitude 0.
+    parameters = {name: known.get(name, jnp.ones((3, 1))) for name in term.parameters}
+    for there, here in zip(term.aim(parameters, geometry)[:4], geometry[:4], strict=True):
+        np.testing.assert_array_equal(there, here)
+    for there, here in zip(term.record(parameters, geometry, light), light, strict=True):
+        np.testing.assert_allclose(there, here, rtol=1e-14)
