@@ -22,6 +22,7 @@ from scipy.special import logsumexp
 
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
+    MIN_DRAWS,
     SAMPLE_DIMS,
     method_of,
     posterior_scalars,
@@ -34,7 +35,6 @@ PROBABILITIES = (0.5, 0.8, 0.95)
 BAND_PROBABILITY = 0.95
 BAND_SIMULATIONS = 1000
 MAX_BAND_POINTS = 500
-MIN_DRAWS = 100
 COMPARABLE = MappingProxyType({"valid": True, "saturated": False})
 """Flags of readings that can be compared with a prediction."""
 
@@ -49,8 +49,6 @@ class Loo:
     pareto_k: np.ndarray
     pit: np.ndarray
     pointwise: np.ndarray
-    weights: np.ndarray
-    """Of each draw (axis 0) where one reading (axis 1) is left out; they sum to one."""
 
     @property
     def unreliable(self) -> int:
@@ -205,7 +203,6 @@ def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | N
         pareto_k=pareto_k,
         pit=_pit(variable, weights),
         pointwise=elpd,
-        weights=weights,
     )
 
 

@@ -29,6 +29,7 @@ import xarray as xr
 from polar_bayes.diagnostics.finding import Finding, judged_by, listed, p_text
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.predictive import FlatVariable
+from polar_bayes.inference.checks import ANGLE_SCALES
 from polar_bayes.observation.data import ANGLES
 
 REPLICATES = 1000
@@ -36,8 +37,6 @@ MAX_READINGS = 600
 """Readings that the checks use; of more, evenly spaced ones."""
 MAX_SATURATED = 0.01
 """Share of the replicates at full scale beyond which the checks leave a reading out."""
-ANGLE_SCALES = (4.0, 15.0)
-"""Length scales of structure over directions, unit degree."""
 STATED_ERRORS = 3.0
 """Stated errors within which a reading is no outlier, however little the others scatter."""
 MAX_LEVERAGE = 0.999

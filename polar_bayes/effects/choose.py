@@ -19,6 +19,7 @@ from numpyro import distributions as dist
 
 from polar_bayes.effects.posterior_change import Baseline, PosteriorChange, SceneDensities
 from polar_bayes.errors import FitError, SceneError
+from polar_bayes.inference.files import COSTS
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import FULL_SCENES, Scene
@@ -170,7 +171,6 @@ class EffectSelection:
 
 
 EFFECT, PARAMETER, BOTH = ("effect",), ("parameter",), ("effect", "parameter")
-COSTS = ("operations", "compile_seconds", "run_seconds")
 PACKAGES = ("polar_bayes", "jax", "numpyro")
 TABLE_COLUMNS = ["data", "shift", "sd", "operations", "time", "result"]
 

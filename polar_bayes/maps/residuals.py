@@ -30,14 +30,12 @@ from numpyro import distributions as dist
 from scipy import special
 
 from polar_bayes.inference.batching import AnyArray, batched
+from polar_bayes.inference.checks import ANGLE_SCALES
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
 from polar_bayes.physics.geometry import Geometry
-
-ANGLE_SCALES = (4.0, 15.0)
-"""Length scales of structure over directions, unit degree."""
 
 LEAST_NEIGHBOR = 0.01
 """Largest weight of two neighbors below which a scale says nothing."""

@@ -14,12 +14,20 @@ from polar_bayes.diagnostics.sensitivity import SENSITIVE
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
-from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
+from polar_bayes.reporting.style import (
+    BLUE,
+    GRAY,
+    GREEN,
+    MAX_PANELS,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+)
 from polar_bayes.reporting.text import CLEAR, DASH, column, interval, number, or_dash, percent
 from polar_bayes.repr_html import Row, Table
 
 COLORS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, GRAY)
-MAX_PANELS = 12
 ASKED = (
     *("method", "settings", "model", "model_settings", "scene", "scene_parts", "links", "priors"),
     *("fixed", "largest_view_zenith", "seed", "precision"),

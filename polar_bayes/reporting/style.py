@@ -34,6 +34,9 @@ ORANGE, SKY, GREEN, BLUE = "#e69f00", "#56b4e9", "#009e73", "#0072b2"
 VERMILLION, PURPLE = "#d55e00", "#cc79a7"
 CHAIN_COLORS = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
 
+MAX_PANELS = 12
+"""Parameters of one figure: more would be too small to read."""
+
 STYLE: Any = {
     "font.size": 9.0,
     "axes.titlesize": 9.0,
