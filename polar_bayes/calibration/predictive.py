@@ -27,7 +27,7 @@ from polar_bayes.inference.batching import ObservationBatch, batched
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import SMALL_BATCH, CompiledModel
 from polar_bayes.inference.program import Program, Values
-from polar_bayes.inference.psis import smooth
+from polar_bayes.inference.psis import draws_at, smooth
 from polar_bayes.observation.data import Observations
 
 Arrays = dict[str, np.ndarray]
@@ -182,7 +182,5 @@ def _take(values: np.ndarray, entry: np.ndarray) -> np.ndarray:
 
 def _resample(weights: np.ndarray, first: np.ndarray) -> np.ndarray:
     """Systematic resampling: indices of equally weighted draws, (fit, DRAWS)."""
-    at = (np.arange(DRAWS) + first[:, None]) / DRAWS
-    cumulative = np.cumsum(weights, axis=-1)
-    found = [np.searchsorted(*row, side="right") for row in zip(cumulative, at, strict=True)]
-    return np.minimum(found, weights.shape[-1] - 1)
+    levels = (np.arange(DRAWS) + first[:, None]) / DRAWS
+    return np.stack([draws_at(*row) for row in zip(levels, weights, strict=True)])

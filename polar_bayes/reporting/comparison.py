@@ -14,16 +14,7 @@ from polar_bayes.diagnostics.sensitivity import SENSITIVE
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
-from polar_bayes.reporting.style import (
-    BLUE,
-    GRAY,
-    GREEN,
-    MAX_PANELS,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-)
+from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import CLEAR, DASH, column, interval, number, or_dash, percent
 from polar_bayes.repr_html import Row, Table
 
@@ -51,7 +42,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
     """
     table, fits = comparison.parameters, list(comparison.verdicts)
     finite = table[np.isfinite(table["mean"])]
-    labels = list(dict.fromkeys(finite.index.get_level_values("parameter")))[:MAX_PANELS]
+    labels = list(dict.fromkeys(finite.index.get_level_values("parameter")))[: style.MAX_PANELS]
     if not labels:
         raise FitError(
             "there is nothing to draw", where="plot_comparison", hint="give fits with finite draws"
@@ -91,7 +82,7 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     sensitivity = sensitivity_table(comparison)
     left_out = [f"{name}: {why}." if name else why for name, why in comparison.left_out.items()]
     predictions: list[page.Block] = [] if comparison.loo.empty else [loo_table(comparison)]
-    more = comparison.parameters.index.get_level_values("parameter").nunique() - MAX_PANELS
+    more = comparison.parameters.index.get_level_values("parameter").nunique() - style.MAX_PANELS
     note = f" {more} more parameters are in the table only." if more > 0 else ""
     figure = page.picture(plot_comparison(comparison), "comparison.figure_parameters", more=note)
     prior = [sensitivity] if sensitivity else []
