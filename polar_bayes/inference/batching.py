@@ -183,6 +183,14 @@ def map_batches(
     return joined
 
 
+def map_elements(function: Callable, values: np.ndarray, size: int) -> np.ndarray:
+    """A function of numbers, of an array of any shape: it is given `size` of them at a time."""
+    flat = np.ravel(values)
+    if not flat.size:
+        return np.zeros(np.shape(values))
+    return map_batches(lambda at: function(flat[at]), flat.size, size).reshape(np.shape(values))
+
+
 def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnce:
     """A function of one pixel, mapped over a batch, compiled."""
 

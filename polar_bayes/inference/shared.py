@@ -42,7 +42,7 @@ from polar_bayes.inference.batching import (
     ObservationBatch,
     Status,
     batched,
-    map_batches,
+    map_elements,
 )
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
@@ -104,14 +104,11 @@ class SharedParameter:
 
     def scores(self, prior: dist.Distribution, draws: Values) -> np.ndarray:
         """Standard scores of draws, in the shape of these."""
-        values = np.asarray(draws[self.name], float)
-        if not values.size:
-            return values
-        flat, transform = values.ravel(), dist.biject_to(prior.support)
         # Some pixels have as many draws as they need, and JAX compiles for each length.
         with jax.enable_x64(True):
-            x = map_batches(lambda at: _coordinates_of(transform, flat[at]), flat.size, SCORED)
-        return (x.reshape(values.shape) - self.mean) / self.sd
+            inverse = functools.partial(_coordinates_of, dist.biject_to(prior.support))
+            x = map_elements(inverse, np.asarray(draws[self.name], float), SCORED)
+        return (x - self.mean) / self.sd
 
 
 # Compiled as a whole: by themselves, their operations are dozens of programs for each shape.
