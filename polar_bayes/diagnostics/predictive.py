@@ -32,8 +32,6 @@ from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.psis import MAX_PARETO_K, smooth
 
 PROBABILITIES = (0.5, 0.8, 0.95)
-BAND_PROBABILITY = 0.95
-BAND_SIMULATIONS = 1000
 MAX_BAND_POINTS = 500
 COMPARABLE = MappingProxyType({"valid": True, "saturated": False})
 """Flags of readings that can be compared with a prediction."""
@@ -102,7 +100,7 @@ def pit_band(pit: np.ndarray) -> PitBand | None:
 def _uniform_band(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points and edges of the band, which depend on the number of values only."""
     values, random = np.linspace(0.0, 1.0, size), np.random.default_rng(214)
-    at, _, lower, upper = ecdf_pit(values, BAND_PROBABILITY, BAND_SIMULATIONS, rng=random)
+    at, _, lower, upper = ecdf_pit(values, ci_prob=0.95, n_simulations=1000, rng=random)
     return at, lower, upper
 
 

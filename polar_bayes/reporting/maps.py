@@ -59,7 +59,6 @@ CHECKS = {
 MAX_PIXELS = 800
 """Longest side of a figure; of larger images every second, third, ... pixel is drawn."""
 
-MAX_K = 1.0
 NO_ANSWER = "#dadada"
 APPROACH_COLORS = (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE)
 STATUS_COLORS = {
@@ -111,7 +110,7 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
         low, high = (shown[f"{name}_quantile"].sel(quantile=q) for q in INTERVALS[95])
         _draw_values(panel(0, at), shown[name], title, "viridis")
         _draw_values(panel(1, at), high - low, "95% width", "cividis")
-    _draw_values(panel(2, 0), shown["pareto_k"], "Pareto k", "magma", limits=(0.0, MAX_K))
+    _draw_values(panel(2, 0), shown["pareto_k"], "Pareto k", "magma", limits=(0.0, 1.0))
     _draw_flags(panel(2, 1), shown["approach"], APPROACH_COLORS)
     status = checked_status(shown)
     colors = [STATUS_COLORS.get(each, NO_ANSWER) for each in flag_meanings(status).values()]

@@ -70,7 +70,6 @@ QUANTITIES = {
     "intensity": "intensity",
 }
 SHORT = {**QUANTITIES, "dop": "DoP", "q": "q", "u": "u"}
-GREEK = {"beta": "β"}
 
 
 def styled[**P, R](draw: Callable[P, R]) -> Callable[P, R]:
@@ -209,7 +208,7 @@ def short_title(scalar: Scalar, posterior: xr.Dataset) -> str:
 
 def quantity_label(name: str, symbol: str, unit: object) -> str:
     """`refractive index n`, `exposure [s]`."""
-    label = f"{name} {GREEK.get(symbol, symbol)}".strip()
+    label = f"{name} {'β' if symbol == 'beta' else symbol}".strip()
     return label if str(unit) == "1" else f"{label} [{unit}]"
 
 
