@@ -234,11 +234,10 @@ def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
 
 
 def _point_rows(result: xr.DataTree, found: Sequence[Scalar]) -> np.ndarray:
-    errors = provenance_of(result).get("standard_errors", {})
-    stated = {name: iter(values) for name, values in errors.items()}
+    stated = dict(with_entries(found, provenance_of(result).get("standard_errors", {})))
     rows = np.full((len(found), len(COLUMNS)), np.nan)
     for row, scalar in zip(rows, found, strict=True):
-        error = next(stated.get(scalar.name, iter(())), None)
+        error = stated.get(scalar)
         row[:2] = scalar.draws.mean(), math.nan if error is None else error
     return rows
 
