@@ -233,10 +233,10 @@ class Program:
 
 def in_blocks(function: JitOnce, rows: tuple[np.ndarray, ...], given: Any) -> Any:
     """What a function that is compiled for a block of rows gives for any number of them."""
-    count, double = len(rows[0]), rows[-1].dtype == np.float64
+    double, device = rows[-1].dtype == np.float64, jax.config.jax_default_device
 
     def of_block(index: np.ndarray) -> Any:
-        with jax.enable_x64(double):  # a thread does not inherit it
+        with jax.enable_x64(double), jax.default_device(device):  # no thread inherits them
             return function(*(jnp.asarray(x[index]) for x in rows), given)
 
     def over[T](run: Callable[[np.ndarray], T], blocks: Iterator[np.ndarray]) -> Iterator[T]:
@@ -244,7 +244,7 @@ def in_blocks(function: JitOnce, rows: tuple[np.ndarray, ...], given: Any) -> An
         with ThreadPoolExecutor(THREADS) as pool:
             yield from pool.map(run, blocks)
 
-    return map_batches(of_block, count, BLOCK, over)
+    return map_batches(of_block, len(rows[0]), BLOCK, over)
 
 
 def compile_program(model: Model, data: Observations) -> Program:
