@@ -131,6 +131,7 @@ def test_the_python_of_a_page_runs(
     monkeypatch.setattr(pb, "fit", fits)
     monkeypatch.setattr(fitting, "PRIOR_DRAWS", 100)
     monkeypatch.setattr(problem, "BLOCK", 100)
+    monkeypatch.setattr("polar_bayes.inference.program.BLOCK", 100)
     namespace: dict[str, object] = {"__name__": page.stem}
     for line, code in blocks(page, "python"):
         exec(compile("\n" * line + code, str(page), "exec"), namespace)

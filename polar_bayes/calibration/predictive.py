@@ -14,7 +14,7 @@ readings and of those left out); Vehtari, Gelman & Gabry (2017), Stat. Comput. 2
 (leave-one-out by smoothed weights).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +23,11 @@ from jaxtyping import Array
 from numpyro import handlers
 
 from polar_bayes.calibration.scores import randomized_pit
-from polar_bayes.inference.batching import ObservationBatch, batched, batches
-from polar_bayes.inference.compile import LRUCache
+from polar_bayes.inference.batching import ObservationBatch, batched
+from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.compiled_model import SMALL_BATCH, CompiledModel
 from polar_bayes.inference.program import Program, Values
-from polar_bayes.inference.psis import smooth
+from polar_bayes.inference.psis import draws_at, smooth
 from polar_bayes.observation.data import Observations
 
 Arrays = dict[str, np.ndarray]
@@ -37,24 +38,19 @@ DRAWS = 128
 DRAW_BATCH = 32
 """Draws of a fit that are evaluated at once."""
 
-FIT_BATCH = 4
-"""Fits in one call of the compiled program."""
-
-_PREDICTORS: LRUCache[Callable] = LRUCache(4)
-
 
 class PredictivePit:
     """PIT values of readings, filled in fit by fit; NaN where a fit has failed."""
 
     def __init__(
         self,
-        program: Program,
+        engine: CompiledModel,
         captures: ObservationBatch,
         replicated: Values,
         numbers: np.ndarray,
         seed: int,
     ) -> None:
-        self._program, self._captures = program, captures.in_precision(np.float32)
+        self._engine, self._captures = engine, captures
         self._names = tuple(sorted(replicated))
         count = len(numbers)
         valid = np.asarray(captures.batched.valid).reshape(count, -1)
@@ -87,7 +83,7 @@ class PredictivePit:
         rows = np.arange(at.size)[:, None]
         latent = {
             name: np.asarray(parameters[name], np.float32)[rows, chosen]
-            for name in self._program.supports
+            for name in self._engine.program.supports
         }
         predicted, log_likelihood = self._predict(at, latent)
         equal = np.full((at.size, DRAWS), 1.0 / DRAWS)
@@ -109,21 +105,12 @@ class PredictivePit:
 
     def _predict(self, at: np.ndarray, latent: Values) -> tuple[Arrays, Arrays]:
         """Predictions of the chosen entries and their log likelihoods: by name, (fit, draw)."""
-        predict = _PREDICTORS.of(
-            (self._program, self._names), lambda: _predictor(self._program, self._names)
-        )
-        shared = jax.tree.map(jnp.asarray, self._captures.static)
         entry = {name: np.maximum(x[at], 0).astype(np.int32) for name, x in self.entry.items()}
         states = (entry, latent, self._keys[at])
-        parts: list = []
-        for index in batches(at.size, FIT_BATCH):
-            wanted = np.int32(min(FIT_BATCH, at.size - len(parts) * FIT_BATCH))
-            own = self._captures.take(at[index])
-            given = jax.tree.map(lambda x, i=index: x[i], states)
-            with jax.enable_x64(False):
-                found = predict(wanted, own, shared, *given)
-            parts.append(jax.tree.map(np.asarray, found))
-        return jax.tree.map(lambda *x: np.concatenate(x)[: at.size], *parts)
+        captures, names = self._captures.subset(at), self._names
+        return self._engine.run(
+            _predictor, names, captures, *states, batch=SMALL_BATCH, single=True
+        )
 
 
 def unranked_reason(
@@ -149,8 +136,9 @@ def unranked_reason(
     return ""
 
 
-def _predictor(program: Program, names: tuple[str, ...]) -> Callable:
+def _predictor(engine: CompiledModel, names: tuple[str, ...]) -> JitOnce:
     """Compiled: predictions of the chosen entries by draws of one fit, and log likelihoods."""
+    program = engine.single_program
 
     def predict(
         data: Observations, entry: dict, latent: Values, key: Array
@@ -194,7 +182,5 @@ def _take(values: np.ndarray, entry: np.ndarray) -> np.ndarray:
 
 def _resample(weights: np.ndarray, first: np.ndarray) -> np.ndarray:
     """Systematic resampling: indices of equally weighted draws, (fit, DRAWS)."""
-    at = (np.arange(DRAWS) + first[:, None]) / DRAWS
-    cumulative = np.cumsum(weights, axis=-1)
-    found = [np.searchsorted(*row, side="right") for row in zip(cumulative, at, strict=True)]
-    return np.minimum(found, weights.shape[-1] - 1)
+    levels = (np.arange(DRAWS) + first[:, None]) / DRAWS
+    return np.stack([draws_at(*row) for row in zip(levels, weights, strict=True)])

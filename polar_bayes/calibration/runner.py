@@ -155,7 +155,7 @@ def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
     ranked = None
     if is_ranked:
         again = {name: np.asarray(values)[:count] for name, values in drawn.replicated.items()}
-        ranked = PredictivePit(engine.single_program, captures, again, numbers, seed)
+        ranked = PredictivePit(engine, captures, again, numbers, seed)
     statistics: list[Marginals | PitCrps | PredictivePit] = [marginals, scores]
     statistics += [ranked] if ranked else []
     outcome = empty_outcome(count)

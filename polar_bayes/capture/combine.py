@@ -15,7 +15,7 @@ DIMS = ("material", "patch")
 # Directions and confidence of such views are those of the last view; their values do not matter.
 DEFAULTS = {"valid": True, "saturated": False, "interpolated": False, "normal_confidence": 1.0}
 FLAGS = tuple(row.name for row in CONTRACT if row.kind == "flag")
-REPEATED = tuple(row.name for row in CONTRACT if row.kind in ("geometry", "trust"))
+PER_VIEW = tuple(row.name for row in CONTRACT if row.kind in ("geometry", "trust"))
 
 
 def combine(
@@ -152,7 +152,7 @@ def _padded(name: str, capture: xr.Dataset, dims: list[Any], views: int) -> np.n
     if "view" not in sizes:
         return values
     widths = [(0, views - size if each == "view" else 0) for each, size in sizes.items()]
-    if name in REPEATED:
+    if name in PER_VIEW:
         return np.pad(values, widths, mode="edge")
     return np.pad(values, widths, constant_values=False if name in FLAGS else np.nan)
 

@@ -13,6 +13,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.request import Request
 from polar_bayes.observation.data import ANGLES, READINGS
 from polar_bayes.observation.links import AbstractLink
+from polar_bayes.physics.geometry import unit_vectors
 from polar_bayes.setups import SETUPS
 
 # --- Constraints of the set-up --------------------------------------------------------------------
@@ -96,13 +97,8 @@ def _distance(some: Directions, others: Directions) -> Float[np.ndarray, "some o
 
 def _angle(some: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Degrees between directions (zenith, azimuth)."""
-    first, second = (
-        np.stack(
-            [np.sin(z) * np.cos(a), np.sin(z) * np.sin(a), np.cos(z) * np.ones_like(a)], axis=-1
-        )
-        for z, a in (np.moveaxis(np.radians(x), -1, 0) for x in (some, others))
-    )
-    half = 0.5 * np.linalg.norm(first - second, axis=-1)  # an arc cosine loses small angles
+    apart = unit_vectors(some) - unit_vectors(others)
+    half = 0.5 * np.linalg.norm(apart, axis=-1)  # an arc cosine loses small angles
     return np.degrees(2.0 * np.arcsin(np.minimum(half, 1.0)))
 
 

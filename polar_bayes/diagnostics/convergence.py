@@ -26,13 +26,12 @@ from polar_bayes.diagnostics.parameters import (
     stats_of,
     with_entries,
 )
-from polar_bayes.inference.mcse import LARGEST_R_HAT, SMALLEST_ESS
+from polar_bayes.inference.mcse import LARGEST_R_HAT, SMALLEST_ESS, TAILS
 from polar_bayes.inference.psis import MAX_PARETO_K, smooth
 from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
 from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
-TAILS = (0.05, 0.95)
 LARGE_CORRECTION = 0.1
 """Error of an approximate mean in sds, or of an sd in its log, that is told."""
 MAX_SECOND_MODE = 0.01
@@ -235,11 +234,10 @@ def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
 
 
 def _point_rows(result: xr.DataTree, found: Sequence[Scalar]) -> np.ndarray:
-    errors = provenance_of(result).get("standard_errors", {})
-    stated = {name: iter(values) for name, values in errors.items()}
+    stated = dict(with_entries(found, provenance_of(result).get("standard_errors", {})))
     rows = np.full((len(found), len(COLUMNS)), np.nan)
     for row, scalar in zip(rows, found, strict=True):
-        error = next(stated.get(scalar.name, iter(())), None)
+        error = stated.get(scalar)
         row[:2] = scalar.draws.mean(), math.nan if error is None else error
     return rows
 

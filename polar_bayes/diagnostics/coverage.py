@@ -11,14 +11,12 @@ import xarray as xr
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.batching import IMAGE, Status, cut
-from polar_bayes.maps.lazy import ensure_loaded, map_parameters
+from polar_bayes.maps.lazy import CHUNK, ensure_loaded, map_parameters
 
 INTERVALS = {50: (0.25, 0.75), 80: (0.1, 0.9), 95: (0.025, 0.975)}
 """Percent, and the levels of both ends."""
 
 CASES = ("unknown", "masked", "unanswered", "answered")
-BLOCK = 65536
-"""Pixels that are evaluated together: a chunk of a store."""
 
 
 def coverage_columns(held: Mapping[int, int], count: int) -> dict[str, float]:
@@ -76,7 +74,7 @@ def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
         )
     maps = ensure_loaded(maps)
     counts: dict[str, np.ndarray] = {}
-    for place in cut(maps, BLOCK):
+    for place in cut(maps, CHUNK):
         for name, true in known.items():
             here = true.isel({dim: part for dim, part in place.items() if dim in true.dims})
             bounds = maps[f"{name}_quantile"].isel(place)

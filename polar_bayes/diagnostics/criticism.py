@@ -39,6 +39,7 @@ from polar_bayes.diagnostics.predictive import (
 from polar_bayes.diagnostics.residuals import residual_findings, residuals_of
 from polar_bayes.errors import FitError
 from polar_bayes.inference.checks import (
+    CARRIES,
     LARGE_FACTOR,
     MASS_AT_BOUND,
     NEAR_BOUND,
@@ -52,8 +53,6 @@ from polar_bayes.observation.data import ANGLES
 from polar_bayes.observation.links import PERFECT
 from polar_bayes.physics.part import absence
 
-CARRIES = 0.3
-"""Correlation with a material parameter from which another one is judged with it."""
 FAR = 0.01
 """Prior probability beyond the posterior median of one parameter that is told."""
 SMALL_FACTOR = 1.0 / 3.0

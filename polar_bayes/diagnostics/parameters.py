@@ -13,6 +13,9 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 SAMPLE_DIMS = ("chain", "draw")
+MIN_DRAWS = 100
+"""Draws of which fewer say too little to check predictions or weigh again."""
+
 APPROXIMATIONS = ("laplace", "variational")
 """Methods whose draws are of the approximation, stored with `log_weight`: log posterior minus log
 approximation, up to a constant."""

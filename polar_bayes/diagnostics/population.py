@@ -21,7 +21,6 @@ from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
 from polar_bayes.priors import RANGES
 
-NEW_MEMBERS = 20_000
 SUMMARY_COLUMNS = (
     "members",
     *(f"{part}{end}" for part in ("location", "spread") for end in ("", "_sd", "_q2.5", "_q97.5")),
@@ -77,7 +76,7 @@ class Population:
         # Near the location a unit of log odds is worth location (1 - location).
         return location * (1.0 - location) * spread if self.scale == "log odds" else spread
 
-    def new_members(self, count: int = NEW_MEMBERS, seed: int = 0) -> np.ndarray:
+    def new_members(self, count: int = 20_000, seed: int = 0) -> np.ndarray:
         """Draws of members that were not measured, shape (count,), unit of the parameter."""
         location, spread = self.location.draws.ravel(), self.spread.draws.ravel()
         # Evenly through the draws; as many ranks of the population as there are draws of it.

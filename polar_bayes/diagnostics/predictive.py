@@ -22,6 +22,7 @@ from scipy.special import logsumexp
 
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
+    MIN_DRAWS,
     SAMPLE_DIMS,
     method_of,
     posterior_scalars,
@@ -31,10 +32,7 @@ from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.psis import MAX_PARETO_K, smooth
 
 PROBABILITIES = (0.5, 0.8, 0.95)
-BAND_PROBABILITY = 0.95
-BAND_SIMULATIONS = 1000
 MAX_BAND_POINTS = 500
-MIN_DRAWS = 100
 COMPARABLE = MappingProxyType({"valid": True, "saturated": False})
 """Flags of readings that can be compared with a prediction."""
 
@@ -49,8 +47,6 @@ class Loo:
     pareto_k: np.ndarray
     pit: np.ndarray
     pointwise: np.ndarray
-    weights: np.ndarray
-    """Of each draw (axis 0) where one reading (axis 1) is left out; they sum to one."""
 
     @property
     def unreliable(self) -> int:
@@ -104,7 +100,7 @@ def pit_band(pit: np.ndarray) -> PitBand | None:
 def _uniform_band(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points and edges of the band, which depend on the number of values only."""
     values, random = np.linspace(0.0, 1.0, size), np.random.default_rng(214)
-    at, _, lower, upper = ecdf_pit(values, BAND_PROBABILITY, BAND_SIMULATIONS, rng=random)
+    at, _, lower, upper = ecdf_pit(values, ci_prob=0.95, n_simulations=1000, rng=random)
     return at, lower, upper
 
 
@@ -205,7 +201,6 @@ def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | N
         pareto_k=pareto_k,
         pit=_pit(variable, weights),
         pointwise=elpd,
-        weights=weights,
     )
 
 

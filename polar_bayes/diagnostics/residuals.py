@@ -29,15 +29,15 @@ import xarray as xr
 from polar_bayes.diagnostics.finding import Finding, judged_by, listed, p_text
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.predictive import FlatVariable
+from polar_bayes.inference.checks import ANGLE_SCALES
 from polar_bayes.observation.data import ANGLES
+from polar_bayes.physics.geometry import unit_vectors
 
 REPLICATES = 1000
 MAX_READINGS = 600
 """Readings that the checks use; of more, evenly spaced ones."""
 MAX_SATURATED = 0.01
 """Share of the replicates at full scale beyond which the checks leave a reading out."""
-ANGLE_SCALES = (4.0, 15.0)
-"""Length scales of structure over directions, unit degree."""
 STATED_ERRORS = 3.0
 """Stated errors within which a reading is no outlier, however little the others scatter."""
 MAX_LEVERAGE = 0.999
@@ -169,18 +169,9 @@ def residual_findings(residuals: Residuals | None) -> dict[str, Finding]:
     return {name: check(residuals) for name, check in checks.items()}
 
 
-def _unit_vectors(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-    zenith, azimuth = np.radians(zenith), np.radians(azimuth)
-    return np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1
-    )
-
-
 def _angle(residuals: Residuals) -> Finding:
     """Neighbors with residuals of one sign, where a coordinate and a scale show it most."""
-    view_zenith, view_azimuth, light_zenith, light_azimuth = residuals.directions.T
-    view = _unit_vectors(view_zenith, view_azimuth)
-    light = _unit_vectors(light_zenith, light_azimuth)
+    view, light = (unit_vectors(residuals.directions[:, at]) for at in ([0, 1], [2, 3]))
     half = (view + light) / np.maximum(np.linalg.norm(view + light, axis=1, keepdims=True), 1e-9)
     # A wrong microfacet distribution errs by the tilt of the half vector, a wrong reflectance by
     # the angle of incidence on the facet, a wrong body or instrument by the view zenith.
@@ -188,7 +179,7 @@ def _angle(residuals: Residuals) -> Finding:
         np.hstack([view, light]),
         np.arccos(np.clip(half[:, 2:], -1.0, 1.0)),
         np.arccos(np.clip(np.sum(half * light, axis=1, keepdims=True), -1.0, 1.0)),
-        np.radians(view_zenith[:, None]),
+        np.radians(residuals.directions[:, :1]),
     )
     same = residuals.group[:, None] == residuals.group[None]
     kernels = []

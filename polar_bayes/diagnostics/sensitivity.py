@@ -20,6 +20,7 @@ import xarray as xr
 from arviz_stats.base import array_stats
 
 from polar_bayes.diagnostics.parameters import (
+    MIN_DRAWS,
     SAMPLE_DIMS,
     method_of,
     posterior_scalars,
@@ -35,7 +36,6 @@ PARTLY = 0.85
 """The same at three quarters of the width; a posterior equal to its prior has 0.95."""
 SENSITIVE = 0.05
 POWERS = (0.99, 1.01)
-MIN_DRAWS = 100
 COLUMNS = (
     *("prior_q2.5", "prior_q97.5", "q2.5", "q97.5", "prior_inside", "width_left", "contraction"),
     *("verdict", "prior_sensitivity", "likelihood_sensitivity", "remark"),

@@ -19,6 +19,7 @@ from numpyro import distributions as dist
 
 from polar_bayes.effects.posterior_change import Baseline, PosteriorChange, SceneDensities
 from polar_bayes.errors import FitError, SceneError
+from polar_bayes.inference.files import COSTS
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import FULL_SCENES, Scene
@@ -170,9 +171,6 @@ class EffectSelection:
 
 
 EFFECT, PARAMETER, BOTH = ("effect",), ("parameter",), ("effect", "parameter")
-COSTS = ("operations", "compile_seconds", "run_seconds")
-PACKAGES = ("polar_bayes", "jax", "numpyro")
-TABLE_COLUMNS = ["data", "shift", "sd", "operations", "time", "result"]
 
 DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
     "largest_move": ("largest change of a predicted reading, in sds of its noise", "1"),
@@ -224,7 +222,7 @@ def make_ledger(
         "combined_change": selection.selected_from.largest_change(selection.combined),
         "full_scene": repr(full),
         "chosen_scene": repr(selection.scene),
-        "versions": json.dumps({name: version(name) for name in PACKAGES}),
+        "versions": json.dumps({n: version(n) for n in ("polar_bayes", "jax", "numpyro")}),
     }
     without = [costs[effect.apply(full)] for effect in effects]
     for name in COSTS:
@@ -268,7 +266,8 @@ def ledger_table(ledger: xr.Dataset) -> pd.DataFrame:
             "time": _share(float(row["run_seconds"]), ledger.attrs["full_run_seconds"]),
             "result": f"{'kept' if bool(row['kept']) else 'dropped'}: {row['reason'].item()}",
         }
-    return pd.DataFrame.from_dict(rows, orient="index", columns=TABLE_COLUMNS)
+    columns = ["data", "shift", "sd", "operations", "time", "result"]
+    return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
 
 
 def ledger_sentences(ledger: xr.Dataset) -> list[str]:

@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from polar_bayes.capture.combine import DIMS, combine
+from polar_bayes.capture.combine import DIMS, PER_VIEW, combine
 from polar_bayes.capture.schema import (
     CONTRACT,
     WAVELENGTH,
@@ -40,7 +40,6 @@ from polar_bayes.errors import CaptureError
 from polar_bayes.paths import existing_file, system_error
 
 KNOWN = {row.name: row for row in (*CONTRACT, WAVELENGTH)}
-PER_VIEW = tuple(row.name for row in CONTRACT if row.kind in ("geometry", "trust"))
 LARGEST = float(np.finfo(np.float64).max)
 FINITE = Interval(-LARGEST, LARGEST)
 

@@ -115,12 +115,12 @@ def cut(image: xr.Dataset, pixels: int) -> Iterator[dict[str, slice]]:
             yield {"y": slice(y, min(y + high, rows)), "x": slice(x, min(x + wide, columns))}
 
 
-def take_rows[T](values: T, which: np.ndarray) -> T:
+def take_rows[T](values: T, which: np.ndarray | slice) -> T:
     """Some pixels of arrays that all begin with the pixel axis."""
     return jax.tree.map(lambda x: np.asarray(x)[which], values)
 
 
-def put_rows[T](values: T, which: np.ndarray, new: T) -> None:
+def put_rows[T](values: T, which: np.ndarray | slice, new: T) -> None:
     """Replace some pixels of arrays that all begin with the pixel axis."""
     for whole, part in zip(jax.tree.leaves(values), jax.tree.leaves(new), strict=True):
         whole[which] = part
@@ -172,8 +172,23 @@ def map_batches(
     function: Callable[[np.ndarray], Any], count: int, size: int, over: Callable = map
 ) -> Any:
     """Results of a function of the indices of one batch, joined along the pixel axis."""
+    # Each part is put in its place as it comes: two copies of all results may not fit into memory.
+    joined = None
     parts = over(lambda index: jax.tree.map(np.asarray, function(index)), batches(count, size))
-    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
+    for begin, part in zip(range(0, count, size), parts, strict=True):
+        if joined is None:
+            joined = jax.tree.map(lambda x: np.empty((count, *x.shape[1:]), x.dtype), part)
+        end = min(begin + size, count)
+        put_rows(joined, slice(begin, end), take_rows(part, slice(end - begin)))
+    return joined
+
+
+def map_elements(function: Callable, values: np.ndarray, size: int) -> np.ndarray:
+    """A function of numbers, of an array of any shape: it is given `size` of them at a time."""
+    flat = np.ravel(values)
+    if not flat.size:
+        return np.zeros(np.shape(values))
+    return map_batches(lambda at: function(flat[at]), flat.size, size).reshape(np.shape(values))
 
 
 def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnce:

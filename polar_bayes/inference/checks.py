@@ -34,6 +34,12 @@ NOISE_FACTOR = "stokes_error_factor"
 LARGE_FACTOR = 3.0
 """Stated errors that are exceeded by this factor, with probability 97.5%, give a caution."""
 
+CARRIES = 0.3
+"""Correlation with a material parameter from which another one is judged with it."""
+
+ANGLE_SCALES = (4.0, 15.0)
+"""Length scales of structure over directions, unit degree."""
+
 SMALLEST_TAIL = 1e-300
 """Probability below which a tail is not told from zero."""
 

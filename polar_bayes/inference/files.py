@@ -348,10 +348,10 @@ STATISTICS = (
 """Variables of `sample_stats` that are read; samplers of other packages have more."""
 
 _EFFECT, _PARAMETER, _ROW = ("effect",), ("parameter",), ("row",)
-_COSTS = ("operations", "compile_seconds", "run_seconds")
+COSTS = ("operations", "compile_seconds", "run_seconds")
 _OF_LEDGER = {
     **dict.fromkeys(("effect", "path", "reason", "kept", "forced"), _EFFECT),
-    **dict.fromkeys(("largest_move", "rms_move", "change", *_COSTS), _EFFECT),
+    **dict.fromkeys(("largest_move", "rms_move", "change", *COSTS), _EFFECT),
     **dict.fromkeys(("shift", "sd_ratio"), (*_EFFECT, *_PARAMETER)),
     **dict.fromkeys(("parameter", "judged"), _PARAMETER),
 }
@@ -364,7 +364,7 @@ LEDGER = Group(
         **dict.fromkeys(("kept", "forced", "judged"), FLAGS),
     },
     attributes={
-        **{f"{which}_{cost}": OPTIONAL for which in ("full", "chosen") for cost in _COSTS},
+        **{f"{which}_{cost}": OPTIONAL for which in ("full", "chosen") for cost in COSTS},
         "combined_change": OPTIONAL,
         "tolerance": FINITE,
     },

@@ -15,6 +15,7 @@ LARGEST_R_HAT, SMALLEST_ESS = 1.01, 400
 """Limits beyond which chains have not converged."""
 
 TAILS = (0.05, 0.95)
+"""Quantiles whose effective sample sizes are those of the tails."""
 
 FALSE_ALARMS = 0.01
 """How often some mean or standard deviation of one fit may be further off than expected."""

@@ -25,6 +25,7 @@ import scipy.optimize
 from jaxtyping import Array, DTypeLike
 
 from polar_bayes.errors import FitError
+from polar_bayes.inference.batching import map_batches
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress
@@ -295,11 +296,11 @@ def from_prior(program: Program, key: Array, draws: int, data: Observations) -> 
     """Unconstrained vectors drawn from the prior; one compiled program serves any number."""
     # The key of a draw depends on its index alone, so a multiple of `KEYS` serves any number.
     keys = np.asarray(jax.random.key_data(jax.random.split(key, KEYS * -(-draws // KEYS))))
-    drawn = [
-        program.drawn_from_prior(keys[begin : begin + KEYS], min(KEYS, draws - begin), data)
-        for begin in range(0, draws, KEYS)
-    ]
-    return np.concatenate(drawn)[:draws]
+
+    def drawn(index: np.ndarray) -> Array:
+        return program.drawn_from_prior(keys[index], min(KEYS, draws - index[0]), data)
+
+    return map_batches(drawn, draws, KEYS)
 
 
 def finite_sd(draws: np.ndarray) -> np.ndarray:

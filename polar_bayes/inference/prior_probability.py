@@ -7,6 +7,7 @@ import numpy as np
 from numpyro import distributions as dist
 from scipy import special
 
+from polar_bayes.inference.batching import map_elements
 from polar_bayes.priors import cast_prior
 
 ROWS = 1024
@@ -28,10 +29,7 @@ def probability_below(prior: dist.Distribution, x: np.ndarray) -> np.ndarray:
     with jax.enable_x64(True):
         if prior.batch_shape:
             return np.asarray(cast_prior(prior).cdf(x))
-        blocks = np.zeros((-(-np.size(x) // ROWS), ROWS))
-        blocks.reshape(-1)[: np.size(x)] = np.ravel(x)
-        found = [np.asarray(cast_prior(prior).cdf(block)) for block in blocks]
-    return np.concatenate([*found, np.zeros(0)])[: np.size(x)].reshape(np.shape(x))
+        return map_elements(cast_prior(prior).cdf, x, ROWS)
 
 
 @probability_below.register

@@ -9,7 +9,6 @@ import time
 from collections.abc import Mapping
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, ArrayLike, Float
@@ -145,15 +144,9 @@ class Problem:
         Returns:
             Arrays of shape (chain, draw, ...), by name.
         """
-        z, count, pieces = z.astype(self.dtype), z.shape[1], []
-        for begin in range(0, count, BLOCK):
-            index = np.minimum(np.arange(begin, begin + BLOCK), count - 1)
-            found = self.program.parameters_of_chains(jnp.asarray(z[:, index]), self.data)
-            pieces.append({name: np.asarray(value) for name, value in found.items()})
-        return {
-            name: np.concatenate([piece[name] for piece in pieces], axis=1)[:, :count]
-            for name in pieces[0]
-        }
+        each = z.reshape(-1, 1, self.program.size).astype(self.dtype)  # a chain of one draw
+        found = in_blocks(self.program.parameters_of_chains, (each,), self.data)
+        return {name: x.reshape(*z.shape[:2], *x.shape[2:]) for name, x in found.items()}
 
     def hold(self, values: Mapping[str, ArrayLike]) -> "Problem":
         """The same problem with some parameters known: it compiles nothing.

@@ -7,7 +7,7 @@ so that fits to captures of one layout share their compiled programs.
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from numpyro.infer.util import compute_log_probs
 from numpyro.primitives import Messenger
 
 from polar_bayes.errors import FitError
+from polar_bayes.inference.batching import map_batches
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
@@ -250,7 +251,7 @@ class Program:
         return JitOnce(evaluate)
 
     @functools.cached_property
-    def parameters_of_chains(self) -> Callable[[Array, Observations], dict[str, Array]]:
+    def parameters_of_chains(self) -> JitOnce:
         """`parameters` of chains of draws, (chain, draw, size), compiled."""
         over_draws = jax.vmap(self.parameters, in_axes=(0, None))
         return JitOnce(jax.vmap(over_draws, in_axes=(0, None)))
@@ -274,24 +275,18 @@ def _all_of(mask: Array, like: Array) -> Array:
 
 def in_blocks(function: JitOnce, rows: tuple[np.ndarray, ...], given: Any) -> Any:
     """What a function that is compiled for a block of rows gives for any number of them."""
-    count, double = len(rows[0]), rows[-1].dtype == np.float64
+    double, device = rows[-1].dtype == np.float64, jax.config.jax_default_device
 
-    def run(start: int) -> Any:
-        index = np.minimum(np.arange(start, start + BLOCK), count - 1)
-        with jax.enable_x64(double):  # a thread does not inherit it
-            return jax.tree.map(np.asarray, function(*(jnp.asarray(x[index]) for x in rows), given))
+    def of_block(index: np.ndarray) -> Any:
+        with jax.enable_x64(double), jax.default_device(device):  # no thread inherits them
+            return function(*(jnp.asarray(x[index]) for x in rows), given)
 
-    first = run(0)  # compiled before the threads start
-    joined = jax.tree.map(lambda x: np.empty((count, *x.shape[1:]), x.dtype), first)
+    def over[T](run: Callable[[np.ndarray], T], blocks: Iterator[np.ndarray]) -> Iterator[T]:
+        yield run(next(blocks))  # compiled before the threads start
+        with ThreadPoolExecutor(THREADS) as pool:
+            yield from pool.map(run, blocks)
 
-    def fill(start: int, block: Any) -> None:
-        for whole, part in zip(jax.tree.leaves(joined), jax.tree.leaves(block), strict=True):
-            whole[start : start + BLOCK] = part[: count - start]
-
-    fill(0, first)
-    with ThreadPoolExecutor(THREADS) as pool:
-        list(pool.map(lambda start: fill(start, run(start)), range(BLOCK, count, BLOCK)))
-    return joined
+    return map_batches(of_block, len(rows[0]), BLOCK, over)
 
 
 def compile_program(model: Model, data: Observations) -> Program:

@@ -40,7 +40,6 @@ from polar_bayes.observation import links
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.paths import SCENE_KEYS, atomic_write, existing_file, is_scene_file
 from polar_bayes.physics import instrument
-from polar_bayes.physics.part import Part
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import parse_prior
 from polar_bayes.setups import SETUPS, Setup, find_setup
@@ -76,10 +75,6 @@ def parse_scene(text: object, where: str) -> Scene:
         hint = "give one such as Scene(surface=SmoothSurface())"
         raise SceneError(f"{text!r} is no scene", where=where, hint=hint)
     return found
-
-
-def _parse_part(text: object, where: str) -> Part:
-    return parse_value(text, _known(polar_bayes.physics, instrument), where, SceneError)
 
 
 # --- Files to arguments ---------------------------------------------------------------------------
@@ -157,8 +152,10 @@ def _scene_of(stated: Mapping[str, Any], where: str) -> str | Scene | Setup | No
     if "surface" not in texts:
         hint = "list every part of the scene, such as surface = 'SmoothSurface()'"
         raise SceneError("it has no surface", where=f"{where}: scene", hint=hint)
-    parts: dict[str, Any] = {
-        name: _parse_part(text, f"{where}: scene.{name}") for name, text in texts.items()
+    known = _known(polar_bayes.physics, instrument)
+    parts = {
+        name: parse_value(text, known, f"{where}: scene.{name}", SceneError)
+        for name, text in texts.items()
     }
     scene = Scene(**parts)
     if setup is None:

@@ -36,7 +36,14 @@ from numpyro import distributions as dist
 from numpyro.distributions import transforms
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batching import LANES, AnyArray, ObservationBatch, Status, batched
+from polar_bayes.inference.batching import (
+    LANES,
+    AnyArray,
+    ObservationBatch,
+    Status,
+    batched,
+    map_elements,
+)
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.corrected_laplace import CorrectedLaplace
@@ -97,13 +104,11 @@ class SharedParameter:
 
     def scores(self, prior: dist.Distribution, draws: Values) -> np.ndarray:
         """Standard scores of draws, in the shape of these."""
-        values = np.asarray(draws[self.name], float)
         # Some pixels have as many draws as they need, and JAX compiles for each length.
-        blocks = np.resize(values, (max(1, -(-values.size // SCORED)), SCORED))
         with jax.enable_x64(True):
-            transform = dist.biject_to(prior.support)
-            x = np.concatenate([_coordinates_of(transform, block) for block in blocks])
-        return (x[: values.size].reshape(values.shape) - self.mean) / self.sd
+            inverse = functools.partial(_coordinates_of, dist.biject_to(prior.support))
+            x = map_elements(inverse, np.asarray(draws[self.name], float), SCORED)
+        return (x - self.mean) / self.sd
 
 
 # Compiled as a whole: by themselves, their operations are dozens of programs for each shape.

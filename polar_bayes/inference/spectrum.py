@@ -30,7 +30,6 @@ from polar_bayes.physics.dispersion import AbstractDispersion, Cauchy, Sellmeier
 from polar_bayes.physics.scene import Scene
 
 BATCH = 64
-LAWS = {law.__name__: law for law in (Cauchy, Sellmeier)}
 
 
 def predict_spectrum(
@@ -111,7 +110,8 @@ def _law_of(provenance: Mapping[str, Any], scene: Scene | None) -> AbstractDispe
         for node in ast.walk(ast.parse(parts, mode="eval")):
             law = node.value if isinstance(node, ast.keyword) and node.arg == "dispersion" else None
             if isinstance(law, ast.Call):
-                return parse_value(ast.unparse(law), LAWS, "dispersion")
+                known = {"Cauchy": Cauchy, "Sellmeier": Sellmeier}
+                return parse_value(ast.unparse(law), known, "dispersion")
     except (SyntaxError, ValueError) as error:  # the user's own part or law
         if "dispersion=" in parts and "dispersion=None" not in parts:
             raise FitError(

@@ -16,6 +16,7 @@ from numpyro import distributions as dist
 
 from polar_bayes.inference.batching import ObservationBatch, Status
 from polar_bayes.inference.checks import (
+    CARRIES,
     CAUTION,
     LARGE_FACTOR,
     MASS_AT_BOUND,
@@ -30,6 +31,7 @@ from polar_bayes.inference.prior_probability import has_probabilities, probabili
 from polar_bayes.inference.problem_batch import BatchDraws
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.psis import LEVELS, Marginals
+from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.maps.residuals import (
     Fitted,
     direction_kernels,
@@ -40,9 +42,6 @@ from polar_bayes.observation.links import PERFECT
 from polar_bayes.physics.part import absence
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 from polar_bayes.priors import RANGES, support_bounds
-
-CARRIES = 0.3
-"""Correlation with a material parameter from which another one is judged with it."""
 
 LOWEST, MEDIAN, HIGHEST = (LEVELS.index(level) for level in (0.025, 0.5, 0.975))
 
@@ -163,7 +162,7 @@ def _bounds(
         for bound in filter(math.isfinite, ends):
             if absent is None or absent.value != bound:
                 draws = scalar.of(engine.prior_parameters)[None]
-                strip = NEAR_BOUND * np.diff(np.quantile(draws, (0.025, 0.975)))
+                strip = NEAR_BOUND * np.diff(np.quantile(draws, CENTRAL_95))
                 if _share_at(bound, draws, np.full((1, MOMENTS), 1.0 / MOMENTS), strip) < (
                     MASS_AT_BOUND
                 ):

@@ -20,10 +20,8 @@ from scipy.special import ndtri
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.importers.detector import read_image
 from polar_bayes.inference.batching import IMAGE, Status, cut
+from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.maps.lazy import CHUNK, checked_status, map_parameters
-
-BOUNDS = (0.025, 0.975)
-"""Levels of the ends of an interval."""
 
 LARGEST_PULL = 0.5
 """Of the priors of all pixels together on the mean of a region, in units of its sd, above which
@@ -114,7 +112,7 @@ def region_means(
         means = _of_regions(total, counts[0], reference)
         sd = means.sd
         cautions += _cautions(name, found, means, shown)
-        interval = means.mean + ndtri(BOUNDS).reshape(-1, *[1] * sd.ndim) * sd
+        interval = means.mean + ndtri(CENTRAL_95).reshape(-1, *[1] * sd.ndim) * sd
         attrs = {key: maps[name].attrs.get(key, "") for key in ("units", "symbol")}
         axes = ("region", *_own_dims(maps, name))
         variables[name] = (axes, means.mean, attrs)
@@ -123,7 +121,7 @@ def region_means(
         pull = np.where(means.is_pull_known, means.pull, np.nan)
         variables[f"{name}_prior_pull"] = (axes, pull, attrs)
     own = {dim: x for dim, x in maps.coords.items() if any(dim in v[0] for v in variables.values())}
-    answer = xr.Dataset(variables, {**own, "region": found, "bound": list(BOUNDS)})
+    answer = xr.Dataset(variables, {**own, "region": found, "bound": list(CENTRAL_95)})
     return answer.isel(region=shown).assign_attrs(cautions=cautions)
 
 

@@ -30,14 +30,12 @@ from numpyro import distributions as dist
 from scipy import special
 
 from polar_bayes.inference.batching import AnyArray, batched
+from polar_bayes.inference.checks import ANGLE_SCALES
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
-from polar_bayes.physics.geometry import Geometry
-
-ANGLE_SCALES = (4.0, 15.0)
-"""Length scales of structure over directions, unit degree."""
+from polar_bayes.physics.geometry import Geometry, unit_vectors
 
 LEAST_NEIGHBOR = 0.01
 """Largest weight of two neighbors below which a scale says nothing."""
@@ -257,19 +255,8 @@ def _basis(changes: np.ndarray) -> np.ndarray:
 def direction_kernels(geometry: Geometry) -> list[Float[np.ndarray, "view view"]]:
     """How near the directions of two views are, for each scale; none where all are far apart."""
     first = [np.asarray(x, float).reshape(-1, np.shape(x)[-1])[0] for x in geometry[:4]]
-    view_zenith, view_azimuth, light_zenith, light_azimuth = np.radians(first)
-    directions = np.stack(
-        [
-            part
-            for zenith, azimuth in ((view_zenith, view_azimuth), (light_zenith, light_azimuth))
-            for part in (
-                np.sin(zenith) * np.cos(azimuth),
-                np.sin(zenith) * np.sin(azimuth),
-                np.cos(zenith),
-            )
-        ]
-    )
-    apart = np.sum((directions[:, :, None] - directions[:, None]) ** 2, axis=0)
+    both = unit_vectors(np.stack(first, axis=-1).reshape(-1, 2, 2))  # of the viewer and the light
+    apart = np.sum((both[:, None] - both) ** 2, axis=(-2, -1))
     np.fill_diagonal(apart, np.inf)
     kernels = [np.exp(-0.5 * apart / math.radians(scale) ** 2) for scale in ANGLE_SCALES]
     return [kernel for kernel in kernels if kernel.max() > LEAST_NEIGHBOR]

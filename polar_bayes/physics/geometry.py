@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
 # Nearest to grazing, in degrees, that single precision or a shifted angle may come.
 STEEPEST_ZENITH = 89.999
@@ -135,6 +136,13 @@ def resolved_cosine(cosine: Array) -> Array:
 def double_angle(cos: Array, sin: Array) -> tuple[Array, Array]:
     """Cosine and sine of twice an angle; of a vector (cos, sin), times its squared length."""
     return (cos - sin) * (cos + sin), 2.0 * sin * cos
+
+
+def unit_vectors(directions: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "... 3"]:
+    """Unit vectors of directions: zenith and azimuth, unit degree."""
+    zenith, azimuth = np.moveaxis(np.radians(directions), -1, 0)
+    sine = np.sin(zenith)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
 
 
 def per_ray[T](arrays: T) -> T:

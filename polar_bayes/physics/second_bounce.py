@@ -28,7 +28,13 @@ from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import Facets, seen
-from polar_bayes.physics.geometry import Geometry, cos_degrees, per_facet, sin_degrees
+from polar_bayes.physics.geometry import (
+    Geometry,
+    cos_degrees,
+    double_angle,
+    per_facet,
+    sin_degrees,
+)
 from polar_bayes.physics.illumination import PointSource, UniformSky
 from polar_bayes.physics.microfacet import SlopeEllipse
 from polar_bayes.physics.part import Parameters, Part, at_least, quotient
@@ -134,7 +140,7 @@ class TwoBounceSurface(RoughSurface):
         contrast = power.contrast * power.sin_squared
         intensity = power.mean * arriving.x + contrast * arriving.y
         q = contrast * arriving.x + power.mean * arriving.y
-        cos, sin = double(axis.y, view.z * -axis.x + view.x * axis.z)
+        cos, sin = double_angle(axis.y, view.z * -axis.x + view.x * axis.z)
         u = -power.cross * arriving.z
         return Vector(
             *(
@@ -193,14 +199,9 @@ def _mirrored(
     cosine = jnp.clip(cosine, GRAZING, 1.0)
     power = stack.reflection(cosine, (1.0 - cosine) * (1.0 + cosine))
     own = back.across(light)
-    cos, sin = double(own.dot(axis), own.dot(back.cross(axis)))
+    cos, sin = double_angle(own.dot(axis), own.dot(back.cross(axis)))
     polarized = lit * power.contrast * power.sin_squared
     return Vector(lit * power.mean, polarized * cos, polarized * sin)
-
-
-def double(cosine: Array, sine: Array) -> tuple[Array, Array]:
-    """Cosine and sine of twice an angle."""
-    return (cosine - sine) * (cosine + sine), 2.0 * cosine * sine
 
 
 def both_sides(sample: Facets) -> Facets:

@@ -33,12 +33,9 @@ from polar_bayes.reporting import page, text
 from polar_bayes.reporting import plots_calibration as figures
 from polar_bayes.reporting.maps import STATUSES, count_table, flag_meanings
 from polar_bayes.reporting.plots_calibration import MAX_INTERVALS, Ranks
-from polar_bayes.reporting.style import QUANTITIES
+from polar_bayes.reporting.style import MAX_PANELS, QUANTITIES
 from polar_bayes.reporting.text import DASH, column, number
 from polar_bayes.repr_html import Table
-
-MAX_PANELS = 12
-"""Parameters of one figure: more would be too small to read."""
 
 MAX_OTHERS = 4
 RANKS_COLUMN, JUDGED_COLUMN = "the ranks", "the tests"

@@ -19,7 +19,6 @@ from polar_bayes.reporting.text import CLEAR, DASH, column, interval, number, or
 from polar_bayes.repr_html import Row, Table
 
 COLORS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, GRAY)
-MAX_PANELS = 12
 ASKED = (
     *("method", "settings", "model", "model_settings", "scene", "scene_parts", "links", "priors"),
     *("fixed", "largest_view_zenith", "seed", "precision"),
@@ -43,7 +42,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
     """
     table, fits = comparison.parameters, list(comparison.verdicts)
     finite = table[np.isfinite(table["mean"])]
-    labels = list(dict.fromkeys(finite.index.get_level_values("parameter")))[:MAX_PANELS]
+    labels = list(dict.fromkeys(finite.index.get_level_values("parameter")))[: style.MAX_PANELS]
     if not labels:
         raise FitError(
             "there is nothing to draw", where="plot_comparison", hint="give fits with finite draws"
@@ -83,7 +82,7 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     sensitivity = sensitivity_table(comparison)
     left_out = [f"{name}: {why}." if name else why for name, why in comparison.left_out.items()]
     predictions: list[page.Block] = [] if comparison.loo.empty else [loo_table(comparison)]
-    more = comparison.parameters.index.get_level_values("parameter").nunique() - MAX_PANELS
+    more = comparison.parameters.index.get_level_values("parameter").nunique() - style.MAX_PANELS
     note = f" {more} more parameters are in the table only." if more > 0 else ""
     figure = page.picture(plot_comparison(comparison), "comparison.figure_parameters", more=note)
     prior = [sensitivity] if sensitivity else []

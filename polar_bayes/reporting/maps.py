@@ -12,13 +12,14 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 
-from polar_bayes.diagnostics.coverage import BLOCK, INTERVALS, map_coverage, map_scalars
+from polar_bayes.diagnostics.coverage import INTERVALS, map_coverage, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, cut
 from polar_bayes.inference.registry import MAP_DEFAULT, METHODS
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.lazy import (
+    CHUNK,
     COPY,
     checked_status,
     count_criticism,
@@ -58,7 +59,6 @@ CHECKS = {
 MAX_PIXELS = 800
 """Longest side of a figure; of larger images every second, third, ... pixel is drawn."""
 
-MAX_K = 1.0
 NO_ANSWER = "#dadada"
 APPROACH_COLORS = (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE)
 STATUS_COLORS = {
@@ -110,7 +110,7 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
         low, high = (shown[f"{name}_quantile"].sel(quantile=q) for q in INTERVALS[95])
         _draw_values(panel(0, at), shown[name], title, "viridis")
         _draw_values(panel(1, at), high - low, "95% width", "cividis")
-    _draw_values(panel(2, 0), shown["pareto_k"], "Pareto k", "magma", limits=(0.0, MAX_K))
+    _draw_values(panel(2, 0), shown["pareto_k"], "Pareto k", "magma", limits=(0.0, 1.0))
     _draw_flags(panel(2, 1), shown["approach"], APPROACH_COLORS)
     status = checked_status(shown)
     colors = [STATUS_COLORS.get(each, NO_ANSWER) for each in flag_meanings(status).values()]
@@ -204,7 +204,7 @@ def count_cases(maps: xr.Dataset) -> pd.DataFrame:
     """Numbers of pixels by status (rows) and approach (columns)."""
     rows, columns = (flag_meanings(maps[name]) for name in ("status", "approach"))
     counts = np.zeros((len(rows), len(columns)), int)
-    for place in cut(maps, BLOCK):
+    for place in cut(maps, CHUNK):
         block = maps.isel(place)
         status = flag_indices(checked_status(block), rows)
         np.add.at(counts, (status, flag_indices(block["approach"], columns)), 1)
@@ -429,7 +429,7 @@ def _over_good(maps: xr.Dataset, scalar: Scalar, ending: str) -> np.ndarray:
     """Values of one map over the good pixels, or widths of its 95% intervals: (pixel,)."""
     values = maps[f"{scalar.name}{ending}"].isel(scalar.index)
     found = []
-    for place in cut(maps, BLOCK):
+    for place in cut(maps, CHUNK):
         block = values.isel(place).load()
         if "quantile" in block.dims:
             low, high = (block.sel(quantile=level, drop=True) for level in INTERVALS[95])

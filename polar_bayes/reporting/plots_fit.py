@@ -35,6 +35,7 @@ from polar_bayes.reporting.style import (
     BLUE,
     CHAIN_COLORS,
     GRAY,
+    MAX_PANELS,
     ORANGE,
     PURPLE,
     QUANTITIES,
@@ -44,7 +45,6 @@ from polar_bayes.reporting.style import (
 )
 
 MAX_PAIRED = 8
-MAX_PANELS = 12
 MAX_POINTS = 800
 RANK_BINS = 20
 MINUS = "\N{MINUS SIGN}"

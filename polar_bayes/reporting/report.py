@@ -21,6 +21,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.expressions import short_text
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.maps.lazy import criticism_sentences
+from polar_bayes.observation.data import ANGLES
 from polar_bayes.paths import as_path
 from polar_bayes.priors import describe_prior, prior_card
 from polar_bayes.reporting import maps, text
@@ -174,12 +175,9 @@ def _accuracy_card(result: xr.DataTree) -> Card:
 
 # --- Cards of what goes into a fit ----------------------------------------------------------------
 
-SHOWN = {"view_zenith", "view_azimuth", "light_zenith", "light_azimuth"}
-"""Variables of every capture."""
-
 
 def _is_capture(value: Any) -> bool:
-    is_dataset = isinstance(value, xr.Dataset) and set(value.data_vars) >= SHOWN
+    is_dataset = isinstance(value, xr.Dataset) and set(value.data_vars) >= {*ANGLES}
     return is_dataset and "status" not in value and PROVENANCE not in value.attrs
 
 
@@ -222,10 +220,6 @@ def _are_priors(value: Any) -> bool:
     return are_named and all(isinstance(each, dist.Distribution) for each in value.values())
 
 
-def _is_described(value: Any) -> bool:
-    return isinstance(value, xr.Dataset) and "status" not in value
-
-
 def _described_card(result: xr.Dataset) -> DisplaySummary:
     """A result that describes and cannot fail: its table and its sentences."""
     found = summary(result)
@@ -244,7 +238,7 @@ VALUES: tuple[tuple[Callable[[Any], bool], Callable[[Any], DisplaySummary]], ...
     (_is_capture, _capture_card),
     (lambda value: isinstance(value, HTMLRepr), _value_card),
     (_are_priors, prior_card),
-    (_is_described, _described_card),
+    (lambda value: isinstance(value, xr.Dataset) and "status" not in value, _described_card),
 )
 """Cards of what is not reported on a page, in the order in which they are tried."""
 

@@ -34,6 +34,9 @@ ORANGE, SKY, GREEN, BLUE = "#e69f00", "#56b4e9", "#009e73", "#0072b2"
 VERMILLION, PURPLE = "#d55e00", "#cc79a7"
 CHAIN_COLORS = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
 
+MAX_PANELS = 12
+"""Parameters of one figure: more would be too small to read."""
+
 STYLE: Any = {
     "font.size": 9.0,
     "axes.titlesize": 9.0,
@@ -67,7 +70,6 @@ QUANTITIES = {
     "intensity": "intensity",
 }
 SHORT = {**QUANTITIES, "dop": "DoP", "q": "q", "u": "u"}
-GREEK = {"beta": "β"}
 
 
 def styled[**P, R](draw: Callable[P, R]) -> Callable[P, R]:
@@ -206,7 +208,7 @@ def short_title(scalar: Scalar, posterior: xr.Dataset) -> str:
 
 def quantity_label(name: str, symbol: str, unit: object) -> str:
     """`refractive index n`, `exposure [s]`."""
-    label = f"{name} {GREEK.get(symbol, symbol)}".strip()
+    label = f"{name} {'β' if symbol == 'beta' else symbol}".strip()
     return label if str(unit) == "1" else f"{label} [{unit}]"
 
 

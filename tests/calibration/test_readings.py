@@ -19,6 +19,7 @@ from polar_bayes.calibration.predictive import (
     unranked_reason,
 )
 from polar_bayes.calibration.runner import draw_captures
+from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.program import compile_program
 from polar_bayes.observation.data import observe
 
@@ -39,12 +40,11 @@ def read():
     capture = plate_capture(np.linspace(30.0, 70.0, 5), 0.03, seed=0)
     valid = xr.DataArray([True, True, False, True, True], dims="view")
     data = observe(capture.assign(valid=valid))
-    with jax.enable_x64(False):
-        rough = compile_program(shifted, data.in_single_precision())
     program, numbers = compile_program(shifted, data), np.arange(FITS)
+    engine = CompiledModel(lambda: shifted, shifted, program, data, "double")
     drawn = draw_captures(program, data, numbers, jax.random.key(3), replicate=True)
     again = drawn.replicated
-    readings = PredictivePit(rough, drawn.captures, again, numbers, seed=4)
+    readings = PredictivePit(engine, drawn.captures, again, numbers, seed=4)
     q = np.asarray(drawn.captures.batched.readings["q"])[:, valid.to_numpy()]
     variance = 1.0 / (1.0 / 0.3**2 + q.shape[1] / NOISE**2)
     mean = variance * q.sum(axis=1) / NOISE**2

@@ -107,7 +107,7 @@ def test_every_wavelength_has_a_row_and_truths_may_have_fewer_axes() -> None:
 def test_the_image_may_be_read_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     maps, truth = make_maps({"roughness": HALF}), known(roughness=SPREAD)
     whole = pb.diagnostics.map_coverage(maps, truth)
-    monkeypatch.setattr(coverage, "BLOCK", 333)
+    monkeypatch.setattr(coverage, "CHUNK", 333)
     pd.testing.assert_frame_equal(pb.diagnostics.map_coverage(maps, truth), whole)
 
 

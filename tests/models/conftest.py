@@ -15,6 +15,7 @@ def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Itera
     monkeypatch.setattr(hierarchical_reparam, "TYPICAL_DRAWS", 50)
     monkeypatch.setattr(fitting, "PRIOR_DRAWS", 100)
     monkeypatch.setattr(problem, "BLOCK", 100)
+    monkeypatch.setattr("polar_bayes.inference.program.BLOCK", 100)
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)

@@ -64,6 +64,7 @@ def result_of(name: str, fitted: dict[str, xr.DataTree]) -> xr.DataTree:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(fitting, "PRIOR_DRAWS", 100)
             patch.setattr(problem, "BLOCK", 100)
+            patch.setattr("polar_bayes.inference.program.BLOCK", 100)
             fitted[name] = pb.fit(capture, scene=PLATE, links=LINKS, method=method, seed=7)
         jax.config.update("jax_disable_most_optimizations", False)
     return fitted[name]
