@@ -21,14 +21,12 @@ from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
     WEIGHTED,
     Scalar,
-    method_of,
-    posterior_scalars,
-    stats_of,
     with_entries,
 )
+from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.inference.mcse import LARGEST_R_HAT, SMALLEST_ESS
 from polar_bayes.inference.psis import MAX_PARETO_K, smooth
-from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
+from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
@@ -94,34 +92,31 @@ class Verdict:
         return f"Nothing speaks against the intervals in what was checked: {made}.{left}"
 
 
-def summary(result: xr.DataTree) -> pd.DataFrame:
+@once
+def summary(fit: FitView) -> pd.DataFrame:
     """One row per scalar parameter of a fit, as `polar_bayes.summary` returns it."""
     # Source: Vehtari et al. (2021), Bayesian Analysis 16(2): rank-normalized split R-hat and ESS.
-    found = posterior_scalars(result)
-    rows = _point_rows(result, found) if method_of(result) == "point" else _draw_rows(found)
-    return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index([s.label for s in found]))
+    rows = _point_rows(fit) if fit.method == "point" else _draw_rows(fit.scalars)
+    return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index([s.label for s in fit.scalars]))
 
 
-def verdict(
-    result: xr.DataTree, table: pd.DataFrame | None = None, criticism: pd.DataFrame | None = None
-) -> Verdict:
-    """Whether the numbers of a fit may be used; its summary and criticism, if computed already."""
-    table = summary(result) if table is None else table
-    criticism = criticize(result) if criticism is None else criticism
-    method, provenance = method_of(result), provenance_of(result)
-    found = posterior_scalars(result)
+@once
+def verdict(fit: FitView) -> Verdict:
+    """Whether the numbers of a fit may be used."""
+    table, criticism = summary(fit), criticize(fit)
+    method, provenance, found = fit.method, fit.provenance, fit.scalars
     noted = (str(problem).rstrip(".") for problem in provenance.get("problems", ()))
     problems = [f"{text[:1].upper()}{text[1:]}." for text in noted]
     problems += _draw_problems(found, method, provenance)
     if method not in (*WEIGHTED, *APPROXIMATIONS, "point"):  # chains, those of users included
-        problems += _chain_problems(result, table)
+        problems += _chain_problems(fit, table)
     problems += _weight_problems(provenance, method)
     against = criticism["sentence"].groupby(criticism["level"], sort=False).agg(list)
     cautions = (
-        *_approximation_cautions(result, found, method),
+        *_approximation_cautions(fit),
         *_mode_cautions(provenance),
         *_tail_cautions(provenance, found, table),
-        *_estimate_cautions(result, table, method),
+        *_estimate_cautions(table, method),
         *_reading_cautions(provenance.get("counts", {})),
         *_capture_cautions(provenance),
         *against.get("caution", []),
@@ -130,7 +125,7 @@ def verdict(
     faults = tuple(against.get("problem", []))
     notes = (
         *against.get("note", []),
-        *_chain_notes(result),
+        *_chain_notes(fit),
         *_reading_notes(provenance.get("counts", {})),
     )
     made, missing = checks_made(method, criticism)
@@ -145,7 +140,7 @@ def verdict(
     )
 
 
-def json_summary(result: xr.DataTree) -> dict[str, Any]:
+def json_summary(result: xr.DataTree | FitView) -> dict[str, Any]:
     """Table and verdict as JSON can hold them; NaN becomes None.
 
     Args:
@@ -159,15 +154,14 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
     Raises:
         FitError: The tree holds no posterior.
     """
-    table, provenance = summary(result), provenance_of(result)
-    criticism = criticize(result)
-    found = verdict(result, table, criticism)
+    fit = view_of(result)
+    found = verdict(fit)
     shown = [column for column in COLUMNS if column != "mcse_mean"]
-    about = {key: provenance.get(key) for key in ("model", "scene", "seed", "counts", "timings")}
+    stated = ("model", "scene", "seed", "counts", "timings")
     return {
         "parameters": {
             str(label): {column: _number(row[column]) for column in shown}
-            for label, row in table.iterrows()
+            for label, row in summary(fit).iterrows()
         },
         "converged": found.converged,
         "passed": found.passed,
@@ -178,26 +172,26 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
         "not_checked": list(found.not_checked),
         "criticism": {
             str(check): {"level": row["level"], "p_value": _number(row["p_value"])}
-            for check, row in criticism.iterrows()
+            for check, row in criticize(fit).iterrows()
         },
-        "method": method_of(result),
-        **about,
+        "method": fit.method,
+        **{key: fit.provenance.get(key) for key in stated},
     }
 
 
-def laplace_k_hat(result: xr.DataTree) -> float:
+def laplace_k_hat(result: xr.DataTree | FitView) -> float:
     """Pareto k-hat of the importance weights of Laplace draws or of a variational guide."""
     return _smoothed_weights(result)[1]
 
 
-def _smoothed_weights(result: xr.DataTree) -> tuple[np.ndarray, float]:
+@once
+def _smoothed_weights(fit: FitView) -> tuple[np.ndarray, float]:
     """Pareto-smoothed importance weights of the draws, and k-hat: none and NaN without weights."""
     # $$ w = p(z | data) / q(z) $$
     # Source: Vehtari et al. (2024), JMLR 25(72).
-    stats = stats_of(result)
-    if "log_weight" not in stats:
+    if "log_weight" not in fit.stats:
         return np.empty(0), math.nan
-    log_weight = stats["log_weight"].to_numpy().astype(float).ravel()
+    log_weight = fit.stats["log_weight"].to_numpy().astype(float).ravel()
     if np.any(np.isnan(log_weight) | np.isposinf(log_weight)) or np.all(np.isneginf(log_weight)):
         return np.empty(0), math.nan
     if np.ptp(log_weight) < 1e-12:
@@ -234,11 +228,11 @@ def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
     return rows
 
 
-def _point_rows(result: xr.DataTree, found: Sequence[Scalar]) -> np.ndarray:
-    errors = provenance_of(result).get("standard_errors", {})
+def _point_rows(fit: FitView) -> np.ndarray:
+    errors = fit.provenance.get("standard_errors", {})
     stated = {name: iter(values) for name, values in errors.items()}
-    rows = np.full((len(found), len(COLUMNS)), np.nan)
-    for row, scalar in zip(rows, found, strict=True):
+    rows = np.full((len(fit.scalars), len(COLUMNS)), np.nan)
+    for row, scalar in zip(rows, fit.scalars, strict=True):
         error = next(stated.get(scalar.name, iter(())), None)
         row[:2] = scalar.draws.mean(), math.nan if error is None else error
     return rows
@@ -286,7 +280,7 @@ def _percentages(flags: Iterable[tuple[str, np.ndarray]]) -> str:
     return listed(f"{label} {bad.mean():.0%} of its draws" for label, bad in flags if bad.any())
 
 
-def _chain_problems(result: xr.DataTree, table: pd.DataFrame) -> Iterator[str]:
+def _chain_problems(fit: FitView, table: pd.DataFrame) -> Iterator[str]:
     """Chains that disagree, are too short, or have diverged."""
     r_hat = table["r_hat"]
     high = r_hat[~(r_hat <= LARGEST_R_HAT)].sort_values(ascending=False)
@@ -307,7 +301,7 @@ def _chain_problems(result: xr.DataTree, table: pd.DataFrame) -> Iterator[str]:
                 f"{part} ESS below {SMALLEST_ESS}: {numbers}; the {estimate} is not known well "
                 "enough, so sample longer, as in Nuts(most_draws=20000)."
             )
-    diverging = stats_of(result).get("diverging")
+    diverging = fit.stats.get("diverging")
     if diverging is not None and diverging.any():
         yield (
             f"{int(diverging.sum())} of {diverging.size} draws diverged: the sampler could not "
@@ -327,17 +321,15 @@ def _weight_problems(provenance: Mapping[str, Any], method: str) -> Iterator[str
         )
 
 
-def _approximation_cautions(
-    result: xr.DataTree, found: Sequence[Scalar], method: str
-) -> Iterator[str]:
-    if method not in APPROXIMATIONS or "log_weight" not in stats_of(result):
+def _approximation_cautions(fit: FitView) -> Iterator[str]:
+    if fit.method not in APPROXIMATIONS or "log_weight" not in fit.stats:
         return
-    weights, k_hat = _smoothed_weights(result)
+    weights, k_hat = _smoothed_weights(fit)
     if k_hat <= MAX_PARETO_K:
-        yield from _corrections(weights, found)
+        yield from _corrections(weights, fit.scalars)
     else:
         draws, shape = ("the guide's draws", "the guide")
-        if method == "laplace":
+        if fit.method == "laplace":
             draws, shape = ("the Laplace draws", "a normal distribution")
         yield (
             f"Pareto k-hat of {draws} is {k_hat:.2f} (at most {MAX_PARETO_K}): the posterior is "
@@ -402,9 +394,9 @@ def _tail_cautions(
         )
 
 
-def _chain_notes(result: xr.DataTree) -> Iterator[str]:
+def _chain_notes(fit: FitView) -> Iterator[str]:
     """Trajectories that were cut short, which costs time and biases nothing."""
-    deep = stats_of(result).get("reached_max_treedepth")
+    deep = fit.stats.get("reached_max_treedepth")
     if deep is not None and deep.sum() > MAX_DEEP_TREES * deep.size:
         yield (
             f"{int(deep.sum())} of {deep.size} draws reached the largest tree depth: steps were "
@@ -413,7 +405,7 @@ def _chain_notes(result: xr.DataTree) -> Iterator[str]:
         )
 
 
-def _estimate_cautions(result: xr.DataTree, table: pd.DataFrame, method: str) -> Iterator[str]:
+def _estimate_cautions(table: pd.DataFrame, method: str) -> Iterator[str]:
     undetermined = table.index[table["sd"].isna()]
     if method == "point" and len(undetermined):
         yield (

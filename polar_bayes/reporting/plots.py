@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from polar_bayes.benchmark.advice import is_accuracy
 from polar_bayes.calibration.verdict import is_calibration
 from polar_bayes.diagnostics.compare import FitComparison
-from polar_bayes.diagnostics.parameters import method_of
+from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 from polar_bayes.reporting.accuracy import plot_accuracy
 from polar_bayes.reporting.comparison import plot_comparison
@@ -68,9 +68,10 @@ def plot(result: Any) -> Figure:
     if is_calibration(result):
         return plot_calibration(result)
     if isinstance(result, xr.DataTree):
-        if method_of(result) == "point":  # it has no draws
-            return plot_readings(result, variables(result)[0])
-        return plot_prior_posterior(result)
+        fit = view_of(result)
+        if fit.method == "point":  # it has no draws
+            return plot_readings(fit, variables(fit)[0])
+        return plot_prior_posterior(fit)
     raise FitError(
         f"there is no figure of a {type(result).__name__}",
         where="plot",

@@ -16,7 +16,9 @@ from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences, i
 from polar_bayes.calibration.verdict import calibration_table, calibration_verdict, is_calibration
 from polar_bayes.capture import plausibility
 from polar_bayes.capture.schema import validate
+from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.coverage import map_scalars
+from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 from polar_bayes.expressions import short_text
 from polar_bayes.inference.result import PROVENANCE, provenance_of
@@ -27,7 +29,7 @@ from polar_bayes.reporting import maps, text
 from polar_bayes.reporting.accuracy import accuracy_page, study_table
 from polar_bayes.reporting.calibration_page import calibration_page, rank_table
 from polar_bayes.reporting.comparison import comparison_page
-from polar_bayes.reporting.fit_page import fit_page, parameter_table, read_fit
+from polar_bayes.reporting.fit_page import fit_page, parameter_table
 from polar_bayes.reporting.page import Page, write_page
 from polar_bayes.reporting.plots_calibration import parameter_ranks
 from polar_bayes.reporting.style import in_default_style
@@ -138,17 +140,18 @@ type Card = tuple[list[str], Table, bool]
 
 
 def _fit_card(result: xr.DataTree) -> Card:
-    fit = read_fit(result)
+    fit = view_of(result)
+    judged = convergence.verdict(fit)
     sentences = [
-        fit.headline(),
-        *fit.verdict.problems,
-        *fit.determined(),
-        fit.verdict.nothing_against,
-        *text.notes(fit.verdict),
-        *(f"Caution: {caution}" for caution in fit.verdict.cautions),
+        text.fit_headline(fit),
+        *judged.problems,
+        *text.determined(fit),
+        judged.nothing_against,
+        *text.notes(judged),
+        *(f"Caution: {caution}" for caution in judged.cautions),
         text.swapped_sentence(fit.provenance),
     ]
-    return sentences, parameter_table(fit), fit.verdict.passed
+    return sentences, parameter_table(fit), judged.passed
 
 
 def _map_card(result: xr.Dataset) -> Card:

@@ -32,6 +32,7 @@ from polar_bayes.diagnostics.compare import compare_predictions
 from polar_bayes.diagnostics.criticism import INDEX_PARAMETERS, criticize
 from polar_bayes.diagnostics.parameters import scalars
 from polar_bayes.diagnostics.predictive import predictive_checks
+from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError, SceneError, one_line
 from polar_bayes.inference.checks import NEAR_BOUND
 from polar_bayes.inference.fitting import fit_request
@@ -263,13 +264,14 @@ class _Fits:
         begun = time.perf_counter()
         try:
             tree = fit_request(request, METHOD, no_progress, begun, with_comparisons=False)
-            checks = predictive_checks(tree)
+            view = view_of(tree)
+            checks = predictive_checks(view)
             loo = [check.loo for check in checks.values() if check.loo is not None]
             if not loo or len(loo) < len(checks):
                 raise FitError(
                     "its draws do not predict the readings", where=name, hint="fit it alone"
                 )
-            levels = criticize(tree, checks)["level"]
+            levels = criticize(view)["level"]
             findings = levels[levels.isin(["caution", "problem"])]
         except (FitError, np.linalg.LinAlgError) as error:
             self.failed[name] = one_line(str(error))
@@ -435,7 +437,9 @@ def _predictions(fits: Mapping[str, _Fit]) -> pd.DataFrame:
     with warnings.catch_warnings():
         # None is declared the best one: scenes that are not told apart are stacked.
         warnings.filterwarnings("ignore", "Difference in performance potentially due to chance")
-        table, left_out = compare_predictions({name: fit.tree for name, fit in fits.items()})
+        table, left_out = compare_predictions(
+            {name: view_of(fit.tree) for name, fit in fits.items()}
+        )
     if table.empty:
         raise FitError(
             " ".join(left_out.values()), where="compare_scenes", hint="give scenes of one capture"
