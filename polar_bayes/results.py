@@ -16,6 +16,7 @@ from polar_bayes.calibration.verdict import (
     CALIBRATION,
     calibration_table,
     calibration_verdict,
+    calibration_view,
     check_calibration,
 )
 from polar_bayes.capture.files import is_result, read_netcdf, write_netcdf
@@ -61,8 +62,8 @@ def _describing(name: str, variable: str, table: str, sentences: str) -> Kind:
 
 
 def _calibration_verdict(calibration: xr.DataTree) -> Verdict:
-    sentences = tuple(calibration_verdict(calibration))
-    passed = is_calibrated(calibration_table(calibration))
+    view = calibration_view(calibration)
+    sentences, passed = tuple(calibration_verdict(view)), is_calibrated(view.table)
     return Verdict(passed, () if passed else sentences, (), sentences if passed else ())
 
 

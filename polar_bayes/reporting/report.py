@@ -13,7 +13,7 @@ import xarray as xr
 from numpyro import distributions as dist
 
 from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences, is_accuracy
-from polar_bayes.calibration.verdict import calibration_table, calibration_verdict, is_calibration
+from polar_bayes.calibration.verdict import calibration_verdict, calibration_view, is_calibration
 from polar_bayes.capture import plausibility
 from polar_bayes.capture.schema import validate
 from polar_bayes.diagnostics import convergence
@@ -163,10 +163,9 @@ def _map_card(result: xr.Dataset) -> Card:
 
 
 def _calibration_card(calibration: xr.DataTree) -> Card:
-    table = calibration_table(calibration)
-    _, passed = text.calibration_headline(table, None)
-    ranks = parameter_ranks(calibration, table)
-    return calibration_verdict(calibration), rank_table(table, ranks), passed
+    view = calibration_view(calibration)
+    _, passed = text.calibration_headline(view.table, None)
+    return calibration_verdict(view), rank_table(view.table, parameter_ranks(view)), passed
 
 
 def _accuracy_card(result: xr.DataTree) -> Card:

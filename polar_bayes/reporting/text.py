@@ -15,7 +15,7 @@ import xarray as xr
 
 from polar_bayes.benchmark.advice import accuracy_dataset
 from polar_bayes.calibration.scores import is_calibrated, p_values, significance_level
-from polar_bayes.calibration.verdict import calibration_verdict
+from polar_bayes.calibration.verdict import CalibrationView, calibration_verdict
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import FitComparison
 from polar_bayes.diagnostics.convergence import Verdict
@@ -598,7 +598,7 @@ def calibration_headline(table: pd.DataFrame, readings: pd.DataFrame | None) -> 
     return f"{headline}.", passed
 
 
-def verdict_after_headline(calibration: xr.DataTree) -> list[str]:
+def verdict_after_headline(calibration: CalibrationView) -> list[str]:
     """Sentences of `calibration_verdict` without the first words, which the headline says."""
     first, *others = calibration_verdict(calibration)
     first = first.partition(": ")[2] or first
