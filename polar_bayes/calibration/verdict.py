@@ -81,11 +81,6 @@ CALIBRATION = Schema(
 )
 
 
-def is_calibration(tree: object) -> bool:
-    """Whether a tree is what `polar_bayes.calibrate` returns."""
-    return CALIBRATION.describes(tree)
-
-
 def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
     """Refuse what is no calibration, or does not hold together."""
     CALIBRATION.check(tree, source)

@@ -103,22 +103,22 @@ def summary(fit: FitView) -> pd.DataFrame:
 @once
 def verdict(fit: FitView) -> Verdict:
     """Whether the numbers of a fit may be used."""
-    table, criticism = summary(fit), criticize(fit)
-    method, provenance, found = fit.method, fit.provenance, fit.scalars
+    method, provenance, criticism = fit.method, fit.provenance, criticize(fit)
     noted = (str(problem).rstrip(".") for problem in provenance.get("problems", ()))
     problems = [f"{text[:1].upper()}{text[1:]}." for text in noted]
-    problems += _draw_problems(found, method, provenance)
+    problems += _draw_problems(fit)
     if method not in (*WEIGHTED, *APPROXIMATIONS, "point"):  # chains, those of users included
-        problems += _chain_problems(fit, table)
-    problems += _weight_problems(provenance, method)
+        problems += _chain_problems(fit)
+    problems += _weight_problems(fit)
     against = criticism["sentence"].groupby(criticism["level"], sort=False).agg(list)
     cautions = (
         *_approximation_cautions(fit),
         *_mode_cautions(provenance),
-        *_tail_cautions(provenance, found, table),
-        *_estimate_cautions(table, method),
+        *_tail_cautions(fit),
+        *_estimate_cautions(fit),
         *_reading_cautions(provenance.get("counts", {})),
-        *_capture_cautions(provenance),
+        *setup_cautions(provenance),
+        *provenance.get("capture_cautions", ()),
         *against.get("caution", []),
         *dict.fromkeys(against.get("not computed", [])),
     )
@@ -238,15 +238,14 @@ def _point_rows(fit: FitView) -> np.ndarray:
     return rows
 
 
-def _draw_problems(
-    found: Sequence[Scalar], method: str, provenance: Mapping[str, Any]
-) -> Iterator[str]:
+def _draw_problems(fit: FitView) -> Iterator[str]:
     """Draws that are not finite, out of range, or all equal."""
+    found, provenance = fit.scalars, fit.provenance
     if infinite := _percentages((s.label, ~np.isfinite(s.draws)) for s in found):
         hint = {
             "laplace": "the posterior is flat or open at its mode, so use method='nuts'",
             "point": "give starting values a chance with narrower priors",
-        }.get(method, "check the readings that the fit could not explain, or narrow the priors")
+        }.get(fit.method, "check the readings that the fit could not explain, or narrow the priors")
         yield f"Not finite: {infinite}; {hint}."
     declared = provenance.get("declared") or {}  # a user's model may give any name to anything
     known = (s for s in found if s.name not in declared)
@@ -257,7 +256,7 @@ def _draw_problems(
         )
     free = (s for s in found if s.name not in (provenance.get("fixed") or {}))
     equal = [s.label for s in free if s.draws.min() == s.draws.max()]
-    if equal and method != "point":
+    if equal and fit.method != "point":
         yield (
             f"All draws are equal: {listed(equal)}; nothing is known of the width of the "
             "posterior, so fit again with more draws, or hold the parameter fixed."
@@ -280,8 +279,9 @@ def _percentages(flags: Iterable[tuple[str, np.ndarray]]) -> str:
     return listed(f"{label} {bad.mean():.0%} of its draws" for label, bad in flags if bad.any())
 
 
-def _chain_problems(fit: FitView, table: pd.DataFrame) -> Iterator[str]:
+def _chain_problems(fit: FitView) -> Iterator[str]:
     """Chains that disagree, are too short, or have diverged."""
+    table = summary(fit)
     r_hat = table["r_hat"]
     high = r_hat[~(r_hat <= LARGEST_R_HAT)].sort_values(ascending=False)
     if len(high):
@@ -310,10 +310,10 @@ def _chain_problems(fit: FitView, table: pd.DataFrame) -> Iterator[str]:
         )
 
 
-def _weight_problems(provenance: Mapping[str, Any], method: str) -> Iterator[str]:
+def _weight_problems(fit: FitView) -> Iterator[str]:
     """Weighted draws that are worth fewer independent ones than chains must have."""
-    effective = provenance.get("effective_draws")
-    if method in WEIGHTED and effective is not None and effective < SMALLEST_ESS:
+    effective = fit.provenance.get("effective_draws")
+    if fit.method in WEIGHTED and effective is not None and effective < SMALLEST_ESS:
         yield (
             f"The effective sample size of the weighted draws is {effective:.0f} (at least "
             f"{SMALLEST_ESS}): the interval is not known well enough, so draw more, as in "
@@ -370,17 +370,15 @@ def _mode_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _tail_cautions(
-    provenance: Mapping[str, Any], found: Sequence[Scalar], table: pd.DataFrame
-) -> Iterator[str]:
+def _tail_cautions(fit: FitView) -> Iterator[str]:
     """Tails of chains that are too light by weighted draws, which reach what chains may miss."""
-    tails = provenance.get("tails") or {}
+    tails = fit.provenance.get("tails") or {}
     if not tails or not tails["k_hat"] <= MAX_PARETO_K:
         return
     nominal, missed = CENTRAL_95[0], []
     variance = nominal * (1.0 - nominal)
-    for scalar, shares in with_entries(found, tails["shares"]):
-        row = table.loc[scalar.label]
+    for scalar, shares in with_entries(fit.scalars, tails["shares"]):
+        row = summary(fit).loc[scalar.label]
         error = math.sqrt(variance / row["ess_tail"] + variance / tails["effective_draws"])
         for share, side, end in zip(shares, ("below", "above"), ("q2.5", "q97.5"), strict=True):
             if share > max(2.0 * nominal, nominal + TAIL_ERRORS * error):
@@ -405,9 +403,10 @@ def _chain_notes(fit: FitView) -> Iterator[str]:
         )
 
 
-def _estimate_cautions(table: pd.DataFrame, method: str) -> Iterator[str]:
-    undetermined = table.index[table["sd"].isna()]
-    if method == "point" and len(undetermined):
+def _estimate_cautions(fit: FitView) -> Iterator[str]:
+    sd = summary(fit)["sd"]
+    undetermined = sd.index[sd.isna()]
+    if fit.method == "point" and len(undetermined):
         yield (
             f"No standard error: {listed(dict.fromkeys(undetermined))}; least squares does not "
             "determine such values, so they say nothing."
@@ -438,12 +437,6 @@ def _reading_notes(counts: Mapping[str, Any]) -> Iterator[str]:
                 f"{count} of {total} readings of {name} lie at the edge of their range and were "
                 "moved to the link's margin."
             )
-
-
-def _capture_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
-    """A set-up that nobody stated, and what is unlikely in the capture."""
-    yield from setup_cautions(provenance)
-    yield from provenance.get("capture_cautions", ())
 
 
 def setup_cautions(provenance: Mapping[str, Any]) -> tuple[str, ...]:

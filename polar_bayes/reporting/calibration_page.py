@@ -12,14 +12,15 @@ from matplotlib.figure import Figure
 
 from polar_bayes.calibration.scores import significance_level
 from polar_bayes.calibration.verdict import (
+    CALIBRATION,
     PASSES,
     CalibrationView,
     calibration_readings,
+    calibration_verdict,
     calibration_view,
     compare_calibrations,
     comparison_sentences,
     holds_readings,
-    is_calibration,
     parameter_deviation,
     reading_deviation,
     reading_ranks,
@@ -110,12 +111,20 @@ def calibration_page(
     )
 
 
+def calibration_card(calibration: xr.DataTree | CalibrationView) -> page.Card:
+    """The card of a calibration."""
+    view = calibration_view(calibration)
+    _, passed = text.calibration_headline(view.table, None)
+    table = rank_table(view.table, figures.parameter_ranks(view))
+    return calibration_verdict(view), table, passed
+
+
 def _others(given: Mapping[str, xr.DataTree], method: str) -> dict[str, CalibrationView]:
     """The calibrations that a page compares with its own, by names on one line."""
     where = "report: comparisons"
     others = {one_line(str(name)): each for name, each in given.items()}
     for name, each in others.items():
-        if not is_calibration(each):
+        if not CALIBRATION.describes(each):
             hint = "give what polar_bayes.calibrate returns"
             raise FitError("it is no calibration", where=f"{where}, {name}", hint=hint)
         if name == method:
@@ -314,3 +323,12 @@ def _provenance_facts(provenance: Mapping[str, Any]) -> Iterator[page.Block]:
     groups |= {titles["priors"]: {n: short_numbers(str(x)) for n, x in priors.items()}}
     for title, values in {"Calibration": own, **groups}.items():
         yield from page.make_facts(values, title)
+
+
+REPORT = page.Report(
+    calibration_page,
+    calibration_card,
+    figures.plot_calibration,
+    ("comparisons",),
+    "calibration.nc",
+)

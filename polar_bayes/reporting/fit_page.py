@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
+from matplotlib.figure import Figure
 
 from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
 from polar_bayes.diagnostics import convergence
@@ -134,6 +135,30 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         sections=sections,
         footer="Computed from result.nc, which lies in the same folder and holds every draw.",
     )
+
+
+def fit_card(result: xr.DataTree | FitView) -> page.Card:
+    """The card of a fit."""
+    fit = view_of(result)
+    judged = convergence.verdict(fit)
+    sentences = [
+        text.fit_headline(fit),
+        *judged.problems,
+        *text.determined(fit),
+        judged.nothing_against,
+        *text.notes(judged),
+        *(f"Caution: {caution}" for caution in judged.cautions),
+        text.swapped_sentence(fit.provenance),
+    ]
+    return sentences, parameter_table(fit), judged.passed
+
+
+def plot_fit(result: xr.DataTree | FitView) -> Figure:
+    """Prior and posterior of a fit, or the readings of a point fit, which has no draws."""
+    fit = view_of(result)
+    if fit.method == "point":
+        return plots_curves.plot_readings(fit, plots_curves.variables(fit)[0])
+    return plots_fit.plot_prior_posterior(fit)
 
 
 # --- Parameters -----------------------------------------------------------------------------------
@@ -537,7 +562,7 @@ def _effects(result: xr.DataTree) -> Iterator[page.Block]:
 def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
     """An accuracy study of the same capture, where the result holds one."""
     if "accuracy" in result.children:
-        study = accuracy_dataset(result)
+        study = accuracy_dataset(result["accuracy"].to_dataset())
         yield " ".join([*accuracy_sentences(study), text.reference_sentence(study)])
         yield accuracy_picture(study)
         yield study_table(study)
@@ -586,3 +611,6 @@ def _counts(counts: Mapping[str, Any]) -> dict[str, Any]:
     margin = counts.get("at_margin") or {}
     found |= {f"{name} at the margin of its link": count for name, count in margin.items()}
     return {name: count for name, count in found.items() if count is not None}
+
+
+REPORT = page.Report(fit_page, fit_card, plot_fit, file="result.nc")

@@ -2,24 +2,15 @@
 
 from typing import Any
 
-import xarray as xr
 from matplotlib.figure import Figure
 
-from polar_bayes.benchmark.advice import is_accuracy
-from polar_bayes.calibration.verdict import is_calibration
 from polar_bayes.diagnostics.compare import FitComparison
-from polar_bayes.diagnostics.view import view_of
-from polar_bayes.errors import FitError
 from polar_bayes.reporting.accuracy import plot_accuracy
 from polar_bayes.reporting.comparison import plot_comparison
 from polar_bayes.reporting.maps import plot_maps
+from polar_bayes.reporting.page import report_of
 from polar_bayes.reporting.plots_calibration import plot_calibration
-from polar_bayes.reporting.plots_curves import (
-    plot_readings,
-    plot_residuals,
-    plot_spectrum,
-    variables,
-)
+from polar_bayes.reporting.plots_curves import plot_readings, plot_residuals, plot_spectrum
 from polar_bayes.reporting.plots_fit import (
     plot_pairs,
     plot_pit,
@@ -61,19 +52,4 @@ def plot(result: Any) -> Figure:
     """
     if isinstance(result, FitComparison):
         return plot_comparison(result)
-    if isinstance(result, xr.Dataset) and "status" in result:
-        return plot_maps(result)
-    if is_accuracy(result):
-        return plot_accuracy(result)
-    if is_calibration(result):
-        return plot_calibration(result)
-    if isinstance(result, xr.DataTree):
-        fit = view_of(result)
-        if fit.method == "point":  # it has no draws
-            return plot_readings(fit, variables(fit)[0])
-        return plot_prior_posterior(fit)
-    raise FitError(
-        f"there is no figure of a {type(result).__name__}",
-        where="plot",
-        hint="polar_bayes.summary has the table of every result",
-    )
+    return report_of(result).plot(result)

@@ -300,9 +300,9 @@ def predictive_sentences(fit: FitView) -> list[str]:
     return sentences
 
 
-def index_sentences(fit: FitView, quantity: str = "refractive_index") -> list[str]:
+def index_sentences(fit: FitView) -> list[str]:
     """What is the refractive index, in a sentence; of many, the range of them."""
-    found = [scalar for scalar in fit.scalars if scalar.name == quantity]
+    found = [scalar for scalar in fit.scalars if scalar.name == "refractive_index"]
     if not found or fit.method == "point":
         return []
     rows = convergence.summary(fit).loc[[scalar.label for scalar in found]]
