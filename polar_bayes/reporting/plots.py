@@ -40,8 +40,8 @@ def plot(result: Any) -> Figure:
     """The main figure of a result.
 
     Args:
-        result: A fit, a map, a calibration, an accuracy study, or what
-            `polar_bayes.diagnostics.compare_fits` returned.
+        result: A fit, a map, a calibration, an accuracy study, several fits by name, or what
+            `polar_bayes.diagnostics.compare_fits` returned of them.
 
     Returns:
         Prior and posterior of a fit, or the readings of a point fit; means and widths of a map;
