@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from polar_bayes.calibration.verdict import (
     CALIBRATION,
     calibration_table,
     calibration_verdict,
+    calibration_view,
     check_calibration,
 )
 from polar_bayes.capture.files import is_result, read_netcdf, write_netcdf
@@ -33,16 +34,23 @@ from polar_bayes.paths import as_path, atomic_write, existing_file
 MIN_GOOD_SHARE = 0.95
 """Share of the pixels read that need an answer for a map to pass."""
 
+LABELED = xr.DataTree | xr.Dataset
+
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of result: its name, how it is recognized, its table, verdict and check."""
+    """A kind of result: its name, how it is recognized, its table, verdict, check and reports.
+
+    The reports are the constant `REPORT` of that file of `polar_bayes.reporting`, which is loaded
+    when it is used; a kind without has neither page nor figure.
+    """
 
     name: str
     applies: Callable[[Any], bool]
     summary: Callable[[Any], pd.DataFrame]
     verdict: Callable[[Any], Verdict]
     check: Callable[[Any, str], None] = lambda result, source: None
+    reports: str = ""
 
 
 def _describing(name: str, variable: str, table: str, sentences: str) -> Kind:
@@ -61,8 +69,8 @@ def _describing(name: str, variable: str, table: str, sentences: str) -> Kind:
 
 
 def _calibration_verdict(calibration: xr.DataTree) -> Verdict:
-    sentences = tuple(calibration_verdict(calibration))
-    passed = is_calibrated(calibration_table(calibration))
+    view = calibration_view(calibration)
+    sentences, passed = tuple(calibration_verdict(view)), is_calibrated(view.table)
     return Verdict(passed, () if passed else sentences, (), sentences if passed else ())
 
 
@@ -104,19 +112,21 @@ def _map_verdict(maps: xr.Dataset) -> Verdict:
 
 
 KINDS = (
-    Kind("accuracy", STUDY.describes, accuracy_table, _accuracy_verdict, STUDY.check),
+    Kind("accuracy", STUDY.describes, accuracy_table, _accuracy_verdict, STUDY.check, "accuracy"),
     Kind(
         "calibration",
         CALIBRATION.describes,
         calibration_table,
         _calibration_verdict,
         check_calibration,
+        "calibration_page",
     ),
     Kind(
         "map",
         lambda result: isinstance(result, xr.Dataset) and "status" in result,
         _map_summary,
         _map_verdict,
+        reports="maps",
     ),
     _describing(
         "profile",
@@ -139,12 +149,19 @@ KINDS = (
     _describing(
         "effects", "kept", "effects.choose:ledger_table", "effects.choose:ledger_sentences"
     ),
-    Kind("fit", FIT.describes, convergence.summary, convergence.verdict, check_fit),
+    Kind(
+        "several fits",
+        lambda result: isinstance(result, Mapping) and not isinstance(result, LABELED),
+        convergence.summary,  # refuses them, with a hint
+        convergence.verdict,
+        reports="comparison",
+    ),
+    Kind("fit", FIT.describes, convergence.summary, convergence.verdict, check_fit, "fit_page"),
 )
 """The kinds of results in the order in which they are tried."""
 
 
-def _kind_of(result: object) -> Kind:
+def kind_of(result: object) -> Kind:
     """The kind of a result; what is none is taken as a fit, which refuses it with a hint."""
     return next((kind for kind in KINDS if kind.applies(result)), KINDS[-1])
 
@@ -171,7 +188,7 @@ def summary(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
     Source:
         Vehtari et al. (2021), Bayesian Analysis 16(2): rank-normalized split R-hat and ESS.
     """
-    return PrintedFrame(_kind_of(result).summary(result))
+    return PrintedFrame(kind_of(result).summary(result))
 
 
 def verdict(result: xr.DataTree | xr.Dataset) -> Verdict:
@@ -193,7 +210,7 @@ def verdict(result: xr.DataTree | xr.Dataset) -> Verdict:
     Raises:
         FitError: It is no result, or its parts do not fit together.
     """
-    kind = _kind_of(result)
+    kind = kind_of(result)
     judged = kind.verdict(result)
     if kind.name == "fit":
         return judged
@@ -244,7 +261,7 @@ def load(path: str | os.PathLike[str], kind: str | None = None) -> Any:
     """
     wanted = kind or "result"
     result, source = _read(path, wanted)
-    found = _kind_of(result)
+    found = kind_of(result)
     if not found.applies(result) or kind not in (None, found.name):
         hint = "give the file that polar_bayes.save or a command wrote"
         raise FitError(f"it holds no {wanted}", where=source, hint=hint)

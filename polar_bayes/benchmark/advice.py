@@ -36,11 +36,6 @@ NUMBERS = (
 TEXTS = ("method", "override", "problems")
 
 
-def is_accuracy(tree: object) -> bool:
-    """Whether a tree is what `polar_bayes.accuracy` returns, and no fit."""
-    return STUDY.describes(tree)
-
-
 def accuracy_dataset(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
     """The group `accuracy` of a tree."""
     if isinstance(result, xr.Dataset):

@@ -11,7 +11,7 @@ import xarray as xr
 
 from polar_bayes.calibration.scores import significance_level
 from polar_bayes.diagnostics.coverage import INTERVALS, coverage_columns
-from polar_bayes.diagnostics.parameters import posterior_scalars, truth_of
+from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 
 MAX_DRAWS = 4000
@@ -62,7 +62,7 @@ def retest(results: Sequence[xr.DataTree]) -> pd.DataFrame:
         raise FitError(
             "a single fit has nothing to agree with", where="retest", hint="give two or more"
         )
-    found = [{each.label: each for each in posterior_scalars(result)} for result in results]
+    found = [{each.label: each for each in view_of(result).scalars} for result in results]
     common = [label for label in found[0] if all(label in each for each in found[1:])]
     if not common:
         hint = "give fits of the same model to captures of the same layout"
@@ -100,9 +100,10 @@ def proxy_scores(
         raise FitError(what, where="proxies", hint="give one mapping for all fits, or one for each")
     rows = []
     for at, (result, values) in enumerate(zip(results, given, strict=True)):
-        for scalar in posterior_scalars(result):
+        fit = view_of(result)
+        for scalar in fit.scalars:
             if values is None:
-                proxy = truth_of(result, scalar)
+                proxy = fit.truth(scalar)
             else:
                 proxy = float(values.get(scalar.label, values.get(scalar.name, math.nan)))
             if math.isfinite(proxy):

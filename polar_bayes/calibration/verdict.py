@@ -1,5 +1,7 @@
 """What a calibration holds in a file, its tables, and the sentences that state what they mean."""
 
+import dataclasses
+import functools
 import math
 from collections.abc import Iterator, Mapping
 
@@ -79,11 +81,6 @@ CALIBRATION = Schema(
 )
 
 
-def is_calibration(tree: object) -> bool:
-    """Whether a tree is what `polar_bayes.calibrate` returns."""
-    return CALIBRATION.describes(tree)
-
-
 def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
     """Refuse what is no calibration, or does not hold together."""
     CALIBRATION.check(tree, source)
@@ -96,6 +93,42 @@ def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
     if (there := groups & set(tree.children)) and there != groups:
         hint = f"give the tree as {CALIBRATION.made_by} returned it, or drop {min(there)}"
         raise FitError(f"it has no group {min(groups - there)}", where=source, hint=hint)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CalibrationView:
+    """A calibration that was checked; the tree must not change while the view is in use."""
+
+    tree: xr.DataTree
+
+    @functools.cached_property
+    def scalars(self) -> list[tuple[Scalar, np.ndarray]]:
+        """Every scalar, whose draws are its ranks by simulation, with its truths."""
+        ranks, truths = (
+            scalars(self.tree[group].to_dataset().rename(simulation="draw").expand_dims("chain"))
+            for group in ("prior_sbc", "truth")
+        )
+        known = {each.label: each.draws[0] for each in truths}
+        if any(each.label not in known for each in ranks):
+            what = "its labels are not those of prior_sbc"
+            hint = "give what polar_bayes.calibrate returned"
+            raise FitError(what, where="calibration: truth", hint=hint)
+        return [(each, known[each.label]) for each in ranks]
+
+    @functools.cached_property
+    def table(self) -> pd.DataFrame:
+        """The table of `calibration_table`."""
+        marginals = self.tree["marginals"].to_dataset()
+        rows = {each.label: _parameter_row(each, true, marginals) for each, true in self.scalars}
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def calibration_view(calibration: xr.DataTree | CalibrationView) -> CalibrationView:
+    """A view itself, or that of a tree, which is checked."""
+    if isinstance(calibration, CalibrationView):
+        return calibration
+    check_calibration(calibration)
+    return CalibrationView(calibration)
 
 
 # --- Tables ---------------------------------------------------------------------------------------
@@ -116,7 +149,7 @@ READING_TESTS = {"predictive_pit": "fresh", "loo_pit": "left out"}
 """The groups of a calibration that hold PIT values of readings, and the names of their tests."""
 
 
-def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
+def calibration_table(calibration: xr.DataTree | CalibrationView) -> pd.DataFrame:
     """One row for each parameter of a calibration."""
     # Columns: `answered` and `failed` fits; `p_value` of uniform ranks; `rank_mean` (a half where
     # the posterior is neither too high nor too low) and `rank_spread` (above one: too narrow); for
@@ -125,22 +158,7 @@ def calibration_table(calibration: xr.DataTree) -> pd.DataFrame:
     # of the same among the fits that have an answer; `spread`, sd of the normal scores of the ranks
     # (above one: truths scatter further than the posterior says), and its test, `p_spread`;
     # `width_95`, mean width of the 95% interval; `crps`, mean continuous ranked probability score.
-    found = calibration_scalars(calibration, "prior_sbc")
-    truths = {each.label: each.draws[0] for each in calibration_scalars(calibration, "truth")}
-    marginals = calibration["marginals"].to_dataset()
-    if any(each.label not in truths for each in found):
-        what = "its labels are not those of prior_sbc"
-        hint = "give what polar_bayes.calibrate returned"
-        raise FitError(what, where="calibration: truth", hint=hint)
-    rows = {each.label: _parameter_row(each, truths[each.label], marginals) for each in found}
-    return pd.DataFrame.from_dict(rows, orient="index")
-
-
-def calibration_scalars(calibration: xr.DataTree, group: str) -> list[Scalar]:
-    """Every scalar of `prior_sbc` or `truth`, with simulations in place of draws."""
-    check_calibration(calibration)
-    dataset = calibration[group].to_dataset()
-    return scalars(dataset.rename(simulation="draw").expand_dims("chain"))
+    return calibration_view(calibration).table
 
 
 def _parameter_row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> dict[str, float]:
@@ -183,7 +201,7 @@ def _finite_mean(values: np.ndarray) -> float:
     return float(finite.mean()) if finite.size else math.nan
 
 
-def calibration_readings(calibration: xr.DataTree) -> pd.DataFrame:
+def calibration_readings(calibration: xr.DataTree | CalibrationView) -> pd.DataFrame:
     """Two rows for each recorded variable: a replicated reading, and one left out of the fit.
 
     Where model, prior, links and method are right, both have uniform PIT values in the fits'
@@ -206,14 +224,14 @@ def calibration_readings(calibration: xr.DataTree) -> pd.DataFrame:
     Source:
         See `polar_bayes.calibration.predictive`.
     """
-    check_calibration(calibration)
-    if not holds_readings(calibration):
+    tree = calibration_view(calibration).tree
+    if not holds_readings(tree):
         hint = "give what polar_bayes.calibrate returns with readings=True"
         raise FitError("it holds no ranks of readings", where="calibration", hint=hint)
     rows = {}
-    for label, pit in reading_ranks(calibration).items():
+    for label, pit in reading_ranks(tree).items():
         name, test = label.rsplit(", ", 1)
-        pareto_k = calibration["readings"][f"{name}_pareto_k"].to_numpy()
+        pareto_k = tree["readings"][f"{name}_pareto_k"].to_numpy()
         untrusted = float(np.sum(pareto_k[np.isfinite(pit)] > MAX_PARETO_K))
         rows[label] = {
             "reading": name,
@@ -241,9 +259,10 @@ def reading_ranks(calibration: xr.DataTree) -> dict[str, np.ndarray]:
 # --- Sentences ------------------------------------------------------------------------------------
 
 
-def calibration_verdict(calibration: xr.DataTree) -> list[str]:
+def calibration_verdict(calibration: xr.DataTree | CalibrationView) -> list[str]:
     """The result of a calibration, in sentences; readings, which are tested separately, last."""
-    table = calibration_table(calibration)
+    calibration = calibration_view(calibration)
+    table = calibration.table
     passed = is_calibrated(table)
     count = int(table["answered"].max() + table["failed"].min())
     sentences = [
@@ -256,7 +275,7 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
             if (found := parameter_deviation(row, significance_level(table)))
         ),
     ]
-    statuses = calibration["fits"]["status"].to_numpy()
+    statuses = calibration.tree["fits"]["status"].to_numpy()
     for status in Status:
         lost = int(np.sum(statuses == status))
         if status != Status.GOOD and lost:
@@ -267,7 +286,7 @@ def calibration_verdict(calibration: xr.DataTree) -> list[str]:
         counted = f"{failed} of {statuses.size} fits have no answer, and count as misses of every"
         sentences.append(f"{counted} interval above.")
     if failed >= HALF * statuses.size:
-        sentences.append(_better_method(calibration))
+        sentences.append(_better_method(calibration.tree))
     if np.mean(statuses == Status.NOT_TRUSTED) > MOST_UNTRUSTED:
         sentences.append(
             "Most fits say themselves that they cannot be trusted: the ranks judge the method, not "
@@ -285,9 +304,9 @@ def _better_method(calibration: xr.DataTree) -> str:
     return f"Half of the fits or more have failed: {advice}."
 
 
-def _reading_sentences(calibration: xr.DataTree) -> list[str]:
-    if not holds_readings(calibration):
-        reason = provenance_of(calibration).get("readings_told", "")
+def _reading_sentences(calibration: CalibrationView) -> list[str]:
+    if not holds_readings(calibration.tree):
+        reason = provenance_of(calibration.tree).get("readings_told", "")
         return [f"Readings were not ranked: {reason}."] if reason else []
     table = calibration_readings(calibration)
     names = ", ".join(dict.fromkeys(table["reading"]))
@@ -381,7 +400,9 @@ def _spread_of_shifted(mean: float) -> float:
 PASSES = "all tests pass"
 
 
-def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFrame:
+def compare_calibrations(
+    calibrations: Mapping[str, xr.DataTree | CalibrationView],
+) -> pd.DataFrame:
     """Compare calibrations of the same parameters by several methods.
 
     Give all of them the same seed: they are then of the same simulations, and scores are compared
@@ -406,20 +427,21 @@ def compare_calibrations(calibrations: Mapping[str, xr.DataTree]) -> pd.DataFram
         raise FitError(
             "there is nothing to compare", where="compare_calibrations", hint="give calibrations"
         )
-    tables = {name: calibration_table(each) for name, each in calibrations.items()}
-    (first, expected), *others = tables.items()
-    for name, table in others:
-        if set(table.index) != set(expected.index):
+    views = {name: calibration_view(each) for name, each in calibrations.items()}
+    (first, baseline), *others = views.items()
+    expected = baseline.table
+    for name, view in others:
+        if set(view.table.index) != set(expected.index):
             what = f"it has other parameters than {first}"
             hint = "calibrate the same model on the same layout"
             raise FitError(what, where=f"compare_calibrations: {name}", hint=hint)
     level = significance_level(expected)
     rows = {}
-    for scalar in calibration_scalars(calibrations[first], "truth"):
-        for name, calibration in calibrations.items():
-            row = tables[name].loc[scalar.label]
+    for scalar, _ in baseline.scalars:
+        for name, view in views.items():
+            row = view.table.loc[scalar.label]
             deviation = parameter_deviation(row, level)
-            change, error = _score_change(calibration, calibrations[first], scalar)
+            change, error = _score_change(view.tree, baseline.tree, scalar)
             rows[scalar.label, name] = {
                 **row,
                 "passes": not deviation,

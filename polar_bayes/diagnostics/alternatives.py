@@ -3,15 +3,15 @@
 import pandas as pd
 import xarray as xr
 
-from polar_bayes.diagnostics.parameters import posterior_scalars, with_entries
+from polar_bayes.diagnostics.parameters import with_entries
+from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.frames import PrintedFrame
-from polar_bayes.inference.result import provenance_of
 
 COLUMNS = ("part", "alternative", "path", "log_bayes_factor", "mean", "other", "shift", "redefined")
 
 
-def alternatives(result: xr.DataTree) -> pd.DataFrame:
+def alternatives(result: xr.DataTree | FitView) -> pd.DataFrame:
     """Answers of the scenes that have another part in the place of one, as the fit has found them.
 
     Args:
@@ -33,9 +33,9 @@ def alternatives(result: xr.DataTree) -> pd.DataFrame:
     Source:
         Kass and Raftery (1995), J. Am. Stat. Assoc. 90, 773 (Bayes factors).
     """
-    provenance = provenance_of(result)
-    tried = provenance.get("alternatives")
-    reason = provenance.get("alternatives_failed") or "the result does not hold them"
+    fit = view_of(result)
+    tried = fit.provenance.get("alternatives")
+    reason = fit.provenance.get("alternatives_failed") or "the result does not hold them"
     compared = [each for each in tried or () if each.get("log_bayes_factor") is not None]
     if tried is None or len(compared) < len(tried):
         failed = [each["failed"] for each in tried or () if each.get("failed")]
@@ -44,11 +44,10 @@ def alternatives(result: xr.DataTree) -> pd.DataFrame:
             where="result",
             hint="fit one material, by a method that gives draws",
         )
-    found = posterior_scalars(result)
-    material = [scalar for scalar in found if scalar.is_material]
+    material = [scalar for scalar in fit.scalars if scalar.is_material]
     rows, labels = [], []
     for each in compared:
-        for scalar, shift in with_entries(material or found, each.get("shift") or {}):
+        for scalar, shift in with_entries(material or fit.scalars, each.get("shift") or {}):
             mean, sd = float(scalar.draws.mean()), float(scalar.draws.std())
             redefined = scalar.name in each["defines"]
             given = [each[name] for name in COLUMNS[:4]]

@@ -11,14 +11,10 @@ from arviz_stats import compare
 from arviz_stats.utils import ELPDDataLOO
 
 from polar_bayes.diagnostics.convergence import Verdict, summary, verdict
-from polar_bayes.diagnostics.parameters import (
-    SAMPLE_DIMS,
-    method_of,
-    posterior_scalars,
-    scalars,
-)
+from polar_bayes.diagnostics.parameters import SAMPLE_DIMS
 from polar_bayes.diagnostics.predictive import Loo, predictive_checks, usable_readings
 from polar_bayes.diagnostics.sensitivity import sensitivity
+from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.psis import MAX_PARETO_K
@@ -75,31 +71,27 @@ def compare_fits(fits: Mapping[str, xr.DataTree]) -> FitComparison:
             hint="give two or more fits by name, such as {'rough': a, 'smooth': b}",
         )
     named = {one_line(str(name)): fit for name, fit in fits.items()}
-    for name, fit in named.items():
-        check_fit(fit, f"compare_fits: {name}")
-    tables = {name: summary(fit) for name, fit in named.items()}
-    (first, reference), *others = named.items()
+    views = {name: view_of(fit, f"compare_fits: {name}") for name, fit in named.items()}
+    (first, reference), *others = views.items()
     for name, fit in others:
-        _check_same_capture(reference, fit, first, name)
-    loo, left_out = compare_predictions(named)
+        _check_same_capture(reference.result, fit.result, first, name)
+    loo, left_out = compare_predictions(views)
     return FitComparison(
-        parameters=_parameters(named, tables),
+        parameters=_parameters(views),
         loo=loo,
         left_out=left_out,
-        verdicts={name: verdict(fit, tables[name]) for name, fit in named.items()},
+        verdicts={name: verdict(fit) for name, fit in views.items()},
     )
 
 
-def _parameters(
-    fits: Mapping[str, xr.DataTree], tables: Mapping[str, pd.DataFrame]
-) -> pd.DataFrame:
+def _parameters(fits: Mapping[str, FitView]) -> pd.DataFrame:
     """The columns of both tables of each fit, parameter by parameter."""
     found = {
-        name: table[[*SUMMARY_COLUMNS]].join(sensitivity(fits[name])[[*SENSITIVITY_COLUMNS]])
-        for name, table in tables.items()
+        name: summary(fit)[[*SUMMARY_COLUMNS]].join(sensitivity(fit)[[*SENSITIVITY_COLUMNS]])
+        for name, fit in fits.items()
     }
-    labels = dict.fromkeys(label for table in tables.values() for label in table.index)
-    rows = [(label, name) for label in labels for name in fits if label in tables[name].index]
+    labels = dict.fromkeys(label for table in found.values() for label in table.index)
+    rows = [(label, name) for label in labels for name in fits if label in found[name].index]
     return pd.concat(found, names=["fit", "parameter"]).swaplevel().loc[rows]
 
 
@@ -127,16 +119,16 @@ def _agree(one: xr.DataArray, other: xr.DataArray | None) -> bool:
     return bool(np.allclose(first[both], second[both], rtol=1e-9, atol=1e-12))
 
 
-def compare_predictions(fits: Mapping[str, xr.DataTree]) -> tuple[pd.DataFrame, dict[str, str]]:
+def compare_predictions(fits: Mapping[str, FitView]) -> tuple[pd.DataFrame, dict[str, str]]:
     """Expected log density of each reading given all others, best fit first; why some have none."""
     left_out, found, used = {}, {}, {}
     for name, fit in fits.items():
         parts = {n: check.loo for n, check in sorted(predictive_checks(fit).items())}
-        if method_of(fit) == "point" or not parts or any(loo is None for loo in parts.values()):
+        if fit.method == "point" or not parts or any(loo is None for loo in parts.values()):
             left_out[name] = "it has no draws that predict the readings"
             continue
         found[name] = [loo for loo in parts.values() if loo is not None]
-        used[name] = {n: usable_readings(fit, n) for n in parts}
+        used[name] = {n: usable_readings(fit.result, n) for n in parts}
     if len(found) < 2:
         return pd.DataFrame(), {"": "Fewer than two fits have draws that predict the readings."}
     (first, expected), *others = used.items()
@@ -233,19 +225,17 @@ WITHOUT = {"discrepancy": "the discrepancy term", "instrument": "any instrument 
 """Fits for comparison, in the groups `without_<key>` of a result: the terms that they omit."""
 
 
-def compare_without(result: xr.DataTree, part: str) -> pd.DataFrame:
+def compare_without(result: xr.DataTree | FitView, part: str) -> pd.DataFrame:
     """The material's intervals with and without a part of the instrument."""
-    group = f"without_{part}"
-    without = scalars(result[group].to_dataset()) if group in result.children else []
-    others = {scalar.label: scalar.draws for scalar in without}
-    rows = {}
-    for scalar in posterior_scalars(result):
-        draws, other = scalar.draws, others.get(scalar.label)
-        if other is None or not scalar.is_material:
+    fit = view_of(result)
+    without, rows = fit.scalars_of(f"without_{part}"), {}
+    for scalar in fit.scalars:
+        if scalar.label not in without or not scalar.is_material:
             continue
-        if not (np.isfinite(draws).all() and np.isfinite(other).all()):
+        both = scalar.draws, without[scalar.label].draws
+        if not all(np.isfinite(draws).all() for draws in both):
             continue
-        own, its = ([each.mean(), *np.quantile(each, CENTRAL_95)] for each in (draws, other))
+        own, its = ([draws.mean(), *np.quantile(draws, CENTRAL_95)] for draws in both)
         width = own[2] - own[1]
         rows[scalar.label] = (*own, *its, (its[2] - its[1]) / width if width > 0.0 else np.nan)
     index = pd.Index(list(rows), dtype=str)

@@ -21,14 +21,12 @@ from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
     WEIGHTED,
     Scalar,
-    method_of,
-    posterior_scalars,
-    stats_of,
     with_entries,
 )
+from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.inference.mcse import LARGEST_R_HAT, SMALLEST_ESS, TAILS
 from polar_bayes.inference.psis import MAX_PARETO_K, smooth
-from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
+from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
@@ -93,43 +91,40 @@ class Verdict:
         return f"Nothing speaks against the intervals in what was checked: {made}.{left}"
 
 
-def summary(result: xr.DataTree) -> pd.DataFrame:
+@once
+def summary(fit: FitView) -> pd.DataFrame:
     """One row per scalar parameter of a fit, as `polar_bayes.summary` returns it."""
     # Source: Vehtari et al. (2021), Bayesian Analysis 16(2): rank-normalized split R-hat and ESS.
-    found = posterior_scalars(result)
-    rows = _point_rows(result, found) if method_of(result) == "point" else _draw_rows(found)
-    return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index([s.label for s in found]))
+    rows = _point_rows(fit) if fit.method == "point" else _draw_rows(fit.scalars)
+    return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index([s.label for s in fit.scalars]))
 
 
-def verdict(
-    result: xr.DataTree, table: pd.DataFrame | None = None, criticism: pd.DataFrame | None = None
-) -> Verdict:
-    """Whether the numbers of a fit may be used; its summary and criticism, if computed already."""
-    table = summary(result) if table is None else table
-    criticism = criticize(result) if criticism is None else criticism
-    method, provenance = method_of(result), provenance_of(result)
-    found = posterior_scalars(result)
+@once
+def verdict(fit: FitView) -> Verdict:
+    """Whether the numbers of a fit may be used."""
+    method, provenance, criticism = fit.method, fit.provenance, criticize(fit)
     noted = (str(problem).rstrip(".") for problem in provenance.get("problems", ()))
     problems = [f"{text[:1].upper()}{text[1:]}." for text in noted]
-    problems += _draw_problems(found, method, provenance)
+    problems += _draw_problems(fit)
     if method not in (*WEIGHTED, *APPROXIMATIONS, "point"):  # chains, those of users included
-        problems += _chain_problems(result, table)
-    problems += _weight_problems(provenance, method)
+        problems += _chain_problems(fit)
+    problems += _weight_problems(fit)
     against = criticism["sentence"].groupby(criticism["level"], sort=False).agg(list)
     cautions = (
-        *_approximation_cautions(result, found, method),
+        *_approximation_cautions(fit),
         *_mode_cautions(provenance),
-        *_tail_cautions(provenance, found, table),
-        *_estimate_cautions(result, table, method),
+        *_tail_cautions(fit),
+        *_estimate_cautions(fit),
         *_reading_cautions(provenance.get("counts", {})),
-        *_capture_cautions(provenance),
+        *setup_cautions(provenance),
+        *provenance.get("capture_cautions", ()),
         *against.get("caution", []),
         *dict.fromkeys(against.get("not computed", [])),
     )
     faults = tuple(against.get("problem", []))
     notes = (
         *against.get("note", []),
-        *_chain_notes(result),
+        *_chain_notes(fit),
         *_reading_notes(provenance.get("counts", {})),
     )
     made, missing = checks_made(method, criticism)
@@ -144,7 +139,7 @@ def verdict(
     )
 
 
-def json_summary(result: xr.DataTree) -> dict[str, Any]:
+def json_summary(result: xr.DataTree | FitView) -> dict[str, Any]:
     """Table and verdict as JSON can hold them; NaN becomes None.
 
     Args:
@@ -158,15 +153,14 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
     Raises:
         FitError: The tree holds no posterior.
     """
-    table, provenance = summary(result), provenance_of(result)
-    criticism = criticize(result)
-    found = verdict(result, table, criticism)
+    fit = view_of(result)
+    found = verdict(fit)
     shown = [column for column in COLUMNS if column != "mcse_mean"]
-    about = {key: provenance.get(key) for key in ("model", "scene", "seed", "counts", "timings")}
+    stated = ("model", "scene", "seed", "counts", "timings")
     return {
         "parameters": {
             str(label): {column: _number(row[column]) for column in shown}
-            for label, row in table.iterrows()
+            for label, row in summary(fit).iterrows()
         },
         "converged": found.converged,
         "passed": found.passed,
@@ -177,26 +171,26 @@ def json_summary(result: xr.DataTree) -> dict[str, Any]:
         "not_checked": list(found.not_checked),
         "criticism": {
             str(check): {"level": row["level"], "p_value": _number(row["p_value"])}
-            for check, row in criticism.iterrows()
+            for check, row in criticize(fit).iterrows()
         },
-        "method": method_of(result),
-        **about,
+        "method": fit.method,
+        **{key: fit.provenance.get(key) for key in stated},
     }
 
 
-def laplace_k_hat(result: xr.DataTree) -> float:
+def laplace_k_hat(result: xr.DataTree | FitView) -> float:
     """Pareto k-hat of the importance weights of Laplace draws or of a variational guide."""
     return _smoothed_weights(result)[1]
 
 
-def _smoothed_weights(result: xr.DataTree) -> tuple[np.ndarray, float]:
+@once
+def _smoothed_weights(fit: FitView) -> tuple[np.ndarray, float]:
     """Pareto-smoothed importance weights of the draws, and k-hat: none and NaN without weights."""
     # $$ w = p(z | data) / q(z) $$
     # Source: Vehtari et al. (2024), JMLR 25(72).
-    stats = stats_of(result)
-    if "log_weight" not in stats:
+    if "log_weight" not in fit.stats:
         return np.empty(0), math.nan
-    log_weight = stats["log_weight"].to_numpy().astype(float).ravel()
+    log_weight = fit.stats["log_weight"].to_numpy().astype(float).ravel()
     if np.any(np.isnan(log_weight) | np.isposinf(log_weight)) or np.all(np.isneginf(log_weight)):
         return np.empty(0), math.nan
     if np.ptp(log_weight) < 1e-12:
@@ -233,24 +227,23 @@ def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
     return rows
 
 
-def _point_rows(result: xr.DataTree, found: Sequence[Scalar]) -> np.ndarray:
-    stated = dict(with_entries(found, provenance_of(result).get("standard_errors", {})))
-    rows = np.full((len(found), len(COLUMNS)), np.nan)
-    for row, scalar in zip(rows, found, strict=True):
+def _point_rows(fit: FitView) -> np.ndarray:
+    stated = dict(with_entries(fit.scalars, fit.provenance.get("standard_errors", {})))
+    rows = np.full((len(fit.scalars), len(COLUMNS)), np.nan)
+    for row, scalar in zip(rows, fit.scalars, strict=True):
         error = stated.get(scalar)
         row[:2] = scalar.draws.mean(), math.nan if error is None else error
     return rows
 
 
-def _draw_problems(
-    found: Sequence[Scalar], method: str, provenance: Mapping[str, Any]
-) -> Iterator[str]:
+def _draw_problems(fit: FitView) -> Iterator[str]:
     """Draws that are not finite, out of range, or all equal."""
+    found, provenance = fit.scalars, fit.provenance
     if infinite := _percentages((s.label, ~np.isfinite(s.draws)) for s in found):
         hint = {
             "laplace": "the posterior is flat or open at its mode, so use method='nuts'",
             "point": "give starting values a chance with narrower priors",
-        }.get(method, "check the readings that the fit could not explain, or narrow the priors")
+        }.get(fit.method, "check the readings that the fit could not explain, or narrow the priors")
         yield f"Not finite: {infinite}; {hint}."
     declared = provenance.get("declared") or {}  # a user's model may give any name to anything
     known = (s for s in found if s.name not in declared)
@@ -261,7 +254,7 @@ def _draw_problems(
         )
     free = (s for s in found if s.name not in (provenance.get("fixed") or {}))
     equal = [s.label for s in free if s.draws.min() == s.draws.max()]
-    if equal and method != "point":
+    if equal and fit.method != "point":
         yield (
             f"All draws are equal: {listed(equal)}; nothing is known of the width of the "
             "posterior, so fit again with more draws, or hold the parameter fixed."
@@ -284,8 +277,9 @@ def _percentages(flags: Iterable[tuple[str, np.ndarray]]) -> str:
     return listed(f"{label} {bad.mean():.0%} of its draws" for label, bad in flags if bad.any())
 
 
-def _chain_problems(result: xr.DataTree, table: pd.DataFrame) -> Iterator[str]:
+def _chain_problems(fit: FitView) -> Iterator[str]:
     """Chains that disagree, are too short, or have diverged."""
+    table = summary(fit)
     r_hat = table["r_hat"]
     high = r_hat[~(r_hat <= LARGEST_R_HAT)].sort_values(ascending=False)
     if len(high):
@@ -305,7 +299,7 @@ def _chain_problems(result: xr.DataTree, table: pd.DataFrame) -> Iterator[str]:
                 f"{part} ESS below {SMALLEST_ESS}: {numbers}; the {estimate} is not known well "
                 "enough, so sample longer, as in Nuts(most_draws=20000)."
             )
-    diverging = stats_of(result).get("diverging")
+    diverging = fit.stats.get("diverging")
     if diverging is not None and diverging.any():
         yield (
             f"{int(diverging.sum())} of {diverging.size} draws diverged: the sampler could not "
@@ -314,10 +308,10 @@ def _chain_problems(result: xr.DataTree, table: pd.DataFrame) -> Iterator[str]:
         )
 
 
-def _weight_problems(provenance: Mapping[str, Any], method: str) -> Iterator[str]:
+def _weight_problems(fit: FitView) -> Iterator[str]:
     """Weighted draws that are worth fewer independent ones than chains must have."""
-    effective = provenance.get("effective_draws")
-    if method in WEIGHTED and effective is not None and effective < SMALLEST_ESS:
+    effective = fit.provenance.get("effective_draws")
+    if fit.method in WEIGHTED and effective is not None and effective < SMALLEST_ESS:
         yield (
             f"The effective sample size of the weighted draws is {effective:.0f} (at least "
             f"{SMALLEST_ESS}): the interval is not known well enough, so draw more, as in "
@@ -325,17 +319,15 @@ def _weight_problems(provenance: Mapping[str, Any], method: str) -> Iterator[str
         )
 
 
-def _approximation_cautions(
-    result: xr.DataTree, found: Sequence[Scalar], method: str
-) -> Iterator[str]:
-    if method not in APPROXIMATIONS or "log_weight" not in stats_of(result):
+def _approximation_cautions(fit: FitView) -> Iterator[str]:
+    if fit.method not in APPROXIMATIONS or "log_weight" not in fit.stats:
         return
-    weights, k_hat = _smoothed_weights(result)
+    weights, k_hat = _smoothed_weights(fit)
     if k_hat <= MAX_PARETO_K:
-        yield from _corrections(weights, found)
+        yield from _corrections(weights, fit.scalars)
     else:
         draws, shape = ("the guide's draws", "the guide")
-        if method == "laplace":
+        if fit.method == "laplace":
             draws, shape = ("the Laplace draws", "a normal distribution")
         yield (
             f"Pareto k-hat of {draws} is {k_hat:.2f} (at most {MAX_PARETO_K}): the posterior is "
@@ -376,17 +368,15 @@ def _mode_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _tail_cautions(
-    provenance: Mapping[str, Any], found: Sequence[Scalar], table: pd.DataFrame
-) -> Iterator[str]:
+def _tail_cautions(fit: FitView) -> Iterator[str]:
     """Tails of chains that are too light by weighted draws, which reach what chains may miss."""
-    tails = provenance.get("tails") or {}
+    tails = fit.provenance.get("tails") or {}
     if not tails or not tails["k_hat"] <= MAX_PARETO_K:
         return
     nominal, missed = CENTRAL_95[0], []
     variance = nominal * (1.0 - nominal)
-    for scalar, shares in with_entries(found, tails["shares"]):
-        row = table.loc[scalar.label]
+    for scalar, shares in with_entries(fit.scalars, tails["shares"]):
+        row = summary(fit).loc[scalar.label]
         error = math.sqrt(variance / row["ess_tail"] + variance / tails["effective_draws"])
         for share, side, end in zip(shares, ("below", "above"), ("q2.5", "q97.5"), strict=True):
             if share > max(2.0 * nominal, nominal + TAIL_ERRORS * error):
@@ -400,9 +390,9 @@ def _tail_cautions(
         )
 
 
-def _chain_notes(result: xr.DataTree) -> Iterator[str]:
+def _chain_notes(fit: FitView) -> Iterator[str]:
     """Trajectories that were cut short, which costs time and biases nothing."""
-    deep = stats_of(result).get("reached_max_treedepth")
+    deep = fit.stats.get("reached_max_treedepth")
     if deep is not None and deep.sum() > MAX_DEEP_TREES * deep.size:
         yield (
             f"{int(deep.sum())} of {deep.size} draws reached the largest tree depth: steps were "
@@ -411,9 +401,10 @@ def _chain_notes(result: xr.DataTree) -> Iterator[str]:
         )
 
 
-def _estimate_cautions(result: xr.DataTree, table: pd.DataFrame, method: str) -> Iterator[str]:
-    undetermined = table.index[table["sd"].isna()]
-    if method == "point" and len(undetermined):
+def _estimate_cautions(fit: FitView) -> Iterator[str]:
+    sd = summary(fit)["sd"]
+    undetermined = sd.index[sd.isna()]
+    if fit.method == "point" and len(undetermined):
         yield (
             f"No standard error: {listed(dict.fromkeys(undetermined))}; least squares does not "
             "determine such values, so they say nothing."
@@ -444,12 +435,6 @@ def _reading_notes(counts: Mapping[str, Any]) -> Iterator[str]:
                 f"{count} of {total} readings of {name} lie at the edge of their range and were "
                 "moved to the link's margin."
             )
-
-
-def _capture_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
-    """A set-up that nobody stated, and what is unlikely in the capture."""
-    yield from setup_cautions(provenance)
-    yield from provenance.get("capture_cautions", ())
 
 
 def setup_cautions(provenance: Mapping[str, Any]) -> tuple[str, ...]:

@@ -24,19 +24,10 @@ from scipy.special import logsumexp
 from polar_bayes.capture.plausibility import IndexByEye, index_sentences
 from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.finding import Finding, judged_by, listed, p_text
-from polar_bayes.diagnostics.parameters import (
-    Scalar,
-    method_of,
-    posterior_scalars,
-    scalars,
-    with_entries,
-)
-from polar_bayes.diagnostics.predictive import (
-    PredictiveCheck,
-    flat_variables,
-    predictive_checks,
-)
+from polar_bayes.diagnostics.parameters import Scalar, with_entries
+from polar_bayes.diagnostics.predictive import PredictiveCheck, predictive_checks
 from polar_bayes.diagnostics.residuals import residual_findings, residuals_of
+from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.inference.checks import (
     CARRIES,
@@ -48,7 +39,7 @@ from polar_bayes.inference.checks import (
     prior_conflict,
     tail_scores,
 )
-from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
+from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.observation.data import ANGLES
 from polar_bayes.observation.links import PERFECT
 from polar_bayes.physics.part import absence
@@ -98,8 +89,9 @@ CHECKS = tuple(QUESTIONS)
 COLUMNS = ("level", "p_value", "statistic", "sentence")
 
 
+@once
 def criticize(
-    result: xr.DataTree, checks: Mapping[str, PredictiveCheck] | None = None
+    result: xr.DataTree | FitView, checks: Mapping[str, PredictiveCheck] | None = None
 ) -> pd.DataFrame:
     """What the readings say against the model of a fit.
 
@@ -122,34 +114,32 @@ def criticize(
         Gelman, Meng and Stern (1996), Statistica Sinica 6, 733; Evans and Moshonov (2006), Bayesian
         Analysis 1, 893.
     """
-    found = posterior_scalars(result)
-    missing = [f"group {name}" for name in GROUPS if name not in result.children]
+    fit = view_of(result)
+    missing = [f"group {name}" for name in GROUPS if name not in fit.result.children]
     if not missing:
-        missing = [name for name in ANGLES if name not in result["constant_data"].data_vars]
-    if method_of(result) == "point" or missing:
+        missing = [name for name in ANGLES if name not in fit.result["constant_data"].data_vars]
+    if fit.method == "point" or missing:
         why = f"The result has no {', '.join(missing)}, so the model was not checked."
-        if method_of(result) == "point":
+        if fit.method == "point":
             why = "A point fit has no draws to criticize."
         return _table(dict.fromkeys(CHECKS, Finding("not computed", sentence=why)))
-    variables = flat_variables(result)
-    checks = predictive_checks(result) if checks is None else checks
-    provenance, priors = provenance_of(result), _prior_draws(result)
-    absent = [s for s in found if _is_absent(s, provenance, priors.get(s.label))]
-    index = _index(result, found)
+    checks = predictive_checks(fit) if checks is None else checks
+    absent = [s for s in fit.scalars if _is_absent(s, fit)]
+    index = _index(fit)
     # Where the index by eye says so, a wider prior is the remedy, and no other check names one.
     is_beyond = bool(index.sentence)
     return _table(
         {
-            "priors": _prior_conflict(result, found, is_beyond),
-            "absent": _absent(found, absent),
-            "noise": _noise(result, found),
-            "bounds": _bounds(result, found, is_beyond),
+            "priors": _prior_conflict(fit, is_beyond),
+            "absent": _absent(fit.scalars, absent),
+            "noise": _noise(fit),
+            "bounds": _bounds(fit, is_beyond),
             "index": index,
-            "systematic errors": _systematic_errors(result, found, absent),
-            **residual_findings(residuals_of(result, variables, found)),
+            "systematic errors": _systematic_errors(fit, absent),
+            **residual_findings(residuals_of(fit)),
             "leave-one-out": _leave_one_out(checks),
-            "repeats": _repeats(result),
-            "alternatives": _alternatives(result, absent),
+            "repeats": _repeats(fit),
+            "alternatives": _alternatives(fit, absent),
         }
     )
 
@@ -162,14 +152,13 @@ def _table(findings: Mapping[str, Finding]) -> pd.DataFrame:
 # --- Priors, noise and bounds ---------------------------------------------------------------------
 
 
-def _prior_conflict(result: xr.DataTree, found: Sequence[Scalar], is_beyond: bool) -> Finding:
+def _prior_conflict(fit: FitView, is_beyond: bool) -> Finding:
     """Posterior medians in the tails of their priors: the farthest, and all of them together."""
-    below = _prior_probability(result, _carriers(found))
+    below = _prior_probability(fit, _carriers(fit.scalars))
     if not below:
         return Finding("not computed", sentence="The fit states no prior probabilities.")
-    provenance = provenance_of(result)
     probability = np.array(list(below.values()))
-    end = np.array([_absent_end(scalar.name, provenance) for scalar in below])
+    end = np.array([_absent_end(scalar.name, fit.provenance) for scalar in below])
     p_value = float(prior_conflict(probability, end))
     tails, score = tail_scores(probability, end)
     names = [scalar.label for scalar in below]
@@ -212,10 +201,10 @@ def _absent_end(name: str, provenance: Mapping[str, Any]) -> float:
     return -1.0 if absent.value <= low else 1.0 if absent.value >= high else 0.0
 
 
-def _prior_probability(result: xr.DataTree, found: Sequence[Scalar]) -> dict[Scalar, float]:
+def _prior_probability(fit: FitView, found: Sequence[Scalar]) -> dict[Scalar, float]:
     """Prior probability below the posterior median of each parameter that has a prior."""
-    stated = provenance_of(result).get("prior_probability") or {}
-    fixed = provenance_of(result).get("fixed") or {}
+    stated = fit.provenance.get("prior_probability") or {}
+    fixed = fit.provenance.get("fixed") or {}
     return {
         scalar: float(below)
         for scalar, below in with_entries(found, stated)
@@ -243,17 +232,17 @@ def _absent(found: Sequence[Scalar], absent: Sequence[Scalar]) -> Finding:
     return Finding("note", statistic=shifts[label], sentence=f"{shown}; {change}.")
 
 
-def _is_absent(scalar: Scalar, provenance: Mapping[str, Any], prior: np.ndarray | None) -> bool:
+def _is_absent(scalar: Scalar, fit: FitView) -> bool:
     """Whether the posterior lies at the absent end, and the readings have brought it there."""
-    absent = absence(scalar.name)
+    absent, prior = absence(scalar.name), fit.prior.get(scalar.label)
     if absent is None or prior is None or not np.isfinite(scalar.draws).all():
         return False
-    if _absent_end(scalar.name, provenance) == 0.0 or not np.ptp(scalar.draws) > 0.0:
+    if _absent_end(scalar.name, fit.provenance) == 0.0 or not np.ptp(scalar.draws) > 0.0:
         return False
     distance = np.abs(scalar.draws - absent.value)
     reach = float(np.quantile(distance, CENTRAL_95[1]))
     is_near = float(np.median(distance)) < 2.0 * float(distance.std())
-    return is_near and float(np.mean(np.abs(prior - absent.value) <= reach)) < 0.5
+    return is_near and float(np.mean(np.abs(prior.draws - absent.value) <= reach)) < 0.5
 
 
 def _without(scalar: Scalar, absent: Sequence[Scalar]) -> float:
@@ -267,14 +256,10 @@ def _without(scalar: Scalar, absent: Sequence[Scalar]) -> float:
     return float(slopes @ ((ends - center) / sd))
 
 
-def _prior_draws(result: xr.DataTree) -> dict[str, np.ndarray]:
-    return {s.label: s.draws for s in scalars(result["prior"].to_dataset())}
-
-
-def _noise(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
+def _noise(fit: FitView) -> Finding:
     """Scatter of the readings beyond what their priors allow, and against their stated errors."""
-    noise = [s for s in found if s.name in PERFECT and np.isfinite(s.draws).all()]
-    below = _prior_probability(result, noise)
+    noise = [s for s in fit.scalars if s.name in PERFECT and np.isfinite(s.draws).all()]
+    below = _prior_probability(fit, noise)
     worse = {
         s.label: share if math.isinf(PERFECT[s.name]) else 1.0 - share for s, share in below.items()
     }
@@ -306,19 +291,19 @@ def _noise(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
     return judged_by(p_value, math.nan, sentence, least=least)
 
 
-def _bounds(result: xr.DataTree, found: Sequence[Scalar], is_beyond: bool) -> Finding:
+def _bounds(fit: FitView, is_beyond: bool) -> Finding:
     """Posterior density at a bound of the support that is as high as inside, unlike the prior's."""
-    provenance, hits = provenance_of(result), []
-    priors = _prior_draws(result)
-    for scalar in found:
-        if scalar.label not in priors or not np.isfinite(scalar.draws).all():
+    hits = []
+    for scalar in fit.scalars:
+        prior = fit.prior.get(scalar.label)
+        if prior is None or not np.isfinite(scalar.draws).all():
             continue
         absent = absence(scalar.name)
-        for bound in filter(math.isfinite, bounds_of(provenance, scalar.name)):
+        for bound in filter(math.isfinite, bounds_of(fit.provenance, scalar.name)):
             if absent is not None and absent.value == bound:
                 continue
             share = _share_at(bound, scalar.draws)
-            if share >= MASS_AT_BOUND and _share_at(bound, priors[scalar.label]) < MASS_AT_BOUND:
+            if share >= MASS_AT_BOUND and _share_at(bound, prior.draws) < MASS_AT_BOUND:
                 hits.append((share, scalar, bound))
     if not hits:
         return Finding("passed")
@@ -341,19 +326,19 @@ def _beyond(scalar: Scalar, bound: float) -> str:
     return f" If the index may lie beyond, give priors={{'{INDEX}': {prior}}}."
 
 
-def _index(result: xr.DataTree, found: Sequence[Scalar]) -> Finding:
+def _index(fit: FitView) -> Finding:
     """Brewster's angle by eye, where it means an index that the prior of the fit excludes."""
-    provenance = provenance_of(result)
+    provenance = fit.provenance
     stated = provenance.get("indices_by_eye") or {}
     by_eye: dict[str, IndexByEye | None] = {n: IndexByEye(*index) for n, index in stated.items()}
-    free = {s.name for s in found} & set(provenance.get("bounds") or {})
+    free = {s.name for s in fit.scalars} & set(provenance.get("bounds") or {})
     free -= set(provenance.get("fixed") or {})
     parameter = next((name for name in INDEX_PARAMETERS if name in free), "")
     bounds = bounds_of(provenance, parameter)
     sentences = index_sentences(by_eye, bounds, parameter, "the prior")
     if not parameter or not sentences:
         return Finding("passed")
-    zeros = [s.draws.std() for s in scalars(result["prior"].to_dataset()) if s.name == "angle_zero"]
+    zeros = [s.draws.std() for s in fit.prior.values() if s.name == "angle_zero"]
     off = 2.0 * float(max(zeros, default=0.0))  # the zero of the angle scale may be off as well
     excluded = any(index and index.is_excluded(bounds, off) for index in by_eye.values())
     is_member = not parameter.endswith("_location")  # a population may have a far member
@@ -369,22 +354,21 @@ def _share_at(bound: float, draws: np.ndarray) -> float:
 # --- Systematic errors ----------------------------------------------------------------------------
 
 
-def _systematic_errors(
-    result: xr.DataTree, found: Sequence[Scalar], absent: Sequence[Scalar]
-) -> Finding:
+def _systematic_errors(fit: FitView, absent: Sequence[Scalar]) -> Finding:
     """Smooth errors that are larger than their prior, or that alone move the answer."""
+    found, groups = fit.scalars, fit.result.children
     amplitude = [s for s in found if s.name == "discrepancy_amplitude"]
     if not amplitude:
         return Finding("passed")
-    if "scenes" in result.children:  # those without smooth errors are among the scenes compared
+    if "scenes" in groups:  # those without smooth errors are among the scenes compared
         return Finding("passed")
-    if WITHOUT not in result.children:
+    if WITHOUT not in groups:
         reason = "Nothing is known of the answer without smooth errors, which was not fitted."
         return Finding("not computed", sentence=reason)
     sizes = [*amplitude, *(s for s in found if s.name == NOISE_FACTOR)]
-    below = _prior_probability(result, sizes)
+    below = _prior_probability(fit, sizes)
     p_value = float(prior_conflict(np.array(list(below.values())), -np.ones(len(below))))
-    without = {s.label: s.draws for s in scalars(result[WITHOUT].to_dataset())}
+    without = {label: s.draws for label, s in fit.scalars_of(WITHOUT).items()}
     shifts = {
         s.label: float((without[s.label].mean() - s.draws.mean()) / s.draws.std())
         for s in found
@@ -393,7 +377,7 @@ def _systematic_errors(
     label = max(shifts, key=lambda name: abs(shifts[name]), default="")
     shift = abs(shifts.get(label, 0.0))
     how = f"amplitude {np.median(amplitude[0].draws):.2g}"
-    if shift > LARGE_DIFFERENCE and not _is_needed(result, amplitude[0]):
+    if shift > LARGE_DIFFERENCE and not _is_needed(fit, amplitude[0]):
         sentence = (
             f"The answer rests on smooth errors that the readings do not show for certain ({how}): "
             f"without them {label} would be {without[label].mean():.4g}, {shift:.1f} sd away; "
@@ -409,13 +393,13 @@ def _systematic_errors(
     return judged_by(p_value, shift, sentence)
 
 
-def _is_needed(result: xr.DataTree, amplitude: Scalar) -> bool:
+def _is_needed(fit: FitView, amplitude: Scalar) -> bool:
     """Whether the readings speak strongly against an amplitude near zero."""
     # The Savage-Dickey ratio of densities at zero, each as the share near it.
-    prior = _prior_draws(result).get(amplitude.label)
+    prior = fit.prior.get(amplitude.label)
     if prior is None:
         return True
-    near = np.quantile(prior, NEAR_ZERO)
+    near = np.quantile(prior.draws, NEAR_ZERO)
     return float(np.mean(amplitude.draws < near)) < math.exp(REFUTED) * NEAR_ZERO
 
 
@@ -450,10 +434,10 @@ def _uniformity(pit: np.ndarray) -> float:
     return float(array_stats.uniformity_test(pit, method="pot_c")[0])
 
 
-def _repeats(result: xr.DataTree) -> Finding:
+def _repeats(fit: FitView) -> Finding:
     """Views that repeat another in its directions and in every digit of its readings."""
-    observed = result["observed_data"].to_dataset()
-    constants = result["constant_data"].to_dataset()
+    observed = fit.result["observed_data"].to_dataset()
+    constants = fit.result["constant_data"].to_dataset()
     columns = [
         values.transpose("view", ...).to_numpy().reshape(observed.sizes["view"], -1)
         for values in (
@@ -480,10 +464,10 @@ def _repeats(result: xr.DataTree) -> Finding:
 # --- Alternatives ---------------------------------------------------------------------------------
 
 
-def _alternatives(result: xr.DataTree, absent: Sequence[Scalar]) -> Finding:
+def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
     """Parts that explain the readings better, or as well with another answer."""
     try:
-        table = alternatives(result)
+        table = alternatives(fit)
     except FitError as error:
         return Finding("not computed", sentence=f"{error.what[:1].upper()}{error.what[1:]}.")
     if table.empty:

@@ -8,8 +8,6 @@ import numpy as np
 import xarray as xr
 
 from polar_bayes.errors import one_line
-from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.result import provenance_of
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 SAMPLE_DIMS = ("chain", "draw")
@@ -70,40 +68,6 @@ def scalars(group: xr.Dataset, sample_dims: Sequence[str] = SAMPLE_DIMS) -> list
         if repeat > 1:
             found[position] = dataclasses.replace(scalar, label=f"{scalar.label}#{repeat}")
     return found
-
-
-def posterior_scalars(result: xr.DataTree) -> list[Scalar]:
-    """Every scalar of the posterior of a result, which is checked first."""
-    check_fit(result)
-    return scalars(result["posterior"].to_dataset())
-
-
-def truth_of(result: xr.DataTree, scalar: Scalar) -> float:
-    """The true value of a parameter, NaN where the capture does not know it."""
-    if "constant_data" not in result.children:
-        return np.nan
-    constants = result["constant_data"].to_dataset()
-    true = constants.get(f"true_{scalar.name}")
-    if true is None or not set(true.dims) <= set(scalar.index):
-        return np.nan
-    return float(true.isel({dim: scalar.index[str(dim)] for dim in true.dims}))
-
-
-def stats_of(result: xr.DataTree) -> Mapping[str, xr.DataArray]:
-    """The sampler's own statistics by name, each (chain, draw); empty where there are none."""
-    if "sample_stats" not in result.children:
-        return {}
-    return {str(name): stat for name, stat in result["sample_stats"].data_vars.items()}
-
-
-def method_of(result: xr.DataTree) -> str:
-    """Kind of the fit's method: as recorded, or inferred from its statistics."""
-    if method := provenance_of(result).get("method"):
-        return str(method)
-    stats = stats_of(result)
-    if "loss" in stats or result["posterior"].sizes.get("draw", 0) == 1:
-        return "point"
-    return "nuts" if "diverging" in stats else "laplace"
 
 
 def _rank(name: str, variable: xr.DataArray, names: Collection[str]) -> tuple[int, int]:

@@ -16,9 +16,9 @@ import scipy.special
 import scipy.stats
 import xarray as xr
 
-from polar_bayes.diagnostics.parameters import Scalar, method_of, posterior_scalars
-from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
+from polar_bayes.diagnostics.parameters import Scalar
+from polar_bayes.diagnostics.view import FitView, once
+from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.priors import RANGES
 
 SUMMARY_COLUMNS = (
@@ -91,21 +91,22 @@ class Population:
         return self.from_scale(center + width * scipy.special.ndtri(rank))
 
 
-def populations(result: xr.DataTree) -> list[Population]:
-    """Every pooled parameter of a result, wavelength by wavelength."""
+@once
+def populations(fit: FitView) -> list[Population]:
+    """Every pooled parameter of a fit, wavelength by wavelength; none of a point fit."""
     found: dict[str, list[Scalar]] = {}
-    for scalar in posterior_scalars(result):
+    for scalar in [] if fit.method == "point" else fit.scalars:
         found.setdefault(scalar.name, []).append(scalar)
-    provenance = provenance_of(result)
     return [
         each
         for name in found
         if {f"{name}_location", f"{name}_spread"} <= set(found)
-        for each in _of_parameter(name, found, provenance)
+        for each in _of_parameter(name, found, fit.provenance)
     ]
 
 
-def population_summary(result: xr.DataTree) -> pd.DataFrame:
+@once
+def population_summary(result: xr.DataTree | FitView) -> pd.DataFrame:
     r"""How much the members of each population differ, and where a new one would lie.
 
     The location is the population's median in the unit of the parameter, the spread the standard
@@ -137,8 +138,7 @@ def population_summary(result: xr.DataTree) -> pd.DataFrame:
     Source:
         Gelman & Pardoe (2006), Technometrics 48(2), 241-251: the pooling factor.
     """
-    check_fit(result)
-    found = [] if method_of(result) == "point" else populations(result)
+    found = populations(result)
     labels = pd.Index([each.label for each in found], dtype=object)
     rows = [_summary_row(each) for each in found]
     return pd.DataFrame(rows, columns=list(SUMMARY_COLUMNS), index=labels)
@@ -199,7 +199,8 @@ MIN_PRECISION_ERRORS = 2.0
 MIN_SPREAD = 1e-6
 
 
-def shrinkage(result: xr.DataTree) -> pd.DataFrame:
+@once
+def shrinkage(fit: FitView) -> pd.DataFrame:
     """Each member's pooled and unpooled estimate, and how far the population shrinks it."""
     # The unpooled estimate is not a further fit: the population is divided out of the draws. If the
     # likelihood of a member is that of $x_m \sim Normal(a, 1/p)$ on the population's scale, its
@@ -211,7 +212,7 @@ def shrinkage(result: xr.DataTree) -> pd.DataFrame:
     # scale, and the bounds of an index are far; elsewhere it is an approximation. The other
     # parameters of the member keep their priors.
     rows = {}
-    for population in [] if method_of(result) == "point" else populations(result):
+    for population in populations(fit):
         location = population.to_scale(population.location.draws.ravel())
         spread, is_finite = population.spread.draws.ravel(), _is_finite(population)
         for scalar in population.members:

@@ -20,15 +20,8 @@ from arviz_stats.base import array_stats
 from arviz_stats.ecdf_utils import ecdf_pit
 from scipy.special import logsumexp
 
-from polar_bayes.diagnostics.parameters import (
-    APPROXIMATIONS,
-    MIN_DRAWS,
-    SAMPLE_DIMS,
-    method_of,
-    posterior_scalars,
-    stats_of,
-)
-from polar_bayes.inference.files import check_fit
+from polar_bayes.diagnostics.parameters import APPROXIMATIONS, MIN_DRAWS, SAMPLE_DIMS
+from polar_bayes.diagnostics.view import FitView, once
 from polar_bayes.inference.psis import MAX_PARETO_K, smooth
 
 PROBABILITIES = (0.5, 0.8, 0.95)
@@ -76,11 +69,11 @@ class PitBand:
     upper: np.ndarray
 
 
-def predictive_checks(result: xr.DataTree) -> dict[str, PredictiveCheck]:
+@once
+def predictive_checks(fit: FitView) -> dict[str, PredictiveCheck]:
     """Compare every recorded variable with its prediction."""
-    check_fit(result)
-    relative_ess, correction = _relative_ess(result), _correction(result)
-    return {v.name: _check(v, relative_ess, correction) for v in flat_variables(result)}
+    relative_ess, correction = _relative_ess(fit), _correction(fit)
+    return {v.name: _check(v, relative_ess, correction) for v in flat_variables(fit)}
 
 
 def pit_band(pit: np.ndarray) -> PitBand | None:
@@ -148,8 +141,10 @@ def _select(result: xr.DataTree, name: str) -> FlatVariable | None:
     return FlatVariable(name, usable, readings, predicted, noise_free, log_likelihood, full_scale)
 
 
-def flat_variables(result: xr.DataTree) -> list[FlatVariable]:
+@once
+def flat_variables(fit: FitView) -> list[FlatVariable]:
     """The recorded variables that a fit predicts and that have readings."""
+    result = fit.result
     names = result["observed_data"].data_vars if "observed_data" in result.children else ()
     found = (_select(result, str(name)) for name in names)
     return [variable for variable in found if variable is not None and variable.observed.size]
@@ -204,21 +199,20 @@ def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | N
     )
 
 
-def _relative_ess(result: xr.DataTree) -> float:
+def _relative_ess(fit: FitView) -> float:
     """Effective over actual draws, averaged over the parameters; 1 for independent draws."""
-    if method_of(result) != "nuts":
+    if fit.method != "nuts":
         return 1.0
-    draws = np.stack([s.draws for s in posterior_scalars(result)])
+    draws = np.stack([s.draws for s in fit.scalars])
     draws = draws[np.isfinite(draws).all(axis=(1, 2)) & (np.ptp(draws, axis=(1, 2)) > 0.0)]
     if not len(draws) or draws[0].size < MIN_DRAWS:
         return 1.0
     return float(np.mean(array_stats.ess(draws, method="mean", relative=True)))
 
 
-def _correction(result: xr.DataTree) -> np.ndarray | None:
+def _correction(fit: FitView) -> np.ndarray | None:
     """Log weights that turn draws of an approximation into posterior draws, where stored."""
-    stats = stats_of(result)
-    if "log_weight" not in stats or method_of(result) not in APPROXIMATIONS:
+    if "log_weight" not in fit.stats or fit.method not in APPROXIMATIONS:
         return None
-    log_weight = stats["log_weight"].to_numpy().astype(float).ravel()
+    log_weight = fit.stats["log_weight"].to_numpy().astype(float).ravel()
     return log_weight - log_weight.max() if np.isfinite(log_weight).all() else None

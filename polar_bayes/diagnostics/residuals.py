@@ -27,8 +27,8 @@ import numpy as np
 import xarray as xr
 
 from polar_bayes.diagnostics.finding import Finding, judged_by, listed, p_text
-from polar_bayes.diagnostics.parameters import Scalar
-from polar_bayes.diagnostics.predictive import FlatVariable
+from polar_bayes.diagnostics.predictive import FlatVariable, flat_variables
+from polar_bayes.diagnostics.view import FitView, once
 from polar_bayes.inference.checks import ANGLE_SCALES
 from polar_bayes.observation.data import ANGLES
 from polar_bayes.physics.geometry import unit_vectors
@@ -66,10 +66,10 @@ class Residuals:
     labels: tuple[str, ...]
 
 
-def residuals_of(
-    result: xr.DataTree, variables: Sequence[FlatVariable], found: Sequence[Scalar]
-) -> Residuals | None:
+@once
+def residuals_of(fit: FitView) -> Residuals | None:
     """Residuals of all variables together, since they share the parameters that absorb them."""
+    result, variables = fit.result, flat_variables(fit)
     constants = result.children.get("constant_data", xr.DataTree()).data_vars
     if not all(name in constants for name in ANGLES):
         return None
@@ -94,7 +94,7 @@ def residuals_of(
     centered = noise_free - noise_free.mean(axis=0)
     covariance = centered.T @ centered / (len(centered) - 1)
     replicated = noise[pick] - noise[pick] @ covariance
-    material = {s.label: s.draws.ravel() for s in found if s.is_material}
+    material = {s.label: s.draws.ravel() for s in fit.scalars if s.is_material}
     material = {n: x for n, x in material.items() if np.isfinite(x).all() and np.ptp(x) > 0.0}
     scores = np.array([(x - x.mean()) / x.std() for x in material.values()]).reshape(
         len(material), len(centered)

@@ -19,15 +19,9 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
-from polar_bayes.diagnostics.parameters import (
-    MIN_DRAWS,
-    SAMPLE_DIMS,
-    method_of,
-    posterior_scalars,
-    scalars,
-)
-from polar_bayes.diagnostics.predictive import flat_variables
+from polar_bayes.diagnostics.parameters import MIN_DRAWS, SAMPLE_DIMS
 from polar_bayes.diagnostics.residuals import readings_alone, residuals_of
+from polar_bayes.diagnostics.view import FitView, once
 from polar_bayes.inference.result import CENTRAL_95
 
 DETERMINED = 0.5
@@ -42,26 +36,25 @@ COLUMNS = (
 )
 
 
-def sensitivity(result: xr.DataTree) -> pd.DataFrame:
+@once
+def sensitivity(fit: FitView) -> pd.DataFrame:
     """How much the data and the prior determine each parameter; empty for a point fit."""
-    found = posterior_scalars(result)
-    if method_of(result) == "point":
+    if fit.method == "point":
         return pd.DataFrame(columns=list(COLUMNS))
-    priors = {}
-    if "prior" in result.children:
-        priors = {scalar.label: scalar.draws for scalar in scalars(result["prior"].to_dataset())}
-    weights = [_scaled_weights(_total(result, group)) for group in ("log_prior", "log_likelihood")]
-    alone = readings_alone(residuals_of(result, flat_variables(result), found))
+    groups = ("log_prior", "log_likelihood")
+    weights = [_scaled_weights(_total(fit.result, group)) for group in groups]
+    alone = readings_alone(residuals_of(fit))
     rows = []
-    for scalar in found:
-        compared = _compare(priors.get(scalar.label), scalar.draws)
+    for scalar in fit.scalars:
+        prior = fit.prior.get(scalar.label)
+        compared = _compare(None if prior is None else prior.draws, scalar.draws)
         rates = [_sensitivity(scalar.draws, each) for each in weights]
         remarks = _remarks(scalar.draws, compared, *rates)
         if scalar.label in alone:
             reading, factor = alone[scalar.label]
             remarks.append(f"rests on {reading}: {factor:.1f} times as wide without it")
         rows.append([*compared, *rates, "; ".join(remarks)])
-    index = pd.Index([scalar.label for scalar in found])
+    index = pd.Index([scalar.label for scalar in fit.scalars])
     return pd.DataFrame(rows, columns=list(COLUMNS), index=index)
 
 

@@ -191,6 +191,13 @@ def accuracy_page(result: xr.DataTree) -> page.Page:
     )
 
 
+def accuracy_card(result: xr.DataTree) -> page.Card:
+    """The card of an accuracy study."""
+    study = accuracy_dataset(result)
+    sentences = [*accuracy_sentences(study), text.reference_sentence(study)]
+    return sentences, study_table(study), not study.attrs["reference_doubts"]
+
+
 def accuracy_picture(study: xr.Dataset) -> page.Picture:
     """Error against time."""
     return page.picture(plot_accuracy(study), "accuracy.figure_front")
@@ -236,3 +243,6 @@ def error_table(study: xr.Dataset) -> Table:
     cells: page.Cells = {str(name): column(name, ".2g") for name in errors.columns}
     caption = "The larger error of mean and standard deviation of each, in posterior sds."
     return page.make_table("error", caption, cells, errors, label="method")
+
+
+REPORT = page.Report(accuracy_page, accuracy_card, plot_accuracy, file="accuracy.nc")

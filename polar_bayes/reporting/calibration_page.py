@@ -12,13 +12,15 @@ from matplotlib.figure import Figure
 
 from polar_bayes.calibration.scores import significance_level
 from polar_bayes.calibration.verdict import (
+    CALIBRATION,
     PASSES,
+    CalibrationView,
     calibration_readings,
-    calibration_table,
+    calibration_verdict,
+    calibration_view,
     compare_calibrations,
     comparison_sentences,
     holds_readings,
-    is_calibration,
     parameter_deviation,
     reading_deviation,
     reading_ranks,
@@ -42,23 +44,23 @@ RANKS_COLUMN, JUDGED_COLUMN = "the ranks", "the tests"
 
 
 def calibration_page(
-    calibration: xr.DataTree, comparisons: Mapping[str, xr.DataTree] | None = None
+    calibration: xr.DataTree | CalibrationView, comparisons: Mapping[str, xr.DataTree] | None = None
 ) -> page.Page:
     """The page of a calibration, compared with others of the same layout."""
-    others = {one_line(str(name)): each for name, each in (comparisons or {}).items()}
-    provenance = provenance_of(calibration)
+    view = calibration_view(calibration)
+    tree, table = view.tree, view.table
+    provenance = provenance_of(tree)
     method = one_line(str(provenance.get("method", "this calibration")))
-    _check_others(others, method)
-    table = calibration_table(calibration)
-    ranks = figures.parameter_ranks(calibration, table)
+    others = _others(comparisons or {}, method)
+    ranks = figures.parameter_ranks(view)
     titles = {label: each.title for label, each in ranks.items()}
-    readings = calibration_readings(calibration) if holds_readings(calibration) else None
+    readings = calibration_readings(view) if holds_readings(tree) else None
     headline, passed = text.calibration_headline(table, readings)
-    first, *problems = text.verdict_after_headline(calibration)
+    first, *problems = text.verdict_after_headline(view)
     introduction = page.caption("calibration.introduction")
     comparison: list[page.Block] = []
     if others:
-        compared = compare_calibrations({method: calibration, **others})
+        compared = compare_calibrations({method: view, **others})
         comparison = [*comparison_sentences(compared), comparison_table(compared, titles)]
     shown = list(ranks.values())
     other_ranks = {name: figures.parameter_ranks(each) for name, each in others.items()}
@@ -77,14 +79,14 @@ def calibration_page(
     estimates = _paged(shown, figures.estimates, "estimates", max_intervals=MAX_INTERVALS)
     simulations = next(iter(ranks.values())).pit.size
     elsewhere = " What it is compared with stays where it is." if others else ""
-    fits = [*_fit_tables(calibration, ranks), *page.make_facts(_fit_facts(calibration))]
+    fits = [*_fit_tables(tree, ranks), *page.make_facts(_fit_facts(tree))]
     sections = [
         page.Section("parameters", "Parameters", [introduction, rank_table(table, ranks)]),
         page.Section("comparison", "Comparison with other methods", comparison),
         page.Section("ranks", "Ranks of the truth", rank_figures),
         page.Section("coverage", "Coverage of the intervals", _paged(shown, coverage, "coverage")),
         page.Section("estimates", "Estimates against the truth", estimates),
-        page.Section("readings", "Readings", _readings(calibration, readings, method)),
+        page.Section("readings", "Readings", _readings(tree, readings, method)),
         page.Section("fits", "Status of the fits", fits),
         page.Section("provenance", "Provenance", _provenance_facts(provenance)),
     ]
@@ -106,10 +108,20 @@ def calibration_page(
     )
 
 
-def _check_others(others: Mapping[str, xr.DataTree], method: str) -> None:
+def calibration_card(calibration: xr.DataTree | CalibrationView) -> page.Card:
+    """The card of a calibration."""
+    view = calibration_view(calibration)
+    _, passed = text.calibration_headline(view.table, None)
+    table = rank_table(view.table, figures.parameter_ranks(view))
+    return calibration_verdict(view), table, passed
+
+
+def _others(given: Mapping[str, xr.DataTree], method: str) -> dict[str, CalibrationView]:
+    """The calibrations that a page compares with its own, by names on one line."""
     where = "report: comparisons"
+    others = {one_line(str(name)): each for name, each in given.items()}
     for name, each in others.items():
-        if not is_calibration(each):
+        if not CALIBRATION.describes(each):
             hint = "give what polar_bayes.calibrate returns"
             raise FitError("it is no calibration", where=f"{where}, {name}", hint=hint)
         if name == method:
@@ -118,6 +130,7 @@ def _check_others(others: Mapping[str, xr.DataTree], method: str) -> None:
     if len(others) > MAX_OTHERS:
         what = f"{len(others)} calibrations are too many for one figure"
         raise FitError(what, where=where, hint=f"give at most {MAX_OTHERS}")
+    return {name: calibration_view(each) for name, each in others.items()}
 
 
 # --- Figures --------------------------------------------------------------------------------------
@@ -307,3 +320,12 @@ def _provenance_facts(provenance: Mapping[str, Any]) -> Iterator[page.Block]:
     groups |= {titles["priors"]: {n: short_numbers(str(x)) for n, x in priors.items()}}
     for title, values in {"Calibration": own, **groups}.items():
         yield from page.make_facts(values, title)
+
+
+REPORT = page.Report(
+    calibration_page,
+    calibration_card,
+    figures.plot_calibration,
+    ("comparisons",),
+    "calibration.nc",
+)

@@ -14,6 +14,7 @@ from polar_bayes.diagnostics.sensitivity import SENSITIVE
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
+from polar_bayes.reporting.fit_page import fit_card
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import CLEAR, DASH, column, interval, number, or_dash, percent
 from polar_bayes.repr_html import Row, Table
@@ -173,3 +174,6 @@ def _settings(provenance: Mapping[str, Any]) -> dict[str, str]:
             if each is not None:
                 found[one_line(f"{key.replace('_', ' ')} {part}".strip())] = one_line(str(each))
     return found
+
+
+REPORT = page.Report(comparison_page, fit_card, lambda fits: plot_comparison(compare_fits(fits)))

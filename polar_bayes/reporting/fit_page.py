@@ -2,42 +2,29 @@
 
 import math
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
+from matplotlib.figure import Figure
 
 from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
-from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.criticism import QUESTIONS, REFUTED, criticize
-from polar_bayes.diagnostics.parameters import (
-    APPROXIMATIONS,
-    Scalar,
-    is_hyperparameter,
-    method_of,
-    posterior_scalars,
-    stats_of,
-    truth_of,
-)
-from polar_bayes.diagnostics.population import (
-    Population,
-    population_summary,
-    populations,
-    shrinkage,
-)
+from polar_bayes.diagnostics.parameters import APPROXIMATIONS, is_hyperparameter
+from polar_bayes.diagnostics.population import population_summary, populations, shrinkage
 from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck, predictive_checks
 from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, sensitivity
+from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.checks import CAUTION, PROBLEM
 from polar_bayes.inference.files import auto_sentences
 from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.registry import METHODS
-from polar_bayes.inference.result import provenance_of
 from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table
@@ -73,93 +60,50 @@ PROVENANCE_GROUPS = {
 """Entries of the provenance, each with the title of its group on the page."""
 
 
-class Fit(NamedTuple):
-    """A result with everything that its report is computed from."""
-
-    result: xr.DataTree
-    posterior: xr.Dataset
-    scalars: list[Scalar]
-    summary: pd.DataFrame
-    prior: pd.DataFrame
-    method: str
-    provenance: dict[str, Any]
-    checks: dict[str, PredictiveCheck]
-    criticism: pd.DataFrame
-    verdict: Verdict
-    has_draws: bool  # that move and are finite
-
-    def table(
-        self, name: str, caption: str, cells: page.Cells, data: pd.DataFrame, prose: str = ""
-    ) -> Table:
-        """A table with a row for each parameter that the numbers have, in groups."""
-        names = set(map(str, self.posterior.data_vars))
-        titles, groups = {}, {}
-        for scalar in self.scalars:
-            if scalar.label in data.index:
-                titles[scalar.label] = parameter_title(scalar, self.posterior)
-                groups[scalar.label] = "" if scalar.is_material else INSTRUMENT_GROUP
-                if is_hyperparameter(scalar.name, names):
-                    groups[scalar.label] = SHARED_GROUP
-        data = data.loc[list(titles)]
-        if TRUTH in cells:
-            truths = pd.Series({each.label: truth_of(self.result, each) for each in self.scalars})
-            if np.isfinite(truths[data.index]).any():
-                data = data.assign(true_value=truths)
-            else:
-                cells = {title: cell for title, cell in cells.items() if title != TRUTH}
-        return page.make_table(
-            name, caption, cells, data, descriptions=titles, groups=groups, prose=[prose]
-        )
-
-    def determined(self) -> list[str]:
-        """Which parameters the data determine; nothing of a fit that failed."""
-        if not self.verdict.passed:
-            return []
-        return text.determined(self.scalars, self.prior, self.posterior)
-
-    def headline(self) -> str:
-        """The verdict in one sentence."""
-        return text.fit_headline(self.method, self.verdict)
-
-
-def read_fit(result: xr.DataTree) -> Fit:
-    """Summaries of a result, which is checked first."""
-    scalars, table = posterior_scalars(result), convergence.summary(result)
-    checks = predictive_checks(result)
-    criticism = criticize(result, checks)
-    return Fit(
-        result=result,
-        posterior=result["posterior"].to_dataset(),
-        scalars=scalars,
-        summary=table,
-        prior=sensitivity(result),
-        method=method_of(result),
-        provenance=provenance_of(result),
-        checks=checks,
-        criticism=criticism,
-        verdict=convergence.verdict(result, table, criticism),
-        has_draws=method_of(result) != "point" and bool(plots_fit.drawable(result)),
+def fit_table(
+    fit: FitView, name: str, caption: str, cells: page.Cells, data: pd.DataFrame, prose: str = ""
+) -> Table:
+    """A table with a row for each parameter that the numbers have, in groups."""
+    names = set(map(str, fit.posterior.data_vars))
+    titles, groups = {}, {}
+    for scalar in fit.scalars:
+        if scalar.label in data.index:
+            titles[scalar.label] = parameter_title(scalar, fit.posterior)
+            groups[scalar.label] = "" if scalar.is_material else INSTRUMENT_GROUP
+            if is_hyperparameter(scalar.name, names):
+                groups[scalar.label] = SHARED_GROUP
+    data = data.loc[list(titles)]
+    if TRUTH in cells:
+        truths = pd.Series({each.label: fit.truth(each) for each in fit.scalars})
+        if np.isfinite(truths[data.index]).any():
+            data = data.assign(true_value=truths)
+        else:
+            cells = {title: cell for title, cell in cells.items() if title != TRUTH}
+    return page.make_table(
+        name, caption, cells, data, descriptions=titles, groups=groups, prose=[prose]
     )
 
 
-def fit_page(result: xr.DataTree) -> page.Page:
+def has_draws(fit: FitView) -> bool:
+    """Whether the fit has draws of a parameter that move and are finite."""
+    return fit.method != "point" and bool(plots_fit.drawable(fit))
+
+
+def fit_page(result: xr.DataTree | FitView) -> page.Page:
     """The page of a fit."""
-    fit = read_fit(result)
-    pooled = [] if fit.method == "point" else populations(result)
-    summary = population_summary(result)
-    sentences = fit.determined()
-    if fit.verdict.passed:
-        trust = text.trust(fit.method, fit.verdict)
-        following = text.next_sentence(result)
-        sentences = [*text.index_sentences(fit), trust, following, *sentences]
-        sentences += text.between_members(summary, pooled, fit.posterior)
+    fit = view_of(result)
+    judged = convergence.verdict(fit)
+    sentences: list[str] = []
+    if judged.passed:
+        sentences = [*text.index_sentences(fit), text.trust(fit), text.next_sentence(fit.result)]
+        sentences += [*text.determined(fit), *text.between_members(fit)]
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")
     source = [page.Details("Source of the model", code=code)] if code else []
     sections = [
         Section("parameters", "Parameters", [parameter_table(fit)]),
-        Section("scenes", "Which scene", _scenes(result)),
-        Section("population", "Population", _population(fit, summary, pooled)),
+        Section("scenes", "Which scene", _scenes(fit.result)),
+        Section("population", "Population", _population(fit)),
         Section("spectrum", "Spectrum", _spectrum(fit)),
         Section("without", "What trusting the instrument would claim", _without(fit), "Instrument"),
         Section("readings", "Readings and fit", _readings(fit)),
@@ -173,8 +117,8 @@ def fit_page(result: xr.DataTree) -> page.Page:
             "Model criticism",
         ),
         Section("checks", "Predictive checks", _checks(fit)),
-        Section("effects", "Effects", _effects(result)),
-        Section("accuracy", "Accuracy against time", _accuracy(result)),
+        Section("effects", "Effects", _effects(fit.result)),
+        Section("accuracy", "Accuracy against time", _accuracy(fit.result)),
         Section("provenance", "Provenance", [*provenance_facts(fit.provenance), *source]),
     ]
     method = METHODS[fit.method].label if fit.method in METHODS else one_line(fit.method)
@@ -183,20 +127,44 @@ def fit_page(result: xr.DataTree) -> page.Page:
         kind="Fit report",
         name=text.capture_name(fit.provenance),
         subtitles=[text.made_by(fit.provenance, method), *filter(None, [swapped])],
-        headline=fit.headline(),
-        passed=fit.verdict.passed,
-        problems=fit.verdict.problems,
-        sentences=[*sentences, *text.notes(fit.verdict)],
-        cautions=fit.verdict.cautions,
+        headline=text.fit_headline(fit),
+        passed=judged.passed,
+        problems=judged.problems,
+        sentences=[*sentences, *text.notes(judged)],
+        cautions=judged.cautions,
         sections=sections,
         footer="Computed from result.nc, which lies in the same folder and holds every draw.",
     )
 
 
+def fit_card(result: xr.DataTree | FitView) -> page.Card:
+    """The card of a fit."""
+    fit = view_of(result)
+    judged = convergence.verdict(fit)
+    sentences = [
+        text.fit_headline(fit),
+        *judged.problems,
+        *text.determined(fit),
+        judged.nothing_against,
+        *text.notes(judged),
+        *(f"Caution: {caution}" for caution in judged.cautions),
+        text.swapped_sentence(fit.provenance),
+    ]
+    return sentences, parameter_table(fit), judged.passed
+
+
+def plot_fit(result: xr.DataTree | FitView) -> Figure:
+    """Prior and posterior of a fit, or the readings of a point fit, which has no draws."""
+    fit = view_of(result)
+    if fit.method == "point":
+        return plots_curves.plot_readings(fit, plots_curves.variables(fit)[0])
+    return plots_fit.plot_prior_posterior(fit)
+
+
 # --- Parameters -----------------------------------------------------------------------------------
 
 
-def parameter_table(fit: Fit) -> Table:
+def parameter_table(fit: FitView) -> Table:
     """Every parameter with its interval, the truth where known, and what the data determine."""
     if fit.method == "point":
         return _estimate_table(fit)
@@ -210,8 +178,8 @@ def parameter_table(fit: Fit) -> Table:
         "by the data": lambda row: str(row["verdict"]),
     }
     caption = page.caption("fit.parameter", determined=DETERMINED, partly=PARTLY)
-    data = fit.summary.join(fit.prior[["prior_inside", "verdict"]])
-    return fit.table("parameter", caption, cells, data)
+    data = convergence.summary(fit).join(sensitivity(fit)[["prior_inside", "verdict"]])
+    return fit_table(fit, "parameter", caption, cells, data)
 
 
 def _truth_cell(row: pd.Series) -> str:
@@ -220,7 +188,7 @@ def _truth_cell(row: pd.Series) -> str:
     return f"{truth} (outside)" if is_outside else truth
 
 
-def _estimate_table(fit: Fit) -> Table:
+def _estimate_table(fit: FitView) -> Table:
     def error(row: pd.Series) -> str:
         size = row["standard_error"]
         return number(size, size) if math.isfinite(size) else "not determined"
@@ -231,11 +199,12 @@ def _estimate_table(fit: Fit) -> Table:
         TRUTH: lambda row: number(row["true_value"], row["standard_error"]),
     }
     caption = "Least squares; standard errors from the curvature and the residuals."
-    data = fit.summary[["mean", "sd"]].set_axis(["estimate", "standard_error"], axis="columns")
-    return fit.table("parameter", caption, cells, data)
+    data = convergence.summary(fit)[["mean", "sd"]]
+    data = data.set_axis(["estimate", "standard_error"], axis="columns")
+    return fit_table(fit, "parameter", caption, cells, data)
 
 
-def sensitivity_table(fit: Fit) -> Table:
+def sensitivity_table(fit: FitView) -> Table:
     """Prior against posterior, and how far a changed prior would change the posterior."""
     cells: page.Cells = {
         "prior 95%": lambda row: interval(row["prior_q2.5"], row["prior_q97.5"]),
@@ -244,19 +213,19 @@ def sensitivity_table(fit: Fit) -> Table:
         **text.SENSITIVITY_CELLS,
     }
     caption = page.caption("fit.sensitivity", sensitive=SENSITIVE)
-    return fit.table("sensitivity", caption, cells, fit.prior, prose="remark")
+    return fit_table(fit, "sensitivity", caption, cells, sensitivity(fit), prose="remark")
 
 
-def _pairs(fit: Fit) -> Iterator[page.Picture]:
-    if fit.has_draws and len(plots_fit.drawable(fit.result, material=True)) > 1:
-        yield page.picture(plots_fit.plot_pairs(fit.result), "fit.figure_pairs")
+def _pairs(fit: FitView) -> Iterator[page.Picture]:
+    if has_draws(fit) and len(plots_fit.drawable(fit, material=True)) > 1:
+        yield page.picture(plots_fit.plot_pairs(fit), "fit.figure_pairs")
 
 
-def _prior(fit: Fit) -> Iterator[page.Block]:
+def _prior(fit: FitView) -> Iterator[page.Block]:
     if fit.method == "point":
         return
-    if fit.has_draws and "prior" in fit.result.children:
-        yield page.picture(plots_fit.plot_prior_posterior(fit.result), "fit.figure_prior")
+    if has_draws(fit) and "prior" in fit.result.children:
+        yield page.picture(plots_fit.plot_prior_posterior(fit), "fit.figure_prior")
     yield sensitivity_table(fit)
 
 
@@ -279,7 +248,7 @@ def _scenes(result: xr.DataTree) -> Iterator[page.Block]:
     yield page.make_table("scene", caption, cells, table, label="scene", prose=["criticism"])
 
 
-def _criticism(fit: Fit) -> Iterator[page.Block]:
+def _criticism(fit: FitView) -> Iterator[page.Block]:
     """The checks of the model, unless there is nothing to check."""
     if fit.method == "point":
         return
@@ -295,7 +264,7 @@ def _criticism(fit: Fit) -> Iterator[page.Block]:
         "criticism",
         caption,
         cells,
-        fit.criticism,
+        criticize(fit),
         label="check",
         descriptions=QUESTIONS,
         prose=["what it says"],
@@ -303,10 +272,10 @@ def _criticism(fit: Fit) -> Iterator[page.Block]:
     yield from _alternatives(fit)
 
 
-def _alternatives(fit: Fit) -> Iterator[page.Block]:
+def _alternatives(fit: FitView) -> Iterator[page.Block]:
     """What the answer assumes, where a part of the scene has an alternative."""
     try:
-        table = alternatives(fit.result)
+        table = alternatives(fit)
     except FitError:  # the check says why
         return
     if table.empty:
@@ -326,29 +295,30 @@ def _alternatives(fit: Fit) -> Iterator[page.Block]:
 # --- Populations and spectra ----------------------------------------------------------------------
 
 
-def _population(fit: Fit, summary: pd.DataFrame, pooled: Sequence[Population]) -> list[page.Block]:
+def _population(fit: FitView) -> list[page.Block]:
     """What the members of each population have in common, where anything is pooled."""
+    summary, pooled = population_summary(fit), populations(fit)
     if not pooled:
         return []
-    members = shrinkage(fit.result)
     drawn = [each.label for each in pooled if math.isfinite(summary.loc[each.label, "pooling"])]
     pictures: list[page.Block] = []
     for label in drawn[:MAX_POPULATIONS]:
-        figure = plots_fit.plot_shrinkage(fit.result, label, summary, members)
+        figure = plots_fit.plot_shrinkage(fit, label)
         instead = "The same." if pictures else ""
         pictures.append(page.picture(figure, "fit.figure_shrinkage", instead=instead, label=label))
     more = len(drawn) - MAX_POPULATIONS
     return [
-        *(text.pooling(summary, pooled, fit.posterior) if fit.verdict.passed else []),
-        population_table(summary, pooled),
+        *(text.pooling(fit) if convergence.verdict(fit).passed else []),
+        population_table(fit),
         *pictures,
         *([f"{more} more populations are in the table only."] if more > 0 else []),
-        page.Details("Every member in numbers", (member_table(fit.result, members, pooled),)),
+        page.Details("Every member in numbers", (member_table(fit),)),
     ]
 
 
-def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> Table:
+def population_table(fit: FitView) -> Table:
     """Location, spread and the range of a new member, for every pooled parameter."""
+    summary = population_summary(fit)
 
     def with_interval(row: pd.Series, part: str) -> str:
         low, high = row[f"{part}_q2.5"], row[f"{part}_q97.5"]
@@ -366,18 +336,17 @@ def population_table(summary: pd.DataFrame, pooled: Sequence[Population]) -> Tab
     }
     members = {
         each.label: f"{summary.loc[each.label, 'members']} members, {SCALES[each.scale]}"
-        for each in pooled
+        for each in populations(fit)
     }
     caption = page.caption("fit.population")
     return page.make_table("population", caption, cells, summary, descriptions=members)
 
 
-def member_table(result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Population]) -> Table:
+def member_table(fit: FitView) -> Table:
     """Every member of every population, with and without it."""
-    posterior = result["posterior"].to_dataset()
     titles = {
-        scalar.label: parameter_title(scalar, posterior)
-        for each in pooled
+        scalar.label: parameter_title(scalar, fit.posterior)
+        for each in populations(fit)
         for scalar in each.members
     }
 
@@ -391,38 +360,38 @@ def member_table(result: xr.DataTree, members: pd.DataFrame, pooled: Sequence[Po
         "95% alone": lambda row: interval(row["unpooled_q2.5"], row["unpooled_q97.5"], scale(row)),
         "pooled share": lambda row: percent(row["shrinkage"]),
     }
-    data = members.loc[list(titles)]
+    data = shrinkage(fit).loc[list(titles)]
     return page.make_table("member", page.caption("fit.member"), cells, data, descriptions=titles)
 
 
-def _spectrum(fit: Fit) -> Iterator[page.Block]:
-    spectra = plots_curves.spectra(fit.result) if fit.has_draws else {}
+def _spectrum(fit: FitView) -> Iterator[page.Block]:
+    spectra = plots_curves.spectra(fit) if has_draws(fit) else {}
     for name, members in spectra.items():
         key = f"fit.figure_spectrum_{'bands' if members[0].is_band else 'intervals'}"
-        figure = plots_curves.plot_spectrum(fit.result, name, spectra)
+        figure = plots_curves.plot_spectrum(fit, name)
         yield page.picture(figure, key, name=name.replace("_", " ").capitalize())
 
 
 # --- The instrument -------------------------------------------------------------------------------
 
 
-def _without(fit: Fit) -> Iterator[page.Block]:
+def _without(fit: FitView) -> Iterator[page.Block]:
     """Each fit without a part of the instrument, compared with the main one."""
     if fit.method == "point":
         return
     for at, (key, part) in enumerate(WITHOUT.items(), start=1):
-        compared = compare_without(fit.result, key)
+        compared = compare_without(fit, key)
         if compared.empty:
             continue
         yield page.Heading(f"Without {part}")
         yield discrepancy_table(fit, compared, part, f"without-{at}")
-        yield from text.overconfidence(compared, fit.scalars, fit.posterior, part)
+        yield from text.overconfidence(fit, compared, part)
     for key, reason in (fit.provenance.get("comparisons_failed") or {}).items():
         yield page.Heading(f"Without {WITHOUT.get(key.removeprefix('without_'), one_line(key))}")
         yield f"This comparison failed, so nothing is said of it: {one_line(reason)}."
 
 
-def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) -> Table:
+def discrepancy_table(fit: FitView, compared: pd.DataFrame, part: str, name: str) -> Table:
     """The fit of the report next to the same fit without a part of the instrument."""
 
     def scale(row: pd.Series) -> float:
@@ -436,30 +405,30 @@ def discrepancy_table(fit: Fit, compared: pd.DataFrame, part: str, name: str) ->
         "width": lambda row: percent(row["width_ratio"]),
         TRUTH: lambda row: number(row["true_value"], scale(row)),
     }
-    return fit.table(name, page.caption("fit.without", part=part), cells, compared)
+    return fit_table(fit, name, page.caption("fit.without", part=part), cells, compared)
 
 
 # --- Readings and checks --------------------------------------------------------------------------
 
 
-def _readings(fit: Fit) -> Iterator[page.Picture]:
-    result = fit.result
-    key = "fit.figure_readings" if fit.has_draws else "fit.figure_point_readings"
-    for name in plots_curves.variables(result):
+def _readings(fit: FitView) -> Iterator[page.Picture]:
+    key = "fit.figure_readings" if has_draws(fit) else "fit.figure_point_readings"
+    for name in plots_curves.variables(fit):
         quantity = QUANTITIES[name]
-        yield page.picture(plots_curves.plot_readings(result, name), key, quantity=quantity)
+        yield page.picture(plots_curves.plot_readings(fit, name), key, quantity=quantity)
         if name != "intensity":
-            figure = plots_curves.plot_residuals(result, name)
+            figure = plots_curves.plot_residuals(fit, name)
             yield page.picture(figure, "fit.figure_residuals", quantity=quantity)
 
 
-def _checks(fit: Fit) -> Iterator[page.Block]:
+def _checks(fit: FitView) -> Iterator[page.Block]:
+    checks = predictive_checks(fit)
     if fit.method != "point":
-        yield from text.predictive_sentences(fit.checks, fit.criticism)
-    if fit.checks:
-        yield check_table(fit.checks)
-    if any(check.pit.size > 1 for check in fit.checks.values()):
-        yield page.picture(plots_fit.plot_pit(fit.result, fit.checks), "fit.figure_pit")
+        yield from text.predictive_sentences(fit)
+    if checks:
+        yield check_table(checks)
+    if any(check.pit.size > 1 for check in checks.values()):
+        yield page.picture(plots_fit.plot_pit(fit), "fit.figure_pit")
 
 
 def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
@@ -511,16 +480,17 @@ def _coverage_cell(probability: float) -> Callable[[pd.Series], str]:
 # --- The method -----------------------------------------------------------------------------------
 
 
-def _convergence(fit: Fit) -> Iterator[page.Block]:
+def _convergence(fit: FitView) -> Iterator[page.Block]:
     if fit.method == "nuts":
         yield convergence_table(fit)
-    yield from page.make_bullets(auto_sentences(fit.result))
+    if "auto" in fit.provenance:
+        yield from page.make_bullets(auto_sentences(fit.result))
     yield from page.make_facts(_sampler_facts(fit))
-    if fit.method == "nuts" and fit.has_draws:
-        yield page.picture(plots_fit.plot_ranks(fit.result), "fit.figure_ranks")
+    if fit.method == "nuts" and has_draws(fit):
+        yield page.picture(plots_fit.plot_ranks(fit), "fit.figure_ranks")
 
 
-def convergence_table(fit: Fit) -> Table:
+def convergence_table(fit: FitView) -> Table:
     """R-hat, effective sample sizes and Monte Carlo error of every parameter."""
     cells: page.Cells = {
         "R-hat": column("r_hat", ".4f"),
@@ -529,8 +499,8 @@ def convergence_table(fit: Fit) -> Table:
         "error of the mean": column("mcse_mean", ".2g"),
     }
     caption = "Wanted: R-hat at most 1.01 and both effective sample sizes (ESS) at least 400."
-    data = fit.summary[["r_hat", "ess_bulk", "ess_tail", "mcse_mean"]]
-    return fit.table("convergence", caption, cells, data)
+    data = convergence.summary(fit)[["r_hat", "ess_bulk", "ess_tail", "mcse_mean"]]
+    return fit_table(fit, "convergence", caption, cells, data)
 
 
 SAMPLER_FACTS: Mapping[str, tuple[str, Callable[[xr.DataArray], object]]] = {
@@ -547,9 +517,9 @@ SAMPLER_FACTS: Mapping[str, tuple[str, Callable[[xr.DataArray], object]]] = {
 }
 
 
-def _sampler_facts(fit: Fit) -> dict[str, object]:
+def _sampler_facts(fit: FitView) -> dict[str, object]:
     """What the sampler or approximation reports of itself."""
-    stats, modes = stats_of(fit.result), fit.provenance.get("modes") or {}
+    stats, modes = fit.stats, fit.provenance.get("modes") or {}
     facts = {
         title: describe(stats[name])
         for name, (title, describe) in SAMPLER_FACTS.items()
@@ -557,7 +527,7 @@ def _sampler_facts(fit: Fit) -> dict[str, object]:
     }
     k_hat = fit.provenance.get("k_hat")
     if fit.method in APPROXIMATIONS and "log_weight" in stats:
-        k_hat = convergence.laplace_k_hat(fit.result)
+        k_hat = convergence.laplace_k_hat(fit)
     if k_hat is not None:
         facts[f"Pareto k-hat (at most {MAX_PARETO_K})"] = or_dash(k_hat, ".2f")
     if (effective := fit.provenance.get("effective_draws")) is not None:
@@ -592,7 +562,7 @@ def _effects(result: xr.DataTree) -> Iterator[page.Block]:
 def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
     """An accuracy study of the same capture, where the result holds one."""
     if "accuracy" in result.children:
-        study = accuracy_dataset(result)
+        study = accuracy_dataset(result["accuracy"].to_dataset())
         yield " ".join([*accuracy_sentences(study), text.reference_sentence(study)])
         yield accuracy_picture(study)
         yield study_table(study)
@@ -641,3 +611,6 @@ def _counts(counts: Mapping[str, Any]) -> dict[str, Any]:
     margin = counts.get("at_margin") or {}
     found |= {f"{name} at the margin of its link": count for name, count in margin.items()}
     return {name: count for name, count in found.items() if count is not None}
+
+
+REPORT = page.Report(fit_page, fit_card, plot_fit, file="result.nc")

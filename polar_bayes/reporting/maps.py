@@ -221,6 +221,15 @@ MAX_COLUMNS = 4
 """Parameters of one figure: more would be too small to read."""
 
 
+def map_card(result: xr.Dataset) -> page.Card:
+    """The card of a map."""
+    table = parameter_table(result, parameter_titles(map_scalars(result)))
+    counts = count_cases(result)
+    headline, passed = text.map_headline(counts)
+    sentences = [headline, *text.pixel_sentences(counts), *criticism_sentences(result)]
+    return sentences, table, passed
+
+
 def map_page(
     maps: xr.Dataset, truth: xr.Dataset | None = None, uncorrected: xr.Dataset | None = None
 ) -> page.Page:
@@ -495,3 +504,6 @@ def _coverage_cells(table: pd.DataFrame, label: str, claimed: int) -> list[str]:
     known = f"{low.removesuffix('%')}{DASH}{high}" if low != DASH else DASH
     is_low = text.coverage_error(row, claimed) < 0
     return [f"{held} (too few)" if is_low else held, known, of_read]
+
+
+REPORT = page.Report(map_page, map_card, plot_maps, ("truth", "uncorrected"))

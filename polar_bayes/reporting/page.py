@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import importlib.resources
 import io
+import pkgutil
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -20,10 +21,11 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 
-from polar_bayes.errors import one_line
+from polar_bayes.errors import FitError, one_line
 from polar_bayes.paths import check_output, replace_file, temporary_folder, write_errors
 from polar_bayes.reporting.style import FIXED_STYLE
 from polar_bayes.repr_html import Row, Table
+from polar_bayes.results import kind_of
 
 PAGE = "index.html"
 MARK, MARK_BYTES = b'<meta name="generator" content="polar_bayes">', 1024
@@ -34,6 +36,33 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 LONG_TABLE = 40
 """Tables with more rows scroll in a box of their own."""
+
+
+type Card = tuple[list[str], Table, bool]
+"""What `polar_bayes.show` has of a result: sentences, a table, and whether it may be used."""
+
+
+class Report(NamedTuple):
+    """What is reported of a kind of result: page, card, figure, and the file that is saved with it.
+
+    Options are the arguments of the page besides the result.
+    """
+
+    page: Callable[..., "Page"]
+    card: Callable[[Any], Card]
+    plot: Callable[[Any], Figure]
+    options: tuple[str, ...] = ()
+    file: str = ""
+
+
+def report_of(result: object) -> Report:
+    """What is reported of results of this kind."""
+    kind = kind_of(result)
+    if not kind.reports:
+        hint = "polar_bayes.summary has its table"
+        raise FitError(f"a result of kind {kind.name} has no page", where="report", hint=hint)
+    found: Report = pkgutil.resolve_name(f"polar_bayes.reporting.{kind.reports}:REPORT")
+    return found
 
 
 type Cells = Mapping[str, Callable[[pd.Series], str]]

@@ -2,24 +2,15 @@
 
 from typing import Any
 
-import xarray as xr
 from matplotlib.figure import Figure
 
-from polar_bayes.benchmark.advice import is_accuracy
-from polar_bayes.calibration.verdict import is_calibration
 from polar_bayes.diagnostics.compare import FitComparison
-from polar_bayes.diagnostics.parameters import method_of
-from polar_bayes.errors import FitError
 from polar_bayes.reporting.accuracy import plot_accuracy
 from polar_bayes.reporting.comparison import plot_comparison
 from polar_bayes.reporting.maps import plot_maps
+from polar_bayes.reporting.page import report_of
 from polar_bayes.reporting.plots_calibration import plot_calibration
-from polar_bayes.reporting.plots_curves import (
-    plot_readings,
-    plot_residuals,
-    plot_spectrum,
-    variables,
-)
+from polar_bayes.reporting.plots_curves import plot_readings, plot_residuals, plot_spectrum
 from polar_bayes.reporting.plots_fit import (
     plot_pairs,
     plot_pit,
@@ -49,8 +40,8 @@ def plot(result: Any) -> Figure:
     """The main figure of a result.
 
     Args:
-        result: A fit, a map, a calibration, an accuracy study, or what
-            `polar_bayes.diagnostics.compare_fits` returned.
+        result: A fit, a map, a calibration, an accuracy study, several fits by name, or what
+            `polar_bayes.diagnostics.compare_fits` returned of them.
 
     Returns:
         Prior and posterior of a fit, or the readings of a point fit; means and widths of a map;
@@ -61,18 +52,4 @@ def plot(result: Any) -> Figure:
     """
     if isinstance(result, FitComparison):
         return plot_comparison(result)
-    if isinstance(result, xr.Dataset) and "status" in result:
-        return plot_maps(result)
-    if is_accuracy(result):
-        return plot_accuracy(result)
-    if is_calibration(result):
-        return plot_calibration(result)
-    if isinstance(result, xr.DataTree):
-        if method_of(result) == "point":  # it has no draws
-            return plot_readings(result, variables(result)[0])
-        return plot_prior_posterior(result)
-    raise FitError(
-        f"there is no figure of a {type(result).__name__}",
-        where="plot",
-        hint="polar_bayes.summary has the table of every result",
-    )
+    return report_of(result).plot(result)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from polar_bayes.calibration.scores import EcdfBand, ecdf_band, histogram_band, significance_level
-from polar_bayes.calibration.verdict import calibration_scalars, calibration_table
+from polar_bayes.calibration.verdict import CalibrationView, calibration_view
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import style
@@ -62,15 +62,13 @@ class Ranks:
         return bool(self.row["p_value"] >= self.level)
 
 
-def parameter_ranks(
-    calibration: xr.DataTree, table: pd.DataFrame | None = None
-) -> dict[str, Ranks]:
+def parameter_ranks(calibration: xr.DataTree | CalibrationView) -> dict[str, Ranks]:
     """Ranks and estimates of every parameter of a calibration by its label."""
-    table = calibration_table(calibration) if table is None else table
-    truths = {each.label: each.draws[0] for each in calibration_scalars(calibration, "truth")}
-    ranks, marginals = (calibration[name].to_dataset() for name in ("prior_sbc", "marginals"))
+    calibration = calibration_view(calibration)
+    table, tree = calibration.table, calibration.tree
+    ranks, marginals = (tree[name].to_dataset() for name in ("prior_sbc", "marginals"))
     found = {}
-    for scalar in calibration_scalars(calibration, "prior_sbc"):
+    for scalar, truth in calibration.scalars:
         place = dict(scalar.index)
         ends = marginals[f"{scalar.name}_quantile"].isel(place).sel(quantile=list(INTERVALS[80]))
         mean = marginals[scalar.name].isel(place).to_numpy()
@@ -80,7 +78,7 @@ def parameter_ranks(
             pit=scalar.draws[0],
             row=table.loc[scalar.label],
             level=significance_level(table),
-            estimates=np.stack([truths[scalar.label], mean, *ends.transpose("quantile", ...)]),
+            estimates=np.stack([truth, mean, *ends.transpose("quantile", ...)]),
         )
     return found
 
@@ -178,7 +176,7 @@ def estimate_panel(axes: Axes, ranks: Ranks) -> None:
 
 @style.styled
 def plot_calibration(
-    calibration: xr.DataTree, *, parameters: Sequence[str] | None = None
+    calibration: xr.DataTree | CalibrationView, *, parameters: Sequence[str] | None = None
 ) -> Figure:
     """Ranks of the truth, their histogram, and estimates against the truth.
 

@@ -12,18 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from polar_bayes.diagnostics.parameters import (
-    SAMPLE_DIMS,
-    Scalar,
-    is_hyperparameter,
-    method_of,
-    posterior_scalars,
-    scalars,
-    truth_of,
-)
+from polar_bayes.diagnostics.parameters import SAMPLE_DIMS, Scalar, is_hyperparameter, scalars
+from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.errors import FitError
-from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.result import provenance_of
 from polar_bayes.inference.spectrum import predict_spectrum
 from polar_bayes.observation.data import ANGLES
 from polar_bayes.reporting import style
@@ -38,10 +29,10 @@ MAX_ROWS = 6
 COLUMNS = 3
 
 
-def variables(result: xr.DataTree) -> list[str]:
-    """The recorded variables of a result that can be drawn, polarization first."""
-    check_fit(result)
-    return [name for name in QUANTITIES if not _missing(result, name)]
+@once
+def variables(fit: FitView) -> list[str]:
+    """The recorded variables of a fit that can be drawn, polarization first."""
+    return [name for name in QUANTITIES if not _missing(fit.result, name)]
 
 
 def _missing(result: xr.DataTree, name: str) -> str:
@@ -54,11 +45,12 @@ def _missing(result: xr.DataTree, name: str) -> str:
     return "" if result["observed_data"].to_dataset()[name].sizes.get("view") else "view"
 
 
-def curves(result: xr.DataTree, name: str) -> list[xr.Dataset]:
+def curves(fit: FitView, name: str) -> list[xr.Dataset]:
     """One recorded variable and its prediction by view, for each material and wavelength."""
-    if name not in variables(result):
+    result = fit.result
+    if name not in variables(fit):
         lacks = f", for it has no {_missing(result, name)}" if name in QUANTITIES else ""
-        hint = f"choose one of {', '.join(variables(result)) or 'none'}"
+        hint = f"choose one of {', '.join(variables(fit)) or 'none'}"
         what = f"the result has no readings of {name} to draw{lacks}"
         raise FitError(what, where="figure", hint=hint)
     observed = result["observed_data"].to_dataset()[name].astype(float)
@@ -112,7 +104,7 @@ def _is_smooth(curve: xr.Dataset) -> bool:
 
 
 @style.styled
-def plot_readings(result: xr.DataTree, name: str) -> Figure:
+def plot_readings(result: xr.DataTree | FitView, name: str) -> Figure:
     """One recorded variable against view zenith, with posterior median and predictive bands.
 
     With 2 to 4 azimuths between view and light: a row for every material and wavelength (at most
@@ -128,7 +120,8 @@ def plot_readings(result: xr.DataTree, name: str) -> Figure:
     Raises:
         FitError: The result has no such variable.
     """
-    figure = _draw_readings(result, curves(result, name), QUANTITIES[name], SHORT[name])
+    fit = view_of(result)
+    figure = _draw_readings(fit, curves(fit, name), QUANTITIES[name], SHORT[name])
     if name == "dop":
         bottom, top = figure.axes[0].get_ylim()
         figure.axes[0].set_ylim(max(bottom, -0.03), min(top, 1.03))
@@ -136,7 +129,7 @@ def plot_readings(result: xr.DataTree, name: str) -> Figure:
 
 
 @style.styled
-def plot_residuals(result: xr.DataTree, name: str) -> Figure:
+def plot_residuals(result: xr.DataTree | FitView, name: str) -> Figure:
     """The same after subtracting the fitted curve: where the model misses, and by how much.
 
     Args:
@@ -149,14 +142,13 @@ def plot_residuals(result: xr.DataTree, name: str) -> Figure:
     Raises:
         FitError: The result has no such variable.
     """
-    residuals = [minus_center(curve) for curve in curves(result, name)]
+    fit = view_of(result)
+    residuals = [minus_center(curve) for curve in curves(fit, name)]
     label = f"{SHORT[name]} minus fit"
-    return _draw_readings(result, residuals, label, label)
+    return _draw_readings(fit, residuals, label, label)
 
 
-def _draw_readings(
-    result: xr.DataTree, found: list[xr.Dataset], label: str, short_label: str
-) -> Figure:
+def _draw_readings(fit: FitView, found: list[xr.Dataset], label: str, short_label: str) -> Figure:
     azimuths = _azimuths(found)
     if len(azimuths) > 1:
         shown = found[:MAX_ROWS]
@@ -164,7 +156,7 @@ def _draw_readings(
     else:
         shown = found[: MAX_ROWS // 2 * COLUMNS]
         figure, panels = _panels_by_curve(shown, label)
-    limit = float(provenance_of(result).get("largest_view_zenith", 90.0))
+    limit = float(fit.provenance.get("largest_view_zenith", 90.0))
     drawn: set[str] = set()
     for axes, curve in panels:
         drawn |= _draw_curve(axes, curve, limit)
@@ -326,27 +318,27 @@ class Spectrum:
         return self.at is not self.measured
 
 
-def spectra(result: xr.DataTree) -> dict[str, list[Spectrum]]:
+@once
+def spectra(fit: FitView) -> dict[str, list[Spectrum]]:
     """Each parameter of a fit over wavelength, of at most 12 members."""
-    every = posterior_scalars(result)
-    names = {scalar.name for scalar in every}
+    names = {scalar.name for scalar in fit.scalars}
     found: dict[str, dict[str, list[Scalar]]] = {}
-    for scalar in every:
+    for scalar in fit.scalars:
         if "wavelength" in scalar.index and not is_hyperparameter(scalar.name, names):
             labels = {dim: at for dim, at in scalar.labels.items() if dim != "wavelength"}
             member = ", ".join(style.coordinate_label(dim, at) for dim, at in labels.items())
             found.setdefault(scalar.name, {}).setdefault(member, []).append(scalar)
     found = {name: members for name, members in found.items() if _can_be_drawn(members)}
-    if not found or method_of(result) == "point":
+    if not found or fit.method == "point":
         return {}
-    wavelengths = result["posterior"].to_dataset()["wavelength"].to_numpy().astype(float)
+    wavelengths = fit.posterior["wavelength"].to_numpy().astype(float)
     low, high = wavelengths.min(), wavelengths.max()
     beyond = min(BEYOND * (high - low), 0.5 * low)
     between = np.union1d(np.linspace(low - beyond, high + beyond, FINE), wavelengths)
-    bands = _bands(result, between)
+    bands = _bands(fit, between)
     return {
         name: [
-            _spectrum(result, title, own, between, bands.get(name, {}).get(at))
+            _spectrum(fit, title, own, between, bands.get(name, {}).get(at))
             for at, (title, own) in enumerate(list(members.items())[:MAX_MEMBERS])
         ]
         for name, members in found.items()
@@ -362,9 +354,9 @@ def _can_be_drawn(members: Mapping[str, Sequence[Scalar]]) -> bool:
     )
 
 
-def _bands(result: xr.DataTree, between: np.ndarray) -> dict[str, dict[int, np.ndarray]]:
+def _bands(fit: FitView, between: np.ndarray) -> dict[str, dict[int, np.ndarray]]:
     """Quantiles between the measured wavelengths, by parameter and number of the member."""
-    posterior = result["posterior"].to_dataset()
+    result, posterior = fit.result, fit.posterior
     step = max(1, posterior.sizes["chain"] * posterior.sizes["draw"] // MAX_DRAWS)
     chosen = {"draw": slice(None, None, step)}
     lead = [str(d) for d in posterior.dims if d in ("patch", "material")]
@@ -393,28 +385,27 @@ def _bands(result: xr.DataTree, between: np.ndarray) -> dict[str, dict[int, np.n
 
 
 def _spectrum(
-    result: xr.DataTree,
+    fit: FitView,
     title: str,
     own: Sequence[Scalar],
     between: np.ndarray,
     band: np.ndarray | None,
 ) -> Spectrum:
-    posterior = result["posterior"].to_dataset()
-    measured = posterior["wavelength"].to_numpy().astype(float)
+    measured = fit.posterior["wavelength"].to_numpy().astype(float)
     order = np.argsort(measured, kind="stable")
     measured, own = measured[order], [own[i] for i in order]
     at, levels = between, band
     if levels is None or not np.isfinite(levels).all():
         draws = np.stack([scalar.draws.ravel() for scalar in own])
         at, levels = measured, np.quantile(draws, LEVELS, axis=1)
-    label = style.short_title(own[0], posterior)
-    true = np.array([truth_of(result, scalar) for scalar in own])
+    label = style.short_title(own[0], fit.posterior)
+    true = np.array([fit.truth(scalar) for scalar in own])
     return Spectrum(style.label_text(title), label, measured, true, at, levels)
 
 
 @style.styled
 def plot_spectrum(
-    result: xr.DataTree, name: str, found: dict[str, list[Spectrum]] | None = None
+    result: xr.DataTree | FitView, name: str, found: dict[str, list[Spectrum]] | None = None
 ) -> Figure:
     """One parameter over wavelength: median, 50% and 95%, a panel for each member.
 
@@ -430,7 +421,8 @@ def plot_spectrum(
     Raises:
         FitError: The fit does not have that parameter over wavelength.
     """
-    found = spectra(result) if found is None else found
+    fit = view_of(result)
+    found = spectra(fit) if found is None else found
     if name not in found:
         hint = f"choose one of {', '.join(found) or 'none'}"
         what = f"{name} was not fitted over wavelength"
@@ -450,7 +442,7 @@ def plot_spectrum(
         axes.set_ylim(low, high)
         axes.locator_params(axis="x", nbins=5)
     style.set_tick_style(panels)
-    sizes = result["posterior"][name].sizes
+    sizes = fit.posterior[name].sizes
     total = np.prod([sizes[dim] for dim in sizes if dim not in (*SAMPLE_DIMS, "wavelength")])
     part = f" (the first {len(shown)} of {int(total)})" if total > len(shown) else ""
     figure.supxlabel(f"wavelength [nm]{part}", fontsize=9)

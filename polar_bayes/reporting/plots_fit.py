@@ -14,14 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
 
-from polar_bayes.diagnostics.parameters import (
-    Scalar,
-    is_hyperparameter,
-    posterior_scalars,
-    scalars,
-    stats_of,
-    truth_of,
-)
+from polar_bayes.diagnostics.parameters import Scalar, is_hyperparameter
 from polar_bayes.diagnostics.population import (
     Population,
     population_summary,
@@ -29,6 +22,7 @@ from polar_bayes.diagnostics.population import (
     shrinkage,
 )
 from polar_bayes.diagnostics.predictive import PredictiveCheck, pit_band, predictive_checks
+from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import style
 from polar_bayes.reporting.style import (
@@ -50,11 +44,12 @@ RANK_BINS = 20
 MINUS = "\N{MINUS SIGN}"
 
 
-def drawable(result: xr.DataTree, *, material: bool = False) -> list[Scalar]:
+@once
+def drawable(fit: FitView, *, material: bool = False) -> list[Scalar]:
     """The parameters that figures show: single numbers that are finite and move."""
     found = [
         scalar
-        for scalar in posterior_scalars(result)
+        for scalar in fit.scalars
         if np.isfinite(scalar.draws).all()
         and np.ptp(scalar.draws) > 0.0
         and (scalar.is_material or not material)
@@ -70,7 +65,7 @@ def _first_material_first(scalar: Scalar) -> tuple[bool, list[int]]:
 
 
 @style.styled
-def plot_pairs(result: xr.DataTree) -> Figure:
+def plot_pairs(result: xr.DataTree | FitView) -> Figure:
     """Joint draws of the material parameters (the first material, at most 8), and correlations.
 
     Args:
@@ -82,23 +77,22 @@ def plot_pairs(result: xr.DataTree) -> Figure:
     Raises:
         FitError: Fewer than two material parameters have draws.
     """
-    found = drawable(result, material=True)
+    fit = view_of(result)
+    found = drawable(fit, material=True)
     found = [s for s in found if _first_material_first(s) == _first_material_first(found[0])]
     found = found[:MAX_PAIRED]
     if len(found) < 2:
         raise _nothing_to_draw("plot_pairs", "two material parameters with draws")
-    posterior = result["posterior"].to_dataset()
-    titles = [parameter_title(scalar, posterior).split(", ") for scalar in found]
+    titles = [parameter_title(scalar, fit.posterior).split(", ") for scalar in found]
     labels = ["\n".join(style.wrap(part, 19) for part in title) for title in titles]
     size = len(found)
     figure, panels = _pair_panels(size, lines=max(label.count("\n") for label in labels) + 1)
     draws = np.stack([scalar.draws.ravel() for scalar in found])
     shown = np.linspace(0, draws.shape[1] - 1, min(MAX_POINTS, draws.shape[1])).astype(int)
-    flags = stats_of(result).get("diverging", np.empty(0))
-    diverging = np.flatnonzero(np.asarray(flags))
+    diverging = np.flatnonzero(np.asarray(fit.stats.get("diverging", np.empty(0))))
     correlation = np.corrcoef(draws)
     limits = [style.padded_range(values, 0.04) for values in draws]
-    truths = [truth_of(result, scalar) for scalar in found]
+    truths = [fit.truth(scalar) for scalar in found]
     for row in range(size):
         for column in range(size):
             axes = panels[row, column]
@@ -128,7 +122,7 @@ def plot_pairs(result: xr.DataTree) -> Figure:
 
 
 @style.styled
-def plot_ranks(result: xr.DataTree) -> Figure:
+def plot_ranks(result: xr.DataTree | FitView) -> Figure:
     """How each chain's draws rank among all draws: flat and overlapping lines are good.
 
     Args:
@@ -140,13 +134,13 @@ def plot_ranks(result: xr.DataTree) -> Figure:
     Raises:
         FitError: There is one chain only, or no parameter moves.
     """
-    found = drawable(result)
+    fit = view_of(result)
+    found = drawable(fit)
     if not found or found[0].draws.shape[0] < 2:
         raise _nothing_to_draw("plot_ranks", "two chains")
     r_hat = array_stats.rhat(np.stack([scalar.draws for scalar in found]))
     worst = np.sort(np.argsort(-r_hat, kind="stable")[:MAX_PANELS])
     found = [found[i] for i in worst]
-    posterior = result["posterior"].to_dataset()
     figure, panels = style.grid(len(found), panel_height=1.35, header=0.5)
     chains, length = found[0].draws.shape
     edges = np.linspace(0.0, 1.0, RANK_BINS + 1)
@@ -158,7 +152,7 @@ def plot_ranks(result: xr.DataTree) -> Figure:
             axes.stairs(share, edges, color=color, lw=1.1, baseline=None)
         axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
         axes.set(xlim=(0, 1), ylim=(0, max(2.0, axes.get_ylim()[1])), xticks=[0, 0.5, 1])
-        style.set_panel_title(axes, parameter_title(scalar, posterior))
+        style.set_panel_title(axes, parameter_title(scalar, fit.posterior))
     style.set_tick_style(panels)
     figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)", fontsize=9)
     figure.supylabel("density", fontsize=9)
@@ -171,7 +165,7 @@ def plot_ranks(result: xr.DataTree) -> Figure:
 
 
 @style.styled
-def plot_prior_posterior(result: xr.DataTree) -> Figure:
+def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
     """Prior against posterior: what the data added.
 
     Args:
@@ -185,22 +179,19 @@ def plot_prior_posterior(result: xr.DataTree) -> Figure:
     Raises:
         FitError: The tree holds no prior, or no parameter moves.
     """
-    found, before = drawable(result), {}
-    if "prior" in result.children:
-        before = {s.label: s.draws for s in scalars(result["prior"].to_dataset())}
-    found = [scalar for scalar in found if scalar.label in before]
+    fit = view_of(result)
+    found = [scalar for scalar in drawable(fit) if scalar.label in fit.prior]
     if not found:
         raise _nothing_to_draw("plot_prior_posterior", "draws of the prior")
-    posterior = result["posterior"].to_dataset()
     # Populations and processes, which concern all members, before the first members.
-    names = set(map(str, posterior.data_vars))
+    names = set(map(str, fit.posterior.data_vars))
     common = [s for s in found if is_hyperparameter(s.name, names)][: MAX_PANELS // 2]
     own = [s for s in found if not is_hyperparameter(s.name, names)]
     found = [*common, *own][:MAX_PANELS]
     figure, panels = style.grid(len(found), panel_height=1.5, header=0.5)
     any_truth = False
     for axes, scalar in zip(panels, found, strict=True):
-        prior, draws = before[scalar.label].ravel(), scalar.draws.ravel()
+        prior, draws = fit.prior[scalar.label].draws.ravel(), scalar.draws.ravel()
         values = np.concatenate([np.quantile(prior, [0.01, 0.99]), draws])
         limits = style.padded_range(values, 0.04)
         _scaled_histogram(axes, prior, limits, GRAY, 0.72)
@@ -208,14 +199,14 @@ def plot_prior_posterior(result: xr.DataTree) -> Figure:
         low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
         axes.plot([low, high], [-0.09, -0.09], color=BLUE, lw=3, solid_capstyle="butt")
         axes.plot([middle], [-0.09], "|", color=style.text_color(), ms=8)
-        true = truth_of(result, scalar)
+        true = fit.truth(scalar)
         if np.isfinite(true):
             any_truth = True
             axes.axvline(true, color=ORANGE, lw=1.6, ls="--")
         axes.set(xlim=limits, ylim=(-0.18, 1.08), yticks=[])
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
-        style.set_panel_title(axes, parameter_title(scalar, posterior))
+        style.set_panel_title(axes, parameter_title(scalar, fit.posterior))
     style.set_tick_style(panels)
     handles: list[Patch | Line2D] = [
         Patch(color=lighten(GRAY, 0.72), label="prior"),
@@ -229,7 +220,9 @@ def plot_prior_posterior(result: xr.DataTree) -> Figure:
 
 
 @style.styled
-def plot_pit(result: xr.DataTree, checks: dict[str, PredictiveCheck] | None = None) -> Figure:
+def plot_pit(
+    result: xr.DataTree | FitView, checks: dict[str, PredictiveCheck] | None = None
+) -> Figure:
     """PIT and leave-one-out PIT of every variable: distance from the uniform distribution.
 
     Args:
@@ -347,7 +340,7 @@ LOGARITHMIC = 15.0
 
 @style.styled
 def plot_shrinkage(
-    result: xr.DataTree,
+    result: xr.DataTree | FitView,
     label: str,
     summary: pd.DataFrame | None = None,
     members: pd.DataFrame | None = None,
@@ -366,9 +359,10 @@ def plot_shrinkage(
     Raises:
         FitError: The result has no such population, or its draws are not finite.
     """
-    summary = population_summary(result) if summary is None else summary
-    members = shrinkage(result) if members is None else members
-    found = {each.label: each for each in populations(result)}
+    fit = view_of(result)
+    summary = population_summary(fit) if summary is None else summary
+    members = shrinkage(fit) if members is None else members
+    found = {each.label: each for each in populations(fit)}
     if label not in found or label not in summary.index:
         hint = f"choose one of {', '.join(summary.index) or 'none'}"
         what = f"{label!r} is no pooled parameter"
@@ -378,7 +372,7 @@ def plot_shrinkage(
     if not np.isfinite(rows["mean"]).all():
         what = "its draws are not finite on the population's scale"
         raise FitError(what, where=f"plot_shrinkage: {label}", hint="see the verdict")
-    rows["true"] = [truth_of(result, scalar) for scalar in population.members]
+    rows["true"] = [fit.truth(scalar) for scalar in population.members]
     rows["name"] = [_member_name(scalar, population) for scalar in population.members]
     rows = rows.sort_values("mean", kind="stable", ignore_index=True)
     count = len(rows)
@@ -398,7 +392,7 @@ def plot_shrinkage(
     axes.set_ylim(-0.7, len(rows) - 0.3)
     axes.set_yticks(range(len(rows)), list(rows["name"]))
     axes.spines["left"].set_visible(False)
-    names = [style.short_title(population.members[0], result["posterior"].to_dataset())]
+    names = [style.short_title(population.members[0], fit.posterior)]
     names += map(style.label_text, style.coordinate_labels(population.location))
     part = f" ({len(rows)} of {count}, evenly from low to high)" if count > len(rows) else ""
     axes.set_xlabel(", ".join(names) + part)

@@ -6,34 +6,25 @@ import inspect
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
 
-from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences, is_accuracy
-from polar_bayes.calibration.verdict import calibration_table, calibration_verdict, is_calibration
 from polar_bayes.capture import plausibility
 from polar_bayes.capture.schema import validate
-from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.errors import FitError
 from polar_bayes.expressions import short_text
 from polar_bayes.inference.result import PROVENANCE, provenance_of
-from polar_bayes.maps.lazy import criticism_sentences
 from polar_bayes.observation.data import ANGLES
 from polar_bayes.paths import as_path
 from polar_bayes.priors import describe_prior, prior_card
-from polar_bayes.reporting import maps, text
-from polar_bayes.reporting.accuracy import accuracy_page, study_table
-from polar_bayes.reporting.calibration_page import calibration_page, rank_table
-from polar_bayes.reporting.comparison import comparison_page
-from polar_bayes.reporting.fit_page import fit_page, parameter_table, read_fit
-from polar_bayes.reporting.page import Page, write_page
-from polar_bayes.reporting.plots_calibration import parameter_ranks
+from polar_bayes.reporting import text
+from polar_bayes.reporting.page import report_of, write_page
 from polar_bayes.reporting.style import in_default_style
 from polar_bayes.repr_html import DisplaySummary, HTMLRepr, Row, Table
-from polar_bayes.results import save, summary, verdict
+from polar_bayes.results import kind_of, save, summary, verdict
 
 MAX_ROWS = 40
 """Rows of a table in a notebook or a terminal."""
@@ -87,20 +78,20 @@ def report(
     folder = as_path(directory, "report")
     page = render(result, truth=truth, uncorrected=uncorrected, comparisons=comparisons)
     files = {}
-    if file := _kind_of(result).file:
+    if file := report_of(result).file:
         files[file] = functools.partial(save, cast(xr.DataTree, result))
     return write_page(folder, page, files)
 
 
 def render(result: Any, **options: Any) -> str:
     """The report as HTML; options that are None are left out."""
-    kind = _kind_of(result)
+    own = report_of(result)
     given = {name: value for name, value in options.items() if value is not None}
     for name in given:
-        if name not in kind.options:
-            owner = next(each.title for each in KINDS if name in each.options)
-            raise FitError(f"it goes with {owner}s only", where=f"report: {name}", hint=HINTS[name])
-    return kind.page(result, **given).html
+        if name not in own.options:
+            owner = "calibrations" if name == "comparisons" else "maps"
+            raise FitError(f"it goes with {owner} only", where=f"report: {name}", hint=HINTS[name])
+    return own.page(result, **given).html
 
 
 def show(result: Any) -> DisplaySummary:
@@ -123,54 +114,15 @@ def show(result: Any) -> DisplaySummary:
 
 def _result_card(result: Any) -> DisplaySummary:
     """The card of a result."""
-    kind = _kind_of(result)
-    sentences, table, passed = kind.card(result)
+    kind = kind_of(result)
+    if not kind.reports:
+        return _described_card(result)
+    sentences, table, passed = report_of(result).card(result)
     total = len(table.rows)
     more = f"The first {MAX_ROWS} of {total} rows." if total > MAX_ROWS else ""
-    title = f"{text.capture_name(provenance_of(result))}: {kind.title}"
+    title = f"{text.capture_name(provenance_of(result))}: {kind.name}"
     lines = tuple(filter(None, [*sentences, more]))
     return DisplaySummary(title, lines, (table.first(MAX_ROWS),), passed)
-
-
-# --- Cards ----------------------------------------------------------------------------------------
-
-type Card = tuple[list[str], Table, bool]
-"""Sentences, a table, and whether the numbers may be used."""
-
-
-def _fit_card(result: xr.DataTree) -> Card:
-    fit = read_fit(result)
-    sentences = [
-        fit.headline(),
-        *fit.verdict.problems,
-        *fit.determined(),
-        fit.verdict.nothing_against,
-        *text.notes(fit.verdict),
-        *(f"Caution: {caution}" for caution in fit.verdict.cautions),
-        text.swapped_sentence(fit.provenance),
-    ]
-    return sentences, parameter_table(fit), fit.verdict.passed
-
-
-def _map_card(result: xr.Dataset) -> Card:
-    table = maps.parameter_table(result, maps.parameter_titles(map_scalars(result)))
-    counts = maps.count_cases(result)
-    headline, passed = text.map_headline(counts)
-    sentences = [headline, *text.pixel_sentences(counts), *criticism_sentences(result)]
-    return sentences, table, passed
-
-
-def _calibration_card(calibration: xr.DataTree) -> Card:
-    table = calibration_table(calibration)
-    _, passed = text.calibration_headline(table, None)
-    ranks = parameter_ranks(calibration, table)
-    return calibration_verdict(calibration), rank_table(table, ranks), passed
-
-
-def _accuracy_card(result: xr.DataTree) -> Card:
-    study = accuracy_dataset(result)
-    sentences = [*accuracy_sentences(study), text.reference_sentence(study)]
-    return sentences, study_table(study), not study.attrs["reference_doubts"]
 
 
 # --- Cards of what goes into a fit ----------------------------------------------------------------
@@ -238,49 +190,5 @@ VALUES: tuple[tuple[Callable[[Any], bool], Callable[[Any], DisplaySummary]], ...
     (_is_capture, _capture_card),
     (lambda value: isinstance(value, HTMLRepr), _value_card),
     (_are_priors, prior_card),
-    (lambda value: isinstance(value, xr.Dataset) and "status" not in value, _described_card),
 )
-"""Cards of what is not reported on a page, in the order in which they are tried."""
-
-
-# --- Kinds of results -----------------------------------------------------------------------------
-
-
-class Kind(NamedTuple):
-    """What is reported of a kind of result: page, card, options, and file in the folder."""
-
-    title: str
-    applies: Callable[[Any], bool]
-    page: Callable[..., Page]
-    card: Callable[[Any], Card] = _fit_card
-    options: tuple[str, ...] = ()
-    file: str = ""
-
-
-def _is_map(result: Any) -> bool:
-    return isinstance(result, xr.Dataset)
-
-
-def _is_several_fits(result: Any) -> bool:
-    return isinstance(result, Mapping) and not isinstance(result, xr.DataTree)
-
-
-KINDS = (
-    Kind("map", _is_map, maps.map_page, _map_card, ("truth", "uncorrected")),
-    Kind("several fits", _is_several_fits, comparison_page),
-    Kind("accuracy", is_accuracy, accuracy_page, _accuracy_card, file="accuracy.nc"),
-    Kind(
-        "calibration",
-        is_calibration,
-        calibration_page,
-        _calibration_card,
-        ("comparisons",),
-        "calibration.nc",
-    ),
-    Kind("fit", lambda result: True, fit_page, file="result.nc"),
-)
-"""In the order in which they are tried; everything else is taken as a fit, which refuses it."""
-
-
-def _kind_of(result: Any) -> Kind:
-    return next(kind for kind in KINDS if kind.applies(result))
+"""Cards of what is no result, in the order in which they are tried."""

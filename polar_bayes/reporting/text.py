@@ -15,12 +15,16 @@ import xarray as xr
 
 from polar_bayes.benchmark.advice import accuracy_dataset
 from polar_bayes.calibration.scores import is_calibrated, p_values, significance_level
-from polar_bayes.calibration.verdict import calibration_verdict
+from polar_bayes.calibration.verdict import CalibrationView, calibration_verdict
+from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import FitComparison
 from polar_bayes.diagnostics.convergence import Verdict
+from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.diagnostics.parameters import Scalar
-from polar_bayes.diagnostics.population import Population
-from polar_bayes.diagnostics.predictive import PredictiveCheck
+from polar_bayes.diagnostics.population import Population, population_summary, populations
+from polar_bayes.diagnostics.predictive import predictive_checks
+from polar_bayes.diagnostics.sensitivity import sensitivity
+from polar_bayes.diagnostics.view import FitView
 from polar_bayes.errors import one_line
 from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.inference.psis import MAX_PARETO_K
@@ -137,8 +141,9 @@ HALF = 0.5
 HELD, PRIOR = " held fixed", "prior of "
 
 
-def fit_headline(method: str, verdict: Verdict) -> str:
+def fit_headline(fit: FitView) -> str:
     """The verdict in one sentence."""
+    method, verdict = fit.method, convergence.verdict(fit)
     name = METHODS[method].subject if method in METHODS else "The method"
     if not verdict.converged:
         failed = "did not converge" if method == "nuts" else "failed"
@@ -177,8 +182,11 @@ def swapped_sentence(provenance: Mapping[str, Any]) -> str:
     return " ".join(sentences) or "Nothing was swapped: all parts and priors are as shipped."
 
 
-def determined(scalars: Sequence[Scalar], prior: pd.DataFrame, posterior: xr.Dataset) -> list[str]:
-    """Which material parameters the data determine, and which they do not."""
+def determined(fit: FitView) -> list[str]:
+    """Which material parameters the data determine; nothing of a fit that failed."""
+    if not convergence.verdict(fit).passed:
+        return []
+    judgement = sensitivity(fit)["verdict"]
     phrases = {
         "determined": "The data determine {}.",
         "partly": "The data determine only in part: {}. There the prior still matters.",
@@ -187,27 +195,21 @@ def determined(scalars: Sequence[Scalar], prior: pd.DataFrame, posterior: xr.Dat
     }
     sentences = []
     for judged, phrase in phrases.items():
-        group = [
-            scalar
-            for scalar in scalars
-            if scalar.is_material
-            and scalar.label in prior.index
-            and prior.loc[scalar.label, "verdict"] == judged
-        ]
+        found = judgement.index[judgement == judged]
+        group = [scalar for scalar in fit.scalars if scalar.is_material and scalar.label in found]
         if group:
-            sentences.append(phrase.format(parameter_names(group, posterior)))
+            sentences.append(phrase.format(parameter_names(group, fit.posterior)))
     return sentences
 
 
-def between_members(
-    summary: pd.DataFrame, populations: Sequence[Population], posterior: xr.Dataset
-) -> list[str]:
+def between_members(fit: FitView) -> list[str]:
     """How much the members of each population differ, and where a new one would lie."""
+    summary = population_summary(fit)
     groups: dict[str, list[Population]] = {}
-    for each in populations:
+    for each in populations(fit):
         if np.isfinite(summary.loc[each.label, "between"]):
             groups.setdefault(each.name, []).append(each)
-    return [_between(summary, group, posterior) for group in groups.values()]
+    return [_between(summary, group, fit.posterior) for group in groups.values()]
 
 
 def _between(summary: pd.DataFrame, group: Sequence[Population], posterior: xr.Dataset) -> str:
@@ -233,15 +235,14 @@ def _between(summary: pd.DataFrame, group: Sequence[Population], posterior: xr.D
     )
 
 
-def pooling(
-    summary: pd.DataFrame, populations: Sequence[Population], posterior: xr.Dataset
-) -> list[str]:
+def pooling(fit: FitView) -> list[str]:
     """Whether the readings of a member or its population decide, population by population."""
+    summary = population_summary(fit)
     groups: dict[bool, list[str]] = {}
-    for each in populations:
+    for each in populations(fit):
         factor = summary.loc[each.label, "pooling"]
         if np.isfinite(factor):
-            names = [short_title(each.members[0], posterior), *coordinate_labels(each.location)]
+            names = [short_title(each.members[0], fit.posterior), *coordinate_labels(each.location)]
             name = f"{', '.join(names)} ({factor:.2f})"
             groups.setdefault(bool(factor > HALF), []).append(name)
     phrases = {
@@ -274,18 +275,16 @@ def _coordinates(group: Sequence[Scalar], posterior: xr.Dataset) -> str:
     return f" ({'; '.join(places[:MAX_NAMED])}{more})"
 
 
-def predictive_sentences(
-    checks: Mapping[str, PredictiveCheck], criticism: pd.DataFrame
-) -> list[str]:
+def predictive_sentences(fit: FitView) -> list[str]:
     """Whether readings scatter about their predictions as the model says, by its one check."""
-    check = criticism.loc["leave-one-out"]
+    check = criticize(fit).loc["leave-one-out"]
     sentences = [str(check["sentence"])] if check["sentence"] else []
     if check["level"] == "passed" and math.isfinite(check["p_value"]):
         sentences.append(
             "The readings are distributed as the model expects (the check leave-one-out, "
             f"p = {check['p_value']:.2g})."
         )
-    for each in checks.values():
+    for each in predictive_checks(fit).values():
         if each.loo and each.loo.unreliable:
             effect = (
                 "leave-one-out cannot be approximated with these draws, so its results on this "
@@ -301,17 +300,12 @@ def predictive_sentences(
     return sentences
 
 
-def index_sentences(fit: Any, quantity: str = "refractive_index") -> list[str]:
-    """What is the refractive index, in a sentence; of many, the range of them.
-
-    Args:
-        fit: The `Fit` of a page.
-        quantity: The parameter.
-    """
-    found = [scalar for scalar in fit.scalars if scalar.name == quantity]
+def index_sentences(fit: FitView) -> list[str]:
+    """What is the refractive index, in a sentence; of many, the range of them."""
+    found = [scalar for scalar in fit.scalars if scalar.name == "refractive_index"]
     if not found or fit.method == "point":
         return []
-    rows = fit.summary.loc[[scalar.label for scalar in found]]
+    rows = convergence.summary(fit).loc[[scalar.label for scalar in found]]
     ends = [interval(row["q2.5"], row["q97.5"]) for _, row in rows.iterrows()]
     if len(found) > SEVERAL:
         low, high = numbers([rows["mean"].min(), rows["mean"].max()], rows["sd"].median())
@@ -350,9 +344,10 @@ def next_sentence(result: xr.DataTree) -> str:
     return f"{views}: the 95% intervals{of} are expected to narrow by {by}."
 
 
-def trust(method: str, verdict: Verdict) -> str:
+def trust(fit: FitView) -> str:
     """Whether the intervals can be trusted, as far as one fit can tell."""
-    if method == "point":
+    verdict = convergence.verdict(fit)
+    if fit.method == "point":
         return (
             "The standard errors are those of least squares: they include no prior and no bounds, "
             "so do not read them as intervals."
@@ -370,11 +365,10 @@ def notes(verdict: Verdict) -> list[str]:
     return [f"Note: {finding}" for finding in verdict.findings]
 
 
-def overconfidence(
-    compared: pd.DataFrame, scalars: Sequence[Scalar], posterior: xr.Dataset, part: str
-) -> list[str]:
+def overconfidence(fit: FitView, compared: pd.DataFrame, part: str) -> list[str]:
     """What to make of a fit that leaves out a part of the instrument."""
-    shared = [scalar for scalar in scalars if scalar.label in compared.index]
+    posterior = fit.posterior
+    shared = [scalar for scalar in fit.scalars if scalar.label in compared.index]
     gain = {scalar: 1.0 - compared.loc[scalar.label, "width_ratio"] for scalar in shared}
     narrower = [scalar for scalar in shared if gain[scalar] > EQUAL_WIDTHS]
     others = [scalar for scalar in shared if gain[scalar] <= EQUAL_WIDTHS]
@@ -604,7 +598,7 @@ def calibration_headline(table: pd.DataFrame, readings: pd.DataFrame | None) -> 
     return f"{headline}.", passed
 
 
-def verdict_after_headline(calibration: xr.DataTree) -> list[str]:
+def verdict_after_headline(calibration: CalibrationView) -> list[str]:
     """Sentences of `calibration_verdict` without the first words, which the headline says."""
     first, *others = calibration_verdict(calibration)
     first = first.partition(": ")[2] or first

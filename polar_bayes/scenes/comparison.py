@@ -30,15 +30,15 @@ from polar_bayes.capture.plausibility import allowing_prior, indices_by_eye
 from polar_bayes.capture.schema import validate
 from polar_bayes.diagnostics.compare import compare_predictions
 from polar_bayes.diagnostics.criticism import INDEX_PARAMETERS, criticize
-from polar_bayes.diagnostics.parameters import scalars
 from polar_bayes.diagnostics.predictive import predictive_checks
+from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import FitError, SceneError, one_line
 from polar_bayes.inference.checks import NEAR_BOUND
 from polar_bayes.inference.fitting import fit_request
 from polar_bayes.inference.importance import Importance
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
-from polar_bayes.inference.result import CENTRAL_95, bounds_of, provenance_of
+from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import parse_prior, support_bounds
@@ -76,7 +76,7 @@ RESIDUAL_CHECKS = ("priors", "noise", "angle", "wavelength", "leave-one-out")
 class _Fit:
     """One fitted candidate."""
 
-    tree: xr.DataTree
+    view: FitView
     request: Request
     seconds: float
     findings: pd.Series
@@ -263,35 +263,35 @@ class _Fits:
         begun = time.perf_counter()
         try:
             tree = fit_request(request, METHOD, no_progress, begun, with_comparisons=False)
-            checks = predictive_checks(tree)
+            view = view_of(tree)
+            checks = predictive_checks(view)
             loo = [check.loo for check in checks.values() if check.loo is not None]
             if not loo or len(loo) < len(checks):
                 raise FitError(
                     "its draws do not predict the readings", where=name, hint="fit it alone"
                 )
-            levels = criticize(tree, checks)["level"]
+            levels = criticize(view)["level"]
             findings = levels[levels.isin(["caution", "problem"])]
         except (FitError, np.linalg.LinAlgError) as error:
             self.failed[name] = one_line(str(error))
             return
         self.done[name] = _Fit(
-            tree,
+            view,
             request,
             seconds=time.perf_counter() - begun,
             findings=findings,
             pointwise=np.concatenate([each.pointwise for each in loo]),
             unreliable=sum(each.unreliable for each in loo),
-            index_bound=_index_bound(tree) if "bounds" in findings.index else float("nan"),
+            index_bound=_index_bound(view) if "bounds" in findings.index else float("nan"),
         )
 
 
-def _index_bound(tree: xr.DataTree) -> float:
+def _index_bound(fit: FitView) -> float:
     """The bound of its prior at which an interval of the index ends; NaN where none does."""
-    provenance = provenance_of(tree)
-    for scalar in scalars(tree["posterior"].to_dataset()):
+    for scalar in fit.scalars:
         if scalar.name in INDEX_PARAMETERS:
             ends = np.quantile(scalar.draws, CENTRAL_95)
-            for bound in bounds_of(provenance, scalar.name):
+            for bound in bounds_of(fit.provenance, scalar.name):
                 if np.abs(ends - bound).min() < NEAR_BOUND * np.ptp(ends):
                     return bound
     return float("nan")
@@ -411,14 +411,13 @@ def _comparison(fits: _Fits) -> SceneComparison:
     table["seconds"] = [fit.seconds for fit in ordered.values()]
     table["index_bound"] = [fit.index_bound for fit in ordered.values()]
     table["criticism"] = [", ".join(fit.findings.index) for fit in ordered.values()]
-    trees = {name: fit.tree for name, fit in ordered.items()}
-    intervals = _intervals(trees)
+    intervals = _intervals({name: fit.view for name, fit in ordered.items()})
     return SceneComparison(
         table=table,
         intervals=intervals,
         between=between_scenes(intervals, table["weight"]),
         scenes={name: fit.request.scene for name, fit in ordered.items()},
-        fits=trees,
+        fits={name: fit.view.result for name, fit in ordered.items()},
         left_out=fits.failed,
         requests={name: fit.request for name, fit in ordered.items()},
     )
@@ -435,7 +434,7 @@ def _predictions(fits: Mapping[str, _Fit]) -> pd.DataFrame:
     with warnings.catch_warnings():
         # None is declared the best one: scenes that are not told apart are stacked.
         warnings.filterwarnings("ignore", "Difference in performance potentially due to chance")
-        table, left_out = compare_predictions({name: fit.tree for name, fit in fits.items()})
+        table, left_out = compare_predictions({name: fit.view for name, fit in fits.items()})
     if table.empty:
         raise FitError(
             " ".join(left_out.values()), where="compare_scenes", hint="give scenes of one capture"
@@ -463,17 +462,17 @@ def stacking_weights(pointwise: np.ndarray) -> np.ndarray:
     return weights.mean(axis=0)
 
 
-def _intervals(trees: Mapping[str, xr.DataTree]) -> pd.DataFrame:
+def _intervals(fits: Mapping[str, FitView]) -> pd.DataFrame:
     """Material parameters of each fit."""
     rows: dict[tuple[str, str], Any] = {}
-    for name, tree in trees.items():
-        for scalar in scalars(tree["posterior"].to_dataset()):
+    for name, fit in fits.items():
+        for scalar in fit.scalars:
             if scalar.is_material:
                 draws = scalar.draws.ravel()
                 ends = np.quantile(draws, CENTRAL_95)
                 rows[scalar.label, name] = (draws.mean(), draws.std(), *ends)
     labels = list(dict.fromkeys(label for label, _ in rows))
-    order = [(label, name) for label in labels for name in trees if (label, name) in rows]
+    order = [(label, name) for label in labels for name in fits if (label, name) in rows]
     table = pd.DataFrame([rows[key] for key in order], columns=["mean", "sd", "q2.5", "q97.5"])
     table.index = pd.MultiIndex.from_tuples(order, names=["parameter", "scene"])
     return table

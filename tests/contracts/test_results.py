@@ -1,6 +1,7 @@
 """Contract of the results: each kind has a card and a page, and survives a file."""
 
 from pathlib import Path
+from pkgutil import resolve_name
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from synthetic_maps import make_maps
 from synthetic_results import make_result
 
 import polar_bayes as pb
+from polar_bayes.results import KINDS
 
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 RESULTS = {
@@ -71,3 +73,18 @@ def test_one_kind_of_result_is_not_taken_for_another(tmp_path: Path) -> None:
     for kind, name in (("fit", "calibration"), ("accuracy", "calibration"), ("calibration", "fit")):
         with pytest.raises(pb.FitError, match=rf"{name}.nc: it holds no {kind}; give the file"):
             pb.load(tmp_path / f"{name}.nc", kind)
+
+
+@each("kind", [kind for kind in KINDS if kind.reports], ids=lambda kind: kind.name)
+def test_every_kind_that_has_reports_has_page_card_and_figure(kind) -> None:
+    reports = resolve_name(f"polar_bayes.reporting.{kind.reports}:REPORT")
+    assert callable(reports.page)
+    assert callable(reports.card)
+    assert callable(reports.plot)
+
+
+def test_a_kind_without_a_page_is_refused_by_name(tmp_path: Path) -> None:
+    profile = xr.Dataset({"prior_beyond": 0.5})
+    for make in (lambda: pb.report(profile, tmp_path), lambda: pb.plot(profile)):
+        with pytest.raises(pb.FitError, match="a result of kind profile has no page; polar_bayes"):
+            make()

@@ -14,7 +14,7 @@ from synthetic_results import edit_provenance, make_result, replace
 
 import polar_bayes as pb
 from polar_bayes.diagnostics.convergence import json_summary, laplace_k_hat, summary, verdict
-from polar_bayes.diagnostics.parameters import method_of
+from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 
 
@@ -218,11 +218,11 @@ def test_another_mode_is_told_as_the_method_sees_it(method: str, words: str) -> 
 @pytest.mark.thorough
 def test_the_method_is_called_as_it_was_stated() -> None:
     tree = make_result(method="laplace")
-    assert method_of(tree) == "laplace"
-    assert method_of(edit_provenance(tree, method="mine")) == "mine"
+    assert view_of(tree).method == "laplace"
+    assert view_of(edit_provenance(tree, method="mine")).method == "mine"
     assert json_summary(edit_provenance(tree, method="mine"))["method"] == "mine"
-    assert method_of(edit_provenance(tree, method=None)) == "laplace"
-    assert method_of(edit_provenance(make_result(), method=None)) == "nuts"
+    assert view_of(edit_provenance(tree, method=None)).method == "laplace"
+    assert view_of(edit_provenance(make_result(), method=None)).method == "nuts"
 
 
 @pytest.mark.thorough

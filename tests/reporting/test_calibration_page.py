@@ -13,6 +13,7 @@ from synthetic_calibrations import NAMES, make_calibration
 from synthetic_results import make_result
 
 import polar_bayes as pb
+from polar_bayes.calibration import verdict
 from polar_bayes.reporting.plots_calibration import parameter_ranks
 from polar_bayes.reporting.report import render
 
@@ -266,3 +267,24 @@ def test_where_half_of_the_fits_fail_a_better_method_is_named(method) -> None:
     few = " ".join(pb.verdict(make_calibration(count=40, failed=(1,), method=name)).sentences)
     assert "1 of 40 fits have no answer" in few
     assert "Half of the fits" not in few
+
+
+def test_a_page_checks_its_calibration_once_and_computes_its_table_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tree, checked, rows = make_calibration(readings={"dop": 1.0}), [], []
+    check, row = verdict.check_calibration, verdict._parameter_row
+
+    def counted_row(scalar, *arguments):
+        rows.append(scalar.label)
+        return row(scalar, *arguments)
+
+    def counted_check(calibration) -> None:
+        checked.append(calibration is tree)
+        check(calibration)
+
+    monkeypatch.setattr(verdict, "check_calibration", counted_check)
+    monkeypatch.setattr(verdict, "_parameter_row", counted_row)
+    render(tree)
+    assert checked == [True]
+    assert sorted(rows) == sorted(set(rows))

@@ -41,6 +41,14 @@ def test_fits_that_cannot_be_told_apart_are_not_ranked() -> None:
     assert "b predicts them about as well as a." in text
 
 
+def test_several_fits_by_name_have_the_figure_of_their_comparison() -> None:
+    fits = {"a": make_result(**SMALL), "b": worse(1.0)}
+    compared = pb.plots.plot_comparison(pb.diagnostics.compare_fits(fits))
+    assert len(pb.plot(fits).axes) == len(compared.axes)
+    with pytest.raises(FitError, match="compare_fits: b: it holds no fit"):
+        pb.plot({**fits, "b": 3})
+
+
 def test_what_differs_is_listed_and_nothing_else(page: Page) -> None:
     rows = page.text.partition("What differs asked for plain other")[2].partition("Only what")[0]
     assert "model per_material hierarchical" in rows

@@ -17,7 +17,7 @@ from polar_bayes.diagnostics.checked import checks_made
 from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.convergence import Verdict, summary, verdict
 from polar_bayes.diagnostics.criticism import criticize
-from polar_bayes.diagnostics.parameters import posterior_scalars
+from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.reporting import fit_page
 from polar_bayes.reporting.report import render, report
@@ -158,10 +158,7 @@ def test_it_is_not_called_narrower_where_it_is_not() -> None:
     plain["absorption"] = plain["absorption"] + 10.0 * float(plain["absorption"].std())
     result["without_discrepancy"] = xr.DataTree(plain)
     said = overconfidence(
-        compare_without(result, "discrepancy"),
-        posterior_scalars(result),
-        result["posterior"].to_dataset(),
-        "the discrepancy term",
+        view_of(result), compare_without(result, "discrepancy"), "the discrepancy term"
     )
     assert "intervals of subsurface fraction, absorption and refractive index are" in said[0]
     assert "of roughness is not narrower, as it happens" in said[1]
@@ -231,13 +228,13 @@ def test_what_is_said_to_be_checked_was_checked(small) -> None:
 
 
 def test_a_note_is_told_and_changes_nothing(monkeypatch: pytest.MonkeyPatch, small) -> None:
-    def with_note(*arguments: object) -> pd.DataFrame:
-        table = criticize(*arguments)
+    def with_note(fit: FitView) -> pd.DataFrame:
+        table = criticize(fit).copy()
         table.loc["bounds", ["level", "sentence"]] = "note", "No light from the body is seen."
         return table
 
-    def verdict_with_note(*arguments: object) -> Verdict:
-        return dataclasses.replace(verdict(*arguments), findings=("No light is seen.",))
+    def verdict_with_note(fit: FitView) -> Verdict:
+        return dataclasses.replace(verdict(fit), findings=("No light is seen.",))
 
     monkeypatch.setattr(fit_page, "criticize", with_note)
     monkeypatch.setattr(convergence, "verdict", verdict_with_note)

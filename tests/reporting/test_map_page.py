@@ -214,7 +214,7 @@ def test_arguments_that_do_not_apply_are_refused(tmp_path: Path) -> None:
             "it is of another image",
         ),
         ((maps, {"truth": xr.Dataset()}), "it knows the truth of no parameter"),
-        ((xr.Dataset(), {}), "it holds no maps"),
+        ((xr.Dataset(), {}), "it holds no fit"),
     ):
         with pytest.raises(pb.PolarBayesError, match=re.escape(says)) as error:
             pb.report(asked[0], tmp_path / "report", **asked[1])

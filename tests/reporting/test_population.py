@@ -7,7 +7,8 @@ from cases import each
 from clipping import clipped
 from synthetic_results import edit_provenance, make_result, pool
 
-from polar_bayes.diagnostics.population import population_summary, populations, shrinkage
+from polar_bayes.diagnostics.population import shrinkage
+from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import fit_page
 from polar_bayes.reporting import text as sentences
@@ -158,25 +159,20 @@ def test_draws_that_are_not_finite_leave_a_page() -> None:
 @pytest.mark.thorough
 def test_sentences_of_many_colors_name_the_first_and_the_last() -> None:
     result = pooled(3, wavelengths=(450.0, 550.0, 650.0))
-    found, table = populations(result), population_summary(result)
-    posterior = result["posterior"].to_dataset()
-    (said,) = sentences.between_members(table, found, posterior)
+    fit = view_of(result)
+    (said,) = sentences.between_members(fit)
     assert "a new material would lie between" in said
     assert "at 450 nm and between" in said
     assert said.endswith("at 650 nm (95%).")
     assert "550" not in said
-    decided = " ".join(sentences.pooling(table, found, posterior))
+    decided = " ".join(sentences.pooling(fit))
     assert decided.count("refractive index, ") == 3
 
 
 @pytest.mark.thorough
 def test_tables_have_a_cell_for_every_head() -> None:
-    result = pooled(3, "roughness", "refractive_index")
-    found = populations(result)
-    for table in (
-        fit_page.population_table(population_summary(result), found),
-        fit_page.member_table(result, shrinkage(result), found),
-    ):
+    fit = view_of(pooled(3, "roughness", "refractive_index"))
+    for table in (fit_page.population_table(fit), fit_page.member_table(fit)):
         assert {len(row.cells) + 1 for row in table.rows} == {len(table.columns)}
 
 
