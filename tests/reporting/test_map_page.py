@@ -1,6 +1,7 @@
 """The page of a map: what became of the pixels comes first, and coverage where truth is known."""
 
 import base64
+import html
 import re
 from pathlib import Path
 
@@ -46,7 +47,7 @@ def truth(name: str = "leaf") -> xr.Dataset:
 def text_of(page: str) -> str:
     """What a reader sees, and nothing of the style."""
     body = re.sub(r"<[^>]*>", " ", page.partition("<body>")[2])
-    return " ".join(body.split())
+    return html.unescape(" ".join(body.split()))
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,116 @@
+"""The size of the house: who raises a number changes it here, and says what paid for it."""
+
+import ast
+from collections import Counter
+from pathlib import Path
+
+from cases import each
+
+ROOT = Path(__file__).parents[1]
+
+CODE = {
+    "benchmark": 591,
+    "calibration": 1123,
+    "capture": 823,
+    "cli": 1117,
+    "design": 1231,
+    "diagnostics": 1683,
+    "effects": 491,
+    "importers": 1212,
+    "inference": 5352,
+    "maps": 1584,
+    "observation": 506,
+    "physics": 2529,
+    "reporting": 3066,
+    "scenes": 710,
+    "own files": 1539,
+    "models": 381,
+    "tests": 24024,
+}
+"""By room, lines at most that are neither blank, comment, docstring nor import."""
+
+WHOLE = {
+    "code": 23938,
+    "classes": 332,
+    "constants": 620,
+    "Any": 360,
+    "longest function": 126,
+}
+"""Of the package, at most so many; of `longest function` the lines."""
+
+
+def lines_of(nodes: list[ast.AST]) -> set[int]:
+    return {line for node in nodes for line in range(node.lineno, node.end_lineno + 1)}
+
+
+def count(path: Path) -> Counter[str]:
+    """What one file holds."""
+    text = path.read_text()
+    tree = ast.parse(text)
+    nodes = list(ast.walk(tree))
+    texts = [
+        node
+        for node in nodes
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    ]
+    imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+    code = {
+        number
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    }
+    assigned = [
+        target
+        for node in tree.body
+        if isinstance(node, ast.Assign | ast.AnnAssign)
+        for target in getattr(node, "targets", [getattr(node, "target", None)])
+    ]
+    names = [target.id.lstrip("_") for target in assigned if isinstance(target, ast.Name)]
+    return Counter(
+        {
+            "code": len(code - lines_of(texts) - lines_of(imports)),
+            "classes": sum(isinstance(node, ast.ClassDef) for node in nodes),
+            "constants": sum(name.isupper() for name in names),
+            "Any": sum(isinstance(node, ast.Name) and node.id == "Any" for node in nodes),
+        }
+    )
+
+
+def longest_function(path: Path) -> int:
+    found = [
+        node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)
+    ]
+    return max((node.end_lineno - node.lineno + 1 for node in found), default=0)
+
+
+def rooms() -> dict[str, list[Path]]:
+    """Python files of every room: each folder of the package, its own files, models and tests."""
+    package = ROOT / "polar_bayes"
+    found = {
+        folder.name: sorted(folder.rglob("*.py"))
+        for folder in sorted(package.iterdir())
+        if folder.is_dir() and not folder.is_symlink()
+    }
+    found["own files"] = sorted(package.glob("*.py"))
+    found |= {name: sorted((ROOT / name).rglob("*.py")) for name in ("models", "tests")}
+    return {name: files for name, files in found.items() if files}
+
+
+@each("room", CODE)
+def test_a_room_holds_no_more_code_than_was_agreed(room: str) -> None:
+    code = sum(count(path)["code"] for path in rooms()[room])
+    assert code <= CODE[room], f"{room}: {code}"
+
+
+def test_every_room_has_a_budget() -> None:
+    assert set(rooms()) == set(CODE)
+
+
+def test_the_package_holds_no_more_parts_than_was_agreed() -> None:
+    files = [path for room, files in rooms().items() if room != "tests" for path in files]
+    found = sum((count(path) for path in files), Counter())
+    found["longest function"] = max(map(longest_function, files))
+    over = {name: found[name] for name, most in WHOLE.items() if found[name] > most}
+    assert not over
