@@ -158,13 +158,13 @@ def _lines(write: Callable[[str], object]) -> Iterator[Callable[[str, float, flo
             write(f"{time.monotonic() - begin:.0f} s: {now[0]}")
             wait = min(2.0 * wait, MOST_LINE_SECONDS)
 
-    teller = threading.Thread(target=tell, daemon=True)
-    teller.start()
+    writer = threading.Thread(target=tell, daemon=True)
+    writer.start()
     try:
         yield show
     finally:
         ended.set()
-        teller.join()
+        writer.join()
         _bars_are_shown.release()
 
 

@@ -25,7 +25,7 @@ CODE = {
     "scenes": 710,
     "own files": 1539,
     "models": 381,
-    "tests": 24024,
+    "tests": 24026,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 

@@ -211,7 +211,7 @@ import numpyro.infer.util
 assert hasattr(numpyro.distributions, "distribution")
 assert isinstance(polar_bayes.PRIORS["roughness"], numpyro.distributions.Distribution)
 program = sys.modules["polar_bayes.inference.program"]
-assert program.potential_energy is numpyro.infer.util.potential_energy  # there is only one
+assert program.compute_log_probs is numpyro.infer.util.compute_log_probs  # there is only one
 """
 
 

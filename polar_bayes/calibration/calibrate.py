@@ -160,8 +160,8 @@ def calibrate(
     }
     if missing.size < simulations:
         provenance["fits found in the store"] = simulations - missing.size
-    if readings:
-        provenance["readings_told"] = plan.compiled.unranked_reason or "ranked"
+    if plan.compiled.unranked_reason:
+        provenance["why_not_ranked"] = plan.compiled.unranked_reason
     return _assemble(plan, join(done, simulations), provenance)
 
 

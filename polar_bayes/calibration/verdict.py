@@ -77,7 +77,7 @@ CALIBRATION = Schema(
             like=Like("predictive_pit", {"_pareto_k": ()}, required=True),
         ),
     },
-    provenance={**COMMON_PROVENANCE, "truth?": {EACH: ANY}, "readings_told?": TEXT},
+    provenance={**COMMON_PROVENANCE, "truth?": {EACH: ANY}, "why_not_ranked?": TEXT},
 )
 
 
@@ -306,7 +306,7 @@ def _better_method(calibration: xr.DataTree) -> str:
 
 def _reading_sentences(calibration: CalibrationView) -> list[str]:
     if not holds_readings(calibration.tree):
-        reason = provenance_of(calibration.tree).get("readings_told", "")
+        reason = provenance_of(calibration.tree).get("why_not_ranked", "")
         return [f"Readings were not ranked: {reason}."] if reason else []
     table = calibration_readings(calibration)
     names = ", ".join(dict.fromkeys(table["reading"]))

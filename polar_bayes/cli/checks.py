@@ -134,7 +134,7 @@ def identify(
     if as_json:
         rows: dict[str, Any] = {name: json_rows(table) for name, (table, _) in found.items()}
         for name, (_, sentences) in found.items():
-            rows["said" if name == "parameters" else f"{name}: said"] = sentences
+            rows["sentences" if name == "parameters" else f"{name}: sentences"] = sentences
         print_json(rows)
         return
     for name, (table, sentences) in found.items():

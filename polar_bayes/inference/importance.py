@@ -264,7 +264,7 @@ class Rounds:
         return np.concatenate(self._log_posterior)
 
     def draw(self) -> np.ndarray:
-        """Draws of the next proposal, (draw, size), to be weighed then."""
+        """Draws of the next proposal, (draw, size), which `weigh` takes next."""
         assert self._next is not None
         self._key, key = jax.random.split(self._key)
         proposal = self._next

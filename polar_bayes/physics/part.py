@@ -72,7 +72,7 @@ class Part(HTMLRepr, abc.ABC):
         """What may stand in its place: a cheaper part, or None for leaving it out.
 
         Returns:
-            Replacements to be weighed, each alone; empty where there is nothing simpler.
+            Replacements to be judged, each alone; empty where there is nothing simpler.
         """
         return ()
 

@@ -347,7 +347,7 @@ def _pixel_tables(counts: pd.DataFrame) -> Iterator[Table]:
     """Pixels by status; and by approach, with how many of them are good."""
     caption = "The status of each pixel. Only good ones count in the other tables."
     yield count_table("status", caption, counts.sum(axis=1).to_frame("pixels"), STATUSES)
-    caption = "How the numbers of each pixel were found, from the cheapest approach to the dearest."
+    caption = "How the numbers of each pixel were found; the cheapest method comes first."
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
     data = pd.DataFrame({"pixels": counts.sum(), "good": good})
     yield count_table("approach", caption, data, APPROACHES)

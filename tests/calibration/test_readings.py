@@ -136,5 +136,5 @@ def test_what_was_not_ranked_is_told() -> None:
     with pytest.raises(pb.FitError, match="no ranks of readings; give what polar_bayes"):
         pb.calibration.calibration_readings(tree)
     assert not any("eadings" in line for line in pb.verdict(tree).sentences)
-    why = make_calibration(readings=None, **{"readings_told": "draws do not hold place"})
+    why = make_calibration(readings=None, why_not_ranked="draws do not hold place")
     assert pb.verdict(why).sentences[-1] == "Readings were not ranked: draws do not hold place."

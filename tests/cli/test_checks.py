@@ -54,10 +54,10 @@ def test_identify_says_what_is_told_and_where_to_look(
     assert main([*words, "--criterion", "refractive_index", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert 0.0 < told["parameters"]["refractive_index"]["prior_share"] < 0.5
-    assert told["said"]
+    assert told["sentences"]
     widths = told["next views"]["refractive_index"]
     assert widths["after 2"] < widths["after 1"] < widths["now"]
-    assert told["next views: said"][0].startswith("Look next at zenith ")
+    assert told["next views: sentences"][0].startswith("Look next at zenith ")
     assert main([*words, "--criterion", "bend"]) == 1
     assert capsys.readouterr().err.splitlines() == [
         "SingleParameter('bend'): no parameter of the material has that name; "
@@ -73,7 +73,9 @@ def test_identify_follows_a_profile(plate: Path, capsys: pytest.CaptureFixture[s
     followed = [row["likelihood"] for row in curve.values()]
     assert None not in followed
     assert max(followed) == 0.0
-    assert told["profile of subsurface_fraction: said"][0].startswith("subsurface_fraction is ")
+    assert told["profile of subsurface_fraction: sentences"][0].startswith(
+        "subsurface_fraction is "
+    )
 
 
 def test_a_mistake_is_one_line(
