@@ -31,7 +31,6 @@ from polar_bayes.design.setup import (
     label_coordinates,
     label_parameters,
     label_scalars,
-    log_density_of_sites,
     make_design_problem,
     posterior_modes,
     provenance_attrs,
@@ -238,15 +237,10 @@ def log_density_parts(
     program: Program, known: Collection[str], z: Float[Array, " size"], data: Observations
 ) -> LogDensityParts:
     """The log posterior density of the unconstrained coordinates in its two parts."""
-    joint, jacobians, trace = log_density_of_sites(program, z, data)
-    of_likelihood = [name for name in jacobians if name in known]
-    terms = [
-        jnp.sum(trace[n]["fn"].log_prob(trace[n]["value"]))
-        for n in (*program.observed, *of_likelihood)
-    ]
-    likelihood = jnp.sum(jnp.stack([*terms, *(jacobians[n] for n in of_likelihood)]))
-    whole = joint + jnp.sum(jnp.stack([*jacobians.values()]))
-    return LogDensityParts(likelihood, whole - likelihood)
+    terms, _ = program.log_terms(z, data)
+    of_likelihood = {*program.observed, *known} & terms.keys()
+    likelihood = sum(terms.pop(name) for name in sorted(of_likelihood))
+    return LogDensityParts(jnp.asarray(likelihood), sum(terms.values(), jnp.zeros((), z.dtype)))
 
 
 def _weighted_potential(compiled_model: CompiledModel, known: frozenset[str]) -> JitOnce:

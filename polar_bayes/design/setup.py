@@ -11,8 +11,6 @@ import numpy as np
 import xarray as xr
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
-from numpyro import distributions as dist
-from numpyro.infer.util import log_density
 
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.errors import FitError
@@ -73,21 +71,6 @@ def posterior_modes(
         problem.program.value_and_gradient, problem.data, problem.data.brightness.dtype
     )
     return find_modes(potential, problem.prior[:STARTS], progress or no_progress)
-
-
-def log_density_of_sites(
-    program: Program, z: Float[Array, " size"], data: Observations
-) -> tuple[Array, dict[str, Array], dict[str, dict]]:
-    """Log joint density, log Jacobian of every latent site, and the trace, from one pass."""
-    free = program.unravel(z)
-    bijections = {name: dist.biject_to(program.supports[name]) for name in free}
-    latent = {name: biject(free[name]) for name, biject in bijections.items()}
-    log_joint, trace = log_density(program.model, (data,), {}, latent)
-    log_jacobian = {
-        name: jnp.sum(biject.log_abs_det_jacobian(free[name], latent[name]))
-        for name, biject in bijections.items()
-    }
-    return log_joint, log_jacobian, trace
 
 
 # --- Names of parameters and coordinates ----------------------------------------------------------

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array
 from numpyro import distributions as dist
 
-from polar_bayes.design.setup import label_coordinates, log_density_of_sites
+from polar_bayes.design.setup import label_coordinates
 from polar_bayes.inference.optimize import (
     ModeStatus,
     ValueAndGradient,
@@ -152,9 +152,9 @@ def compile_density(request: Request, data: Observations) -> SceneDensity:
     program = compile_program(request.bind(request.scene), data)
 
     def evaluate(z: Array, data: Observations) -> tuple[Array, dict[str, Array]]:
-        log_joint, log_jacobian, trace = log_density_of_sites(program, z, data)
+        terms, trace = program.log_terms(z, data)
         predicted = {name: noise_free(trace, name) for name in program.observed}
-        return -(log_joint + sum(log_jacobian.values())), predicted
+        return -sum(terms.values(), jnp.zeros((), z.dtype)), predicted
 
     compiled = compile_and_count(evaluate, jnp.zeros(program.size), data)
     coordinates = label_coordinates(program, request.capture)

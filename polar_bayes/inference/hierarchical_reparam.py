@@ -40,7 +40,6 @@ import numpy as np
 import scipy.optimize
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
-from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import JitOnce
@@ -322,15 +321,9 @@ class HierarchicalReparam:
 
     def _group_prior(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """Minus the log prior density of the coordinates of all groups."""
-        free, latent = self.program.unravel(z), self.program.constrain(z)
-        trace = self.program.trace(z, data)
-        total = jnp.zeros((), z.dtype)
-        for name, value in latent.items():
-            if self.groups.axis in self.program.dims[name]:
-                bijection = dist.biject_to(self.program.supports[name])
-                total = total - jnp.sum(trace[name]["fn"].log_prob(value))
-                total = total - jnp.sum(bijection.log_abs_det_jacobian(free[name], value))
-        return total
+        terms, _ = self.program.log_terms(z, data)
+        own = [n for n in self.program.supports if self.groups.axis in self.program.dims[n]]
+        return -sum((terms[name] for name in own), jnp.zeros((), z.dtype))
 
     def _conditional(
         self, common: Float[Array, " common"], given: ReparamInputs

@@ -108,17 +108,22 @@ class Program:
         held = {n: jnp.where(jnp.isnan(x), values[n], x) for n, x in data.held.items()}
         return values | held
 
-    def _log_terms(
-        self, model: Model, sites: dict[str, Array], data: Observations
-    ) -> tuple[list[Array], Sites]:
-        """Terms of the log density of the unconstrained sites, and the trace of the model.
+    def log_terms(
+        self, z: Float[Array, " size"], data: Observations
+    ) -> tuple[dict[str, Array], Sites]:
+        """The log density by site, with the log volume of its coordinates; the trace of the model.
 
         The coordinate of what is held has a standard normal density, and its prior none.
         """
+        return self._log_terms(self.model, self.unravel(z), data)
+
+    def _log_terms(
+        self, model: Model, sites: dict[str, Array], data: Observations
+    ) -> tuple[dict[str, Array], Sites]:
         log_probs, trace = compute_log_probs(
             model, (data,), {}, self._values(sites, data), sum_log_prob=False
         )
-        terms = [own for name, own in log_probs.items() if name not in sites]
+        terms = {name: jnp.sum(own) for name, own in log_probs.items()}
         for name, x in sites.items():
             bijection = dist.biject_to(self.supports[name])
             own = [log_probs[name], bijection.log_abs_det_jacobian(x, bijection(x))]
@@ -126,7 +131,7 @@ class Program:
                 free = jnp.isnan(data.held[name])
                 own = [jnp.where(_all_of(free, term), term, 0.0) for term in own]
                 own.append(jnp.where(_all_of(free, x), 0.0, -0.5 * x**2))
-            terms += own
+            terms[name] = sum(map(jnp.sum, own), jnp.zeros((), x.dtype))
         return terms, trace
 
     def free(self, data: Observations) -> Observations:
@@ -157,7 +162,7 @@ class Program:
         self, z: Float[Array, " size"], data: Observations
     ) -> tuple[dict[str, Array], Float[Array, ""]]:
         """Both, by one trace of the model."""
-        terms, trace = self._log_terms(self.model, self.unravel(z), data)
+        terms, trace = self.log_terms(z, data)
         return self._parameters(trace), -_total(terms, data)
 
     def _parameters(self, trace: dict) -> dict[str, Array]:
@@ -262,8 +267,8 @@ class Program:
         return JitOnce(jax.jacfwd(self.constrain))
 
 
-def _total(terms: list[Array], data: Observations) -> Array:
-    return sum(map(jnp.sum, terms), jnp.zeros((), data.brightness.dtype))
+def _total(terms: Mapping[str, Array], data: Observations) -> Array:
+    return sum(terms.values(), jnp.zeros((), data.brightness.dtype))
 
 
 def _all_of(mask: Array, like: Array) -> Array:
