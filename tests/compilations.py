@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Iterator
 
 import jax
+import pytest
 
 
 @contextlib.contextmanager
@@ -19,3 +20,21 @@ def compilations() -> Iterator[list[str]]:
     jax.monitoring.register_event_duration_secs_listener(listen)
     yield found
     jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def compiled_fast(
+    monkeypatch: pytest.MonkeyPatch, *, starts: int, typical: int, draws: int, block: int
+) -> Iterator[None]:
+    """What a fixture yields from where programs are compiled more often than they run."""
+    numbers = {
+        "initialization.STARTS": starts,
+        "hierarchical_reparam.MOST_STARTS": 4,
+        "hierarchical_reparam.TYPICAL_DRAWS": typical,
+        "fitting.PRIOR_DRAWS": draws,
+        "program.BLOCK": block,
+    }
+    for name, number in numbers.items():
+        monkeypatch.setattr(f"polar_bayes.inference.{name}", number)
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)

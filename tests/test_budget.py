@@ -13,11 +13,11 @@ CODE = {
     "calibration": 1123,
     "capture": 823,
     "cli": 1117,
-    "design": 1214,
+    "design": 1192,
     "diagnostics": 1683,
     "effects": 491,
     "importers": 1212,
-    "inference": 5350,
+    "inference": 5352,
     "maps": 1584,
     "observation": 506,
     "physics": 2529,
@@ -25,12 +25,12 @@ CODE = {
     "scenes": 710,
     "own files": 1539,
     "models": 381,
-    "tests": 24026,
+    "tests": 24024,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23919,
+    "code": 23899,
     "classes": 332,
     "constants": 620,
     "Any": 360,

@@ -27,7 +27,7 @@ from test_architecture import LAYERS
 import polar_bayes as pb
 from polar_bayes.capture.schema import CONTRACT
 from polar_bayes.cli import commands
-from polar_bayes.inference import fitting, problem
+from polar_bayes.inference import fitting
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
@@ -130,7 +130,6 @@ def test_the_python_of_a_page_runs(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pb, "fit", fits)
     monkeypatch.setattr(fitting, "PRIOR_DRAWS", 100)
-    monkeypatch.setattr(problem, "BLOCK", 100)
     monkeypatch.setattr("polar_bayes.inference.program.BLOCK", 100)
     namespace: dict[str, object] = {"__name__": page.stem}
     for line, code in blocks(page, "python"):

@@ -4,11 +4,11 @@ At every value of the coordinate $z_i$ of a parameter all others are optimized,
 
 $$ \max_{z_{-i}} [\log L(z) + w \log \pi(z)] $$
 
-by numerical continuation: BFGS starts where the value before ended. All grids and parameters share
-one compiled potential. $w = 1$ gives the profile of
-the posterior, $w$ = `PRIOR_WEIGHT` that of the likelihood: a thousandth of the prior keeps
-coordinates that the data do not determine from diverging. The priors of the instrument's parameters
-belong to $L$ in both: a calibration determines them, and without it they trade for one another.
+by numerical continuation: BFGS starts where the value before ended, in one compiled potential for
+all grids. $w = 1$ gives the profile of the posterior, $w$ = `PRIOR_WEIGHT` that of the likelihood:
+a thousandth of the prior keeps coordinates that the data do not determine from diverging. The
+priors of the instrument's parameters belong to $L$ in both: a calibration determines them, and
+without it they trade for one another.
 """
 
 import itertools
@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-import scipy.optimize
 import xarray as xr
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
@@ -42,6 +41,8 @@ from polar_bayes.inference.optimize import (
     Modes,
     NumpyPotential,
     ValueAndGradient,
+    conditional_mode,
+    conditional_normal,
     finite_potential,
     ignore_line_search_warnings,
 )
@@ -260,7 +261,7 @@ def _weighted_potential(compiled_model: CompiledModel, known: frozenset[str]) ->
 MAX_GRADIENT = 0.03
 """Largest gradient left, per posterior sd: a profile is then within half its square of its mode."""
 
-SETTLED_GRADIENT = 1e-4
+SETTLED_GRADIENT = 1e-5
 """The same at which a search ends."""
 
 MAX_MODES = 3
@@ -273,20 +274,6 @@ class ProfileCurve(NamedTuple):
     grid: np.ndarray
     value: np.ndarray
     best: np.ndarray
-
-
-def conditional_normal(
-    covariance: Float[np.ndarray, "size size"], index: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Regression of all coordinates on one, and the Cholesky factor of what it leaves."""
-    size = len(covariance)
-    slope = covariance[:, index] / covariance[index, index]
-    others = np.delete(np.arange(size), index)
-    factor = np.zeros((size, max(size - 1, 1)))
-    if size > 1:
-        residual = covariance - np.outer(slope, covariance[index])
-        factor[others] = np.linalg.cholesky(residual[np.ix_(others, others)])
-    return slope, factor
 
 
 def _trace_profile(
@@ -303,31 +290,15 @@ def _trace_profile(
             last = [start] * len(potentials)
             for point in side:
                 guesses = [z + slope * (grid[point] - z[index]) for z in last]
-                for kind, potential in enumerate(potentials):
+                for kind, potential in enumerate(map(finite_potential, potentials)):
                     # The likelihood starts at the posterior's mode where that is better.
-                    near = [guesses[kind], *last[:kind]]
-                    z = _conditional_mode(potential, near, factor)
+                    near = min([guesses[kind], *last[:kind]], key=lambda z: potential(z)[0])
+                    z, _ = conditional_mode(potential, near, factor, gtol=SETTLED_GRADIENT)
                     last[kind] = z
-                    height = _log_density_at(potential, z, factor)
+                    height = _log_density_at(potentials[kind], z, factor)
                     if height > np.nan_to_num(value[kind, point], nan=-np.inf):
                         value[kind, point], best[kind, point] = height, z
     return ProfileCurve(grid, value, best)
-
-
-def _conditional_mode(
-    potential: ValueAndGradient, guesses: Sequence[np.ndarray], factor: np.ndarray
-) -> np.ndarray:
-    """The best vector near the best guess, along the directions that the factor has."""
-    guarded = finite_potential(potential)
-    guess = min(guesses, key=lambda z: guarded(z)[0])
-
-    def along(y: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = guarded(guess + factor @ y)
-        return value, factor.T @ gradient
-
-    origin, options = np.zeros(factor.shape[1]), {"gtol": SETTLED_GRADIENT}
-    found = scipy.optimize.minimize(along, origin, jac=True, method="BFGS", options=options)
-    return guess + factor @ found.x
 
 
 def _log_density_at(potential: ValueAndGradient, z: np.ndarray, factor: np.ndarray) -> float:

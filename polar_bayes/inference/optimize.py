@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-from jaxtyping import Array, DTypeLike
+from jaxtyping import Array, DTypeLike, Float
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batching import map_batches
@@ -207,6 +207,35 @@ def find_mode(
         z = z - step
     status = ModeStatus.OK if decrement < SETTLED else ModeStatus.NOT_CONVERGED
     return Optimum(z, float(value), decrement, covariance, status)
+
+
+def conditional_normal(
+    covariance: Float[np.ndarray, "size size"], index: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Regression of all coordinates on one, and a factor of the covariance that it leaves."""
+    # The factor has a row of zeros for the one, and a column of zeros where there is no other.
+    size = len(covariance)
+    slope = covariance[:, index] / covariance[index, index]
+    others = np.delete(np.arange(size), index)
+    factor = np.zeros((size, max(size - 1, 1)))
+    if size > 1:
+        among = np.linalg.inv(covariance)[np.ix_(others, others)]
+        factor[others] = np.linalg.cholesky(np.linalg.inv(among))
+    return slope, factor
+
+
+def conditional_mode(
+    potential: ValueAndGradient, start: np.ndarray, factor: np.ndarray, **options: float
+) -> tuple[np.ndarray, float]:
+    """Where a finite potential is least along the columns of a factor, by BFGS; its value there."""
+
+    def along(y: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = potential(start + factor @ y)
+        return value, factor.T @ gradient
+
+    origin = np.zeros(factor.shape[1])
+    found = scipy.optimize.minimize(along, origin, jac=True, method="BFGS", options=options)
+    return start + factor @ found.x, float(found.fun)
 
 
 def distinct_modes(ends: list[Optimum]) -> Modes | None:

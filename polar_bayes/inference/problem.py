@@ -18,7 +18,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import TRACING_LOCK
 from polar_bayes.inference.compiled_model import CompiledModel, compile_model
 from polar_bayes.inference.initialization import AbstractInit
-from polar_bayes.inference.program import BLOCK, Draw, Program, Values, in_blocks
+from polar_bayes.inference.program import Draw, Program, Values, in_blocks
 from polar_bayes.inference.request import Request
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.priors import RANGES, describe_prior, support_bounds
@@ -185,12 +185,7 @@ class Problem:
 
     def prepare_predictions(self) -> None:
         """Begin to compile what `predict` needs, in parallel with whatever follows."""
-        keys = jax.random.key_data(jax.random.key(0))
-        self.program.described.begin(
-            jax.ShapeDtypeStruct((BLOCK, *keys.shape), keys.dtype),
-            jax.ShapeDtypeStruct((BLOCK, self.program.size), self.dtype),
-            self.data,
-        )
+        self.program.begin_described(self.data)
 
     def predict(self, key: Array, z: Float[np.ndarray, "chain draw size"]) -> Draw:
         """Parameters, densities and predicted readings of draws.

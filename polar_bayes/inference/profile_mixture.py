@@ -18,13 +18,13 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 from jaxtyping import DTypeLike, Float, Int
 
 from polar_bayes.inference.batching import take_rows
 from polar_bayes.inference.initialization import Coordinates
 from polar_bayes.inference.optimize import (
-    ValueAndGradient,
+    conditional_mode,
+    conditional_normal,
     finite_potential,
     forward_difference_hessian,
     ignore_line_search_warnings,
@@ -153,18 +153,18 @@ def profile_mixture(coordinates: Coordinates) -> Mixture:
     heavy = modes.weight >= LEAST_WEIGHT
     z, covariance = modes.z[heavy], modes.covariance[heavy]
     peaks = Peaks(z, np.array([potential(each)[0] for each in z]), covariance)
-    sd, precision = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), np.linalg.inv(covariance)
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
     @functools.cache
-    def given_one(at: int, fixed: int) -> tuple[np.ndarray, np.ndarray]:
-        """The other coordinates, and the factor of their covariance."""
-        others = np.setdiff1d(np.arange(z.shape[1]), fixed)
-        return others, np.linalg.cholesky(np.linalg.inv(precision[at][np.ix_(others, others)]))
+    def given_one(at: int, fixed: int) -> np.ndarray:
+        """The factor of the covariance of the other coordinates."""
+        return conditional_normal(covariance[at], fixed)[1]
 
     def conditional(peak: np.ndarray, z: np.ndarray, axis: np.ndarray) -> Conditional:
         found = []
         for at, start, fixed in zip(peak.tolist(), z, axis.tolist(), strict=True):
-            x, height = _conditional_mode(potential, start, *given_one(at, fixed))
+            factor = given_one(at, fixed)
+            x, height = conditional_mode(potential, start, factor, gtol=0.05, maxiter=25)
             hessian = symmetrize(forward_difference_hessian(potential, x, 0.3 * sd[at], dtype))
             found.append((x, height, hessian))
         xs, heights, hessians = map(np.stack, zip(*found, strict=True))
@@ -174,29 +174,3 @@ def profile_mixture(coordinates: Coordinates) -> Mixture:
         return mixture_of(
             profile_components(peaks, coordinates.axes, coordinates.prior_sd, conditional), dtype
         )
-
-
-def _conditional_mode(
-    potential: ValueAndGradient, start: np.ndarray, others: np.ndarray, half: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Where the potential is least over the other coordinates, in units of their covariance."""
-    if not others.size:
-        return start, potential(start)[0]
-
-    def along(y: np.ndarray) -> np.ndarray:
-        x = start.copy()
-        x[others] += half @ y
-        return x
-
-    def objective(y: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = potential(along(y))
-        return value, half.T @ gradient[others]
-
-    found = scipy.optimize.minimize(
-        objective,
-        np.zeros(others.size),
-        jac=True,
-        method="BFGS",
-        options={"gtol": 0.05, "maxiter": 25},
-    )
-    return along(found.x), float(found.fun)

@@ -123,7 +123,7 @@ class Program:
         log_probs, trace = compute_log_probs(
             model, (data,), {}, self._values(sites, data), sum_log_prob=False
         )
-        terms = {name: jnp.sum(own) for name, own in log_probs.items()}
+        terms = {name: jnp.sum(own) for name, own in log_probs.items() if name not in sites}
         for name, x in sites.items():
             bijection = dist.biject_to(self.supports[name])
             own = [log_probs[name], bijection.log_abs_det_jacobian(x, bijection(x))]
@@ -239,6 +239,15 @@ class Program:
             return jax.lax.map(lambda kz: self.describe(kz[0], kz[1], data), (wrapped, z))
 
         return JitOnce(describe)
+
+    def begin_described(self, data: Observations) -> None:
+        """Begin to compile the description of a block of draws."""
+        keys = jax.random.key_data(jax.random.key(0))
+        self.described.begin(
+            jax.ShapeDtypeStruct((BLOCK, *keys.shape), keys.dtype),
+            jax.ShapeDtypeStruct((BLOCK, self.size), data.brightness.dtype),
+            data,
+        )
 
     def log_density(self, z: np.ndarray, data: Observations) -> np.ndarray:
         """Log posterior densities of vectors, (draw, size); minus infinity where there is none."""

@@ -14,7 +14,7 @@ import numpyro
 import pytest
 import xarray as xr
 from cases import each
-from compilations import compilations
+from compilations import compilations, compiled_fast
 from numpyro import distributions as dist
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture, plates
@@ -23,7 +23,7 @@ from spectral_plates import spectral_plate
 import polar_bayes as pb
 from polar_bayes.effects.choose import ChosenScene
 from polar_bayes.inference import fitting as fitting
-from polar_bayes.inference import hierarchical_reparam, initialization, optimize, problem, request
+from polar_bayes.inference import optimize, problem, request
 from polar_bayes.inference.compile import LRUCache, cache_key
 from polar_bayes.inference.optimize import ignore_line_search_warnings
 from polar_bayes.inference.problem import compile_model
@@ -55,15 +55,7 @@ def colors(seed: int) -> xr.Dataset:
 
 @pytest.fixture(autouse=True)
 def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(initialization, "STARTS", 2)
-    monkeypatch.setattr(hierarchical_reparam, "MOST_STARTS", 4)
-    monkeypatch.setattr(hierarchical_reparam, "TYPICAL_DRAWS", 20)
-    monkeypatch.setattr(fitting, "PRIOR_DRAWS", 20)
-    monkeypatch.setattr(problem, "BLOCK", 50)
-    monkeypatch.setattr("polar_bayes.inference.program.BLOCK", 50)
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+    yield from compiled_fast(monkeypatch, starts=2, typical=20, draws=20, block=50)
 
 
 @pytest.fixture

@@ -2,20 +2,10 @@
 
 from collections.abc import Iterator
 
-import jax
 import pytest
-
-from polar_bayes.inference import fitting, hierarchical_reparam, initialization, problem
+from compilations import compiled_fast
 
 
 @pytest.fixture
 def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(initialization, "STARTS", 4)
-    monkeypatch.setattr(hierarchical_reparam, "MOST_STARTS", 4)
-    monkeypatch.setattr(hierarchical_reparam, "TYPICAL_DRAWS", 50)
-    monkeypatch.setattr(fitting, "PRIOR_DRAWS", 100)
-    monkeypatch.setattr(problem, "BLOCK", 100)
-    monkeypatch.setattr("polar_bayes.inference.program.BLOCK", 100)
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+    yield from compiled_fast(monkeypatch, starts=4, typical=50, draws=100, block=100)

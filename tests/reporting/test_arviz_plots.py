@@ -14,7 +14,7 @@ from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.errors import FitError
-from polar_bayes.inference import fitting, problem
+from polar_bayes.inference import fitting
 
 METHODS = {
     "nuts": pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50),
@@ -63,7 +63,6 @@ def result_of(name: str, fitted: dict[str, xr.DataTree]) -> xr.DataTree:
         jax.config.update("jax_disable_most_optimizations", True)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(fitting, "PRIOR_DRAWS", 100)
-            patch.setattr(problem, "BLOCK", 100)
             patch.setattr("polar_bayes.inference.program.BLOCK", 100)
             fitted[name] = pb.fit(capture, scene=PLATE, links=LINKS, method=method, seed=7)
         jax.config.update("jax_disable_most_optimizations", False)
