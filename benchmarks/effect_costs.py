@@ -13,12 +13,12 @@ import numpy as np
 import xarray as xr
 
 import polar_bayes as pb
-from polar_bayes.effects.posterior_change import compile_and_count, run_seconds
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 from polar_bayes.physics.scene import MANY_FACETS
 from polar_bayes.physics.variants import Effect, effects_of, simplify
+from polar_bayes.scenes.posterior_change import compile_and_count, run_seconds
 
 FILM, COAT = pb.ThinFilm(1.38, 120.0), pb.ClearCoat(1.5, 0.05)
 

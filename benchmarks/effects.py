@@ -17,9 +17,9 @@ import xarray as xr
 from effect_costs import gradients
 
 import polar_bayes as pb
-from polar_bayes.effects.choose import ledger_table
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.physics.scene import FULL_SCENES, MANY_FACETS
+from polar_bayes.scenes.effects import ledger_table
 
 METHOD = pb.methods.Nuts(draws=1000, most_draws=4000, effective_draws=1500)
 

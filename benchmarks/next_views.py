@@ -36,10 +36,10 @@ from polar_bayes.design.optimal_design import Selection, fedorov_exchange
 from polar_bayes.design.setup import parameter_vector, unconstrain
 from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout, layout_key
-from polar_bayes.inference.corrected_laplace import CorrectedLaplace
-from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.problem_batch import problem_batch
+from polar_bayes.inference.program import from_prior
 from polar_bayes.inference.request import resolve
+from polar_bayes.methods.corrected_laplace import CorrectedLaplace
 from polar_bayes.observation.data import observe
 
 NAMES = ("roughness", "subsurface_fraction", "absorption", "refractive_index")

@@ -29,10 +29,9 @@ from paper_study import (
 
 import polar_bayes as pb
 from polar_bayes.calibration.runner import Simulations, draw_captures
-from polar_bayes.inference.least_squares import Estimate, estimate
-from polar_bayes.inference.optimize import from_prior
-from polar_bayes.inference.program import Program, compile_program
+from polar_bayes.inference.program import Program, compile_program, from_prior
 from polar_bayes.inference.request import resolve
+from polar_bayes.methods.least_squares import Estimate, estimate
 from polar_bayes.observation.data import observe
 
 USUAL = ("laplace", "importance", "nuts")

@@ -38,13 +38,10 @@ from numpyro.infer import SVI, Trace_ELBO
 from numpyro.infer.autoguide import AutoLaplaceApproximation
 
 import polar_bayes as pb
+from polar_bayes.inference.batch_modes import find_modes
 from polar_bayes.inference.batching import LANES, ObservationBatch
 from polar_bayes.inference.compiled_model import CompiledModel
-from polar_bayes.inference.levenberg_marquardt import (
-    exact_derivatives,
-    find_modes,
-    scoring_derivatives,
-)
+from polar_bayes.inference.scoring import exact_derivatives, scoring_derivatives
 from polar_bayes.maps.fit_map import mask_missing, plan_map
 from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import Observations

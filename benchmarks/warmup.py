@@ -31,8 +31,8 @@ from accuracy_scenes import CASES
 from plates import GONIOMETER, GONIOMETER_VIEWS, LINKS, PLATE, plate_capture, plates
 
 import polar_bayes as pb
-from polar_bayes.inference.mcse import measure, standard_errors
 from polar_bayes.inference.result import provenance_of
+from polar_bayes.numerics.mcse import measure, standard_errors
 
 TWO, FOUR = (1.45, 1.55), (1.45, 1.5, 1.55, 1.6)
 Asked = tuple[Callable[[int], xr.Dataset], dict[str, Any]]

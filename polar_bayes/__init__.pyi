@@ -5,10 +5,10 @@ from . import calibration as calibration
 from . import capture as capture
 from . import design as design
 from . import diagnostics as diagnostics
-from . import effects as effects
 from . import importers as importers
 from . import inference as inference
 from . import maps as maps
+from . import methods as methods
 from . import models as models  # type: ignore[attr-defined]
 from . import physics as physics
 from . import reporting as reporting
@@ -24,7 +24,6 @@ from .capture.files import (
 from .design.identify import identify as identify
 from .design.next_views import next_views as next_views
 from .design.profile import profile as profile
-from .effects.choose import choose_effects as choose_effects
 from .errors import (
     CaptureError as CaptureError,
     FitError as FitError,
@@ -38,11 +37,6 @@ from .importers.images import (
     from_polarizer as from_polarizer,
 )
 from .importers.table import from_table as from_table
-from .inference import methods as methods
-from .inference.scene_file import (
-    load_scene as load_scene,
-    save_scene as save_scene,
-)
 from .maps.fit_map import fit_pixels as fit_pixels
 from .observation import links as links
 from .physics import instrument as instrument
@@ -87,5 +81,10 @@ from .results import (
     verdict as verdict,
 )
 from .scenes.comparison import compare_scenes as compare_scenes
+from .scenes.effects import choose_effects as choose_effects
 from .scenes.fitting import fit as fit
+from .scenes.scene_file import (
+    load_scene as load_scene,
+    save_scene as save_scene,
+)
 from .simulation import simulate as simulate

@@ -9,7 +9,6 @@ from textbook import plate_q
 
 import polar_bayes as pb
 from polar_bayes.inference.batching import ObservationBatch, cut
-from polar_bayes.inference.corrected_laplace import CorrectedLaplace
 from polar_bayes.maps.fit_map import (
     MapPlan,
     blank,
@@ -19,6 +18,7 @@ from polar_bayes.maps.fit_map import (
     plan_map,
     with_pixel_numbers,
 )
+from polar_bayes.methods.corrected_laplace import CorrectedLaplace
 from polar_bayes.models.per_material import per_material
 
 NOISE = 0.02

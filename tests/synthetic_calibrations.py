@@ -7,7 +7,7 @@ import xarray as xr
 from scipy import stats
 
 from polar_bayes.inference.batching import MethodUsed, Status
-from polar_bayes.inference.psis import LEVELS
+from polar_bayes.numerics.psis import LEVELS
 
 CENTER, PRIOR_SD, NOISE = 0.5, 0.1, 0.05
 NAMES = ("roughness", "subsurface_fraction", "refractive_index")

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from polar_bayes.inference.batching import MethodUsed, Status
-from polar_bayes.inference.psis import LEVELS
+from polar_bayes.numerics.psis import LEVELS
 
 LEVELS_HERE = np.array(LEVELS)
 

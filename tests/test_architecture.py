@@ -20,6 +20,7 @@ LAYERS = (
         "polar_bayes.repr_html",
         "polar_bayes.progress",
     ),
+    ("polar_bayes.numerics",),
     ("polar_bayes.capture",),
     ("polar_bayes.importers",),
     ("polar_bayes.physics",),
@@ -28,11 +29,11 @@ LAYERS = (
     ("polar_bayes.models",),
     ("polar_bayes.simulation",),
     ("polar_bayes.inference",),
+    ("polar_bayes.methods",),
     ("polar_bayes.maps",),
     ("polar_bayes.diagnostics",),
     ("polar_bayes.scenes",),
     ("polar_bayes.calibration", "polar_bayes.design"),
-    ("polar_bayes.effects",),
     ("polar_bayes.benchmark",),
     ("polar_bayes.results",),
     ("polar_bayes.reporting",),
@@ -55,7 +56,7 @@ HOMES = {
     "netCDF4": ("polar_bayes.capture",),
     "PIL": ("polar_bayes.importers",),
     "polanalyser": ("polar_bayes.importers",),
-    "optimistix": ("polar_bayes.inference",),
+    "optimistix": ("polar_bayes.methods",),
     "tinygp": ("polar_bayes.models",),
     "arviz_base": (
         "polar_bayes.inference",
@@ -63,7 +64,7 @@ HOMES = {
         "polar_bayes.diagnostics",
         "polar_bayes.reporting",
     ),
-    "arviz_stats": ("polar_bayes.inference", "polar_bayes.diagnostics", "polar_bayes.reporting"),
+    "arviz_stats": ("polar_bayes.numerics", "polar_bayes.diagnostics", "polar_bayes.reporting"),
     "zarr": ("polar_bayes.maps",),
     "portalocker": ("polar_bayes.maps",),
     "distributed": ("polar_bayes.maps",),
@@ -99,7 +100,9 @@ def imports(path: Path) -> Iterator[tuple[str, bool]]:
                 yield alias.name, id(node) in inside
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            yield node.module or "", id(node) in inside
+            module = node.module or ""
+            for name in [alias.name for alias in node.names] if module == "polar_bayes" else [""]:
+                yield f"{module}.{name}".rstrip("."), id(node) in inside
 
 
 def belongs(module: str, layer: str) -> bool:

@@ -43,7 +43,7 @@ def test_a_scene_shows_its_parts_and_parameters() -> None:
 @pytest.mark.thorough
 def test_a_chosen_scene_is_shown_as_a_scene() -> None:
     scene = pb.setups.SETUPS["paper"].scene
-    chosen = pb.effects.ChosenScene(
+    chosen = pb.scenes.ChosenScene(
         **{f.name: getattr(scene, f.name) for f in dataclasses.fields(pb.Scene)}
     )
     # In the sentence on the class, and in no field.

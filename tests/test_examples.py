@@ -27,10 +27,10 @@ from test_architecture import LAYERS
 import polar_bayes as pb
 from polar_bayes.capture.schema import CONTRACT
 from polar_bayes.cli import commands
-from polar_bayes.inference import fitting
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
+from polar_bayes.scenes import fit_request as fitting
 from polar_bayes.scenes.fitting import fit
 
 ROOT = Path(__file__).parents[1]

@@ -8,8 +8,8 @@ from numpyro import distributions as dist
 import polar_bayes as pb
 from polar_bayes.errors import FitError
 from polar_bayes.expressions import parse_value, short_text
-from polar_bayes.inference.scene_file import parse_link, parse_method, parse_scene
 from polar_bayes.priors import PRIORS, parse_prior, prior_text
+from polar_bayes.scenes.scene_file import parse_link, parse_method, parse_scene
 from polar_bayes.setups import SETUPS
 
 WEIGHTS = dist.CategoricalProbs(jnp.array([0.25, 0.75]))

@@ -14,8 +14,7 @@ import xarray as xr
 from jaxtyping import Array
 from one_material import SCENE
 
-from polar_bayes.inference.optimize import from_prior
-from polar_bayes.inference.program import Program, compile_program
+from polar_bayes.inference.program import Program, compile_program, from_prior
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.observation.data import Observations, observe
 

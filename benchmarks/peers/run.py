@@ -37,7 +37,7 @@ from one_material import SCENE, layout
 from posterior import CHAINS, Posterior
 
 import polar_bayes as pb
-from polar_bayes.inference.mcse import measure
+from polar_bayes.numerics.mcse import measure
 
 PEERS = (
     "polar_bayes", "numpyro", "blackjax", "pymc", "emcee", "bumps", "scipy",

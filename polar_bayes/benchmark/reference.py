@@ -12,12 +12,12 @@ from jaxtyping import Array, Float
 
 from polar_bayes.benchmark.run import labeled
 from polar_bayes.errors import FitError
-from polar_bayes.inference.importance import Importance
-from polar_bayes.inference.mcse import LARGEST_R_HAT
-from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
-from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.result import CENTRAL_95
+from polar_bayes.methods.importance import Importance
+from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
+from polar_bayes.methods.nuts import Nuts
+from polar_bayes.numerics.mcse import LARGEST_R_HAT
 from polar_bayes.progress import no_progress
 
 # --- Distances from the reference -----------------------------------------------------------------

@@ -24,20 +24,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polar_bayes.diagnostics.parameters import scalars
-from polar_bayes.effects.choose import choose_effects
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.compile import LRUCache, cache_key
-from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import Problem, make_problem
-from polar_bayes.inference.psis import CHAINS, numpy_generator
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import posterior_of
 from polar_bayes.interrupts import on_interrupt
+from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
+from polar_bayes.numerics.psis import CHAINS, numpy_generator
 from polar_bayes.paths import temporary_folder
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.variants import Effect, parts_of, simplify
 from polar_bayes.progress import no_progress
+from polar_bayes.scenes.effects import choose_effects
 
 try:
     import resource

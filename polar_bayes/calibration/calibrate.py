@@ -26,13 +26,13 @@ from polar_bayes.calibration.runner import (
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.compiled_model import layout_key
-from polar_bayes.inference.method import AbstractBatchMethod, find_method, make_method, name_of
 from polar_bayes.inference.program import Values
-from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
-from polar_bayes.inference.registry import FIT_DEFAULT
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE, dims_of, shape_of
 from polar_bayes.maps.blocks import as_completed, workers
+from polar_bayes.methods.method import AbstractBatchMethod, find_method, make_method, name_of
+from polar_bayes.methods.registry import FIT_DEFAULT
+from polar_bayes.numerics.psis import LEVELS, MAX_PARETO_K
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.paths import as_path

@@ -27,7 +27,7 @@ from polar_bayes.inference.batching import ObservationBatch, batched
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import SMALL_BATCH, CompiledModel
 from polar_bayes.inference.program import Program, Values
-from polar_bayes.inference.psis import draws_at, smooth
+from polar_bayes.numerics.psis import draws_at, smooth
 from polar_bayes.observation.data import Observations
 
 Arrays = dict[str, np.ndarray]

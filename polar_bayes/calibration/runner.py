@@ -24,11 +24,9 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.batching import ObservationBatch
 from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout
-from polar_bayes.inference.method import AbstractBatchMethod
 from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.problem_batch import Outcome, empty_outcome, problem_batch
 from polar_bayes.inference.program import Program, Values, compile_program
-from polar_bayes.inference.psis import Marginals
 from polar_bayes.inference.request import Request
 from polar_bayes.interrupts import on_interrupt, resume_hint
 from polar_bayes.maps.blocks import (
@@ -42,6 +40,8 @@ from polar_bayes.maps.blocks import (
     locked_ledger,
     written,
 )
+from polar_bayes.methods.method import AbstractBatchMethod
+from polar_bayes.numerics.psis import Marginals
 from polar_bayes.observation.data import Observations
 from polar_bayes.paths import TEMPORARY_PREFIX, replace_file, temporary_folder
 from polar_bayes.priors import describe_prior

@@ -16,7 +16,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from polar_bayes.inference.program import Values
-from polar_bayes.inference.psis import effective_draws
+from polar_bayes.numerics.psis import effective_draws
 
 
 class PitCrps:

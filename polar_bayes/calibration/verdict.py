@@ -33,8 +33,8 @@ from polar_bayes.inference.files import (
     Like,
     Schema,
 )
-from polar_bayes.inference.psis import LEVELS, MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
+from polar_bayes.numerics.psis import LEVELS, MAX_PARETO_K
 
 # --- Schema ---------------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ from polar_bayes.cli.options import (
     seed_option,
 )
 from polar_bayes.cli.printing import NOT_CONVERGED, json_rows, print_frame, print_json, say
-from polar_bayes.inference.registry import FIT_DEFAULT, METHODS
+from polar_bayes.methods.registry import FIT_DEFAULT, METHODS
 from polar_bayes.progress import stages
 
 CALIBRATION_COLUMNS = (

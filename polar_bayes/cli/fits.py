@@ -44,7 +44,7 @@ from polar_bayes.cli.printing import (
     print_verdict,
     say,
 )
-from polar_bayes.inference.registry import FIT_DEFAULT, MAP_DEFAULT
+from polar_bayes.methods.registry import FIT_DEFAULT, MAP_DEFAULT
 from polar_bayes.paths import write_errors
 from polar_bayes.progress import stages
 
@@ -184,7 +184,7 @@ def map_(
     **settings: Any,
 ) -> None:
     """Fit every pixel of an image."""
-    from polar_bayes.inference.scene_file import parse_method
+    from polar_bayes.scenes.scene_file import parse_method
 
     if draws is not None and method != MAP_DEFAULT:
         raise click.UsageError(f"--draws needs --method {MAP_DEFAULT}")
@@ -243,7 +243,7 @@ def effects(capture: Path, as_json: bool, out: Path | None, **settings: Any) -> 
     if out is not None:
         pb.save(ledger, out)
     if as_json:
-        print_json(pb.effects.ledger_summary(ledger))
+        print_json(pb.scenes.ledger_summary(ledger))
     else:
         print_frame(pb.summary(ledger), pb.verdict(ledger).sentences)
 
@@ -258,7 +258,7 @@ def scene(source: Path | str, out: Path | None) -> None:
     """Write the scene, links, priors and method of a result as a file that --scene takes."""
     found = source if isinstance(source, str) else pb.load(source)
     if out is None:
-        click.echo(pb.inference.scene_text(found), nl=False)
+        click.echo(pb.scenes.scene_text(found), nl=False)
     else:
         pb.save_scene(found, out)
         click.echo(f"{out}: edit it, and give it as --scene {out}")

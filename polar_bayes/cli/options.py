@@ -14,7 +14,7 @@ from click.core import ParameterSource
 
 import polar_bayes as pb
 from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
-from polar_bayes.inference.registry import method_names
+from polar_bayes.methods.registry import method_names
 from polar_bayes.paths import as_path, check_output, is_scene_file, refuse_inputs
 
 
@@ -247,8 +247,8 @@ def read_scene_options(settings: dict[str, Any]) -> dict[str, Any]:
 
     What is given on the command line counts more than what the file says.
     """
-    from polar_bayes.inference.scene_file import load_scene, parse_link, parse_method
     from polar_bayes.priors import parse_prior
+    from polar_bayes.scenes.scene_file import load_scene, parse_link, parse_method
 
     source = click.get_current_context().get_parameter_source
     found, stated = dict(settings), {}

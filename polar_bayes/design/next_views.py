@@ -51,15 +51,15 @@ from polar_bayes.design.setup import (
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.compiled_model import compile_model
-from polar_bayes.inference.optimize import from_prior
 from polar_bayes.inference.problem import observe_request
+from polar_bayes.inference.program import from_prior
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import capture_of
-from polar_bayes.inference.scene_file import arguments_of
 from polar_bayes.observation.data import ANGLES, Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.progress import Progress, with_progress
+from polar_bayes.scenes.scene_file import arguments_of
 
 APART = ("wavelength", "reading")
 WIDTH = 2.0 * 1.959963984540054

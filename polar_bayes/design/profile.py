@@ -25,19 +25,19 @@ from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
 from polar_bayes.design.setup import (
-    Coordinate,
     DesignProblem,
-    label_coordinates,
     label_parameters,
-    label_scalars,
     make_design_problem,
     posterior_modes,
     provenance_attrs,
 )
+from polar_bayes.diagnostics.parameters import Coordinate, label_coordinates, label_scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
-from polar_bayes.inference.optimize import (
+from polar_bayes.inference.program import Program
+from polar_bayes.inference.request import resolve
+from polar_bayes.numerics.optimize import (
     Modes,
     NumpyPotential,
     ValueAndGradient,
@@ -46,8 +46,6 @@ from polar_bayes.inference.optimize import (
     finite_potential,
     ignore_line_search_warnings,
 )
-from polar_bayes.inference.program import Program
-from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene

@@ -1,6 +1,5 @@
 """Set-up of a design problem: model, capture, posterior modes, and the labels of coordinates."""
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -12,23 +11,17 @@ import xarray as xr
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from polar_bayes.diagnostics.parameters import Scalar, scalars
+from polar_bayes.diagnostics.parameters import Scalar, label_scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.initialization import STARTS
-from polar_bayes.inference.optimize import (
-    Modes,
-    NumpyPotential,
-    ValueAndGradient,
-    find_modes,
-    from_prior,
-)
 from polar_bayes.inference.problem import compile_request
-from polar_bayes.inference.program import Program
+from polar_bayes.inference.program import Program, from_prior
 from polar_bayes.inference.request import Request
-from polar_bayes.inference.result import PROVENANCE, posterior_of, shape_of
+from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.numerics.optimize import Modes, NumpyPotential, ValueAndGradient, find_modes
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress, no_progress
 
@@ -108,42 +101,6 @@ def label_parameters(problem: DesignProblem) -> ParameterLabels:
     positions = label_scalars(program, capture, unravel(jnp.arange(flat.size, dtype=flat.dtype)))
     rows = [int(scalar.draws.item()) for scalar in positions]
     return ParameterLabels(label_scalars(program, capture, draws), rows)
-
-
-@dataclasses.dataclass(frozen=True, order=True)
-class Coordinate:
-    """One unconstrained coordinate: its label in tables, its site, and its number in the site.
-
-    `is_entry` is False where the site has fewer coordinates than numbers, such as a simplex.
-    """
-
-    index: int
-    label: str
-    site: str
-    entry: int
-    is_entry: bool
-
-
-def label_coordinates(program: Program, capture: xr.Dataset) -> list[Coordinate]:
-    """All unconstrained coordinates in their order."""
-    found = []
-    for site, positions in program.positions.items():
-        flat = positions.ravel()
-        is_entry = flat.size == np.prod(shape_of(program, site), initial=1)
-        named = label_scalars(program, capture, {site: flat[None, None]}) if is_entry else []
-        labels = {int(scalar.draws.item()): scalar.label for scalar in named}
-        found += [
-            Coordinate(index, labels.get(index, f"{site}[{entry}]"), site, entry, is_entry)
-            for entry, index in enumerate(flat.tolist())
-        ]
-    return sorted(found)
-
-
-def label_scalars(program: Program, capture: xr.Dataset, draws: Mapping[str, Any]) -> list[Scalar]:
-    """Scalars of chains of draws, with the capture's own labels of axes, such as wavelengths."""
-    group = posterior_of(program, draws)
-    labels = {str(dim): capture[dim] for dim in group.dims if dim in capture.coords}
-    return scalars(group.assign_coords(labels))
 
 
 # --- Draws of the posterior, over which the criterion of a design is averaged ---------------------

@@ -17,8 +17,8 @@ from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import CENTRAL_95
+from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.observation.data import ANGLES
 
 SUMMARY_COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")

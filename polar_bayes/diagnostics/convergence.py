@@ -24,9 +24,9 @@ from polar_bayes.diagnostics.parameters import (
     with_entries,
 )
 from polar_bayes.diagnostics.view import FitView, once, view_of
-from polar_bayes.inference.mcse import LARGEST_R_HAT, SMALLEST_ESS, TAILS
-from polar_bayes.inference.psis import MAX_PARETO_K, smooth
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
+from polar_bayes.numerics.mcse import LARGEST_R_HAT, SMALLEST_ESS, TAILS
+from polar_bayes.numerics.psis import MAX_PARETO_K, smooth
 from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")

@@ -3,11 +3,14 @@
 import dataclasses
 import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from polar_bayes.errors import one_line
+from polar_bayes.inference.program import Program
+from polar_bayes.inference.result import posterior_of, shape_of
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 SAMPLE_DIMS = ("chain", "draw")
@@ -105,3 +108,42 @@ def _coordinate(variable: xr.DataArray, dim: str) -> list[str]:
         else one_line(str(value))
         for value in values
     ]
+
+
+# --- Unconstrained coordinates --------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, order=True)
+class Coordinate:
+    """One unconstrained coordinate: its label in tables, its site, and its number in the site.
+
+    `is_entry` is False where the site has fewer coordinates than numbers, such as a simplex.
+    """
+
+    index: int
+    label: str
+    site: str
+    entry: int
+    is_entry: bool
+
+
+def label_coordinates(program: Program, capture: xr.Dataset) -> list[Coordinate]:
+    """All unconstrained coordinates in their order."""
+    found = []
+    for site, positions in program.positions.items():
+        flat = positions.ravel()
+        is_entry = flat.size == np.prod(shape_of(program, site), initial=1)
+        named = label_scalars(program, capture, {site: flat[None, None]}) if is_entry else []
+        labels = {int(scalar.draws.item()): scalar.label for scalar in named}
+        found += [
+            Coordinate(index, labels.get(index, f"{site}[{entry}]"), site, entry, is_entry)
+            for entry, index in enumerate(flat.tolist())
+        ]
+    return sorted(found)
+
+
+def label_scalars(program: Program, capture: xr.Dataset, draws: Mapping[str, Any]) -> list[Scalar]:
+    """Scalars of chains of draws, with the capture's own labels of axes, such as wavelengths."""
+    group = posterior_of(program, draws)
+    labels = {str(dim): capture[dim] for dim in group.dims if dim in capture.coords}
+    return scalars(group.assign_coords(labels))

@@ -22,7 +22,7 @@ from scipy.special import logsumexp
 
 from polar_bayes.diagnostics.parameters import APPROXIMATIONS, MIN_DRAWS, SAMPLE_DIMS
 from polar_bayes.diagnostics.view import FitView, once
-from polar_bayes.inference.psis import MAX_PARETO_K, smooth
+from polar_bayes.numerics.psis import MAX_PARETO_K, smooth
 
 PROBABILITIES = (0.5, 0.8, 0.95)
 MAX_BAND_POINTS = 500

@@ -24,8 +24,6 @@ from polar_bayes.physics.geometry import Geometry
 
 IMAGE = ("y", "x")
 
-AnyArray = Array | np.ndarray
-
 LANES = 16
 """Pixels of a batch that are computed together: their data fit into the cache of one core."""
 
@@ -115,17 +113,6 @@ def cut(image: xr.Dataset, pixels: int) -> Iterator[dict[str, slice]]:
             yield {"y": slice(y, min(y + high, rows)), "x": slice(x, min(x + wide, columns))}
 
 
-def take_rows[T](values: T, which: np.ndarray | slice) -> T:
-    """Some pixels of arrays that all begin with the pixel axis."""
-    return jax.tree.map(lambda x: np.asarray(x)[which], values)
-
-
-def put_rows[T](values: T, which: np.ndarray | slice, new: T) -> None:
-    """Replace some pixels of arrays that all begin with the pixel axis."""
-    for whole, part in zip(jax.tree.leaves(values), jax.tree.leaves(new), strict=True):
-        whole[which] = part
-
-
 # --- Status of each pixel, and the method used ----------------------------------------------------
 
 
@@ -160,35 +147,6 @@ class MethodUsed(enum.IntEnum):
 
 
 # --- A function of one pixel as a compiled program of a batch -------------------------------------
-
-
-def batches(count: int, size: int) -> Iterator[np.ndarray]:
-    """Indices of batches of one size; the last is filled up with the last pixel."""
-    for begin in range(0, count, size):
-        yield np.minimum(np.arange(begin, begin + size), count - 1)
-
-
-def map_batches(
-    function: Callable[[np.ndarray], Any], count: int, size: int, over: Callable = map
-) -> Any:
-    """Results of a function of the indices of one batch, joined along the pixel axis."""
-    # Each part is put in its place as it comes: two copies of all results may not fit into memory.
-    joined = None
-    parts = over(lambda index: jax.tree.map(np.asarray, function(index)), batches(count, size))
-    for begin, part in zip(range(0, count, size), parts, strict=True):
-        if joined is None:
-            joined = jax.tree.map(lambda x: np.empty((count, *x.shape[1:]), x.dtype), part)
-        end = min(begin + size, count)
-        put_rows(joined, slice(begin, end), take_rows(part, slice(end - begin)))
-    return joined
-
-
-def map_elements(function: Callable, values: np.ndarray, size: int) -> np.ndarray:
-    """A function of numbers, of an array of any shape: it is given `size` of them at a time."""
-    flat = np.ravel(values)
-    if not flat.size:
-        return np.zeros(np.shape(values))
-    return map_batches(lambda at: function(flat[at]), flat.size, size).reshape(np.shape(values))
 
 
 def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnce:

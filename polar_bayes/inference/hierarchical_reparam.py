@@ -43,7 +43,8 @@ from jaxtyping import Array, Float
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compile import JitOnce
-from polar_bayes.inference.optimize import (
+from polar_bayes.inference.program import Model, Program, compile_program, from_prior
+from polar_bayes.numerics.optimize import (
     Modes,
     NumpyPotential,
     ValueAndGradient,
@@ -51,11 +52,9 @@ from polar_bayes.inference.optimize import (
     distinct_modes,
     find_mode,
     finite_potential,
-    from_prior,
     ignore_line_search_warnings,
     symmetrize,
 )
-from polar_bayes.inference.program import Model, Program, compile_program
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress
 

@@ -31,20 +31,24 @@ from polar_bayes.inference.hierarchical_reparam import (
     find_groups,
     fit_reparam,
 )
-from polar_bayes.inference.optimize import (
+from polar_bayes.inference.program import (
     KEYS,
+    Model,
+    Program,
+    begin_from_prior,
+    from_prior,
+    in_blocks,
+)
+from polar_bayes.numerics.optimize import (
     Modes,
     NumpyPotential,
     ValueAndGradient,
-    begin_from_prior,
     distinct_modes,
     find_mode,
     find_modes,
     finite_sd,
-    from_prior,
     ignore_line_search_warnings,
 )
-from polar_bayes.inference.program import Model, Program, in_blocks
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress
 

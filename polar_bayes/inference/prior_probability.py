@@ -7,7 +7,7 @@ import numpy as np
 from numpyro import distributions as dist
 from scipy import special
 
-from polar_bayes.inference.batching import map_elements
+from polar_bayes.numerics.batches import map_elements
 from polar_bayes.priors import cast_prior
 
 ROWS = 1024

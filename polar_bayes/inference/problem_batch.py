@@ -6,9 +6,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from polar_bayes.inference.batching import AnyArray, MethodUsed, ObservationBatch, Status
+from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.program import Values
+from polar_bayes.numerics.batches import AnyArray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -22,8 +22,8 @@ from numpyro.infer.util import compute_log_probs
 from numpyro.primitives import Messenger
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batching import map_batches
 from polar_bayes.inference.compile import JitOnce
+from polar_bayes.numerics.batches import map_batches
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -463,3 +463,24 @@ def _check_readings(sampled: Mapping[str, dict], data: Observations) -> None:
             where="model",
             hint=f"end it with declare_readings(...), or observe {' or '.join(data.readings)}",
         )
+
+
+KEYS = 500
+"""Prior draws that one call of a compiled program makes at most."""
+
+
+def begin_from_prior(program: Program, data: Observations) -> None:
+    """Begin to compile what `from_prior` needs."""
+    key = jax.random.key_data(jax.random.key(0))
+    program.drawn_from_prior.begin(jax.ShapeDtypeStruct((KEYS, *key.shape), key.dtype), KEYS, data)
+
+
+def from_prior(program: Program, key: Array, draws: int, data: Observations) -> np.ndarray:
+    """Unconstrained vectors drawn from the prior; one compiled program serves any number."""
+    # The key of a draw depends on its index alone, so a multiple of `KEYS` serves any number.
+    keys = np.asarray(jax.random.key_data(jax.random.split(key, KEYS * -(-draws // KEYS))))
+
+    def drawn(index: np.ndarray) -> np.ndarray:
+        return np.asarray(program.drawn_from_prior(keys[index], min(KEYS, draws - index[0]), data))
+
+    return map_batches(drawn, draws, KEYS)

@@ -30,7 +30,6 @@ from polar_bayes.inference.compiled_model import MOMENTS, CompiledModel
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.problem_batch import BatchDraws
 from polar_bayes.inference.program import Values
-from polar_bayes.inference.psis import LEVELS, Marginals
 from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.maps.residuals import (
     Fitted,
@@ -38,6 +37,7 @@ from polar_bayes.maps.residuals import (
     fitted_readings,
     residual_tail,
 )
+from polar_bayes.numerics.psis import LEVELS, Marginals
 from polar_bayes.observation.links import PERFECT
 from polar_bayes.physics.part import absence
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
@@ -63,9 +63,6 @@ class Criticism(enum.IntEnum):
 
 
 PROBLEMS = Criticism.PRIORS_PROBLEM | Criticism.NOISE_PROBLEM | Criticism.RESIDUALS_PROBLEM
-
-UNKNOWN = -1
-"""Value of chunks that are not written: no check has a caution and a problem."""
 
 
 @dataclasses.dataclass(frozen=True)

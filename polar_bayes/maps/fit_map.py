@@ -26,33 +26,23 @@ from polar_bayes.inference.batching import (
     cut,
 )
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout, layout_key
-from polar_bayes.inference.corrected_laplace import CorrectedLaplace
-from polar_bayes.inference.method import AbstractBatchMethod, find_method, name_of
 from polar_bayes.inference.problem_batch import (
     Outcome,
     ProblemBatch,
     empty_outcome,
     problem_batch,
 )
-from polar_bayes.inference.psis import LEVELS, Marginals
-from polar_bayes.inference.registry import MAP_DEFAULT
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE
-from polar_bayes.inference.shared import (
-    DISAGREEMENT,
-    SharedParameter,
-    as_priors,
-    estimate_shared,
-    of_priors,
-)
-from polar_bayes.inference.shared import PIXELS as SHARED_PIXELS
 from polar_bayes.maps.blocks import as_completed, workers
-from polar_bayes.maps.criticism import (
-    PROBLEMS,
-    UNKNOWN,
-    Criticism,
-    PixelCriticism,
-)
+from polar_bayes.maps.criticism import PROBLEMS, Criticism, PixelCriticism
+from polar_bayes.maps.lazy import DISAGREEMENT, UNKNOWN
+from polar_bayes.maps.shared import PIXELS as SHARED_PIXELS
+from polar_bayes.maps.shared import SharedParameter, as_priors, estimate_shared, of_priors
+from polar_bayes.methods.corrected_laplace import CorrectedLaplace
+from polar_bayes.methods.method import AbstractBatchMethod, find_method, name_of
+from polar_bayes.methods.registry import MAP_DEFAULT
+from polar_bayes.numerics.psis import LEVELS, Marginals
 from polar_bayes.observation.data import ANGLES, READINGS, Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.part import notation

@@ -15,14 +15,18 @@ from xarray.core import indexing
 from polar_bayes.capture.files import load_capture
 from polar_bayes.errors import CaptureError, FitError, PolarBayesError
 from polar_bayes.inference.batching import IMAGE, Status, cut
-from polar_bayes.inference.psis import LEVELS
 from polar_bayes.inference.result import PROVENANCE, provenance_of
-from polar_bayes.inference.shared import DISAGREEMENT
-from polar_bayes.maps.criticism import UNKNOWN
+from polar_bayes.numerics.psis import LEVELS
 from polar_bayes.observation.data import READINGS
 from polar_bayes.paths import as_path
 
 zarr = lazy_loader.load("zarr")  # 0.1 s that results of other kinds need not wait for
+
+DISAGREEMENT = 3.1
+"""Of the information matrix test, a standard normal number: once in a thousand right models."""
+
+UNKNOWN = -1
+"""Value of chunks that are not written: no check has a caution and a problem."""
 
 MOST_BYTES = 2**31
 """Maps in chunks (Dask) that are computed at once, into memory."""

@@ -28,8 +28,8 @@ from polar_bayes.calibration.verdict import (
 from polar_bayes.diagnostics.coverage import INTERVALS
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batching import MethodUsed, Status
-from polar_bayes.inference.psis import MAX_PARETO_K
 from polar_bayes.inference.result import provenance_of
+from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, text
 from polar_bayes.reporting import plots_calibration as figures

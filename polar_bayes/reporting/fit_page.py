@@ -23,8 +23,8 @@ from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.checks import CAUTION, PROBLEM
 from polar_bayes.inference.files import auto_sentences
-from polar_bayes.inference.psis import MAX_PARETO_K
-from polar_bayes.inference.registry import METHODS
+from polar_bayes.methods.registry import METHODS
+from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table

@@ -16,7 +16,6 @@ from polar_bayes.diagnostics.coverage import INTERVALS, map_coverage, map_scalar
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, cut
-from polar_bayes.inference.registry import MAP_DEFAULT, METHODS
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.lazy import (
     CHUNK,
@@ -30,6 +29,7 @@ from polar_bayes.maps.lazy import (
     shared_parameters,
     start_sentences,
 )
+from polar_bayes.methods.registry import MAP_DEFAULT, METHODS
 from polar_bayes.physics.part import notation
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts

@@ -27,8 +27,8 @@ from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.diagnostics.view import FitView
 from polar_bayes.errors import one_line
 from polar_bayes.inference.batching import MIN_VIEWS
-from polar_bayes.inference.psis import MAX_PARETO_K
-from polar_bayes.inference.registry import METHODS
+from polar_bayes.methods.registry import METHODS
+from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.reporting.style import QUANTITIES, coordinate_labels, short_title
 from polar_bayes.results import MIN_GOOD_SHARE, verdict
 

@@ -34,16 +34,16 @@ from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import FitError, SceneError, one_line
 from polar_bayes.inference.checks import NEAR_BOUND
-from polar_bayes.inference.fitting import fit_request
-from polar_bayes.inference.importance import Importance
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
+from polar_bayes.methods.importance import Importance
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import parse_prior, support_bounds
 from polar_bayes.progress import Progress, no_progress, with_progress
-from polar_bayes.scenes.candidates import (
+from polar_bayes.scenes.fit_request import fit_request
+from polar_bayes.scenes.library import (
     Choice,
     SceneLibrary,
     default_links,

@@ -9,12 +9,12 @@ from numpyro import distributions as dist
 
 import polar_bayes.scenes  # its names load the comparison, and with it diagnostics, on first use
 from polar_bayes.capture.schema import validate
-from polar_bayes.inference.fitting import choose_method, fit_request
-from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.request import resolve
+from polar_bayes.methods.method import AbstractMethod
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
+from polar_bayes.scenes.fit_request import choose_method, fit_request
 
 
 @with_progress

@@ -16,16 +16,16 @@ import xarray as xr
 from polar_bayes.diagnostics.convergence import verdict
 from polar_bayes.diagnostics.parameters import SAMPLE_DIMS
 from polar_bayes.errors import FitError
-from polar_bayes.inference.fitting import fit_request, try_alternatives
-from polar_bayes.inference.importance import Importance
-from polar_bayes.inference.least_squares import Point
-from polar_bayes.inference.method import AbstractMethod
-from polar_bayes.inference.nuts import Nuts
 from polar_bayes.inference.problem import make_problem
-from polar_bayes.inference.psis import FINITE_VARIANCE
 from polar_bayes.inference.result import PROVENANCE, provenance_of
+from polar_bayes.methods.importance import Importance
+from polar_bayes.methods.least_squares import Point
+from polar_bayes.methods.method import AbstractMethod
+from polar_bayes.methods.nuts import Nuts
+from polar_bayes.numerics.psis import FINITE_VARIANCE
 from polar_bayes.progress import Progress
 from polar_bayes.scenes.comparison import FitArguments, compare_candidates
+from polar_bayes.scenes.fit_request import fit_request, try_alternatives
 
 OF_DRAWS = (
     *("posterior", "sample_stats", "log_prior", "log_likelihood"),

@@ -17,11 +17,11 @@ from polar_bayes.benchmark import run
 from polar_bayes.benchmark.advice import AS_GIVEN
 from polar_bayes.benchmark.reference import ReferenceRun, best_reference, run_reference
 from polar_bayes.benchmark.run import AbstractOverride, Trial, run_in_subprocess
-from polar_bayes.inference.mcse import standard_errors
-from polar_bayes.inference.method import AbstractMethod, PosteriorDraws
 from polar_bayes.inference.problem import make_problem
-from polar_bayes.inference.psis import systematic_resample
 from polar_bayes.inference.request import resolve
+from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
+from polar_bayes.numerics.mcse import standard_errors
+from polar_bayes.numerics.psis import systematic_resample
 from polar_bayes.physics.variants import parts_of
 
 LINKS = {"q": pb.links.StokesLink()}

@@ -17,9 +17,9 @@ import polar_bayes as pb
 from polar_bayes.errors import FitError
 from polar_bayes.inference import hierarchical_reparam, problem
 from polar_bayes.inference.batching import MethodUsed, Status
-from polar_bayes.inference.method import AbstractMethod, PosteriorDraws, thin_draws
 from polar_bayes.inference.problem import Problem, compile_model
 from polar_bayes.inference.request import resolve
+from polar_bayes.methods.method import AbstractMethod, PosteriorDraws, thin_draws
 from polar_bayes.observation.data import observe
 from polar_bayes.progress import no_progress
 

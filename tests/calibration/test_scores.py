@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from polar_bayes.calibration.scores import PitCrps, crps, randomized_pit
-from polar_bayes.inference.psis import summarize
+from polar_bayes.numerics.psis import summarize
 
 
 def even(fits: int, draws: int) -> np.ndarray:

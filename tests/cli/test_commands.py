@@ -8,7 +8,7 @@ from cases import each
 
 import polar_bayes as pb
 from polar_bayes.cli import main
-from polar_bayes.inference import method
+from polar_bayes.methods import method
 
 
 def test_simulate_writes_what_fit_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -85,9 +85,9 @@ def test_the_command_line_says_what_python_can(
     assert main(["scene", "--from", str(out), "--out", str(file)]) == 0
     main(["fit", str(plate), "--scene", str(file), "--out", str(again)])
     assert pb.load(again)["posterior"].equals(pb.load(out)["posterior"])
-    assert pb.inference.scene_text(pb.load(again)) == text == file.read_text()
+    assert pb.scenes.scene_text(pb.load(again)) == text == file.read_text()
     main(["fit", str(plate), "--scene", str(file), "--method", "laplace", "--out", str(again)])
-    assert 'method = "Laplace()"' in pb.inference.scene_text(pb.load(again))
+    assert 'method = "Laplace()"' in pb.scenes.scene_text(pb.load(again))
     words = ["simulate", "--scene", str(file), "--name", "mine", "--out", str(tmp_path / "s.nc")]
     assert main(words) == 0
     capture = pb.load_capture(tmp_path / "s.nc")

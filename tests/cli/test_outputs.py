@@ -120,8 +120,8 @@ def test_a_demo_writes_in_no_folder_of_anothers(held, plate, tmp_path, capsys):
 
 
 def test_names_of_options_are_those_of_the_tables():
-    from polar_bayes.inference.registry import method_names
     from polar_bayes.inference.request import MODELS
+    from polar_bayes.methods.registry import method_names
 
     known = {
         cli_options.MODEL: MODELS,

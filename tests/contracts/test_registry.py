@@ -12,8 +12,8 @@ from plates import LINKS, PLATE, plate_capture
 
 import polar_bayes as pb
 from polar_bayes.cli.entry import main
-from polar_bayes.inference.method import AbstractMethod, find_method, make_method
-from polar_bayes.inference.registry import METHODS, method_names
+from polar_bayes.methods.method import AbstractMethod, find_method, make_method
+from polar_bayes.methods.registry import METHODS, method_names
 
 ONE = {"scene": PLATE, "links": LINKS}
 

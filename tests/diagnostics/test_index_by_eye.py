@@ -8,8 +8,8 @@ from plates import LINKS, PLATE, plates
 from synthetic_results import edit_provenance, make_result
 
 import polar_bayes as pb
-from polar_bayes.inference import fitting
 from polar_bayes.inference.request import resolve
+from polar_bayes.scenes import fit_request as fitting
 
 BOUNDS = {"refractive_index": [1.2, 2.0]}
 FAR, NEAR, MOVED = [3.0, 3.5, 4.2, 0.98], [1.9, 2.1, 2.3, 0.98], [3.0, 3.5, 4.2, 0.7]

@@ -17,8 +17,8 @@ from toy_models import line
 
 import polar_bayes as pb
 from polar_bayes.inference import compile
-from polar_bayes.inference import fitting as fitting
 from polar_bayes.inference.compile import JitOnce, bytes_of
+from polar_bayes.scenes import fit_request as fitting
 
 
 @pytest.fixture

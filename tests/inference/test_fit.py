@@ -317,7 +317,7 @@ def test_progress_reports_every_stage(capture: xr.Dataset) -> None:
 def test_a_comparison_that_fails_is_told_and_costs_nothing(
     capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from polar_bayes.inference import fitting
+    from polar_bayes.scenes import fit_request as fitting
 
     whole = fitting.make_problem
 

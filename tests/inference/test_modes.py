@@ -5,7 +5,7 @@ import pytest
 from cases import each
 from scipy.stats import multivariate_normal
 
-from polar_bayes.inference.optimize import (
+from polar_bayes.numerics.optimize import (
     ModeStatus,
     central_difference_hessian,
     distinct_modes,

@@ -21,16 +21,16 @@ from plates import LINKS, PLATE, plate_capture, plates
 from spectral_plates import spectral_plate
 
 import polar_bayes as pb
-from polar_bayes.effects.choose import ChosenScene
-from polar_bayes.inference import fitting as fitting
-from polar_bayes.inference import optimize, problem, request
+from polar_bayes.inference import problem, request
+from polar_bayes.inference import program as programs
 from polar_bayes.inference.compile import LRUCache, cache_key
-from polar_bayes.inference.optimize import ignore_line_search_warnings
 from polar_bayes.inference.problem import compile_model
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.inference.request import resolve
 from polar_bayes.models.per_material import per_material
+from polar_bayes.numerics.optimize import ignore_line_search_warnings
 from polar_bayes.observation.data import observe
+from polar_bayes.scenes.effects import ChosenScene
 
 # The goals let chains of other readings stop at another length.
 NUTS = pb.methods.Nuts(
@@ -126,15 +126,15 @@ def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
 def test_any_number_of_prior_draws_is_served_by_one_program(
     compiled: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(optimize, "KEYS", 8)
+    monkeypatch.setattr(programs, "KEYS", 8)
     with jax.enable_x64(True):
         data = observe(one(1))
         program = compiled_model(one(1)).program
-        few = optimize.from_prior(program, jax.random.key(5), 3, data)
+        few = programs.from_prior(program, jax.random.key(5), 3, data)
         compiled.clear()
-        more = optimize.from_prior(program, jax.random.key(5), 7, data)
+        more = programs.from_prior(program, jax.random.key(5), 7, data)
         assert compiled == []
-        many = optimize.from_prior(program, jax.random.key(5), 20, data)
+        many = programs.from_prior(program, jax.random.key(5), 20, data)
         assert "jit(draw)" not in compiled
         alone = program.from_prior(jax.random.split(jax.random.key(5), 20)[19], data)
     assert few.shape == (3, program.size)

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from polar_bayes.inference.proposals import normal_points, random_rotations
-from polar_bayes.inference.psis import effective_draws, smooth, summarize
+from polar_bayes.numerics.mixtures import normal_points, random_rotations
+from polar_bayes.numerics.psis import effective_draws, smooth, summarize
 
 
 def theirs(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,11 +10,11 @@ from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, planned, plate_i
 from toy_models import BEND, bent, squared
 
 import polar_bayes as pb
-from polar_bayes.inference import importance
+from polar_bayes.inference.batch_modes import find_conditional_modes
 from polar_bayes.inference.batching import MethodUsed, Status
-from polar_bayes.inference.levenberg_marquardt import find_conditional_modes
-from polar_bayes.inference.method import AbstractMethod
 from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.methods import importance
+from polar_bayes.methods.method import AbstractMethod
 from polar_bayes.reporting.text import APPROACHES
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")

@@ -16,14 +16,14 @@ from plate_images import ASKED, NAMES, mapped, planned, plate_image, stacked
 from scipy import optimize, stats
 
 import polar_bayes as pb
+from polar_bayes.inference.batch_modes import find_modes
 from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status
-from polar_bayes.inference.corrected_laplace import CorrectedLaplace
-from polar_bayes.inference.importance import Importance
-from polar_bayes.inference.laplace import Laplace
-from polar_bayes.inference.levenberg_marquardt import find_modes
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.maps.fit_map import MapPlan, blank, fit_pixels
+from polar_bayes.methods.corrected_laplace import CorrectedLaplace
+from polar_bayes.methods.importance import Importance
+from polar_bayes.methods.laplace import Laplace
 from polar_bayes.models.per_material import per_material
 from polar_bayes.physics.facets import FacetQuadrature
 

@@ -12,8 +12,8 @@ from plates import PLATE
 
 import polar_bayes as pb
 from polar_bayes.inference.batching import Status
-from polar_bayes.inference.shared import SharedParameter
 from polar_bayes.maps import fit_map
+from polar_bayes.maps.shared import SharedParameter
 from polar_bayes.models.per_material import per_material
 
 SHARED = ("stokes_error_factor",)

@@ -8,7 +8,7 @@ from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polar_bayes.inference.levenberg_marquardt import cholesky, inverse
+from polar_bayes.numerics.levenberg_marquardt import cholesky, inverse
 
 SIZES = range(1, 8)
 FACTOR, INVERSE = jax.jit(jax.vmap(cholesky)), jax.jit(jax.vmap(inverse))

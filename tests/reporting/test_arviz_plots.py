@@ -14,7 +14,7 @@ from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.errors import FitError
-from polar_bayes.inference import fitting
+from polar_bayes.scenes import fit_request as fitting
 
 METHODS = {
     "nuts": pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50),

@@ -14,8 +14,8 @@ from plates import LINKS, PLATE, plate_capture, plates
 
 import polar_bayes as pb
 from polar_bayes.scenes import comparison as selection
-from polar_bayes.scenes.candidates import SceneLibrary
 from polar_bayes.scenes.comparison import FitArguments, between_scenes, stacking_weights
+from polar_bayes.scenes.library import SceneLibrary
 from polar_bayes.scenes.sentences import SceneComparison
 from polar_bayes.scenes.stacking import stack_fits
 

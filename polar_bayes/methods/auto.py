@@ -1,0 +1,246 @@
+"""Automatic choice of a method: the cheapest whose own diagnostics accept its draws."""
+
+import dataclasses
+import math
+import time
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple, override
+
+import numpy as np
+from jaxtyping import Array
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.compile import OutOfTimeError, run_until
+from polar_bayes.inference.problem import Problem
+from polar_bayes.methods.importance import Importance
+from polar_bayes.methods.method import AbstractMethod, PosteriorDraws, flatten, make_method
+from polar_bayes.methods.nuts import Nuts
+from polar_bayes.methods.registry import method_names
+from polar_bayes.numerics.mcse import LARGEST_R_HAT, draws_needed, largest_error
+from polar_bayes.numerics.psis import MAX_PARETO_K, max_effective_size
+from polar_bayes.progress import Progress
+
+RESERVE = 8
+"""Times as many weighted draws as normal posteriors need: long tails need more."""
+
+MOST_DRAWS = 2**17
+"""Weighted draws beyond which chains are the better way."""
+
+MARGIN, MOST_TIMES = 1.5, 16.0
+"""Draws of a second try: more than the first error asks for, but not above so many times."""
+
+
+def expected_error(draws: PosteriorDraws, problem: Problem) -> float:
+    """Monte Carlo error of a mean or standard deviation that 1% of the fits exceed.
+
+    In posterior standard deviations; the largest of all parameters.
+    """
+    return largest_error(*draws.standard_errors(lambda z: flatten(problem.constrain(z))))
+
+
+@dataclasses.dataclass(frozen=True)
+class Auto(AbstractMethod):
+    """The cheapest method whose own diagnostics say that it is good enough.
+
+    Methods are tried from cheap to exact: importance (of one material in one color), NUTS. One is
+    taken when Pareto k-hat is at most 0.7, R-hat at most 1.01, nothing diverged, no mode was left
+    out, and the Monte Carlo error of every mean and standard deviation is within the tolerance (but
+    in 1% of the fits). Where only that is missing, the same method is tried once more with more
+    draws.
+
+    Args:
+        tolerance: Largest error of a posterior mean or standard deviation, in posterior standard
+            deviations, above 0 and at most 1.
+        seconds: Of the whole fit, counted from the call of `fit`, > 0. What is not done by then is
+            abandoned, comparison fits included, which are made by the method that was taken; only
+            the first method always ends.
+
+    Raises:
+        FitError: A setting is out of range.
+    """
+
+    tolerance: float = 0.1
+    seconds: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.tolerance <= 1.0:
+            hint = "give posterior standard deviations above 0, at most 1, such as 0.1"
+            self.refuse(f"tolerance is {self.tolerance}", hint)
+        if not self.seconds > 0.0:
+            self.refuse(f"seconds is {self.seconds}", "give a time above 0, such as 60")
+
+    def candidates(self, problem: Problem) -> dict[str, AbstractMethod]:
+        """What is tried for a capture, each with as many draws as it takes.
+
+        The order is that of their costs once all programs are compiled.
+
+        Weighted draws are left out where even equal weights could not meet the tolerance.
+
+        Args:
+            problem: The capture and its model.
+
+        Returns:
+            Methods by name.
+        """
+        needed = draws_needed(self.tolerance, int(problem.describe()["size"].sum()))
+        chains = Nuts(effective_draws=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
+        if not problem.is_one_spectrum_point:
+            return {"nuts": chains}
+        weighted = Importance(draws=max(2048, 2 * min(RESERVE * needed, MOST_DRAWS)), rounds=1)
+        if max_effective_size(weighted.draws) < needed:
+            return {"nuts": chains}
+        return {"importance": weighted, "nuts": chains}
+
+    @override
+    def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
+        deadline = self.deadline(problem)
+        attempts: list[Attempt] = []
+        best: tuple[Attempt, PosteriorDraws] | None = None
+        waiting = list(self.candidates(problem).items())
+        tried: set[str] = set()
+        while waiting:
+            name, method = waiting.pop(0)
+            # The first one always ends: there is nothing else to return.
+            until = deadline if attempts else np.inf
+            attempt, draws = self._try(name, method, problem, key, progress, until)
+            attempts.append(attempt)
+            # Of two in doubt the more expensive one is nearer to exact.
+            if draws is not None and (best is None or attempt.error <= best[0].error):
+                best = attempt, draws
+            if attempt.taken:
+                break
+            if name not in tried and np.isfinite(attempt.error):
+                tried.add(name)
+                times = MARGIN * (attempt.error / self.tolerance) ** 2
+                # Powers of two: of a layout, few numbers of draws are ever compiled.
+                more = method.scale_draws(min(2.0 ** math.ceil(math.log2(times)), MOST_TIMES))
+                waiting[:0] = [] if more is None else [(name, more)]
+        if best is None:
+            raise FitError(
+                "; ".join(f"{attempt.name}: {attempt.why}" for attempt in attempts),
+                where="method='auto'",
+                hint="give more seconds, or check the capture against the prior predictive",
+            )
+        return self._report(*best, attempts)
+
+    @override
+    def deadline(self, problem: Problem) -> float:
+        return problem.start_time + self.seconds
+
+    @override
+    def for_comparison(self, problem: Problem, draws: PosteriorDraws) -> tuple[AbstractMethod, ...]:
+        chosen = self.candidates(problem)[draws.metadata["auto"]["chosen"]]
+        return chosen.for_comparison(problem, draws)
+
+    def _try(
+        self,
+        name: str,
+        method: AbstractMethod,
+        problem: Problem,
+        key: Array,
+        progress: Progress,
+        deadline: float,
+    ) -> tuple["Attempt", PosteriorDraws | None]:
+        """One method, judged by its own diagnostics, or abandoned at the deadline."""
+        begin = time.perf_counter()
+
+        def run(progress: Progress) -> tuple[Attempt, PosteriorDraws]:
+            begin = time.perf_counter()
+            draws = method.run(problem, key, progress)
+            return self._judge(name, draws, problem, begin), draws
+
+        try:
+            return run_until(deadline, progress, run)
+        except (FitError, OutOfTimeError) as failure:
+            return Attempt(name, time.perf_counter() - begin, why=str(failure)), None
+
+    def _judge(self, name: str, draws: PosteriorDraws, problem: Problem, begin: float) -> "Attempt":
+        error = expected_error(draws, problem)
+        doubts = _bias_doubts(draws, problem)
+        biased = bool(doubts)
+        if not error <= self.tolerance:
+            doubts.append(f"its Monte Carlo error may be {error:.2g} posterior sd")
+        return Attempt(
+            name,
+            time.perf_counter() - begin,
+            why="; ".join(doubts),
+            error=np.inf if biased else error,  # bias weighs more than any noise
+            monte_carlo=error,
+            taken=not doubts,
+            r_hat=draws.r_hat,
+            k_hat=draws.k_hat,
+            effective_draws=draws.effective_draws,
+        )
+
+    def _report(
+        self, attempt: "Attempt", draws: PosteriorDraws, attempts: list["Attempt"]
+    ) -> PosteriorDraws:
+        """The draws with what was tried, and a problem where nothing was good enough."""
+        problems = list(draws.problems)
+        if not attempt.taken:
+            problems.append(
+                f"no method met the tolerance of {self.tolerance:g} posterior sd within "
+                f"{self.seconds:g} s: {attempt.name} came nearest, and "
+                f"{attempt.why or 'was not judged'}"
+            )
+        summary = {
+            "tolerance": self.tolerance,
+            "seconds": self.seconds,
+            "chosen": attempt.name,
+            "met": attempt.taken,
+            "expected_error": _rounded(attempt.monte_carlo),
+            "steps": [each.as_metadata() for each in attempts],
+        }
+        metadata = draws.metadata | {"auto": summary}
+        return dataclasses.replace(draws, problems=problems, metadata=metadata)
+
+
+class Attempt(NamedTuple):
+    """One method that was tried."""
+
+    name: str
+    seconds: float
+    why: str = ""
+    error: float = np.inf
+    monte_carlo: float = np.inf
+    taken: bool = False
+    r_hat: float = np.nan
+    k_hat: float = np.nan
+    effective_draws: float = np.nan
+
+    def as_metadata(self) -> dict[str, Any]:
+        """What JSON can hold."""
+        numbers = ("seconds", "monte_carlo", "r_hat", "k_hat", "effective_draws")
+        texts = {"name": self.name, "taken": self.taken, "why": self.why}
+        return texts | {name: _rounded(getattr(self, name)) for name in numbers}
+
+
+def _bias_doubts(draws: PosteriorDraws, problem: Problem) -> list[str]:
+    """Why draws may be biased."""
+    doubts = draws.doubts
+    if draws.k_hat > MAX_PARETO_K and not doubts:
+        doubts.append(f"its Pareto k-hat is {draws.k_hat:.2f}")
+    if draws.r_hat > LARGEST_R_HAT:
+        doubts.append(f"its R-hat is {draws.r_hat:.3f}")
+    # Where all chains began at one mode, R-hat cannot see the others.
+    if draws.method == "nuts" and (
+        (weight := problem.initialize().missed_mode_weight(draws.z)) > 0.0
+    ):
+        doubts.append(f"a mode of weight {weight:.2g} was not visited by every chain")
+    return doubts
+
+
+def _rounded(value: float) -> float | None:
+    return round(float(value), 4) if np.isfinite(value) else None
+
+
+STUDY_METHODS: Mapping[str, AbstractMethod] = MappingProxyType(
+    {
+        **{name: make_method(name) for name in method_names(one=True) if name != "auto"},
+        "nuts short": Nuts(warmup=100, draws=100, most_draws=100),
+        "nuts long": Nuts(warmup=1000, draws=4000, most_draws=4000),
+    }
+)
+"""Methods that `polar_bayes.accuracy` compares. One more is one more value:
+`{**STUDY_METHODS, "mine": Mine()}`."""

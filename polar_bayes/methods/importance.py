@@ -1,0 +1,382 @@
+"""Importance sampling from mixtures at all modes and along their profiles.
+
+Many captures are fitted side by side by the same mixtures and rounds, with the searches of all
+and the densities of all their draws in compiled programs.
+
+Source:
+    Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72): Pareto-smoothed importance sampling;
+    Cappe, Douc, Guillin, Marin & Robert (2008), Stat. Comput. 18, 447-459: population Monte Carlo;
+    Cornuet, Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), 798-812: weights over all rounds.
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, ClassVar, override
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+import scipy.special
+from jaxtyping import Array, Float
+
+from polar_bayes.errors import FitError
+from polar_bayes.inference.batch_modes import find_all_modes, find_conditional_modes
+from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status, batched
+from polar_bayes.inference.compile import JitOnce
+from polar_bayes.inference.compiled_model import (
+    MOMENTS,
+    SMALL_BATCH,
+    CompiledModel,
+    evaluate_draws,
+)
+from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
+from polar_bayes.inference.program import THREADS, Values
+from polar_bayes.inference.result import CENTRAL_95
+from polar_bayes.methods.method import AbstractBatchMethod, AbstractMethod, PosteriorDraws
+from polar_bayes.methods.profile_mixture import (
+    LEAST_WEIGHT,
+    MOST_COORDINATES,
+    Conditional,
+    Peaks,
+    mixture_of,
+    profile_components,
+    profile_mixture,
+)
+from polar_bayes.numerics.batches import AnyArray, take_rows
+from polar_bayes.numerics.levenberg_marquardt import NormalApproximation
+from polar_bayes.numerics.mixtures import Mixture, draw_mixture, fit_mixture, log_density
+from polar_bayes.numerics.optimize import finite_sd
+from polar_bayes.numerics.psis import (
+    FINITE_VARIANCE,
+    MAX_PARETO_K,
+    effective_draws,
+    numpy_generator,
+    smooth,
+    systematic_resample,
+)
+from polar_bayes.observation.data import Observations
+from polar_bayes.progress import Progress, no_progress
+
+SIDE_BY_SIDE = 1024
+"""Draws whose proposal density is computed together: that of all at once would fill the memory."""
+
+
+GROUP = 64
+"""Captures at most whose draws are in memory in each thread."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Importance(AbstractMethod):
+    """Importance sampling from a mixture at all modes and along their profiles.
+
+    Draws come from a mixture of Student t distributions with 8 degrees of freedom, at each mode
+    that holds 0.1% of the Laplace evidence or more and along the profiles of every coordinate
+    through it, each as heavy as the square root of its evidence. Weighting them by the posterior
+    corrects what the normal approximation gets wrong, as far as the mixture reaches; Pareto k-hat
+    says how far. In further rounds a mixture that is fitted to the weighted draws of all rounds
+    before proposes as many draws again, until there are enough effective ones and their weights
+    have a finite variance.
+
+    Args:
+        draws: Of the mixture of each round, at least 256.
+        rounds: At most, at least 1.
+
+    Raises:
+        FitError: Fewer draws or rounds.
+    """
+
+    draws: int = 2048
+    rounds: int = 6
+
+    group_size: ClassVar[int] = AbstractBatchMethod.group_size
+
+    def __post_init__(self) -> None:
+        self.check_least(draws=256, rounds=1)
+
+    @override
+    def prepare(self, problem: Problem) -> None:
+        problem.prepare_search()
+
+    @override
+    def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
+        initialization = problem.initialize(progress)
+        coordinates = initialization.joint_coordinates("Importance")
+        key_rounds, key_resample = jax.random.split(key)
+        sample = Rounds(self, profile_mixture(coordinates), key_rounds)
+        while sample.is_open:
+            sample.weigh(coordinates.log_density(sample.draw()))
+            progress("weighting draws", len(sample.proposals) / self.rounds)
+        weights, k_hat, effective = sample.weights, sample.k_hat, sample.effective
+        if not np.isfinite(weights).all():
+            raise FitError(
+                "the posterior density is zero at every draw",
+                where="Importance",
+                hint="use method='nuts'",
+            )
+        z = coordinates.forward(sample.z)
+        index = systematic_resample(weights, effective, numpy_generator(key_resample))
+        problems = []
+        if not k_hat <= MAX_PARETO_K:
+            problems.append(
+                f"Pareto k-hat of the weights is {k_hat:.2f} (at most {MAX_PARETO_K}): they do "
+                "not reach all of the posterior, so use method='nuts'"
+            )
+        return PosteriorDraws(
+            method="importance",
+            z=z[index],
+            stats={"lp": sample.log_posterior[index]},
+            problems=problems,
+            weighted=(z, weights),
+            k_hat=k_hat,
+            effective_draws=effective,
+            gradients=float(initialization.metadata["gradients"]),
+            densities=float(len(z)),
+            metadata={"modes": initialization.metadata},
+        )
+
+    @override
+    def run_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
+        if not batch.engine.initializer.is_plain:
+            yield from super().run_batch(batch)
+            return
+        count = max(min(THREADS, len(batch)), -(-len(batch) // GROUP))
+        groups = [batch.subset(x) for x in np.array_split(np.arange(len(batch)), count)]
+        found: list[int] = []
+        with ThreadPoolExecutor(THREADS) as pool:
+            for answer in itertools.chain.from_iterable(pool.map(self._run_group, groups)):
+                found.extend(answer.at)
+                yield answer
+        lost = np.flatnonzero(~np.isin(batch.at, found))
+        if lost.size:  # no mode was found side by side
+            yield from super().run_batch(batch.subset(lost))
+
+    def _run_group(self, batch: ProblemBatch) -> list[BatchDraws]:
+        """Weighted draws of the captures that have a mode."""
+        engine, pixels = batch.engine, batch.pixels
+        with jax.enable_x64(engine.precision == "double"):  # a thread does not inherit it
+            owner, modes = find_all_modes(engine, pixels)
+            if not owner.size:
+                return []
+            mixtures = profile_mixtures(engine, pixels, owner, modes)
+            samples = {
+                row: Rounds(self, mixture, jax.random.wrap_key_data(jnp.asarray(batch.keys[row])))
+                for row, mixture in mixtures.items()
+            }
+            while left := [row for row, sample in samples.items() if sample.is_open]:
+                z = np.stack([samples[row].draw() for row in left])
+                some = pixels.subset(np.array(left))
+                drawn = engine.run(_densities, self.draws, some, z, batch=SMALL_BATCH)
+                for at, row in enumerate(left):
+                    parameters, log_posterior = jax.tree.map(lambda x, at=at: x[at], drawn)
+                    samples[row].weigh(log_posterior, parameters)
+        heaviest = take_rows((modes.z, modes.root), np.unique(owner, return_index=True)[1])
+        return [
+            sample.answer(batch.at[[row]], take_rows(heaviest, np.array([at])))
+            for at, (row, sample) in enumerate(samples.items())
+        ]
+
+
+ONE_ROUND = Importance(rounds=1)
+"""Draws that check others, or serve a comparison."""
+
+
+def suits_profiles(problem: Problem) -> bool:
+    """Whether draws along all profiles are few enough to serve as a check."""
+    return problem.program.size <= MOST_COORDINATES
+
+
+def tail_shares(problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
+    """Shares of weighted draws beyond the 95% intervals of chains, an entry of the provenance.
+
+    Chains that never entered an arm of the posterior agree with each other; draws along its
+    profiles reach the arm. Empty where such draws do not suit the problem.
+    """
+    if not suits_profiles(problem):
+        return {}
+    try:
+        found = ONE_ROUND.run(problem, key, no_progress)
+    except FitError:
+        return {}
+    assert found.weighted is not None
+    z, weights = found.weighted
+    shares = {}
+    for name, x in problem.constrain(z[None]).items():
+        draws = np.reshape(x, (len(weights), -1))
+        low, high = np.quantile(np.reshape(parameters[name], (-1, draws.shape[1])), CENTRAL_95, 0)
+        beyond = np.stack([weights @ (draws < low), weights @ (draws > high)], axis=1)
+        shares[name] = np.round(beyond, 5).tolist()
+    known = {"k_hat": found.k_hat, "effective_draws": found.effective_draws}
+    return {"tails": {**known, "shares": shares}}
+
+
+COMPONENTS = 8
+"""Of the mixtures of further rounds."""
+
+ENOUGH_SHARE = 0.2
+"""Effective sample size, as a share of the draws of one round, after which no round follows."""
+
+FITTED_PER_SIZE = 10
+"""Effective draws for each coordinate to which a mixture is fitted: weights that leave fewer are
+raised to a power below 1."""
+
+
+class Rounds:
+    """Draws of one posterior in all rounds, weighted over the mean density of their proposals."""
+
+    def __init__(self, settings: Importance, proposal: Mixture, key: Array) -> None:
+        self._draws, self._rounds = settings.draws, settings.rounds
+        self._next: Mixture | None = proposal
+        self._key = key
+        self.proposals: list[Mixture] = []
+        self._z: list[np.ndarray] = []
+        self._log_posterior: list[np.ndarray] = []
+        self._parameters: list[Values] = []
+        self._log_proposals = np.empty((0, 0))  # (proposal, draw)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a further round is needed, and there are draws to which it can be fitted."""
+        return self._next is not None
+
+    @property
+    def z(self) -> Float[np.ndarray, "draw size"]:
+        """Draws of all rounds."""
+        return np.concatenate(self._z)
+
+    @property
+    def log_posterior(self) -> Float[np.ndarray, " draw"]:
+        """Their log posterior densities."""
+        return np.concatenate(self._log_posterior)
+
+    def draw(self) -> np.ndarray:
+        """Draws of the next proposal, (draw, size), which `weigh` takes next."""
+        assert self._next is not None
+        self._key, key = jax.random.split(self._key)
+        proposal = self._next
+        z, log_proposal = map(np.asarray, _propose(proposal, self._draws, key))
+        older = [np.asarray(_log_densities(each, z)) for each in self.proposals]
+        newer = [np.asarray(_log_densities(proposal, block)) for block in self._z]
+        above = np.concatenate([self._log_proposals, np.reshape(older, (-1, len(z)))], axis=1)
+        below = np.concatenate([*newer, log_proposal])
+        self._log_proposals = np.concatenate([above, below[None]])
+        self.proposals.append(proposal)
+        self._z.append(z)
+        return z
+
+    def weigh(self, log_posterior: np.ndarray, parameters: Values | None = None) -> None:
+        """Weigh the last draws by their densities, all others anew, and fit the next proposal."""
+        self._log_posterior.append(log_posterior)
+        self._parameters.append(parameters or {})
+        mean = scipy.special.logsumexp(self._log_proposals, axis=0) - math.log(len(self.proposals))
+        log_ratios = self.log_posterior - mean
+        weights, k_hat = smooth(log_ratios[None])
+        self.weights, self.k_hat = weights[0], float(k_hat[0])
+        self.effective = float(effective_draws(weights)[0])
+        enough = self.effective >= ENOUGH_SHARE * self._draws and self.k_hat <= FINITE_VARIANCE
+        is_last = enough or len(self.proposals) == self._rounds
+        self._next = None if is_last or not self.is_finite else self._fit(log_ratios)
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether any draw has a density."""
+        return bool(np.isfinite(self.weights).all())
+
+    def answer(self, at: np.ndarray, mode: tuple[AnyArray, AnyArray]) -> BatchDraws:
+        """All draws as those of the capture at one place of a batch."""
+        if not self.is_finite:
+            return BatchDraws(at, Status.NOT_CONVERGED, pareto_k=self.k_hat, mode=mode)
+        return BatchDraws(
+            at,
+            Status.GOOD if self.k_hat <= MAX_PARETO_K else Status.NOT_TRUSTED,
+            jax.tree.map(lambda *rows: np.concatenate(rows)[None], *self._parameters),
+            self.weights[None],
+            self.effective,
+            MethodUsed.IMPORTANCE,
+            self.k_hat,
+            mode=mode,
+        )
+
+    def _fit(self, log_ratios: np.ndarray) -> Mixture:
+        """A mixture for the next round."""
+        self._key, key = jax.random.split(self._key)
+        z = self.z
+        weights = _temper(log_ratios, FITTED_PER_SIZE * z.shape[1])
+        # One length compiles once: the draws of rounds to come have no weight.
+        missing = self._rounds * self._draws - len(z)
+        z = np.pad(z, ((0, missing), (0, 0)))
+        padded = np.pad(weights, (0, missing)).astype(z.dtype)
+        return _fit_mixture(jnp.asarray(z), jnp.asarray(padded), COMPONENTS, key)
+
+
+_fit_mixture = functools.partial(jax.jit, static_argnums=2)(fit_mixture)
+
+
+@jax.jit
+def _log_densities(proposal: Mixture, z: Array) -> Array:
+    return jax.lax.map(
+        lambda z: log_density(proposal, z[None])[0], z, batch_size=min(SIDE_BY_SIDE, len(z))
+    )
+
+
+def _temper(log_ratios: np.ndarray, least: float) -> np.ndarray:
+    """Weights, raised to the largest power up to 1 that leaves so large an effective sample."""
+    relative = log_ratios - np.max(log_ratios)
+
+    def weights(power: float) -> np.ndarray:
+        raised = np.exp(power * np.where(np.isfinite(relative), relative, -1e300))
+        return raised / raised.sum()
+
+    def excess(power: float) -> float:
+        return float(effective_draws(weights(power)[None])[0]) - least
+
+    if excess(1.0) >= 0.0 or excess(1e-6) <= 0.0:
+        return weights(1.0)
+    return weights(scipy.optimize.brentq(excess, 1e-6, 1.0, xtol=1e-3))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _propose(proposal: Mixture, count: int, key: Array) -> tuple[Array, Array]:
+    z = draw_mixture(proposal, count, key)
+    return z, _log_densities(proposal, z)
+
+
+# --- Many captures side by side -------------------------------------------------------------------
+
+
+def profile_mixtures(
+    engine: CompiledModel, pixels: ObservationBatch, owner: np.ndarray, modes: NormalApproximation
+) -> dict[int, Mixture]:
+    """The first proposal of every pixel from its modes, the heaviest of which come first."""
+    first, inverse = np.unique(owner, return_index=True, return_inverse=True)[1:]
+    weight = np.exp(modes.log_evidence - modes.log_evidence[first][inverse])
+    heavy = weight >= LEAST_WEIGHT * np.bincount(inverse, weight)[inverse]
+    owner, modes = owner[heavy], take_rows(modes, heavy)
+    z, value, root = map(np.asarray, modes[:3])
+
+    def conditional(peak: np.ndarray, z: np.ndarray, axis: np.ndarray) -> Conditional:
+        return find_conditional_modes(engine, pixels.subset(owner[peak]), z, axis)
+
+    peaks = Peaks(z, value, np.swapaxes(root, 1, 2) @ root)
+    prior_sd = finite_sd(engine.prior_draws(MOMENTS))
+    components = profile_components(peaks, np.arange(engine.program.size), prior_sd, conditional)
+    return {
+        int(pixel): mixture_of(take_rows(components, owner[components.peak] == pixel), engine.dtype)
+        for pixel in np.unique(owner)
+    }
+
+
+def _densities(engine: CompiledModel, draws: int) -> JitOnce:
+    """The program of parameters and log posterior densities of so many draws of one pixel."""
+    del draws  # programs of other numbers are others
+    program = engine.program
+
+    def of_pixel(data: Observations, z: Array) -> tuple[Values, Array]:
+        return evaluate_draws(program, z, data)
+
+    return batched(of_pixel, lanes=1)

@@ -1,0 +1,176 @@
+r"""A mixture of Laplace approximations along the profiles of a posterior.
+
+A posterior with an arm, such as a roughness that no view resolves together with an index that makes
+up for it, is not like the normal distribution at its mode, and draws from that never reach the arm.
+From each mode every coordinate is moved outwards in growing steps, the others following to their
+conditional mode, until the Laplace approximation to its marginal density has fallen by
+`LARGEST_DROP`. Each point on these profiles gets a normal distribution with the covariance there.
+
+Source:
+    Rue, Martino & Chopin (2009), J. R. Stat. Soc. B 71, 319-392 (Laplace approximations to marginal
+    densities; exploration along axes from the mode); Geweke (1989), Econometrica 57, 1317-1339
+    (proposals widened along each axis).
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import DTypeLike, Float, Int
+
+from polar_bayes.inference.initialization import Coordinates
+from polar_bayes.numerics.batches import take_rows
+from polar_bayes.numerics.mixtures import Mixture
+from polar_bayes.numerics.optimize import (
+    conditional_mode,
+    conditional_normal,
+    finite_potential,
+    forward_difference_hessian,
+    ignore_line_search_warnings,
+    symmetrize,
+)
+
+LEAST_WEIGHT = 1e-3
+"""Share of the Laplace evidence; modes of less get no draws."""
+
+LARGEST_DROP = 4.5
+"""Of a log marginal density along its profile: that of a normal distribution at three sds."""
+
+FIRST_STEP, GROWTH, MOST_STEPS = 1.5, 1.5, 8
+"""Of a profile: the first in posterior sds, each longer than the one before; 74 sds in all."""
+
+WIDEST = 3.0
+"""Standard deviations at a point, at most, in units of those of the prior; of those at the mode
+where the curvature is not positive definite, so that it says nothing of them."""
+
+MOST_COORDINATES = 20
+"""Posteriors of more coordinates are described by their modes alone."""
+
+COMPONENTS = 64
+"""Of the mixture, or a multiple: one program draws from those of most posteriors."""
+
+
+class Peaks(NamedTuple):
+    """Modes of one posterior or of several, and the normal distributions there."""
+
+    z: Float[np.ndarray, "peak size"]
+    value: Float[np.ndarray, " peak"]
+    covariance: Float[np.ndarray, "peak size size"]
+
+
+class Components(NamedTuple):
+    """Normal distributions, and the number of the peak that each belongs to."""
+
+    peak: Int[np.ndarray, " component"]
+    z: Float[np.ndarray, "component size"]
+    covariance: Float[np.ndarray, "component size size"]
+    log_evidence: Float[np.ndarray, " component"]
+
+
+Conditional = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Modes of all coordinates but one, (row, size), the potentials there, and the Hessians."""
+
+ConditionalModes = Callable[[np.ndarray, np.ndarray, np.ndarray], Conditional]
+"""From numbers of peaks, (row,), vectors near the modes, and the coordinate that stays of each."""
+
+
+def profile_components(
+    peaks: Peaks, axes: np.ndarray, prior_sd: np.ndarray, conditional: ConditionalModes
+) -> Components:
+    """Normal distributions at every peak, and along its profiles.
+
+    Args:
+        peaks: The peaks.
+        axes: The coordinates that are moved.
+        prior_sd: Standard deviations of all coordinates before any reading.
+        conditional: Finds the modes of the others.
+    """
+    size = peaks.z.shape[1]
+    every = np.arange(len(peaks.z))
+    found = [_components(every, *peaks)]
+    sd = np.sqrt(np.diagonal(peaks.covariance, axis1=1, axis2=2))
+    marginal = found[0].log_evidence[:, None] - np.log(sd)
+    factor = np.linalg.cholesky(peaks.covariance)
+    corners = np.meshgrid(every, axes if size <= MOST_COORDINATES else [], [-1.0, 1.0])
+    peak, axis, sign = (corner.ravel() for corner in corners)
+    axis = axis.astype(int)
+    z, own, step = peaks.z[peak], peaks.covariance[peak], sign * FIRST_STEP * sd[peak, axis]
+    for _ in range(MOST_STEPS):
+        if not peak.size:
+            break
+        # The others are first moved to where a normal distribution has their mean.
+        along = np.take_along_axis(own, axis[:, None, None], axis=1)[:, 0]
+        slope = along / np.take_along_axis(along, axis[:, None], axis=1)
+        z, value, hessian = conditional(peak, z + step[:, None] * slope, axis)
+        known = np.isfinite(value) & np.isfinite(hessian).all((1, 2))
+        hessian = np.where(known[:, None, None], hessian, np.eye(size))
+        curvature = prior_sd[:, None] * hessian * prior_sd
+        is_definite = np.linalg.eigvalsh(curvature)[:, 0] > 0.0
+        unit = np.where(is_definite[:, None, None], np.diag(prior_sd), factor[peak])
+        values, vectors = np.linalg.eigh(np.swapaxes(unit, 1, 2) @ hessian @ unit)
+        root = unit @ vectors / np.sqrt(np.maximum(values, WIDEST**-2))[:, None]
+        reached = _components(peak, z, value, root @ np.swapaxes(root, 1, 2))
+        # Of the coordinate that was moved, by a normal distribution of the others.
+        variance = reached.covariance[np.arange(axis.size), axis, axis]
+        drop = marginal[peak, axis] - (reached.log_evidence - 0.5 * np.log(variance))
+        inside = known & (drop <= LARGEST_DROP)
+        reached, axis, step = take_rows((reached, axis, step * GROWTH), inside)
+        peak, z, own, _ = reached
+        found.append(reached)
+    return Components(*map(np.concatenate, zip(*found, strict=True)))
+
+
+def _components(
+    peak: np.ndarray, z: np.ndarray, value: np.ndarray, covariance: np.ndarray
+) -> Components:
+    evidence = -value + 0.5 * np.linalg.slogdet(covariance)[1]
+    return Components(peak, z, covariance, evidence)
+
+
+def mixture_of(components: Components, dtype: DTypeLike) -> Mixture:
+    """The mixture of components, each as heavy as the square root of its evidence."""
+    # The square root: tails need more draws than they weigh.
+    share = np.exp(0.5 * (components.log_evidence - components.log_evidence.max()))
+    which = np.resize(np.arange(share.size), COMPONENTS * -(-share.size // COMPONENTS))
+    share = (share / np.bincount(which))[which]
+    size = components.z.shape[1]
+    return Mixture(
+        center=jnp.zeros(size, dtype),
+        half=jnp.eye(size, dtype=dtype),
+        log_share=jnp.asarray(np.log(share / share.sum()), dtype),
+        mean=jnp.asarray(components.z[which], dtype),
+        scale=jnp.asarray(np.linalg.cholesky(components.covariance)[which], dtype),
+    )
+
+
+def profile_mixture(coordinates: Coordinates) -> Mixture:
+    """Components at every heavy mode of one capture, and along its profiles."""
+    modes = coordinates.modes
+    dtype = jnp.asarray(modes.z).dtype  # of the fit: modes are searched in double precision
+    potential = finite_potential(coordinates.potential)
+    heavy = modes.weight >= LEAST_WEIGHT
+    z, covariance = modes.z[heavy], modes.covariance[heavy]
+    peaks = Peaks(z, np.array([potential(each)[0] for each in z]), covariance)
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+
+    @functools.cache
+    def given_one(at: int, fixed: int) -> np.ndarray:
+        """The factor of the covariance of the other coordinates."""
+        return conditional_normal(covariance[at], fixed)[1]
+
+    def conditional(peak: np.ndarray, z: np.ndarray, axis: np.ndarray) -> Conditional:
+        found = []
+        for at, start, fixed in zip(peak.tolist(), z, axis.tolist(), strict=True):
+            factor = given_one(at, fixed)
+            x, height = conditional_mode(potential, start, factor, gtol=0.05, maxiter=25)
+            hessian = symmetrize(forward_difference_hessian(potential, x, 0.3 * sd[at], dtype))
+            found.append((x, height, hessian))
+        xs, heights, hessians = map(np.stack, zip(*found, strict=True))
+        return xs, heights, hessians
+
+    with ignore_line_search_warnings():
+        return mixture_of(
+            profile_components(peaks, coordinates.axes, coordinates.prior_sd, conditional), dtype
+        )

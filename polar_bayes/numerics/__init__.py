@@ -1,0 +1,1 @@
+"""Functions of arrays, which know no capture, scene or model."""

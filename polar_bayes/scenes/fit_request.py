@@ -1,0 +1,331 @@
+"""One capture and one scene in, an ArviZ DataTree out."""
+
+import contextlib
+import dataclasses
+import inspect
+import json
+import math
+import platform
+import time
+from collections.abc import Callable, Collection, Mapping
+from importlib.metadata import version
+from types import FunctionType
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+from numpyro import distributions as dist
+from numpyro.primitives import Messenger
+
+from polar_bayes import methods
+from polar_bayes.capture.plausibility import cautions, indices_by_eye
+from polar_bayes.capture.schema import count
+from polar_bayes.errors import FitError
+from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_until
+from polar_bayes.inference.prior_probability import has_probabilities, probability_below
+from polar_bayes.inference.problem import Problem, make_problem
+from polar_bayes.inference.program import BLOCK, THREADS, from_prior
+from polar_bayes.inference.request import Request
+from polar_bayes.inference.result import assemble, posterior_of
+from polar_bayes.methods.method import AbstractMethod, find_method
+from polar_bayes.numerics.mcse import SMALLEST_ESS
+from polar_bayes.physics.instrument import AbstractInstrumentTerm, Discrepancy
+from polar_bayes.physics.scene import Scene
+from polar_bayes.priors import support_bounds
+from polar_bayes.progress import Progress
+from polar_bayes.scenes.neighbors import compare_alternatives
+
+PRIOR_DRAWS = 500
+
+DIAGNOSTICS = ("r_hat", "k_hat", "effective_draws")
+"""What a method states of its own draws, stored with the result; None where it states nothing."""
+
+
+def fit_request(
+    request: Request,
+    method: AbstractMethod,
+    progress: Progress,
+    start_time: float,
+    *,
+    with_comparisons: bool = True,
+) -> xr.DataTree:
+    """The fit of a request, in the precision that is switched on."""
+    key, key_comparisons, key_posterior, key_prior = jax.random.split(
+        jax.random.key(request.seed), 4
+    )
+    key_search, key_draws = jax.random.split(key)
+    key_check = jax.random.fold_in(key, 1)
+    problem = make_problem(request, key_search, start_time)
+    _check_room(problem, PRIOR_DRAWS)
+    method.prepare(problem)
+    problem.prepare_predictions()
+    timings, prepared = _Timings(start_time), time.perf_counter() - start_time
+    draws = method.run(problem, key_draws, progress)
+    timings.record("draws")
+    if problem.search_seconds:
+        timings.split("draws", "modes", prepared + problem.search_seconds)
+    _check_room(problem, draws.z[..., 0].size + PRIOR_DRAWS)
+    posterior = problem.predict(key_posterior, draws.z)
+    prior_z = from_prior(problem.program, key_prior, PRIOR_DRAWS, problem.data)
+    prior = problem.predict(key_prior, prior_z[None])
+    timings.record("prediction")
+    checked = method.cross_check(problem, posterior.parameters, key_check)
+    timings.record("cross-check")
+
+    comparisons: dict[str, xr.Dataset] = {}
+    failed: dict[str, str] = {}
+    alternatives: dict[str, Any] = {}
+    deadline = method.deadline(problem)
+    compares = with_comparisons and draws.covariance is None  # a point has no intervals to compare
+    if compares:
+        methods = method.for_comparison(problem, draws)
+        given = request, problem, methods, deadline, key_comparisons, progress
+        comparisons, failed = _fit_comparisons(*given)
+    if isinstance(request.scene.ledger, xr.Dataset):
+        comparisons["effects"] = request.scene.ledger  # how the scene was chosen
+    timings.record("comparisons")
+    if compares:
+        alternatives = try_alternatives(
+            request, problem, posterior.parameters, key_check, progress, deadline=deadline
+        )
+    timings.record("alternatives")
+
+    stated = {name: getattr(draws, name) for name in DIAGNOSTICS}
+    provenance = {
+        **_provenance(request, method, problem),
+        "prior_probability": _prior_probability(request, posterior.parameters),
+        "timings": {stage: round(seconds, 3) for stage, seconds in timings.seconds.items()},
+        "problems": draws.problems,
+        "method": draws.method,
+        **{name: value if math.isfinite(value) else None for name, value in stated.items()},
+        **draws.metadata,
+        **checked,
+        **alternatives,
+        **({"comparisons_failed": failed} if failed else {}),
+    }
+    return assemble(
+        problem.program,
+        request.capture,
+        problem.data,
+        posterior,
+        prior,
+        draws.stats,
+        comparisons,
+        provenance,
+    )
+
+
+def choose_method(
+    method: str | AbstractMethod, tolerance: float | None, seconds: float | None
+) -> AbstractMethod:
+    """The settings that a caller asks for, by name or as they are."""
+    limits = {"tolerance": tolerance, "seconds": seconds}
+    given = {name: value for name, value in limits.items() if value is not None}
+    if given and method != "auto":
+        raise FitError(
+            f"{' and '.join(given)} needs method='auto'",
+            where=f"fit: method={method!r}",
+            hint="leave it out, or give method='auto'",
+        )
+    if given:
+        return methods.Auto(**given)
+    return find_method(method, "fit", one=True)
+
+
+def try_alternatives(
+    request: Request,
+    problem: Problem,
+    posterior: Mapping[str, Any],
+    key: Array,
+    progress: Progress,
+    *,
+    deadline: float = math.inf,
+    compared: Collection[Scene] = (),
+) -> dict[str, Any]:
+    """Entries of the provenance: the comparison with alternative parts, or why there is none."""
+
+    def compare(progress: Progress) -> list[dict[str, Any]]:
+        return compare_alternatives(request, problem, posterior, key, progress, compared)
+
+    try:
+        return {"alternatives": run_until(deadline, progress, compare)}
+    except (FitError, OutOfTimeError) as error:
+        return {"alternatives_failed": str(error)}
+
+
+class _Timings:
+    """Seconds of each stage, compilation included."""
+
+    def __init__(self, start_time: float) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = start_time
+
+    def record(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage] = now - self._last
+        self._last = now
+
+    def split(self, stage: str, first: str, seconds: float) -> None:
+        """Count so many seconds of a stage as those of its first part."""
+        self.seconds[first] = seconds
+        self.seconds[stage] -= seconds
+
+
+def _check_room(problem: Problem, draws: int) -> None:
+    """Refuse predictions of more draws than the memory can hold."""
+    data = problem.data
+    readings = len(problem.program.observed) * problem.dtype.itemsize * math.prod(data.shape)
+    # Noise-free readings, predicted ones and the density of each; in blocks, then all of them.
+    check_memory((draws + THREADS * BLOCK) * 3 * readings)
+
+
+def _fit_comparisons(
+    request: Request,
+    problem: Problem,
+    methods: tuple[AbstractMethod, ...],
+    deadline: float,
+    key: Array,
+    progress: Progress,
+) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
+    """Posteriors of the same capture with less of the instrument, and why others failed."""
+    instrument = request.scene.instrument
+    if instrument is None or not request.scene.has(Discrepancy):
+        return {}, {}
+    removed: dict[str, list[AbstractInstrumentTerm]] = {
+        "without_discrepancy": [each for each in instrument.terms if isinstance(each, Discrepancy)],
+        "without_instrument": list(instrument.terms),
+    }
+    found: dict[str, xr.Dataset] = {}
+    failed: dict[str, str] = {}
+
+    def compare(progress: Progress) -> None:
+        for number, (name, terms) in enumerate(removed.items()):
+            done = number / len(removed)
+            progress("comparing", done)
+            try:
+                other, gone = _without(request, problem, terms)
+                z = _first_trusted(
+                    methods, other, key, lambda *_, done=done: progress("comparing", done)
+                )
+                values = other.constrain(z)
+                kept = {name: x for name, x in values.items() if name not in gone}
+                found[name] = posterior_of(other.program, kept)
+            except FitError as error:  # a failed comparison must not cost the user the fit
+                failed[name] = str(error)
+
+    late = ""
+    try:
+        run_until(deadline, progress, compare)
+    except OutOfTimeError as error:
+        late = str(error)
+    progress("comparing", 1.0)
+    done = dict(found)  # an abandoned thread may still write to its own
+    return done, {name: late for name in removed if late and name not in done} | failed
+
+
+def _first_trusted(
+    methods: tuple[AbstractMethod, ...], problem: Problem, key: Array, progress: Progress
+) -> np.ndarray:
+    """Draws of the first method that trusts enough of its own, or of the last."""
+    for method in methods[:-1]:
+        with contextlib.suppress(FitError):
+            draws = method.run(problem, key, progress)
+            if not draws.doubts and draws.effective_draws >= 0.5 * SMALLEST_ESS:
+                return draws.z
+    return methods[-1].run(problem, key, progress).z
+
+
+def _without(
+    request: Request, problem: Problem, terms: list[AbstractInstrumentTerm]
+) -> tuple[Problem, set[str]]:
+    """The problem without terms of the instrument, and the parameters that it does not have."""
+    gone = {name for term in terms for name in term.parameters}
+    neutral = {name: value for term in terms for name, value in term.neutral.items()}
+    if all(term.neutral or not term.parameters for term in terms) and problem.data.held:
+        return problem.hold(neutral), gone
+    scene = request.scene
+    for term in terms:
+        scene = scene.without(type(term))
+    return make_problem(dataclasses.replace(request, scene=scene), problem.key), gone
+
+
+def _model_settings(model: Callable) -> dict[str, Any]:
+    """The fields of a model that is a value, in what JSON can hold."""
+    if not dataclasses.is_dataclass(model) or isinstance(model, type):
+        return {}
+    return json.loads(json.dumps(dataclasses.asdict(model), default=repr))
+
+
+def _model_source(model: Callable) -> str:
+    """The source of a model of the user's own, so that a result shows what was fitted."""
+    while isinstance(model, Messenger):
+        model = model.fn
+    code = model if isinstance(model, FunctionType) else type(model)
+    if (code.__module__ or "").startswith("polar_bayes."):  # None: of exec() in a bare namespace
+        return ""
+    try:
+        return inspect.getsource(code)
+    except (OSError, TypeError):
+        return ""
+
+
+def _finite_bounds(prior: dist.Distribution) -> list[float | None]:
+    """Where the support of a prior ends; None, which JSON can hold, where it does not."""
+    return [bound if math.isfinite(bound) else None for bound in support_bounds(prior)]
+
+
+def _prior_probability(request: Request, posterior: Mapping[str, Any]) -> dict[str, list[float]]:
+    """Prior probability below each posterior median, where a prior has such a function."""
+    found = {}
+    for name, prior in request.priors.items():
+        if name in posterior and name not in request.fixed:
+            median = np.median(np.asarray(posterior[name], float), axis=(0, 1))
+            if has_probabilities(prior):
+                found[name] = probability_below(prior, median).ravel().tolist()
+    return found
+
+
+def _indices_by_eye(request: Request) -> dict[str, list[float]]:
+    """Index by eye of each material; none where a coat or polarized light moves the peak."""
+    source = getattr(request.scene.surface, "illumination", None)
+    if request.scene.coat is not None or getattr(source, "polarization", None) is not None:
+        return {}
+    found = indices_by_eye(request.capture)
+    return {name: list(index) for name, index in found.items() if index is not None}
+
+
+def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> dict[str, Any]:
+    """Everything that is needed to repeat the fit."""
+    data = problem.data
+    at_boundary = {
+        name: int(np.sum((np.asarray(link.reading(x)) != np.asarray(x)) & np.asarray(data.valid)))
+        for name, link in request.links.items()
+        for x in [data.readings[name]]
+    }
+    packages = ("polar_bayes", "jax", "numpyro", "arviz", "optimistix", "numpy", "xarray")
+    used = {"used": int(np.sum(data.valid)), "at_margin": at_boundary}
+    return {
+        "settings": dataclasses.asdict(method),
+        "method_parts": repr(method),
+        **request.describe(),
+        "model_settings": _model_settings(request.model),
+        "model_source": _model_source(request.model),
+        "capture_cautions": list(cautions(request.capture)),
+        "indices_by_eye": _indices_by_eye(request),
+        "bounds": {name: _finite_bounds(prior) for name, prior in request.priors.items()},
+        "declared": request.declared,
+        "fixed": request.fixed,
+        "swapped": list(request.swapped),
+        "largest_view_zenith": request.largest_view_zenith,
+        "precision": request.precision,
+        "chain_method": "threads",
+        "versions": {name: version(name) for name in packages},
+        "machine": {"processor": platform.machine(), "python": platform.python_version()},
+        "counts": {**count(request.capture), **used},
+        "capture": {
+            str(key): value if isinstance(value, str | int | float) else str(value)
+            for key, value in request.capture.attrs.items()
+        },
+    }

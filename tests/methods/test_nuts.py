@@ -1,0 +1,67 @@
+"""The loop around the NUTS kernel, on a normal distribution of known width."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import polar_bayes as pb
+from polar_bayes.inference.initialization import Target
+from polar_bayes.methods import nuts
+
+
+def density(z: jax.Array, center: jax.Array) -> jax.Array:
+    return 0.5 * jnp.sum((z - center) ** 2)
+
+
+def target(size: int, chains: int) -> Target:
+    starts = np.random.default_rng(0).standard_normal((chains, size))
+    return Target(
+        density=density,
+        given=jnp.zeros(size),
+        potential=lambda z: (0.5 * float(z @ z), z),
+        starts=starts,
+        metric=np.eye(size),
+    )
+
+
+def test_how_draws_are_cut_into_blocks_changes_nothing() -> None:
+    """A warm-up that ends inside a block, too: its steps are counted, its draws are not kept."""
+    told = []
+    with jax.enable_x64(True):
+        for block in (60, 35):  # 60 divides the warm-up and the draws, 35 does neither
+            settings = pb.methods.Nuts(chains=2, warmup=60, draws=120, most_draws=120, block=block)
+            here = target(3, 2)
+            sampler = nuts.Sampler(density, settings.static(here))
+            told.append(nuts.sample(sampler, here, jax.random.key(1), settings))
+    (z, stats, *_), (again, others, *_) = told
+    assert z.shape == (2, 120, 3)
+    assert np.array_equal(z, again)
+    for name in ("n_steps", "warmup_steps", "energy"):
+        assert np.array_equal(stats[name], others[name]), name
+    assert np.all(stats["warmup_steps"] >= 60)  # a draw takes one step at least
+
+
+def funnel(z: jax.Array, scale: jax.Array) -> jax.Array:
+    """Neal (2003), Ann. Statist. 31, 705: at its neck every step is too long."""
+    return 0.5 * (z[0] / scale) ** 2 + 0.5 * jnp.sum(z[1:] ** 2) * jnp.exp(-z[0]) + z[0]
+
+
+def test_where_draws_diverge_it_changes_nothing_either() -> None:
+    """Chains are redone after the same draws, whether a block holds one or all of them."""
+    told = []
+    with jax.enable_x64(True):
+        for block in (20, 50, 100):
+            settings = pb.methods.Nuts(
+                chains=2, warmup=100, draws=100, most_draws=400, effective_draws=1e6, block=block
+            )
+            here = target(3, 2)._replace(density=funnel, given=jnp.asarray(3.0))
+            here = here._replace(potential=jax.value_and_grad(lambda z: funnel(z, 3.0)))
+            sampler = nuts.Sampler(funnel, settings.static(here))
+            told.append(nuts.sample(sampler, here, jax.random.key(1), settings))
+    z, stats, reached, halvings = told[0]
+    assert halvings > 0
+    assert not reached
+    for again, others, *_, as_often in told[1:]:
+        assert as_often == halvings
+        assert np.array_equal(z, again)
+        assert np.array_equal(stats["warmup_steps"], others["warmup_steps"])
