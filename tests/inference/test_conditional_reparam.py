@@ -13,10 +13,10 @@ from numpyro import distributions as dist
 from scipy import stats
 
 import polar_bayes as pb
-from polar_bayes.inference.compile import LRUCache
 from polar_bayes.inference.conditional_reparam import ConditionalReparam, find_coefficients
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
+from polar_bayes.numerics.compile import LRUCache
 from polar_bayes.observation.data import Observations, observe
 
 VIEWS, NOISE, WIDTH = 9, 0.05, 0.3
