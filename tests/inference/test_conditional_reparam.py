@@ -111,7 +111,7 @@ def posterior_of_index(link: pb.links.AbstractLink | None, method: str) -> tuple
 @pytest.mark.parametrize("method", ["nuts", "importance"])
 def test_chains_of_both_coordinates_agree(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     mean, error = posterior_of_index(None, method)
-    monkeypatch.setattr("polar_bayes.inference.problem._COMPILED", LRUCache(1))
+    monkeypatch.setattr("polar_bayes.inference.compiled_model._COMPILED", LRUCache(1))
     monkeypatch.setattr("polar_bayes.inference.initialization.find_coefficients", lambda *_: None)
     expected, own_error = posterior_of_index(None, "nuts")
     assert abs(mean - expected) < 4.0 * np.hypot(error, own_error)
