@@ -338,7 +338,7 @@ def test_a_comparison_that_fails_is_told_and_costs_nothing(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    "at, scene", [("comparing", "goniometer"), ("comparing alternatives", "paper")]
+    ("at", "scene"), [("comparing", "goniometer"), ("comparing alternatives", "paper")]
 )
 def test_who_stops_a_comparison_keeps_the_fit(at: str, scene: str, tmp_path: Path) -> None:
     kept: list[xr.DataTree] = []
