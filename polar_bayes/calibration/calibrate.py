@@ -101,9 +101,9 @@ def calibrate(
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.
-        FitError: An argument cannot be used, the store exists already (or, to resume, belongs to
-            another request), or it cannot be written.
-        OutputError: Another process is writing the store, or its journal is that of something else.
+        FitError: An argument cannot be used, or the store to resume was begun with another request.
+        OutputError: The store exists already, cannot be written, or is none to resume; or another
+            process is writing it.
     """
     start = time.perf_counter()
     if resume and store is None:

@@ -22,7 +22,7 @@ from jaxtyping import Array
 from polar_bayes.calibration.predictive import Arrays, PredictivePit, unranked_reason
 from polar_bayes.calibration.scores import PitCrps
 from polar_bayes.capture.files import read_netcdf, write_netcdf
-from polar_bayes.errors import FitError, PolarBayesError
+from polar_bayes.errors import FitError, OutputError, PolarBayesError
 from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status
 from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout
@@ -354,17 +354,17 @@ def open_store(folder: Path, plan: CalibrationPlan, *, resume: bool) -> Iterator
     """The blocks of a calibration in a folder, which is made, or read where it is resumed."""
     where = str(folder)
     if not resume and folder.exists():
-        raise FitError("it is there already", where=where, hint=RESUME)
-    with written(folder, FitError):
+        raise OutputError("it is there already", where=where, hint=RESUME)
+    with written(folder):
         folder.mkdir(exist_ok=resume)
         others = [path for path in folder.iterdir() if not path.match(BLOCK_FILE)]
     names = [path.name for path in others if not path.name.startswith(TEMPORARY_PREFIX)]
     if names and JOURNAL not in names:
         what = "it holds no calibration that this version can resume"
-        raise FitError(what, where=where, hint=OTHER_OUT)
+        raise OutputError(what, where=where, hint=OTHER_OUT)
     journal_of_plan = folder / JOURNAL, folder, "calibration", topics_of(plan)
     with open_journal(*journal_of_plan, resume=True) as journal:
-        with written(folder, FitError):
+        with written(folder):
             journal.read()
             journal.begin()
         yield BlockStore(folder, journal)
@@ -391,7 +391,7 @@ class BlockStore:
         """Write a block, named by the numbers of its first and last simulation."""
         numbers = numbers_of(block)
         path = self.folder / f"{numbers.min():08d}-{numbers.max():08d}.nc"
-        with written(self.folder, FitError), temporary_folder(self.folder) as unfinished:
+        with written(self.folder), temporary_folder(self.folder) as unfinished:
             write_netcdf(block, unfinished / path.name)
             replace_file(unfinished / path.name, path)
             self.journal.add(path.stem)

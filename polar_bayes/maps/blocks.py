@@ -307,7 +307,7 @@ def taken_over(store: Path) -> OutputError:
 
 
 @contextlib.contextmanager
-def written(store: Path, kind: type[PolarBayesError] = OutputError) -> Iterator[None]:
+def written(store: Path) -> Iterator[None]:
     """Errors of the system or the libraries below, as one line."""
     try:
         yield
@@ -317,4 +317,4 @@ def written(store: Path, kind: type[PolarBayesError] = OutputError) -> Iterator[
         reason = (getattr(error, "strerror", None) or "").lower() or str(error)
         what = f"it could not be written ({reason or type(error).__name__})"
         hint = "make room or give another --out; --resume goes on where it stopped"
-        raise kind(what, where=str(store), hint=hint) from error
+        raise OutputError(what, where=str(store), hint=hint) from error
