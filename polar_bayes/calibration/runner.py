@@ -235,7 +235,6 @@ def join(blocks: Sequence[xr.DataTree], count: int) -> xr.DataTree:
             coords="minimal",
             compat="override",
             join="exact",
-            combine_attrs="override",
         )
         ordered = whole.sortby("simulation").drop_duplicates("simulation")
         groups[name] = ordered.sel(simulation=slice(0, count - 1))

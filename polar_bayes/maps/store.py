@@ -187,12 +187,12 @@ class _MapStore:
         self._store, self._image, self._plan = store, image, plan
         # The size of blocks depends on the image alone, so resumed maps have the same blocks.
         size = min(BLOCK, max(LEAST, image.sizes["y"] * image.sizes["x"] // PARTS))
-        self._regions = list(cut(image, size))
-        self._chunks = {dim: part.stop for dim, part in self._regions[0].items()}
-        request, sizes = plan.request, dict(image.sizes)
+        self._regions = {_label(region): region for region in cut(image, size)}
+        self._chunks = {dim: part.stop for dim, part in next(iter(self._regions.values())).items()}
+        request = plan.request
         pixel = _digest(request.capture), plan.intensity_unit
         self.topics = {
-            "capture": digest(pixel, sizes, self._chunks),
+            "capture": digest(pixel, dict(image.sizes), self._chunks),
             **request_topics(request),
             "method": digest(plan.settings),
             "seed": str(request.seed),
@@ -225,20 +225,19 @@ class _MapStore:
     def check_finished(self) -> None:
         """Refuse a finished map of readings that have changed, or with missing chunks."""
         where = str(self._store)
-        readings = [_digest(self._image.isel(region)) for region in self._regions]
-        if _metadata(self._store)["attributes"][FINISHED] != self._digest_all(readings):
+        readings = [_digest(self._image.isel(region)) for region in self._regions.values()]
+        if _metadata(self._store)["attributes"][FINISHED] != digest(list(self._regions), readings):
             what = "the capture has changed since it was made"
             raise FitError(what, where=where, hint=OTHER_OUT)
         self._maps = open_map(self._store)  # what pixels share was estimated, and has no map
-        files = [file for region in self._regions for file in self._files(region)]
+        files = [file for region in self._regions.values() for file in self._files(region)]
         if missing := sum(not file.is_file() for file in files):
             what = f"{missing} of {len(files)} chunks are missing"
             raise OutputError(what, where=where, hint=f"copy the store again, or {OTHER_OUT}")
 
     def check_readings(self, journal: Journal) -> None:
         """Refuse to resume where the readings of a finished block have changed."""
-        for region in self._regions:
-            name = _label(region)
+        for name, region in self._regions.items():
             if journal.done.get(name) not in (None, _digest(self._image.isel(region))):
                 what = f"the capture has changed since block {name} was fitted"
                 raise FitError(what, where=str(self._store), hint=OTHER_OUT)
@@ -249,20 +248,18 @@ class _MapStore:
             empty = folder / self._store.name
             self._write_blank(empty)
             files = sorted(path.relative_to(empty) for path in empty.rglob("*") if path.is_file())
-            if self._store.exists():
-                for file in files:
-                    found, expected = self._store / file, (empty / file).read_bytes()
-                    if not found.is_file() or found.read_bytes() != expected:
-                        what = "it is missing or not as written, or the capture has changed since"
-                        where = self._store
-                        raise OutputError(what, where=f"{where}: {file}", hint=OTHER_OUT)
-                journal.begin()
-                return
-            for path in (*empty.rglob("*"), empty):
-                sync(path)
+            is_there = self._store.exists()
+            for file in files if is_there else ():
+                found, expected = self._store / file, (empty / file).read_bytes()
+                if not found.is_file() or found.read_bytes() != expected:
+                    what = "it is missing or not as written, or the capture has changed since"
+                    raise OutputError(what, where=f"{self._store}: {file}", hint=OTHER_OUT)
             journal.begin()
-            empty.rename(self._store)
-            sync(self._store.parent)
+            if not is_there:
+                for path in (*empty.rglob("*"), empty):
+                    sync(path)
+                empty.rename(self._store)
+                sync(self._store.parent)
 
     def _write_blank(self, path: Path) -> None:
         """The store with names, axes and attributes; chunks not yet written read as not fitted."""
@@ -285,10 +282,10 @@ class _MapStore:
         stored = xr.open_zarr(self._store, chunks=None, consolidated=False)
         regions = [
             region
-            for region in self._regions
-            if _label(region) not in journal.done or not self._is_whole(stored, region)
+            for name, region in self._regions.items()
+            if name not in journal.done or not self._is_whole(stored, region)
         ]
-        every = sum(map(_size, self._regions))
+        every = sum(map(_size, self._regions.values()))
         done = every - sum(map(_size, regions))
         with workers(scheduler) as (executor, count):
             opened = self._image if scheduler is None else None  # a cluster opens it for itself
@@ -331,19 +328,15 @@ class _MapStore:
 
     def finish(self, journal: Journal) -> None:
         """Mark the store as finished, with a digest of the readings."""
-        readings = [journal.done[_label(region)] for region in self._regions]
+        readings = [journal.done[name] for name in self._regions]
         with written(self._store), temporary_folder(self._store.parent) as folder:
             metadata = _metadata(self._store)
             if metadata["attributes"].get(REQUEST) != self.request:
                 raise taken_over(self._store)
-            metadata["attributes"][FINISHED] = self._digest_all(readings)
+            metadata["attributes"][FINISHED] = digest(list(self._regions), readings)
             unfinished = folder / METADATA
             unfinished.write_text(json.dumps(metadata, indent=2))
             replace_file(unfinished, self._store / METADATA)
-
-    def _digest_all(self, readings: list[str]) -> str:
-        """Digest of the readings of all blocks."""
-        return digest([_label(region) for region in self._regions], readings)
 
 
 def _metadata(store: Path) -> dict[str, Any]:
