@@ -240,7 +240,8 @@ class _MapStore:
         for name, region in self._regions.items():
             if journal.done.get(name) not in (None, _digest(self._image.isel(region))):
                 what = f"the capture has changed since block {name} was fitted"
-                raise FitError(what, where=str(self._store), hint=OTHER_OUT)
+                hint = f"{OTHER_OUT}, or remove {self._store.name}{JOURNAL} to fit all blocks again"
+                raise FitError(what, where=str(self._store), hint=hint)
 
     def begin(self, journal: Journal) -> None:
         """Put the store without values in its place, or check that it is as it was put there."""

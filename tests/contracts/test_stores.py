@@ -131,7 +131,7 @@ def test_a_damaged_block_is_fitted_again(kind, whole, begun, tmp_path, damage) -
         ({"priors": {"refractive_index": dist.Uniform(1.2, 2.0 + 1e-9)}}, "priors"),
         ({"links": {"q": dataclasses.replace(LINKS["q"], degrees_of_freedom=5.0)}}, "links"),
         ({"model": handlers.condition(per_material, data={"stokes_error_factor": 1.1})}, "model"),
-        ({"scene": dataclasses.replace(PLATE, mixing=pb.DopMixing())}, "scene, another priors"),
+        ({"scene": dataclasses.replace(PLATE, mixing=pb.DopMixing())}, "scene(, another priors)?"),
         ({"largest_view_zenith": 70.0}, "(capture, another )?largest_view_zenith"),
     ],
     ids=lambda each: each if isinstance(each, str) else "",
