@@ -238,7 +238,7 @@ class Forecast:
         minutes = left * (time.perf_counter() - begin) / len(numbers) / 60.0
         both = np.all([each["fits"]["status"] == Status.GOOD for each in (own, other)], axis=0)
         one, two = (each["marginals"].to_dataset().isel(simulation=both) for each in (own, other))
-        moved = [np.abs(two[name] - one[name]) / one[f"{name}_sd"] for name in own["truth"]]
+        moved = [(abs(two[name] - one[name]) / one[f"{name}_sd"]).values for name in own["truth"]]
         largest = max((np.max(each, initial=0.0) for each in moved), default=0.0)
         return (
             f", by {self.faster} about {max(minutes, 0.1):.2g} min; both vouch for {both.sum()} of "

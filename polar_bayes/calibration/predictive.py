@@ -172,7 +172,7 @@ def _choose(valid: np.ndarray, uniform: np.ndarray) -> np.ndarray:
     return np.where(count > 0, entry, -1)
 
 
-def _take(values: np.ndarray, entry: np.ndarray) -> np.ndarray:
+def _take(values: Array | np.ndarray, entry: np.ndarray) -> np.ndarray:
     flat = np.asarray(values, np.float32).reshape(len(values), -1)
     return flat[np.arange(len(flat)), np.maximum(entry, 0)]
 
