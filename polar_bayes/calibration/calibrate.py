@@ -15,28 +15,24 @@ from dask.base import tokenize
 from numpyro import distributions as dist
 
 from polar_bayes.calibration.runner import (
-    Block,
     BlockStore,
     CalibrationPlan,
     cut,
     fit_block,
     join,
+    numbers_of,
     open_store,
 )
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batching import MethodUsed, Status
+from polar_bayes.inference.batching import Status
 from polar_bayes.inference.compiled_model import layout_key
-from polar_bayes.inference.program import Values
 from polar_bayes.inference.request import Request, resolve
-from polar_bayes.inference.result import PROVENANCE, dims_of, shape_of
+from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.maps.blocks import as_completed, workers
 from polar_bayes.methods.method import AbstractBatchMethod, find_method, make_method, name_of
 from polar_bayes.methods.registry import FIT_DEFAULT
-from polar_bayes.numerics.psis import LEVELS, MAX_PARETO_K
-from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.paths import as_path
-from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Counter, no_progress, notice, with_counter
 
@@ -105,10 +101,11 @@ def calibrate(
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.
-        FitError: An argument cannot be used, the store exists already (or, to resume, belongs to
-            another request), or it cannot be written.
-        OutputError: Another process is writing the store, or its ledger is damaged.
+        FitError: An argument cannot be used, or the store to resume was begun with another request.
+        OutputError: The store exists already, cannot be written, or is none to resume; or another
+            process is writing it.
     """
+    start = time.perf_counter()
     if resume and store is None:
         raise FitError(
             "there is no store to go on with", where="calibrate: resume", hint="give store="
@@ -117,8 +114,7 @@ def calibrate(
         hint = f"give {MIN_SIMULATIONS} or more"
         raise FitError(f"simulations is {simulations}", where="calibrate", hint=hint)
     arguments = {"model": model, "scene": scene, "priors": priors, "links": links}
-    unknown = set(truth or {}) - set(arguments)
-    if unknown:
+    if unknown := set(truth or {}) - set(arguments):
         what = f"{', '.join(sorted(unknown))} cannot differ"
         raise FitError(what, where="calibrate: truth", hint=f"give some of {', '.join(arguments)}")
 
@@ -129,24 +125,20 @@ def calibrate(
 
     request = resolved({})
     settings = find_method(FIT_DEFAULT if method is None else method, "calibrate", many=True)
-    start = time.perf_counter()
     plan = make_plan(request, resolved(truth) if truth else None, settings, readings)
     if not plan.compiled.shared:
         what = "the data-generating model and the fitted model share no parameter"
         hint = "give models whose parameters have the same names and shapes"
         raise FitError(what, where="calibrate: truth", hint=hint)
     folder = None if store is None else as_path(store, "store")
+    forecast = Forecast(plan)
     with (
         contextlib.nullcontext()
         if folder is None
         else open_store(folder, plan, resume=resume) as blocks
     ):
-        done = [] if blocks is None else blocks.blocks()
-        stored = np.concatenate([*(block.numbers for block in done), []])
-        missing = np.setdiff1d(np.arange(simulations), stored).astype(int)
-        forecast = Forecast(plan)
-        done += _fit_all(
-            plan, missing, simulations, blocks, scheduler, progress or no_progress, forecast
+        tree, found = _fit_all(
+            plan, simulations, blocks, scheduler, progress or no_progress, forecast
         )
     provenance = {
         **request.describe(),
@@ -156,13 +148,14 @@ def calibrate(
         "truth": {name: repr(value) for name, value in (truth or {}).items()},
         "capture": str(request.capture.attrs.get("name", "capture")),
         "seconds": round(time.perf_counter() - start, 3),
-        **({"forecast": forecast.sentence} if forecast.sentence else {}),
+        "forecast": forecast.sentence,
+        "fits found in the store": found,
+        "why_not_ranked": plan.compiled.unranked_reason,
     }
-    if missing.size < simulations:
-        provenance["fits found in the store"] = simulations - missing.size
-    if plan.compiled.unranked_reason:
-        provenance["why_not_ranked"] = plan.compiled.unranked_reason
-    return _assemble(plan, join(done, simulations), provenance)
+    optional = ("forecast", "fits found in the store", "why_not_ranked")
+    stated = {name: x for name, x in provenance.items() if x or name not in optional}
+    tree.attrs[PROVENANCE] = json.dumps(stated, sort_keys=True)
+    return tree
 
 
 def make_plan(
@@ -180,28 +173,28 @@ def make_plan(
 
 def _fit_all(
     plan: CalibrationPlan,
-    missing: np.ndarray,
-    total: int,
+    simulations: int,
     store: BlockStore | None,
     scheduler: str | None,
     progress: Counter,
     forecast: "Forecast",
-) -> list[Block]:
-    """Fit blocks on threads or workers; the result does not depend on which of them fits what."""
-    found: list[Block] = []
-    if not missing.size:
-        return found
-    done = total - missing.size
-    with workers(scheduler) as (executor, count):
+) -> tuple[xr.DataTree, int]:
+    """The groups of a calibration, and how many of its fits were in the store."""
+    blocks = [] if store is None else store.blocks()
+    stored = np.concatenate([*map(numbers_of, blocks), []])
+    missing = np.setdiff1d(np.arange(simulations), stored).astype(int)
+    found = done = simulations - missing.size
+    # The result does not depend on which thread or worker fits what, and when.
+    with workers(scheduler if missing.size else None) as (executor, count):
         tasks = ((plan, numbers) for numbers in cut(missing, plan.block))
         for _, block in as_completed(executor, count, fit_block, tasks):
             if store is not None:
                 store.add(block)
-            found.append(block)
-            done += len(block.numbers)
-            progress(done, total)
-            forecast.see(block, total - done)
-    return found
+            blocks.append(block)
+            done += len(numbers_of(block))
+            progress(done, simulations)
+            forecast.see(block, simulations - done)
+    return join(blocks, simulations), found
 
 
 @dataclasses.dataclass
@@ -216,15 +209,15 @@ class Forecast:
     pilot: int = 8
     long: float = 300.0
     faster: str = "importance"
-    _seen: list[Block] = dataclasses.field(default_factory=list)
+    _seen: list[xr.DataTree] = dataclasses.field(default_factory=list)
     _begin: float = 0.0
 
-    def see(self, block: Block, left: int) -> None:
+    def see(self, block: xr.DataTree, left: int) -> None:
         """Take in a finished block; once there are enough, say what can be said."""
         self._seen.append(block)
         if len(self._seen) == 1:  # its programs are compiled
             self._begin = time.perf_counter()
-        count = sum(len(each.numbers) for each in self._seen[1:])
+        count = sum(len(numbers_of(each)) for each in self._seen[1:])
         if self.sentence or count < self.pilot:
             return
         seconds = left * (time.perf_counter() - self._begin) / count
@@ -238,94 +231,16 @@ class Forecast:
         """What the faster method makes of the same simulations."""
         plan = dataclasses.replace(self.plan, settings=make_method(self.faster), readings=False)
         own = join(self._seen, sys.maxsize)
-        fit_block(plan, own.numbers)  # compiles its programs
+        numbers = numbers_of(own)
+        fit_block(plan, numbers)  # compiles its programs
         begin = time.perf_counter()
-        other = fit_block(plan, own.numbers)
-        minutes = left * (time.perf_counter() - begin) / len(own.numbers) / 60.0
-        both = (own.outcome.status == Status.GOOD) & (other.outcome.status == Status.GOOD)
-        moved = [
-            np.abs(other.mean[name] - mean)[both] / own.sd[name][both]
-            for name, mean in own.mean.items()
-        ]
+        other = fit_block(plan, numbers)
+        minutes = left * (time.perf_counter() - begin) / len(numbers) / 60.0
+        both = np.all([each["fits"]["status"] == Status.GOOD for each in (own, other)], axis=0)
+        one, two = (each["marginals"].to_dataset().isel(simulation=both) for each in (own, other))
+        moved = [(abs(two[name] - one[name]) / one[f"{name}_sd"]).values for name in own["truth"]]
         largest = max((np.max(each, initial=0.0) for each in moved), default=0.0)
         return (
             f", by {self.faster} about {max(minutes, 0.1):.2g} min; both vouch for {both.sum()} of "
             f"{len(both)}, whose means differ by at most {largest:.2g} sd"
         )
-
-
-# --- The finished calibration as a tree -----------------------------------------------------------
-
-
-def _assemble(
-    plan: CalibrationPlan, simulated: Block, provenance: Mapping[str, Any]
-) -> xr.DataTree:
-    """Put labels on the arrays of all simulations."""
-    program, data, captured = plan.compiled.program, plan.compiled.data, plan.request.capture
-    dims, lengths = dims_of(program), dict(data.dims)
-    axes = {
-        dim: captured[dim].to_numpy() if dim in captured.coords else np.arange(lengths[dim])
-        for name in simulated.truth
-        for dim in dims[name]
-        if dim in lengths
-    }
-    axes["simulation"] = simulated.numbers
-
-    def labeled(values: Values, suffix: str = "") -> dict[str, xr.DataArray]:
-        first = ("quantile",) if suffix == "_quantile" else ()
-        return {
-            f"{name}{suffix}": xr.DataArray(
-                np.reshape(x, (*np.shape(x)[: len(first) + 1], *shape_of(program, name))),
-                dims=(*first, "simulation", *dims[name]),
-                attrs={"symbol": notation(name)[0], "units": notation(name)[2]},
-            )
-            for name, x in values.items()
-        }
-
-    def pit_of_readings(values: Values) -> dict[str, tuple]:
-        return {
-            name: ("simulation", x, {"symbol": notation(name)[0], "units": "1"})
-            for name, x in values.items()
-        }
-
-    fits: dict[str, tuple] = {
-        name: ("simulation", x) for name, x in simulated.outcome._asdict().items()
-    }
-    for name, flags in {"status": Status, "approach": MethodUsed}.items():
-        meanings = " ".join(flag.name.lower() for flag in flags)
-        fits[name] = (*fits[name], {"flag_meanings": meanings})
-    quantiles = {name: np.moveaxis(x, 1, 0) for name, x in simulated.quantiles.items()}
-    marginals = {
-        **labeled(simulated.mean),
-        **labeled(simulated.sd, "_sd"),
-        **labeled(quantiles, "_quantile"),
-        **labeled(simulated.crps, "_crps"),
-    }
-    simulation = {"simulation": simulated.numbers}
-    groups = {
-        "prior_sbc": xr.Dataset(labeled(simulated.pit), axes),
-        "truth": xr.Dataset(labeled(simulated.truth), axes),
-        "marginals": xr.Dataset(marginals, {**axes, "quantile": list(LEVELS)}),
-        "fits": xr.Dataset(fits, simulation),
-    }
-    if simulated.entry:
-        groups["predictive_pit"] = xr.Dataset(pit_of_readings(simulated.fresh), simulation)
-        groups["loo_pit"] = xr.Dataset(pit_of_readings(simulated.left_out), simulation)
-        groups["readings"] = xr.Dataset(_chosen_readings(simulated, data), simulation)
-    tree = xr.DataTree.from_dict(groups)
-    tree.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
-    return tree
-
-
-def _chosen_readings(simulated: Block, data: Observations) -> dict[str, tuple]:
-    """Axes of the readings that were ranked, and Pareto k of leaving them out."""
-    k_name = f"Pareto k of the weights without it; above {MAX_PARETO_K} they say little"
-    chosen: dict[str, tuple] = {}
-    for name, entry in simulated.entry.items():
-        k = simulated.left_out_k[name]
-        chosen[f"{name}_pareto_k"] = ("simulation", k, {"long_name": k_name})
-        index = np.unravel_index(np.maximum(entry, 0), data.shape)
-        for (dim, _), at in zip(data.dims, index, strict=True):
-            attributes = {"long_name": f"number of its {dim}, -1 where none is valid"}
-            chosen[f"{name}_{dim}"] = ("simulation", np.where(entry < 0, -1, at), attributes)
-    return chosen

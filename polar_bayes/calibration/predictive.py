@@ -62,10 +62,7 @@ class PredictivePit:
         self._uniform = {n: uniform[:, 1:, at] for at, n in enumerate(self._names)}
         fitted = self._captures.batched.readings
         self._observed = {
-            n: np.stack(
-                [_take(np.asarray(x[n], np.float32), self.entry[n]) for x in (replicated, fitted)],
-                axis=-1,
-            )
+            n: np.stack([_take(x[n], self.entry[n]) for x in (replicated, fitted)], axis=-1)
             for n in self._names
         }
         key = jax.random.fold_in(jax.random.key(seed), 2)
@@ -175,8 +172,8 @@ def _choose(valid: np.ndarray, uniform: np.ndarray) -> np.ndarray:
     return np.where(count > 0, entry, -1)
 
 
-def _take(values: np.ndarray, entry: np.ndarray) -> np.ndarray:
-    flat = values.reshape(len(values), -1)
+def _take(values: Array | np.ndarray, entry: np.ndarray) -> np.ndarray:
+    flat = np.asarray(values, np.float32).reshape(len(values), -1)
     return flat[np.arange(len(flat)), np.maximum(entry, 0)]
 
 

@@ -7,7 +7,7 @@ Source:
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,52 +16,36 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from jaxtyping import Array
 
 from polar_bayes.calibration.predictive import Arrays, PredictivePit, unranked_reason
 from polar_bayes.calibration.scores import PitCrps
-from polar_bayes.errors import FitError
-from polar_bayes.inference.batching import ObservationBatch
+from polar_bayes.capture.files import read_netcdf, write_netcdf
+from polar_bayes.errors import FitError, OutputError, PolarBayesError
+from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout
 from polar_bayes.inference.problem import observe_request
-from polar_bayes.inference.problem_batch import Outcome, empty_outcome, problem_batch
+from polar_bayes.inference.problem_batch import empty_outcome, problem_batch
 from polar_bayes.inference.program import Program, Values, compile_program
 from polar_bayes.inference.request import Request
-from polar_bayes.interrupts import on_interrupt, resume_hint
+from polar_bayes.inference.result import dims_of, shape_of
 from polar_bayes.maps.blocks import (
-    ADDRESS,
     OTHER_OUT,
+    RESUME,
     VERSIONS,
-    Entry,
-    Ledger,
+    Journal,
     digest,
-    digest_files,
-    locked_ledger,
+    open_journal,
+    request_topics,
     written,
 )
 from polar_bayes.methods.method import AbstractBatchMethod
 from polar_bayes.numerics.compile import TRACING_LOCK, JitOnce, LRUCache
-from polar_bayes.numerics.psis import Marginals
+from polar_bayes.numerics.psis import LEVELS, MAX_PARETO_K, Marginals
 from polar_bayes.observation.data import Observations
 from polar_bayes.paths import TEMPORARY_PREFIX, replace_file, temporary_folder
-from polar_bayes.priors import describe_prior
-
-
-class Block(NamedTuple):
-    """Some simulations and their fits, NaN where a fit has no answer; axis 0 is the simulation."""
-
-    numbers: np.ndarray
-    truth: Arrays
-    pit: Arrays
-    crps: Arrays
-    mean: Arrays
-    sd: Arrays
-    quantiles: Arrays
-    outcome: Outcome
-    fresh: Arrays
-    left_out: Arrays
-    left_out_k: Arrays
-    entry: Arrays
+from polar_bayes.physics.part import notation
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -138,8 +122,8 @@ class CompiledPlan:
 _COMPILED: LRUCache[CompiledPlan] = LRUCache(4)
 
 
-def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
-    """Simulate some captures and fit each; this is what a worker is sent."""
+def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> xr.DataTree:
+    """The calibration by some simulations, NaN where a fit has no answer; a worker is sent this."""
     # The result of a simulation depends on its number alone, not on the others of its block.
     compiled, seed, count = plan.compiled, plan.request.seed, len(numbers)
     program, data, shared = compiled.generative_program, compiled.data, compiled.shared
@@ -163,27 +147,103 @@ def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> Block:
         outcome.put(found)
         for statistic in statistics if found.draws else ():
             statistic.describe(found.at, found.draws, found.weights)
-    return Block(
-        numbers=np.asarray(numbers),
-        truth=truth,
-        pit=scores.pit,
-        crps=scores.crps,
-        mean=marginals.mean,
-        sd=marginals.sd,
-        quantiles={name: np.moveaxis(x, 0, 1) for name, x in marginals.quantiles.items()},
-        outcome=outcome,
-        fresh=ranked.fresh if ranked else {},
-        left_out=ranked.left_out if ranked else {},
-        left_out_k=ranked.left_out_k if ranked else {},
-        entry=ranked.entry if ranked else {},
-    )
+    groups = _label_groups(compiled, numbers, truth, scores, marginals)
+    fits: dict[str, tuple] = {name: ("simulation", x) for name, x in outcome._asdict().items()}
+    for name, flags in {"status": Status, "approach": MethodUsed}.items():
+        meanings = " ".join(flag.name.lower() for flag in flags)
+        fits[name] = (*fits[name], {"flag_meanings": meanings})
+    groups["fits"] = xr.Dataset(fits, {"simulation": numbers})
+    if ranked:
+        groups |= _label_readings(ranked, data, numbers)
+    return xr.DataTree.from_dict(groups)
 
 
-def join(blocks: Iterable[Block], count: int) -> Block:
+def _label_groups(
+    compiled: "CompiledPlan",
+    numbers: np.ndarray,
+    truth: Arrays,
+    scores: PitCrps,
+    marginals: Marginals,
+) -> dict[str, xr.Dataset]:
+    """What is known of the parameters of some simulations, with names, axes and units."""
+    program, captured = compiled.program, compiled.plan.request.capture
+    dims, lengths = dims_of(program), dict(compiled.data.dims)
+    axes = {
+        dim: captured[dim].to_numpy() if dim in captured.coords else np.arange(lengths[dim])
+        for name in truth
+        for dim in dims[name]
+        if dim in lengths
+    }
+    axes["simulation"] = numbers
+
+    def labeled(values: Values, suffix: str = "", first: tuple[str, ...] = ()) -> dict[str, tuple]:
+        found = {}
+        for name, x in values.items():
+            symbol, _, unit = notation(name)
+            shape = (*np.shape(x)[: len(first) + 1], *shape_of(program, name))
+            attributes = {"symbol": symbol, "units": unit}
+            axes_of_name = (*first, "simulation", *dims[name])
+            found[f"{name}{suffix}"] = axes_of_name, np.reshape(x, shape), attributes
+        return found
+
+    own = {
+        **labeled(marginals.mean),
+        **labeled(marginals.sd, "_sd"),
+        **labeled(marginals.quantiles, "_quantile", ("quantile",)),
+        **labeled(scores.crps, "_crps"),
+    }
+    return {
+        "prior_sbc": xr.Dataset(labeled(scores.pit), axes),
+        "truth": xr.Dataset(labeled(truth), axes),
+        "marginals": xr.Dataset(own, {**axes, "quantile": list(LEVELS)}),
+    }
+
+
+def _label_readings(
+    ranked: PredictivePit, data: Observations, numbers: np.ndarray
+) -> dict[str, xr.Dataset]:
+    """PIT values of readings, which readings they are, and Pareto k of leaving them out."""
+    k_name = f"Pareto k of the weights without it; above {MAX_PARETO_K} they say little"
+    chosen: dict[str, tuple] = {}
+    for name, entry in ranked.entry.items():
+        k = ranked.left_out_k[name]
+        chosen[f"{name}_pareto_k"] = ("simulation", k, {"long_name": k_name})
+        index = np.unravel_index(np.maximum(entry, 0), data.shape)
+        for (dim, _), at in zip(data.dims, index, strict=True):
+            attributes = {"long_name": f"number of its {dim}, -1 where none is valid"}
+            chosen[f"{name}_{dim}"] = ("simulation", np.where(entry < 0, -1, at), attributes)
+
+    def pit(values: Arrays) -> dict[str, tuple]:
+        return {
+            name: ("simulation", x, {"symbol": notation(name)[0], "units": "1"})
+            for name, x in values.items()
+        }
+
+    groups = {"predictive_pit": pit(ranked.fresh), "loo_pit": pit(ranked.left_out)}
+    groups["readings"] = chosen
+    return {name: xr.Dataset(own, {"simulation": numbers}) for name, own in groups.items()}
+
+
+def join(blocks: Sequence[xr.DataTree], count: int) -> xr.DataTree:
     """The first simulations of a calibration as one block, in order."""
-    whole = jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
-    numbers, first = np.unique(whole.numbers, return_index=True)
-    return jax.tree.map(lambda x: x[first[numbers < count]], whole)
+    groups = {}
+    for name in blocks[0].children:
+        whole = xr.concat(
+            [block[name].to_dataset() for block in blocks],
+            "simulation",
+            data_vars="minimal",
+            coords="minimal",
+            compat="override",
+            join="exact",
+        )
+        ordered = whole.sortby("simulation").drop_duplicates("simulation")
+        groups[name] = ordered.sel(simulation=slice(0, count - 1))
+    return xr.DataTree.from_dict(groups)
+
+
+def numbers_of(block: xr.DataTree) -> np.ndarray:
+    """The numbers of the simulations of a block."""
+    return block["fits"]["simulation"].to_numpy()
 
 
 def cut(numbers: np.ndarray, size: int) -> list[np.ndarray]:
@@ -284,7 +344,7 @@ def _batch(data: Observations, recorded: tuple) -> ObservationBatch:
 
 # --- Blocks on the disk ---------------------------------------------------------------------------
 
-LEDGER, BLOCK_FILE = "ledger", "[0-9]*-[0-9]*.npz"
+JOURNAL, BLOCK_FILE = "journal", "[0-9]*-[0-9]*.nc"
 LIBRARIES = ("polar_bayes", "jax", "jaxlib", "numpyro", "numpy", "scipy")
 
 
@@ -293,22 +353,20 @@ def open_store(folder: Path, plan: CalibrationPlan, *, resume: bool) -> Iterator
     """The blocks of a calibration in a folder, which is made, or read where it is resumed."""
     where = str(folder)
     if not resume and folder.exists():
-        raise FitError("it is there already", where=where, hint=f"{OTHER_OUT}, or --resume")
-    with written(folder, FitError):
+        raise OutputError("it is there already", where=where, hint=RESUME)
+    with written(folder):
         folder.mkdir(exist_ok=resume)
         others = [path for path in folder.iterdir() if not path.match(BLOCK_FILE)]
     names = [path.name for path in others if not path.name.startswith(TEMPORARY_PREFIX)]
-    if names and LEDGER not in names:
-        raise FitError("it holds no calibration", where=where, hint=OTHER_OUT)
-    ledger_of_plan = folder / LEDGER, folder, "calibration", fingerprint_of(plan)
-    with (
-        locked_ledger(*ledger_of_plan, resume=True) as ledger,
-        on_interrupt(lambda: resume_hint(folder)),
-    ):
-        with written(folder, FitError):
-            ledger.read()
-            ledger.begin()
-        yield BlockStore(folder, ledger)
+    if names and JOURNAL not in names:
+        what = "it holds no calibration that this version can resume"
+        raise OutputError(what, where=where, hint=OTHER_OUT)
+    journal_of_plan = folder / JOURNAL, folder, "calibration", topics_of(plan)
+    with open_journal(*journal_of_plan, resume=True) as journal:
+        with written(folder):
+            journal.read()
+            journal.begin()
+        yield BlockStore(folder, journal)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -316,64 +374,38 @@ class BlockStore:
     """A folder of blocks, each in a file that is there whole or not at all."""
 
     folder: Path
-    ledger: Ledger
+    journal: Journal
 
-    def blocks(self) -> list[Block]:
+    def blocks(self) -> list[xr.DataTree]:
         """The finished blocks; those whose files are lost or damaged are fitted again."""
-        paths = {label: self.folder / f"{label}.npz" for label in sorted(self.ledger.entries)}
-        return [_read(path) for label, path in paths.items() if self.ledger.holds(label, [path])]
+        found = []
+        for path in sorted(self.folder.glob(BLOCK_FILE)):
+            broken = FitError("it cannot be read", where=str(path), hint=RESUME)
+            if path.stem in self.journal.done:
+                with contextlib.suppress(PolarBayesError):
+                    found.append(read_netcdf(xr.DataTree, path, broken))
+        return found
 
-    def add(self, block: Block) -> None:
-        """Write a block; arrays are named by their path, such as `pit/roughness`."""
-        label = f"{block.numbers.min():08d}-{block.numbers.max():08d}"
-        path = self.folder / f"{label}.npz"
-        arrays = {
-            jax.tree_util.keystr(at, simple=True, separator="/"): np.asarray(x)
-            for at, x in jax.tree_util.tree_leaves_with_path(block)
-        }
-        with written(self.folder, FitError), temporary_folder(self.folder) as unfinished:
-            np.savez(unfinished / path.name, allow_pickle=False, **arrays)
+    def add(self, block: xr.DataTree) -> None:
+        """Write a block, named by the numbers of its first and last simulation."""
+        numbers = numbers_of(block)
+        path = self.folder / f"{numbers.min():08d}-{numbers.max():08d}.nc"
+        with written(self.folder), temporary_folder(self.folder) as unfinished:
+            write_netcdf(block, unfinished / path.name)
             replace_file(unfinished / path.name, path)
-            self.ledger.add(label, Entry(digest(block.numbers), digest_files([path])))
+            self.journal.add(path.stem)
 
 
-def _read(path: Path) -> Block:
-    parts: dict[str, Any] = {name: {} for name in Block._fields}
-    with np.load(path, allow_pickle=False) as file:
-        for key, values in file.items():
-            name, _, entry = key.partition("/")
-            if entry:
-                parts[name][entry] = values
-            else:
-                parts[name] = values
-    return Block(**{**parts, "outcome": Outcome(**parts["outcome"])})
-
-
-def fingerprint_of(plan: CalibrationPlan) -> dict[str, str]:
+def topics_of(plan: CalibrationPlan) -> dict[str, str]:
     """One text per topic that determines the fits; their number may differ between runs."""
-    truth = _topics(plan.generative_request) if plan.generative_request is not None else {}
+    truth = request_topics(plan.generative_request) if plan.generative_request is not None else {}
     data = plan.compiled.data
     return {
         "capture": digest(jax.tree.leaves(data), data.dims, tuple(data.readings)),
-        **_topics(plan.request),
+        **request_topics(plan.request),
         "truth": " ".join(f"{topic}: {text}" for topic, text in truth.items()),
         "method": repr(plan.settings),
         "seed": str(plan.request.seed),
         "readings": str(plan.readings),
         VERSIONS: " ".join(f"{name} {version(name)}" for name in LIBRARIES),
-    }
-
-
-def _topics(request: Request) -> dict[str, str]:
-    priors = (
-        f"{name}={describe_prior(prior)} {digest(prior)}"
-        for name, prior in sorted(request.priors.items())
-    )
-    links = (f"{name}={link!r}" for name, link in sorted(request.links.items()))
-    return {
-        "model": f"{request.model_name} {digest(request.model, request.fixed)}",
-        "scene": ADDRESS.sub("", repr(request.scene)),
-        "priors": ", ".join(priors),
-        "links": ADDRESS.sub("", ", ".join(links)),
-        "largest_view_zenith": repr(request.largest_view_zenith),
     }

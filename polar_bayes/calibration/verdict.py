@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
@@ -134,10 +134,7 @@ def calibration_view(calibration: xr.DataTree | CalibrationView) -> CalibrationV
 # --- Tables ---------------------------------------------------------------------------------------
 
 HALF = 0.5
-"""Share of failed fits from which another method is named."""
-
-MOST_UNTRUSTED = 0.5
-"""Share of fits that are not trusted above which their ranks do not judge the model."""
+"""Share of fits that have failed, or are not trusted, from which another method is named."""
 
 SHIFT_LIMIT = SPREAD_LIMIT = 2.5
 TAIL_LIMIT = 2.0
@@ -163,24 +160,26 @@ def calibration_table(calibration: xr.DataTree | CalibrationView) -> pd.DataFram
 
 def _parameter_row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> dict[str, float]:
     pit, index = scalar.draws[0], dict(scalar.index)
-    finite = pit[np.isfinite(pit)]
-    bounds = marginals[f"{scalar.name}_quantile"].isel(index)
-    scatter = spread_of_scores(finite)
+    own = marginals.isel(index)
+    bounds = own[f"{scalar.name}_quantile"]
+    columns = _rank_columns(pit)
+    scatter = spread_of_scores(pit[np.isfinite(pit)])
     held = {}
     for percent, levels in INTERVALS.items():
         low, high = (bounds.sel(quantile=level).to_numpy() for level in levels)
         held[percent] = int(np.sum((low <= truth) & (truth <= high)))
+    tests = {
+        f"p_held_{percent}": coverage_p_value(hits, int(columns["answered"]), percent / 100.0)
+        for percent, hits in held.items()
+    }
+    means = {"width_95": high - low, "crps": own[f"{scalar.name}_crps"].to_numpy()}
     return {
-        **_rank_columns(pit),
+        **columns,
         **coverage_columns(held, pit.size),
-        **{
-            f"p_held_{percent}": coverage_p_value(hits, finite.size, percent / 100.0)
-            for percent, hits in held.items()
-        },
+        **tests,
         "p_spread": scatter.p_value,
         "spread": scatter.spread,
-        "width_95": _finite_mean(high - low),
-        "crps": _finite_mean(marginals[f"{scalar.name}_crps"].isel(index).to_numpy()),
+        **{name: float(pd.Series(x[np.isfinite(x)]).mean()) for name, x in means.items()},
     }
 
 
@@ -194,11 +193,6 @@ def _rank_columns(pit: np.ndarray) -> dict[str, float]:
         "rank_mean": ranks.mean,
         "rank_spread": ranks.spread,
     }
-
-
-def _finite_mean(values: np.ndarray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else math.nan
 
 
 def calibration_readings(calibration: xr.DataTree | CalibrationView) -> pd.DataFrame:
@@ -281,27 +275,21 @@ def calibration_verdict(calibration: xr.DataTree | CalibrationView) -> list[str]
         if status != Status.GOOD and lost:
             name = status.name.lower().replace("_", " ")
             sentences.append(f"{lost} of {statuses.size} fits: {name}.")
-    failed = int(table["failed"].max())
-    if failed:
+    if failed := int(table["failed"].max()):
         counted = f"{failed} of {statuses.size} fits have no answer, and count as misses of every"
         sentences.append(f"{counted} interval above.")
     if failed >= HALF * statuses.size:
-        sentences.append(_better_method(calibration.tree))
-    if np.mean(statuses == Status.NOT_TRUSTED) > MOST_UNTRUSTED:
+        advice = "use method='nuts', whose chains begin at every mode"
+        if provenance_of(calibration.tree).get("method") == "nuts":
+            advice = "give longer chains, as in Nuts(most_draws=20000), or narrower priors"
+        sentences.append(f"Half of the fits or more have failed: {advice}.")
+    if np.mean(statuses == Status.NOT_TRUSTED) > HALF:
         sentences.append(
             "Most fits say themselves that they cannot be trusted: the ranks judge the method, not "
             "the model. Another method or longer chains may do; chains (method='nuts') are the "
             "slowest and the surest."
         )
     return sentences + _reading_sentences(calibration)
-
-
-def _better_method(calibration: xr.DataTree) -> str:
-    """What to try where half of the fits have failed."""
-    advice = "use method='nuts', whose chains begin at every mode"
-    if provenance_of(calibration).get("method") == "nuts":
-        advice = "give longer chains, as in Nuts(most_draws=20000), or narrower priors"
-    return f"Half of the fits or more have failed: {advice}."
 
 
 def _reading_sentences(calibration: CalibrationView) -> list[str]:
@@ -313,24 +301,18 @@ def _reading_sentences(calibration: CalibrationView) -> list[str]:
     sentences = [
         f"Readings ({names}; fresh ones and ones left out) "
         f"{'pass' if is_calibrated(table) else 'fail'} a joint test of their own that a right "
-        f"model fails {FALSE_ALARMS:.0%} of the time.",
-        *_reading_deviations(table),
+        f"model fails {FALSE_ALARMS:.0%} of the time."
     ]
-    sentences += [
-        f"{label}: in {int(row['untrusted'])} of {int(row['answered'])} fits the weights "
-        f"without it say little (Pareto k above {MAX_PARETO_K:g})."
-        for label, row in table.iterrows()
-        if row["untrusted"] > 0
-    ]
-    return sentences
-
-
-def _reading_deviations(table: pd.DataFrame) -> Iterator[str]:
-    """A sentence for each row that fails its test."""
     for label, row in table.iterrows():
         if not row["p_value"] >= significance_level(table):  # a row without p-value fails too
             p_value = f" (p = {row['p_value']:.2g})" if row["answered"] > 1 else ""
-            yield f"{label}: {reading_deviation(row)}{p_value}."
+            sentences.append(f"{label}: {reading_deviation(row)}{p_value}.")
+    sentences += [
+        f"{label}: in {int(row['untrusted'])} of {int(row['answered'])} fits the weights "
+        f"without it say little (Pareto k above {MAX_PARETO_K:g})."
+        for label, row in table[table["untrusted"] > 0].iterrows()
+    ]
+    return sentences
 
 
 def parameter_deviation(row: pd.Series, level: float) -> str:

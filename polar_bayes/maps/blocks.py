@@ -1,9 +1,10 @@
 """Work in blocks, on threads or workers of a cluster, and resumable after an interruption.
 
-A resumable run has a ledger, which one process at a time locks. Its first line is the fingerprint
-of the run, and each further line a finished block, added when the files of the block are on the
-disk. Every line has a checksum. A resume requires the same fingerprint, and fits a block again
-where it has no line or its files are not those of the line.
+A store of blocks (a map, the fits of a calibration) has a journal, which one process at a time
+locks. Its first line states the request by topic, and each further line a block, added when the
+block is on the disk. A resume requires the same request, and fits a block again where it has no
+line or cannot be read: what is read has checksums, those of Zarr or of
+`polar_bayes.capture.files.write_netcdf`.
 """
 
 import contextlib
@@ -16,11 +17,10 @@ import json
 import os
 import re
 import types
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import jax
 import lazy_loader
@@ -29,6 +29,8 @@ from numpyro import distributions as dist
 from numpyro.primitives import Messenger
 
 from polar_bayes.errors import FitError, OutputError, PolarBayesError
+from polar_bayes.inference.request import Request
+from polar_bayes.interrupts import on_interrupt, resume_hint
 from polar_bayes.paths import output_error, sync
 from polar_bayes.priors import describe_prior
 
@@ -102,12 +104,20 @@ def digest(*parts: Any) -> str:
     return hashlib.sha256(_text(parts).encode()).hexdigest()
 
 
-def digest_files(files: Iterable[Path]) -> str:
-    """SHA-256 of the contents of files, one after the other."""
-    found = hashlib.sha256()
-    for file in files:
-        found.update(hashlib.sha256(file.read_bytes()).digest())
-    return found.hexdigest()
+def request_topics(request: Request) -> dict[str, str]:
+    """One text per argument that two requests may differ in."""
+    priors = (
+        f"{name}={describe_prior(prior)} {digest(prior)}"
+        for name, prior in sorted(request.priors.items())
+    )
+    links = (f"{name}={link!r}" for name, link in sorted(request.links.items()))
+    return {
+        "model": f"{request.model_name} {digest(request.model, request.fixed)}",
+        "scene": ADDRESS.sub("", repr(request.scene)),
+        "priors": ", ".join(priors),
+        "links": ADDRESS.sub("", ", ".join(links)),
+        "largest_view_zenith": repr(request.largest_view_zenith),
+    }
 
 
 def _text(part: Any) -> str:
@@ -151,100 +161,75 @@ def _text_of_callable(part: Callable) -> str:
     return ADDRESS.sub("", repr(part))
 
 
-# --- The ledger of a resumable run: which blocks are on the disk ----------------------------------
+# --- The journal of a store: which blocks are on the disk -----------------------------------------
 
 OTHER_OUT = "give another --out"
 REPEAT = f"repeat the command as it was, or {OTHER_OUT}"
+RESUME = f"{OTHER_OUT}, or --resume"
 VERSIONS = "versions"
-"""Topic of a fingerprint: the versions of the libraries."""
+"""Topic of a request: the versions of the libraries."""
 
 
-def begun_with_another(topics: Iterable[str]) -> str:
-    """What differs between a run that is resumed and the one that was begun."""
-    return f"it was begun with another {', another '.join(topics)}".replace(
-        f"another {VERSIONS}", "other versions of the libraries"
-    )
-
-
-class Entry(NamedTuple):
-    """A finished block: digests of what it was made from, and of its files."""
-
-    inputs: str
-    files: str
-
-
-class Ledger:
-    """A file with the fingerprint of a run in its head, and a line per finished block."""
-
-    # A line without an end was cut off by a crash and is ignored; any other line that fails its
-    # checksum is an error.
+class Journal:
+    """The request of a store in the first line of a file, and a line for each finished block."""
 
     def __init__(
-        self, opened: BinaryIO, file: Path, store: Path, kind: str, fingerprint: Mapping[str, str]
+        self, opened: BinaryIO, file: Path, store: Path, kind: str, topics: Mapping[str, str]
     ) -> None:
         self._opened, self._file, self._store, self._size = opened, file, store, 0
-        self._kind, self._fingerprint = kind, fingerprint
-        self._magic = f"polar_bayes {kind} ".encode()
-        self._head = self._magic + json.dumps(fingerprint, sort_keys=True).encode() + b"\n"
-        self.entries: dict[str, Entry] = {}
+        self._kind, self._topics = kind, topics
+        self._magic = f"polar_bayes journal of a {kind} ".encode()
+        self._head = self._magic + json.dumps(topics, sort_keys=True).encode() + b"\n"
+        self.done: dict[str, str] = {}
+        """By the name of each finished block, the digest of what it was made from."""
 
     def read(self) -> None:
-        """Read the entries; a file that holds anything else is refused and left as it is."""
-        where = str(self._file)
+        """Read which blocks are finished; a file that holds anything else is left as it is."""
         content = self._opened.read()
-        if self._head.startswith(content):  # empty, or cut off within the head
+        if self._head.startswith(content):  # empty, or cut off within the first line
             return
+        where = str(self._file)
         if not content.startswith(self._magic):
-            hint = f"move that file away, or {OTHER_OUT}"
-            raise OutputError(f"it is not the ledger of a {self._kind}", where=where, hint=hint)
+            what = f"it is not the journal of a {self._kind} that this version can resume"
+            raise OutputError(what, where=where, hint=f"move that file away, or {OTHER_OUT}")
         if not content.startswith(self._head):
-            raise FitError(begun_with_another(self._differing(content)), where=where, hint=REPEAT)
+            raise FitError(self._difference(content), where=where, hint=REPEAT)
+        # The last line was cut off by a crash where it has no end. A damaged name is that of no
+        # block, so its block is fitted again.
         *lines, rest = content[len(self._head) :].split(b"\n")
         self._size = len(content) - len(rest)
-        for number, line in enumerate(lines, 2):
-            body, _, checksum = line.rpartition(b" ")
-            fields = body.rsplit(b" ", 2)
-            if len(fields) != 3 or checksum != _checksum(body):
-                hint = f"remove that file to fit all blocks again, or {OTHER_OUT}"
-                raise OutputError(f"line {number} is damaged", where=where, hint=hint)
-            label, inputs, files = (field.decode("ascii") for field in fields)
-            self.entries[label] = Entry(inputs, files)
+        parts = (line.decode("ascii", "replace").rpartition(" ") for line in lines)
+        self.done = {name: made_from for name, _, made_from in parts}
 
-    def _differing(self, content: bytes) -> list[str]:
-        """Topics whose texts are not those of the head; all where it cannot be read."""
+    def _difference(self, content: bytes) -> str:
+        """What differs between this request and the one of the file."""
         begun: Any = None
         with contextlib.suppress(ValueError):
             begun = json.loads(content[len(self._magic) :].partition(b"\n")[0])
         begun = begun if isinstance(begun, dict) else {}
-        topics = {**self._fingerprint, **begun}
-        differing = [name for name in topics if self._fingerprint.get(name) != begun.get(name)]
-        return differing or list(topics)
+        topics = {**self._topics, **begun}
+        differing = [name for name in topics if self._topics.get(name) != begun.get(name)]
+        names = ", another ".join(differing or topics)
+        return f"it was begun with another {names}".replace(
+            f"another {VERSIONS}", "other versions of the libraries"
+        )
 
     def begin(self) -> None:
-        """Cut off an incomplete last line; write the head where there is none."""
+        """Cut off an incomplete last line; write the request where there is none."""
         self._opened.truncate(self._size)
         if self._size == 0:
             self._append(self._head)
             sync(self._file.parent)
 
-    def add(self, label: str, entry: Entry) -> None:
+    def add(self, name: str, made_from: str = "") -> None:
         """Record a block that is on the disk."""
         if not self.is_in_place():
             raise taken_over(self._store)
-        body = f"{label} {entry.inputs} {entry.files}".encode()
-        self._append(body + b" " + _checksum(body) + b"\n")
-        self.entries[label] = entry
-
-    def holds(self, label: str, files: Iterable[Path]) -> bool:
-        """Whether a block is finished and its files are as they were written."""
-        entry, files = self.entries.get(label), list(files)
-        if entry is None or not all(file.is_file() for file in files):
-            return False
-        with written(self._store):
-            return digest_files(files) == entry.files
+        self._append(f"{name} {made_from}\n".encode())
+        self.done[name] = made_from
 
     def end(self) -> None:
-        """Remove the ledger of a finished run."""
+        """Remove the journal of a finished store."""
         if self.is_in_place():
             self._file.unlink()
             sync(self._file.parent)
@@ -264,18 +249,19 @@ class Ledger:
 
 
 @contextlib.contextmanager
-def locked_ledger(
-    file: Path, store: Path, kind: str, fingerprint: Mapping[str, str], *, resume: bool
-) -> Iterator[Ledger]:
-    """The ledger of a store, locked: the lock ends with the block, or with the process."""
-    # A ledger that was made here and in which nothing was written is removed again.
+def open_journal(
+    file: Path, store: Path, kind: str, topics: Mapping[str, str], *, resume: bool
+) -> Iterator[Journal]:
+    """The journal of a store, locked: the lock ends with the block, or with the process."""
+    # A journal that was made here and in which nothing was written is removed again.
     opened, is_new = _open(file, kind, resume=resume)
     try:
         _lock(opened, file, store)
-        ledger = Ledger(opened, file, store, kind, fingerprint)
-        if not ledger.is_in_place():
+        journal = Journal(opened, file, store, kind, topics)
+        if not journal.is_in_place():
             raise taken_over(store)
-        yield ledger
+        with on_interrupt(lambda: resume_hint(store)):
+            yield journal
     except BaseException:
         if is_new and os.fstat(opened.fileno()).st_size == 0:
             file.unlink(missing_ok=True)
@@ -290,14 +276,13 @@ def _open(file: Path, kind: str, *, resume: bool) -> tuple[BinaryIO, bool]:
         with contextlib.suppress(FileExistsError):
             return file.open("x+b", buffering=0), True
         if not resume:
-            hint = f"{OTHER_OUT}, or --resume"
-            raise OutputError("it is there already", where=str(file), hint=hint)
+            raise OutputError("it is there already", where=str(file), hint=RESUME)
         if file.is_file():
             return file.open("r+b", buffering=0), False
     except OSError as error:
         raise output_error(error, file) from error
     hint = f"move it away, or {OTHER_OUT}"
-    raise OutputError(f"it is not the ledger of a {kind}", where=str(file), hint=hint)
+    raise OutputError(f"it is not the journal of a {kind}", where=str(file), hint=hint)
 
 
 def _lock(opened: BinaryIO, file: Path, store: Path) -> None:
@@ -312,12 +297,8 @@ def _lock(opened: BinaryIO, file: Path, store: Path) -> None:
         raise OutputError(f"it cannot be locked ({error})", where=str(file), hint=hint) from error
 
 
-def _checksum(body: bytes) -> bytes:
-    return f"{zlib.crc32(body):08x}".encode()
-
-
 def taken_over(store: Path) -> OutputError:
-    """The error of a process that finds the store or its ledger no longer there."""
+    """The error of a process that finds the store or its journal no longer there."""
     return OutputError(
         "another process has finished, moved or removed it",
         where=str(store),
@@ -326,7 +307,7 @@ def taken_over(store: Path) -> OutputError:
 
 
 @contextlib.contextmanager
-def written(store: Path, kind: type[PolarBayesError] = OutputError) -> Iterator[None]:
+def written(store: Path) -> Iterator[None]:
     """Errors of the system or the libraries below, as one line."""
     try:
         yield
@@ -336,4 +317,4 @@ def written(store: Path, kind: type[PolarBayesError] = OutputError) -> Iterator[
         reason = (getattr(error, "strerror", None) or "").lower() or str(error)
         what = f"it could not be written ({reason or type(error).__name__})"
         hint = "make room or give another --out; --resume goes on where it stopped"
-        raise kind(what, where=str(store), hint=hint) from error
+        raise OutputError(what, where=str(store), hint=hint) from error

@@ -161,21 +161,11 @@ def _open_store(path: Path, error: type[PolarBayesError], hint: str, **options: 
         opened = xr.open_dataset(path, engine="zarr", consolidated=False, cache=False, **options)
     except Exception as cause:  # the libraries below raise nearly every type for a broken store
         raise error("it cannot be read as Zarr", where=where, hint=hint) from cause
-    guarded = {
-        name: xr.Variable(
-            variable.dims,
-            indexing.LazilyIndexedArray(_Guarded(variable, f"{where}: {name}", error, hint)),
-            variable.attrs,
-            variable.encoding,
-            fastpath=True,
-        )
-        for name, variable in opened.variables.items()
-        if name not in opened.xindexes
-    }
-    coords = {name: guarded.pop(name) for name in list(guarded) if name in opened.coords}
-    found = opened.assign(guarded).assign_coords(coords)
-    found.encoding = opened.encoding
-    return found
+    for name, variable in opened.variables.items():
+        if name not in opened.xindexes:
+            guarded = _Guarded(variable.copy(deep=False), f"{where}: {name}", error, hint)
+            variable.data = indexing.LazilyIndexedArray(guarded)
+    return opened
 
 
 class _Guarded(BackendArray):

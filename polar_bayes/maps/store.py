@@ -1,10 +1,10 @@
 """Maps of images that do not fit into memory: block by block from file to file, resumable.
 
 A map is a Zarr store that appears whole, without values, with the digest of its request in the
-attribute `lazy.REQUEST`. Each block is on the disk before its line is in the ledger next to the
-store (`blocks.Ledger`). The attribute `lazy.FINISHED` is written last. Nothing is written to a
-store that does not hold the digest, and nothing is removed but the ledger and unfinished folders of
-this package.
+attribute `lazy.REQUEST`. Each block is on the disk before its line is in the journal next to the
+store (`blocks.Journal`). The attribute `lazy.FINISHED` is written last. Nothing is written to a
+store that does not hold the digest, and nothing is removed but the journal and unfinished folders
+of this package.
 """
 
 import contextlib
@@ -22,17 +22,15 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from polar_bayes.capture.schema import CONTRACT, LABELS, WAVELENGTH
 from polar_bayes.errors import CaptureError, FitError, OutputError
 from polar_bayes.inference.batching import IMAGE, cut
-from polar_bayes.interrupts import on_interrupt, resume_hint
 from polar_bayes.maps.blocks import (
     OTHER_OUT,
     REPEAT,
-    Entry,
-    Ledger,
+    RESUME,
+    Journal,
     as_completed,
-    begun_with_another,
     digest,
-    digest_files,
-    locked_ledger,
+    open_journal,
+    request_topics,
     taken_over,
     workers,
     written,
@@ -45,7 +43,6 @@ from polar_bayes.maps.fit_map import (
     fit_block,
     fit_pixels,
     plan_map,
-    provenance_json,
     with_pixel_numbers,
 )
 from polar_bayes.maps.lazy import FINISHED, REQUEST, check_whole, open_capture, open_map
@@ -61,13 +58,10 @@ PARTS, LEAST = 4, 1024
 READ = frozenset((*(row.name for row in CONTRACT), WAVELENGTH.name, *LABELS))
 """Variables of a capture that a fit reads; known truths and other variables are not among them."""
 
-LEDGER = ".progress"
-"""Ending of the name of the ledger, which lies next to an unfinished map."""
+JOURNAL = ".progress"
+"""Ending of the name of the journal, which lies next to an unfinished map."""
 
 METADATA = "zarr.json"
-
-TOPIC = "capture or other settings"
-"""The one topic of the fingerprint of a map, so errors do not name the setting that differs."""
 
 Region = dict[str, slice]
 
@@ -99,8 +93,8 @@ def map_file(
         out: The folder of a Zarr store to write.
         scheduler: Address of a `dask.distributed` scheduler whose workers can read `capture`; by
             default threads of this process.
-        resume: Go on with a map that was broken off; what is done stays. Blocks whose files are
-            missing or altered are fitted again. A finished map of the same capture is returned.
+        resume: Go on with a map that was broken off; what is done stays. Blocks that are missing or
+            damaged are fitted again. A finished map of the same capture is returned.
         progress: Called with the pixels that are done, and all.
         settings: Arguments of `polar_bayes.fit_pixels`.
 
@@ -121,23 +115,21 @@ def map_file(
     with _in_capture(source):
         plan = plan_map(image, **(DEFAULTS | settings))
     target = _MapStore(store, image, plan)
-    file, fingerprint = store.with_name(f"{store.name}{LEDGER}"), {TOPIC: target.request}
-    with locked_ledger(file, store, "map", fingerprint, resume=resume) as ledger:
-        is_finished = target.is_finished(resume=resume)
+    journal_of_map = store.with_name(f"{store.name}{JOURNAL}"), store, "map", target.topics
+    with open_journal(*journal_of_map, resume=resume) as journal:
         with written(store):
-            ledger.read()
-        if is_finished:
+            journal.read()
+        if target.is_finished(resume=resume):
             target.check_finished()
         else:
-            target.check_readings(ledger)
+            target.check_readings(journal)
             with _in_capture(source):
                 target.estimate()
-            target.begin(ledger)
-            with on_interrupt(lambda: resume_hint(store)):
-                target.run(ledger, source, scheduler, progress or no_progress)
-            target.finish(ledger)
+            target.begin(journal)
+            target.run(journal, source, scheduler, progress or no_progress)
+            target.finish(journal)
         with written(store):
-            ledger.end()
+            journal.end()
     return open_map(store)
 
 
@@ -195,11 +187,19 @@ class _MapStore:
         self._store, self._image, self._plan = store, image, plan
         # The size of blocks depends on the image alone, so resumed maps have the same blocks.
         size = min(BLOCK, max(LEAST, image.sizes["y"] * image.sizes["x"] // PARTS))
-        self._regions = list(cut(image, size))
-        self._chunks = {dim: part.stop for dim, part in self._regions[0].items()}
-        request, sizes = plan.request, dict(image.sizes)
-        asked = provenance_json(plan), request.model, request.priors, _digest(request.capture)
-        self.request = digest(*asked, sizes, self._chunks)
+        self._regions = {_label(region): region for region in cut(image, size)}
+        self._chunks = {dim: part.stop for dim, part in next(iter(self._regions.values())).items()}
+        request = plan.request
+        pixel = _digest(request.capture), plan.intensity_unit
+        self.topics = {
+            "capture": digest(pixel, dict(image.sizes), self._chunks),
+            **request_topics(request),
+            "method": digest(plan.settings),
+            "seed": str(request.seed),
+            "precision": request.precision,
+            "shared": f"{[each.name for each in plan.shared]}, {plan.shares_by_default}",
+        }
+        self.request = digest(self.topics)
 
     def is_finished(self, *, resume: bool) -> bool:
         """Whether the store is a finished map; a store of another request is refused."""
@@ -207,14 +207,14 @@ class _MapStore:
         if not os.path.lexists(self._store):
             return False
         if not resume:
-            hint = f"{OTHER_OUT}, or --resume"
-            raise OutputError("it is there already", where=where, hint=hint)
+            raise OutputError("it is there already", where=where, hint=RESUME)
         attributes = _metadata(self._store)["attributes"]
         if REQUEST not in attributes:
             what = "it is not a map that can be resumed"
             raise OutputError(what, where=where, hint=OTHER_OUT)
         if attributes[REQUEST] != self.request:
-            raise FitError(begun_with_another([TOPIC]), where=where, hint=REPEAT)
+            what = "it was begun with another capture or other settings, or by another version"
+            raise FitError(what, where=where, hint=REPEAT)
         return FINISHED in attributes
 
     def estimate(self) -> None:
@@ -225,44 +225,42 @@ class _MapStore:
     def check_finished(self) -> None:
         """Refuse a finished map of readings that have changed, or with missing chunks."""
         where = str(self._store)
-        readings = [_digest(self._image.isel(region)) for region in self._regions]
-        if _metadata(self._store)["attributes"][FINISHED] != self._digest_all(readings):
+        readings = [_digest(self._image.isel(region)) for region in self._regions.values()]
+        if _metadata(self._store)["attributes"][FINISHED] != digest(list(self._regions), readings):
             what = "the capture has changed since it was made"
             raise FitError(what, where=where, hint=OTHER_OUT)
         self._maps = open_map(self._store)  # what pixels share was estimated, and has no map
-        files = [file for region in self._regions for file in self._files(region)]
+        files = [file for region in self._regions.values() for file in self._files(region)]
         if missing := sum(not file.is_file() for file in files):
             what = f"{missing} of {len(files)} chunks are missing"
             raise OutputError(what, where=where, hint=f"copy the store again, or {OTHER_OUT}")
 
-    def check_readings(self, ledger: Ledger) -> None:
+    def check_readings(self, journal: Journal) -> None:
         """Refuse to resume where the readings of a finished block have changed."""
-        for region in self._regions:
-            entry = ledger.entries.get(_label(region))
-            if entry is not None and _digest(self._image.isel(region)) != entry.inputs:
-                what = f"the capture has changed since block {_label(region)} was fitted"
-                raise FitError(what, where=str(self._store), hint=OTHER_OUT)
+        for name, region in self._regions.items():
+            if journal.done.get(name) not in (None, _digest(self._image.isel(region))):
+                what = f"the capture has changed since block {name} was fitted"
+                hint = f"{OTHER_OUT}, or remove {self._store.name}{JOURNAL} to fit all blocks again"
+                raise FitError(what, where=str(self._store), hint=hint)
 
-    def begin(self, ledger: Ledger) -> None:
+    def begin(self, journal: Journal) -> None:
         """Put the store without values in its place, or check that it is as it was put there."""
         with written(self._store), temporary_folder(self._store.parent) as folder:
             empty = folder / self._store.name
             self._write_blank(empty)
             files = sorted(path.relative_to(empty) for path in empty.rglob("*") if path.is_file())
-            if self._store.exists():
-                for file in files:
-                    found, expected = self._store / file, (empty / file).read_bytes()
-                    if not found.is_file() or found.read_bytes() != expected:
-                        what = "it is missing or not as written, or the capture has changed since"
-                        where = self._store
-                        raise OutputError(what, where=f"{where}: {file}", hint=OTHER_OUT)
-                ledger.begin()
-                return
-            for path in (*empty.rglob("*"), empty):
-                sync(path)
-            ledger.begin()
-            empty.rename(self._store)
-            sync(self._store.parent)
+            is_there = self._store.exists()
+            for file in files if is_there else ():
+                found, expected = self._store / file, (empty / file).read_bytes()
+                if not found.is_file() or found.read_bytes() != expected:
+                    what = "it is missing or not as written, or the capture has changed since"
+                    raise OutputError(what, where=f"{self._store}: {file}", hint=OTHER_OUT)
+            journal.begin()
+            if not is_there:
+                for path in (*empty.rglob("*"), empty):
+                    sync(path)
+                empty.rename(self._store)
+                sync(self._store.parent)
 
     def _write_blank(self, path: Path) -> None:
         """The store with names, axes and attributes; chunks not yet written read as not fitted."""
@@ -280,10 +278,15 @@ class _MapStore:
             write_empty_chunks=True,
         )
 
-    def run(self, ledger: Ledger, source: Path, scheduler: str | None, progress: Counter) -> None:
-        """Fit and write every block that the ledger does not hold or whose files have changed."""
-        regions = [r for r in self._regions if not ledger.holds(_label(r), self._files(r))]
-        every = sum(map(_size, self._regions))
+    def run(self, journal: Journal, source: Path, scheduler: str | None, progress: Counter) -> None:
+        """Fit and write every block that is not on the disk."""
+        stored = xr.open_zarr(self._store, chunks=None, consolidated=False)
+        regions = [
+            region
+            for name, region in self._regions.items()
+            if name not in journal.done or not self._is_whole(stored, region)
+        ]
+        every = sum(map(_size, self._regions.values()))
         done = every - sum(map(_size, regions))
         with workers(scheduler) as (executor, count):
             opened = self._image if scheduler is None else None  # a cluster opens it for itself
@@ -293,9 +296,19 @@ class _MapStore:
             ):
                 with written(self._store):
                     self._write(block, region)
-                    ledger.add(_label(region), Entry(readings, digest_files(self._files(region))))
+                    journal.add(_label(region), readings)
                 done += _size(region)
                 progress(done, every)
+
+    def _is_whole(self, stored: xr.Dataset, region: Region) -> bool:
+        """Whether every chunk of a block is there and has the checksum that it was written with."""
+        if not all(file.is_file() for file in self._files(region)):
+            return False  # it would be read as not fitted
+        try:
+            stored[list(self._maps.data_vars)].isel(region).load()
+        except Exception:  # codecs raise nearly every type for a broken chunk
+            return False
+        return True
 
     def _write(self, block: xr.Dataset, region: Region) -> None:
         """Write a block and wait until it is on the disk."""
@@ -314,21 +327,17 @@ class _MapStore:
             found.append(self._store.joinpath(str(name), "c", *map(str, at)))
         return found
 
-    def finish(self, ledger: Ledger) -> None:
+    def finish(self, journal: Journal) -> None:
         """Mark the store as finished, with a digest of the readings."""
-        readings = [ledger.entries[_label(region)].inputs for region in self._regions]
+        readings = [journal.done[name] for name in self._regions]
         with written(self._store), temporary_folder(self._store.parent) as folder:
             metadata = _metadata(self._store)
             if metadata["attributes"].get(REQUEST) != self.request:
                 raise taken_over(self._store)
-            metadata["attributes"][FINISHED] = self._digest_all(readings)
+            metadata["attributes"][FINISHED] = digest(list(self._regions), readings)
             unfinished = folder / METADATA
             unfinished.write_text(json.dumps(metadata, indent=2))
             replace_file(unfinished, self._store / METADATA)
-
-    def _digest_all(self, readings: list[str]) -> str:
-        """Digest of the readings of all blocks."""
-        return digest([_label(region) for region in self._regions], readings)
 
 
 def _metadata(store: Path) -> dict[str, Any]:

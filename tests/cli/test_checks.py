@@ -34,7 +34,7 @@ def test_calibrate_prints_a_table_and_writes_every_fit(
     ]
     assert main([*words, "--out", str(out), "--resume", "--seed", "1"]) == 1
     assert capsys.readouterr().err.splitlines() == [
-        f"{store}/ledger: it was begun with another seed; "
+        f"{store}/journal: it was begun with another seed; "
         "repeat the command as it was, or give another --out"
     ]
     more = [*words[:3], "24", *words[4:], "--out", str(out), "--resume", "--json"]
