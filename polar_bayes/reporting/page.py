@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import matplotlib
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from polar_bayes.errors import FitError, one_line
@@ -204,8 +205,10 @@ def picture(
     alternative, caption = (each.format(**values) for each in _captions()[kind][name])
     buffer = io.BytesIO()
     with matplotlib.rc_context(FIXED_STYLE):
-        # No date and a fixed salt: the same result gives the same page, byte for byte.
-        figure.savefig(buffer, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
+        # No date and a fixed salt: the same result gives the same page, byte for byte. `savefig`
+        # would draw a figure with a layout twice.
+        figure.dpi = 160
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
     encoded = base64.b64encode(buffer.getvalue()).decode("ascii")
     source = f"data:image/svg+xml;base64,{encoded}"
     return Picture(source, alternative, (instead or caption) + more, figure.get_figwidth() > 7.0)
