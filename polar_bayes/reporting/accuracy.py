@@ -121,7 +121,6 @@ def front_panel(axes: Axes, study: xr.Dataset, time: str) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # often less than a decade
     style.plain_numbers(axes.xaxis, axes.yaxis)
     _name_methods(axes, known, time, colors)
-    style.set_tick_style(axes)
 
 
 def _assign(names: pd.Series, values: Sequence[str]) -> dict[str, str]:

@@ -64,7 +64,6 @@ def plot_comparison(comparison: FitComparison) -> Figure:
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
         style.set_panel_title(axes, style.label_text(label.replace("_", " ")))
-    style.set_tick_style(panels)
     handles = [
         Line2D([], [], color=color, marker="o", ms=4.5, lw=2.0, label=style.label_text(name, 24))
         for name, color in colors.items()

@@ -216,7 +216,6 @@ def plot_calibration(
         right.set_ylabel("posterior mean", fontsize=8)
     for axes, label in zip(panels[-3:], (*2 * ("rank of the truth",), "truth"), strict=True):
         axes.set_xlabel(label, fontsize=8)
-    style.set_tick_style(panels)
     return figure
 
 
@@ -271,7 +270,6 @@ def interval_coverage(
     ticks = [each / 100.0 for each in (*range(0, 50, 10), *INTERVALS) if each / 100.0 > least]
     axes.set_xticks(ticks, [f"{tick:.0%}" for tick in ticks])
     axes.set_xlabel("share of all fits whose interval holds the truth", fontsize=9)
-    style.set_tick_style(axes)
     _name_methods(figure, method, colors)
     return figure
 
@@ -304,9 +302,8 @@ def _panels(
     for axes, each in zip(panels, ranks, strict=True):
         style.set_panel_title(axes, each.title)
         draw(axes, each)
-    style.set_tick_style(panels)
-    figure.supxlabel(labels[0], fontsize=9)
-    figure.supylabel(labels[1], fontsize=9)
+    figure.supxlabel(labels[0])
+    figure.supylabel(labels[1])
     return figure
 
 

@@ -160,7 +160,6 @@ def _draw_readings(fit: FitView, found: list[xr.Dataset], label: str, short_labe
     drawn: set[str] = set()
     for axes, curve in panels:
         drawn |= _draw_curve(axes, curve, limit)
-    style.set_tick_style(figure.axes)
     zenith = np.concatenate([curve["zenith"] for curve in found])
     zenith = zenith[np.isfinite(zenith)]
     low, high = (float(zenith.min()), float(zenith.max())) if zenith.size else (0.0, 90.0)
@@ -169,7 +168,7 @@ def _draw_readings(fit: FitView, found: list[xr.Dataset], label: str, short_labe
     where = f", {_azimuth_title(azimuths[0])}" if len(azimuths) == 1 else ""
     # Not as a title: there the legend would cover it.
     part = f" (the first {len(shown)} of {len(found)})" if len(found) > len(shown) else ""
-    figure.supxlabel(f"view zenith [degree]{where}{part}", fontsize=9)
+    figure.supxlabel(f"view zenith [degree]{where}{part}")
     handles = [handle for key, handle in _reading_handles().items() if key in drawn]
     style.add_legend(figure, handles, columns=4 if figure.get_figwidth() > 7.0 else 3)
     return figure
@@ -441,12 +440,11 @@ def plot_spectrum(
     for axes in panels:
         axes.set_ylim(low, high)
         axes.locator_params(axis="x", nbins=5)
-    style.set_tick_style(panels)
     sizes = fit.posterior[name].sizes
     total = np.prod([sizes[dim] for dim in sizes if dim not in (*SAMPLE_DIMS, "wavelength")])
     part = f" (the first {len(shown)} of {int(total)})" if total > len(shown) else ""
-    figure.supxlabel(f"wavelength [nm]{part}", fontsize=9)
-    figure.supylabel(shown[0].label, fontsize=9)
+    figure.supxlabel(f"wavelength [nm]{part}")
+    figure.supylabel(shown[0].label)
     style.add_legend(figure, _spectrum_handles(shown), columns=5)
     return figure
 

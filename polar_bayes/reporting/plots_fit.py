@@ -153,9 +153,8 @@ def plot_ranks(result: xr.DataTree | FitView) -> Figure:
         axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
         axes.set(xlim=(0, 1), ylim=(0, max(2.0, axes.get_ylim()[1])), xticks=[0, 0.5, 1])
         style.set_panel_title(axes, parameter_title(scalar, fit.posterior))
-    style.set_tick_style(panels)
-    figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)", fontsize=9)
-    figure.supylabel("density", fontsize=9)
+    figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)")
+    figure.supylabel("density")
     handles = [
         Line2D([], [], color=color, label=f"chain {i + 1}")
         for i, color in enumerate(CHAIN_COLORS[:chains])
@@ -207,7 +206,6 @@ def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
         style.set_panel_title(axes, parameter_title(scalar, fit.posterior))
-    style.set_tick_style(panels)
     handles: list[Patch | Line2D] = [
         Patch(color=lighten(GRAY, 0.72), label="prior"),
         Patch(color=lighten(BLUE, 0.45), label="posterior"),
@@ -247,8 +245,7 @@ def plot_pit(
             _pit_panel(axes, values)
             axes.set_title(f"{QUANTITIES.get(check.name, check.name)}: {kind}", loc="left")
         panels[row, 0].set_ylabel("share below, minus uniform")
-    style.set_tick_style(list(panels.flat))
-    figure.supxlabel("PIT: share of the prediction below the reading", fontsize=9)
+    figure.supxlabel("PIT: share of the prediction below the reading")
     return figure
 
 
@@ -396,7 +393,6 @@ def plot_shrinkage(
     names += map(style.label_text, style.coordinate_labels(population.location))
     part = f" ({len(rows)} of {count}, evenly from low to high)" if count > len(rows) else ""
     axes.set_xlabel(", ".join(names) + part)
-    style.set_tick_style(axes)
     axes.tick_params(axis="y", length=0, labelsize=6.0 if is_dense else 7.5)
     style.add_legend(figure, _shrinkage_legend(rows), columns=2)
     return figure
