@@ -90,9 +90,7 @@ COLUMNS = ("level", "p_value", "statistic", "sentence")
 
 
 @once
-def criticize(
-    result: xr.DataTree | FitView, checks: Mapping[str, PredictiveCheck] | None = None
-) -> pd.DataFrame:
+def criticize(result: xr.DataTree | FitView) -> pd.DataFrame:
     """What the readings say against the model of a fit.
 
     A check with a p-value gives a caution below 0.02 and a problem below 0.004, which is the
@@ -100,7 +98,6 @@ def criticize(
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-        checks: Those of `predictive_checks(result)`, where they are there already.
 
     Returns:
         A row for each check of `QUESTIONS`. Columns: level ("passed", "note", "caution", "problem"
@@ -123,7 +120,6 @@ def criticize(
         if fit.method == "point":
             why = "A point fit has no draws to criticize."
         return _table(dict.fromkeys(CHECKS, Finding("not computed", sentence=why)))
-    checks = predictive_checks(fit) if checks is None else checks
     absent = [s for s in fit.scalars if _is_absent(s, fit)]
     index = _index(fit)
     # Where the index by eye says so, a wider prior is the remedy, and no other check names one.
@@ -137,7 +133,7 @@ def criticize(
             "index": index,
             "systematic errors": _systematic_errors(fit, absent),
             **residual_findings(residuals_of(fit)),
-            "leave-one-out": _leave_one_out(checks),
+            "leave-one-out": _leave_one_out(predictive_checks(fit)),
             "repeats": _repeats(fit),
             "alternatives": _alternatives(fit, absent),
         }

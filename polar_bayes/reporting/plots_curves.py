@@ -45,6 +45,7 @@ def _missing(result: xr.DataTree, name: str) -> str:
     return "" if result["observed_data"].to_dataset()[name].sizes.get("view") else "view"
 
 
+@once
 def curves(fit: FitView, name: str) -> list[xr.Dataset]:
     """One recorded variable and its prediction by view, for each material and wavelength."""
     result = fit.result
@@ -403,15 +404,12 @@ def _spectrum(
 
 
 @style.styled
-def plot_spectrum(
-    result: xr.DataTree | FitView, name: str, found: dict[str, list[Spectrum]] | None = None
-) -> Figure:
+def plot_spectrum(result: xr.DataTree | FitView, name: str) -> Figure:
     """One parameter over wavelength: median, 50% and 95%, a panel for each member.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
         name: The parameter, such as refractive_index.
-        found: That of `spectra(result)`, where it is there already.
 
     Returns:
         The figure: bands between and beyond the measured wavelengths where the fit ties colors
@@ -421,7 +419,7 @@ def plot_spectrum(
         FitError: The fit does not have that parameter over wavelength.
     """
     fit = view_of(result)
-    found = spectra(fit) if found is None else found
+    found = spectra(fit)
     if name not in found:
         hint = f"choose one of {', '.join(found) or 'none'}"
         what = f"{name} was not fitted over wavelength"

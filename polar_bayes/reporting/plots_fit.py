@@ -10,6 +10,7 @@ from arviz_stats.base import array_stats
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
@@ -21,7 +22,7 @@ from polar_bayes.diagnostics.population import (
     populations,
     shrinkage,
 )
-from polar_bayes.diagnostics.predictive import PredictiveCheck, pit_band, predictive_checks
+from polar_bayes.diagnostics.predictive import pit_band, predictive_checks
 from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import style
@@ -41,7 +42,6 @@ from polar_bayes.reporting.style import (
 MAX_PAIRED = 8
 MAX_POINTS = 800
 RANK_BINS = 20
-MINUS = "\N{MINUS SIGN}"
 
 
 @once
@@ -86,37 +86,43 @@ def plot_pairs(result: xr.DataTree | FitView) -> Figure:
     titles = [parameter_title(scalar, fit.posterior).split(", ") for scalar in found]
     labels = ["\n".join(style.wrap(part, 19) for part in title) for title in titles]
     size = len(found)
-    figure, panels = _pair_panels(size, lines=max(label.count("\n") for label in labels) + 1)
+    lines = max(label.count("\n") for label in labels) + 1
+    # Placed by hand: a layout engine takes seconds for this many axes.
+    side, margin = max(5.6, min(1.35 * size + 0.9, 9.6)), 0.42 + 0.16 * lines
+    figure = style.NotebookFigure(figsize=(side, side))
+    places = figure.add_gridspec(
+        *(size, size), left=(margin + 0.25) / side, bottom=margin / side, right=0.985, top=0.99,
+        hspace=0.12, wspace=0.12,
+    )  # fmt: skip
     draws = np.stack([scalar.draws.ravel() for scalar in found])
     shown = np.linspace(0, draws.shape[1] - 1, min(MAX_POINTS, draws.shape[1])).astype(int)
     diverging = np.flatnonzero(np.asarray(fit.stats.get("diverging", np.empty(0))))
     correlation = np.corrcoef(draws)
     limits = [style.padded_range(values, 0.04) for values in draws]
     truths = [fit.truth(scalar) for scalar in found]
-    for row in range(size):
-        for column in range(size):
-            axes = panels[row, column]
-            axes.set_xlim(limits[column])
-            if row == column:
-                counts, edges = np.histogram(draws[row], 30, range=limits[row])
-                axes.stairs(counts, edges, fill=True, color=lighten(BLUE, 0.45))
-                axes.set_ylim(0, 1.08 * counts.max())
-                _draw_truth(axes, truths[row], np.nan)
-            elif row > column:
-                axes.set_ylim(limits[row])
-                xy = draws[[column, row]]
-                axes.plot(*xy[:, shown], "o", color=BLUE, ms=1.6, mew=0, alpha=0.4, rasterized=True)
-                if diverging.size:
-                    cross: dict[str, Any] = {"color": VERMILLION, "ms": 4, "mew": 1.2}
-                    axes.plot(*xy[:, diverging], "x", rasterized=True, **cross)
-                _draw_truth(axes, truths[column], truths[row])
-            else:
-                _write_correlation(axes, correlation[row, column])
-            _pair_ticks(axes, row, column, size)
-        panels[-1, row].set_xlabel(labels[row], fontsize=8)
-        if row:
-            panels[row, 0].set_ylabel(labels[row], fontsize=8)
-    panels[0, 0].set_ylabel("share of draws", fontsize=8)
+    for row, column in zip(*np.triu_indices(size, 1), strict=True):
+        _write_correlation(figure, places[row, column], correlation[row, column])
+    for row, column in zip(*np.tril_indices(size), strict=True):
+        axes = figure.add_subplot(places[row, column])
+        axes.set_xlim(limits[column])
+        if row == column:
+            counts, edges = np.histogram(draws[row], 30, range=limits[row])
+            axes.stairs(counts, edges, fill=True, color=lighten(BLUE, 0.45))
+            axes.set_ylim(0, 1.08 * counts.max())
+            _draw_truth(axes, truths[row], np.nan)
+        else:
+            axes.set_ylim(limits[row])
+            xy = draws[[column, row]]
+            axes.plot(*xy[:, shown], "o", color=BLUE, ms=1.6, mew=0, alpha=0.4, rasterized=True)
+            if diverging.size:
+                cross: dict[str, Any] = {"color": VERMILLION, "ms": 4, "mew": 1.2}
+                axes.plot(*xy[:, diverging], "x", rasterized=True, **cross)
+            _draw_truth(axes, truths[column], truths[row])
+        _pair_ticks(axes, row, column, size)
+        if row == size - 1:
+            axes.set_xlabel(labels[column], fontsize=8)
+        if column == 0:
+            axes.set_ylabel(labels[row] if row else "share of draws", fontsize=8)
     figure.align_labels()
     return figure
 
@@ -218,14 +224,11 @@ def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
 
 
 @style.styled
-def plot_pit(
-    result: xr.DataTree | FitView, checks: dict[str, PredictiveCheck] | None = None
-) -> Figure:
+def plot_pit(result: xr.DataTree | FitView) -> Figure:
     """PIT and leave-one-out PIT of every variable: distance from the uniform distribution.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-        checks: Those of `predictive_checks(result)`, where they are there already.
 
     Returns:
         The figure: a row for each variable, bands that hold the whole curve with 95%.
@@ -233,8 +236,7 @@ def plot_pit(
     Raises:
         FitError: No variable has two readings and enough draws.
     """
-    checks = predictive_checks(result) if checks is None else checks
-    rows = [check for check in checks.values() if check.pit.size >= 2]
+    rows = [check for check in predictive_checks(result).values() if check.pit.size >= 2]
     if not rows:
         raise _nothing_to_draw("plot_pit", "two readings and 100 draws")
     figure = style.NotebookFigure(figsize=(8.2, 2.1 * len(rows) + 0.5), layout="constrained")
@@ -247,18 +249,6 @@ def plot_pit(
         panels[row, 0].set_ylabel("share below, minus uniform")
     figure.supxlabel("PIT: share of the prediction below the reading")
     return figure
-
-
-def _pair_panels(size: int, *, lines: int) -> tuple[Figure, np.ndarray]:
-    """Panels for pairs, placed by hand: a layout engine takes seconds for this many axes."""
-    side = max(5.6, min(1.35 * size + 0.9, 9.6))
-    margin = 0.42 + 0.16 * lines
-    figure = style.NotebookFigure(figsize=(side, side))
-    place = {"left": (margin + 0.25) / side, "bottom": margin / side, "right": 0.985, "top": 0.99}
-    panels = figure.subplots(
-        size, size, squeeze=False, gridspec_kw={**place, "hspace": 0.12, "wspace": 0.12}
-    )
-    return figure, panels
 
 
 def _pit_panel(axes: Axes, values: np.ndarray | None) -> None:
@@ -290,19 +280,12 @@ def _draw_truth(axes: Axes, x: float, y: float) -> None:
         axes.axhline(y, **line)
 
 
-def _write_correlation(axes: Axes, value: float) -> None:
-    axes.axis("off")
-    strength = min(abs(value), 1.0)
-    axes.text(
-        0.5,
-        0.5,
-        "0.00" if abs(value) < 0.005 else f"{value:+.2f}".replace("-", MINUS),
-        ha="center",
-        va="center",
-        transform=axes.transAxes,
-        fontsize=8.0 + 3.0 * strength,
-        color=style.text_color() if strength > 0.3 else GRAY,
-    )
+def _write_correlation(figure: Figure, place: SubplotSpec, value: float) -> None:
+    strength, box = min(abs(value), 1.0), place.get_position(figure)
+    text = "0.00" if abs(value) < 0.005 else f"{value:+.2f}".replace("-", "\N{MINUS SIGN}")
+    color = style.text_color() if strength > 0.3 else GRAY
+    at = (box.x0 + box.x1) / 2.0, (box.y0 + box.y1) / 2.0
+    figure.text(*at, text, ha="center", va="center", fontsize=8.0 + 3.0 * strength, color=color)
 
 
 def _pair_ticks(axes: Axes, row: int, column: int, size: int) -> None:
@@ -336,19 +319,12 @@ LOGARITHMIC = 15.0
 
 
 @style.styled
-def plot_shrinkage(
-    result: xr.DataTree | FitView,
-    label: str,
-    summary: pd.DataFrame | None = None,
-    members: pd.DataFrame | None = None,
-) -> Figure:
+def plot_shrinkage(result: xr.DataTree | FitView, label: str) -> Figure:
     """Every member of one population: alone (hollow), pooled (filled), and the population.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
         label: Of the population, such as `refractive_index` or `refractive_index[450]`.
-        summary: That of `population_summary`, where it is there already.
-        members: That of `shrinkage`, where it is there already.
 
     Returns:
         The figure: members sorted by their pooled mean, at most 60, taken evenly.
@@ -357,8 +333,7 @@ def plot_shrinkage(
         FitError: The result has no such population, or its draws are not finite.
     """
     fit = view_of(result)
-    summary = population_summary(fit) if summary is None else summary
-    members = shrinkage(fit) if members is None else members
+    summary, members = population_summary(fit), shrinkage(fit)
     found = {each.label: each for each in populations(fit)}
     if label not in found or label not in summary.index:
         hint = f"choose one of {', '.join(summary.index) or 'none'}"

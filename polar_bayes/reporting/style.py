@@ -102,9 +102,7 @@ def _settings() -> Any:
     own: Any = matplotlib.rcParams
     default: Any = matplotlib.rcParamsDefault
     wanted = {**STYLE, **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), own["text.color"])}
-    unset = {
-        key: value if own[key] == default[key] else own[key] for key, value in wanted.items()
-    }
+    unset = {key: value if own[key] == default[key] else own[key] for key, value in wanted.items()}
     families = own["font.family"]
     # DejaVu Sans comes last, so that every letter of a name can be drawn.
     fonts = [*([] if families == default["font.family"] else families), "DejaVu Sans"]
