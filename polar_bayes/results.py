@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from polar_bayes.benchmark.advice import STUDY, accuracy_dataset, accuracy_sentences, accuracy_table
+from polar_bayes.benchmark.advice import STUDY, accuracy_sentences, accuracy_table, accuracy_view
 from polar_bayes.calibration.scores import is_calibrated
 from polar_bayes.calibration.verdict import (
     CALIBRATION,
@@ -75,9 +75,9 @@ def _calibration_verdict(calibration: xr.DataTree) -> Verdict:
 
 
 def _accuracy_verdict(study: xr.DataTree | xr.Dataset) -> Verdict:
-    doubts = str(accuracy_dataset(study).attrs["reference_doubts"])
-    problems = (f"The reference is in doubt: {doubts}.",) if doubts else ()
-    return Verdict(not doubts, problems, (), tuple(accuracy_sentences(study)))
+    view = accuracy_view(study)
+    problems = (f"The reference is in doubt: {view.doubts}.",) if view.doubts else ()
+    return Verdict(not view.doubts, problems, (), tuple(accuracy_sentences(view)))
 
 
 def _map_summary(maps: xr.Dataset) -> pd.DataFrame:

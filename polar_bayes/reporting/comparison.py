@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from polar_bayes.diagnostics.compare import FitComparison, compare_fits
-from polar_bayes.diagnostics.sensitivity import SENSITIVE
+from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
@@ -146,7 +146,7 @@ def sensitivity_table(comparison: FitComparison) -> Table | None:
         "by the data": lambda row: str(row["verdict"]),
         **text.SENSITIVITY_CELLS,
     }
-    caption = page.caption("comparison.sensitivity", sensitive=SENSITIVE)
+    caption = page.caption("comparison.sensitivity", sensitive=LIMITS.sensitive)
     prose = ["fit", "remark"]
     return page.make_table("sensitivity", caption, cells, known, prose=prose)
 

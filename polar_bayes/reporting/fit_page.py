@@ -10,15 +10,16 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
-from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
+from polar_bayes.benchmark.advice import accuracy_sentences, accuracy_view
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
-from polar_bayes.diagnostics.criticism import QUESTIONS, REFUTED, criticize
+from polar_bayes.diagnostics.criticism import QUESTIONS, criticize
+from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.parameters import APPROXIMATIONS, is_hyperparameter
 from polar_bayes.diagnostics.population import population_summary, populations, shrinkage
 from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck, predictive_checks
-from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, sensitivity
+from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.checks import CAUTION, PROBLEM
@@ -177,7 +178,7 @@ def parameter_table(fit: FitView) -> Table:
         "prior inside": lambda row: percent(row["prior_inside"]),
         "by the data": lambda row: str(row["verdict"]),
     }
-    caption = page.caption("fit.parameter", determined=DETERMINED, partly=PARTLY)
+    caption = page.caption("fit.parameter", determined=LIMITS.determined, partly=LIMITS.partly)
     data = convergence.summary(fit).join(sensitivity(fit)[["prior_inside", "verdict"]])
     return fit_table(fit, "parameter", caption, cells, data)
 
@@ -212,7 +213,7 @@ def sensitivity_table(fit: FitView) -> Table:
         "width left": lambda row: percent(row["width_left"]),
         **text.SENSITIVITY_CELLS,
     }
-    caption = page.caption("fit.sensitivity", sensitive=SENSITIVE)
+    caption = page.caption("fit.sensitivity", sensitive=LIMITS.sensitive)
     return fit_table(fit, "sensitivity", caption, cells, sensitivity(fit), prose="remark")
 
 
@@ -288,7 +289,7 @@ def _alternatives(fit: FitView) -> Iterator[page.Block]:
         "would be": column("other", ".4g"),
         "shift (sd)": lambda row: "redefined" if row["redefined"] else f"{row['shift']:+.1f}",
     }
-    caption = page.caption("fit.alternative", better=-math.log(CAUTION), refuted=REFUTED)
+    caption = page.caption("fit.alternative", better=-math.log(CAUTION), refuted=LIMITS.refuted)
     yield page.make_table("alternative", caption, cells, table)
 
 
@@ -562,7 +563,7 @@ def _effects(result: xr.DataTree) -> Iterator[page.Block]:
 def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
     """An accuracy study of the same capture, where the result holds one."""
     if "accuracy" in result.children:
-        study = accuracy_dataset(result["accuracy"].to_dataset())
+        study = accuracy_view(result["accuracy"].to_dataset())
         yield " ".join([*accuracy_sentences(study), text.reference_sentence(study)])
         yield accuracy_picture(study)
         yield study_table(study)

@@ -1,6 +1,7 @@
 """Figures of a fit: its parameters, its checks, and the members of its populations."""
 
 import functools
+import itertools
 from typing import Any
 
 import numpy as np
@@ -100,9 +101,9 @@ def plot_pairs(result: xr.DataTree | FitView) -> Figure:
     correlation = np.corrcoef(draws)
     limits = [style.padded_range(values, 0.04) for values in draws]
     truths = [fit.truth(scalar) for scalar in found]
-    for row, column in zip(*np.triu_indices(size, 1), strict=True):
+    for row, column in itertools.combinations(range(size), 2):
         _write_correlation(figure, places[row, column], correlation[row, column])
-    for row, column in zip(*np.tril_indices(size), strict=True):
+    for row, column in ((row, column) for row in range(size) for column in range(row + 1)):
         axes = figure.add_subplot(places[row, column])
         axes.set_xlim(limits[column])
         if row == column:

@@ -13,13 +13,14 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from polar_bayes.benchmark.advice import accuracy_dataset
+from polar_bayes.benchmark.advice import Study, accuracy_view
 from polar_bayes.calibration.scores import is_calibrated, p_values, significance_level
 from polar_bayes.calibration.verdict import CalibrationView, calibration_verdict
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import FitComparison
 from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.criticism import criticize
+from polar_bayes.diagnostics.finding import join
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.population import Population, population_summary, populations
 from polar_bayes.diagnostics.predictive import predictive_checks
@@ -111,11 +112,6 @@ def p_value(level: float) -> Callable[[pd.Series], str]:
         return or_dash(row["p_value"], ".2g") + (" (fails)" if row["p_value"] < level else "")
 
     return cell
-
-
-def join(names: Sequence[str]) -> str:
-    """`a, b and c`."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def join_first(names: Sequence[str]) -> str:
@@ -640,13 +636,13 @@ def interval_sentences(table: pd.DataFrame, titles: Mapping[str, str]) -> list[s
 # --- Accuracy studies -----------------------------------------------------------------------------
 
 
-def reference_sentence(result: xr.DataTree | xr.Dataset) -> str:
+def reference_sentence(result: Study) -> str:
     """What the reference is, and how accurate it is."""
-    study = accuracy_dataset(result).attrs
+    view = accuracy_view(result)
+    study = view.study.attrs
     sentence = (
         f"The reference is {study['reference_draws']:,} draws of {study['reference']} with an "
         f"effective sample size of {study['reference_effective_draws']:,.0f}; its own Monte Carlo "
         f"error is at most {study['reference_error']:.2g} posterior sd."
     )
-    doubts = study["reference_doubts"]
-    return f"{sentence} Against it speaks: {doubts}." if doubts else sentence
+    return f"{sentence} Against it speaks: {view.doubts}." if view.doubts else sentence
