@@ -211,9 +211,8 @@ def study_table(study: AccuracyView) -> Table:
         "gradients": column("gradients", ",.0f"),
         "densities": column("densities", ",.0f"),
     }
-    caption = page.caption("accuracy.study")
     return page.make_table(
-        "study", caption, cells, table, label="method", descriptions=marks, prose=["method"]
+        "accuracy.study", cells, table, label="method", descriptions=marks, prose=["method"]
     )
 
 
@@ -221,8 +220,7 @@ def error_table(study: AccuracyView) -> Table:
     """Errors of every parameter by the methods as given."""
     errors = study.errors[study.is_given]
     cells: page.Cells = {str(name): column(name, ".2g") for name in errors.columns}
-    caption = "The larger error of mean and standard deviation of each, in posterior sds."
-    return page.make_table("error", caption, cells, errors, label="method")
+    return page.make_table("accuracy.error", cells, errors, label="method")
 
 
 REPORT = page.Report(accuracy_page, accuracy_card, plot_accuracy, file="accuracy.nc")

@@ -116,8 +116,7 @@ def loo_table(comparison: FitComparison) -> Table:
         "weight": lambda row: f"{row['weight']:.2f}",
         "k > 0.7": lambda row: f"{int(row['unreliable'])}",
     }
-    caption = page.caption("comparison.loo", clear=CLEAR)
-    return page.make_table("loo", caption, cells, comparison.loo, label="fit")
+    return page.make_table("comparison.loo", cells, comparison.loo, label="fit", clear=CLEAR)
 
 
 def parameter_table(comparison: FitComparison) -> Table:
@@ -130,9 +129,7 @@ def parameter_table(comparison: FitComparison) -> Table:
         "R-hat": column("r_hat", ".3f"),
         "ESS": lambda row: or_dash(np.floor(row["ess_bulk"]), ".0f"),
     }
-    caption = "Posterior mean, standard deviation and equal-tailed 95% interval by each fit."
-    data = comparison.parameters
-    return page.make_table("parameter", caption, cells, data, prose=["fit"])
+    return page.make_table("comparison.parameter", cells, comparison.parameters, prose=["fit"])
 
 
 def sensitivity_table(comparison: FitComparison) -> Table | None:
@@ -146,9 +143,10 @@ def sensitivity_table(comparison: FitComparison) -> Table | None:
         "by the data": lambda row: str(row["verdict"]),
         **text.SENSITIVITY_CELLS,
     }
-    caption = page.caption("comparison.sensitivity", sensitive=LIMITS.sensitive)
     prose = ["fit", "remark"]
-    return page.make_table("sensitivity", caption, cells, known, prose=prose)
+    return page.make_table(
+        "comparison.sensitivity", cells, known, prose=prose, sensitive=LIMITS.sensitive
+    )
 
 
 def settings_table(provenances: Mapping[str, Mapping[str, Any]]) -> Table:

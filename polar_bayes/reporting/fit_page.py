@@ -23,7 +23,7 @@ from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.checks import CAUTION, PROBLEM
-from polar_bayes.inference.files import auto_sentences
+from polar_bayes.inference.files import sentences_of_auto
 from polar_bayes.methods.registry import METHODS
 from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.priors import short_numbers
@@ -62,7 +62,7 @@ PROVENANCE_GROUPS = {
 
 
 def fit_table(
-    fit: FitView, name: str, caption: str, cells: page.Cells, data: pd.DataFrame, prose: str = ""
+    fit: FitView, key: str, cells: page.Cells, data: pd.DataFrame, **options: Any
 ) -> Table:
     """A table with a row for each parameter that the numbers have, in groups."""
     names = set(map(str, fit.posterior.data_vars))
@@ -80,9 +80,7 @@ def fit_table(
             data = data.assign(true_value=truths)
         else:
             cells = {title: cell for title, cell in cells.items() if title != TRUTH}
-    return page.make_table(
-        name, caption, cells, data, descriptions=titles, groups=groups, prose=[prose]
-    )
+    return page.make_table(key, cells, data, descriptions=titles, groups=groups, **options)
 
 
 def has_draws(fit: FitView) -> bool:
@@ -178,9 +176,9 @@ def parameter_table(fit: FitView) -> Table:
         "prior inside": lambda row: percent(row["prior_inside"]),
         "by the data": lambda row: str(row["verdict"]),
     }
-    caption = page.caption("fit.parameter", determined=LIMITS.determined, partly=LIMITS.partly)
     data = convergence.summary(fit).join(sensitivity(fit)[["prior_inside", "verdict"]])
-    return fit_table(fit, "parameter", caption, cells, data)
+    limits = {"determined": LIMITS.determined, "partly": LIMITS.partly}
+    return fit_table(fit, "fit.parameter", cells, data, **limits)
 
 
 def _truth_cell(row: pd.Series) -> str:
@@ -199,10 +197,9 @@ def _estimate_table(fit: FitView) -> Table:
         "standard error": error,
         TRUTH: lambda row: number(row["true_value"], row["standard_error"]),
     }
-    caption = "Least squares; standard errors from the curvature and the residuals."
     data = convergence.summary(fit)[["mean", "sd"]]
     data = data.set_axis(["estimate", "standard_error"], axis="columns")
-    return fit_table(fit, "parameter", caption, cells, data)
+    return fit_table(fit, "fit.estimate", cells, data, name="parameter")
 
 
 def sensitivity_table(fit: FitView) -> Table:
@@ -213,8 +210,8 @@ def sensitivity_table(fit: FitView) -> Table:
         "width left": lambda row: percent(row["width_left"]),
         **text.SENSITIVITY_CELLS,
     }
-    caption = page.caption("fit.sensitivity", sensitive=LIMITS.sensitive)
-    return fit_table(fit, "sensitivity", caption, cells, sensitivity(fit), prose="remark")
+    options = {"prose": ["remark"], "sensitive": LIMITS.sensitive}
+    return fit_table(fit, "fit.sensitivity", cells, sensitivity(fit), **options)
 
 
 def _pairs(fit: FitView) -> Iterator[page.Picture]:
@@ -245,8 +242,7 @@ def _scenes(result: xr.DataTree) -> Iterator[page.Block]:
         **{name: operator.itemgetter(name) for name in texts},
         "criticism": lambda row: row["criticism"] or DASH,
     }
-    caption = page.caption("fit.scene")
-    yield page.make_table("scene", caption, cells, table, label="scene", prose=["criticism"])
+    yield page.make_table("fit.scene", cells, table, label="scene", prose=["criticism"])
 
 
 def _criticism(fit: FitView) -> Iterator[page.Block]:
@@ -260,15 +256,13 @@ def _criticism(fit: FitView) -> Iterator[page.Block]:
         "p": column("p_value", ".2g"),
         "what it says": lambda row: row["sentence"] or DASH,
     }
-    caption = page.caption("fit.criticism", caution=CAUTION, problem=PROBLEM)
     yield page.make_table(
-        "criticism",
-        caption,
-        cells,
-        criticize(fit),
+        *("fit.criticism", cells, criticize(fit)),
         label="check",
         descriptions=QUESTIONS,
         prose=["what it says"],
+        caution=CAUTION,
+        problem=PROBLEM,
     )
     yield from _alternatives(fit)
 
@@ -289,8 +283,8 @@ def _alternatives(fit: FitView) -> Iterator[page.Block]:
         "would be": column("other", ".4g"),
         "shift (sd)": lambda row: "redefined" if row["redefined"] else f"{row['shift']:+.1f}",
     }
-    caption = page.caption("fit.alternative", better=-math.log(CAUTION), refuted=LIMITS.refuted)
-    yield page.make_table("alternative", caption, cells, table)
+    better = -math.log(CAUTION)
+    yield page.make_table("fit.alternative", cells, table, better=better, refuted=LIMITS.refuted)
 
 
 # --- Populations and spectra ----------------------------------------------------------------------
@@ -339,8 +333,7 @@ def population_table(fit: FitView) -> Table:
         each.label: f"{summary.loc[each.label, 'members']} members, {SCALES[each.scale]}"
         for each in populations(fit)
     }
-    caption = page.caption("fit.population")
-    return page.make_table("population", caption, cells, summary, descriptions=members)
+    return page.make_table("fit.population", cells, summary, descriptions=members)
 
 
 def member_table(fit: FitView) -> Table:
@@ -362,7 +355,7 @@ def member_table(fit: FitView) -> Table:
         "pooled share": lambda row: percent(row["shrinkage"]),
     }
     data = shrinkage(fit).loc[list(titles)]
-    return page.make_table("member", page.caption("fit.member"), cells, data, descriptions=titles)
+    return page.make_table("fit.member", cells, data, descriptions=titles)
 
 
 def _spectrum(fit: FitView) -> Iterator[page.Block]:
@@ -406,7 +399,7 @@ def discrepancy_table(fit: FitView, compared: pd.DataFrame, part: str, name: str
         "width": lambda row: percent(row["width_ratio"]),
         TRUTH: lambda row: number(row["true_value"], scale(row)),
     }
-    return fit_table(fit, name, page.caption("fit.without", part=part), cells, compared)
+    return fit_table(fit, "fit.without", cells, compared, name=name, part=part)
 
 
 # --- Readings and checks --------------------------------------------------------------------------
@@ -440,7 +433,7 @@ def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
         "readings": column("readings", ".0f"),
         "residual RMS": column("residual_rms", ".3g"),
     }
-    caption = "Residual: reading minus the noise-free prediction, in the unit of the reading."
+    key = "fit.residual"
     if any(check.pit.size for check in checks.values()):
         cells |= {f"inside {p:.0%}": _coverage_cell(p) for p in PROBABILITIES}
         cells |= {
@@ -448,8 +441,10 @@ def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
             "p": column("p_loo", ".1f"),
             "k > 0.7": column("unreliable", ".0f"),
         }
-        caption += page.caption("fit.predictive_check")
-    return page.make_table("check", caption, cells, data, label="variable", descriptions=QUANTITIES)
+        key = "fit.predictive_check"
+    return page.make_table(
+        key, cells, data, name="check", label="variable", descriptions=QUANTITIES
+    )
 
 
 def _check_numbers(check: PredictiveCheck) -> dict[str, float]:
@@ -485,7 +480,7 @@ def _convergence(fit: FitView) -> Iterator[page.Block]:
     if fit.method == "nuts":
         yield convergence_table(fit)
     if "auto" in fit.provenance:
-        yield from page.make_bullets(auto_sentences(fit.result))
+        yield from page.make_bullets(sentences_of_auto(fit.provenance))
     yield from page.make_facts(_sampler_facts(fit))
     if fit.method == "nuts" and has_draws(fit):
         yield page.picture(plots_fit.plot_ranks(fit), "fit.figure_ranks")
@@ -499,9 +494,8 @@ def convergence_table(fit: FitView) -> Table:
         "ESS tail": lambda row: or_dash(np.floor(row["ess_tail"]), ".0f"),
         "error of the mean": column("mcse_mean", ".2g"),
     }
-    caption = "Wanted: R-hat at most 1.01 and both effective sample sizes (ESS) at least 400."
     data = convergence.summary(fit)[["r_hat", "ess_bulk", "ess_tail", "mcse_mean"]]
-    return fit_table(fit, "convergence", caption, cells, data)
+    return fit_table(fit, "fit.convergence", cells, data)
 
 
 SAMPLER_FACTS: Mapping[str, tuple[str, Callable[[xr.DataArray], object]]] = {

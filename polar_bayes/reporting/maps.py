@@ -345,12 +345,10 @@ def _wavelengths(maps: xr.Dataset) -> list[float]:
 
 def _pixel_tables(counts: pd.DataFrame) -> Iterator[Table]:
     """Pixels by status; and by approach, with how many of them are good."""
-    caption = "The status of each pixel. Only good ones count in the other tables."
-    yield count_table("status", caption, counts.sum(axis=1).to_frame("pixels"), STATUSES)
-    caption = "How the numbers of each pixel were found; the cheapest method comes first."
+    yield count_table("map.status", counts.sum(axis=1).to_frame("pixels"), STATUSES)
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
     data = pd.DataFrame({"pixels": counts.sum(), "good": good})
-    yield count_table("approach", caption, data, APPROACHES)
+    yield count_table("map.approach", data, APPROACHES)
 
 
 def _criticism_table(maps: xr.Dataset) -> Iterator[Table]:
@@ -358,9 +356,7 @@ def _criticism_table(maps: xr.Dataset) -> Iterator[Table]:
     data = count_criticism(maps)
     if not data.empty:
         yield page.make_table(
-            "criticism",
-            "What the readings of a pixel say against its model. A pixel with a problem is "
-            "contradicted; a caution is told next to numbers that are good otherwise.",
+            "map.criticism",
             {str(level): text.column(str(level), ",.0f") for level in data.columns},
             data,
             label="check",
@@ -369,7 +365,7 @@ def _criticism_table(maps: xr.Dataset) -> Iterator[Table]:
         )
 
 
-def count_table(name: str, caption: str, data: pd.DataFrame, meanings: Mapping[str, str]) -> Table:
+def count_table(key: str, data: pd.DataFrame, meanings: Mapping[str, str]) -> Table:
     """Counts by flag: how many there are, their share, and how many of them fulfil a condition."""
     what, *others = map(str, data.columns)
     total = int(data[what].sum())
@@ -380,9 +376,8 @@ def count_table(name: str, caption: str, data: pd.DataFrame, meanings: Mapping[s
     }
     data = data.copy()
     data.insert(1, "share", data[what] / max(total, 1))
-    return page.make_table(
-        name, caption, cells, data, label=name, descriptions=meanings, prose=[name]
-    )
+    label = key.partition(".")[2]
+    return page.make_table(key, cells, data, label=label, descriptions=meanings, prose=[label])
 
 
 def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
@@ -401,8 +396,7 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
         return lambda row: number(row[column], row["typical sd"])
 
     return page.make_table(
-        "parameter",
-        page.caption("map.parameter"),
+        "map.parameter",
         {column: cell(column) for column in columns},
         pd.DataFrame.from_dict(data, orient="index", columns=columns),
         descriptions={scalar.label: title for scalar, title in titles.items()},
@@ -418,8 +412,7 @@ def shared_table(shared: pd.DataFrame) -> Table:
         return lambda row: number(row[column], width[row.name])
 
     return page.make_table(
-        "shared",
-        page.caption("map.shared"),
+        "map.shared",
         {
             **{column: cell(column) for column in ("q2.5", "q50", "q97.5")},
             "pixels": text.column("pixels", ",.0f"),

@@ -71,23 +71,29 @@ type Cells = Mapping[str, Callable[[pd.Series], str]]
 
 
 def make_table(
-    table: str,
-    caption: str,
+    key: str,
     cells: Cells,
     data: pd.DataFrame,
     *,
+    name: str = "",
     label: str = "parameter",
     descriptions: Mapping[str, str] = {},
     groups: Mapping[str, str] = {},
     prose: Collection[str] = (),
+    **values: object,
 ) -> Table:
-    """A table with a row for each row of numbers; `label` heads the column of their names."""
+    """A table with a row for each row of numbers; `label` heads the column of their names.
+
+    The key is that of its caption, which the values fill in; the table is called after it, unless
+    it has another name.
+    """
     rows = []
-    for key, numbers in data.iterrows():
-        name = str(key[0] if isinstance(key, tuple) else key)
+    for at, numbers in data.iterrows():
+        row = str(at[0] if isinstance(at, tuple) else at)
         texts = tuple(cell(numbers) for cell in cells.values())
-        rows.append(Row(name, texts, descriptions.get(name, ""), groups.get(name, "")))
-    return Table((label, *cells), tuple(rows), prose, table, caption, data)
+        rows.append(Row(row, texts, descriptions.get(row, ""), groups.get(row, "")))
+    name = name or key.partition(".")[2]
+    return Table((label, *cells), tuple(rows), prose, name, caption(key, **values), data)
 
 
 def second_label(row: pd.Series) -> str:

@@ -103,7 +103,7 @@ def plot_pairs(result: xr.DataTree | FitView) -> Figure:
     truths = [fit.truth(scalar) for scalar in found]
     for row, column in itertools.combinations(range(size), 2):
         _write_correlation(figure, places[row, column], correlation[row, column])
-    for row, column in ((row, column) for row in range(size) for column in range(row + 1)):
+    for row, column in ((at, other) for at in range(size) for other in range(at + 1)):
         axes = figure.add_subplot(places[row, column])
         axes.set_xlim(limits[column])
         if row == column:
