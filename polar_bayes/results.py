@@ -34,7 +34,10 @@ from polar_bayes.paths import as_path, atomic_write, existing_file
 MIN_GOOD_SHARE = 0.95
 """Share of the pixels read that need an answer for a map to pass."""
 
-LABELED = xr.DataTree | xr.Dataset
+type Capture = xr.Dataset
+type Fit = xr.DataTree
+type Result = xr.DataTree | xr.Dataset
+"""A result of any kind."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +77,7 @@ def _calibration_verdict(calibration: xr.DataTree) -> Verdict:
     return Verdict(passed, () if passed else sentences, (), sentences if passed else ())
 
 
-def _accuracy_verdict(study: xr.DataTree | xr.Dataset) -> Verdict:
+def _accuracy_verdict(study: Result) -> Verdict:
     view = accuracy_view(study)
     problems = (f"The reference is in doubt: {view.doubts}.",) if view.doubts else ()
     return Verdict(not view.doubts, problems, (), tuple(accuracy_sentences(view)))
@@ -151,7 +154,9 @@ KINDS = (
     ),
     Kind(
         "several fits",
-        lambda result: isinstance(result, Mapping) and not isinstance(result, LABELED),
+        lambda result: (
+            isinstance(result, Mapping) and not isinstance(result, xr.DataTree | xr.Dataset)
+        ),
         convergence.summary,  # refuses them, with a hint
         convergence.verdict,
         reports="comparison",
@@ -166,7 +171,7 @@ def kind_of(result: object) -> Kind:
     return next((kind for kind in KINDS if kind.applies(result)), KINDS[-1])
 
 
-def summary(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
+def summary(result: Result) -> pd.DataFrame:
     """The table of a result of any kind, numbers unrounded; printed, it shows every column.
 
     Args:
@@ -191,7 +196,7 @@ def summary(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
     return PrintedFrame(kind_of(result).summary(result))
 
 
-def verdict(result: xr.DataTree | xr.Dataset) -> Verdict:
+def verdict(result: Result) -> Verdict:
     """Whether the numbers of a result of any kind may be used, and what follows from them.
 
     A fit by sampling fails on any R-hat above 1.01, any effective sample size below 400 and any
@@ -218,7 +223,7 @@ def verdict(result: xr.DataTree | xr.Dataset) -> Verdict:
     return dataclasses.replace(judged, cautions=cautions)
 
 
-def save(result: xr.DataTree | xr.Dataset, path: str | os.PathLike[str]) -> None:
+def save(result: Result, path: str | os.PathLike[str]) -> None:
     """Write a result of any kind to a netCDF-4 file with a checksum, which `load` verifies.
 
     Args:
@@ -269,7 +274,7 @@ def load(path: str | os.PathLike[str], kind: str | None = None) -> Any:
     return result
 
 
-def _read(path: str | os.PathLike[str], wanted: str) -> tuple[xr.DataTree | xr.Dataset, str]:
+def _read(path: str | os.PathLike[str], wanted: str) -> tuple[Result, str]:
     """A tree, or the dataset of a store or of a file without groups, and the path as text."""
     if as_path(path, wanted).suffix == ".zarr":
         return open_map(path), str(path)

@@ -20,12 +20,10 @@ STUDY = Schema(
     provenance=COMMON_PROVENANCE,
 )
 
-TIMES = ("seconds_first", "seconds_again")
 NUMBERS = (
     *("r_hat", "k_hat", "effective_draws", "gradients", "densities"),
-    *(*TIMES, "peak_memory"),
+    *("seconds_first", "seconds_again", "peak_memory"),
 )
-TEXTS = ("method", "override", "problems")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,7 +55,10 @@ class AccuracyView:
                 "interval": np.fmax.reduce(self._larger("low_error", "high_error"), axis=1),
                 "wasserstein": np.fmax.reduce(distance, axis=1),
                 **{name: self.study[name].to_numpy() for name in NUMBERS},
-                **{name: [str(x) for x in self.study[name].to_numpy()] for name in TEXTS},
+                **{
+                    name: [str(x) for x in self.study[name].to_numpy()]
+                    for name in ("method", "override", "problems")
+                },
             },
             index=pd.Index(self.errors.index, name="row"),
         )
@@ -99,7 +100,9 @@ def accuracy_view(result: Study) -> AccuracyView:
     check = FIT.check if is_fit and "accuracy" in result.children else STUDY.check
     check(result, "accuracy")
     found = result["accuracy"].to_dataset().transpose("row", "parameter", ...)
-    if pd.MultiIndex.from_arrays([found[name].to_numpy() for name in TEXTS[:2]]).has_duplicates:
+    if pd.MultiIndex.from_arrays(
+        [found[name].to_numpy() for name in ("method", "override")]
+    ).has_duplicates:
         raise FitError(
             "two rows have one name",
             where="accuracy",
@@ -129,7 +132,7 @@ def pareto_front(seconds: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 def time_column(table: pd.DataFrame) -> str:
     """The column of times that is filled in: of the first fit, where it was measured."""
-    return TIMES[0] if table[TIMES[0]].notna().any() else TIMES[1]
+    return "seconds_first" if table["seconds_first"].notna().any() else "seconds_again"
 
 
 def accuracy_sentences(result: Study, tolerance: float = 0.1) -> list[str]:

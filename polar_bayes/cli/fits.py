@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -47,6 +47,9 @@ from polar_bayes.cli.printing import (
 from polar_bayes.methods.registry import FIT_DEFAULT, MAP_DEFAULT
 from polar_bayes.paths import write_errors
 from polar_bayes.progress import stages
+
+if TYPE_CHECKING:
+    from polar_bayes.results import Result
 
 DEMO = "polar-bayes demo"
 """Attribute of the capture of a demo, by which the next demo recognizes its folder."""
@@ -126,7 +129,8 @@ def fit(
         raise click.UsageError("--seconds needs --method auto")
     with stages() as progress:
         if choose:
-            options = {key: settings[key] for key in OF_CHOICE}
+            matter = ("scene", "model", "priors", "links", "largest_view_zenith", "seed")
+            options = {key: settings[key] for key in matter}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             chosen: Any = pb.choose_effects(data, progress=progress, **options)
             say("\n".join(pb.verdict(chosen.ledger).sentences), err=True)
@@ -143,10 +147,6 @@ def fit(
     for sentence in told:
         say(sentence, err=True)
     return print_fit(result, as_json=as_json)
-
-
-OF_CHOICE = ("scene", "model", "priors", "links", "largest_view_zenith", "seed")
-"""Options of a fit that matter for the choice of its effects."""
 
 
 def _in_setup(chosen: Any, scene: Any) -> Any:
@@ -329,12 +329,12 @@ def report(
     click.echo(f"report: {page}")
 
 
-def _is_new_fit(result: Any) -> bool:
+def _is_new_fit(result: "Result") -> bool:
     """Whether it is a fit of which nobody has asked yet what to measure next."""
     return "posterior" in result and "next_views" not in result and pb.verdict(result).passed
 
 
-def _add_next_views(result: Any) -> None:
+def _add_next_views(result: "Result") -> None:
     """Keep with a fit which views to take next; where that is not known, say why."""
     try:
         with stages() as progress:
